@@ -1,0 +1,1 @@
+"""Checkpoint to network to integer netlist; imports nothing of ours outside this package."""

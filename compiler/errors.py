@@ -1,0 +1,71 @@
+"""The error tree: one base, one child per party that must act.
+
+Every message is *where: what was found, what is allowed; what to do*, on one line. The command line prints it
+and exits with 2; nothing here carries a traceback to a user.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+class SpikeloomError(Exception):
+    """Base of everything that a user can cause and mend."""
+
+
+class ModelError(SpikeloomError):
+    """The checkpoint, its graph or its options cannot be used: the user mends the model."""
+
+
+class DataError(SpikeloomError):
+    """The recordings cannot be used: the user mends the data."""
+
+
+class OptionError(SpikeloomError):
+    """An option has a value that does not exist: the user mends the command."""
+
+
+class FormatError(SpikeloomError):
+    """A netlist file is truncated, altered or from another version."""
+
+
+class NumericRangeError(SpikeloomError):
+    """A chip register would overflow: the simulation stops instead of inventing a value."""
+
+
+class VerifyError(Exception):
+    """A network broke a rule of the intermediate representation: a defect of ours, never of the user."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Violation:
+    """One limit that a network breaks.
+
+    Parameters
+    ----------
+    owner : str
+        Who breaks it, for example ``core 3 (fc1)``.
+    rule : str
+        Name of the limit in the target file, for example ``loihi1.core.axons_in``.
+    used, allowed : int
+        Amount found and amount allowed.
+    remedy : str
+        What would make it fit.
+    """
+
+    owner: str
+    rule: str
+    used: int
+    allowed: int
+    remedy: str
+
+    def __str__(self) -> str:
+        return f"{self.owner}: {self.used} used, {self.allowed} allowed ({self.rule}); {self.remedy}"
+
+
+class CapacityError(SpikeloomError):
+    """A network does not fit the chip; holds every violation, not the first."""
+
+    def __init__(self, violations: tuple[Violation, ...]) -> None:
+        self.violations = violations
+        super().__init__("\n".join(str(violation) for violation in violations))

@@ -1,0 +1,1 @@
+"""The float world: tactile graphs, recordings, networks and training; may import the compiler."""

@@ -1,0 +1,1 @@
+"""Netlist and events to spikes, verdicts and costs; holds the command line."""
