@@ -32,8 +32,8 @@ def write_atomically(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         # mkstemp makes private files; a result should have the permissions of any other new file.
         mask = os.umask(0)
         os.umask(mask)
-        os.chmod(beside, 0o666 & ~mask)
-        os.replace(beside, path)
+        Path(beside).chmod(0o666 & ~mask)
+        Path(beside).replace(path)
     except BaseException:
         Path(beside).unlink(missing_ok=True)
         raise

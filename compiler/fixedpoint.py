@@ -1,0 +1,176 @@
+"""Loihi's integer arithmetic: decay, saturation, bias encoding. Exact and small; int64 in, int64 out.
+
+Every rounding that a chip register performs is written here once, for arrays. (:mod:`runtime.spec` states the same
+rules a second time in plain Python integers, on purpose: the tests hold the two together.)
+
+References
+----------
+.. [1] M. Davies et al., "Loihi: A Neuromorphic Manycore Processor with On-Chip Learning", IEEE Micro 38(1), 2018.
+.. [2] nengo-loihi, ``builder/discretize.py`` and ``emulator/interface.py``; lava, ``proc/lif/models.py``.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+IntArray = npt.NDArray[np.int64]
+FloatArray = npt.NDArray[np.float64]
+
+DECAY_BITS = 12
+"""Decay registers count in 1/4096."""
+
+MEMBRANE_SHIFT = 6
+"""A weight of one adds 2**6 to the membrane; a threshold mantissa is worth 2**6 too, a bias is not shifted."""
+
+ACCUMULATOR_MAX = 2**21 - 1
+"""Largest magnitude of the shifted synaptic sum of one step (21 bits and sign)."""
+
+CURRENT_MAX = 2**23 - 1
+"""Largest magnitude of the current register (24 bits, two's complement)."""
+
+MEMBRANE_MAX = 2**23 - 1
+"""The membrane register saturates at plus and minus this value (24 bits)."""
+
+BIAS_MANTISSA_MAX = 2**12 - 1
+"""Largest magnitude of a bias mantissa (13 bits, signed, used symmetrically)."""
+
+BIAS_EXPONENT_MAX = 7
+"""Largest bias exponent."""
+
+THRESHOLD_MANTISSA_MAX = 2**17 - 1
+"""Largest threshold mantissa (17 bits)."""
+
+ONE_STEP_SUM_MAX = ACCUMULATOR_MAX >> MEMBRANE_SHIFT
+"""Largest sum of effective weights (mantissa times 2**exponent) that one step may bring: 32767."""
+
+
+def decay(x: IntArray, lost: IntArray | int) -> IntArray:
+    """Scale by ``(4096 - lost) / 4096``, rounding toward zero (magnitude floored).
+
+    Parameters
+    ----------
+    x : IntArray
+        Register values, any shape.
+    lost : IntArray or int
+        Share that is lost, in 1/4096, 0 to 4096; broadcasts against `x`.
+
+    Examples
+    --------
+    >>> decay(np.array([1, 5, 6, -5, -6, 64, -64, 3840, -1920, 8128, -8191, 8388607, -8388607]), 3277).tolist()
+    [0, 0, 1, 0, -1, 12, -12, 767, -383, 1625, -1637, 1677311, -1677311]
+    >>> decay(np.array([7, -7]), 0).tolist(), decay(np.array([7, -7]), 4096).tolist()
+    ([7, -7], [0, 0])
+    """
+    factor = 4096 - np.asarray(lost, np.int64)
+    kept: IntArray = np.right_shift(np.abs(x) * factor, DECAY_BITS)
+    return np.where(x < 0, -kept, kept)
+
+
+def saturate(x: IntArray, limit: int) -> IntArray:
+    """Clip to ``-limit … limit``.
+
+    Examples
+    --------
+    >>> saturate(np.array([8388607, 8388608, -8388609]), MEMBRANE_MAX).tolist()
+    [8388607, 8388607, -8388607]
+    """
+    return np.clip(x, -limit, limit)
+
+
+def round_half_even(x: FloatArray) -> IntArray:
+    """Round to the nearest integer, ties to the even one.
+
+    Examples
+    --------
+    >>> round_half_even(np.array([0.5, 1.5, -2.5, 2.4])).tolist()
+    [0, 2, -2, 2]
+    """
+    return np.rint(x).astype(np.int64)
+
+
+def weight_step(bits: int) -> int:
+    """Distance between neighbouring mixed-sign weight mantissas of a storage width.
+
+    A mixed-sign format spends one bit on the sign and drops the least significant bits of a 9-bit span, so even
+    8 bits only hold even mantissas.
+
+    Parameters
+    ----------
+    bits : int
+        Storage width, 2 to 8.
+
+    Examples
+    --------
+    >>> [weight_step(bits) for bits in (8, 6, 4, 2)]
+    [2, 8, 32, 128]
+    """
+    return 1 << (9 - bits)
+
+
+def quantise_weights(weight: FloatArray, scale: float, bits: int) -> IntArray:
+    """Round to mixed-sign mantissas: multiples of the step of `bits`, symmetric range.
+
+    Parameters
+    ----------
+    weight : FloatArray
+        Real weights, any shape.
+    scale : float
+        Mantissa units per real unit.
+    bits : int
+        Storage width, 2 to 8.
+
+    Returns
+    -------
+    IntArray
+        Mantissas, same shape as `weight`.
+
+    Notes
+    -----
+    The range of a width is ``-256 … 256 - step``. The negative end has no mirror and is left unused, so that a
+    network and its negation quantise alike: 8 bits hold -254 … 254, 2 bits the three values -128, 0, 128.
+
+    Examples
+    --------
+    >>> quantise_weights(np.array([1.0, -1.0, 0.5, 0.003]), 254.0, 8).tolist()
+    [254, -254, 128, 0]
+    >>> quantise_weights(np.array([1.0, -1.0, 0.4]), 128.0, 2).tolist()
+    [128, -128, 0]
+    """
+    step = weight_step(bits)
+    limit = 256 - step
+    rounded: IntArray = round_half_even(np.asarray(weight) * (scale / step)) * step
+    return saturate(rounded, limit)
+
+
+def encode_bias(bias: FloatArray) -> tuple[IntArray, IntArray]:
+    """Round biases to mantissa and exponent, the smallest exponent that holds each.
+
+    Parameters
+    ----------
+    bias : FloatArray
+        Biases in membrane units (1/64 of a weight unit), any shape.
+
+    Returns
+    -------
+    mantissa, exponent : IntArray
+        ``mantissa * 2**exponent`` is the nearest value that the chip can hold.
+
+    Raises
+    ------
+    ValueError
+        If a magnitude exceeds ``4095 * 2**7``.
+
+    Examples
+    --------
+    >>> [part.tolist() for part in encode_bias(np.array([-4095.0, 4096.0, 4095.4, 0.4]))]
+    [[-4095, 2048, 4095, 0], [0, 1, 0, 0]]
+    """
+    exponent = np.zeros(np.shape(bias), np.int64)
+    for candidate in range(1, BIAS_EXPONENT_MAX + 1):
+        too_small = np.abs(np.rint(np.ldexp(bias, -exponent))) > BIAS_MANTISSA_MAX
+        exponent = np.where(too_small, candidate, exponent)
+    mantissa = round_half_even(np.ldexp(bias, -exponent))
+    if np.any(np.abs(mantissa) > BIAS_MANTISSA_MAX):
+        raise ValueError(f"bias of magnitude {np.abs(bias).max():.6g} exceeds 4095 * 2**7 membrane units")
+    return mantissa, exponent
