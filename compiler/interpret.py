@@ -1,0 +1,208 @@
+"""The meaning of the intermediate representation: layer by layer over all time steps.
+
+One matrix product per projection, then the recurrence. The integer stage is exact: products run in floating point
+only where every partial sum is an integer that the type holds (below 2**24 in float32, 2**53 in float64).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from compiler.fixedpoint import MEMBRANE_MAX, MEMBRANE_SHIFT, IntArray
+from compiler.ir import INPUT, IntegerNetwork, IntegerPopulation, Network, Population, Sparse
+
+BoolArray = npt.NDArray[np.bool_]
+Floating = npt.NDArray[np.floating[Any]]
+
+BATCH = 8
+"""Recordings that run together: one layer's membranes then stay in cache."""
+
+DENORMAL = 1e-30
+"""Membranes below this are flushed to zero; beside a threshold they are nothing."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Activity:
+    """Spikes of each population, and the values that were compared with the threshold.
+
+    Parameters
+    ----------
+    spikes : tuple of (samples, steps, neurons) bool
+        One array per population, all aligned with the data.
+    membranes : tuple of (samples, steps, neurons), or None
+        Membrane before the reset; float64 in model units, or int64 register values.
+    """
+
+    spikes: tuple[BoolArray, ...]
+    membranes: tuple[npt.NDArray[Any], ...] | None
+
+
+def product(weight: Sparse, spikes: BoolArray, dtype: npt.DTypeLike) -> Floating:
+    """Synaptic sums of every step: ``spikes @ weight.T`` in `dtype`.
+
+    Parameters
+    ----------
+    weight : csr_array (n_post, n_pre)
+        Weights.
+    spikes : (samples, steps, n_pre) bool
+        Presynaptic spikes.
+
+    Returns
+    -------
+    (samples, steps, n_post) of `dtype`
+    """
+    samples, steps, n_pre = spikes.shape
+    dense = weight.toarray().astype(dtype)
+    sums: Floating = spikes.reshape(samples * steps, n_pre).astype(dtype) @ dense.T
+    return sums.reshape(samples, steps, -1)
+
+
+def integer_sums(weight: Sparse, spikes: BoolArray) -> Floating:
+    """Exact synaptic sums of integer weights, in a floating type that holds each of them; (samples, steps, n_post)."""
+    largest = int(abs(weight).sum(axis=1).max(initial=0))
+    return product(weight, spikes, np.float32 if largest < 2**24 else np.float64)
+
+
+def float_recurrence(
+    population: Population, current: Floating, *, membranes: bool = False
+) -> tuple[BoolArray, Floating | None]:
+    """LIF in the type of `current`: ``u = beta * u * (1 - s) + I``, ``s = u > theta``, with ``I`` the given current."""
+    spikes = np.empty(current.shape, np.bool_)
+    kept = np.empty_like(current) if membranes else None
+    u = np.zeros_like(current[:, 0])
+    beta, theta = current.dtype.type(population.beta), current.dtype.type(population.theta)
+    for step in range(current.shape[1]):
+        u *= beta
+        u += current[:, step]
+        fired = np.greater(u, theta, out=spikes[:, step])
+        if kept is not None:
+            kept[:, step] = u
+        u *= ~fired
+        if step % 16 == 15:
+            # A decaying membrane ends in denormals, which cost a hundred times a normal operation.
+            u[np.abs(u) < DENORMAL] = 0
+    return spikes, kept
+
+
+def integer_recurrence(
+    population: IntegerPopulation, sums: Floating, *, membranes: bool = False
+) -> tuple[BoolArray, IntArray | None]:
+    """Loihi's compartment on given synaptic sums (in weight units); :mod:`runtime.spec` holds the definition.
+
+    Runs in float64, exactly: registers times a 12-bit factor stay below 2**36, a product with 2**-12 only moves the
+    point, and truncation is the chip's rounding toward zero.
+    """
+    spikes = np.empty(sums.shape, np.bool_)
+    kept = np.empty(sums.shape, np.int64) if membranes else None
+    threshold = (population.threshold << MEMBRANE_SHIFT).astype(np.float64)
+    bias = population.bias.astype(np.float64)
+    keep_u, keep_v = (4096 - (population.decay_u + 1)) / 4096, (4096 - population.decay_v) / 4096
+    u = np.zeros(sums.shape[::2])
+    v = np.zeros_like(u)
+    inflow = np.empty_like(u)
+    for step in range(sums.shape[1]):
+        np.multiply(sums[:, step], 1 << MEMBRANE_SHIFT, out=inflow)
+        u *= keep_u
+        np.trunc(u, out=u)
+        u += inflow
+        v *= keep_v
+        np.trunc(v, out=v)
+        v += u
+        v += bias
+        np.clip(v, -MEMBRANE_MAX, MEMBRANE_MAX, out=v)
+        fired = np.greater(v, threshold, out=spikes[:, step])
+        if kept is not None:
+            kept[:, step] = v
+        v *= ~fired
+    return spikes, kept
+
+
+def run_float(
+    network: Network, events: BoolArray, *, dtype: npt.DTypeLike = np.float64, membranes: bool = False
+) -> Activity:
+    """Run the float stage.
+
+    Parameters
+    ----------
+    network : Network
+        Float stage.
+    events : (samples, steps, channels) bool
+        Input events.
+    dtype : float32 or float64
+        Arithmetic of the whole run.
+    membranes : bool
+        Keep the membranes too (8 bytes a neuron and step).
+    """
+
+    def layer(post: int, sums: Floating) -> tuple[BoolArray, Floating | None]:
+        population = network.populations[post]
+        sums += population.bias.astype(dtype)
+        return float_recurrence(population, sums, membranes=membranes)
+
+    return _run(network, events, lambda p, spikes: product(p.weight, spikes, dtype), layer)
+
+
+def run_integer(network: IntegerNetwork, events: BoolArray, *, membranes: bool = False) -> Activity:
+    """Run the integer stage, aligned with the data; parameters as :func:`run_float`, membranes in register values."""
+
+    def layer(post: int, sums: Floating) -> tuple[BoolArray, IntArray | None]:
+        return integer_recurrence(network.populations[post], sums, membranes=membranes)
+
+    return _run(network, events, lambda p, spikes: integer_sums(p.effective(), spikes), layer)
+
+
+def _run(
+    network: Network | IntegerNetwork,
+    events: BoolArray,
+    sums_of: Callable[[Any, BoolArray], Floating],
+    layer: Callable[[int, Floating], tuple[BoolArray, npt.NDArray[Any] | None]],
+) -> Activity:
+    """Run batch by batch on all cores, population by population."""
+
+    def batch(part: BoolArray) -> list[tuple[BoolArray, npt.NDArray[Any] | None]]:
+        done: list[tuple[BoolArray, npt.NDArray[Any] | None]] = []
+        for post in range(len(network.populations)):
+            sums: Floating | None = None
+            for projection in network.projections:
+                if projection.post == post:
+                    source = part if projection.pre == INPUT else done[projection.pre][0]
+                    more = sums_of(projection, source)
+                    sums = more if sums is None else sums + more
+            assert sums is not None, "verify: every population is reached"
+            done.append(layer(post, sums))
+        return done
+
+    parts = [events[i : i + BATCH] for i in range(0, len(events), BATCH)]
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        results = list(pool.map(batch, parts))
+    spikes = tuple(np.concatenate([result[i][0] for result in results]) for i in range(len(network.populations)))
+    if any(trace is None for _, trace in results[0]):
+        return Activity(spikes=spikes, membranes=None)
+    traces = [np.concatenate([np.asarray(r[i][1]) for r in results]) for i in range(len(network.populations))]
+    return Activity(spikes=spikes, membranes=tuple(traces))
+
+
+def channels_last(events: npt.NDArray[Any]) -> BoolArray:
+    """Reorder recordings (samples, taxels, polarities, steps) to the (samples, steps, channels) used here."""
+    samples, taxels, polarities, steps = events.shape
+    flat = events.reshape(samples, taxels * polarities, steps)
+    return np.ascontiguousarray(flat.transpose(0, 2, 1)).astype(np.bool_)
+
+
+def vote(counts: IntArray) -> IntArray:
+    """Class of each sample from its spike counts (samples, classes): most spikes, lowest index on a tie.
+
+    Examples
+    --------
+    >>> vote(np.array([[1, 3, 3], [0, 0, 0]])).tolist()
+    [1, 0]
+    """
+    winner: IntArray = np.argmax(counts, axis=1)
+    return winner

@@ -1,0 +1,231 @@
+"""The intermediate representation: populations, projections, input and read-out, in a float and an integer stage.
+
+Populations are numbered by their place in the tuple; ``INPUT`` (-1) stands for the input wherever a projection names
+its source. Weights are sparse matrices whose *stored* entries are the structural synapses: a stored zero is a synapse
+of weight zero. What one object can know is checked on construction, everything else in :mod:`compiler.verify`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import networkx as nx
+import numpy as np
+
+from compiler.fixedpoint import DECAY_BITS, FloatArray, IntArray
+
+INPUT = -1
+"""Source id of a projection that starts at the input."""
+
+Sparse = Any
+"""A ``scipy.sparse.csr_array``; scipy ships no types."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Input:
+    """Event input: channel ``taxel * polarities + polarity``."""
+
+    taxels: int
+    polarities: int
+
+    @property
+    def size(self) -> int:
+        """Number of channels."""
+        return self.taxels * self.polarities
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Readout:
+    """Spike-count vote over one population.
+
+    Parameters
+    ----------
+    population : int
+        Index of the population that votes.
+    label : (neurons,) int64
+        Class that each of its neurons votes for. The class with most spikes wins, the lowest index on a tie.
+    """
+
+    population: int
+    label: IntArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Population:
+    """LIF neurons of the float model: ``u <- beta * u * (1 - s) + I + bias``, ``s = u > theta``.
+
+    Parameters
+    ----------
+    name : str
+        Unique in the network.
+    beta, theta : float
+        Decay (0 to 1) and threshold, in the model's membrane units.
+    bias : (neurons,) float64
+        Added in every step.
+    """
+
+    name: str
+    beta: float
+    theta: float
+    bias: FloatArray
+
+    @property
+    def size(self) -> int:
+        """Number of neurons."""
+        return len(self.bias)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Projection:
+    """Synapses from one population to another.
+
+    Parameters
+    ----------
+    pre, post : int
+        Population indices; `pre` may be ``INPUT``.
+    weight : csr_array (neurons of post, neurons of pre) float64
+        ``weight[i, j]`` is from neuron j of `pre` to neuron i of `post`.
+    """
+
+    pre: int
+    post: int
+    weight: Sparse
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Network:
+    """A spiking network in real numbers."""
+
+    input: Input
+    populations: tuple[Population, ...]
+    projections: tuple[Projection, ...]
+    readout: Readout
+    classes: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class IntegerPopulation:
+    """The same neurons in Loihi's registers; units as in :class:`compiler.netlist.Netlist`.
+
+    Parameters
+    ----------
+    name : str
+        Unique in the network.
+    beta, theta : float
+        What the float model asked for.
+    scale : float
+        Weight units per membrane unit of the float model.
+    decay_u, decay_v : int
+        Decay registers.
+    threshold : (neurons,) int64
+        Threshold mantissas.
+    bias_mantissa, bias_exponent : (neurons,) int64
+        Encoded biases.
+    """
+
+    name: str
+    beta: float
+    theta: float
+    scale: float
+    decay_u: int
+    decay_v: int
+    threshold: IntArray
+    bias_mantissa: IntArray
+    bias_exponent: IntArray
+
+    @property
+    def size(self) -> int:
+        """Number of neurons."""
+        return len(self.threshold)
+
+    @property
+    def bias(self) -> IntArray:
+        """``mantissa * 2**exponent``, membrane units; shape (neurons,)."""
+        return self.bias_mantissa << self.bias_exponent
+
+    @property
+    def realised_beta(self) -> float:
+        """Decay factor of the membrane register."""
+        return ((1 << DECAY_BITS) - self.decay_v) / (1 << DECAY_BITS)
+
+    @property
+    def realised_theta(self) -> FloatArray:
+        """Thresholds in the float model's units; shape (neurons,)."""
+        realised: FloatArray = self.threshold / self.scale
+        return realised
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class IntegerProjection:
+    """Synapses as stored: mantissas of `bits` bits with a common exponent.
+
+    Parameters
+    ----------
+    pre, post : int
+        Population indices; `pre` may be ``INPUT``.
+    weight : csr_array (neurons of post, neurons of pre) int64
+        Signed mantissas.
+    exponent : int
+        A synapse adds ``mantissa * 2**exponent`` weight units.
+    bits : int
+        Storage width of a mantissa.
+    """
+
+    pre: int
+    post: int
+    weight: Sparse
+    exponent: int
+    bits: int
+
+    def effective(self) -> Sparse:
+        """Weights in weight units, csr_array of int64; exact, since mantissas are even."""
+        scaled = self.weight.copy()
+        scaled.data = scaled.data >> 1 if self.exponent < 0 else scaled.data << self.exponent
+        return scaled
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class IntegerNetwork:
+    """A spiking network in chip integers, not yet on cores."""
+
+    input: Input
+    populations: tuple[IntegerPopulation, ...]
+    projections: tuple[IntegerProjection, ...]
+    readout: Readout
+    classes: int
+
+
+def depths(network: Network | IntegerNetwork) -> tuple[int, ...]:
+    """Steps that each population lags behind the data: the longest path from the input, minus one.
+
+    Examples
+    --------
+    A population that listens to the input has depth 0, its listeners depth 1.
+    """
+    found = [0] * len(network.populations)
+    for post in range(len(network.populations)):
+        sources = [projection.pre for projection in network.projections if projection.post == post]
+        found[post] = max((found[pre] + 1 for pre in sources if pre != INPUT), default=0)
+    return tuple(found)
+
+
+def to_networkx(network: Network | IntegerNetwork) -> nx.MultiDiGraph:
+    """Populations as nodes (``input`` among them), projections as edges with their synapse count."""
+    graph = nx.MultiDiGraph()
+    graph.add_node("input", neurons=network.input.size)
+    for population in network.populations:
+        graph.add_node(population.name, neurons=population.size)
+    for projection in network.projections:
+        pre = "input" if projection.pre == INPUT else network.populations[projection.pre].name
+        graph.add_edge(pre, network.populations[projection.post].name, synapses=int(projection.weight.nnz))
+    return graph
+
+
+def fan_in(network: Network | IntegerNetwork, post: int) -> IntArray:
+    """Structural synapses into each neuron of a population; shape (neurons,)."""
+    total = np.zeros(network.populations[post].size, np.int64)
+    for projection in network.projections:
+        if projection.post == post:
+            total += np.diff(projection.weight.indptr)
+    return total

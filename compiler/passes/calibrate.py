@@ -1,0 +1,69 @@
+"""Run the float network on training recordings, so that scales can be chosen by what they do to spikes.
+
+The network is not changed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from compiler.errors import DataError
+from compiler.interpret import BoolArray, run_float
+from compiler.ir import INPUT, Network
+
+RECORDINGS = 32
+"""Recordings used at most, evenly spaced over the split: flips are counted on eight thousand steps a neuron."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Calibration:
+    """Spikes of the float64 model on the calibration recordings.
+
+    Parameters
+    ----------
+    events : (samples, steps, channels) bool
+        Input events.
+    spikes : tuple of (samples, steps, neurons) bool
+        Spikes of each population.
+    """
+
+    events: BoolArray
+    spikes: tuple[BoolArray, ...]
+
+    def source(self, pre: int) -> BoolArray:
+        """Spikes of a projection's source population, or the input events."""
+        return self.events if pre == INPUT else self.spikes[pre]
+
+
+def evenly_spaced(events: BoolArray, count: int = RECORDINGS) -> BoolArray:
+    """At most `count` recordings, evenly spaced over the first axis."""
+    if len(events) <= count:
+        return events
+    return events[np.linspace(0, len(events) - 1, count).round().astype(np.int64)]
+
+
+def calibrate(network: Network, events: BoolArray) -> Calibration:
+    """Run the float64 model.
+
+    Parameters
+    ----------
+    network : Network
+        Float stage.
+    events : (samples, steps, channels) bool
+        Training recordings; all of them are run.
+
+    Raises
+    ------
+    DataError
+        If there is no recording, or its channels are not the network's.
+    """
+    if not len(events):
+        raise DataError("calibration: the split is empty; give recordings with a train split")
+    if events.shape[2] != network.input.size:
+        raise DataError(
+            f"calibration: the recordings have {events.shape[2]} channels, the network has {network.input.size}; "
+            "give recordings of the sensor that it was trained on"
+        )
+    return Calibration(events=events, spikes=run_float(network, events).spikes)

@@ -1,0 +1,151 @@
+"""Write a partitioned, placed network down as a netlist.
+
+Every non-zero synapse is stored once; nothing else changes. Lists are stored sparse unless they are nearly full, as
+far as the core's memory allows it, because a zero inside a dense list is visited, and paid, like any other synapse.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from compiler.fixedpoint import IntArray
+from compiler.ir import INPUT, IntegerNetwork, depths, fan_in
+from compiler.netlist import Layer, Netlist, read_only
+from compiler.passes.partition import Chunk, Lists, Partition, choose_dense, index_bits, lean_fits, lists_into
+from compiler.targets import Target
+
+
+def _entries(
+    network: IntegerNetwork, chunk: Chunk, lists: Lists, dense: IntArray, base: int
+) -> tuple[IntArray, IntArray, IntArray]:
+    """Synapses of a chunk's lists: entries per list, targets on the core, mantissas."""
+    columns = network.projections[lists.projection].weight[chunk.first : chunk.last].tocsc()
+    length = np.where(dense, lists.last - lists.first + 1, lists.nonzero)
+    start = np.concatenate([[0], np.cumsum(length)])
+    target = np.zeros(start[-1], np.int64)
+    weight = np.zeros(start[-1], np.int64)
+    for i, source in enumerate(lists.source):
+        held = slice(columns.indptr[source], columns.indptr[source + 1])
+        row, data = columns.indices[held], columns.data[held]
+        row, data = row[data != 0], data[data != 0]
+        place = slice(start[i], start[i + 1])
+        if dense[i]:
+            target[place] = base + np.arange(lists.first[i], lists.last[i] + 1)
+            weight[start[i] + row - lists.first[i]] = data
+        else:
+            target[place] = base + row
+            weight[place] = data
+    return length, target, weight
+
+
+def _layers(network: IntegerNetwork) -> tuple[Layer, ...]:
+    return tuple(
+        Layer(
+            name=population.name,
+            neurons=population.size,
+            depth=depth,
+            scale=population.scale,
+            beta=population.beta,
+            theta=population.theta,
+            weight_bits=max(p.bits for p in network.projections if p.post == post),
+            synapses=int(fan_in(network, post).sum()),
+            max_fan_in=int(fan_in(network, post).max()),
+        )
+        for post, (population, depth) in enumerate(zip(network.populations, depths(network), strict=True))
+    )
+
+
+def emit(
+    network: IntegerNetwork,
+    partition: Partition,
+    tiles: tuple[int, ...],
+    target: Target,
+    provenance: Mapping[str, Any],
+) -> Netlist:
+    """Assemble the netlist of a partitioned network.
+
+    Parameters
+    ----------
+    network : IntegerNetwork
+        Integer stage.
+    partition : Partition
+        Chunks of each core.
+    tiles : tuple of int
+        Tile of each core.
+    target : Target
+        Chip.
+    provenance : mapping
+        JSON values to remember.
+    """
+    compartment_id = [np.zeros(population.size, np.int64) for population in network.populations]
+    placed: list[tuple[Chunk, int, int]] = []  # chunk, core, base on it
+    counts: list[int] = []
+    for core, chunks in enumerate(partition.cores):
+        base = 0
+        for chunk in chunks:
+            placed.append((chunk, core, base))
+            ids = sum(counts) + base + np.arange(chunk.size)
+            compartment_id[chunk.population][chunk.first : chunk.last] = ids
+            base += chunk.size
+        counts.append(base)
+
+    formats: dict[tuple[int, int, int], int] = {}
+    axons_per_core = np.zeros(len(partition.cores), np.int64)
+    parts: dict[str, list[IntArray]] = {key: [] for key in ("source", "format", "length", "target", "weight")}
+    lean = [lean_fits(network, target, chunks) for chunks in partition.cores]
+    for chunk, core, base in placed:
+        for lists in lists_into(network, chunk):
+            projection = network.projections[lists.projection]
+            dense, _ = choose_dense(lists, projection, base, chunk.size, lean=lean[core], target=target)
+            length, targets, weights = _entries(network, chunk, lists, dense, base)
+            sparse_bits = index_bits(base + chunk.size - 1, target)
+            form = [
+                formats.setdefault((projection.bits, projection.exponent, 0 if flag else sparse_bits), len(formats))
+                for flag in dense
+            ]
+            source = lists.source
+            if projection.pre != INPUT:
+                source = network.input.size + compartment_id[projection.pre][source]
+            axons_per_core[core] += len(source)
+            for key, value in zip(parts, (source, np.array(form), length, targets, weights), strict=True):
+                parts[key].append(value)
+
+    order = [chunk for chunk, _, _ in placed]
+    populations = [network.populations[chunk.population] for chunk in order]
+    neurons = [np.arange(chunk.first, chunk.last) for chunk in order]
+    rows = list(zip(populations, neurons, strict=True))
+    votes = [
+        network.readout.label[n] if chunk.population == network.readout.population else np.full(chunk.size, -1)
+        for chunk, n in zip(order, neurons, strict=True)
+    ]
+    columns = sorted(formats, key=lambda key: formats[key])
+    return Netlist(
+        target=target.name,
+        taxels=network.input.taxels,
+        polarities=network.input.polarities,
+        classes=network.classes,
+        layers=_layers(network),
+        core_tile=read_only(tiles),
+        core_compartments=read_only(np.concatenate([[0], np.cumsum(counts)])),
+        core_axons=read_only(np.concatenate([[0], np.cumsum(axons_per_core)])),
+        layer=read_only(np.concatenate([np.full(chunk.size, chunk.population) for chunk in order])),
+        neuron=read_only(np.concatenate(neurons)),
+        decay_u=read_only(np.concatenate([np.full(len(n), p.decay_u) for p, n in rows])),
+        decay_v=read_only(np.concatenate([np.full(len(n), p.decay_v) for p, n in rows])),
+        threshold=read_only(np.concatenate([p.threshold[n] for p, n in rows])),
+        bias_mantissa=read_only(np.concatenate([p.bias_mantissa[n] for p, n in rows])),
+        bias_exponent=read_only(np.concatenate([p.bias_exponent[n] for p, n in rows])),
+        readout_class=read_only(np.concatenate(votes)),
+        axon_source=read_only(np.concatenate(parts["source"])),
+        axon_format=read_only(np.concatenate(parts["format"])),
+        axon_synapses=read_only(np.concatenate([[0], np.cumsum(np.concatenate(parts["length"]))])),
+        synapse_target=read_only(np.concatenate(parts["target"])),
+        synapse_weight=read_only(np.concatenate(parts["weight"])),
+        format_weight_bits=read_only([key[0] for key in columns]),
+        format_exponent=read_only([key[1] for key in columns]),
+        format_index_bits=read_only([key[2] for key in columns]),
+        provenance=dict(provenance),
+    )

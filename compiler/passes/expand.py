@@ -1,0 +1,149 @@
+"""Expand a graph convolution to the synapses that it means: fan-in weights per pair of taxels.
+
+Outputs equal those of the factored form up to floating-point rounding (float64 throughout).
+
+References
+----------
+.. [1] J. Du et al., "Topology Adaptive Graph Convolutional Networks", 2017, arXiv:1710.10370: the K-hop filter
+   ``y = sum_k A^k x g_k + b``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy import sparse
+
+from compiler.errors import ModelError
+from compiler.fixedpoint import FloatArray
+from compiler.frontends.checkpoint import Checkpoint
+from compiler.ir import INPUT, Input, Network, Population, Projection, Readout, Sparse
+
+AFFINE_TOLERANCE = 1e-9
+"""Largest deviation from affinity, relative to the stage's largest response, that rounding in float64 explains."""
+
+
+def expand_graph_convolution(adjacency: FloatArray, hops: FloatArray) -> Sparse:
+    """Effective weights ``W[(i, f), (j, c)] = sum_k (A^k)[i, j] * g[k, f, c]``.
+
+    Parameters
+    ----------
+    adjacency : (taxels, taxels) float64
+        Normalised propagation matrix; row i gathers into taxel i.
+    hops : (K + 1, features, channels) float64
+        Filter of each hop.
+
+    Returns
+    -------
+    csr_array (taxels * features, taxels * channels) float64
+        Rows are taxel-major (``taxel * features + feature``), columns likewise. The stored entries are all pairs of
+        taxels that some hop connects, whatever their weight.
+    """
+    taxels = len(adjacency)
+    n_hops, features, channels = hops.shape
+    reach = np.zeros((taxels, taxels), np.bool_)
+    weight = np.zeros((taxels, features, taxels, channels))
+    power, pattern = np.eye(taxels), np.eye(taxels, dtype=np.bool_)
+    for k in range(n_hops):
+        weight += np.einsum("ij,fc->ifjc", power, hops[k])
+        reach |= pattern
+        power = adjacency @ power
+        pattern = (adjacency != 0).astype(np.int64) @ pattern.astype(np.int64) > 0
+    structure = np.broadcast_to(reach[:, None, :, None], weight.shape)
+    shape = (taxels * features, taxels * channels)
+    return _stored(weight.reshape(shape), structure.reshape(shape))
+
+
+def _stored(weight: FloatArray, structure: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> Sparse:
+    row, column = np.nonzero(structure)
+    matrix = sparse.csr_array((weight[row, column], (row, column)), shape=weight.shape)
+    matrix.sort_indices()
+    return matrix
+
+
+def probe_affine(
+    stage: Callable[[FloatArray], FloatArray], channels: int, *, name: str, seed: int = 0
+) -> tuple[FloatArray, FloatArray]:
+    """Weights and bias of any affine stage between two spiking layers, by probing it with unit vectors.
+
+    Parameters
+    ----------
+    stage : callable
+        Maps (batch, channels) float64 to (batch, outputs) float64.
+    channels : int
+        Number of inputs.
+    name : str
+        For messages.
+    seed : int
+        Seed of the random vectors that test affinity.
+
+    Returns
+    -------
+    weight : (outputs, channels) float64
+    bias : (outputs,) float64
+
+    Raises
+    ------
+    ModelError
+        If the stage does not map random combinations to the same combinations of its responses.
+
+    Examples
+    --------
+    >>> weight, bias = probe_affine(lambda x: x @ np.array([[1.0], [2.0]]) + 3, 2, name="fc")
+    >>> weight.tolist(), bias.tolist()
+    ([[1.0, 2.0]], [3.0])
+    """
+    bias = stage(np.zeros((1, channels)))[0]
+    weight = (stage(np.eye(channels)) - bias).T
+    inputs = np.random.default_rng(seed).normal(size=(8, channels)) * 10.0 ** np.arange(-2, 6)[:, None]
+    responses, affine = stage(inputs), inputs @ weight.T + bias
+    worst = np.abs(responses - affine).max(axis=1) / np.maximum(np.abs(affine).max(axis=1), 1e-300)
+    if not np.all(worst <= AFFINE_TOLERANCE):
+        raise ModelError(
+            f"stage {name}: is not affine (a random combination of inputs is off by {worst.max():.2g} of the response, "
+            f"{AFFINE_TOLERANCE:g} allowed); only affine stages between spiking layers can be lowered to synapses"
+        )
+    return weight, bias
+
+
+def expand(checkpoint: Checkpoint, adjacency: FloatArray) -> Network:
+    """Lower a checkpoint on its taxel graph to a network of populations and synapses, in float64.
+
+    Spikes equal those of the float64 model up to the rounding of a differently ordered sum.
+
+    Parameters
+    ----------
+    checkpoint : Checkpoint
+        Trained weights.
+    adjacency : (taxels, taxels) float64
+        Normalised propagation matrix of the graph that it was trained on.
+
+    Raises
+    ------
+    ModelError
+        If graph and weights disagree about the number of taxels.
+    """
+    if adjacency.shape != (checkpoint.taxels, checkpoint.taxels):
+        raise ModelError(
+            f"graph and weights disagree: the graph has {len(adjacency)} taxels, fc1 was trained on "
+            f"{checkpoint.taxels}; give the graph that the checkpoint was trained on"
+        )
+    hops = checkpoint.hops.astype(np.float64)
+    conv = expand_graph_convolution(adjacency, hops)
+    stages = [("conv1", conv, np.tile(checkpoint.conv_bias.astype(np.float64), checkpoint.taxels))]
+    for dense in checkpoint.dense:
+        weight = dense.weight.astype(np.float64)
+        stages.append((dense.name, _stored(weight, np.ones(weight.shape, np.bool_)), dense.bias.astype(np.float64)))
+    return Network(
+        input=Input(taxels=checkpoint.taxels, polarities=hops.shape[2]),
+        populations=tuple(
+            Population(name=name, beta=checkpoint.beta, theta=checkpoint.theta, bias=bias) for name, _, bias in stages
+        ),
+        projections=tuple(
+            Projection(pre=post - 1 if post else INPUT, post=post, weight=weight)
+            for post, (_, weight, _) in enumerate(stages)
+        ),
+        readout=Readout(population=len(stages) - 1, label=np.arange(checkpoint.classes)),
+        classes=checkpoint.classes,
+    )

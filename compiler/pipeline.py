@@ -1,0 +1,136 @@
+"""The ordered passes: checkpoint to netlist, verified after each, printable after each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy.typing as npt
+
+from compiler.fixedpoint import FloatArray
+from compiler.frontends.checkpoint import Checkpoint
+from compiler.interpret import channels_last
+from compiler.ir import IntegerNetwork, Network
+from compiler.netlist import Netlist
+from compiler.passes.bounds import RangeProof, prove_ranges
+from compiler.passes.calibrate import Calibration, calibrate, evenly_spaced
+from compiler.passes.emit import emit
+from compiler.passes.expand import expand
+from compiler.passes.legalize import LimitUse, require_legal
+from compiler.passes.partition import partition
+from compiler.passes.place import Placement, core_traffic, place
+from compiler.passes.quantize import Choice, quantize
+from compiler.targets import load_target
+from compiler.verify import verify
+
+STAGES = ("expand", "quantize", "place")
+"""Stages after which the artefact can be dumped: float network, integer network, netlist."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Compilation:
+    """Everything that one compilation produced.
+
+    Parameters
+    ----------
+    network : Network
+        Float stage, expanded.
+    integer : IntegerNetwork
+        Integer stage.
+    netlist : Netlist
+        The result.
+    choices : tuple of Choice
+        Scale of each layer and why.
+    proofs : tuple of RangeProof
+        Worst-case register values of each layer.
+    uses : tuple of LimitUse
+        Use of every limit by every core.
+    placement : Placement
+        Tiles and what they cost.
+    core_bound : int
+        No legal partition uses fewer cores.
+    """
+
+    network: Network
+    integer: IntegerNetwork
+    netlist: Netlist
+    choices: tuple[Choice, ...]
+    proofs: tuple[RangeProof, ...]
+    uses: tuple[LimitUse, ...]
+    placement: Placement
+    core_bound: int
+
+
+def compile_checkpoint(
+    checkpoint: Checkpoint,
+    adjacency: FloatArray,
+    *,
+    target: str = "loihi1",
+    weight_bits: int = 8,
+    training_events: npt.NDArray[Any] | None = None,
+    ranges: str = "proven",
+    margin: float = 0.1,
+    provenance: Mapping[str, Any] | None = None,
+    after: Callable[[str, Network | IntegerNetwork | Netlist], None] | None = None,
+) -> Compilation:
+    """Lower a trained checkpoint to a placed netlist that obeys every limit of the chip.
+
+    Parameters
+    ----------
+    checkpoint : Checkpoint
+        Trained weights.
+    adjacency : (taxels, taxels) float64
+        Normalised propagation matrix of the graph that it was trained on.
+    target : str
+        Chip.
+    weight_bits : int
+        Storage width of the weights.
+    training_events : (samples, taxels, polarities, steps), optional
+        Training recordings for calibration; at most 32, evenly spaced, are used.
+    ranges : {"proven", "observed"}
+        How scales are kept from overflowing, see :func:`compiler.passes.quantize.quantize`.
+    margin : float
+        Share added to observed ranges.
+    provenance : mapping, optional
+        JSON values to store with the netlist.
+    after : callable, optional
+        Called with the name of each stage in ``STAGES`` and its artefact.
+
+    Raises
+    ------
+    OptionError, ModelError, DataError, CapacityError
+        As the passes say.
+    """
+    chip = load_target(target)
+    publish = after or (lambda _stage, _artefact: None)
+
+    network = expand(checkpoint, adjacency)
+    verify(network)
+    publish("expand", network)
+
+    calibration: Calibration | None = None
+    rates: tuple[FloatArray, ...] | None = None
+    if training_events is not None:
+        calibration = calibrate(network, evenly_spaced(channels_last(training_events)))
+        rates = tuple(spikes.mean(axis=(0, 1)) for spikes in calibration.spikes)
+
+    integer, choices = quantize(network, chip, bits=weight_bits, calibration=calibration, ranges=ranges, margin=margin)
+    verify(integer)
+    publish("quantize", integer)
+
+    parts = partition(integer, chip, rates)
+    placement = place(core_traffic(integer, parts, rates), chip)
+    netlist = emit(integer, parts, placement.tiles, chip, provenance or {})
+    uses = require_legal(netlist, chip)
+    publish("place", netlist)
+    return Compilation(
+        network=network,
+        integer=integer,
+        netlist=netlist,
+        choices=choices,
+        proofs=prove_ranges(integer),
+        uses=uses,
+        placement=placement,
+        core_bound=parts.bound,
+    )

@@ -1,0 +1,218 @@
+"""Netlist to one file and back: an uncompressed ``.npz`` that numpy alone can read, without pickle.
+
+Members, format version 1
+-------------------------
+``manifest``
+    JSON text (0-d string): ``format`` ("spikeloom-netlist"), ``version``, ``target``, ``taxels``, ``polarities``,
+    ``classes``, ``layers`` (one object per :class:`compiler.netlist.Layer`) and ``provenance``.
+``sha256``
+    Hex digest (0-d string) over all other members in the order below: name, dtype, shape and bytes of each.
+every array field of :class:`compiler.netlist.Netlist`
+    Under its own name and meaning, in the narrowest little-endian signed type that holds it.
+
+Equal netlists give equal bytes: members are stored, not compressed, in a fixed order and with a fixed date.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+import zipfile
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from compiler.atomic import write_atomically
+from compiler.errors import FormatError
+from compiler.netlist import Layer, Netlist, read_only
+
+FORMAT = "spikeloom-netlist"
+VERSION = 1
+SIZE_LIMIT = 2**32
+"""Bytes that a netlist file may have, 4 GiB: some hundred times the synapses of a whole chip."""
+
+_EPOCH = (1980, 1, 1, 0, 0, 0)
+_SCALARS = ("target", "taxels", "polarities", "classes", "layers", "provenance")
+ARRAYS = tuple(field.name for field in fields(Netlist) if field.name not in _SCALARS)
+"""Array members in file order."""
+
+
+def _narrow(array: np.ndarray[Any, np.dtype[np.int64]]) -> np.ndarray[Any, Any]:
+    for dtype in ("<i1", "<i2", "<i4"):
+        info = np.iinfo(dtype)
+        if not array.size or (info.min <= array.min() and array.max() <= info.max):
+            return array.astype(dtype)
+    return array.astype("<i8")
+
+
+def _digest(members: dict[str, np.ndarray[Any, Any]]) -> str:
+    digest = hashlib.sha256()
+    for name, array in members.items():
+        digest.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def netlist_bytes(netlist: Netlist) -> bytes:
+    """File content of a netlist; equal netlists give equal bytes."""
+    manifest = {
+        "format": FORMAT,
+        "version": VERSION,
+        "target": netlist.target,
+        "taxels": netlist.taxels,
+        "polarities": netlist.polarities,
+        "classes": netlist.classes,
+        "layers": [asdict(layer) for layer in netlist.layers],
+        "provenance": dict(netlist.provenance),
+    }
+    members: dict[str, np.ndarray[Any, Any]] = {"manifest": np.array(json.dumps(manifest, sort_keys=True))}
+    members |= {name: _narrow(getattr(netlist, name)) for name in ARRAYS}
+    members["sha256"] = np.array(_digest(members))
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
+        for name, array in members.items():
+            content = io.BytesIO()
+            np.lib.format.write_array(content, array, version=(1, 0), allow_pickle=False)
+            archive.writestr(zipfile.ZipInfo(f"{name}.npy", date_time=_EPOCH), content.getvalue())
+    return file.getvalue()
+
+
+def write_netlist(netlist: Netlist, path: str | os.PathLike[str]) -> str:
+    """Write a netlist, whole or not at all; return the sha256 of the file.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written; an older file is left as it was.
+    """
+    content = netlist_bytes(netlist)
+    with write_atomically(path) as file:
+        file.write(content)
+    return hashlib.sha256(content).hexdigest()
+
+
+def _members(path: Path) -> dict[str, np.ndarray[Any, Any]]:
+    if path.stat().st_size > SIZE_LIMIT:
+        raise FormatError(f"{path}: {path.stat().st_size} bytes, {SIZE_LIMIT} allowed; this is no netlist of one chip")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            infos = archive.infolist()
+            if any(info.compress_type != zipfile.ZIP_STORED for info in infos):
+                raise FormatError(f"{path}: has compressed members, a netlist stores them plainly; compile it again")
+            if sum(info.file_size for info in infos) > path.stat().st_size:
+                raise FormatError(f"{path}: declares more bytes than it has; compile it again")
+            found = {}
+            for info in infos:
+                content = io.BytesIO(archive.read(info))
+                found[info.filename.removesuffix(".npy")] = np.lib.format.read_array(content, allow_pickle=False)
+            return found
+    except (zipfile.BadZipFile, ValueError, EOFError, OSError) as error:
+        if isinstance(error, FileNotFoundError):
+            raise
+        raise FormatError(f"{path}: is truncated or not a netlist ({error}); compile it again") from error
+
+
+def read_netlist(path: str | os.PathLike[str]) -> Netlist:
+    """Read and check a netlist file.
+
+    Raises
+    ------
+    FormatError
+        If it is missing, truncated, altered, from a newer version or inconsistent.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FormatError(f"{path}: no such file; write one with spikeloom compile")
+    members = _members(path)
+    missing = sorted({"manifest", "sha256"} - set(members))
+    if missing:
+        raise FormatError(f"{path}: is not a netlist (no {' and no '.join(missing)}); write one with spikeloom compile")
+    try:
+        manifest = json.loads(str(members["manifest"]))
+    except ValueError as error:
+        raise FormatError(f"{path}: has an unreadable manifest; compile it again") from error
+    if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
+        raise FormatError(f"{path}: is not a netlist; write one with spikeloom compile")
+    if manifest.get("version") != VERSION:
+        raise FormatError(
+            f"{path}: has format version {manifest.get('version')}, this program reads {VERSION}; "
+            "compile it again or update spikeloom"
+        )
+    stated = str(members.pop("sha256"))
+    names = {"manifest", *ARRAYS}
+    if set(members) != names:
+        odd = ", ".join(sorted(names ^ set(members)))
+        raise FormatError(f"{path}: has missing or unknown members ({odd}); compile it again")
+    if _digest({"manifest": members["manifest"], **{name: members[name] for name in ARRAYS}}) != stated:
+        raise FormatError(f"{path}: its content does not match its hash, so it was altered; compile it again")
+    try:
+        netlist = Netlist(
+            target=manifest["target"],
+            taxels=manifest["taxels"],
+            polarities=manifest["polarities"],
+            classes=manifest["classes"],
+            layers=tuple(Layer(**layer) for layer in manifest["layers"]),
+            provenance=manifest["provenance"],
+            **{name: read_only(members[name]) for name in ARRAYS},
+        )
+    except (KeyError, TypeError) as error:
+        raise FormatError(f"{path}: has an incomplete manifest ({error}); compile it again") from error
+    faults = inconsistencies(netlist)
+    if faults:
+        raise FormatError(f"{path}: {'; '.join(faults)}; compile it again")
+    return netlist
+
+
+def _bounds_fault(name: str, bounds: np.ndarray[Any, Any], parts: int, total: int) -> str | None:
+    good = len(bounds) == parts + 1 and bounds[0] == 0 and bounds[-1] == total and np.all(np.diff(bounds) >= 0)
+    return None if good else f"{name} does not divide {total} entries in {parts} parts"
+
+
+def inconsistencies(netlist: Netlist) -> list[str]:
+    """Say what in a netlist points nowhere: a file can match its hash and still be nonsense."""
+    compartments, axons, synapses = netlist.n_compartments, netlist.n_axons, netlist.n_synapses
+    found: list[str | None] = [
+        _bounds_fault("core_compartments", netlist.core_compartments, netlist.n_cores, compartments),
+        _bounds_fault("core_axons", netlist.core_axons, netlist.n_cores, axons),
+        _bounds_fault("axon_synapses", netlist.axon_synapses, axons, synapses),
+    ]
+    for name in ("neuron", "decay_u", "decay_v", "threshold", "bias_mantissa", "bias_exponent", "readout_class"):
+        if len(getattr(netlist, name)) != compartments:
+            found.append(f"{name} has {len(getattr(netlist, name))} entries for {compartments} compartments")
+    if len(netlist.axon_format) != axons or len(netlist.synapse_target) != synapses:
+        found.append("axon_format or synapse_target has the wrong length")
+    if any(found):
+        return [fault for fault in found if fault]
+
+    def outside(array: np.ndarray[Any, Any], low: int, high: int) -> bool:
+        return bool(array.size and (array.min() < low or array.max() >= high))
+
+    ranges = {
+        "layer": (netlist.layer, 0, len(netlist.layers)),
+        "axon_source": (netlist.axon_source, 0, netlist.n_inputs + compartments),
+        "axon_format": (netlist.axon_format, 0, len(netlist.format_exponent)),
+        "readout_class": (netlist.readout_class, -1, netlist.classes),
+        "decay_u": (netlist.decay_u, 0, 4096),
+        "decay_v": (netlist.decay_v, 0, 4096),
+        "threshold": (netlist.threshold, 0, 2**17),
+        "bias_mantissa": (netlist.bias_mantissa, -4096, 4096),
+        "bias_exponent": (netlist.bias_exponent, 0, 8),
+        "synapse_weight": (netlist.synapse_weight, -256, 256),
+    }
+    found += [
+        f"{name} has values outside {low} … {high - 1}"
+        for name, (a, low, high) in ranges.items()
+        if outside(a, low, high)
+    ]
+    on_core = np.diff(netlist.core_compartments)[netlist.core_of_axon()][netlist.axon_of_synapse()]
+    if outside(netlist.synapse_target, 0, 2**31) or np.any(netlist.synapse_target >= on_core):
+        found.append("synapse_target points beyond its core")
+    for index, layer in enumerate(netlist.layers):
+        neurons = np.sort(netlist.neuron[netlist.layer == index])
+        if not np.array_equal(neurons, np.arange(layer.neurons)):
+            found.append(f"layer {layer.name} does not hold each of its {layer.neurons} neurons once")
+    return [fault for fault in found if fault]
