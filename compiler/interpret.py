@@ -92,12 +92,13 @@ def float_recurrence(
 
 
 def integer_recurrence(
-    population: IntegerPopulation, sums: Floating, *, membranes: bool = False
+    population: IntegerPopulation, sums: Floating, *, membranes: bool = False, saturates: bool = True
 ) -> tuple[BoolArray, IntArray | None]:
     """Loihi's compartment on given synaptic sums (in weight units); :mod:`runtime.spec` holds the definition.
 
     Runs in float64, exactly: registers times a 12-bit factor stay below 2**36, a product with 2**-12 only moves the
-    point, and truncation is the chip's rounding toward zero.
+    point, and truncation is the chip's rounding toward zero. With `saturates` off the membrane has no limits, which
+    tells what saturation does.
     """
     spikes = np.empty(sums.shape, np.bool_)
     kept = np.empty(sums.shape, np.int64) if membranes else None
@@ -116,7 +117,8 @@ def integer_recurrence(
         np.trunc(v, out=v)
         v += u
         v += bias
-        np.clip(v, -MEMBRANE_MAX, MEMBRANE_MAX, out=v)
+        if saturates:
+            np.clip(v, -MEMBRANE_MAX, MEMBRANE_MAX, out=v)
         fired = np.greater(v, threshold, out=spikes[:, step])
         if kept is not None:
             kept[:, step] = v
@@ -149,11 +151,13 @@ def run_float(
     return _run(network, events, lambda p, spikes: product(p.weight, spikes, dtype), layer)
 
 
-def run_integer(network: IntegerNetwork, events: BoolArray, *, membranes: bool = False) -> Activity:
+def run_integer(
+    network: IntegerNetwork, events: BoolArray, *, membranes: bool = False, saturates: bool = True
+) -> Activity:
     """Run the integer stage, aligned with the data; parameters as :func:`run_float`, membranes in register values."""
 
     def layer(post: int, sums: Floating) -> tuple[BoolArray, IntArray | None]:
-        return integer_recurrence(network.populations[post], sums, membranes=membranes)
+        return integer_recurrence(network.populations[post], sums, membranes=membranes, saturates=saturates)
 
     return _run(network, events, lambda p, spikes: integer_sums(p.effective(), spikes), layer)
 

@@ -167,6 +167,17 @@ def read_netlist(path: str | os.PathLike[str]) -> Netlist:
     return netlist
 
 
+def is_netlist(path: str | os.PathLike[str]) -> bool:
+    """Whether a file claims to be a netlist: an archive with a manifest, or a name that ends in ``.loom``."""
+    if str(path).endswith(".loom"):
+        return True
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return "manifest.npy" in archive.namelist()
+    except (zipfile.BadZipFile, OSError):
+        return False
+
+
 def _bounds_fault(name: str, bounds: np.ndarray[Any, Any], parts: int, total: int) -> str | None:
     good = len(bounds) == parts + 1 and bounds[0] == 0 and bounds[-1] == total and np.all(np.diff(bounds) >= 0)
     return None if good else f"{name} does not divide {total} entries in {parts} parts"

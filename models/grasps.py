@@ -41,6 +41,42 @@ _JITTER = 0.4  # of a level, in each step under load
 _STRAY = 0.01  # events from nothing
 
 
+SPLITS = {"train": (60, 1), "test": (24, 2)}
+"""Grasps of each class, and the seed, of the splits that stand in for a data set."""
+
+SPLIT_STEPS = 100
+
+
+def synthetic_split(split: str, *, limit: int | None = None) -> Recordings:
+    """Draw the split of the fixed synthetic data set that the shipped checkpoint was trained and tested on.
+
+    Parameters
+    ----------
+    split : {"train", "test"}
+        360 or 144 recordings of 100 steps, 6 classes.
+    limit : int, optional
+        First recordings only.
+
+    Raises
+    ------
+    OptionError
+        If there is no such split, or `limit` is below 1.
+    """
+    if split not in SPLITS:
+        raise OptionError(f"--split {split}: the synthetic grasps have no such split; allowed: {', '.join(SPLITS)}")
+    if limit is not None and limit < 1:
+        raise OptionError(f"--limit {limit}: at least 1 recording is needed; give a positive number")
+    per_class, seed = SPLITS[split]
+    grasps = synthetic_grasps(per_class=per_class, steps=SPLIT_STEPS, seed=seed)
+    return Recordings(
+        events=grasps.events[:limit],
+        labels=grasps.labels[:limit],
+        files=grasps.files[:limit],
+        split=split,
+        source=grasps.source,
+    )
+
+
 def synthetic_grasps(
     *,
     coordinates: ArrayLike = NEUTOUCH,

@@ -1,0 +1,77 @@
+"""Read a netlist back as an integer network: the inverse of :mod:`compiler.passes.emit`, cores forgotten.
+
+Synapses of weight zero are stored by chance (inside dense lists) and are left out.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import sparse
+
+from compiler.errors import FormatError
+from compiler.ir import INPUT, Input, IntegerNetwork, IntegerPopulation, IntegerProjection, Readout
+from compiler.netlist import Netlist
+
+
+def _one(netlist: Netlist, layer: int, field: str) -> int:
+    values = np.unique(getattr(netlist, field)[netlist.compartments_of(layer)])
+    if len(values) != 1:
+        raise FormatError(f"layer {netlist.layers[layer].name}: has {len(values)} values of {field}, one is allowed")
+    return int(values[0])
+
+
+def lift(netlist: Netlist) -> IntegerNetwork:
+    """Collect compartments to populations and axons to projections, one per pair of layers and weight format.
+
+    Raises
+    ------
+    FormatError
+        If the compartments of a layer have different decays, which the network form cannot say.
+    """
+    populations = []
+    for index, layer in enumerate(netlist.layers):
+        ids = netlist.compartments_of(index)
+        populations.append(
+            IntegerPopulation(
+                name=layer.name,
+                beta=layer.beta,
+                theta=layer.theta,
+                scale=layer.scale,
+                decay_u=_one(netlist, index, "decay_u"),
+                decay_v=_one(netlist, index, "decay_v"),
+                threshold=netlist.threshold[ids],
+                bias_mantissa=netlist.bias_mantissa[ids],
+                bias_exponent=netlist.bias_exponent[ids],
+            )
+        )
+    axon = netlist.axon_of_synapse()
+    source, form = netlist.axon_source[axon], netlist.axon_format[axon]
+    target = netlist.synapse_compartment()
+    inner = source >= netlist.n_inputs
+    pre = np.where(inner, netlist.layer[np.where(inner, source - netlist.n_inputs, 0)], INPUT)
+    column = np.where(inner, netlist.neuron[np.where(inner, source - netlist.n_inputs, 0)], source)
+    post, row = netlist.layer[target], netlist.neuron[target]
+    exponent, bits = netlist.format_exponent[form], netlist.format_weight_bits[form]
+    kinds = np.stack([post, pre, exponent, bits])
+    sizes = {INPUT: netlist.n_inputs} | {i: layer.neurons for i, layer in enumerate(netlist.layers)}
+    projections = []
+    for kind in np.unique(kinds, axis=1).T:
+        held = np.all(kinds == kind[:, None], axis=0) & (netlist.synapse_weight != 0)
+        weight = sparse.csr_array(
+            (netlist.synapse_weight[held], (row[held], column[held])), shape=(sizes[int(kind[0])], sizes[int(kind[1])])
+        )
+        weight.sum_duplicates()
+        projections.append(
+            IntegerProjection(
+                pre=int(kind[1]), post=int(kind[0]), weight=weight, exponent=int(kind[2]), bits=int(kind[3])
+            )
+        )
+    voters = np.flatnonzero(netlist.readout_class >= 0)
+    voting = int(netlist.layer[voters[0]])
+    return IntegerNetwork(
+        input=Input(taxels=netlist.taxels, polarities=netlist.polarities),
+        populations=tuple(populations),
+        projections=tuple(projections),
+        readout=Readout(population=voting, label=netlist.readout_class[netlist.compartments_of(voting)]),
+        classes=netlist.classes,
+    )

@@ -1,0 +1,173 @@
+"""Layers that compute all time steps at once: a K-hop graph convolution and a leaky integrate-and-fire recurrence.
+
+Time comes first, (steps, samples, …), so that a layer is one matrix product over all steps and samples, followed by a
+recurrence that runs along the first axis only.
+
+References
+----------
+.. [1] J. Du et al., "Topology Adaptive Graph Convolutional Networks", 2017, arXiv:1710.10370.
+.. [2] Y. Wu et al., "Spatio-Temporal Backpropagation for Training High-Performance Spiking Neural Networks",
+   Frontiers in Neuroscience 12, 2018: the rectangular surrogate.
+.. [3] F. Gu et al., "TactileSGNet: A Spiking Graph Neural Network for Event-based Tactile Object Recognition",
+   IROS 2020.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+from torch import Tensor
+
+SURROGATE_HALF_WIDTH = 0.5
+"""The surrogate derivative of a spike is 1 where the membrane is nearer to the threshold than this, 0 elsewhere."""
+
+
+def tag_convolution(x: Tensor, adjacency: Tensor, hops: Tensor, bias: Tensor) -> Tensor:
+    """K-hop filter ``y = sum_k A^k x g_k^T + b`` [1]_, summed in the order of the released operator.
+
+    Parameters
+    ----------
+    x : (steps, samples, taxels, channels)
+        Input; no gradient flows into it.
+    adjacency : (taxels, taxels)
+        Propagation matrix; row i gathers into taxel i.
+    hops : (K + 1, features, channels)
+        Filter of each hop.
+    bias : (features,)
+        Added after the last hop.
+
+    Returns
+    -------
+    (steps, samples, taxels * features)
+        Taxel-major: entry ``taxel * features + feature``.
+    """
+    steps, samples, taxels, channels = x.shape
+    # Taxels first: a hop is then one product of (taxels, taxels) with a wide matrix.
+    reached = [x.permute(2, 0, 1, 3).reshape(taxels, -1)]
+    for _ in range(1, len(hops)):
+        reached.append(adjacency @ reached[-1])
+    rows = torch.stack([hop.view(taxels, -1, channels).transpose(0, 1).reshape(-1, channels) for hop in reached])
+    out: Tensor = _HopSum.apply(rows, hops, bias)  # type: ignore[no-untyped-call]
+    return out.view(steps, samples, -1)
+
+
+class _HopSum(torch.autograd.Function):
+    """``sum_k rows_k hops_k^T + bias``: one product per hop forward, one in all for the gradient of the filters."""
+
+    @staticmethod
+    def forward(ctx: Any, rows: Tensor, hops: Tensor, bias: Tensor) -> Tensor:
+        ctx.save_for_backward(rows)
+        out = rows[0] @ hops[0].t()
+        term = torch.empty_like(out)
+        for k in range(1, len(hops)):
+            out += torch.mm(rows[k], hops[k].t(), out=term)
+        out += bias
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[None, Tensor, Tensor]:
+        (rows,) = ctx.saved_tensors
+        n_hops, n_rows, channels = rows.shape
+        beside = rows.transpose(0, 1).reshape(n_rows, n_hops * channels)
+        hops = (beside.t() @ gradients[0]).view(n_hops, channels, -1).transpose(1, 2)
+        return None, hops, gradients[0].sum(0)
+
+
+def lif(current: Tensor, beta: float, theta: float) -> tuple[Tensor, Tensor]:
+    """Leaky integrate-and-fire neurons along the first axis, from rest.
+
+    ``u_t = beta * u_{t-1} * (1 - s_{t-1}) + current_t`` and ``s_t = u_t > theta``, a strict comparison. The gradient
+    runs through the decay and through the reset, with the surrogate [2]_ for the derivative of the spike.
+
+    Parameters
+    ----------
+    current : (steps, ...)
+        Input current.
+    beta, theta : float
+        Decay (0 to 1) and threshold.
+
+    Returns
+    -------
+    spikes, membrane : (steps, ...)
+        Zeros and ones, and the membrane that was compared with `theta`; no gradient flows from the membrane.
+    """
+    spikes, membrane = _Lif.apply(current, beta, theta)  # type: ignore[no-untyped-call]
+    return spikes, membrane
+
+
+class _Lif(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, current: Tensor, beta: float, theta: float) -> tuple[Tensor, Tensor]:
+        ctx.beta, ctx.theta = beta, theta
+        current = current.contiguous()
+        spikes, membrane = torch.empty_like(current), torch.empty_like(current)
+        _integrate(_rows(current), *_scalars(current, beta, theta), _rows(spikes), _rows(membrane))
+        ctx.save_for_backward(membrane)
+        ctx.mark_non_differentiable(membrane)
+        return spikes, membrane
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:
+        spikes_gradient = gradients[0].contiguous()
+        (membrane,) = ctx.saved_tensors
+        out = torch.empty_like(membrane)
+        constants = _scalars(membrane, ctx.beta, ctx.theta, SURROGATE_HALF_WIDTH)
+        _differentiate(_rows(spikes_gradient), _rows(membrane), *constants, _rows(out))
+        return out, None, None
+
+
+def _rows(tensor: Tensor) -> np.ndarray[Any, Any]:
+    """View as (steps, everything else)."""
+    view: np.ndarray[Any, Any] = tensor.detach().view(len(tensor), -1).numpy()
+    return view
+
+
+def _scalars(like: Tensor, *values: float) -> tuple[Any, ...]:
+    """Round to the precision of `like`, in which the recurrence is defined."""
+    kind = np.float32 if like.dtype == torch.float32 else np.float64
+    return tuple(kind(value) for value in values)
+
+
+# Each step is a function of its own on one-dimensional arrays: only so does the compiler vectorise the loops.
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _integrate_step(current: Any, before: Any, beta: Any, theta: Any, spikes: Any, membrane: Any) -> None:
+    zero, one = membrane.dtype.type(0), membrane.dtype.type(1)
+    for i in range(len(membrane)):
+        u = (zero if before[i] > theta else before[i] * beta) + current[i]
+        membrane[i] = u
+        spikes[i] = one if u > theta else zero
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _integrate(current: Any, beta: Any, theta: Any, spikes: Any, membrane: Any) -> None:
+    steps, size = current.shape
+    before = np.zeros(size, current.dtype)
+    for t in range(steps):
+        _integrate_step(current[t], before, beta, theta, spikes[t], membrane[t])
+        before = membrane[t]
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _differentiate_step(
+    from_above: Any, membrane: Any, later: Any, beta: Any, theta: Any, half_width: Any, out: Any
+) -> None:
+    zero = membrane.dtype.type(0)
+    for i in range(len(membrane)):
+        u = membrane[i]
+        through_spike = from_above[i] - later[i] * (u * beta)
+        through_decay = zero if u > theta else later[i] * beta
+        out[i] = through_decay + (through_spike if abs(u - theta) < half_width else zero)
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _differentiate(spikes_gradient: Any, membrane: Any, beta: Any, theta: Any, half_width: Any, out: Any) -> None:
+    steps, size = membrane.shape
+    later = np.zeros(size, membrane.dtype)
+    for t in range(steps - 1, -1, -1):
+        _differentiate_step(spikes_gradient[t], membrane[t], later, beta, theta, half_width, out[t])
+        later = out[t]

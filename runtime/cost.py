@@ -1,0 +1,180 @@
+"""What a run costs: synaptic operations, neuron updates, packets, hops, and energy per named table.
+
+Everything is computed from counts of a simulation and from the netlist; the simulators know no joules. A *synaptic
+operation* is one stored entry of a synapse list visited by one spike; zeros held in a dense list are visited too and
+are also counted apart. Priced is a run of ``T + depth`` chip steps in which input events act in the step they arrive
+in: they visit synapses, but their injection into the mesh has no public price.
+
+References
+----------
+.. [1] M. Davies et al., IEEE Micro 38(1), 2018, table 2.
+.. [2] J. Boyle et al., "SANA-FE", IEEE TCAD 44(8), 3165-3178, 2025.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from compiler.fixedpoint import FloatArray, IntArray
+from compiler.netlist import Netlist
+from compiler.passes.place import hops
+from compiler.targets import EnergyTable, Target
+from runtime.trace import Counts
+
+EVENTS = (
+    "synaptic_operation_dense",
+    "synaptic_operation_sparse",
+    "neuron_idle",
+    "neuron_active",
+    "spike",
+    "packet",
+    "hop_east_west",
+    "hop_north_south",
+)
+"""Events that energy tables may price; ``synaptic_operation`` in a table prices both forms."""
+
+OPTIONAL = frozenset({"spike"})
+"""Events that a table may leave out because it prices them elsewhere (Davies: in the active neuron update)."""
+
+NOT_PRICED = (
+    "injection of input events into the mesh (no public figure per event)",
+    "reset of each compartment at the start of its layer's window (one register write each; no public figure)",
+    "static power (depends on time; a run at full speed and one at 20 ms a step differ)",
+)
+"""What no table covers; always listed, never counted as zero."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Costs:
+    """Counts per recording and layer, and energies.
+
+    Parameters
+    ----------
+    events : mapping of str to (samples, layers) float64
+        Amount of each event in ``EVENTS``. Synaptic operations belong to the layer that receives them, packets and
+        hops to the layer that sends them.
+    zeros : (samples, layers) int64
+        Synaptic operations on stored zeros.
+    steps : int
+        Chip steps of a recording.
+    energy : mapping of str to (samples, layers) float64
+        Joules per table.
+    unpriced : mapping of str to tuple of str
+        Tables that cannot price the run, and the events that they lack.
+    """
+
+    events: Mapping[str, FloatArray]
+    zeros: FloatArray
+    steps: int
+    energy: Mapping[str, FloatArray]
+    unpriced: Mapping[str, tuple[str, ...]]
+
+    @property
+    def synaptic_operations(self) -> FloatArray:
+        """Visited entries, dense and sparse; shape (samples, layers)."""
+        return self.events["synaptic_operation_dense"] + self.events["synaptic_operation_sparse"]
+
+
+def _visits(netlist: Netlist, kept: IntArray) -> FloatArray:
+    """Entries that one spike of each source visits in each layer, over the synapses that `kept` marks with 1."""
+    axon = netlist.axon_of_synapse()
+    source = netlist.axon_source[axon]
+    layers = len(netlist.layers)
+    flat = source * layers + netlist.layer[netlist.synapse_compartment()]
+    size = netlist.n_inputs + netlist.n_compartments
+    visits: FloatArray = np.bincount(flat, kept, size * layers).reshape(size, layers)
+    return visits
+
+
+def _routes(netlist: Netlist, target: Target) -> FloatArray:
+    """Packets, east-west hops and north-south hops of one spike of each compartment; shape (compartments, 3)."""
+    width = target.limit("mesh.width")
+    inner = netlist.axon_source >= netlist.n_inputs
+    source = netlist.axon_source[inner] - netlist.n_inputs
+    start = netlist.core_tile[netlist.core_of_compartment()[source]]
+    end = netlist.core_tile[netlist.core_of_axon()[inner]]
+    moves = [hops(int(a), int(b), width) for a, b in zip(start, end, strict=True)]
+    routes = np.zeros((netlist.n_compartments, 3))
+    np.add.at(routes, source, np.column_stack([np.ones(len(moves)), np.array(moves).reshape(-1, 2)]))
+    return routes
+
+
+def count(netlist: Netlist, target: Target, counts: Counts, steps: int) -> tuple[dict[str, FloatArray], FloatArray]:
+    """Amount of every event per recording and layer, and the visited zeros.
+
+    Parameters
+    ----------
+    netlist : Netlist
+        What ran.
+    target : Target
+        Its chip.
+    counts : Counts
+        Of a batch: arrays have one leading axis of recordings.
+    steps : int
+        Data steps T of a recording.
+    """
+    dense = (netlist.format_index_bits[netlist.axon_format] == 0)[netlist.axon_of_synapse()]
+    sources = np.concatenate([counts.inputs, counts.spikes], axis=1).astype(np.float64)
+    of_layer = np.eye(len(netlist.layers))[netlist.layer]
+    sent = [counts.spikes @ (route[:, None] * of_layer) for route in _routes(netlist, target).T]
+    neurons = np.array([layer.neurons for layer in netlist.layers], np.float64)
+    active = counts.updates.astype(np.float64)
+    events = {
+        "synaptic_operation_dense": sources @ _visits(netlist, dense.astype(np.int64)),
+        "synaptic_operation_sparse": sources @ _visits(netlist, (~dense).astype(np.int64)),
+        "neuron_idle": neurons * (steps + netlist.max_depth) - active,
+        "neuron_active": active,
+        "spike": counts.spikes @ of_layer,
+        "packet": sent[0],
+        "hop_east_west": sent[1],
+        "hop_north_south": sent[2],
+    }
+    return events, sources @ _visits(netlist, (netlist.synapse_weight == 0).astype(np.int64))
+
+
+def price(table: EnergyTable, events: Mapping[str, FloatArray]) -> FloatArray | tuple[str, ...]:
+    """Energy in joules, or the events that happened and that the table has no price for."""
+    names = {
+        event: "synaptic_operation" if "synaptic_operation" in table.prices and event.startswith("syn") else event
+        for event in EVENTS
+    }
+    lacking = tuple(
+        event
+        for event, name in names.items()
+        if name not in table.prices and event not in OPTIONAL and np.any(events[event])
+    )
+    if lacking:
+        return lacking
+    energy = np.zeros_like(events["packet"])
+    for event, name in names.items():
+        if name in table.prices:
+            energy = energy + events[event] * table.joule(name)
+    return energy
+
+
+def estimate(netlist: Netlist, target: Target, counts: Counts, steps: int) -> Costs:
+    """Price a run with every table of its chip.
+
+    Parameters
+    ----------
+    netlist : Netlist
+        What ran.
+    target : Target
+        Its chip, with energy tables.
+    counts : Counts
+        Of a batch of recordings, neuron updates included.
+    steps : int
+        Data steps T of a recording.
+    """
+    events, zeros = count(netlist, target, counts, steps)
+    priced = {table.name: price(table, events) for table in target.energy}
+    return Costs(
+        events=events,
+        zeros=zeros,
+        steps=steps + netlist.max_depth,
+        energy={name: result for name, result in priced.items() if not isinstance(result, tuple)},
+        unpriced={name: result for name, result in priced.items() if isinstance(result, tuple)},
+    )

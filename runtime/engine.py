@@ -1,0 +1,318 @@
+"""The fast twin of :mod:`runtime.spec`: the same spikes, membranes and counts, bit for bit.
+
+Compartments are renumbered by layer and neuron ("positions"), so that a layer is one contiguous range whatever its
+cores; :mod:`runtime.kernel` tells what is made of them. Where :func:`compiler.netlist.one_step_bounds` proves that
+neither accumulator nor current can overflow, the kernel that checks nothing is used.
+
+The kernel knows no whole recordings: :func:`advance` moves a state by any number of chip steps, and :func:`simulate`
+does so once per recording.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from compiler.errors import NumericRangeError
+from compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, DECAY_BITS, MEMBRANE_SHIFT, IntArray
+from compiler.netlist import Netlist, one_step_bounds
+from runtime.kernel import State, Tables, chip_steps
+from runtime.trace import REGISTER_LIMITS, BoolArray, Counts, MembraneArray, Trace, check_channels, range_error
+
+EventArray = npt.NDArray[np.uint8 | np.bool_]
+
+BLOCK = 32
+"""Segments of a row start and end at multiples of this many positions."""
+
+MERGED_GAP = 1
+"""Blocks without synapses that a segment spans rather than ends at."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Engine:
+    """A netlist prepared for the kernel by :func:`prepare`; holds no state and can be shared by threads.
+
+    Parameters
+    ----------
+    netlist : Netlist
+        What it was made from.
+    tables : Tables
+        What the kernel reads.
+    negative : (entries,) int64, or None
+        Packed magnitudes of negative weights; None where no register can overflow, whatever the input.
+    """
+
+    netlist: Netlist
+    tables: Tables
+    negative: IntArray | None
+
+
+def _padded(size: int) -> int:
+    """Next multiple of a block."""
+    return -(-size // BLOCK) * BLOCK
+
+
+def _registers_hold(netlist: Netlist) -> bool:
+    """Whether no input whatever can make an accumulator or a current overflow."""
+    positive, negative = one_step_bounds(netlist)
+    worst = np.maximum(positive, negative) << MEMBRANE_SHIFT
+    # a current that loses lost/4096 a step and gains `worst` cannot climb beyond worst * 4096 / lost
+    highest = (worst << DECAY_BITS) // (netlist.decay_u + 1)
+    return bool(np.all(worst <= ACCUMULATOR_MAX) and np.all(highest <= CURRENT_MAX))
+
+
+def _segments(source: IntArray, target: IntArray, n_sources: int) -> tuple[dict[str, IntArray], IntArray, int]:
+    """Cut each source's targets into segments.
+
+    Returns
+    -------
+    geometry : dict
+        ``shape``, ``base``, ``first``, ``start``, ``stop`` and ``offset`` of :class:`runtime.kernel.Tables`.
+    entry : (synapses,) int64
+        Index of each synapse in the array of weights.
+    size : int
+        Length of that array.
+    """
+    blocks = int(target.max(initial=0)) // BLOCK + 1
+    used = np.unique(source * blocks + target // BLOCK)
+    of_source, block = np.divmod(used, blocks)
+    begins = np.ones(len(used), np.bool_)
+    begins[1:] = (np.diff(of_source) != 0) | (np.diff(block) > MERGED_GAP + 1)
+    ends = np.append(begins[1:], True)[: len(used)]
+    of_source, start, stop = of_source[begins], block[begins] * BLOCK, (block[ends] + 1) * BLOCK
+    bounds = np.append(0, np.cumsum(stop - start))
+    segment = np.searchsorted(of_source * blocks * BLOCK + start, source * blocks * BLOCK + target, side="right") - 1
+    entry = bounds[segment] + target - start[segment]
+
+    rows = np.searchsorted(of_source, np.arange(n_sources + 1))
+    shapes: dict[bytes, int] = {}
+    shape, first, members = np.zeros(n_sources, np.int64), [0], []
+    for s, (begin, end) in enumerate(zip(rows[:-1].tolist(), rows[1:].tolist(), strict=True)):
+        known = len(shapes)
+        shape[s] = shapes.setdefault(start[begin:end].tobytes() + stop[begin:end].tobytes(), known)
+        if shape[s] == known:
+            members.append(np.arange(begin, end))
+            first.append(first[-1] + end - begin)
+    member = np.concatenate(members)
+    base = bounds[rows[:-1]]
+    geometry = {
+        "shape": shape,
+        "base": base,
+        "first": np.array(first),
+        "start": start[member],
+        "stop": stop[member],
+        "offset": bounds[member] - base[of_source[member]],
+    }
+    return geometry, entry, int(bounds[-1])
+
+
+def prepare(netlist: Netlist, *, checked: bool = False) -> Engine:
+    """Lay a netlist out for the kernel.
+
+    Parameters
+    ----------
+    netlist : Netlist
+        The placed network.
+    checked : bool
+        Check registers in every step even where it is proven that they hold any input.
+    """
+    n_inputs = netlist.n_inputs
+    compartment = np.lexsort((netlist.neuron, netlist.layer))
+    position = np.empty_like(compartment)
+    position[compartment] = np.arange(len(compartment))
+
+    source_id = np.append(np.arange(n_inputs), n_inputs + position)
+    source = source_id[netlist.axon_source][netlist.axon_of_synapse()]
+    target = position[netlist.synapse_compartment()]
+    weight = netlist.effective_weight()
+    geometry, entry, size = _segments(source, target, len(source_id))
+
+    shift = int(np.bincount(target).max(initial=0)).bit_length()
+    largest = int(np.maximum(*one_step_bounds(netlist)).max(initial=0))
+    narrow = (largest + 1) << shift < 2**31
+    checked = checked or not narrow or not _registers_hold(netlist)
+    packed = np.zeros(size, np.int32 if narrow else np.int64)
+    negative = np.zeros(size, packed.dtype) if checked else None
+    if negative is None:
+        np.add.at(packed, entry, (weight << shift) + 1)
+    else:
+        np.add.at(packed, entry, np.where(weight >= 0, (weight << shift) + 1, 0))
+        np.add.at(negative, entry, np.where(weight < 0, (-weight << shift) + 1, 0))
+
+    shared = np.stack([netlist.layer, netlist.decay_u, netlist.decay_v, netlist.threshold])[:, compartment]
+    begins = np.append(True, np.any(np.diff(shared) != 0, axis=0))
+    layer, decay_u, decay_v, threshold = np.ascontiguousarray(shared[:, begins])
+    bias = np.zeros(_padded(len(compartment)), np.int32)
+    bias[: len(compartment)] = (netlist.bias_mantissa << netlist.bias_exponent)[compartment]
+    tables = Tables(
+        **geometry,
+        weight=packed,
+        shift=np.int32(shift),
+        run_start=np.append(np.flatnonzero(begins), len(compartment)),
+        run_layer=layer,
+        run_depth=np.array([part.depth for part in netlist.layers])[layer],
+        keep_u=(2**DECAY_BITS - 1 - decay_u).astype(np.int32),
+        keep_v=(2**DECAY_BITS - decay_v).astype(np.int32),
+        threshold=(threshold << MEMBRANE_SHIFT).astype(np.int32),
+        bias=bias,
+        compartment=compartment,
+    )
+    return Engine(netlist=netlist, tables=tables, negative=negative)
+
+
+def start(engine: Engine) -> State:
+    """State of a chip before the first chip step of a recording."""
+    netlist = engine.netlist
+    size = _padded(netlist.n_compartments)
+    scratch = 0 if engine.negative is None else size
+    return State(
+        clock=np.zeros(2, np.int64),
+        fired=np.zeros(size + 1, np.int64),
+        current=np.zeros(size, np.int32),
+        membrane=np.zeros(size, np.int32),
+        total=np.zeros(size, np.int32),
+        positive=np.zeros(scratch, engine.tables.weight.dtype),
+        negative=np.zeros(scratch, engine.tables.weight.dtype),
+        flags=np.zeros(size, np.uint8),
+        active=np.zeros(netlist.n_inputs + size + 1, np.int64),
+        inputs=np.zeros(netlist.n_inputs, np.int64),
+        spikes=np.zeros(netlist.n_compartments, np.int64),
+        updates=np.zeros(len(netlist.layers), np.int64),
+        saturations=np.zeros(len(netlist.layers), np.int64),
+    )
+
+
+def advance(
+    engine: Engine,
+    state: State,
+    events: EventArray,
+    *,
+    length: int,
+    steps: int | None = None,
+    spikes: BoolArray | None = None,
+    membranes: MembraneArray | None = None,
+) -> None:
+    """Run some chip steps; any split of a recording into calls gives the same result.
+
+    Parameters
+    ----------
+    engine : Engine
+        The prepared network.
+    state : State
+        Changed in place. After an error it is of no further use.
+    events : (n_inputs, columns) uint8 or bool
+        Events of the data steps from ``state.clock[0]`` on; steps beyond the last column have none.
+    length : int
+        Data steps of the whole recording, which close each layer's window; any large number if it has no end.
+    steps : int, optional
+        How many chip steps to run; by default one per column.
+    spikes, membranes : (steps, compartments), optional
+        Zeroed arrays to fill, see :class:`runtime.trace.Trace`.
+
+    Raises
+    ------
+    DataError
+        If the events have another number of input channels than the network.
+    NumericRangeError
+        As :func:`runtime.spec.simulate` does, with the same message.
+    """
+    check_channels(engine.netlist, events.shape[0])
+    steps = events.shape[1] if steps is None else steps
+    n = engine.netlist.n_compartments
+    step, compartment, register, value = chip_steps(
+        engine.tables,
+        engine.negative,
+        state,
+        np.ascontiguousarray(events != 0).view(np.uint8),
+        int(state.clock[0]) + steps,
+        length,
+        np.zeros((0, n), np.bool_) if spikes is None else spikes,
+        np.zeros((0, n), np.int32) if membranes is None else membranes,
+    )
+    if step >= 0:
+        raise range_error(engine.netlist, tuple(REGISTER_LIMITS)[register], compartment, step, value)
+
+
+def simulate(
+    netlist: Netlist | Engine,
+    events: EventArray,
+    *,
+    spikes: bool = False,
+    membranes: bool = False,
+    threads: int | None = None,
+    progress: Callable[[int], object] | None = None,
+) -> Trace:
+    """Run a batch of recordings through the chip, each from rest.
+
+    Parameters
+    ----------
+    netlist : Netlist or Engine
+        The placed network; :func:`prepare` it once to run several batches.
+    events : (recordings, n_inputs, T) uint8 or bool
+        Input events; any value but zero is an event.
+    spikes, membranes : bool
+        Whether to keep these per chip step: one and four bytes for each recording, chip step and compartment.
+    threads : int, optional
+        Recordings that run at the same time, by default one per processor. Results do not depend on it.
+    progress : callable, optional
+        Called in the calling thread with the number of recordings finished so far.
+
+    Returns
+    -------
+    Trace
+        With one leading axis for the recordings.
+
+    Raises
+    ------
+    DataError
+        If the recordings have another number of input channels than the network.
+    NumericRangeError
+        As :func:`runtime.spec.simulate` does, with the same message, for the first recording that overflows; a note
+        on the exception says which.
+    """
+    engine = netlist if isinstance(netlist, Engine) else prepare(netlist)
+    netlist = engine.netlist
+    check_channels(netlist, events.shape[1])
+    recordings, _, length = events.shape
+    chip_length = length + netlist.max_depth
+    shape = (recordings, chip_length, netlist.n_compartments)
+    kept_spikes = np.zeros(shape, np.bool_) if spikes else None
+    kept_membranes = np.zeros(shape, np.int32) if membranes else None
+    counts = Counts(
+        inputs=np.zeros((recordings, netlist.n_inputs), np.int64),
+        spikes=np.zeros((recordings, netlist.n_compartments), np.int64),
+        updates=np.zeros((recordings, len(netlist.layers)), np.int64),
+        saturations=np.zeros((recordings, len(netlist.layers)), np.int64),
+    )
+
+    def run(index: int) -> None:
+        state = start(engine)
+        try:
+            advance(
+                engine,
+                state,
+                events[index],
+                length=length,
+                steps=chip_length,
+                spikes=None if kept_spikes is None else kept_spikes[index],
+                membranes=None if kept_membranes is None else kept_membranes[index],
+            )
+        except NumericRangeError as error:
+            error.add_note(f"recording {index} of {recordings}, counted from 0")
+            raise
+        counts.inputs[index] = state.inputs
+        counts.spikes[index] = state.spikes
+        counts.updates[index] = state.updates
+        counts.saturations[index] = state.saturations
+
+    with ThreadPoolExecutor(threads or os.cpu_count()) as pool:
+        for done, _ in enumerate(pool.map(run, range(recordings)), start=1):
+            if progress is not None:
+                progress(done)
+    return Trace(counts=counts, spikes=kept_spikes, membranes=kept_membranes)

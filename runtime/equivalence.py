@@ -1,0 +1,372 @@
+"""How closely the chip's spikes follow the float model, and which deviation costs what.
+
+The reference is the float model in the released operator order, in float32. A float64 run stands beside it: spikes
+in which the two differ are ill-posed, decided by the rounding of a sum and not by the chip.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from compiler.errors import DataError, ModelError
+from compiler.fixedpoint import MEMBRANE_SHIFT, FloatArray, IntArray
+from compiler.frontends.checkpoint import Checkpoint
+from compiler.interpret import BoolArray, channels_last, run_float, run_integer, vote
+from compiler.ir import IntegerNetwork, Network, Projection
+from compiler.lift import lift
+from compiler.netlist import Netlist
+from compiler.passes.expand import expand
+from runtime import engine, spec
+from runtime.trace import aligned
+from runtime.votes import predictions
+
+LADDER = ("float64", "beta", "weights", "bias_threshold", "rounding", "saturation")
+"""Deviations in the order in which they are added; the last one is the chip."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LayerSpikes:
+    """Spikes of one layer over all recordings.
+
+    Parameters
+    ----------
+    float, chip : int
+        Spikes of the float32 reference and of the chip.
+    different : int
+        Entries (recording, step, neuron) in which they differ.
+    ill_posed : int
+        Entries in which the float64 model differs from the float32 one.
+    """
+
+    float: int
+    chip: int
+    different: int
+    ill_posed: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Divergence:
+    """The first entry in which chip and float model differ: first recording, then step, layer, neuron.
+
+    Parameters
+    ----------
+    file : str
+        Recording.
+    step : int
+        Data step.
+    layer : str
+        Layer.
+    neuron : int
+        Neuron of the layer.
+    taxel, feature : int or None
+        The same in a graph convolution's own terms.
+    float_membrane, chip_membrane : float
+        Membranes before the comparison, in the float model's units.
+    chip_register : int
+        Membrane register before the comparison.
+    theta, chip_theta : float
+        Thresholds in the float model's units.
+    ill_posed : bool
+        Whether the float64 model sides with the chip.
+    """
+
+    file: str
+    step: int
+    layer: str
+    neuron: int
+    taxel: int | None
+    feature: int | None
+    float_membrane: float
+    chip_membrane: float
+    chip_register: int
+    theta: float
+    chip_theta: float
+    ill_posed: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Verdict:
+    """Everything that verify found.
+
+    Parameters
+    ----------
+    files : tuple of str
+        Recordings.
+    labels, float_predictions, chip_predictions : (samples,) int64
+        Classes.
+    spikes : mapping of str to LayerSpikes
+        Per layer.
+    spec_samples : int
+        Recordings on which the specification was run beside the engine.
+    spec_equals_engine : bool
+        Whether every spike, membrane and count was equal there.
+    first_divergence : Divergence or None
+        None if no spike differs.
+    ladder : tuple of (stage, mapping of layer to different entries)
+        Differences from the float32 reference with one deviation more on each rung.
+    same_checkpoint : bool
+        Whether the netlist was compiled from this very checkpoint file.
+    """
+
+    files: tuple[str, ...]
+    labels: IntArray
+    float_predictions: IntArray
+    chip_predictions: IntArray
+    spikes: Mapping[str, LayerSpikes]
+    spec_samples: int
+    spec_equals_engine: bool
+    first_divergence: Divergence | None
+    ladder: tuple[tuple[str, Mapping[str, int]], ...]
+    same_checkpoint: bool
+
+    @property
+    def float_accuracy(self) -> float:
+        """Share of recordings that the float model gets right."""
+        return float(np.mean(self.float_predictions == self.labels))
+
+    @property
+    def chip_accuracy(self) -> float:
+        """Share of recordings that the chip gets right."""
+        return float(np.mean(self.chip_predictions == self.labels))
+
+    @property
+    def decision_agreement(self) -> float:
+        """Share of recordings in which both decide alike."""
+        return float(np.mean(self.float_predictions == self.chip_predictions))
+
+
+def require_match(netlist: Netlist, checkpoint: Checkpoint) -> None:
+    """Refuse a netlist and a checkpoint of different architecture.
+
+    Raises
+    ------
+    ModelError
+        If layer names or sizes differ.
+    """
+    ours = {layer.name: layer.neurons for layer in netlist.layers}
+    theirs = {"conv1": checkpoint.taxels * checkpoint.hops.shape[1]}
+    theirs |= {dense.name: len(dense.bias) for dense in checkpoint.dense}
+    if ours != theirs:
+        sizes = [", ".join(f"{name} {neurons}" for name, neurons in side.items()) for side in (ours, theirs)]
+        raise ModelError(
+            f"netlist and checkpoint disagree: the netlist has {sizes[0]}, the checkpoint {sizes[1]}; "
+            "give the checkpoint that the netlist was compiled from"
+        )
+
+
+def _same_run(netlist: Netlist, prepared: engine.Engine, events: npt.NDArray[np.uint8]) -> bool:
+    """Whether specification and engine agree on one recording: every spike, membrane and count."""
+    slow = spec.simulate(netlist, events)
+    fast = engine.simulate(prepared, events[None], spikes=True, membranes=True, updates=True)
+    pairs = [
+        (slow.spikes, fast.spikes),
+        (slow.membranes, fast.membranes),
+        (slow.counts.inputs, fast.counts.inputs),
+        (slow.counts.spikes, fast.counts.spikes),
+        (slow.counts.updates, fast.counts.updates),
+        (slow.counts.saturations, fast.counts.saturations),
+    ]
+    return all(a is not None and b is not None and np.array_equal(a, b[0]) for a, b in pairs)
+
+
+def realised(network: Network, integer: IntegerNetwork) -> tuple[Network, Network, Network]:
+    """Float networks that carry the chip's decay; that and its weights; and all of these and its biases and thresholds.
+
+    Returns
+    -------
+    tuple of three Network
+        In the float model's units, to be run in float64.
+    """
+    beta = replace(
+        network,
+        populations=tuple(
+            replace(population, beta=chip.realised_beta)
+            for population, chip in zip(network.populations, integer.populations, strict=True)
+        ),
+    )
+    weights = replace(
+        beta,
+        projections=tuple(
+            Projection(
+                pre=projection.pre,
+                post=projection.post,
+                weight=projection.effective().astype(np.float64) / integer.populations[projection.post].scale,
+            )
+            for projection in integer.projections
+        ),
+    )
+    bias_threshold = replace(
+        weights,
+        populations=tuple(
+            replace(
+                population,
+                bias=chip.bias / (chip.scale * (1 << MEMBRANE_SHIFT)),
+                theta=_uniform(chip.realised_theta),
+            )
+            for population, chip in zip(beta.populations, integer.populations, strict=True)
+        ),
+    )
+    return beta, weights, bias_threshold
+
+
+def _uniform(theta: FloatArray) -> float:
+    if np.ptp(theta) != 0:
+        raise ModelError("the ladder: a layer has several thresholds, one is allowed; compile with one scale per layer")
+    return float(theta[0])
+
+
+def _first_divergence(
+    netlist: Netlist,
+    prepared: engine.Engine,
+    reference: list[BoolArray],
+    chip: list[BoolArray],
+    wide: list[BoolArray],
+    events: npt.NDArray[np.uint8],
+    files: tuple[str, ...],
+    membrane: Callable[[int, int], npt.NDArray[np.floating]],
+) -> Divergence | None:
+    differs = [(a != b) for a, b in zip(reference, chip, strict=True)]
+    broken = np.any([d.any(axis=(1, 2)) for d in differs], axis=0)
+    if not broken.any():
+        return None
+    sample = int(np.argmax(broken))
+    step, index, neuron = min(
+        (int(step), layer, int(neuron))
+        for layer, d in enumerate(differs)
+        for step, neuron in np.argwhere(d[sample])[:1]
+    )
+    layer = netlist.layers[index]
+    trace = engine.simulate(prepared, events[sample : sample + 1], membranes=True)
+    assert trace.membranes is not None, "membranes were asked for"
+    register = int(aligned(netlist, trace.membranes, index)[0, step, neuron])
+    unit = layer.scale * (1 << MEMBRANE_SHIFT)
+    threshold = int(netlist.threshold[netlist.compartments_of(index)[neuron]])
+    graph = layer.depth == 0 and layer.neurons % netlist.taxels == 0
+    features = layer.neurons // netlist.taxels
+    return Divergence(
+        file=files[sample],
+        step=step,
+        layer=layer.name,
+        neuron=neuron,
+        taxel=neuron // features if graph else None,
+        feature=neuron % features if graph else None,
+        float_membrane=float(membrane(sample, index)[step, neuron]),
+        chip_membrane=register / unit,
+        chip_register=register,
+        theta=layer.theta,
+        chip_theta=threshold / layer.scale,
+        ill_posed=bool(wide[index][sample, step, neuron] != reference[index][sample, step, neuron]),
+    )
+
+
+def verify(
+    netlist: Netlist,
+    checkpoint: Checkpoint,
+    adjacency: FloatArray,
+    events: npt.NDArray[np.uint8],
+    labels: IntArray,
+    files: tuple[str, ...],
+    *,
+    spec_samples: int = 3,
+    progress: Callable[[str], None] | None = None,
+) -> Verdict:
+    """Compare float model, chip and specification.
+
+    Parameters
+    ----------
+    netlist : Netlist
+        Compiled network.
+    checkpoint : Checkpoint
+        What it was compiled from, or another checkpoint of the same architecture.
+    adjacency : (taxels, taxels) float64
+        Normalised propagation matrix of its graph.
+    events : (samples, taxels, polarities, steps) uint8
+        Recordings.
+    labels : (samples,) int64
+        Their classes.
+    files : tuple of str
+        Their names.
+    spec_samples : int
+        Recordings on which the specification runs beside the engine.
+    progress : callable, optional
+        Told the name of each part as it starts.
+
+    Raises
+    ------
+    ModelError, DataError, NumericRangeError
+        If the parts do not belong together, or a register of the chip overflows.
+    """
+    from models.reference import float_membranes, float_spikes  # torch, so only here
+
+    if not 1 <= spec_samples:
+        raise DataError(f"--spec-samples {spec_samples}: at least 1 recording is needed; give a positive number")
+    tell = progress or (lambda _part: None)
+    require_match(netlist, checkpoint)
+    names = [layer.name for layer in netlist.layers]
+    flat = events.reshape(len(events), netlist.n_inputs, -1)
+
+    tell("float32 reference")
+    narrow = float_spikes(checkpoint, adjacency, events, dtype="float32")
+    reference = [narrow[name] for name in names]
+    tell("float64 beside it")
+    double = float_spikes(checkpoint, adjacency, events, dtype="float64")
+    wide = [double[name] for name in names]
+
+    tell("chip")
+    prepared = engine.prepare(netlist)
+    trace = engine.simulate(prepared, flat, spikes=True)
+    assert trace.spikes is not None, "spikes were asked for"
+    chip = [aligned(netlist, trace.spikes, layer) for layer in range(len(names))]
+
+    tell("specification")
+    checked = min(spec_samples, len(flat))
+    equal = all(_same_run(netlist, prepared, recording) for recording in flat[:checked])
+
+    def differences(stage: list[BoolArray] | tuple[BoolArray, ...]) -> dict[str, int]:
+        return {name: int(np.count_nonzero(a != b)) for name, a, b in zip(names, reference, stage, strict=True)}
+
+    network, integer = expand(checkpoint, adjacency), lift(netlist)
+    inputs = channels_last(events)
+    ladder = [("float64", differences(wide))]
+    for stage, rung in zip(LADDER[1:4], realised(network, integer), strict=True):
+        tell(f"ladder: {stage}")
+        ladder.append((stage, differences(run_float(rung, inputs).spikes)))
+    tell("ladder: rounding")
+    ladder.append(("rounding", differences(run_integer(integer, inputs, saturates=False).spikes)))
+    ladder.append(("saturation", differences(chip)))
+
+    tell("first divergence")
+    divergence = _first_divergence(
+        netlist,
+        prepared,
+        reference,
+        chip,
+        wide,
+        flat,
+        files,
+        lambda sample, layer: float_membranes(checkpoint, adjacency, events[sample : sample + 1])[names[layer]][0],
+    )
+    return Verdict(
+        files=files,
+        labels=labels,
+        float_predictions=vote(reference[-1].sum(axis=1)),
+        chip_predictions=predictions(netlist, trace.counts.spikes),
+        spikes={
+            name: LayerSpikes(
+                float=int(np.count_nonzero(reference[i])),
+                chip=int(np.count_nonzero(chip[i])),
+                different=ladder[-1][1][name],
+                ill_posed=ladder[0][1][name],
+            )
+            for i, name in enumerate(names)
+        },
+        spec_samples=checked,
+        spec_equals_engine=equal,
+        first_divergence=divergence,
+        ladder=tuple(ladder),
+        same_checkpoint=netlist.provenance.get("checkpoint_sha256") == checkpoint.sha256,
+    )

@@ -1,0 +1,403 @@
+"""Results as JSON values for machines and as plain tables for people."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from compiler.fixedpoint import FloatArray, IntArray
+from compiler.frontends.checkpoint import Checkpoint
+from compiler.netlist import Netlist
+from compiler.passes.legalize import LimitUse
+from compiler.pipeline import Compilation
+from runtime.cost import NOT_PRICED, Costs
+from runtime.equivalence import Verdict
+from runtime.intervals import wilson
+
+Json = dict[str, Any]
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Align columns: the first to the left, the others to the right.
+
+    Examples
+    --------
+    >>> print(table(["layer", "spikes"], [["conv1", "12"], ["fc1", "3456"]]))
+      layer  spikes
+      conv1      12
+      fc1      3456
+    """
+    lines = [list(head), *(list(row) for row in rows)]
+    widths = [max(len(line[i]) for line in lines) for i in range(len(head))]
+    return "\n".join(
+        "  "
+        + "  ".join(
+            cell.ljust(width) if i == 0 else cell.rjust(width)
+            for i, (cell, width) in enumerate(zip(line, widths, strict=True))
+        ).rstrip()
+        for line in lines
+    )
+
+
+def percent(right: int, total: int) -> str:
+    """Accuracy with its Wilson interval.
+
+    Examples
+    --------
+    >>> percent(127, 144)
+    '88.19 % (127 of 144; 95 % interval 81.9 … 92.5)'
+    """
+    low, high = wilson(right, total)
+    return f"{100 * right / total:.2f} % ({right} of {total}; 95 % interval {100 * low:.1f} … {100 * high:.1f})"
+
+
+def si(value: float, unit: str) -> str:
+    """Three digits with an SI prefix.
+
+    Examples
+    --------
+    >>> si(0.000321, "J"), si(0.0, "J"), si(2.5e-9, "J")
+    ('321 µJ', '0 J', '2.5 nJ')
+    """
+    for factor, prefix in ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"), (1e-12, "p")):
+        if abs(value) >= factor:
+            return f"{value / factor:.3g} {prefix}{unit}"
+    return f"{value:.3g} {unit}"
+
+
+# -- netlists and checkpoints ------------------------------------------------------------------------------------------
+
+
+def netlist_json(netlist: Netlist, uses: Sequence[LimitUse], sha256: str) -> Json:
+    """What a netlist is: sizes, layers, use of every limit."""
+    core = netlist.core_of_compartment()
+    layers = []
+    for index, layer in enumerate(netlist.layers):
+        ids = netlist.compartments_of(index)
+        exponents = netlist.format_exponent[netlist.axon_format[netlist.axon_of_synapse()]]
+        into = netlist.layer[netlist.synapse_compartment()] == index
+        layers.append(
+            {
+                "name": layer.name,
+                "neurons": layer.neurons,
+                "synapses": layer.synapses,
+                "max_fan_in": layer.max_fan_in,
+                "weight_bits": layer.weight_bits,
+                "scale": layer.scale,
+                "exponents": sorted({int(e) for e in exponents[into]}),
+                "threshold": _one_or_many(netlist.threshold[ids]),
+                "theta": layer.theta,
+                "theta_realised": _one_or_many(netlist.threshold[ids] / layer.scale),
+                "beta": layer.beta,
+                "beta_realised": _one_or_many((4096 - netlist.decay_v[ids]) / 4096),
+                "depth": layer.depth,
+                "synapses_stored": int(np.count_nonzero(into)),
+                "cores": sorted({int(c) for c in core[ids]}),
+            }
+        )
+    return {
+        "target": netlist.target,
+        "taxels": netlist.taxels,
+        "classes": netlist.classes,
+        "neurons": netlist.n_compartments,
+        "synapses": sum(layer.synapses for layer in netlist.layers),
+        "synapses_stored": netlist.n_synapses,
+        "synapses_nonzero": int(np.count_nonzero(netlist.synapse_weight)),
+        "cores": netlist.n_cores,
+        "tiles": netlist.core_tile.tolist(),
+        "layers": layers,
+        "limits": [asdict(use) for use in uses],
+        "provenance": dict(netlist.provenance),
+        "sha256": sha256,
+    }
+
+
+def _one_or_many(values: IntArray | FloatArray) -> Any:
+    distinct = np.unique(values).tolist()
+    return distinct[0] if len(distinct) == 1 else distinct
+
+
+def compilation_json(compilation: Compilation, sha256: str) -> Json:
+    """A netlist with the reasons for its scales, the proofs and the placement."""
+    return netlist_json(compilation.netlist, compilation.uses, sha256) | {
+        "calibration": [asdict(choice) for choice in compilation.choices],
+        "proofs": [asdict(proof) | {"holds": proof.holds} for proof in compilation.proofs],
+        "core_bound": compilation.core_bound,
+        "placement": asdict(compilation.placement),
+    }
+
+
+def netlist_text(report: Json) -> str:
+    """Layers, cores and the fullest core of every limit."""
+    layers = [
+        [
+            layer["name"],
+            f"{layer['neurons']:,}",
+            f"{layer['synapses']:,}",
+            f"{layer['synapses_stored']:,}",
+            str(layer["max_fan_in"]),
+            str(layer["weight_bits"]),
+            f"{layer['scale']:.6g}",
+            _text(layer["threshold"]),
+            _text(layer["theta_realised"]),
+            _text(layer["beta_realised"]),
+            _text(layer["cores"], brief=False),
+        ]
+        for layer in report["layers"]
+    ]
+    head = ["layer", "neurons", "synapses", "stored", "fan-in", "bits", "scale", "threshold", "θ", "β", "cores"]
+    fullest: dict[str, Json] = {}
+    for use in report["limits"]:
+        if use["name"] not in fullest or use["used"] > fullest[use["name"]]["used"]:
+            fullest[use["name"]] = use
+    limits = [
+        [
+            use["name"],
+            f"{use['used']:,}",
+            f"{use['allowed']:,}",
+            f"{100 * use['used'] / use['allowed']:.0f} %",
+            "chip" if use["core"] is None else str(use["core"]),
+        ]
+        for use in fullest.values()
+    ]
+    return "\n".join(
+        [
+            f"{report['target']}: {report['neurons']:,} neurons, {report['synapses']:,} synapses "
+            f"({report['synapses_stored']:,} stored, {report['synapses_nonzero']:,} non-zero), {report['cores']} cores "
+            f"on tiles {', '.join(map(str, report['tiles']))}",
+            table(head, layers),
+            "",
+            table(["limit", "used", "allowed", "fill", "fullest core"], limits),
+        ]
+    )
+
+
+def _text(value: Any, *, brief: bool = True) -> str:
+    if isinstance(value, list):
+        return f"{min(value):.6g}…{max(value):.6g}" if brief and value else " ".join(map(str, value))
+    return f"{value:.6g}"
+
+
+def compilation_text(report: Json) -> str:
+    """A compilation for people: layers, limits, calibration, proof, placement."""
+    lines = [netlist_text(report), ""]
+    calibrated = report["calibration"][0]["flips"] is not None
+    if calibrated:
+        rows = [
+            [
+                choice["layer"],
+                str(choice["candidates"]),
+                f"{choice['clipped']:,}",
+                f"{choice['flips']:,}",
+                f"{choice['spikes']:,}",
+            ]
+            for choice in report["calibration"]
+        ]
+        lines.append("scales chosen on training recordings (each layer on the float model's own input):")
+        lines.append(table(["layer", "tried", "weights clipped", "spikes moved", "of"], rows))
+    else:
+        lines.append("scales taken from the weights and the proven bounds; --calibrate chooses them on training data")
+    worst = max(report["proofs"], key=lambda proof: proof["accumulator"])
+    if all(proof["holds"] for proof in report["proofs"]):
+        lines.append(
+            f"proof: no register overflows for any input (fullest accumulator: {worst['layer']}, "
+            f"{100 * worst['accumulator'] / (2**21 - 1):.1f} % of 21 bits)"
+        )
+    else:
+        loose = ", ".join(proof["layer"] for proof in report["proofs"] if not proof["holds"])
+        lines.append(f"no proof of range for {loose}: the simulator stops at the first overflow")
+    placement = report["placement"]
+    optimal = "optimal" if placement["spike_hops"] <= placement["bound"] else f"bound {placement['bound']:.1f}"
+    lines.append(
+        f"cores: {report['cores']} used, {report['core_bound']} at least; "
+        f"spike-hops a step: {placement['spike_hops']:.1f} ({optimal})"
+    )
+    return "\n".join(lines)
+
+
+def checkpoint_json(checkpoint: Checkpoint) -> Json:
+    """What a checkpoint holds, and what of it was assumed."""
+    return {
+        "layout": checkpoint.layout,
+        "taxels": checkpoint.taxels,
+        "classes": checkpoint.classes,
+        "hops": int(checkpoint.hops.shape[0] - 1),
+        "layers": [
+            {"name": "conv1", "neurons": checkpoint.taxels * int(checkpoint.hops.shape[1])},
+            *({"name": dense.name, "neurons": len(dense.bias)} for dense in checkpoint.dense),
+        ],
+        "beta": checkpoint.beta,
+        "theta": checkpoint.theta,
+        "assumed": list(checkpoint.assumed),
+        "graph": checkpoint.graph,
+        "training": None if checkpoint.training is None else dict(checkpoint.training),
+        "sha256": checkpoint.sha256,
+    }
+
+
+def checkpoint_text(report: Json) -> str:
+    """A checkpoint for people."""
+    layers = ", ".join(f"{layer['name']} {layer['neurons']:,}" for layer in report["layers"])
+    lines = [
+        f"checkpoint, {report['layout']} layout: {report['taxels']} taxels, K = {report['hops']}, {layers}, "
+        f"{report['classes']} classes",
+        f"  graph: {report['graph'] or 'not in the file; name it with --graph'}",
+    ]
+    for name in ("beta", "theta"):
+        source = f"assumed; override with --{name}" if name in report["assumed"] else "read from the file"
+        lines.append(f"  {name}: {report[name]:g} ({source})")
+    for key, value in (report["training"] or {}).items():
+        text = str(value)
+        lines.append(f"  {key}: {text if len(text) <= 100 else text[:97] + '…'}")
+    lines.append(f"  sha256: {report['sha256']}")
+    return "\n".join(lines)
+
+
+# -- runs --------------------------------------------------------------------------------------------------------------
+
+
+def run_json(files: tuple[str, ...], labels: IntArray, counts: IntArray, predictions: IntArray) -> Json:
+    """Predictions and class spike counts of a run."""
+    return {
+        "samples": len(files),
+        "accuracy": float(np.mean(labels == predictions)),
+        "files": list(files),
+        "labels": labels.tolist(),
+        "predictions": predictions.tolist(),
+        "counts": counts.tolist(),
+    }
+
+
+def run_text(report: Json) -> str:
+    """Accuracy, and the recordings that went wrong."""
+    rows = list(zip(report["files"], report["labels"], report["predictions"], report["counts"], strict=True))
+    wrong = [
+        [file, str(label), str(found), str(counts[label]), str(counts[found])]
+        for file, label, found, counts in rows
+        if label != found
+    ]
+    lines = [f"chip accuracy: {percent(len(rows) - len(wrong), len(rows))}"]
+    if wrong:
+        lines.append(table(["decided wrongly", "label", "decision", "votes for label", "for decision"], wrong))
+    return "\n".join(lines)
+
+
+def verify_json(verdict: Verdict) -> Json:
+    """A verdict under the keys that scripts rely on."""
+    return {
+        "samples": len(verdict.files),
+        "accuracy": {"float": verdict.float_accuracy, "chip": verdict.chip_accuracy},
+        "decision_agreement": verdict.decision_agreement,
+        "spikes": {name: asdict(layer) for name, layer in verdict.spikes.items()},
+        "spec_equals_engine": verdict.spec_equals_engine,
+        "spec_samples": verdict.spec_samples,
+        "first_divergence": None if verdict.first_divergence is None else asdict(verdict.first_divergence),
+        "ladder": [{"stage": stage, "different": dict(different)} for stage, different in verdict.ladder],
+        "same_checkpoint": verdict.same_checkpoint,
+    }
+
+
+def verify_text(report: Json) -> str:
+    """A verdict for people."""
+    samples = report["samples"]
+    right = {side: round(share * samples) for side, share in report["accuracy"].items()}
+    equal = round(report["decision_agreement"] * samples)
+    lines = [
+        f"float accuracy:    {percent(right['float'], samples)}",
+        f"chip accuracy:     {percent(right['chip'], samples)}",
+        f"decisions equal:   {equal} of {samples}",
+        f"spec = engine:     {'yes' if report['spec_equals_engine'] else 'NO'}, every spike and membrane of "
+        f"{report['spec_samples']} recordings",
+    ]
+    if not report["same_checkpoint"]:
+        lines.append("note: the netlist was compiled from another checkpoint file than this one")
+    names = list(report["spikes"])
+    rows = [
+        [name, *(f"{layer[key]:,}" for key in ("float", "chip", "different", "ill_posed"))]
+        for name, layer in report["spikes"].items()
+    ]
+    lines += ["", table(["spikes", "float", "chip", "different", "ill-posed"], rows), ""]
+    ladder = [[rung["stage"], *(f"{rung['different'][name]:,}" for name in names)] for rung in report["ladder"]]
+    lines += [table(["different, adding", *names], ladder), ""]
+    first = report["first_divergence"]
+    if first is None:
+        lines.append("no spike differs")
+    else:
+        where = f"neuron {first['neuron']}"
+        if first["taxel"] is not None:
+            where = f"taxel {first['taxel']}, feature {first['feature']}"
+        lines.append(
+            f"first divergence: {first['file']}, step {first['step']}, {first['layer']} {where}: membrane "
+            f"{first['float_membrane']:.6f} float, {first['chip_membrane']:.6f} chip ({first['chip_register']}/64 units); "
+            f"threshold {first['theta']:g} and {first['chip_theta']:.6f}"
+            + (" (ill-posed: float64 sides with the chip)" if first["ill_posed"] else "")
+        )
+    return "\n".join(lines)
+
+
+def estimate_json(netlist: Netlist, costs: Costs) -> Json:
+    """Costs per inference and per layer under the keys that scripts rely on."""
+    per_sample: dict[str, FloatArray] = {
+        "synaptic_operations": costs.synaptic_operations,
+        "synaptic_operations_on_zeros": costs.zeros,
+        "spikes": costs.events["spike"],
+        "neuron_updates": costs.events["neuron_active"],
+        "neuron_accesses": costs.events["neuron_active"] + costs.events["neuron_idle"],
+        "packets": costs.events["packet"],
+        "hops": costs.events["hop_east_west"] + costs.events["hop_north_south"],
+    }
+
+    def summary(reduce: Any) -> Json:
+        values: Json = {key: float(reduce(amount.sum(axis=1))) for key, amount in per_sample.items()}
+        return values | {"energy_j": {name: float(reduce(e.sum(axis=1))) for name, e in costs.energy.items()}}
+
+    layers = []
+    for index, layer in enumerate(netlist.layers):
+        means: Json = {key: float(amount[:, index].mean()) for key, amount in per_sample.items()}
+        means["energy_j"] = {name: float(energy[:, index].mean()) for name, energy in costs.energy.items()}
+        layers.append({"name": layer.name} | means)
+    return {
+        "samples": len(costs.zeros),
+        "chip_steps": costs.steps,
+        "per_inference": summary(np.mean),
+        "min": summary(np.min),
+        "max": summary(np.max),
+        "layers": layers,
+        "not_modelled": [f"{name}: no price for {', '.join(events)}" for name, events in costs.unpriced.items()],
+        "not_priced": list(NOT_PRICED),
+    }
+
+
+def estimate_text(report: Json) -> str:
+    """Costs for people: the mean inference, its range, its layers."""
+    columns = [report["per_inference"], report["min"], report["max"]]
+    rows = [
+        [key.replace("_", " "), *(f"{column[key]:,.0f}" for column in columns)]
+        for key in columns[0]
+        if key != "energy_j"
+    ]
+    rows += [[f"energy, {name}", *(si(c["energy_j"][name], "J") for c in columns)] for name in columns[0]["energy_j"]]
+    tables = list(columns[0]["energy_j"])
+    layers = [
+        [
+            layer["name"],
+            f"{layer['synaptic_operations']:,.0f}",
+            f"{layer['spikes']:,.0f}",
+            f"{layer['neuron_updates']:,.0f}",
+            *(si(layer["energy_j"][name], "J") for name in tables),
+        ]
+        for layer in report["layers"]
+    ]
+    lines = [
+        f"per inference of {report['chip_steps']} chip steps, over {report['samples']} recordings:",
+        table(["", "mean", "min", "max"], rows),
+        "",
+        table(["layer (mean)", "synaptic operations", "spikes", "neuron updates", *tables], layers),
+        "",
+        *(f"not modelled: {line}" for line in report["not_modelled"]),
+        *(f"not priced: {line}" for line in report["not_priced"]),
+    ]
+    return "\n".join(lines)

@@ -1,0 +1,108 @@
+"""What a simulation hands back: spikes, membranes, counts. Shared by both simulators; nobody else counts.
+
+Chip steps run from 0 to ``T + netlist.max_depth - 1`` for a recording of ``T`` data steps. Compartments are in the
+order of the netlist's ids. A batch of recordings adds one leading axis to every array.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from compiler.errors import DataError, NumericRangeError
+from compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, IntArray
+from compiler.netlist import Netlist
+
+BoolArray = npt.NDArray[np.bool_]
+MembraneArray = npt.NDArray[np.int32]
+
+REGISTER_LIMITS = {"synaptic sum": ACCUMULATOR_MAX, "current": CURRENT_MAX}
+"""Registers that may not overflow, in the order in which a step fills them, and their largest magnitude."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Counts:
+    """Events of a whole run; every array is int64.
+
+    Parameters
+    ----------
+    inputs : (…, n_inputs) int64
+        Input events per channel.
+    spikes : (…, compartments) int64
+        Spikes per compartment.
+    updates : (…, layers) int64
+        Neuron updates: compartment-steps inside the layer's window in which the compartment had work to do, that is
+        its membrane or its current was not zero before the step, or an active axon held a synapse to it (whatever
+        the weight), or its bias is not zero.
+    saturations : (…, layers) int64
+        Compartment-steps whose membrane was clipped to its register.
+    """
+
+    inputs: IntArray
+    spikes: IntArray
+    updates: IntArray
+    saturations: IntArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Trace:
+    """Result of a simulation.
+
+    Parameters
+    ----------
+    counts : Counts
+        What happened, summed over chip steps.
+    spikes : (…, chip steps, compartments) bool, or None
+        Whether a compartment spiked in a chip step; None where it was not asked for.
+    membranes : (…, chip steps, compartments) int32, or None
+        The saturated membrane that was compared with the threshold, before a spike resets it, in 1/64 of a weight
+        unit; zero outside the layer's window. None where it was not asked for.
+    """
+
+    counts: Counts
+    spikes: BoolArray | None
+    membranes: MembraneArray | None
+
+
+def aligned(netlist: Netlist, array: npt.NDArray[Any], layer: int) -> npt.NDArray[Any]:
+    """Cut one layer out of a trace and shift it back by its depth, as the float model counts time.
+
+    Parameters
+    ----------
+    netlist : Netlist
+        The network that was simulated.
+    array : (…, chip steps, compartments)
+        Spikes or membranes of a :class:`Trace`.
+    layer : int
+        Index into ``netlist.layers``.
+
+    Returns
+    -------
+    (…, T, neurons)
+        Ordered by neuron.
+    """
+    depth = netlist.layers[layer].depth
+    length = array.shape[-2] - netlist.max_depth
+    return array[..., depth : depth + length, netlist.compartments_of(layer)]
+
+
+def check_channels(netlist: Netlist, channels: int) -> None:
+    """Raise DataError unless recordings of so many input channels fit the network."""
+    if channels != netlist.n_inputs:
+        raise DataError(
+            f"recordings: {channels} input channels found, the netlist has {netlist.n_inputs}; "
+            "use recordings of the sensor that the network was compiled for"
+        )
+
+
+def range_error(netlist: Netlist, register: str, compartment: int, chip_step: int, value: int) -> NumericRangeError:
+    """Error of a register that would overflow; `register` is a key of `REGISTER_LIMITS`."""
+    layer = netlist.layers[netlist.layer[compartment]].name
+    core = int(np.searchsorted(netlist.core_compartments, compartment, side="right")) - 1
+    return NumericRangeError(
+        f"{layer} neuron {netlist.neuron[compartment]} on core {core}, chip step {chip_step}: {register} {value} found, "
+        f"magnitudes up to {REGISTER_LIMITS[register]} allowed; compile with a smaller scale for {layer}"
+    )

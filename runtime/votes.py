@@ -1,0 +1,22 @@
+"""Read-out of a simulated netlist: spike counts to classes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from compiler.fixedpoint import IntArray
+from compiler.interpret import vote
+from compiler.netlist import Netlist
+
+
+def class_counts(netlist: Netlist, spikes: IntArray) -> IntArray:
+    """Votes per class from spike counts per compartment (samples, compartments); shape (samples, classes)."""
+    voters = np.flatnonzero(netlist.readout_class >= 0)
+    counts = np.zeros((len(spikes), netlist.classes), np.int64)
+    np.add.at(counts.T, netlist.readout_class[voters], spikes[:, voters].T)
+    return counts
+
+
+def predictions(netlist: Netlist, spikes: IntArray) -> IntArray:
+    """Class of each recording from spike counts per compartment; ties go to the lowest class."""
+    return vote(class_counts(netlist, spikes))
