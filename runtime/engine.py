@@ -44,13 +44,13 @@ class Engine:
         What it was made from.
     tables : Tables
         What the kernel reads.
-    negative : (entries,) int64, or None
+    negative : (entries,) like the tables' weights, or None
         Packed magnitudes of negative weights; None where no register can overflow, whatever the input.
     """
 
     netlist: Netlist
     tables: Tables
-    negative: IntArray | None
+    negative: npt.NDArray[Any] | None
 
 
 def _padded(size: int) -> int:
@@ -230,7 +230,7 @@ def advance(
         engine.negative,
         state,
         np.ascontiguousarray(events != 0).view(np.uint8),
-        int(state.clock[0]) + steps,
+        steps,
         length,
         np.zeros((0, n), np.bool_) if spikes is None else spikes,
         np.zeros((0, n), np.int32) if membranes is None else membranes,

@@ -12,14 +12,15 @@ bits of an accumulator say whether any synapse reached the compartment, which th
 *Decay in 32 bits.* With ``m = 4096 a + b``, ``floor(m f / 4096) = a f + floor(b f / 4096)``; for ``m < 2**23`` and
 ``f <= 4096`` nothing exceeds 2**24.
 
-*Two specialisations.* Without `negative` weights no register can overflow, net weights add up in 32 bits and nothing
-is checked; with them positive and negative weights add up apart in 64 bits and every step is checked.
+*Specialisations.* Without `negative` weights no register can overflow, net weights add up and nothing is checked; with
+them positive and negative weights add up apart and every step is checked. Sums are kept in 64 bits where all synapses
+at once would not fit into 32.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -103,8 +104,8 @@ class State(NamedTuple):
     current: AnyArray
     membrane: AnyArray
     total: AnyArray
-    positive: IntArray
-    negative: IntArray
+    positive: AnyArray
+    negative: AnyArray
     flags: AnyArray
     active: IntArray
     inputs: IntArray
@@ -114,22 +115,20 @@ class State(NamedTuple):
 
 
 def _compiled(function: Function) -> Function:
-    """Compile a helper of the kernel; it is cached with its caller."""
-    helper: Function = njit(nogil=True)(function)
-    return helper
+    """Compile a part of the kernel; it is cached with the whole."""
+    return cast(Function, njit(nogil=True)(function))
 
 
 def _compiled_and_cached(function: Function) -> Function:
     """Compile and keep the machine code on disk, if there is any place for it."""
     try:
-        kernel: Function = njit(nogil=True, cache=True)(function)
+        return cast(Function, njit(nogil=True, cache=True)(function))
     except RuntimeError:  # neither the folder of this file nor the user's cache folder can be written
-        kernel = njit(nogil=True)(function)
-    return kernel
+        return cast(Function, njit(nogil=True)(function))
 
 
 @_compiled
-def _kept(x, factor):  # type: ignore[no-untyped-def]
+def _kept(x: Any, factor: Any) -> Any:
     """``x * factor / 4096`` rounded toward zero; all int32."""
     magnitude = np.int32(abs(x))
     high = np.int32(np.int32(magnitude >> DECAY_BITS) * factor)
@@ -139,7 +138,28 @@ def _kept(x, factor):  # type: ignore[no-untyped-def]
 
 
 @_compiled
-def _deliver(tables, weight, sources, total):  # type: ignore[no-untyped-def]
+def _is_open(tables: Tables, run: int, step: int, length: int) -> Any:
+    """Whether a run integrates in this chip step."""
+    return 0 <= step - tables.run_depth[run] < length
+
+
+@_compiled
+def _list_sources(state: State, events: AnyArray, t: int, length: int) -> int:
+    """List the channels with an event in column `t` and the compartments that spiked one step ago."""
+    n = 0
+    if state.clock[0] < length and t < events.shape[1]:
+        for channel in range(events.shape[0]):
+            state.active[n] = channel
+            n += events[channel, t]
+            state.inputs[channel] += events[channel, t]
+    for k in range(state.clock[1]):
+        state.active[n] = state.fired[k]
+        n += 1
+    return n
+
+
+@_compiled
+def _deliver(tables: Tables, weight: AnyArray, sources: AnyArray, total: AnyArray) -> None:
     """Add the rows of all sources to the accumulators."""
     k = 0
     while k < sources.size:
@@ -172,7 +192,7 @@ def _deliver(tables, weight, sources, total):  # type: ignore[no-untyped-def]
 
 
 @_compiled
-def _fold(positive, negative, shift, current, keep_u, total):  # type: ignore[no-untyped-def]
+def _fold(positive: AnyArray, negative: AnyArray, shift: Any, current: AnyArray, keep_u: Any, total: AnyArray) -> bool:
     """Turn the two sums of a run into one packed accumulator; return whether a register overflows."""
     overflow = False
     for i in range(total.size):
@@ -186,11 +206,34 @@ def _fold(positive, negative, shift, current, keep_u, total):  # type: ignore[no
 
 
 @_compiled
-def _find_overflow(tables, state, step, length):  # type: ignore[no-untyped-def]
+def _deliver_checked(tables: Tables, negative: AnyArray, state: State, n: int, step: int, length: int) -> bool:
+    """Deliver the active sources; return whether a register overflows, and leave the sums in place if so."""
+    _deliver(tables, tables.weight, state.active[:n], state.positive)
+    _deliver(tables, negative, state.active[:n], state.negative)
+    overflow = False
+    for r in range(tables.run_layer.size):
+        if _is_open(tables, r, step, length):
+            run = slice(tables.run_start[r], tables.run_start[r + 1])
+            overflow |= _fold(
+                state.positive[run],
+                state.negative[run],
+                tables.shift,
+                state.current[run],
+                tables.keep_u[r],
+                state.total[run],
+            )
+    if not overflow:
+        state.positive[:] = 0
+        state.negative[:] = 0
+    return overflow
+
+
+@_compiled
+def _find_overflow(tables: Tables, state: State, step: int, length: int) -> tuple[int, int, int]:
     """Lowest compartment that overflows: its id, its register (0 sum, 1 current) and the value."""
     found, register, value = tables.compartment.size, 0, 0
     for r in range(tables.run_layer.size):
-        if tables.run_depth[r] <= step < tables.run_depth[r] + length:
+        if _is_open(tables, r, step, length):
             for i in range(tables.run_start[r], tables.run_start[r + 1]):
                 p = (state.positive[i] >> tables.shift) << MEMBRANE_SHIFT
                 n = (state.negative[i] >> tables.shift) << MEMBRANE_SHIFT
@@ -206,8 +249,18 @@ def _find_overflow(tables, state, step, length):  # type: ignore[no-untyped-def]
 
 
 @_compiled
-def _sweep(total, shift, current, membrane, bias, keep_u, keep_v, threshold, flags):  # type: ignore[no-untyped-def]
-    """Let a run integrate; membranes are left before reset. Every number is int32, or half of a vector is lost."""
+def _sweep(
+    total: AnyArray,
+    shift: Any,
+    current: AnyArray,
+    membrane: AnyArray,
+    bias: AnyArray,
+    keep_u: Any,
+    keep_v: Any,
+    threshold: Any,
+    flags: AnyArray,
+) -> tuple[Any, Any]:
+    """Let a run integrate; membranes are left before reset. All is int32: wider numbers would halve the speed."""
     arrivals = np.int32((1 << shift) - 1)
     updates = np.int32(0)
     saturations = np.int32(0)
@@ -230,92 +283,81 @@ def _sweep(total, shift, current, membrane, bias, keep_u, keep_v, threshold, fla
     return updates, saturations
 
 
+@_compiled
+def _integrate(tables: Tables, state: State, shift: Any, step: int, length: int) -> None:
+    """Let all runs integrate whose window is open; hold the others at rest."""
+    for r in range(tables.run_layer.size):
+        run = slice(tables.run_start[r], tables.run_start[r + 1])
+        if _is_open(tables, r, step, length):
+            updates, saturations = _sweep(
+                state.total[run],
+                shift,
+                state.current[run],
+                state.membrane[run],
+                tables.bias[run],
+                tables.keep_u[r],
+                tables.keep_v[r],
+                tables.threshold[r],
+                state.flags[run],
+            )
+            state.updates[tables.run_layer[r]] += updates
+            state.saturations[tables.run_layer[r]] += saturations
+        else:
+            state.total[run] = 0
+            state.current[run] = 0
+            state.membrane[run] = 0
+            state.flags[run] = 0
+
+
+@_compiled
+def _reset_and_count(tables: Tables, state: State, n_inputs: int, spikes: AnyArray, t: int) -> None:
+    """Reset the membranes of the compartments that spiked, count and list them for the next step."""
+    fired = 0
+    words = state.flags.view(np.uint64)
+    for w in range(words.size):
+        if words[w]:  # most groups of eight flags are empty
+            for i in range(8 * w, 8 * w + 8):
+                state.fired[fired] = n_inputs + i
+                fired += state.flags[i]
+    for k in range(fired):
+        i = state.fired[k] - n_inputs
+        state.membrane[i] = 0
+        state.spikes[tables.compartment[i]] += 1
+        if spikes.shape[0]:
+            spikes[t, tables.compartment[i]] = True
+    state.clock[0] += 1
+    state.clock[1] = fired
+
+
 @_compiled_and_cached
-def chip_steps(tables, negative, state, events, until, length, spikes, membranes):  # type: ignore[no-untyped-def]
-    """Run chip steps ``state.clock[0] … until - 1``; column 0 of `events` is the first of them.
+def chip_steps(
+    tables: Tables,
+    negative: AnyArray | None,
+    state: State,
+    events: AnyArray,
+    steps: int,
+    length: int,
+    spikes: AnyArray,
+    membranes: AnyArray,
+) -> tuple[int, int, int, int]:
+    """Run chip steps; column 0 of `events`, 0 or 1, belongs to the first of them.
 
     `spikes` and `membranes` have one row per step, or none where they are not wanted. Returns chip step,
     compartment, register and value of the first overflow; the chip step is -1 if there is none.
     """
-    n_inputs = events.shape[0]
-    began = state.clock[0]
-    words = state.flags.view(np.uint64)
-    for step in range(began, until):
-        t = step - began
-        # gather input: of the channels with an event now and the compartments that spiked one step ago
-        n = 0
-        if step < length and t < events.shape[1]:
-            for channel in range(n_inputs):
-                state.active[n] = channel
-                n += events[channel, t]
-                state.inputs[channel] += events[channel, t]
-        for k in range(state.clock[1]):
-            state.active[n] = state.fired[k]
-            n += 1
+    for t in range(steps):
+        step = state.clock[0]
+        n = _list_sources(state, events, t, length)
         if negative is None:
             _deliver(tables, tables.weight, state.active[:n], state.total)
-            shift = tables.shift
+            _integrate(tables, state, tables.shift, step, length)
         else:
-            _deliver(tables, tables.weight, state.active[:n], state.positive)
-            _deliver(tables, negative, state.active[:n], state.negative)
-            shift = np.int32(FOLDED_SHIFT)
-            overflow = False
-            for r in range(tables.run_layer.size):
-                if tables.run_depth[r] <= step < tables.run_depth[r] + length:
-                    run = slice(tables.run_start[r], tables.run_start[r + 1])
-                    overflow |= _fold(
-                        state.positive[run],
-                        state.negative[run],
-                        tables.shift,
-                        state.current[run],
-                        tables.keep_u[r],
-                        state.total[run],
-                    )
-            if overflow:
+            if _deliver_checked(tables, negative, state, n, step, length):
                 found, register, value = _find_overflow(tables, state, step, length)
                 return step, found, register, value
-            state.positive[:] = 0
-            state.negative[:] = 0
-
-        for r in range(tables.run_layer.size):
-            run = slice(tables.run_start[r], tables.run_start[r + 1])
-            if tables.run_depth[r] <= step < tables.run_depth[r] + length:
-                updates, saturations = _sweep(
-                    state.total[run],
-                    shift,
-                    state.current[run],
-                    state.membrane[run],
-                    tables.bias[run],
-                    tables.keep_u[r],
-                    tables.keep_v[r],
-                    tables.threshold[r],
-                    state.flags[run],
-                )
-                state.updates[tables.run_layer[r]] += updates
-                state.saturations[tables.run_layer[r]] += saturations
-            else:  # held at rest outside its window
-                state.total[run] = 0
-                state.current[run] = 0
-                state.membrane[run] = 0
-                state.flags[run] = 0
+            _integrate(tables, state, np.int32(FOLDED_SHIFT), step, length)
         if membranes.shape[0]:
             for i in range(tables.compartment.size):
                 membranes[t, tables.compartment[i]] = state.membrane[i]
-
-        # list who spiked: most words of eight flags are empty
-        fired = 0
-        for w in range(words.size):
-            if words[w]:
-                for i in range(8 * w, 8 * w + 8):
-                    state.fired[fired] = n_inputs + i
-                    fired += state.flags[i]
-        # reset and count
-        for k in range(fired):
-            i = state.fired[k] - n_inputs
-            state.membrane[i] = 0
-            state.spikes[tables.compartment[i]] += 1
-            if spikes.shape[0]:
-                spikes[t, tables.compartment[i]] = True
-        state.clock[0] = step + 1
-        state.clock[1] = fired
+        _reset_and_count(tables, state, events.shape[0], spikes, t)
     return -1, 0, 0, 0

@@ -35,8 +35,8 @@ from compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, DECAY_BITS, MEMBRA
 from compiler.netlist import Netlist
 from runtime.trace import Counts, Trace, check_channels, range_error
 
-DECAY_ONE = 2**DECAY_BITS  # decay registers count in 1/4096
-UNIT = 2**MEMBRANE_SHIFT  # a weight or a threshold of one, in membrane units
+DECAY_ONE: int = 2**DECAY_BITS  # decay registers count in 1/4096
+UNIT: int = 2**MEMBRANE_SHIFT  # a weight or a threshold of one, in membrane units
 
 
 @dataclass(slots=True)

@@ -101,8 +101,9 @@ def check_channels(netlist: Netlist, channels: int) -> None:
 def range_error(netlist: Netlist, register: str, compartment: int, chip_step: int, value: int) -> NumericRangeError:
     """Error of a register that would overflow; `register` is a key of `REGISTER_LIMITS`."""
     layer = netlist.layers[netlist.layer[compartment]].name
+    neuron = netlist.neuron[compartment]
     core = int(np.searchsorted(netlist.core_compartments, compartment, side="right")) - 1
     return NumericRangeError(
-        f"{layer} neuron {netlist.neuron[compartment]} on core {core}, chip step {chip_step}: {register} {value} found, "
+        f"{layer} neuron {neuron} on core {core}, chip step {chip_step}: {register} {value} found, "
         f"magnitudes up to {REGISTER_LIMITS[register]} allowed; compile with a smaller scale for {layer}"
     )

@@ -1,0 +1,273 @@
+"""The fast simulator is the plain one, bit for bit, on networks of any kind; and its own promises."""
+
+import itertools
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from random_netlists import (
+    Axon,
+    Neuron,
+    assert_equal,
+    build,
+    by_engine,
+    large_netlist,
+    netlists,
+    recording_of,
+    recordings,
+)
+
+from compiler.errors import NumericRangeError
+from runtime import engine, kernel, spec
+from runtime.trace import Counts, Trace
+
+REPEATABLE = settings(max_examples=150, deadline=None, derandomize=True)
+
+
+def outcome(simulate, *arguments, **options) -> Trace | str:
+    try:
+        return simulate(*arguments, **options)
+    except NumericRangeError as error:
+        return str(error)
+
+
+def random_batch(seed: int, channels: int, *, size: int = 6, length: int = 30) -> np.ndarray:
+    return (np.random.default_rng(seed).random((size, channels, length)) < 0.15).astype(np.uint8)
+
+
+def assert_twins_agree(netlist, events) -> None:
+    expected = outcome(spec.simulate, netlist, events)
+    for checked in (False, True):
+        found = outcome(by_engine, netlist, events, checked=checked)
+        if isinstance(expected, str):
+            assert found == expected
+        else:
+            assert isinstance(found, Trace), found
+            assert_equal(found, expected)
+
+
+@REPEATABLE
+@given(st.data())
+def test_any_network(data):
+    netlist = data.draw(netlists())
+    assert_twins_agree(netlist, data.draw(recordings(netlist)))
+
+
+@REPEATABLE
+@given(st.data())
+def test_any_network_without_large_exponents(data):
+    # few of these overflow, so traces are compared and not messages
+    netlist = data.draw(netlists(weight_exponents=(-1, 0)))
+    assert_twins_agree(netlist, data.draw(recordings(netlist, max_length=20)))
+
+
+@pytest.mark.parametrize("proved", [True, False])
+def test_large_networks_reach_every_regime(proved):
+    saturations = 0
+    for seed in range(4):
+        netlist = large_netlist(seed, proved=proved)
+        assert (engine.prepare(netlist).negative is None) == proved
+        events = random_batch(seed, netlist.n_inputs, size=1)[0]
+        trace = spec.simulate(netlist, events)
+        for checked in (False, True):
+            assert_equal(by_engine(netlist, events, checked=checked), trace)
+        neuron_steps = netlist.n_compartments * events.shape[1]
+        assert neuron_steps // 10 < np.count_nonzero(trace.membranes < 0)
+        assert neuron_steps // 10 < trace.counts.spikes.sum() < neuron_steps * 9 // 10
+        assert neuron_steps // 2 < trace.counts.updates.sum() < neuron_steps
+        saturations += trace.counts.saturations.sum()
+    assert saturations > 0
+
+
+def test_ties_at_the_threshold():
+    # weights and thresholds from the same few numbers, no bias: a membrane often lands on its threshold
+    rng = np.random.default_rng(5)
+    neurons = [Neuron(decay_v=4095, threshold=int(rng.choice([2, 4, 6]))) for _ in range(40)]
+    axons = [
+        Axon(source=s, targets=tuple((int(t), int(rng.choice([-2, 2, 4]))) for t in rng.permutation(40)[:10]))
+        for s in range(50)
+    ]
+    netlist = build(neurons, axons, n_inputs=10, depths=[0])
+    events = random_batch(6, 10, size=1, length=200)[0]
+    trace = spec.simulate(netlist, events)
+    assert_twins_agree(netlist, events)
+    ties = trace.membranes == 64 * netlist.threshold
+    assert np.count_nonzero(ties) > 100
+    assert not trace.spikes[ties].any()
+
+
+@pytest.mark.parametrize(("fan_in", "dtype"), [(200, np.int32), (2000, np.int64)])
+def test_sums_beyond_32_bits(fan_in, dtype):
+    # sum and number of arrivals of 2000 large synapses need 64 bits, of 200 they do not; few are hit at once
+    axons = [Axon(source=i, exponent=7, targets=((0, 254 if i % 2 else -254), (1, 2))) for i in range(fan_in)]
+    netlist = build([Neuron(threshold=1000), Neuron(decay_u=100)], axons, n_inputs=fan_in, depths=[0])
+    prepared = engine.prepare(netlist)
+    assert prepared.negative is not None
+    assert prepared.tables.weight.dtype == dtype
+    events = np.zeros((fan_in, 60), np.uint8)
+    events[np.random.default_rng(0).integers(fan_in, size=50), np.arange(50)] = 1
+    assert_twins_agree(netlist, events)
+    assert isinstance(outcome(spec.simulate, netlist, events), Trace)
+    events[:, 30] = 1
+    assert_twins_agree(netlist, events)
+    assert isinstance(outcome(spec.simulate, netlist, events), str)
+
+
+@pytest.mark.parametrize("checked", [False, True])
+@pytest.mark.parametrize(
+    ("membrane", "kept"), [(8388607, 1677311), (-8388607, -1677311), (6, 1), (-6, -1), (-5, 0), (-8191, -1637)]
+)
+def test_decay_of_registers_set_by_hand(membrane, kept, checked):
+    # a positive saturated membrane is above every threshold, so no run can leave one behind
+    neuron = spec.Compartment(layer=0, depth=0, decay_u=4095, decay_v=3277, threshold=100000, bias=0, membrane=membrane)
+    assert spec.compartment_step(neuron, 0, 0) == (kept, False, False)
+    prepared = engine.prepare(
+        build([Neuron(decay_v=3277, threshold=100000)], [], n_inputs=1, depths=[0]), checked=checked
+    )
+    state = engine.start(prepared)
+    state.membrane[0] = membrane
+    engine.advance(prepared, state, np.zeros((1, 1), np.uint8), length=1)
+    assert state.membrane[0] == kept
+
+
+def test_several_axons_of_one_source_add_up():
+    # twice on one core, once on another, one list with a repeated target, in which weights cancel
+    netlist = build(
+        [Neuron(), Neuron(core=1)],
+        [
+            Axon(source=0, targets=((0, 10), (0, -10), (0, 4))),
+            Axon(source=0, exponent=-1, targets=((0, 6),)),
+            Axon(source=0, core=1, targets=((0, -20),)),
+        ],
+        n_inputs=1,
+        depths=[0],
+    )
+    trace = by_engine(netlist, np.ones((1, 1), np.uint8))
+    assert trace.membranes.tolist() == [[7 * 64, -20 * 64]]
+    assert_twins_agree(netlist, np.ones((1, 1), np.uint8))
+
+
+@pytest.mark.parametrize("proved", [True, False])
+def test_threads_and_batches_do_not_matter(proved):
+    netlist = large_netlist(7, proved=proved)
+    prepared = engine.prepare(netlist)
+    events = random_batch(8, netlist.n_inputs)
+    one = engine.simulate(prepared, events, spikes=True, membranes=True, threads=1)
+    three = engine.simulate(netlist, events.astype(np.bool_), spikes=True, membranes=True, threads=3)
+    assert_equal(one, three)
+    for index in range(len(events)):  # each alone, so nothing leaks from one into the next
+        alone = engine.simulate(prepared, events[index : index + 1], spikes=True, membranes=True)
+        assert_equal(recording_of(one, index), recording_of(alone, 0))
+    repeated = engine.simulate(prepared, events[[0, 0, 0]], spikes=True, membranes=True, threads=1)
+    for index in range(3):
+        assert_equal(recording_of(repeated, index), recording_of(one, 0))
+
+
+def test_events_of_any_layout():
+    netlist = large_netlist(7, proved=True)
+    events = random_batch(8, netlist.n_inputs)
+    transposed = np.ascontiguousarray(events.transpose(2, 1, 0)).transpose(2, 1, 0) * 3
+    transposed.flags.writeable = False
+    expected = engine.simulate(netlist, events, spikes=True, membranes=True)
+    assert_equal(engine.simulate(netlist, transposed, spikes=True, membranes=True), expected)
+
+
+def test_only_what_is_asked_for_is_kept():
+    netlist = large_netlist(7, proved=True)
+    events = random_batch(8, netlist.n_inputs)
+    everything = engine.simulate(netlist, events, spikes=True, membranes=True)
+    counted = engine.simulate(netlist, events)
+    assert counted.spikes is None
+    assert counted.membranes is None
+    assert everything.spikes.dtype == np.bool_
+    assert everything.membranes.dtype == np.int32
+    np.testing.assert_array_equal(counted.counts.spikes, everything.spikes.sum(axis=1))
+    np.testing.assert_array_equal(counted.counts.inputs, events.sum(axis=2))
+    assert engine.simulate(netlist, events[:0], spikes=True).spikes.shape == (0, 33, 300)
+
+
+@settings(REPEATABLE, max_examples=25)
+@given(st.booleans(), st.lists(st.integers(0, 33), max_size=8), st.integers(0, 100))
+def test_any_split_into_steps_is_the_batch(proved, cuts, seed):
+    netlist = large_netlist(9, proved=proved)
+    events = random_batch(seed, netlist.n_inputs, size=1)
+    prepared = engine.prepare(netlist)
+    whole = engine.simulate(prepared, events, spikes=True, membranes=True)
+    chip_length = 30 + netlist.max_depth
+    bounds = sorted({0, *cuts, chip_length})
+    assert_equal(in_pieces(prepared, events[0], bounds), recording_of(whole, 0))
+
+
+def in_pieces(prepared: engine.Engine, events: np.ndarray, bounds: list[int]) -> Trace:
+    """Run a recording in calls that stop at `bounds`."""
+    n = prepared.netlist.n_compartments
+    state = engine.start(prepared)
+    spikes = np.zeros((bounds[-1], n), np.bool_)
+    membranes = np.zeros((bounds[-1], n), np.int32)
+    for begin, end in itertools.pairwise(bounds):
+        engine.advance(
+            prepared,
+            state,
+            events[:, begin:end],
+            length=events.shape[1],
+            steps=end - begin,
+            spikes=spikes[begin:end],
+            membranes=membranes[begin:end],
+        )
+        assert state.clock[0] == end
+    counts = Counts(inputs=state.inputs, spikes=state.spikes, updates=state.updates, saturations=state.saturations)
+    return Trace(counts=counts, spikes=spikes, membranes=membranes)
+
+
+@pytest.mark.parametrize("proved", [True, False])
+def test_one_step_at_a_time_is_the_batch(proved):
+    netlist = large_netlist(10, proved=proved)
+    events = random_batch(11, netlist.n_inputs, size=1)
+    prepared = engine.prepare(netlist)
+    whole = engine.simulate(prepared, events, spikes=True, membranes=True)
+    assert_equal(in_pieces(prepared, events[0], list(range(30 + netlist.max_depth + 1))), recording_of(whole, 0))
+
+
+def test_a_stream_without_end():
+    netlist = large_netlist(10, proved=True)
+    events = random_batch(12, netlist.n_inputs, size=1)
+    prepared = engine.prepare(netlist)
+    whole = engine.simulate(prepared, events, spikes=True)
+    state, spikes = engine.start(prepared), np.zeros((30, 300), np.bool_)
+    engine.advance(prepared, state, events[0], length=2**62, spikes=spikes)
+    np.testing.assert_array_equal(spikes, whole.spikes[0, :30])
+
+
+def test_the_first_recording_that_overflows_is_named():
+    netlist = build([Neuron()], [Axon(source=0, exponent=7, targets=((0, 254), (0, 254)))], n_inputs=1, depths=[0])
+    events = np.zeros((40, 1, 5), np.uint8)
+    events[30, 0, 1] = events[12, 0, 3] = 1
+    with pytest.raises(NumericRangeError) as caught:
+        engine.simulate(netlist, events, threads=2)
+    assert str(caught.value) == outcome(spec.simulate, netlist, events[12])
+    assert caught.value.__notes__ == ["recording 12 of 40, counted from 0"]
+
+
+def test_progress_counts_recordings():
+    netlist = large_netlist(7, proved=True)
+    seen: list[int] = []
+    engine.simulate(netlist, random_batch(8, netlist.n_inputs), threads=2, progress=seen.append)
+    assert seen == [1, 2, 3, 4, 5, 6]
+
+
+def test_the_kernel_compiles_where_nothing_can_be_cached(monkeypatch):
+    def njit(**options):
+        if options.get("cache"):
+            raise RuntimeError("cannot cache function: no locator available")
+        return lambda function: (function, options)
+
+    monkeypatch.setattr(kernel, "njit", njit)
+    assert kernel._compiled_and_cached(len) == (len, {"nogil": True})
+
+
+def test_simulators_do_not_load_torch():
+    code = "import sys, runtime.engine, runtime.spec; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,0 +1,302 @@
+"""What one chip step does, in literal numbers, for the plain simulator and both kernels of the fast one."""
+
+import numpy as np
+import pytest
+from random_netlists import MEMORYLESS, SIMULATORS, Axon, Neuron, build
+
+from compiler.errors import DataError, NumericRangeError
+from compiler.netlist import Netlist
+from runtime.trace import Trace, aligned
+
+NEVER = 2**17 - 1
+
+pytestmark = pytest.mark.parametrize("simulate", SIMULATORS)
+
+
+def single(neuron: Neuron, *weights: tuple[int, int]) -> Netlist:
+    """One neuron; channel i has one synapse of (mantissa, exponent) `weights[i]` to it."""
+    axons = [Axon(source=i, exponent=e, targets=((0, mantissa),)) for i, (mantissa, e) in enumerate(weights)]
+    return build([neuron], axons, n_inputs=max(1, len(weights)), depths=[0])
+
+
+def events(*channels: str) -> np.ndarray:
+    """Events from one string of digits per channel."""
+    return np.array([[int(digit) for digit in channel] for channel in channels], np.uint8)
+
+
+def membranes(trace: Trace) -> list[int]:
+    return trace.membranes[:, 0].tolist()
+
+
+def spikes(trace: Trace, compartment: int = 0) -> list[int]:
+    return np.flatnonzero(trace.spikes[:, compartment]).tolist()
+
+
+DECAY_VECTORS = [
+    (1, 0),
+    (5, 0),
+    (6, 1),
+    (-5, 0),
+    (-6, -1),
+    (64, 12),
+    (-64, -12),
+    (3840, 767),
+    (-1920, -383),
+    (8128, 1625),
+    (-8191, -1637),
+]
+
+
+@pytest.mark.parametrize(("value", "kept"), DECAY_VECTORS)
+def test_membrane_decay_vectors(simulate, value, kept):
+    # the bias and one event make `value` in the first step; in the second one only the bias is added
+    bias = value if abs(value) <= 4095 else value % 64
+    weight = (value - bias) // 64
+    neuron = Neuron(decay_v=3277, bias=bias, threshold=NEVER)
+    first, second = membranes(simulate(single(neuron, (weight, 0)), events("10")))
+    assert first == value
+    assert second - bias == kept
+
+
+def test_decay_of_a_saturated_membrane(simulate):
+    # a current that hardly decays drives the membrane to its limit; then it is pushed back below it
+    neuron = Neuron(decay_u=0, decay_v=3277, threshold=NEVER)
+    trace = simulate(single(neuron, (-254, 7), (254, 7)), events("11110", "00001"))
+    last_current = -6237224  # x -> -floor(|x| * 4095 / 4096) - 2080768 four times, then + 2080768
+    assert membranes(trace)[3] == -8388607
+    assert membranes(trace)[4] - last_current == -1677311
+    assert trace.counts.saturations.tolist() == [1]
+
+
+def test_the_published_six_step_run(simulate):
+    # Inputs i0, i1 drive h0, h1, which drive o. The published run counts steps from 1 and its inputs are neurons: an
+    # input of published step s acts on h in s + 1. Ours are channels, whose events act in their own step, so a
+    # channel's data step t is published step t + 1 and a compartment's chip step t is published step t + 2.
+    n_inputs = 2
+    h = Neuron(layer=0, core=0, decay_u=MEMORYLESS, decay_v=3277, threshold=80)
+    o = Neuron(layer=1, core=1, decay_u=MEMORYLESS, decay_v=3277, threshold=80)
+    netlist = build(
+        [h, h, o],
+        [
+            Axon(core=0, source=0, targets=((0, 60), (1, -30))),
+            Axon(core=0, source=1, targets=((0, 50), (1, 90))),
+            Axon(core=1, source=n_inputs + 0, targets=((0, 100),)),
+            Axon(core=1, source=n_inputs + 1, targets=((0, 70),)),
+        ],
+        n_inputs=n_inputs,
+        depths=[0, 1],
+    )
+    inputs = events("110100", "100110")
+    trace = simulate(netlist, inputs)
+    assert trace.membranes[:4, 1].tolist() == [3840, -1153, -230, 3795]  # published steps 2 to 5
+
+    fired: dict[int, set[str]] = {step: set() for step in range(1, 7)}
+    for channel, t in np.argwhere(inputs).tolist():
+        fired[t + 1].add(("i0", "i1")[channel])
+    for t, compartment in np.argwhere(trace.spikes).tolist():
+        fired[t + 2].add(("h0", "h1", "o")[compartment])
+    assert fired == {1: {"i0", "i1"}, 2: {"i0", "h0"}, 3: {"o"}, 4: {"i0", "i1"}, 5: {"i1", "h0"}, 6: {"h1", "o"}}
+
+
+@pytest.mark.parametrize(("bias", "expected"), [(0, []), (1, [0]), (-1, [])])
+def test_compare_is_strict(simulate, bias, expected):
+    trace = simulate(single(Neuron(threshold=100, bias=bias), (100, 0)), events("1"))
+    assert membranes(trace) == [6400 + bias]
+    assert spikes(trace) == expected
+
+
+def test_threshold_at_zero_and_at_its_largest(simulate):
+    assert spikes(simulate(single(Neuron(threshold=0)), events("000"))) == []
+    assert spikes(simulate(single(Neuron(threshold=0, bias=1)), events("000"))) == [0, 1, 2]
+    # a saturated membrane, 8388607, is above the largest threshold, 64 * 131071 = 8388544
+    neuron = Neuron(threshold=NEVER, decay_u=0, decay_v=0, bias=4095, bias_exponent=7)
+    assert spikes(simulate(single(neuron, (254, 7)), events("1110"))) == [2]
+
+
+@pytest.mark.parametrize(
+    ("decay_u", "weight", "expected"),
+    [
+        (0, 32, [2048, 2047, 2046, 2045]),  # loses 1/4096
+        (0, -32, [-2048, -2047, -2046, -2045]),
+        (2047, -32, [-2048, -1024, -512, -256]),  # loses 2048/4096
+        (4094, 128, [8192, 2 + 2, 0, 0]),  # keeps 1/4096, as the membrane does
+        (4095, 128, [8192, 0 + 2, 0, 0]),  # keeps nothing
+    ],
+)
+def test_current_decay_has_an_offset_of_one(simulate, decay_u, weight, expected):
+    neuron = Neuron(decay_u=decay_u, decay_v=4095, threshold=NEVER)  # below 4096 such a membrane forgets at once
+    assert membranes(simulate(single(neuron, (weight, 0)), events("1000"))) == expected
+
+
+def test_membrane_decay_has_no_offset(simulate):
+    kept = simulate(single(Neuron(decay_v=0, threshold=NEVER), (64, 0)), events("100"))
+    assert membranes(kept) == [4096, 4096, 4096]
+    lost = simulate(single(Neuron(decay_v=1, threshold=NEVER), (64, 0)), events("100"))
+    assert membranes(lost) == [4096, 4095, 4094]
+
+
+def test_decay_rounds_toward_zero(simulate):
+    trace = simulate(single(Neuron(decay_v=2048, bias=-1, threshold=NEVER), (2, -1)), events("100"))
+    assert membranes(trace) == [63, 30, 14]
+    # -(1 * 2048 // 4096) is 0, where an arithmetic shift would say -1
+    trace = simulate(single(Neuron(decay_v=2048, bias=-1, threshold=NEVER)), events("000"))
+    assert membranes(trace) == [-1, -1, -1]
+
+
+def test_bias_is_not_shifted_and_exponents_scale(simulate):
+    neuron = Neuron(decay_v=4095, bias=-4095, bias_exponent=7, threshold=NEVER)
+    trace = simulate(single(neuron, (-256, -1), (254, 7)), events("0100", "0010"))
+    plain = -4095 * 128
+    assert membranes(trace) == [plain, plain - 127 - 128 * 64, plain - 129 + 254 * 128 * 64, plain + 379]
+
+
+def test_reset_takes_the_membrane_and_leaves_the_current(simulate):
+    neuron = Neuron(decay_u=2047, decay_v=0, threshold=100)
+    trace = simulate(single(neuron, (128, 0)), events("1000"))
+    assert membranes(trace) == [8192, 4096, 6144, 7168]
+    assert spikes(trace) == [0, 3]
+
+
+def test_layers_integrate_in_their_window_only(simulate):
+    # the depths leave gaps; every neuron spikes from its bias alone in each step of its window
+    neurons = [Neuron(layer=i, bias=1, threshold=0) for i in range(3)]
+    netlist = build(neurons, [], n_inputs=1, depths=[0, 2, 5])
+    trace = simulate(netlist, np.zeros((1, 3), np.uint8))
+    assert trace.spikes.shape == trace.membranes.shape == (8, 3)
+    assert [spikes(trace, c) for c in range(3)] == [[0, 1, 2], [2, 3, 4], [5, 6, 7]]
+    np.testing.assert_array_equal(trace.membranes, trace.spikes)
+    for layer in range(3):
+        assert aligned(netlist, trace.spikes, layer).tolist() == [[True], [True], [True]]
+        assert aligned(netlist, trace.spikes[None], layer).shape == (1, 3, 1)
+
+
+def test_what_arrives_outside_the_window_is_dropped(simulate):
+    # a skip from the input arrives too early, a recurrent spike too late; both are dropped, overflow or not
+    first = Neuron(layer=0, threshold=0, bias=1)
+    second = Neuron(layer=1, decay_v=0, threshold=NEVER)
+    huge = ((1, 254), (1, 254))
+    netlist = build(
+        [first, second],
+        [Axon(source=0, exponent=7, targets=huge), Axon(source=1, targets=((1, 2), (0, 2)))],
+        n_inputs=1,
+        depths=[0, 2],
+    )
+    trace = simulate(netlist, events("1100"))
+    # first spikes in steps 0 to 3, which arrive in 1 to 4; the window of second is 2 to 5
+    assert trace.membranes[:, 1].tolist() == [0, 0, 128, 256, 384, 384]
+    assert trace.membranes[:, 0].tolist() == [1, 129, 129, 129, 0, 0]
+
+
+def test_aligned_orders_neurons(simulate):
+    # the two neurons of layer 0 sit on two cores, behind one of layer 1
+    neurons = [Neuron(layer=0, core=1, bias=7), Neuron(layer=0, core=0, bias=8), Neuron(layer=1, core=0, bias=9)]
+    netlist = build(neurons, [], n_inputs=1, depths=[0, 1])
+    trace = simulate(netlist, np.zeros((1, 1), np.uint8))
+    assert netlist.neuron.tolist() == [1, 0, 0]
+    assert aligned(netlist, trace.membranes, 0).tolist() == [[7, 8]]
+    assert aligned(netlist, trace.membranes, 1).tolist() == [[9]]
+
+
+def test_counts(simulate):
+    neurons = [
+        Neuron(layer=0, decay_v=2048, threshold=NEVER),  # driven once by a weight of 2: 128, 64, … 1, 0
+        Neuron(layer=0, threshold=NEVER),  # reached by zero weights only
+        Neuron(layer=1, bias=1, threshold=0),  # works and spikes in every step of its window
+        Neuron(layer=0, decay_u=2047, decay_v=4095, threshold=NEVER),  # its current takes longer than its membrane
+    ]
+    axons = [Axon(source=0, targets=((0, 2), (1, 0), (3, 2))), Axon(source=1, targets=((1, 0),))]
+    netlist = build(neurons, axons, n_inputs=2, depths=[0, 1])
+    trace = simulate(netlist, events("100000000000", "001100000000"))
+    assert trace.counts.inputs.tolist() == [1, 2]
+    assert trace.counts.spikes.tolist() == [0, 0, 12, 0]
+    # neuron 0 starts nine steps with work (an event, then 128, 64, … 1), neuron 1 three, neuron 3 nine (128 … 1)
+    assert trace.counts.updates.tolist() == [9 + 3 + 9, 12]
+    assert trace.counts.saturations.tolist() == [0, 0]
+    assert all(count.dtype == np.int64 for count in (trace.counts.inputs, trace.counts.spikes, trace.counts.updates))
+
+
+def test_an_empty_recording(simulate):
+    trace = simulate(build([Neuron(bias=1)], [], n_inputs=1, depths=[2]), np.zeros((1, 0), np.uint8))
+    assert trace.spikes.shape == (2, 1)
+    assert trace.counts.updates.tolist() == [0]
+
+
+def test_positive_sum_overflow(simulate):
+    netlist = build(
+        [Neuron(layer=1), Neuron(layer=0, core=1)],
+        [
+            Axon(core=1, source=0, exponent=7, targets=((0, 254),)),
+            Axon(core=1, source=1, exponent=0, targets=((0, 254), (0, 2))),
+            Axon(core=1, source=1, exponent=7, targets=((0, -254),)),  # in another order the sum would hold
+        ],
+        n_inputs=2,
+        depths=[0, 1],
+    )
+    # 254 * 128 + 254 is 32766, the largest even sum that holds; the other 2 are too many
+    with pytest.raises(NumericRangeError) as caught:
+        simulate(netlist, events("0101", "0001"))
+    assert str(caught.value) == (
+        "layer0 neuron 0 on core 1, chip step 3: synaptic sum 2097152 found, magnitudes up to 2097151 allowed; "
+        "compile with a smaller scale for layer0"
+    )
+
+
+def test_largest_sums_hold(simulate):
+    neuron = Neuron(threshold=NEVER)
+    netlist = single(neuron, (254, 7), (254, 0), (2, -1), (-254, 7), (-254, 0), (-2, -1))
+    trace = simulate(netlist, events("10", "10", "10", "01", "01", "01"))
+    assert membranes(trace) == [2097088, -2097088 + 419315]
+
+
+def test_negative_sum_overflow(simulate):
+    netlist = single(Neuron(), (-254, 7), (-256, 0), (254, 7))
+    with pytest.raises(NumericRangeError) as caught:
+        simulate(netlist, events("1", "1", "1"))
+    assert str(caught.value) == (
+        "layer0 neuron 0 on core 0, chip step 0: synaptic sum -2097152 found, magnitudes up to 2097151 allowed; "
+        "compile with a smaller scale for layer0"
+    )
+
+
+def test_current_overflow(simulate):
+    netlist = single(Neuron(decay_u=0), (-254, 7))
+    with pytest.raises(NumericRangeError) as caught:
+        simulate(netlist, events("111111"))
+    # the current is -8320024 after four steps
+    assert str(caught.value) == (
+        "layer0 neuron 0 on core 0, chip step 4: current -10398760 found, magnitudes up to 8388607 allowed; "
+        "compile with a smaller scale for layer0"
+    )
+
+
+def test_first_overflow_is_reported(simulate):
+    # In step 4 compartments 1, 2 and 3 overflow: 1 in its current, 2 and 3 in their sum. Compartment 0 would in step
+    # 5. Positions of the fast simulator run the other way round: by layer.
+    neurons = [Neuron(layer=3 - i, decay_u=0 if i == 1 else MEMORYLESS, threshold=NEVER) for i in range(4)]
+    axons = [
+        Axon(source=0, exponent=7, targets=((1, 254),)),
+        Axon(source=1, exponent=7, targets=((2, 254), (2, 254), (3, 254), (3, 254))),
+        Axon(source=2, exponent=7, targets=((0, 254), (0, 254))),
+    ]
+    netlist = build(neurons, axons, n_inputs=3, depths=[0, 0, 0, 0])
+    with pytest.raises(NumericRangeError, match="layer2 neuron 0 on core 0, chip step 4: current 10398760 found"):
+        simulate(netlist, events("111110", "000010", "000001"))
+    with pytest.raises(NumericRangeError, match="layer1 neuron 0 on core 0, chip step 4: synaptic sum 4161536 found"):
+        simulate(netlist, events("011110", "000010", "000001"))
+    with pytest.raises(NumericRangeError, match="layer3 neuron 0 on core 0, chip step 5: synaptic sum 4161536 found"):
+        simulate(netlist, events("011110", "000001", "000001"))
+
+
+def test_sum_is_checked_before_current(simulate):
+    netlist = single(Neuron(decay_u=0), (254, 7), (254, 7))
+    with pytest.raises(NumericRangeError, match="chip step 4: synaptic sum 4161536 found"):
+        simulate(netlist, events("11111", "00001"))
+
+
+def test_wrong_number_of_channels(simulate):
+    with pytest.raises(DataError) as caught:
+        simulate(single(Neuron()), np.zeros((2, 3), np.uint8))
+    assert str(caught.value) == (
+        "recordings: 2 input channels found, the netlist has 1; "
+        "use recordings of the sensor that the network was compiled for"
+    )
