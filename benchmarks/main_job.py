@@ -51,9 +51,6 @@ def main() -> None:
         "compile, calibrated": lambda: compile_checkpoint(checkpoint, adjacency, training_events=train),
         "compile, from the weights": lambda: compile_checkpoint(checkpoint, adjacency),
         "engine, all recordings": lambda: engine.simulate(prepared, flat, threads=1),
-        "engine, all recordings, neuron updates counted": lambda: engine.simulate(
-            prepared, flat, updates=True, threads=1
-        ),
         "engine, one recording": lambda: engine.simulate(prepared, flat[:1], threads=1),
         "float model, all recordings": lambda: float_spikes(checkpoint, adjacency, test, dtype="float32"),
     }

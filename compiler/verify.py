@@ -21,6 +21,7 @@ from compiler.ir import (
     Network,
     Population,
     Projection,
+    depths,
     to_networkx,
 )
 
@@ -48,6 +49,12 @@ def _projections_fit(network: Network | IntegerNetwork) -> Faults:
             yield f"projection {i} has unsorted or repeated synapses"
 
 
+def _populations_exist(network: Network | IntegerNetwork) -> bool:
+    """Whether every projection joins populations that there are; :func:`_projections_fit` says which does not."""
+    count = len(network.populations)
+    return all(INPUT <= p.pre < count and 0 <= p.post < count for p in network.projections)
+
+
 def _is_feed_forward(network: Network | IntegerNetwork) -> Faults:
     projections: tuple[Projection | IntegerProjection, ...] = network.projections
     for i, projection in enumerate(projections):
@@ -55,7 +62,20 @@ def _is_feed_forward(network: Network | IntegerNetwork) -> Faults:
             yield f"projection {i} runs from population {projection.pre} to {projection.post}, not forward"
 
 
+def _no_layer_is_skipped(network: Network | IntegerNetwork) -> Faults:
+    if not _populations_exist(network):
+        return
+    depth = {INPUT: -1} | dict(enumerate(depths(network)))
+    projections: tuple[Projection | IntegerProjection, ...] = network.projections
+    for i, projection in enumerate(projections):
+        early = depth[projection.post] - depth[projection.pre] - 1
+        if early > 0:
+            yield f"projection {i} skips a layer: a spike takes one step on the chip, so it would arrive {early} early"
+
+
 def _everything_is_reached(network: Network | IntegerNetwork) -> Faults:
+    if not _populations_exist(network):
+        return
     reached = nx.descendants(to_networkx(network), "input")
     for population in network.populations:
         if population.name not in reached:
@@ -101,12 +121,15 @@ def _mantissas_hold(network: IntegerNetwork) -> Faults:
         step, data = weight_step(projection.bits), projection.weight.data
         if data.dtype != np.int64 or np.any(data % step) or np.any(data < -256) or np.any(data > 256 - step):
             yield f"projection {i} has mantissas that {projection.bits} bits cannot hold"
+        if projection.exponent < -1:
+            yield f"projection {i} has exponent {projection.exponent}: below -1 its weights are no whole units"
 
 
 _SHARED: tuple[Callable[[Network | IntegerNetwork], Faults], ...] = (
     _names_are_unique,
     _projections_fit,
     _is_feed_forward,
+    _no_layer_is_skipped,
     _everything_is_reached,
     _readout_fits,
 )

@@ -107,16 +107,60 @@ class _Lif(torch.autograd.Function):
         _integrate(_rows(current), *_scalars(current, beta, theta), _rows(spikes), _rows(membrane))
         ctx.save_for_backward(membrane)
         ctx.mark_non_differentiable(membrane)
+        ctx.set_materialize_grads(False)
         return spikes, membrane
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:
-        spikes_gradient = gradients[0].contiguous()
         (membrane,) = ctx.saved_tensors
+        spikes_gradient = gradients[0].contiguous()
         out = torch.empty_like(membrane)
         constants = _scalars(membrane, ctx.beta, ctx.theta, SURROGATE_HALF_WIDTH)
         _differentiate(_rows(spikes_gradient), _rows(membrane), *constants, _rows(out))
         return out, None, None
+
+
+def spike_linear(spikes: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    """Affine layer over zeros and ones, which adds up the weights of the inputs that spiked.
+
+    Costs what the spikes cost (5 to 15 % of a dense product here); only the gradient of `spikes` is dense.
+
+    Parameters
+    ----------
+    spikes : (steps, samples, inputs)
+        Zeros and ones.
+    weight : (inputs, outputs)
+        Transposed against torch's ``Linear``, so that the weights of one input lie side by side.
+    bias : (outputs,)
+        Starts each sum; the inputs follow in ascending order.
+
+    Returns
+    -------
+    (steps, samples, outputs)
+    """
+    out: Tensor = _SpikeLinear.apply(spikes, weight, bias)  # type: ignore[no-untyped-call]
+    return out
+
+
+class _SpikeLinear(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, spikes: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        rows = spikes.reshape(-1, spikes.shape[-1]).contiguous()
+        source, bounds = _events(rows.numpy())
+        out = bias.repeat(len(rows), 1)
+        _gather(source, bounds, weight.detach().contiguous().numpy(), out.numpy())
+        ctx.events = source, bounds
+        ctx.save_for_backward(weight)
+        return out.view(*spikes.shape[:-1], -1)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        (weight,) = ctx.saved_tensors
+        above = gradients[0].contiguous()
+        rows = above.view(-1, above.shape[-1])
+        out = torch.zeros_like(weight)
+        _scatter(*ctx.events, rows.numpy(), out.numpy())
+        return above @ weight.t(), out, rows.sum(0)
 
 
 def _rows(tensor: Tensor) -> np.ndarray[Any, Any]:
@@ -171,3 +215,38 @@ def _differentiate(spikes_gradient: Any, membrane: Any, beta: Any, theta: Any, h
     for t in range(steps - 1, -1, -1):
         _differentiate_step(spikes_gradient[t], membrane[t], later, beta, theta, half_width, out[t])
         later = out[t]
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _events(spikes: Any) -> Any:
+    """Inputs that spiked, row after row, and where each row's begin: int32 (spikes,), int64 (rows + 1,)."""
+    rows, inputs = spikes.shape
+    source = np.empty(spikes.size, np.int32)
+    bounds = np.zeros(rows + 1, np.int64)
+    found = 0
+    for row in range(rows):
+        for i in range(inputs):
+            source[found] = i
+            found += spikes[row, i] != 0
+        bounds[row + 1] = found
+    return source[:found].copy(), bounds
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _add(total: Any, term: Any) -> None:
+    for i in range(len(total)):
+        total[i] += term[i]
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _gather(source: Any, bounds: Any, weight: Any, out: Any) -> None:
+    for row in range(len(out)):
+        for event in range(bounds[row], bounds[row + 1]):
+            _add(out[row], weight[source[event]])
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _scatter(source: Any, bounds: Any, rows: Any, out: Any) -> None:
+    for row in range(len(rows)):
+        for event in range(bounds[row], bounds[row + 1]):
+            _add(out[source[event]], rows[row])

@@ -220,7 +220,7 @@ def _estimate(arguments: Arguments) -> Outcome:
     data = _recordings(arguments, netlist)
     _progress("running")
     events = data.events.reshape(len(data.events), netlist.n_inputs, -1)
-    trace = engine.simulate(netlist, events, updates=True)
+    trace = engine.simulate(netlist, events)
     costs = cost.estimate(netlist, load_target(netlist.target), trace.counts, data.steps)
     return render.estimate_json(netlist, costs), render.estimate_text, 0
 

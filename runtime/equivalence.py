@@ -161,7 +161,7 @@ def require_match(netlist: Netlist, checkpoint: Checkpoint) -> None:
 def _same_run(netlist: Netlist, prepared: engine.Engine, events: npt.NDArray[np.uint8]) -> bool:
     """Whether specification and engine agree on one recording: every spike, membrane and count."""
     slow = spec.simulate(netlist, events)
-    fast = engine.simulate(prepared, events[None], spikes=True, membranes=True, updates=True)
+    fast = engine.simulate(prepared, events[None], spikes=True, membranes=True)
     pairs = [
         (slow.spikes, fast.spikes),
         (slow.membranes, fast.membranes),

@@ -5,6 +5,7 @@ The recordings may not be redistributed. Point SPIKELOOM_SHARED at a folder that
 """
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,8 @@ SHARED = Path(os.environ.get("SPIKELOOM_SHARED", Path(__file__).resolve().parent
 def _shared(relative: str) -> Path:
     path = SHARED / relative
     if not path.exists():
+        if os.environ.get("SPIKELOOM_REQUIRE_RECORDINGS"):
+            pytest.fail(f"the released file {relative} is missing, and SPIKELOOM_REQUIRE_RECORDINGS forbids to skip")
         pytest.skip(f"the released file {relative} is not on this machine (set SPIKELOOM_SHARED)")
     return path
 
@@ -41,3 +44,22 @@ def released_checkpoint() -> Path:
 def shared_dir() -> Path:
     """The folder that holds the released files."""
     return _shared("checkpoints").parent
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the option that writes golden texts anew."""
+    parser.addoption("--update-golden", action="store_true", help="write tests/golden anew instead of comparing")
+
+
+@pytest.fixture
+def golden(request: pytest.FixtureRequest) -> Callable[[str, str], None]:
+    """Compare a text with the file of that name in ``tests/golden``; ``--update-golden`` writes it."""
+
+    def compare(name: str, text: str) -> None:
+        path = Path(__file__).parent / "golden" / name
+        if request.config.getoption("--update-golden"):
+            path.parent.mkdir(exist_ok=True)
+            path.write_text(text, encoding="utf-8")
+        assert text == path.read_text(encoding="utf-8"), f"{path} differs; --update-golden writes it anew"
+
+    return compare

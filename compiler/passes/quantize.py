@@ -1,7 +1,8 @@
 """Round a network to chip integers: one scale per population.
 
-Spikes change. Which scale is best is decided by counting spikes that differ from the float64 model's on the
-calibration recordings, layer by layer with the float model's own input; without calibration by the weights alone.
+Spikes change. Which scale is best is decided on the calibration recordings: first by the spikes of a layer that differ
+from the float64 model's when it gets the float model's own input; among the few best by how far the class counts of
+the whole integer network move. Without calibration the weights alone decide.
 """
 
 from __future__ import annotations
@@ -15,15 +16,16 @@ import numpy as np
 
 from compiler.errors import ModelError, OptionError
 from compiler.fixedpoint import (
+    BIAS_EXPONENT_MAX,
+    BIAS_MANTISSA_MAX,
     MEMBRANE_SHIFT,
     ONE_STEP_SUM_MAX,
     THRESHOLD_MANTISSA_MAX,
-    FloatArray,
     encode_bias,
     quantise_weights,
     weight_step,
 )
-from compiler.interpret import BATCH, integer_recurrence, integer_sums, product
+from compiler.interpret import BATCH, integer_recurrence, integer_sums, product, run_integer
 from compiler.ir import IntegerNetwork, IntegerPopulation, IntegerProjection, Network, Population, Projection
 from compiler.passes.calibrate import Calibration
 from compiler.targets import Target
@@ -34,6 +36,9 @@ CLIPPING = tuple(2 ** (k / 4) for k in range(13))
 WORTHWHILE = 0.95
 """The largest exponent that leaves this share of the finest weight scale is taken: each step up lets threshold and
 bias round twice as finely (a proof at exponent 0 costs fc1 of the released networks two percent of scale)."""
+
+SHORTLIST, SHORTLIST_RATIO = 3, 1.25
+"""Scales of a layer that are compared within the whole network, and by how much they may exceed the fewest flips."""
 
 RANGES = ("proven", "observed")
 """How a scale is kept from overflowing the accumulator; ``observed`` trusts the calibration recordings."""
@@ -77,6 +82,16 @@ class _Layer:
 
     population: IntegerPopulation
     projections: tuple[IntegerProjection, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Candidate:
+    """A layer at one scale, its largest one-sided sum, its calibration flips, and how many scales were compared."""
+
+    layer: _Layer
+    reached: float
+    flips: int | None
+    tried: int
 
 
 def decay_registers(beta: float) -> tuple[int, int]:
@@ -172,7 +187,10 @@ def _fit(
     A threshold is a whole number of weight units. Only scales at which it is one exactly are tried, so it carries
     no rounding at all; that costs at most one unit of scale in ``theta * scale``.
     """
-    units = int(population.theta * mantissa_scale * 2.0**exponent)
+    bias_limit = BIAS_MANTISSA_MAX << BIAS_EXPONENT_MAX
+    bias_peak = float(np.abs(population.bias).max(initial=0)) * (1 << MEMBRANE_SHIFT)
+    biggest = min(THRESHOLD_MANTISSA_MAX, bias_limit * population.theta / bias_peak if bias_peak else np.inf)
+    units = int(min(population.theta * mantissa_scale * 2.0**exponent, biggest))
     while units >= 1:
         layer = _round_layer(population, projections, units / (population.theta * 2.0**exponent), exponent, bits)
         if layer is not None:
@@ -181,7 +199,7 @@ def _fit(
                 return layer, reached
             units = min(units - 1, int(units * ONE_STEP_SUM_MAX / reached))
         else:
-            units //= 2  # threshold or bias beyond its register: far too fine
+            units -= 1  # a bias that rounds just out of its register
     return None
 
 
@@ -198,6 +216,8 @@ def _candidate(
     finest = 0.0
     for exponent in sorted(exponents):
         fitted = _fit(population, projections, bits, mantissa_scale, exponent, observed)
+        if fitted is None and chosen is None:
+            continue  # the threshold is less than a unit, a larger exponent makes it more
         if fitted is None or _mantissa_scale(fitted[0]) < WORTHWHILE * finest:
             break
         finest = max(finest, _mantissa_scale(fitted[0]))
@@ -209,48 +229,75 @@ def _mantissa_scale(layer: _Layer) -> float:
     return layer.population.scale / 2.0 ** layer.projections[0].exponent
 
 
-def _quantise_population(
+def _shortlist(
     network: Network,
     post: int,
     bits: int,
     exponents: tuple[int, ...],
     calibration: Calibration | None,
-    ranges: str,
-    margin: float,
-) -> tuple[_Layer, Choice]:
+    observed: float | None,
+) -> list[_Candidate]:
+    """Scales of one population worth a closer look, best first; a single one without calibration."""
     population = network.populations[post]
     projections = tuple(p for p in network.projections if p.post == post)
-    observed = None
-    if ranges == "observed" and calibration is not None:
-        observed = _observed_sum(projections, calibration) * (1 + margin)
     peak = max(float(np.abs(p.weight.data).max(initial=0)) for p in projections)
     full = (256 - weight_step(bits)) / peak if peak else 1.0 / population.theta
     factors = CLIPPING if calibration is not None else (1.0,)
     fitted = [_candidate(population, projections, bits, full * f, exponents, observed) for f in factors]
-    found: dict[float, tuple[_Layer, float]] = {c[0].population.scale: c for c in fitted if c is not None}
+    found = list({c[0].population.scale: c for c in fitted if c is not None}.values())
     if not found:
         raise ModelError(
             f"{population.name}: no scale at {bits} bits keeps its threshold of at least one unit within the "
             f"accumulator ({ONE_STEP_SUM_MAX} units a step); use more bits or smaller weights"
         )
-    candidates = list(found.values())
-    flips = None
     if calibration is None:
-        layer, reached = candidates[0]
-    else:
-        counts = [_count_flips(layer, post, calibration) for layer, _ in candidates]
-        flips = min(counts)
-        layer, reached = candidates[counts.index(flips)]
-    limit = (256 - weight_step(bits)) / _mantissa_scale(layer) * (1 + 1e-12)
-    return layer, Choice(
-        layer=population.name,
-        scale=layer.population.scale,
-        exponent=layer.projections[0].exponent,
-        clipped=int(sum(np.count_nonzero(np.abs(p.weight.data) > limit) for p in projections)),
-        candidates=len(candidates),
-        flips=flips,
+        return [_Candidate(layer=found[0][0], reached=found[0][1], flips=None, tried=1)]
+    counted = [
+        _Candidate(layer=layer, reached=reached, flips=_count_flips(layer, post, calibration), tried=len(found))
+        for layer, reached in found
+    ]
+    counted.sort(key=lambda candidate: candidate.flips or 0)
+    worst = SHORTLIST_RATIO * (counted[0].flips or 0)
+    return [candidate for candidate in counted[:SHORTLIST] if (candidate.flips or 0) <= worst]
+
+
+def _settle(network: Network, shortlists: list[list[_Candidate]], calibration: Calibration) -> list[_Candidate]:
+    """Pick one scale per population, in order, by how far the whole network's class counts move from float64."""
+    wanted = calibration.spikes[network.readout.population].sum(axis=1, dtype=np.int64)
+    chosen = [candidates[0] for candidates in shortlists]
+    for post, candidates in enumerate(shortlists):
+        if len(candidates) > 1:
+            distances = []
+            for candidate in candidates:
+                trial = _assemble(network, [candidate if i == post else kept for i, kept in enumerate(chosen)])
+                spikes = run_integer(trial, calibration.events).spikes[network.readout.population]
+                distances.append(int(np.abs(spikes.sum(axis=1, dtype=np.int64) - wanted).sum()))
+            chosen[post] = candidates[distances.index(min(distances))]
+    return chosen
+
+
+def _assemble(network: Network, chosen: list[_Candidate]) -> IntegerNetwork:
+    return IntegerNetwork(
+        input=network.input,
+        populations=tuple(candidate.layer.population for candidate in chosen),
+        projections=tuple(projection for candidate in chosen for projection in candidate.layer.projections),
+        readout=network.readout,
+        classes=network.classes,
+    )
+
+
+def _explain(network: Network, post: int, chosen: _Candidate, bits: int, calibration: Calibration | None) -> Choice:
+    limit = (256 - weight_step(bits)) / _mantissa_scale(chosen.layer) * (1 + 1e-12)
+    incoming = [p for p in network.projections if p.post == post]
+    return Choice(
+        layer=network.populations[post].name,
+        scale=chosen.layer.population.scale,
+        exponent=chosen.layer.projections[0].exponent,
+        clipped=int(sum(np.count_nonzero(np.abs(p.weight.data) > limit) for p in incoming)),
+        candidates=chosen.tried,
+        flips=chosen.flips,
         spikes=None if calibration is None else int(np.count_nonzero(calibration.spikes[post])),
-        headroom=1 - reached / ONE_STEP_SUM_MAX,
+        headroom=1 - chosen.reached / ONE_STEP_SUM_MAX,
     )
 
 
@@ -305,22 +352,16 @@ def quantize(
     if ranges == "observed" and calibration is None:
         raise OptionError("--ranges observed: nothing was observed; give --calibrate, or use --ranges proven")
     exponents = target.choices["synapse.exponent"]
-    done = [
-        _quantise_population(network, post, bits, exponents, calibration, ranges, margin)
-        for post in range(len(network.populations))
-    ]
-    projections = [projection for layer, _ in done for projection in layer.projections]
-    quantised = IntegerNetwork(
-        input=network.input,
-        populations=tuple(layer.population for layer, _ in done),
-        projections=tuple(projections),
-        readout=network.readout,
-        classes=network.classes,
-    )
-    return quantised, tuple(choice for _, choice in done)
-
-
-def dequantise(integer: IntegerProjection, scale: float) -> FloatArray:
-    """Weights that the chip realises, in the float model's units; the stored entries of a csr_array."""
-    weight: FloatArray = integer.effective().data / scale
-    return weight
+    shortlists = []
+    for post in range(len(network.populations)):
+        incoming = tuple(p for p in network.projections if p.post == post)
+        observed = None
+        if ranges == "observed" and calibration is not None:
+            observed = _observed_sum(incoming, calibration) * (1 + margin)
+        shortlists.append(_shortlist(network, post, bits, exponents, calibration, observed))
+    if calibration is None:
+        chosen = [candidates[0] for candidates in shortlists]
+    else:
+        chosen = _settle(network, shortlists, calibration)
+    choices = tuple(_explain(network, post, candidate, bits, calibration) for post, candidate in enumerate(chosen))
+    return _assemble(network, chosen), choices

@@ -1,0 +1,89 @@
+"""The float model of a checkpoint, in the released operator order, as ``verify`` compares the chip with it.
+
+Released order: hop 0 first, then one propagation and one linear map per hop, added up, bias last; then the
+recurrence. In float32 this gives every spike of the released code on the released test recordings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from compiler.frontends.checkpoint import Checkpoint
+from models.layers import lif, tag_convolution
+
+BATCH = 8
+"""Recordings that run together: few enough for the caches."""
+
+DTYPES = {"float32": torch.float32, "float64": torch.float64}
+
+
+def _layers(
+    checkpoint: Checkpoint, adjacency: npt.NDArray[np.float64], events: npt.NDArray[np.uint8], dtype: str
+) -> Iterator[tuple[str, torch.Tensor, torch.Tensor]]:
+    """Name, spikes and membranes of each layer, (steps, samples, neurons)."""
+    kind = DTYPES[dtype]
+
+    def tensor(array: npt.NDArray[np.generic]) -> torch.Tensor:
+        return torch.tensor(np.ascontiguousarray(array), dtype=kind)
+
+    x = tensor(events.transpose(3, 0, 1, 2))
+    hops = tensor(checkpoint.hops)
+    current = tag_convolution(x, tensor(adjacency), hops, tensor(checkpoint.conv_bias))
+    spikes, membranes = lif(current, checkpoint.beta, checkpoint.theta)
+    yield "conv1", spikes, membranes
+    for dense in checkpoint.dense:
+        current = torch.nn.functional.linear(spikes, tensor(dense.weight), tensor(dense.bias))
+        spikes, membranes = lif(current, checkpoint.beta, checkpoint.theta)
+        yield dense.name, spikes, membranes
+
+
+def float_spikes(
+    checkpoint: Checkpoint,
+    adjacency: npt.NDArray[np.float64],
+    events: npt.NDArray[np.uint8],
+    *,
+    dtype: str = "float32",
+) -> dict[str, npt.NDArray[np.bool_]]:
+    """Spikes of every layer on recordings.
+
+    Parameters
+    ----------
+    checkpoint : Checkpoint
+        Trained weights.
+    adjacency : (taxels, taxels) float64
+        Normalised propagation matrix; rounded to `dtype`.
+    events : (samples, taxels, channels, steps) uint8
+        Recordings.
+    dtype : {"float32", "float64"}
+        Arithmetic; float32 is what the network was trained in.
+
+    Returns
+    -------
+    dict of str to (samples, steps, neurons) bool
+        One entry per layer, in order.
+    """
+    batches: dict[str, list[npt.NDArray[np.bool_]]] = {}
+    with torch.no_grad():
+        for start in range(0, len(events), BATCH):
+            for name, spikes, _ in _layers(checkpoint, adjacency, events[start : start + BATCH], dtype):
+                batches.setdefault(name, []).append(spikes.bool().transpose(0, 1).numpy())
+    return {name: np.concatenate(parts) for name, parts in batches.items()}
+
+
+def float_membranes(
+    checkpoint: Checkpoint,
+    adjacency: npt.NDArray[np.float64],
+    events: npt.NDArray[np.uint8],
+    *,
+    dtype: str = "float32",
+) -> dict[str, npt.NDArray[np.floating]]:
+    """Membranes of every layer before the comparison; as :func:`float_spikes`, (samples, steps, neurons) of `dtype`."""
+    with torch.no_grad():
+        return {
+            name: membranes.transpose(0, 1).contiguous().numpy()
+            for name, _, membranes in _layers(checkpoint, adjacency, events, dtype)
+        }

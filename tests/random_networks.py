@@ -1,0 +1,253 @@
+"""Networks built by hand or drawn by hypothesis, float and integer, for the tests of the compiler."""
+
+import dataclasses
+import itertools
+
+import numpy as np
+from hypothesis import strategies as st
+from scipy import sparse
+
+from compiler.fixedpoint import weight_step
+from compiler.frontends.checkpoint import Checkpoint, Dense
+from compiler.ir import (
+    INPUT,
+    Input,
+    IntegerNetwork,
+    IntegerPopulation,
+    IntegerProjection,
+    Network,
+    Population,
+    Projection,
+    Readout,
+)
+from compiler.targets import Quantity, Target, load_target
+
+LOIHI = load_target("loihi1")
+"""The chip that most tests compile for."""
+
+BITS = (2, 3, 4, 5, 6, 8)
+"""Storage widths of a mixed-sign weight."""
+
+
+def small_target(**limits: int) -> Target:
+    """Loihi 1 with other limits; ``core_axons_in=3`` sets ``core.axons_in``."""
+    changed = {name.replace("_", ".", 1): value for name, value in limits.items()}
+    assert set(changed) <= set(LOIHI.limits)
+    return dataclasses.replace(
+        LOIHI,
+        limits={
+            rule: Quantity(value=changed.get(rule, old.value), unit=old.unit, source=old.source)
+            for rule, old in LOIHI.limits.items()
+        },
+    )
+
+
+def stored(dense, structure=None):
+    """csr_array of `dense` that stores every entry, zeros too, or those where `structure` holds."""
+    dense = np.asarray(dense)
+    row, column = np.nonzero(np.ones(dense.shape) if structure is None else structure)
+    matrix = sparse.csr_array((dense[row, column], (row, column)), shape=dense.shape)
+    matrix.sort_indices()
+    return matrix
+
+
+def chain(*weights, beta=0.2, theta=0.5, biases=None, polarities=1) -> Network:
+    """Float network of dense layers, one after the other; ``weights[k]`` is (outputs, inputs)."""
+    weights = [np.asarray(weight, float) for weight in weights]
+    biases = biases or [np.zeros(len(weight)) for weight in weights]
+    return Network(
+        input=Input(taxels=weights[0].shape[1] // polarities, polarities=polarities),
+        populations=tuple(
+            Population(name=f"fc{i + 1}", beta=beta, theta=theta, bias=np.asarray(bias, float))
+            for i, bias in enumerate(biases)
+        ),
+        projections=tuple(
+            Projection(pre=i - 1 if i else INPUT, post=i, weight=stored(weight)) for i, weight in enumerate(weights)
+        ),
+        readout=Readout(population=len(weights) - 1, label=np.arange(len(weights[-1]))),
+        classes=len(weights[-1]),
+    )
+
+
+def integer_population(name, size, *, threshold=100, decay_u=4095, decay_v=3277, bias=0, exponent=0):
+    """Integer population with equal neurons, or with one threshold or bias mantissa each."""
+    return IntegerPopulation(
+        name=name,
+        beta=0.2,
+        theta=0.5,
+        scale=2.0 * float(np.max(threshold, initial=1)),
+        decay_u=decay_u,
+        decay_v=decay_v,
+        threshold=np.broadcast_to(np.asarray(threshold, np.int64), (size,)).copy(),
+        bias_mantissa=np.broadcast_to(np.asarray(bias, np.int64), (size,)).copy(),
+        bias_exponent=np.broadcast_to(np.asarray(exponent, np.int64), (size,)).copy(),
+    )
+
+
+def integer_chain(*weights, bits=8, exponent=0, thresholds=None, polarities=1) -> IntegerNetwork:
+    """Integer network of layers, one after the other; zero weights are not stored."""
+    weights = [np.asarray(weight, np.int64) for weight in weights]
+    thresholds = thresholds or [100] * len(weights)
+    return IntegerNetwork(
+        input=Input(taxels=weights[0].shape[1] // polarities, polarities=polarities),
+        populations=tuple(
+            integer_population(f"fc{i + 1}", len(weight), threshold=threshold)
+            for i, (weight, threshold) in enumerate(zip(weights, thresholds, strict=True))
+        ),
+        projections=tuple(
+            IntegerProjection(
+                pre=i - 1 if i else INPUT, post=i, weight=stored(weight, weight != 0), exponent=exponent, bits=bits
+            )
+            for i, weight in enumerate(weights)
+        ),
+        readout=Readout(population=len(weights) - 1, label=np.arange(len(weights[-1]))),
+        classes=len(weights[-1]),
+    )
+
+
+def random_checkpoint(*, taxels=5, features=3, hops=4, sizes=(6, 5, 4), seed=0, beta=0.2, theta=0.5) -> Checkpoint:
+    """A small TactileSGNet with random float32 weights."""
+    rng = np.random.default_rng(seed)
+
+    def draw(*shape, spread=1.0):
+        return rng.normal(0, spread, shape).astype(np.float32)
+
+    widths = [taxels * features, *sizes]
+    return Checkpoint(
+        hops=draw(hops, features, 2),
+        conv_bias=draw(features, spread=0.1),
+        dense=tuple(
+            Dense(name=f"fc{i}", weight=draw(size, before, spread=before**-0.5), bias=draw(size, spread=0.1))
+            for i, (before, size) in enumerate(zip(widths, sizes, strict=False), 1)
+        ),
+        beta=beta,
+        theta=theta,
+        assumed=(),
+        graph=None,
+        edges=None,
+        layout="spikeloom",
+        training=None,
+        sha256="0" * 64,
+    )
+
+
+def _wiring(draw):
+    """Population sizes by depth, and the projections between neighbouring depths as (pre, post)."""
+    by_depth = draw(st.lists(st.lists(st.integers(1, 7), min_size=1, max_size=2), min_size=1, max_size=3))
+    ids, sizes = [], []
+    for layer in by_depth:
+        ids.append(list(range(len(sizes), len(sizes) + len(layer))))
+        sizes += layer
+    pairs = [(INPUT, post) for post in ids[0]]
+    for before, after in itertools.pairwise(ids):
+        for post in after:
+            pairs += [(pre, post) for pre in draw(st.lists(st.sampled_from(before), min_size=1, unique=True))]
+    return sizes, pairs
+
+
+def _structure(rng, density, rows, columns):
+    return rng.random((rows, columns)) < density
+
+
+def _readout(draw, sizes):
+    classes = draw(st.integers(1, 4))
+    label = draw(st.lists(st.integers(0, classes - 1), min_size=sizes[-1], max_size=sizes[-1]))
+    return Readout(population=len(sizes) - 1, label=np.array(label)), classes
+
+
+@st.composite
+def float_networks(draw, *, betas=(0.0, 0.2, 0.5, 0.9)) -> Network:
+    """Float networks whose weights and biases are multiples of 1/64, so that sums are exact in any order."""
+    sizes, pairs = _wiring(draw)
+    sensor = Input(taxels=draw(st.integers(1, 5)), polarities=draw(st.sampled_from([1, 2])))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    spread, density = draw(st.sampled_from([1, 8, 64, 300])), draw(st.sampled_from([0.3, 0.8, 1.0]))
+    every = {INPUT: sensor.size} | dict(enumerate(sizes))
+    readout, classes = _readout(draw, sizes)
+    return Network(
+        input=sensor,
+        populations=tuple(
+            Population(
+                name=f"layer{i}",
+                beta=draw(st.sampled_from(betas)),
+                theta=draw(st.sampled_from([0.25, 0.5, 1.0, 3.0])),
+                bias=rng.integers(-40, 40, size) / 64 * draw(st.sampled_from([0, 1])),
+            )
+            for i, size in enumerate(sizes)
+        ),
+        projections=tuple(
+            Projection(
+                pre=pre,
+                post=post,
+                weight=stored(
+                    rng.integers(-spread, spread + 1, (every[post], every[pre])) / 64,
+                    _structure(rng, density, every[post], every[pre]),
+                ),
+            )
+            for pre, post in pairs
+        ),
+        readout=readout,
+        classes=classes,
+    )
+
+
+@st.composite
+def integer_networks(draw, *, exponents=(-1, 0, 1, 3), bits=BITS) -> IntegerNetwork:
+    """Integer networks with registers at their extremes, several thresholds, and stored zeros."""
+    sizes, pairs = _wiring(draw)
+    sensor = Input(taxels=draw(st.integers(1, 5)), polarities=draw(st.sampled_from([1, 2])))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    density = draw(st.sampled_from([0.0, 0.3, 0.8, 1.0]))
+    every = {INPUT: sensor.size} | dict(enumerate(sizes))
+
+    def projection(pre, post):
+        width = draw(st.sampled_from(bits))
+        step = weight_step(width)
+        structure = _structure(rng, density, every[post], every[pre])
+        mantissa = rng.integers(-256 // step, (256 - step) // step, structure.shape, endpoint=True) * step
+        return IntegerProjection(
+            pre=pre,
+            post=post,
+            weight=stored(mantissa, structure),
+            exponent=draw(st.sampled_from(exponents)),
+            bits=width,
+        )
+
+    readout, classes = _readout(draw, sizes)
+    return IntegerNetwork(
+        input=sensor,
+        populations=tuple(
+            integer_population(
+                f"layer{i}",
+                size,
+                threshold=rng.choice([0, 1, 127, 500, 2**17 - 1], size) if draw(st.booleans()) else 64,
+                decay_u=draw(st.sampled_from([0, 2048, 4095, 4095])),
+                decay_v=draw(st.sampled_from([0, 1, 3277, 4095])),
+                bias=rng.integers(-4095, 4096, size) if draw(st.booleans()) else 0,
+                exponent=rng.integers(0, 8, size),
+            )
+            for i, size in enumerate(sizes)
+        ),
+        projections=tuple(projection(pre, post) for pre, post in pairs),
+        readout=readout,
+        classes=classes,
+    )
+
+
+@st.composite
+def recordings_for(draw, channels, *, samples=3, most=9) -> np.ndarray:
+    """Events (samples, steps, channels) bool."""
+    shape = (draw(st.integers(1, samples)), draw(st.integers(1, most)), channels)
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    return rng.random(shape) < draw(st.sampled_from([0.1, 0.5, 1.0]))
+
+
+def dense_weights(network: IntegerNetwork, post: int) -> dict[int, np.ndarray]:
+    """Effective weights into a population by source, (neurons of post, neurons of pre), in plain integers."""
+    found = {}
+    for p in network.projections:
+        if p.post == post:
+            effective = p.weight.toarray() * 2 ** (p.exponent + 1)
+            assert not np.any(effective % 2)
+            found[p.pre] = found.get(p.pre, 0) + effective // 2
+    return found

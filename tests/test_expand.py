@@ -1,0 +1,241 @@
+import dataclasses
+import re
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from random_networks import random_checkpoint
+
+from compiler.errors import ModelError
+from compiler.interpret import run_float
+from compiler.ir import INPUT, depths, fan_in
+from compiler.passes.expand import expand, expand_graph_convolution, probe_affine
+from compiler.verify import verify
+from models.graphs import build_graph, normalised_adjacency
+
+# Pairs of taxels within three hops times 64 features and 2 polarities. The hand-drawn graph, the tree and 1, 3 and 4
+# neighbours are also published counts.
+CONV_SYNAPSES = {
+    "manual": (97_920, 60),
+    "mst:0": (45_440, 36),
+    "knn:1": (27_776, 16),
+    "knn:2": (49_792, 28),
+    "knn:3": (104_576, 62),
+    "knn:4": (117_888, 62),
+    "knn:5": (138_368, 78),
+    "knn:6": (155_520, 78),
+    "knn:7": (167_040, 78),
+    "knn:8": (181_120, 78),
+}
+"""Structural synapses and largest fan-in."""
+
+
+def adjacency_of(name):
+    graph = build_graph(name)
+    return normalised_adjacency(graph.edges, graph.n_taxels)
+
+
+def factored(adjacency, hops):
+    """The graph convolution as models compute it: propagate, then filter, hop by hop."""
+    taxels, channels = len(adjacency), hops.shape[2]
+
+    def stage(x):
+        signal = x.reshape(len(x), taxels, channels)
+        total = np.zeros((len(x), taxels, hops.shape[1]))
+        for k, filters in enumerate(hops):
+            if k:
+                signal = np.einsum("ij,bjc->bic", adjacency, signal)
+            total = total + np.einsum("bic,fc->bif", signal, filters)
+        return total.reshape(len(x), -1)
+
+    return stage
+
+
+@st.composite
+def graphs(draw):
+    """Adjacency of up to seven taxels, directed, with repeated edges and isolated taxels."""
+    taxels = draw(st.integers(1, 7))
+    node = st.integers(0, taxels - 1)
+    edges = draw(st.lists(st.tuples(node, node), max_size=14))
+    return normalised_adjacency(np.array(edges, np.int64).reshape(-1, 2), taxels)
+
+
+@settings(deadline=None)
+@given(graphs(), st.integers(1, 5), st.integers(1, 3), st.integers(1, 3), st.integers(0, 2**32 - 1))
+def test_the_expanded_convolution_is_the_probed_one(adjacency, n_hops, features, channels, seed):
+    hops = np.random.default_rng(seed).normal(size=(n_hops, features, channels))
+    expanded = expand_graph_convolution(adjacency, hops)
+    weight, bias = probe_affine(factored(adjacency, hops), len(adjacency) * channels, name="conv1")
+    np.testing.assert_allclose(expanded.toarray(), weight, rtol=0, atol=1e-12)
+    assert not bias.any()
+
+
+def test_the_expanded_convolution_is_the_probed_one_on_the_manual_graph():
+    adjacency, hops = adjacency_of("manual"), np.random.default_rng(1).normal(size=(4, 64, 2))
+    weight, _ = probe_affine(factored(adjacency, hops), 78, name="conv1")
+    np.testing.assert_allclose(expand_graph_convolution(adjacency, hops).toarray(), weight, rtol=0, atol=1e-12)
+
+
+def test_two_taxels_by_hand():
+    adjacency = np.array([[0.0, 1.0], [1.0, 0.0]])
+    hops = np.array([[[1.0, 2.0]], [[10.0, 20.0]], [[100.0, 200.0]]])
+    # even hops come back to the taxel, odd ones end on the other
+    assert expand_graph_convolution(adjacency, hops).toarray().tolist() == [[101, 202, 10, 20], [10, 20, 101, 202]]
+
+
+def test_rows_gather():
+    adjacency = np.array([[0.0, 0.5], [0.0, 0.0]])  # taxel 0 hears taxel 1
+    hops = np.array([[[1.0]], [[8.0]]])
+    assert expand_graph_convolution(adjacency, hops).toarray().tolist() == [[1, 4], [0, 1]]
+
+
+@pytest.mark.parametrize("name", CONV_SYNAPSES)
+def test_structural_synapses_of_each_graph(name):
+    for prefix in ("", "released:"):
+        weight = expand_graph_convolution(adjacency_of(prefix + name), np.ones((4, 64, 2)))
+        assert (weight.nnz, np.diff(weight.indptr).max()) == CONV_SYNAPSES[name]
+
+
+def test_structure_does_not_depend_on_the_weights():
+    adjacency = adjacency_of("manual")
+    zero = expand_graph_convolution(adjacency, np.zeros((4, 64, 2)))
+    assert zero.nnz == 97_920
+    assert not zero.data.any()
+
+
+def test_hops_that_cancel_leave_a_synapse_of_weight_zero():
+    adjacency = np.array([[0.0, 1.0], [1.0, 0.0]])
+    weight = expand_graph_convolution(adjacency, np.array([[[1.0]], [[0.0]], [[-1.0]]]))
+    assert weight.nnz == 4
+    assert not weight.toarray().any()
+
+
+def test_an_isolated_taxel_hears_itself_only():
+    adjacency = normalised_adjacency([[0, 1], [1, 0]], 3)
+    weight = expand_graph_convolution(adjacency, np.ones((4, 2, 2)))
+    assert np.diff(weight.indptr).tolist() == [4, 4, 4, 4, 2, 2]
+    assert weight.toarray()[4:].tolist() == [[0, 0, 0, 0, 1, 1]] * 2
+
+
+# --- probing
+
+
+@pytest.mark.parametrize(
+    "stage",
+    [
+        pytest.param(lambda x: np.maximum(x, 0), id="relu"),
+        pytest.param(lambda x: x + 1e-6 * x**2, id="slightly-square"),
+        pytest.param(lambda x: np.clip(x, -1e4, 1e4), id="clipped"),
+        pytest.param(lambda x: x - x.mean(axis=0), id="batch-normalised"),
+        pytest.param(lambda x: np.round(x, 3), id="rounded"),
+    ],
+)
+def test_a_stage_that_is_not_affine_is_refused(stage):
+    with pytest.raises(ModelError) as caught:
+        probe_affine(stage, 3, name="pool1")
+    assert re.fullmatch(
+        r"stage pool1: is not affine \(a random combination of inputs is off by [\d.e+-]+ of the response, 1e-09 "
+        r"allowed\); only affine stages between spiking layers can be lowered to synapses",
+        str(caught.value),
+    )
+
+
+def test_a_stage_that_is_not_a_number_is_refused():
+    with pytest.raises(ModelError) as caught:
+        probe_affine(lambda x: np.where(np.abs(x) > 1, np.nan, x), 2, name="odd")
+    assert str(caught.value) == (
+        "stage odd: is not affine (a random combination of inputs is off by nan of the response, 1e-09 allowed); "
+        "only affine stages between spiking layers can be lowered to synapses"
+    )
+
+
+def test_a_stage_that_ignores_its_input_is_affine():
+    weight, bias = probe_affine(lambda x: np.full((len(x), 2), 0.0), 3, name="silent")
+    assert (weight.tolist(), bias.tolist()) == ([[0, 0, 0], [0, 0, 0]], [0, 0])
+
+
+@given(st.integers(1, 6), st.integers(1, 6), st.integers(0, 2**32 - 1))
+def test_probing_finds_weights_and_bias(inputs, outputs, seed):
+    rng = np.random.default_rng(seed)
+    weight, bias = rng.normal(size=(outputs, inputs)), rng.normal(size=outputs)
+    found, offset = probe_affine(lambda x: x @ weight.T + bias, inputs, name="fc")
+    np.testing.assert_allclose(found, weight, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(offset, bias, rtol=0, atol=0)
+
+
+# --- whole checkpoints
+
+
+def ring(taxels):
+    source = np.arange(taxels)
+    edges = np.stack([source, (source + 1) % taxels], axis=1)
+    return normalised_adjacency(np.concatenate([edges, edges[:, ::-1]]), taxels)
+
+
+def test_a_checkpoint_becomes_a_chain_of_populations():
+    checkpoint = random_checkpoint(taxels=5, features=3, sizes=(6, 5, 4))
+    network = expand(checkpoint, ring(5))
+    verify(network)
+    assert [population.name for population in network.populations] == ["conv1", "fc1", "fc2", "fc3"]
+    assert [population.size for population in network.populations] == [15, 6, 5, 4]
+    assert [(p.pre, p.post) for p in network.projections] == [(INPUT, 0), (0, 1), (1, 2), (2, 3)]
+    assert depths(network) == (0, 1, 2, 3)
+    assert (network.input.taxels, network.input.polarities, network.classes) == (5, 2, 4)
+    assert network.readout.population == 3
+    assert network.readout.label.tolist() == [0, 1, 2, 3]
+    # every feature of a taxel has the bias of that feature
+    np.testing.assert_array_equal(network.populations[0].bias.reshape(5, 3), np.tile(checkpoint.conv_bias, (5, 1)))
+    for population, projection, dense in zip(
+        network.populations[1:], network.projections[1:], checkpoint.dense, strict=True
+    ):
+        np.testing.assert_array_equal(projection.weight.toarray(), dense.weight.astype(np.float64))
+        np.testing.assert_array_equal(population.bias, dense.bias.astype(np.float64))
+        assert projection.weight.nnz == dense.weight.size
+
+
+def test_dense_synapses_of_weight_zero_are_structural():
+    checkpoint = random_checkpoint()
+    zeroed = dataclasses.replace(checkpoint.dense[0], weight=np.zeros_like(checkpoint.dense[0].weight))
+    network = expand(dataclasses.replace(checkpoint, dense=(zeroed, *checkpoint.dense[1:])), ring(5))
+    assert fan_in(network, 1).tolist() == [15] * 6
+
+
+def test_the_released_size_has_459392_structural_synapses():
+    checkpoint = random_checkpoint(taxels=39, features=64, sizes=(128, 256, 36))
+    network = expand(checkpoint, adjacency_of("manual"))
+    assert [int(fan_in(network, post).sum()) for post in range(4)] == [97_920, 319_488, 32_768, 9_216]
+    assert sum(int(fan_in(network, post).sum()) for post in range(4)) == 459_392
+    assert [int(fan_in(network, post).max()) for post in range(4)] == [60, 2496, 128, 256]
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.integers(0, 2**32 - 1), st.floats(0, 0.99))
+def test_the_expanded_network_spikes_like_the_checkpoint(seed, beta):
+    """Against the plain order of operations: propagate, filter, integrate, step by step."""
+    checkpoint, adjacency = random_checkpoint(seed=seed, beta=beta), ring(5)
+    events = np.random.default_rng(seed).random((2, 12, 10)) < 0.3
+    spikes = run_float(expand(checkpoint, adjacency), events).spikes
+    convolution = factored(adjacency, checkpoint.hops.astype(np.float64))
+    for sample in range(2):
+        signal = convolution(events[sample].astype(float)) + np.tile(checkpoint.conv_bias.astype(np.float64), 5)
+        for layer in range(4):
+            if layer:
+                dense = checkpoint.dense[layer - 1]
+                signal = fired.astype(float) @ dense.weight.T.astype(float) + dense.bias.astype(float)
+            u, s = np.zeros(signal.shape[1]), np.zeros(signal.shape[1])
+            fired = np.zeros(signal.shape, bool)
+            for t, current in enumerate(signal):
+                u = beta * u * (1 - s) + current
+                s = u > checkpoint.theta
+                fired[t] = s
+            np.testing.assert_array_equal(spikes[layer][sample], fired)
+
+
+def test_a_graph_of_another_size_is_refused():
+    with pytest.raises(ModelError) as caught:
+        expand(random_checkpoint(taxels=5), ring(6))
+    assert str(caught.value) == (
+        "graph and weights disagree: the graph has 6 taxels, fc1 was trained on 5; "
+        "give the graph that the checkpoint was trained on"
+    )

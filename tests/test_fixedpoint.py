@@ -1,0 +1,155 @@
+import re
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from compiler.fixedpoint import (
+    ACCUMULATOR_MAX,
+    BIAS_EXPONENT_MAX,
+    BIAS_MANTISSA_MAX,
+    CURRENT_MAX,
+    MEMBRANE_MAX,
+    MEMBRANE_SHIFT,
+    ONE_STEP_SUM_MAX,
+    THRESHOLD_MANTISSA_MAX,
+    decay,
+    encode_bias,
+    quantise_weights,
+    round_half_even,
+    saturate,
+    weight_step,
+)
+
+# Published for decay_v = 3277, factor 819/4096.
+PUBLISHED = [
+    (1, 0),
+    (5, 0),
+    (6, 1),
+    (-5, 0),
+    (-6, -1),
+    (64, 12),
+    (-64, -12),
+    (3840, 767),
+    (-1920, -383),
+    (8128, 1625),
+    (-8191, -1637),
+    (8388607, 1677311),
+    (-8388607, -1677311),
+]
+BITS = (2, 3, 4, 5, 6, 8)
+
+
+def test_registers_have_their_published_widths():
+    assert (ACCUMULATOR_MAX, CURRENT_MAX, MEMBRANE_MAX) == (2097151, 8388607, 8388607)
+    assert (BIAS_MANTISSA_MAX, BIAS_EXPONENT_MAX, THRESHOLD_MANTISSA_MAX) == (4095, 7, 131071)
+    assert MEMBRANE_SHIFT == 6
+    assert 64 * ONE_STEP_SUM_MAX <= ACCUMULATOR_MAX < 64 * (ONE_STEP_SUM_MAX + 1)
+
+
+@pytest.mark.parametrize(("before", "after"), PUBLISHED)
+def test_decay_of_beta_one_fifth_is_the_published_one(before, after):
+    assert decay(np.array([before]), 3277).tolist() == [after]
+
+
+@pytest.mark.parametrize(("lost", "expected"), [(0, [7, -7]), (1, [6, -6]), (4095, [0, 0]), (4096, [0, 0])])
+def test_decay_at_the_ends_of_its_register(lost, expected):
+    assert decay(np.array([7, -7]), lost).tolist() == expected
+
+
+def test_decay_keeps_one_4096th_at_4095():
+    assert decay(np.array([4095, 4096, -4096, 8388607, -8388607]), 4095).tolist() == [0, 1, -1, 2047, -2047]
+
+
+def test_decay_broadcasts_a_decay_per_neuron():
+    assert decay(np.array([[100, -100], [64, 64]]), np.array([0, 3277])).tolist() == [[100, -19], [64, 12]]
+
+
+@given(st.integers(-(2**24), 2**24), st.integers(0, 4096))
+def test_decay_rounds_the_exact_product_toward_zero(x, lost):
+    exact = Fraction(x * (4096 - lost), 4096)
+    result = decay(np.array([x]), lost)
+    assert result.dtype == np.int64
+    assert result.tolist() == [int(exact)]  # int of a fraction truncates
+
+
+@pytest.mark.parametrize("limit", [MEMBRANE_MAX, 10])
+def test_saturate_at_the_limit_and_one_past_it(limit):
+    values = np.array([limit - 1, limit, limit + 1, -limit + 1, -limit, -limit - 1])
+    assert saturate(values, limit).tolist() == [limit - 1, limit, limit, -limit + 1, -limit, -limit]
+
+
+def test_round_half_even_goes_to_the_even_neighbour():
+    assert round_half_even(np.array([-1.5, -0.5, 0.5, 1.5, 2.5, 2.499, -2.501])).tolist() == [-2, 0, 0, 2, 2, 2, -3]
+
+
+@pytest.mark.parametrize(
+    ("bits", "step", "largest"),
+    [(2, 128, 128), (3, 64, 192), (4, 32, 224), (5, 16, 240), (6, 8, 248), (8, 2, 254)],
+)
+def test_each_width_has_its_step_and_largest_mantissa(bits, step, largest):
+    assert weight_step(bits) == step
+    ends = np.array([largest, largest + step / 2, largest + step, 1e6, -largest, -largest - step, -1e6])
+    assert quantise_weights(ends, 1.0, bits).tolist() == [largest] * 4 + [-largest] * 3
+
+
+@pytest.mark.parametrize("bits", BITS)
+def test_weights_at_half_a_step_and_just_beyond(bits):
+    step = weight_step(bits)
+    values = np.array([step / 2, -step / 2, step / 2 + 1e-6, -step / 2 - 1e-6])
+    assert quantise_weights(values, 1.0, bits).tolist() == [0, 0, step, -step]
+
+
+@given(st.sampled_from(BITS), st.lists(st.floats(-3, 3), min_size=1, max_size=5), st.floats(0.1, 300))
+def test_weights_are_the_nearest_of_their_grid_and_symmetric(bits, weights, scale):
+    step, weight = weight_step(bits), np.array(weights)
+    mantissa = quantise_weights(weight, scale, bits)
+    grid = np.arange(-(256 - step), 256, step)
+    assert set(mantissa.tolist()) <= set(grid.tolist())
+    assert np.array_equal(quantise_weights(-weight, scale, bits), -mantissa)
+    nearest = np.abs(grid[:, None] - weight * scale).min(axis=0)
+    np.testing.assert_allclose(np.abs(mantissa - weight * scale), nearest, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("bias", "mantissa", "exponent"),
+    [
+        (0.0, 0, 0),
+        (0.5, 0, 0),
+        (0.51, 1, 0),
+        (-1.5, -2, 0),
+        (4095.0, 4095, 0),
+        (4095.49, 4095, 0),
+        (4095.5, 2048, 1),
+        (4096.0, 2048, 1),
+        (-4096.0, -2048, 1),
+        (8190.0, 4095, 1),
+        (8191.0, 2048, 2),
+        (4095.0 * 128, 4095, 7),
+        (-4095.0 * 128, -4095, 7),
+        (4095.49 * 128, 4095, 7),
+    ],
+)
+def test_bias_takes_the_smallest_exponent(bias, mantissa, exponent):
+    found = encode_bias(np.array([bias]))
+    assert [part.tolist() for part in found] == [[mantissa], [exponent]]
+    assert all(part.dtype == np.int64 for part in found)
+
+
+@pytest.mark.parametrize("bias", [4095.5 * 128, -4095.5 * 128, 1e9])
+def test_a_bias_beyond_the_register_is_refused(bias):
+    message = f"bias of magnitude {abs(bias):.6g} exceeds 4095 * 2**7 membrane units"
+    with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
+        encode_bias(np.array([0.0, bias]))
+
+
+@given(st.lists(st.floats(-4095 * 128, 4095 * 128), min_size=1, max_size=4))
+def test_a_bias_is_off_by_half_a_unit_of_its_exponent_at_most(bias):
+    mantissa, exponent = encode_bias(np.array(bias))
+    assert np.all(np.abs(mantissa) <= 4095)
+    assert np.all((exponent >= 0) & (exponent <= 7))
+    assert np.all(np.abs(mantissa * 2.0**exponent - bias) <= 2.0**exponent / 2)
+    smaller = np.abs(np.rint(np.array(bias) / 2.0 ** (exponent - 1))) <= 4095
+    assert not np.any(smaller & (exponent > 0))
