@@ -11,14 +11,48 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import torch
 
 from compiler.atomic import write_atomically
 from compiler.frontends.checkpoint import FORMAT, VERSION, arrays_digest
+from models.evtouch import Recordings
 from models.graphs import Graph
+from models.train import Trained
 
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 
 Tensors = Mapping[str, npt.NDArray[np.float32]]
+
+
+def training_record(
+    trained: Trained, training: Recordings, test: Recordings, *, command: str, seed: int
+) -> dict[str, Any]:
+    """Everything needed to repeat a training, and what it reached; JSON values only.
+
+    The best epoch is chosen on the test split, as the published figures are; the last one is not chosen at all.
+    """
+    last, best = trained.history[-1], trained.history[trained.best_epoch - 1]
+    return {
+        "command": command,
+        "seed": seed,
+        "epochs": len(trained.history),
+        "data": training.source,
+        "data_sha256": arrays_digest(
+            {
+                "train": training.events,
+                "train_labels": training.labels,
+                "test": test.events,
+                "test_labels": test.labels,
+            }
+        ),
+        "test_samples": last.tested,
+        "last": {"epoch": last.epoch, "correct": last.correct, "accuracy": last.accuracy},
+        "best": {"epoch": best.epoch, "correct": best.correct, "accuracy": best.accuracy},
+        "best_note": "epoch chosen on the test split",
+        "history": [[e.training_loss, e.test_loss, e.correct] for e in trained.history],
+        "torch": torch.__version__,
+        "numpy": np.__version__,
+    }
 
 
 def checkpoint_bytes(

@@ -30,8 +30,8 @@ from compiler.serialize import is_netlist, read_netlist, write_netlist
 from compiler.targets import load_target
 from compiler.text import text
 from models.evtouch import Recordings, load_recordings
-from models.grasps import synthetic_split
 from models.graphs import CHOICES, build_graph, normalised_adjacency
+from models.grasps import synthetic_split
 from runtime import render
 
 Arguments = argparse.Namespace
@@ -109,8 +109,8 @@ def _adjacency(checkpoint: Checkpoint, graph: str | None, where: str) -> tuple[s
         trained = normalised_adjacency(checkpoint.edges, checkpoint.taxels)
         if not np.array_equal(trained, adjacency):
             raise ModelError(
-                f"{where}: graph and weights disagree: it was trained on {checkpoint.graph}, --graph says {built.name}; "
-                "leave --graph away"
+                f"{where}: graph and weights disagree: it was trained on {checkpoint.graph}, --graph says "
+                f"{built.name}; leave --graph away"
             )
     return built.name, adjacency
 
@@ -225,7 +225,40 @@ def _estimate(arguments: Arguments) -> Outcome:
     return render.estimate_json(netlist, costs), render.estimate_text, 0
 
 
-def _demo(arguments: Arguments) -> Outcome:
+def _train(arguments: Arguments) -> Outcome:
+    from models.checkpoint import save_checkpoint, training_record
+    from models.networks import Architecture
+    from models.train import train
+
+    graph = build_graph(arguments.graph)
+    if not Path(arguments.output).absolute().parent.is_dir():
+        raise OptionError(f"-o {arguments.output}: the folder does not exist; make it first")
+    training = _load(arguments.data, "train", classes=None, taxels=graph.n_taxels)
+    test = _load(arguments.data, "test", classes=int(training.labels.max()) + 1, taxels=graph.n_taxels)
+    _progress("")
+    architecture = Architecture(taxels=graph.n_taxels, classes=int(training.labels.max()) + 1)
+    trained = train(
+        training,
+        test,
+        normalised_adjacency(graph.edges, graph.n_taxels),
+        architecture,
+        epochs=arguments.epochs,
+        seed=arguments.seed,
+    )
+    command = f"spikeloom train --data {training.source} --graph {graph.name} --epochs {arguments.epochs}"
+    record = training_record(trained, training, test, command=f"{command} --seed {arguments.seed}", seed=arguments.seed)
+    save_checkpoint(
+        arguments.output,
+        {"last": trained.last, "best": trained.best},
+        graph,
+        beta=architecture.beta,
+        theta=architecture.theta,
+        training=record | {"spikeloom": version()},
+    )
+    return record | {"sha256": _sha256(arguments.output)}, render.training_text, 0
+
+
+def _demo(_arguments: Arguments) -> Outcome:
     parser = build_parser()
     reports: Report = {}
     sections: list[str] = []
@@ -241,9 +274,19 @@ def _demo(arguments: Arguments) -> Outcome:
 
 
 def _inputs(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--data", required=True, metavar="PATH", help="folder or zip in the released layout, or 'synthetic'")
+    parser.add_argument(
+        "--data", required=True, metavar="PATH", help="folder or zip in the released layout, or 'synthetic'"
+    )
     parser.add_argument("--split", default="test", help="split to read (default: test)")
     parser.add_argument("--limit", type=int, metavar="N", help="first N recordings only")
+
+
+def _inputs_of_training(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--data", required=True, metavar="PATH", help="folder, zip, or 'synthetic'")
+    parser.add_argument("--graph", required=True, help=f"taxel graph: {CHOICES}")
+    parser.add_argument("--epochs", type=int, default=100, metavar="N", help="default: 100, as released")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of weights and order (default: 0)")
+    parser.add_argument("-o", "--output", required=True, metavar="OUT.pt")
 
 
 def _model(parser: argparse.ArgumentParser, *, graph: bool = True) -> None:
@@ -323,6 +366,8 @@ def build_parser() -> argparse.ArgumentParser:
     sub.add_argument("netlist")
     _inputs(sub)
 
+    sub = command("train", _train, "train a network by the released protocol; keeps the last and the best epoch")
+    _inputs_of_training(sub)
     command("demo", _demo, "the main job on a shipped checkpoint and synthetic grasps; needs no file and no network")
     return parser
 

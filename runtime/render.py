@@ -256,6 +256,18 @@ def checkpoint_text(report: Json) -> str:
     return "\n".join(lines)
 
 
+def training_text(report: Json) -> str:
+    """A finished training for people."""
+    last, best, total = report["last"], report["best"], report["test_samples"]
+    return "\n".join(
+        [
+            report["command"],
+            f"  last epoch ({last['epoch']}): {percent(last['correct'], total)}",
+            f"  best epoch ({best['epoch']}, chosen on test): {percent(best['correct'], total)}",
+        ]
+    )
+
+
 # -- runs --------------------------------------------------------------------------------------------------------------
 
 
@@ -331,8 +343,8 @@ def verify_text(report: Json) -> str:
             where = f"taxel {first['taxel']}, feature {first['feature']}"
         lines.append(
             f"first divergence: {first['file']}, step {first['step']}, {first['layer']} {where}: membrane "
-            f"{first['float_membrane']:.6f} float, {first['chip_membrane']:.6f} chip ({first['chip_register']}/64 units); "
-            f"threshold {first['theta']:g} and {first['chip_theta']:.6f}"
+            f"{first['float_membrane']:.6f} float, {first['chip_membrane']:.6f} chip "
+            f"({first['chip_register']}/64 units); threshold {first['theta']:g} and {first['chip_theta']:.6f}"
             + (" (ill-posed: float64 sides with the chip)" if first["ill_posed"] else "")
         )
     return "\n".join(lines)
