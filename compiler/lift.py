@@ -1,6 +1,7 @@
 """Read a netlist back as an integer network: the inverse of :mod:`compiler.passes.emit`, cores forgotten.
 
-Synapses of weight zero are stored by chance (inside dense lists) and are left out.
+Synapses of weight zero are stored by chance (inside dense lists) and are left out. A layer whose weights all rounded
+to zero stores no synapse; it is given an empty projection from where it would listen.
 """
 
 from __future__ import annotations
@@ -16,7 +17,9 @@ from compiler.netlist import Netlist
 def _one(netlist: Netlist, layer: int, field: str) -> int:
     values = np.unique(getattr(netlist, field)[netlist.compartments_of(layer)])
     if len(values) != 1:
-        raise FormatError(f"layer {netlist.layers[layer].name}: has {len(values)} values of {field}, one is allowed")
+        raise FormatError(
+            f"layer {netlist.layers[layer].name}: has {len(values)} values of {field}, one is allowed; compile it again"
+        )
     return int(values[0])
 
 
@@ -26,7 +29,8 @@ def lift(netlist: Netlist) -> IntegerNetwork:
     Raises
     ------
     FormatError
-        If the compartments of a layer have different decays, which the network form cannot say.
+        If the compartments of a layer have different decays, or several layers vote, which the network form cannot
+        say.
     """
     populations = []
     for index, layer in enumerate(netlist.layers):
@@ -66,12 +70,23 @@ def lift(netlist: Netlist) -> IntegerNetwork:
                 pre=int(kind[1]), post=int(kind[0]), weight=weight, exponent=int(kind[2]), bits=int(kind[3])
             )
         )
-    voters = np.flatnonzero(netlist.readout_class >= 0)
-    voting = int(netlist.layer[voters[0]])
+    reached = {projection.post for projection in projections}
+    for index, layer in enumerate(netlist.layers):
+        if index not in reached:
+            before = next((i for i, other in enumerate(netlist.layers) if other.depth == layer.depth - 1), INPUT)
+            nothing = sparse.csr_array((layer.neurons, sizes[before]), dtype=np.int64)
+            projections.append(
+                IntegerProjection(pre=before, post=index, weight=nothing, exponent=0, bits=layer.weight_bits)
+            )
+    voting = np.unique(netlist.layer[netlist.readout_class >= 0])
+    if len(voting) != 1:
+        raise FormatError(f"netlist: {len(voting)} layers vote for classes, one is allowed; compile it again")
     return IntegerNetwork(
         input=Input(taxels=netlist.taxels, polarities=netlist.polarities),
         populations=tuple(populations),
         projections=tuple(projections),
-        readout=Readout(population=voting, label=netlist.readout_class[netlist.compartments_of(voting)]),
+        readout=Readout(
+            population=int(voting[0]), label=netlist.readout_class[netlist.compartments_of(int(voting[0]))]
+        ),
         classes=netlist.classes,
     )

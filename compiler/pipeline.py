@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy.typing as npt
 
+from compiler.errors import OptionError
 from compiler.fixedpoint import FloatArray
 from compiler.frontends.checkpoint import Checkpoint
 from compiler.interpret import channels_last
@@ -103,6 +105,8 @@ def compile_checkpoint(
         As the passes say.
     """
     chip = load_target(target)
+    if not 0 <= margin < math.inf:
+        raise OptionError(f"--margin {margin:g}: is no share to add to a range; give a number from 0")
     publish = after or (lambda _stage, _artefact: None)
 
     network = expand(checkpoint, adjacency)

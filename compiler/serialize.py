@@ -18,7 +18,9 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import math
 import os
+import struct
 import zipfile
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -29,6 +31,7 @@ import numpy as np
 from compiler.atomic import write_atomically
 from compiler.errors import FormatError
 from compiler.netlist import Layer, Netlist, read_only
+from compiler.targets import known_targets
 
 FORMAT = "spikeloom-netlist"
 VERSION = 1
@@ -36,6 +39,8 @@ SIZE_LIMIT = 2**32
 """Bytes that a netlist file may have, 4 GiB: some hundred times the synapses of a whole chip."""
 
 _EPOCH = (1980, 1, 1, 0, 0, 0)
+_ZIP_ERRORS = (zipfile.BadZipFile, struct.error, ValueError, EOFError, OverflowError, MemoryError, RuntimeError)
+"""What zipfile and numpy raise on content that is no netlist; a header may announce more than the memory holds."""
 _SCALARS = ("target", "taxels", "polarities", "classes", "layers", "provenance")
 ARRAYS = tuple(field.name for field in fields(Netlist) if field.name not in _SCALARS)
 """Array members in file order."""
@@ -98,21 +103,20 @@ def write_netlist(netlist: Netlist, path: str | os.PathLike[str]) -> str:
 def _members(path: Path) -> dict[str, np.ndarray[Any, Any]]:
     if path.stat().st_size > SIZE_LIMIT:
         raise FormatError(f"{path}: {path.stat().st_size} bytes, {SIZE_LIMIT} allowed; this is no netlist of one chip")
+    file = io.BytesIO(path.read_bytes())
     try:
-        with zipfile.ZipFile(path) as archive:
+        with zipfile.ZipFile(file) as archive:
             infos = archive.infolist()
             if any(info.compress_type != zipfile.ZIP_STORED for info in infos):
                 raise FormatError(f"{path}: has compressed members, a netlist stores them plainly; compile it again")
-            if sum(info.file_size for info in infos) > path.stat().st_size:
+            if sum(info.file_size for info in infos) > len(file.getbuffer()):
                 raise FormatError(f"{path}: declares more bytes than it has; compile it again")
             found = {}
             for info in infos:
                 content = io.BytesIO(archive.read(info))
                 found[info.filename.removesuffix(".npy")] = np.lib.format.read_array(content, allow_pickle=False)
             return found
-    except (zipfile.BadZipFile, ValueError, EOFError, OSError) as error:
-        if isinstance(error, FileNotFoundError):
-            raise
+    except _ZIP_ERRORS as error:
         raise FormatError(f"{path}: is truncated or not a netlist ({error}); compile it again") from error
 
 
@@ -123,17 +127,20 @@ def read_netlist(path: str | os.PathLike[str]) -> Netlist:
     ------
     FormatError
         If it is missing, truncated, altered, from a newer version or inconsistent.
+    OSError
+        If it cannot be read.
     """
     path = Path(path)
     if not path.is_file():
-        raise FormatError(f"{path}: no such file; write one with spikeloom compile")
+        found = "is not a file" if path.exists() else "no such file"
+        raise FormatError(f"{path}: {found}; write one with spikeloom compile")
     members = _members(path)
     missing = sorted({"manifest", "sha256"} - set(members))
     if missing:
         raise FormatError(f"{path}: is not a netlist (no {' and no '.join(missing)}); write one with spikeloom compile")
     try:
         manifest = json.loads(str(members["manifest"]))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise FormatError(f"{path}: has an unreadable manifest; compile it again") from error
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
         raise FormatError(f"{path}: is not a netlist; write one with spikeloom compile")
@@ -149,18 +156,22 @@ def read_netlist(path: str | os.PathLike[str]) -> Netlist:
         raise FormatError(f"{path}: has missing or unknown members ({odd}); compile it again")
     if _digest({"manifest": members["manifest"], **{name: members[name] for name in ARRAYS}}) != stated:
         raise FormatError(f"{path}: its content does not match its hash, so it was altered; compile it again")
-    try:
-        netlist = Netlist(
-            target=manifest["target"],
-            taxels=manifest["taxels"],
-            polarities=manifest["polarities"],
-            classes=manifest["classes"],
-            layers=tuple(Layer(**layer) for layer in manifest["layers"]),
-            provenance=manifest["provenance"],
-            **{name: read_only(members[name]) for name in ARRAYS},
+    faults = _type_faults(manifest, members)
+    if faults:
+        raise FormatError(f"{path}: {'; '.join(faults)}; compile it again")
+    if manifest["target"] not in known_targets():
+        raise FormatError(
+            f"{path}: is for {manifest['target']!r}, this program knows {', '.join(known_targets())}; update spikeloom"
         )
-    except (KeyError, TypeError) as error:
-        raise FormatError(f"{path}: has an incomplete manifest ({error}); compile it again") from error
+    netlist = Netlist(
+        target=manifest["target"],
+        taxels=manifest["taxels"],
+        polarities=manifest["polarities"],
+        classes=manifest["classes"],
+        layers=tuple(Layer(**layer) for layer in manifest["layers"]),
+        provenance=manifest["provenance"],
+        **{name: read_only(members[name]) for name in ARRAYS},
+    )
     faults = inconsistencies(netlist)
     if faults:
         raise FormatError(f"{path}: {'; '.join(faults)}; compile it again")
@@ -176,6 +187,38 @@ def is_netlist(path: str | os.PathLike[str]) -> bool:
             return "manifest.npy" in archive.namelist()
     except (zipfile.BadZipFile, OSError):
         return False
+
+
+def _type_faults(manifest: dict[str, Any], members: dict[str, np.ndarray[Any, Any]]) -> list[str]:
+    """Say which entries of the manifest or which arrays are missing or of another kind than :class:`Netlist` asks."""
+    layers = manifest.get("layers")
+    entries = {
+        "target": isinstance(manifest.get("target"), str),
+        "provenance": isinstance(manifest.get("provenance"), dict),
+        "layers": isinstance(layers, list) and bool(layers) and all(map(_is_layer, layers)),
+    }
+    entries |= {name: _is(manifest.get(name), "int", 1) for name in ("taxels", "polarities", "classes")}
+    faults = [f"the manifest has no usable {name}" for name, good in entries.items() if not good]
+    return faults + [
+        f"{name} is no list of integers"
+        for name in ARRAYS
+        if members[name].ndim != 1 or members[name].dtype.kind != "i"
+    ]
+
+
+def _is(value: Any, kind: str, least: float = -math.inf) -> bool:
+    """Whether a JSON value is of a kind (a number where a float is asked for may be whole) and finite."""
+    if kind == "str":
+        return isinstance(value, str)
+    numbers = (int, float) if kind == "float" else (int,)
+    return isinstance(value, numbers) and not isinstance(value, bool) and least <= value < math.inf
+
+
+def _is_layer(entry: Any) -> bool:
+    wanted = {field.name: str(field.type) for field in fields(Layer)}
+    if not isinstance(entry, dict) or set(entry) != set(wanted):
+        return False
+    return all(_is(entry[name], kind, 0) for name, kind in wanted.items()) and entry["scale"] > 0
 
 
 def _bounds_fault(name: str, bounds: np.ndarray[Any, Any], parts: int, total: int) -> str | None:
@@ -196,6 +239,8 @@ def inconsistencies(netlist: Netlist) -> list[str]:
             found.append(f"{name} has {len(getattr(netlist, name))} entries for {compartments} compartments")
     if len(netlist.axon_format) != axons or len(netlist.synapse_target) != synapses:
         found.append("axon_format or synapse_target has the wrong length")
+    if not len(netlist.format_exponent) == len(netlist.format_weight_bits) == len(netlist.format_index_bits):
+        found.append("the format arrays have different lengths")
     if any(found):
         return [fault for fault in found if fault]
 
@@ -213,6 +258,10 @@ def inconsistencies(netlist: Netlist) -> list[str]:
         "bias_mantissa": (netlist.bias_mantissa, -4096, 4096),
         "bias_exponent": (netlist.bias_exponent, 0, 8),
         "synapse_weight": (netlist.synapse_weight, -256, 256),
+        "format_weight_bits": (netlist.format_weight_bits, 1, 9),
+        "format_exponent": (netlist.format_exponent, -1, 8),
+        "format_index_bits": (netlist.format_index_bits, 0, 13),
+        "core_tile": (netlist.core_tile, 0, 2**31),
     }
     found += [
         f"{name} has values outside {low} … {high - 1}"

@@ -14,10 +14,10 @@ import numpy.typing as npt
 import torch
 
 from compiler.atomic import write_atomically
-from compiler.frontends.checkpoint import FORMAT, VERSION, arrays_digest
+from compiler.frontends.checkpoint import FORMAT, VERSION, arrays_digest, content_digest
 from models.evtouch import Recordings
 from models.graphs import Graph
-from models.train import Trained
+from models.protocols import Reported
 
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 
@@ -25,17 +25,20 @@ Tensors = Mapping[str, npt.NDArray[np.float32]]
 
 
 def training_record(
-    trained: Trained, training: Recordings, test: Recordings, *, command: str, seed: int
+    reported: Reported, training: Recordings, test: Recordings, *, command: str, seed: int
 ) -> dict[str, Any]:
-    """Everything needed to repeat a training, and what it reached; JSON values only.
+    """Everything needed to repeat a training, and what it reached by both protocols; JSON values only.
 
-    The best epoch is chosen on the test split, as the published figures are; the last one is not chosen at all.
+    The best epoch is chosen on the test split, as the published figures are; the clean one on a part of the training
+    split; the last one is not chosen at all.
     """
-    last, best = trained.history[-1], trained.history[trained.best_epoch - 1]
+    history = reported.trained.history
+    chosen = {"last": len(history), "best": reported.trained.best_epoch, "clean": reported.clean_epoch}
+    validation = reported.validation.history[reported.clean_epoch - 1]
     return {
         "command": command,
         "seed": seed,
-        "epochs": len(trained.history),
+        "epochs": len(history),
         "data": training.source,
         "data_sha256": arrays_digest(
             {
@@ -45,11 +48,20 @@ def training_record(
                 "test_labels": test.labels,
             }
         ),
-        "test_samples": last.tested,
-        "last": {"epoch": last.epoch, "correct": last.correct, "accuracy": last.accuracy},
-        "best": {"epoch": best.epoch, "correct": best.correct, "accuracy": best.accuracy},
-        "best_note": "epoch chosen on the test split",
-        "history": [[e.training_loss, e.test_loss, e.correct] for e in trained.history],
+        "test_samples": len(test),
+        **{
+            name: {
+                "epoch": epoch,
+                "correct": history[epoch - 1].correct,
+                "accuracy": history[epoch - 1].accuracy,
+                "chosen_on": {"last": "nothing", "best": "the test split", "clean": "a part of the training split"}[
+                    name
+                ],
+            }
+            for name, epoch in chosen.items()
+        },
+        "validation": {"correct": validation.correct, "samples": validation.tested},
+        "history": [[e.training_loss, e.test_loss, e.correct] for e in history],
         "torch": torch.__version__,
         "numpy": np.__version__,
     }
@@ -67,7 +79,7 @@ def checkpoint_bytes(
 
     Parameters
     ----------
-    weights : mapping of ``last`` and optionally ``best`` to tensors
+    weights : mapping of ``last``, ``best`` or ``clean`` (at least one) to tensors
         ``conv1.hops`` (K + 1, features, channels), ``conv1.bias``, ``fc1.weight``, ``fc1.bias`` … float32.
     graph : Graph
         What it was trained on.
@@ -76,28 +88,31 @@ def checkpoint_bytes(
     training : mapping
         JSON values: how it was made and what it reached.
     """
+    tensors_of_one = next(iter(weights.values()))
+    stages = sum(name.startswith("fc") and name.endswith(".weight") for name in tensors_of_one)
     arrays = {
         f"{which}/{name}": np.ascontiguousarray(array, "<f4")
         for which, tensors in weights.items()
         for name, array in sorted(tensors.items())
     }
-    stages = [name for name in weights["last"] if name.endswith(".bias") and name.startswith("fc")]
-    manifest = {
+    manifest: dict[str, Any] = {
         "format": FORMAT,
         "version": VERSION,
         "architecture": "tactilesgnet",
         "taxels": graph.n_taxels,
-        "classes": len(weights["last"][max(stages)]),
+        "classes": len(tensors_of_one[f"fc{stages}.bias"]),
         "beta": beta,
         "theta": theta,
         "graph": {"name": graph.name, "edges": graph.edges.tolist()},
         "weights": list(weights),
         "training": dict(training),
-        "sha256": arrays_digest(arrays),
     }
+    manifest["sha256"] = content_digest(manifest, arrays)
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
-        archive.writestr(zipfile.ZipInfo("manifest.json", date_time=_EPOCH), json.dumps(manifest, indent=1))
+        archive.writestr(
+            zipfile.ZipInfo("manifest.json", date_time=_EPOCH), json.dumps(manifest, indent=1, allow_nan=False)
+        )
         for name, array in arrays.items():
             content = io.BytesIO()
             np.lib.format.write_array(content, array, version=(1, 0), allow_pickle=False)

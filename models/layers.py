@@ -94,7 +94,8 @@ def lif(current: Tensor, beta: float, theta: float) -> tuple[Tensor, Tensor]:
     spikes, membrane : (steps, ...)
         Zeros and ones, and the membrane that was compared with `theta`; no gradient flows from the membrane.
     """
-    spikes, membrane = _Lif.apply(current, beta, theta)  # type: ignore[no-untyped-call]
+    function = _Lif if current.device.type == "cpu" else LifSteps
+    spikes, membrane = function.apply(current, beta, theta)  # type: ignore[no-untyped-call]
     return spikes, membrane
 
 
@@ -104,7 +105,8 @@ class _Lif(torch.autograd.Function):
         ctx.beta, ctx.theta = beta, theta
         current = current.contiguous()
         spikes, membrane = torch.empty_like(current), torch.empty_like(current)
-        _integrate(_rows(current), *_scalars(current, beta, theta), _rows(spikes), _rows(membrane))
+        kind = _kind(current)
+        _integrate(_rows(current), kind(beta), kind(theta), _rows(spikes), _rows(membrane))
         ctx.save_for_backward(membrane)
         ctx.mark_non_differentiable(membrane)
         ctx.set_materialize_grads(False)
@@ -115,8 +117,42 @@ class _Lif(torch.autograd.Function):
         (membrane,) = ctx.saved_tensors
         spikes_gradient = gradients[0].contiguous()
         out = torch.empty_like(membrane)
-        constants = _scalars(membrane, ctx.beta, ctx.theta, SURROGATE_HALF_WIDTH)
-        _differentiate(_rows(spikes_gradient), _rows(membrane), *constants, _rows(out))
+        kind = _kind(membrane)
+        beta, theta, half_width = kind(ctx.beta), kind(ctx.theta), kind(SURROGATE_HALF_WIDTH)
+        _differentiate(_rows(spikes_gradient), _rows(membrane), beta, theta, half_width, _rows(out))
+        return out, None, None
+
+
+class LifSteps(torch.autograd.Function):
+    """The same recurrence and gradient in torch operations, one step at a time: for devices without the kernels."""
+
+    @staticmethod
+    def forward(ctx: Any, current: Tensor, beta: float, theta: float) -> tuple[Tensor, Tensor]:
+        """See :func:`lif`."""
+        ctx.beta, ctx.theta = beta, theta
+        spikes, membrane = torch.empty_like(current), torch.empty_like(current)
+        u = torch.zeros_like(current[0])
+        for t in range(len(current)):
+            u = torch.where(u > theta, 0.0, u * beta) + current[t]
+            membrane[t] = u
+            spikes[t] = u > theta
+        ctx.save_for_backward(membrane)
+        ctx.mark_non_differentiable(membrane)
+        ctx.set_materialize_grads(False)
+        return spikes, membrane
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:
+        """Gradient of the spikes through decay and reset."""
+        (membrane,) = ctx.saved_tensors
+        out = torch.empty_like(membrane)
+        later = torch.zeros_like(membrane[0])
+        for t in range(len(membrane) - 1, -1, -1):
+            u = membrane[t]
+            through_spike = gradients[0][t] - later * (u * ctx.beta)
+            near = (u - ctx.theta).abs() < SURROGATE_HALF_WIDTH
+            later = torch.where(u > ctx.theta, 0.0, later * ctx.beta) + torch.where(near, through_spike, 0.0)
+            out[t] = later
         return out, None, None
 
 
@@ -138,6 +174,8 @@ def spike_linear(spikes: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     -------
     (steps, samples, outputs)
     """
+    if spikes.device.type != "cpu":
+        return spikes @ weight + bias
     out: Tensor = _SpikeLinear.apply(spikes, weight, bias)  # type: ignore[no-untyped-call]
     return out
 
@@ -159,7 +197,8 @@ class _SpikeLinear(torch.autograd.Function):
         above = gradients[0].contiguous()
         rows = above.view(-1, above.shape[-1])
         out = torch.zeros_like(weight)
-        _scatter(*ctx.events, rows.numpy(), out.numpy())
+        source, bounds = ctx.events
+        _scatter(source, bounds, rows.numpy(), out.numpy())
         return above @ weight.t(), out, rows.sum(0)
 
 
@@ -169,16 +208,15 @@ def _rows(tensor: Tensor) -> np.ndarray[Any, Any]:
     return view
 
 
-def _scalars(like: Tensor, *values: float) -> tuple[Any, ...]:
-    """Round to the precision of `like`, in which the recurrence is defined."""
-    kind = np.float32 if like.dtype == torch.float32 else np.float64
-    return tuple(kind(value) for value in values)
+def _kind(like: Tensor) -> type[np.float32] | type[np.float64]:
+    """Precision in which the recurrence is defined: that of `like`."""
+    return np.float32 if like.dtype == torch.float32 else np.float64
 
 
 # Each step is a function of its own on one-dimensional arrays: only so does the compiler vectorise the loops.
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@numba.njit(cache=True)
 def _integrate_step(current: Any, before: Any, beta: Any, theta: Any, spikes: Any, membrane: Any) -> None:
     zero, one = membrane.dtype.type(0), membrane.dtype.type(1)
     for i in range(len(membrane)):
@@ -187,7 +225,7 @@ def _integrate_step(current: Any, before: Any, beta: Any, theta: Any, spikes: An
         spikes[i] = one if u > theta else zero
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@numba.njit(cache=True)
 def _integrate(current: Any, beta: Any, theta: Any, spikes: Any, membrane: Any) -> None:
     steps, size = current.shape
     before = np.zeros(size, current.dtype)
@@ -196,7 +234,7 @@ def _integrate(current: Any, beta: Any, theta: Any, spikes: Any, membrane: Any) 
         before = membrane[t]
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@numba.njit(cache=True)
 def _differentiate_step(
     from_above: Any, membrane: Any, later: Any, beta: Any, theta: Any, half_width: Any, out: Any
 ) -> None:
@@ -208,7 +246,7 @@ def _differentiate_step(
         out[i] = through_decay + (through_spike if abs(u - theta) < half_width else zero)
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@numba.njit(cache=True)
 def _differentiate(spikes_gradient: Any, membrane: Any, beta: Any, theta: Any, half_width: Any, out: Any) -> None:
     steps, size = membrane.shape
     later = np.zeros(size, membrane.dtype)
@@ -217,7 +255,7 @@ def _differentiate(spikes_gradient: Any, membrane: Any, beta: Any, theta: Any, h
         later = out[t]
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@numba.njit(cache=True)
 def _events(spikes: Any) -> Any:
     """Inputs that spiked, row after row, and where each row's begin: int32 (spikes,), int64 (rows + 1,)."""
     rows, inputs = spikes.shape
@@ -232,20 +270,20 @@ def _events(spikes: Any) -> Any:
     return source[:found].copy(), bounds
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@numba.njit(cache=True)
 def _add(total: Any, term: Any) -> None:
     for i in range(len(total)):
         total[i] += term[i]
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@numba.njit(cache=True)
 def _gather(source: Any, bounds: Any, weight: Any, out: Any) -> None:
     for row in range(len(out)):
         for event in range(bounds[row], bounds[row + 1]):
             _add(out[row], weight[source[event]])
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@numba.njit(cache=True)
 def _scatter(source: Any, bounds: Any, rows: Any, out: Any) -> None:
     for row in range(len(rows)):
         for event in range(bounds[row], bounds[row + 1]):

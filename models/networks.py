@@ -16,7 +16,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
-from torch.nn.utils import skip_init
 
 from models.layers import lif, spike_linear, tag_convolution
 
@@ -56,18 +55,17 @@ class Architecture:
 
 
 class TagConvolution(nn.Module):
-    """Filters of a K-hop graph convolution, under the names that torch_geometric gives them."""
+    """K-hop graph convolution with filters (K + 1, features, channels)."""
 
     def __init__(self, channels: int, features: int, hops: int, generator: torch.Generator) -> None:
         super().__init__()
-        self.lins = nn.ModuleList(skip_init(nn.Linear, channels, features, bias=False) for _ in range(hops + 1))
+        self.hops = nn.Parameter(torch.empty(hops + 1, features, channels))
         self.bias = nn.Parameter(torch.zeros(features))
-        for lin in self.lins:
-            _uniform(lin.weight, channels, generator)
+        _uniform(self.hops, channels, generator)
 
     def forward(self, x: Tensor, adjacency: Tensor) -> Tensor:
         """See :func:`models.layers.tag_convolution`."""
-        return tag_convolution(x, adjacency, torch.stack([lin.weight for lin in self.lins]), self.bias)
+        return tag_convolution(x, adjacency, self.hops, self.bias)
 
 
 class SpikeLinear(nn.Module):
@@ -130,22 +128,17 @@ class TactileSGNet(nn.Module):
 
     def export_weights(self) -> Weights:
         """Copy of the weights."""
-        weights = {name: parameter.detach().numpy() for name, parameter in self.named_parameters()}
-        hops = np.stack([weights[f"conv1.lins.{k}.weight"] for k in range(self.architecture.hops + 1)])
-        exported = {"conv1.hops": hops, "conv1.bias": weights["conv1.bias"].copy()}
-        for name in self.dense:
-            exported[f"{name}.weight"] = weights[f"{name}.weight"].T.copy()
-            exported[f"{name}.bias"] = weights[f"{name}.bias"].copy()
-        return exported
+        state = {name: parameter.detach().cpu().numpy() for name, parameter in self.named_parameters()}
+        return {name: (array.T if _turned(name) else array).copy(order="C") for name, array in state.items()}
 
     def load_weights(self, weights: Mapping[str, NDArray[np.float32]]) -> None:
         """Take over what `export_weights` returned."""
-        state = {f"conv1.lins.{k}.weight": hop for k, hop in enumerate(weights["conv1.hops"])}
-        for name in ("conv1.bias", *(f"{name}.bias" for name in self.dense)):
-            state[name] = weights[name]
-        for name in self.dense:
-            state[f"{name}.weight"] = weights[f"{name}.weight"].T
-        self.load_state_dict({name: torch.tensor(array) for name, array in state.items()})
+        self.load_state_dict({n: torch.tensor(array.T if _turned(n) else array) for n, array in weights.items()})
+
+
+def _turned(name: str) -> bool:
+    """Whether a weight lies transposed in this network."""
+    return name.endswith(".weight")
 
 
 def _uniform(weight: Tensor, fan_in: int, generator: torch.Generator) -> None:

@@ -14,9 +14,12 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import math
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -25,11 +28,15 @@ from torch import Tensor
 from tqdm import tqdm
 
 from compiler.errors import DataError, OptionError
+from compiler.frontends.checkpoint import arrays_digest
 from models.evtouch import Recordings
 from models.networks import Architecture, TactileSGNet, Weights
+from models.resume import TrainingState, pack, read_state, unpack, write_state
 
 DECAY_EPOCHS = 40
 """The learning rate falls to a tenth after so many epochs; the first of each such block still has the old rate."""
+
+DEVICES = ("cpu", "cuda")
 
 TEST_BATCH = 2  # larger batches outgrow the cache
 
@@ -76,6 +83,8 @@ class Trained:
         the latter is chosen on test data, as the published figures are.
     best_epoch : int
         Counted from 1.
+    kept : dict of arrays, or None
+        Weights after the epoch that was asked for.
     history : tuple of Epoch
         All epochs.
     """
@@ -84,6 +93,7 @@ class Trained:
     last: Weights
     best: Weights
     best_epoch: int
+    kept: Weights | None
     history: tuple[Epoch, ...]
 
 
@@ -96,9 +106,15 @@ def train(
     epochs: int = 100,
     seed: int = 0,
     learning_rate: float = 1e-3,
+    device: str = "cpu",
+    keep_epoch: int | None = None,
+    state: Path | None = None,
+    resume: bool = False,
+    label: str = "train",
+    position: int = 0,
     after_epoch: Callable[[Epoch], None] | None = None,
 ) -> Trained:
-    """Train a `TactileSGNet` from scratch.
+    """Train a `TactileSGNet` from scratch, or go on with an interrupted training.
 
     Parameters
     ----------
@@ -114,36 +130,63 @@ def train(
         Of the initial weights and of the order of recordings.
     learning_rate : float
         At the start.
+    device : {"cpu", "cuda"}
+        Where the network runs.
+    keep_epoch : int, optional
+        Epoch, counted from 1, whose weights are kept too.
+    state : path, optional
+        File that holds the state after each epoch; the caller removes it when the result is safe.
+    resume : bool
+        Continue from `state` if it exists. On the CPU the final weights equal those of an uninterrupted training.
+    label, position : str, int
+        Name and row of the progress bar, where several trainings run side by side.
     after_epoch : callable, optional
         Called with the figures of each epoch.
 
     Raises
     ------
     OptionError
-        If `epochs` or `seed` is too small.
+        If `epochs` or `seed` is too small, there is no such device, or `state` belongs to another training.
     DataError
-        If recordings and architecture disagree.
+        If recordings and architecture disagree, or the loss is no longer a number.
     """
-    for name, value, least in (("epochs", epochs, 1), ("seed", seed, 0)):
-        if value < least:
-            raise OptionError(f"{name}: {value}, allowed are {least} or more; choose another")
+    _check_options(epochs, seed, device)
     for recordings in (training, test):
         _check(recordings, architecture)
+    options = {
+        "architecture": repr(architecture),
+        "graph": arrays_digest({"adjacency": adjacency}),
+        "training data": arrays_digest({"events": training.events, "labels": training.labels}),
+        "test data": arrays_digest({"events": test.events, "labels": test.labels}),
+        "epochs": epochs,
+        "seed": seed,
+        "learning rate": learning_rate,
+        "device": device,
+        "kept epoch": keep_epoch,
+    }
     order = np.random.default_rng(seed)
     history: list[Epoch] = []
-    best: Weights = {}
-    best_epoch = 0
+    weights: dict[str, Weights] = {}
     with _one_thread():
-        network = TactileSGNet(architecture, adjacency, seed=seed)
-        optimizer = torch.optim.Adam(network.parameters(), lr=learning_rate, amsgrad=True, fused=True)
-        with tqdm(range(epochs), desc="train", unit="epoch", disable=None) as progress:
-            for index in progress:
+        network = TactileSGNet(architecture, adjacency, seed=seed).to(device)
+        optimizer = torch.optim.Adam(network.parameters(), lr=learning_rate, amsgrad=True, fused=device == "cpu")
+        if resume and state is not None and state.exists():
+            found = read_state(state, options)
+            history, weights = _restore(found, network, optimizer, order)
+        bar = tqdm(total=epochs, initial=len(history), desc=label, unit="epoch", position=position, disable=None)
+        with bar as progress:
+            for index in range(len(history), epochs):
                 rate = float(optimizer.param_groups[0]["lr"])
                 training_loss = _train_epoch(network, optimizer, training, order.permutation(len(training)))
+                _require_finite(training_loss, index + 1)
                 if index % DECAY_EPOCHS == 0 and index > 1:
                     for group in optimizer.param_groups:
                         group["lr"] *= 0.1
                 test_loss, correct = evaluate(network, test)
+                if correct > max((epoch.correct for epoch in history), default=-1):
+                    weights["best"] = network.export_weights()
+                if index + 1 == keep_epoch:
+                    weights["kept"] = network.export_weights()
                 history.append(
                     Epoch(
                         epoch=index + 1,
@@ -154,13 +197,72 @@ def train(
                         tested=len(test),
                     )
                 )
-                if not best or correct > history[best_epoch - 1].correct:
-                    best, best_epoch = network.export_weights(), index + 1
+                if state is not None:
+                    write_state(state, _state(options, network, optimizer, order, history, weights))
                 progress.set_postfix(loss=f"{training_loss:.4f}", test=f"{correct}/{len(test)}")
+                progress.update()
                 if after_epoch is not None:
                     after_epoch(history[-1])
         last = network.export_weights()
-    return Trained(architecture=architecture, last=last, best=best, best_epoch=best_epoch, history=tuple(history))
+    correct_by_epoch = [epoch.correct for epoch in history]
+    return Trained(
+        architecture=architecture,
+        last=last,
+        best=weights["best"],
+        best_epoch=correct_by_epoch.index(max(correct_by_epoch)) + 1,
+        kept=weights.get("kept"),
+        history=tuple(history),
+    )
+
+
+def _check_options(epochs: int, seed: int, device: str) -> None:
+    for name, value, least in (("epochs", epochs, 1), ("seed", seed, 0)):
+        if value < least:
+            raise OptionError(f"{name}: {value}, allowed are {least} or more; choose another")
+    if device not in DEVICES:
+        raise OptionError(f"--device {device}: unknown; allowed: {', '.join(DEVICES)}")
+    if device == "cuda" and not torch.cuda.is_available():
+        raise OptionError("--device cuda: this machine has no usable GPU; leave --device away")
+
+
+def _require_finite(loss: float, epoch: int) -> None:
+    if not math.isfinite(loss):
+        raise DataError(
+            f"epoch {epoch}: the loss is {loss}, a finite number is needed; the state of the epoch before is kept, "
+            "try a lower learning rate"
+        )
+
+
+def _restore(
+    found: TrainingState, network: TactileSGNet, optimizer: torch.optim.Optimizer, order: np.random.Generator
+) -> tuple[list[Epoch], dict[str, Weights]]:
+    """Put a state back; return its history and the weights that it kept."""
+    unpack(found.arrays, network, optimizer, found.progress["rate"])
+    order.bit_generator.state = found.progress["order"]
+    weights: dict[str, Weights] = {}
+    for key, array in found.arrays.items():
+        which, _, name = key.partition("/")
+        if which in ("best", "kept"):
+            weights.setdefault(which, {})[name] = array
+    return [Epoch(**epoch) for epoch in found.progress["history"]], weights
+
+
+def _state(
+    options: Mapping[str, Any],
+    network: TactileSGNet,
+    optimizer: torch.optim.Optimizer,
+    order: np.random.Generator,
+    history: list[Epoch],
+    weights: Mapping[str, Weights],
+) -> TrainingState:
+    arrays = pack(network, optimizer)
+    arrays |= {f"{which}/{name}": array for which, held in weights.items() for name, array in held.items()}
+    progress = {
+        "history": [asdict(epoch) for epoch in history],
+        "order": order.bit_generator.state,
+        "rate": float(optimizer.param_groups[0]["lr"]),
+    }
+    return TrainingState(options=options, progress=progress, arrays=arrays)
 
 
 def evaluate(network: TactileSGNet, recordings: Recordings) -> tuple[float, int]:
@@ -170,10 +272,19 @@ def evaluate(network: TactileSGNet, recordings: Recordings) -> tuple[float, int]
         for start in range(0, len(recordings), TEST_BATCH):
             chosen = slice(start, start + TEST_BATCH)
             labels = recordings.labels[chosen]
-            rates = network(_time_first(recordings.events[chosen]))
+            rates = _rates(network, recordings.events[chosen])
             loss += float(_loss(rates, labels)) * len(labels)
             correct += int(np.sum(rates.numpy().argmax(axis=1) == labels))
     return loss / len(recordings), correct
+
+
+def predict(network: TactileSGNet, recordings: Recordings) -> NDArray[np.int64]:
+    """Class of each recording; equal top rates count for the lowest one."""
+    found = []
+    with torch.no_grad(), _one_thread():
+        for start in range(0, len(recordings), TEST_BATCH):
+            found.append(_rates(network, recordings.events[start : start + TEST_BATCH]).numpy().argmax(axis=1))
+    return np.concatenate(found)
 
 
 def _train_epoch(
@@ -183,7 +294,7 @@ def _train_epoch(
     for index in order:
         chosen = slice(index, index + 1)
         optimizer.zero_grad()
-        loss = _loss(network(_time_first(recordings.events[chosen])), recordings.labels[chosen])
+        loss = _loss(_rates(network, recordings.events[chosen]), recordings.labels[chosen])
         loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
         total += float(loss.detach())
@@ -194,6 +305,12 @@ def _loss(rates: Tensor, labels: NDArray[np.int64]) -> Tensor:
     target = torch.zeros_like(rates)
     target[torch.arange(len(labels)), torch.tensor(labels)] = 1.0
     return torch.nn.functional.mse_loss(rates, target)
+
+
+def _rates(network: TactileSGNet, events: NDArray[np.uint8]) -> Tensor:
+    """Spike rates on the CPU, computed where the network is."""
+    rates: Tensor = network(_time_first(events).to(network.adjacency.device)).cpu()
+    return rates
 
 
 def _time_first(events: NDArray[np.uint8]) -> Tensor:

@@ -12,15 +12,14 @@ import json
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
-from importlib import metadata, resources
+from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
 from compiler.atomic import write_atomically
-from compiler.errors import ModelError, OptionError, SpikeloomError
-from compiler.fixedpoint import FloatArray
+from compiler.errors import OptionError, SpikeloomError
 from compiler.frontends.checkpoint import Checkpoint, read_checkpoint
 from compiler.netlist import Netlist
 from compiler.passes.legalize import measure
@@ -29,18 +28,17 @@ from compiler.pipeline import STAGES, compile_checkpoint
 from compiler.serialize import is_netlist, read_netlist, write_netlist
 from compiler.targets import load_target
 from compiler.text import text
-from models.evtouch import Recordings, load_recordings
+from models.evtouch import Recordings
 from models.graphs import CHOICES, build_graph, normalised_adjacency
-from models.grasps import synthetic_split
 from runtime import render
+from runtime.inputs import SYNTHETIC, propagation, recordings, require_place, shipped
+from runtime.tables import show
 
 Arguments = argparse.Namespace
 Report = dict[str, Any]
 Outcome = tuple[Report, Callable[[Report], str], int]
 """JSON values, how to print them for people, and the exit code."""
 
-PRETRAINED = "pretrained:"
-SYNTHETIC = "synthetic"
 DEMO = (
     ("compile", "pretrained:grasps", "--calibrate", SYNTHETIC, "-o", "{folder}/grasps.loom"),
     ("verify", "{folder}/grasps.loom", "--checkpoint", "pretrained:grasps", "--data", SYNTHETIC),
@@ -71,52 +69,9 @@ def _checkpoint(path: str, arguments: Arguments) -> Checkpoint:
     )
 
 
-def shipped(path: str) -> str:
-    """Resolve ``pretrained:NAME`` to the file that the package ships.
-
-    Raises
-    ------
-    OptionError
-        If there is no such checkpoint.
-    """
-    if not path.startswith(PRETRAINED):
-        return path
-    folder = Path(str(resources.files("models") / "pretrained"))
-    known = {file.stem: file for file in sorted(folder.glob("*.pt"))}
-    name = path.removeprefix(PRETRAINED)
-    if name not in known:
-        raise OptionError(f"{path}: no such shipped checkpoint; allowed: {', '.join(PRETRAINED + n for n in known)}")
-    return str(known[name])
-
-
-def _load(path: str, split: str, *, limit: int | None = None, classes: int | None, taxels: int | None) -> Recordings:
-    """Read recordings, or make the package's own synthetic ones."""
-    _progress("reading the recordings")
-    if path == SYNTHETIC:
-        return synthetic_split(split, limit=limit)
-    return load_recordings(path, split, limit=limit, classes=classes, taxels=taxels)
-
-
-def _adjacency(checkpoint: Checkpoint, graph: str | None, where: str) -> tuple[str, FloatArray]:
-    """Name and propagation matrix of the graph that was asked for, or of the one in the checkpoint."""
-    if graph is None:
-        if checkpoint.edges is None:
-            raise ModelError(f"{where}: the graph is not in this file; name it with --graph: {CHOICES}")
-        return str(checkpoint.graph), normalised_adjacency(checkpoint.edges, checkpoint.taxels)
-    built = build_graph(graph)
-    adjacency = normalised_adjacency(built.edges, built.n_taxels)
-    if checkpoint.edges is not None:
-        trained = normalised_adjacency(checkpoint.edges, checkpoint.taxels)
-        if not np.array_equal(trained, adjacency):
-            raise ModelError(
-                f"{where}: graph and weights disagree: it was trained on {checkpoint.graph}, --graph says "
-                f"{built.name}; leave --graph away"
-            )
-    return built.name, adjacency
-
-
 def _recordings(arguments: Arguments, netlist: Netlist) -> Recordings:
-    return _load(
+    _progress("reading the recordings")
+    return recordings(
         arguments.data,
         arguments.split,
         limit=arguments.limit,
@@ -126,12 +81,14 @@ def _recordings(arguments: Arguments, netlist: Netlist) -> Recordings:
 
 
 def _compile(arguments: Arguments) -> Outcome:
-    checkpoint = _checkpoint(arguments.checkpoint, arguments)
-    name, adjacency = _adjacency(checkpoint, arguments.graph, arguments.checkpoint)
+    require_place(arguments.output, "-o")
     load_target(arguments.target)
+    checkpoint = _checkpoint(arguments.checkpoint, arguments)
+    name, adjacency = propagation(checkpoint, arguments.graph, arguments.checkpoint)
     training = None
     if arguments.calibrate is not None:
-        training = _load(arguments.calibrate, "train", classes=checkpoint.classes, taxels=checkpoint.taxels).events
+        _progress("reading the recordings")
+        training = recordings(arguments.calibrate, "train", classes=checkpoint.classes, taxels=checkpoint.taxels).events
     _progress("compiling")
 
     def dump(stage: str, artefact: Any) -> None:
@@ -168,7 +125,8 @@ def _inspect(arguments: Arguments) -> Outcome:
         netlist = read_netlist(arguments.path)
         uses = measure(netlist, load_target(netlist.target))
         return render.netlist_json(netlist, uses, _sha256(arguments.path)), render.netlist_text, 0
-    return render.checkpoint_json(_checkpoint(arguments.path, arguments)), render.checkpoint_text, 0
+    given = tuple(name for name in ("beta", "theta") if getattr(arguments, name) is not None)
+    return render.checkpoint_json(_checkpoint(arguments.path, arguments), given), render.checkpoint_text, 0
 
 
 def _run(arguments: Arguments) -> Outcome:
@@ -176,10 +134,12 @@ def _run(arguments: Arguments) -> Outcome:
     from runtime.trace import aligned
     from runtime.votes import class_counts, predictions
 
+    if arguments.spikes is not None:
+        require_place(arguments.spikes, "--spikes")
     netlist = read_netlist(arguments.netlist)
     data = _recordings(arguments, netlist)
     _progress("running")
-    events = data.events.reshape(len(data.events), netlist.n_inputs, -1)
+    events = data.events.reshape(len(data), -1, data.steps)
     trace = engine.simulate(netlist, events, spikes=arguments.spikes is not None)
     if trace.spikes is not None:
         layers = {layer.name: aligned(netlist, trace.spikes, i) for i, layer in enumerate(netlist.layers)}
@@ -197,7 +157,7 @@ def _verify(arguments: Arguments) -> Outcome:
         raise OptionError(f"--min-agreement {arguments.min_agreement}: not a share; give a number from 0 to 1")
     netlist = read_netlist(arguments.netlist)
     checkpoint = _checkpoint(arguments.checkpoint, arguments)
-    _, adjacency = _adjacency(checkpoint, arguments.graph, arguments.checkpoint)
+    _, adjacency = propagation(checkpoint, arguments.graph, arguments.checkpoint)
     data = _recordings(arguments, netlist)
     verdict = verify(
         netlist,
@@ -219,7 +179,7 @@ def _estimate(arguments: Arguments) -> Outcome:
     netlist = read_netlist(arguments.netlist)
     data = _recordings(arguments, netlist)
     _progress("running")
-    events = data.events.reshape(len(data.events), netlist.n_inputs, -1)
+    events = data.events.reshape(len(data), -1, data.steps)
     trace = engine.simulate(netlist, events)
     costs = cost.estimate(netlist, load_target(netlist.target), trace.counts, data.steps)
     return render.estimate_json(netlist, costs), render.estimate_text, 0
@@ -230,11 +190,11 @@ def _train(arguments: Arguments) -> Outcome:
     from models.networks import Architecture
     from models.train import train
 
+    require_place(arguments.output, "-o")
     graph = build_graph(arguments.graph)
-    if not Path(arguments.output).absolute().parent.is_dir():
-        raise OptionError(f"-o {arguments.output}: the folder does not exist; make it first")
-    training = _load(arguments.data, "train", classes=None, taxels=graph.n_taxels)
-    test = _load(arguments.data, "test", classes=int(training.labels.max()) + 1, taxels=graph.n_taxels)
+    _progress("reading the recordings")
+    training = recordings(arguments.data, "train", classes=None, taxels=graph.n_taxels)
+    test = recordings(arguments.data, "test", classes=int(training.labels.max()) + 1, taxels=graph.n_taxels)
     _progress("")
     architecture = Architecture(taxels=graph.n_taxels, classes=int(training.labels.max()) + 1)
     trained = train(
@@ -245,7 +205,8 @@ def _train(arguments: Arguments) -> Outcome:
         epochs=arguments.epochs,
         seed=arguments.seed,
     )
-    command = f"spikeloom train --data {training.source} --graph {graph.name} --epochs {arguments.epochs}"
+    data = arguments.data if arguments.data == SYNTHETIC else training.source
+    command = f"spikeloom train --data {data} --graph {graph.name} --epochs {arguments.epochs}"
     record = training_record(trained, training, test, command=f"{command} --seed {arguments.seed}", seed=arguments.seed)
     save_checkpoint(
         arguments.output,
@@ -303,9 +264,16 @@ def _model(parser: argparse.ArgumentParser, *, graph: bool = True) -> None:
     parser.add_argument("--theta", type=float, help="threshold, where the file does not say (default: 0.5)")
 
 
+class _Parser(argparse.ArgumentParser):
+    """Reports a wrong command line in one line, as any other mistake is."""
+
+    def error(self, message: str) -> NoReturn:
+        raise OptionError(f"{message}; see {self.prog} --help")
+
+
 def build_parser() -> argparse.ArgumentParser:
     """Describe every command and option."""
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="spikeloom",
         description="Lower a trained spiking graph network for touch to a Loihi netlist, run it bit for bit, "
         "compare it with the float model and price it.",
@@ -372,19 +340,30 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _mistake(error: Exception) -> str:
+    """Lines for a user: one, or one per violated limit."""
+    if isinstance(error, OSError) and error.strerror:
+        where = error.filename or "a file"
+        return f"{where}: {error.strerror}; check space and permissions, nothing was changed"
+    if isinstance(error, MemoryError):
+        return f"out of memory ({error or 'no size known'}); give fewer recordings with --limit"
+    return " ".join([str(error), *(f"({note})" for note in getattr(error, "__notes__", ()))])
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; return its exit code."""
-    arguments = build_parser().parse_args(argv)
+    words = sys.argv[1:] if argv is None else argv
     try:
+        arguments = build_parser().parse_args(words)
         report, as_text, code = arguments.action(arguments)
         _progress("")
-        print(json.dumps(report) if arguments.json else as_text(report))
+        show(json.dumps(report) if arguments.json else as_text(report))
         return int(code)
     except (SpikeloomError, OSError, MemoryError) as error:
         _progress("")
-        if arguments.debug:
+        if "--debug" in words:
             raise
-        sys.stderr.write(f"spikeloom: {error or type(error).__name__}\n")
+        sys.stderr.writelines(f"spikeloom: {line}\n" for line in _mistake(error).splitlines())
         return 2
     except KeyboardInterrupt:
         _progress("")

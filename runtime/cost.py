@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from compiler.fixedpoint import FloatArray, IntArray
+from compiler.fixedpoint import FloatArray
 from compiler.netlist import Netlist
 from compiler.passes.place import hops
 from compiler.targets import EnergyTable, Target
@@ -56,7 +56,7 @@ class Costs:
     events : mapping of str to (samples, layers) float64
         Amount of each event in ``EVENTS``. Synaptic operations belong to the layer that receives them, packets and
         hops to the layer that sends them.
-    zeros : (samples, layers) int64
+    zeros : (samples, layers) float64
         Synaptic operations on stored zeros.
     steps : int
         Chip steps of a recording.
@@ -78,15 +78,14 @@ class Costs:
         return self.events["synaptic_operation_dense"] + self.events["synaptic_operation_sparse"]
 
 
-def _visits(netlist: Netlist, kept: IntArray) -> FloatArray:
+def _visits(netlist: Netlist, kept: FloatArray) -> FloatArray:
     """Entries that one spike of each source visits in each layer, over the synapses that `kept` marks with 1."""
     axon = netlist.axon_of_synapse()
     source = netlist.axon_source[axon]
     layers = len(netlist.layers)
     flat = source * layers + netlist.layer[netlist.synapse_compartment()]
     size = netlist.n_inputs + netlist.n_compartments
-    visits: FloatArray = np.bincount(flat, kept, size * layers).reshape(size, layers)
-    return visits
+    return np.bincount(flat, kept, size * layers).astype(np.float64).reshape(size, layers)
 
 
 def _routes(netlist: Netlist, target: Target) -> FloatArray:
@@ -123,8 +122,8 @@ def count(netlist: Netlist, target: Target, counts: Counts, steps: int) -> tuple
     neurons = np.array([layer.neurons for layer in netlist.layers], np.float64)
     active = counts.updates.astype(np.float64)
     events = {
-        "synaptic_operation_dense": sources @ _visits(netlist, dense.astype(np.int64)),
-        "synaptic_operation_sparse": sources @ _visits(netlist, (~dense).astype(np.int64)),
+        "synaptic_operation_dense": sources @ _visits(netlist, dense.astype(np.float64)),
+        "synaptic_operation_sparse": sources @ _visits(netlist, (~dense).astype(np.float64)),
         "neuron_idle": neurons * (steps + netlist.max_depth) - active,
         "neuron_active": active,
         "spike": counts.spikes @ of_layer,
@@ -132,7 +131,7 @@ def count(netlist: Netlist, target: Target, counts: Counts, steps: int) -> tuple
         "hop_east_west": sent[1],
         "hop_north_south": sent[2],
     }
-    return events, sources @ _visits(netlist, (netlist.synapse_weight == 0).astype(np.int64))
+    return events, sources @ _visits(netlist, (netlist.synapse_weight == 0).astype(np.float64))
 
 
 def price(table: EnergyTable, events: Mapping[str, FloatArray]) -> FloatArray | tuple[str, ...]:

@@ -21,7 +21,7 @@ from compiler.lift import lift
 from compiler.netlist import Netlist
 from compiler.passes.expand import expand
 from runtime import engine, spec
-from runtime.trace import aligned
+from runtime.trace import aligned, check_channels
 from runtime.votes import predictions
 
 LADDER = ("float64", "beta", "weights", "bias_threshold", "rounding", "saturation")
@@ -145,10 +145,12 @@ def require_match(netlist: Netlist, checkpoint: Checkpoint) -> None:
     Raises
     ------
     ModelError
-        If layer names or sizes differ.
+        If taxels, channels, or layer names or sizes differ.
     """
-    ours = {layer.name: layer.neurons for layer in netlist.layers}
-    theirs = {"conv1": checkpoint.taxels * checkpoint.hops.shape[1]}
+    ours = {"taxels": netlist.taxels, "channels": netlist.polarities}
+    ours |= {layer.name: layer.neurons for layer in netlist.layers}
+    theirs = {"taxels": checkpoint.taxels, "channels": checkpoint.hops.shape[2]}
+    theirs |= {"conv1": checkpoint.taxels * checkpoint.hops.shape[1]}
     theirs |= {dense.name: len(dense.bias) for dense in checkpoint.dense}
     if ours != theirs:
         sizes = [", ".join(f"{name} {neurons}" for name, neurons in side.items()) for side in (ours, theirs)]
@@ -306,8 +308,10 @@ def verify(
         raise DataError(f"--spec-samples {spec_samples}: at least 1 recording is needed; give a positive number")
     tell = progress or (lambda _part: None)
     require_match(netlist, checkpoint)
+    network, integer = expand(checkpoint, adjacency), lift(netlist)
     names = [layer.name for layer in netlist.layers]
-    flat = events.reshape(len(events), netlist.n_inputs, -1)
+    flat = events.reshape(len(events), -1, events.shape[3])
+    check_channels(netlist, flat.shape[1])
 
     tell("float32 reference")
     narrow = float_spikes(checkpoint, adjacency, events, dtype="float32")
@@ -329,7 +333,6 @@ def verify(
     def differences(stage: list[BoolArray] | tuple[BoolArray, ...]) -> dict[str, int]:
         return {name: int(np.count_nonzero(a != b)) for name, a, b in zip(names, reference, stage, strict=True)}
 
-    network, integer = expand(checkpoint, adjacency), lift(netlist)
     inputs = channels_last(events)
     ladder = [("float64", differences(wide))]
     for stage, rung in zip(LADDER[1:4], realised(network, integer), strict=True):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -15,57 +15,9 @@ from compiler.passes.legalize import LimitUse
 from compiler.pipeline import Compilation
 from runtime.cost import NOT_PRICED, Costs
 from runtime.equivalence import Verdict
-from runtime.intervals import wilson
+from runtime.tables import percent, si, table
 
 Json = dict[str, Any]
-
-
-def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Align columns: the first to the left, the others to the right.
-
-    Examples
-    --------
-    >>> print(table(["layer", "spikes"], [["conv1", "12"], ["fc1", "3456"]]))
-      layer  spikes
-      conv1      12
-      fc1      3456
-    """
-    lines = [list(head), *(list(row) for row in rows)]
-    widths = [max(len(line[i]) for line in lines) for i in range(len(head))]
-    return "\n".join(
-        "  "
-        + "  ".join(
-            cell.ljust(width) if i == 0 else cell.rjust(width)
-            for i, (cell, width) in enumerate(zip(line, widths, strict=True))
-        ).rstrip()
-        for line in lines
-    )
-
-
-def percent(right: int, total: int) -> str:
-    """Accuracy with its Wilson interval.
-
-    Examples
-    --------
-    >>> percent(127, 144)
-    '88.19 % (127 of 144; 95 % interval 81.9 … 92.5)'
-    """
-    low, high = wilson(right, total)
-    return f"{100 * right / total:.2f} % ({right} of {total}; 95 % interval {100 * low:.1f} … {100 * high:.1f})"
-
-
-def si(value: float, unit: str) -> str:
-    """Three digits with an SI prefix.
-
-    Examples
-    --------
-    >>> si(0.000321, "J"), si(0.0, "J"), si(2.5e-9, "J")
-    ('321 µJ', '0 J', '2.5 nJ')
-    """
-    for factor, prefix in ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"), (1e-12, "p")):
-        if abs(value) >= factor:
-            return f"{value / factor:.3g} {prefix}{unit}"
-    return f"{value:.3g} {unit}"
 
 
 # -- netlists and checkpoints ------------------------------------------------------------------------------------------
@@ -218,8 +170,8 @@ def compilation_text(report: Json) -> str:
     return "\n".join(lines)
 
 
-def checkpoint_json(checkpoint: Checkpoint) -> Json:
-    """What a checkpoint holds, and what of it was assumed."""
+def checkpoint_json(checkpoint: Checkpoint, given: tuple[str, ...]) -> Json:
+    """What a checkpoint holds, and what of it the user gave or was assumed."""
     return {
         "layout": checkpoint.layout,
         "taxels": checkpoint.taxels,
@@ -231,6 +183,7 @@ def checkpoint_json(checkpoint: Checkpoint) -> Json:
         ],
         "beta": checkpoint.beta,
         "theta": checkpoint.theta,
+        "given": list(given),
         "assumed": list(checkpoint.assumed),
         "graph": checkpoint.graph,
         "training": None if checkpoint.training is None else dict(checkpoint.training),
@@ -247,7 +200,9 @@ def checkpoint_text(report: Json) -> str:
         f"  graph: {report['graph'] or 'not in the file; name it with --graph'}",
     ]
     for name in ("beta", "theta"):
-        source = f"assumed; override with --{name}" if name in report["assumed"] else "read from the file"
+        source = "given" if name in report["given"] else "read from the file"
+        if name in report["assumed"]:
+            source = f"assumed; override with --{name}"
         lines.append(f"  {name}: {report[name]:g} ({source})")
     for key, value in (report["training"] or {}).items():
         text = str(value)

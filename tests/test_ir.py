@@ -61,9 +61,7 @@ def test_a_sound_network_passes(make):
 
 def test_two_populations_of_one_name():
     network = with_population(small(), 1, name="fc1")
-    assert refused(network) == (
-        "two populations are called 'fc1'"
-    )
+    assert refused(network) == ("two populations are called 'fc1'")
 
 
 def test_a_projection_of_the_wrong_shape():
@@ -187,13 +185,16 @@ def test_registers_at_their_ends_and_one_past_them(field, good, bad, message):
 
 
 @pytest.mark.parametrize(
-    ("bits", "good", "bad"), [(8, (-256, 254), (-258, 256, 3)), (4, (-256, 224), (256, 16)), (2, (128, -256), (256, 64))]
+    ("bits", "good", "bad"),
+    [(8, (-256, 254), (-258, 256, 3)), (4, (-256, 224), (256, 16)), (2, (128, -256), (256, 64))],
 )
 def test_mantissas_of_each_width(bits, good, bad):
     for value in good:
         verify(integer_chain([[value]], bits=bits))
     for value in bad:
-        assert refused(integer_chain([[value]], bits=bits)) == f"projection 0 has mantissas that {bits} bits cannot hold"
+        assert (
+            refused(integer_chain([[value]], bits=bits)) == f"projection 0 has mantissas that {bits} bits cannot hold"
+        )
 
 
 def test_mantissas_of_another_type():

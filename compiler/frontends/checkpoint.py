@@ -1,18 +1,16 @@
 """Read trained TactileSGNet checkpoints: our own files, the released layout and bare state dicts.
 
-Our own format, version 1, is a plain zip that needs neither pickle nor torch:
+Our own format, version 1, is a plain zip (members stored, not compressed) that needs neither pickle nor torch:
 
 ``manifest.json``
     ``format`` ("spikeloom-checkpoint"), ``version``, ``architecture`` ("tactilesgnet"), ``taxels``, ``classes``,
     ``beta``, ``theta``, ``graph`` (``name`` and ``edges``, pairs of source and target, repeats adding up),
     ``weights`` (the sets in the file: ``last``, and ``best`` where the epoch that did best on the test split was
-    kept), ``training`` (how it was made and what it reached) and ``sha256`` over all arrays.
+    kept), ``training`` (how it was made and what it reached) and ``sha256`` over all of these and all arrays.
 ``last/NAME.npy``, ``best/NAME.npy``
-    ``conv1.hops`` (K + 1, features, channels), ``conv1.bias``, and ``weight`` and ``bias`` of ``fc1``, ``fc2`` …
+    float32: ``conv1.hops`` (K + 1, features, channels), ``conv1.bias``, ``weight`` and ``bias`` of ``fc1``, ``fc2`` …
 
-The released layout is a ``.t7`` file of ``torch.save``: a dict whose ``net_list`` holds one state dict per run, with
-the weights of the *last* epoch, while ``best_acc`` belongs to the best one. It holds no graph, no decay and no threshold.
-torch is imported only to read that one, always with ``weights_only=True``.
+Files of ``torch.save`` are read by :mod:`compiler.frontends.released`.
 """
 
 from __future__ import annotations
@@ -20,9 +18,9 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import math
 import os
 import re
-import warnings
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -32,8 +30,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from compiler.errors import ModelError
+from compiler.errors import ModelError, OptionError
 from compiler.fixedpoint import IntArray
+from compiler.frontends.released import DAMAGED, GIVE, NOT_A_CHECKPOINT, read_released
+from compiler.frontends.tensors import Arrays, faults_of, size, taxel_faults, wanted_dense
 
 FORMAT = "spikeloom-checkpoint"
 VERSION = 1
@@ -41,11 +41,17 @@ BETA, THETA = 0.2, 0.5
 """Decay and threshold of the released code; files in its layout do not hold them."""
 
 SIZE_LIMIT = 2**28
-"""Bytes that a checkpoint may have, packed or unpacked: 256 MiB, a hundred times the released ones."""
+"""Bytes that a checkpoint may have: 256 MiB, a hundred times the released ones."""
 
-WEIGHTS = ("last", "best")
+WEIGHTS = ("last", "best", "clean")
+"""Sets that our own format can hold."""
 
 Float32Array = npt.NDArray[np.float32]
+
+_NPY = re.compile(
+    rb"\x93NUMPY\x01\x00..\{'descr': '<f4', 'fortran_order': False, 'shape': \(([\d, ]{0,80})\), \} *\n", re.DOTALL
+)
+_AGAIN = "copy or train it again"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -86,6 +92,10 @@ class Checkpoint:
         Its edge list, (source, target).
     layout : {"spikeloom", "released", "state_dict"}
         Kind of file.
+    weights : {"last", "best", "clean"}
+        Epoch that the weights are from.
+    runs : int
+        Trainings that the file holds; this is one of them.
     training : mapping or None
         JSON values: how it was made and what it reached.
     sha256 : str
@@ -101,6 +111,8 @@ class Checkpoint:
     graph: str | None
     edges: IntArray | None
     layout: str
+    weights: str
+    runs: int
     training: Mapping[str, Any] | None
     sha256: str
 
@@ -124,11 +136,17 @@ def arrays_digest(arrays: Mapping[str, npt.NDArray[Any]]) -> str:
     return digest.hexdigest()
 
 
+def content_digest(manifest: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]]) -> str:
+    """Hash that a manifest states: over its other entries and all arrays."""
+    stated = {key: value for key, value in manifest.items() if key != "sha256"}
+    return hashlib.sha256(f"{json.dumps(stated, sort_keys=True)}\n{arrays_digest(arrays)}".encode()).hexdigest()
+
+
 def read_checkpoint(
     path: str | os.PathLike[str],
     *,
     run: int = 0,
-    weights: str = "last",
+    weights: str | None = None,
     beta: float | None = None,
     theta: float | None = None,
 ) -> Checkpoint:
@@ -140,238 +158,180 @@ def read_checkpoint(
         File.
     run : int
         Which run of a released file.
-    weights : {"last", "best"}
-        Which epoch, where the file holds both.
+    weights : {"last", "best", "clean"}, optional
+        Which epoch, where the file holds several; the first of these that it holds without. The best one was chosen
+        on the test split, the clean one on a part of the training split.
     beta, theta : float, optional
         Decay and threshold; taken from the file, or from the released code where the file does not say.
 
     Raises
     ------
     ModelError
-        If the file is no checkpoint, holds code, is damaged, or its tensors do not make a TactileSGNet.
+        If the file is no checkpoint, holds code, is damaged or altered, does not hold what is asked for, or its
+        tensors do not make a TactileSGNet; every fault of the tensors is listed.
+    OptionError
+        If `weights`, `beta` or `theta` has a value that does not exist.
     """
-    where = str(path)
-    path = Path(path)
-    if not path.is_file():
-        raise ModelError(f"{where}: no such file; give a checkpoint (.pt, .t7)")
-    if path.stat().st_size > SIZE_LIMIT:
-        raise ModelError(
-            f"{where}: {path.stat().st_size} bytes, {SIZE_LIMIT} allowed; this is no TactileSGNet checkpoint"
-        )
-    content = path.read_bytes()
-    declared = _declared_size(content)
-    if declared > SIZE_LIMIT:
-        raise ModelError(f"{where}: unpacks to {declared} bytes, {SIZE_LIMIT} allowed; refused")
-    manifest = _read_manifest(where, content)
-    if manifest is not None:
-        tensors = _own_tensors(where, content, manifest, weights)
-        layout, training = "spikeloom", manifest.get("training")
-        if run != 0:
-            raise ModelError(f"{where}: --run {run}: the file holds one run; leave --run away")
-    else:
-        loaded = _torch_load(where, content)
-        tensors, layout, training = _released_tensors(where, loaded, run)
-        if weights != "last":
+    if weights is not None and weights not in WEIGHTS:
+        raise OptionError(f"--weights {weights}: unknown; choose from {', '.join(WEIGHTS)}")
+    _require_constants("", OptionError, beta, theta)
+    where, path = str(path), Path(path)
+    content = _content(where, path)
+    members = _own_members(where, content)
+    given = {"beta": beta, "theta": theta}
+    if members is None:
+        arrays, layout, runs, training = read_released(where, content, run)
+        if weights not in (None, "last"):
             raise ModelError(f"{where}: --weights {weights}: the file holds the last epoch only; leave --weights away")
-    hops, bias, dense = _assemble(where, tensors)
-    graph = (manifest or {}).get("graph") or {}
-    values = {"beta": (beta, BETA), "theta": (theta, THETA)}
-    found = {name: given if given is not None else (manifest or {}).get(name) for name, (given, _) in values.items()}
-    checkpoint = Checkpoint(
-        hops=hops,
-        conv_bias=bias,
-        dense=dense,
-        beta=float(BETA if found["beta"] is None else found["beta"]),
-        theta=float(THETA if found["theta"] is None else found["theta"]),
-        assumed=tuple(name for name, value in found.items() if value is None),
-        graph=graph.get("name"),
-        edges=np.array(graph["edges"], np.int64).reshape(-1, 2) if "edges" in graph else None,
+        graph, edges, chosen, held = None, None, "last", {"beta": BETA, "theta": THETA}
+        assumed = tuple(name for name, value in given.items() if value is None)
+    else:
+        if run != 0:
+            raise ModelError(f"{where}: --run {run}: the file holds only run 0; leave --run away")
+        arrays, chosen, (graph, edges, held, training) = _own_arrays(where, members, weights)
+        layout, runs, assumed = "spikeloom", 1, ()
+    stages = sorted({key.split(".")[0] for key in arrays if key.startswith("fc")}, key=lambda name: int(name[2:]))
+    return Checkpoint(
+        hops=_plain(arrays["conv1.hops"]),
+        conv_bias=_plain(arrays["conv1.bias"]),
+        dense=tuple(
+            Dense(name=name, weight=_plain(arrays[f"{name}.weight"]), bias=_plain(arrays[f"{name}.bias"]))
+            for name in stages
+        ),
+        beta=held["beta"] if beta is None else beta,
+        theta=held["theta"] if theta is None else theta,
+        assumed=assumed,
+        graph=graph,
+        edges=edges,
         layout=layout,
+        weights=chosen,
+        runs=runs,
         training=training,
         sha256=hashlib.sha256(content).hexdigest(),
     )
-    if not (0 <= checkpoint.beta < 1 and 0 < checkpoint.theta < np.inf):
-        raise ModelError(
-            f"{where}: beta {checkpoint.beta:g}, theta {checkpoint.theta:g}: allowed are 0 <= beta < 1 and theta > 0; "
-            "correct --beta or --theta"
+
+
+def _plain(array: npt.NDArray[Any]) -> Float32Array:
+    copy = np.array(array, np.float32, order="C")
+    copy.flags.writeable = False
+    return copy
+
+
+def _require_constants(
+    where: str, error: type[ModelError] | type[OptionError], beta: float | None, theta: float | None
+) -> None:
+    if beta is not None and not 0 <= beta < 1:
+        raise error(
+            f"{where}beta {beta:g}: allowed are 0 <= beta < 1; it is the share of the membrane that a step keeps"
         )
-    return checkpoint
+    if theta is not None and not 0 < theta < math.inf:
+        raise error(f"{where}theta {theta:g}: allowed are numbers above 0; it is the threshold of a spike")
 
 
-def _declared_size(content: bytes) -> int:
+def _content(where: str, path: Path) -> bytes:
+    """Bytes of the file."""
+    if not path.is_file():
+        raise ModelError(f"{where}: no such file; {GIVE}")
+    try:
+        with path.open("rb") as file:
+            content = file.read(SIZE_LIMIT + 1)
+    except OSError as error:
+        raise ModelError(f"{where}: cannot be read ({error.strerror or error}); check its permissions") from error
+    if len(content) > SIZE_LIMIT:
+        raise ModelError(f"{where}: more than {SIZE_LIMIT} bytes, the limit of a checkpoint; {GIVE}")
+    return content
+
+
+def _own_members(where: str, content: bytes) -> dict[str, bytes] | None:
+    """Members of a file in our own format, or None if it is something else; no zip may claim more than it has."""
+    if content[:2] != b"PK":
+        return None
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            return sum(info.file_size for info in archive.infolist())
-    except zipfile.BadZipFile:
-        return 0
-
-
-def _read_manifest(where: str, content: bytes) -> dict[str, Any] | None:
-    """Manifest of our own format, or None if the file is something else."""
-    try:
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            infos = archive.infolist()
+            declared = sum(info.file_size for info in infos)
+            if declared > len(content):
+                raise ModelError(
+                    f"{where}: {len(content)} bytes claim to hold {declared}, checkpoints are not compressed; "
+                    "do not trust this file"
+                )
             if "manifest.json" not in archive.namelist():
                 return None
-            manifest = json.loads(archive.read("manifest.json"))
-    except zipfile.BadZipFile:
-        return None
-    except ValueError as error:
-        raise ModelError(f"{where}: has an unreadable manifest; the file is damaged") from error
+            return {info.filename: archive.read(info) for info in infos}
+    except (zipfile.BadZipFile, EOFError, OSError, RuntimeError, ValueError) as error:
+        raise ModelError(f"{where}: {DAMAGED}") from error
+
+
+def _manifest(where: str, content: bytes) -> dict[str, Any]:
+    try:
+        manifest = json.loads(content)
+    except (ValueError, RecursionError) as error:
+        raise ModelError(f"{where}: {DAMAGED}") from error
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
-        raise ModelError(f"{where}: is an archive but not a checkpoint; give a checkpoint (.pt, .t7)")
+        raise ModelError(f"{where}: {NOT_A_CHECKPOINT}")
     if manifest.get("version") != VERSION:
         raise ModelError(
-            f"{where}: has format version {manifest.get('version')}, this program reads {VERSION}; update spikeloom"
+            f"{where}: has format version {manifest.get('version')!r}, this program reads {VERSION}; update spikeloom"
         )
     return manifest
 
 
-def _own_tensors(where: str, content: bytes, manifest: dict[str, Any], weights: str) -> dict[str, npt.NDArray[Any]]:
-    held = manifest.get("weights", [])
-    if weights not in held:
-        raise ModelError(f"{where}: --weights {weights}: the file holds {', '.join(held)}; choose one of these")
-    arrays: dict[str, npt.NDArray[Any]] = {}
+def _own_arrays(
+    where: str, members: dict[str, bytes], weights: str | None
+) -> tuple[Arrays, str, tuple[str, IntArray, dict[str, float], dict[str, Any]]]:
+    """Arrays of one set, its name, and graph name, edges, neuron constants and training record."""
+    manifest = _manifest(where, members.pop("manifest.json"))
     try:
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            for name in archive.namelist():
-                if name.endswith(".npy"):
-                    member = io.BytesIO(archive.read(name))
-                    arrays[name.removesuffix(".npy")] = np.lib.format.read_array(member, allow_pickle=False)
-    except (zipfile.BadZipFile, ValueError, EOFError) as error:
-        raise ModelError(f"{where}: is truncated or damaged ({error}); copy or train it again") from error
-    if arrays_digest(arrays) != manifest.get("sha256"):
-        raise ModelError(f"{where}: its arrays do not match its hash, so it was altered; copy or train it again")
-    return {name.removeprefix(f"{weights}/"): array for name, array in arrays.items() if name.startswith(f"{weights}/")}
-
-
-def _torch_load(where: str, content: bytes) -> Any:
-    import pickle
-
-    import torch
-
+        arrays: Arrays = {name.removesuffix(".npy"): _read_npy(content) for name, content in members.items()}
+    except ValueError as error:
+        raise ModelError(f"{where}: {DAMAGED}") from error
+    if content_digest(manifest, arrays) != manifest.get("sha256"):
+        raise ModelError(f"{where}: its content does not match its hash, so it was altered; {_AGAIN}")
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # old files make torch warn about its own storage classes
-            return torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
-    except pickle.UnpicklingError as error:
-        unsafe = (
-            "Unsupported global" in str(error) or "Unsupported class" in str(error) or "WeightsUnpickler" in str(error)
-        )
-        if unsafe:
-            raise ModelError(
-                f"{where}: holds code or objects beside weights and is not loaded; save its state_dict instead"
-            ) from error
-        raise ModelError(f"{where}: is not a checkpoint or is damaged; give a checkpoint (.pt, .t7)") from error
-    except (
-        RuntimeError,
-        EOFError,
-        ValueError,
-        KeyError,
-        IndexError,
-        AttributeError,
-        TypeError,
-        OSError,
-        AssertionError,
-    ) as e:
-        raise ModelError(f"{where}: is not a checkpoint or is damaged; give a checkpoint (.pt, .t7)") from e
-
-
-def _released_tensors(
-    where: str, loaded: Any, run: int
-) -> tuple[dict[str, npt.NDArray[Any]], str, dict[str, Any] | None]:
-    import torch
-
-    layout, training = "state_dict", None
-    state = loaded
-    if isinstance(loaded, dict) and "net_list" in loaded:
-        runs = loaded["net_list"]
-        if not isinstance(runs, list) or not runs:
-            raise ModelError(f"{where}: net_list holds no run; give another file")
-        if not 0 <= run < len(runs):
-            raise ModelError(f"{where}: --run {run}: the file holds runs 0 to {len(runs) - 1}; choose one of these")
-        layout, state = "released", runs[run]
-        training = {"runs": len(runs), "epoch": "last", "epochs": _plain(loaded.get("num_epochs"))}
-        best = loaded.get("best_acc")
-        if isinstance(best, torch.Tensor) and best.numel() > run:
-            training["best_acc"] = round(float(best.flatten()[run]), 4)
-            training["best_acc_note"] = "of the best epoch on the test split, not of these weights"
-    elif run != 0:
-        raise ModelError(f"{where}: --run {run}: the file holds one run; leave --run away")
-    if not isinstance(state, Mapping) or not all(isinstance(value, torch.Tensor) for value in state.values()):
-        raise ModelError(f"{where}: holds no state dict of tensors; give a checkpoint (.pt, .t7)")
-    tensors = {str(name): tensor.detach().cpu().float().numpy() for name, tensor in state.items()}
-    return _unify_convolution(tensors), layout, training
-
-
-def _plain(value: Any) -> Any:
-    return value if isinstance(value, int | float | str) else None
-
-
-def _unify_convolution(tensors: dict[str, npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:
-    """Bring both key styles of torch_geometric's TAGConv to ``conv1.hops`` and ``conv1.bias``."""
-    found = dict(tensors)
-    old = found.pop("conv1.lin.weight", None)
-    if old is not None:
-        # old releases: one linear map on the concatenated hops, (features, (K + 1) * channels), two channels
-        if old.ndim == 2 and old.shape[1] % 2 == 0:
-            found["conv1.hops"] = old.reshape(len(old), -1, 2).transpose(1, 0, 2)
-        if "conv1.lin.bias" in found:
-            found["conv1.bias"] = found.pop("conv1.lin.bias")
-        return found
-    hops = {int(key.split(".")[2]): key for key in found if re.fullmatch(r"conv1\.lins\.\d+\.weight", key)}
-    if hops and sorted(hops) == list(range(len(hops))):
-        parts = [found.pop(hops[k]) for k in range(len(hops))]
-        if all(part.ndim == 2 and part.shape == parts[0].shape for part in parts):
-            found["conv1.hops"] = np.stack(parts)
-    return found
-
-
-def _assemble(where: str, tensors: dict[str, npt.NDArray[Any]]) -> tuple[Float32Array, Float32Array, tuple[Dense, ...]]:
-    """Check names, shapes and values; every fault is listed."""
-    stages = sorted({int(m[1]) for key in tensors if (m := re.fullmatch(r"fc([1-9])\.(?:weight|bias)", key))})
-    last = max([3, *stages])
-    expected = ["conv1.hops", "conv1.bias"]
-    expected += [f"fc{i}.{part}" for i in range(1, last + 1) for part in ("weight", "bias")]
-    shown = {"conv1.hops": "conv1.lins.0.weight … (or conv1.lin.weight)"}
-    faults = [f"{shown.get(name, name)} is missing" for name in expected if name not in tensors]
-    faults += [f"{name} is not part of a TactileSGNet" for name in sorted(set(tensors) - set(expected))]
-    for name in expected:
-        array = tensors.get(name)
-        if array is not None:
-            dims = 3 if name == "conv1.hops" else 2 if name.endswith("weight") else 1
-            if array.dtype.kind not in "fiu" or array.ndim != dims or not array.size:
-                faults.append(f"{name} has shape {array.shape}, {dims} dimensions are needed")
-            elif bad := int(np.count_nonzero(~np.isfinite(array))):
-                faults.append(f"{name} has {bad} values that are NaN or infinite")
-    if not faults:
-        faults = _shape_faults(tensors, last)
+        sets = [name for name in WEIGHTS if name in manifest["weights"]]
+        graph = manifest["graph"]
+        edges = np.array(graph["edges"], np.int64).reshape(-1, 2)
+        edges.flags.writeable = False
+        held = {name: float(manifest[name]) for name in ("beta", "theta")}
+        taxels, classes = int(manifest["taxels"]), int(manifest["classes"])
+        facts = str(graph["name"]), edges, held, dict(manifest["training"])
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise ModelError(f"{where}: has an incomplete manifest ({error!r}); {_AGAIN}") from error
+    _require_constants(f"{where}: ", ModelError, held["beta"], held["theta"])
+    if weights is None and sets:
+        weights = sets[0]
+    if weights not in sets:
+        raise ModelError(f"{where}: --weights {weights}: the file holds {', '.join(sets)}; choose one that it holds")
+    chosen = {name.removeprefix(f"{weights}/"): a for name, a in arrays.items() if name.startswith(f"{weights}/")}
+    faults = _own_faults(chosen, taxels, classes)
+    if edges.size and (edges.min() < 0 or edges.max() >= taxels):
+        faults.append(f"the graph joins taxels outside 0..{taxels - 1}")
     if faults:
-        raise ModelError(f"{where}: {'; '.join(faults)}; give the state dict of a TactileSGNet")
-    dense = tuple(
-        Dense(
-            name=f"fc{i}",
-            weight=tensors[f"fc{i}.weight"].astype(np.float32),
-            bias=tensors[f"fc{i}.bias"].astype(np.float32),
-        )
-        for i in range(1, last + 1)
-    )
-    return tensors["conv1.hops"].astype(np.float32), tensors["conv1.bias"].astype(np.float32), dense
+        raise ModelError(f"{where}: {'; '.join(faults)}; {_AGAIN}")
+    return chosen, weights, facts
 
 
-def _shape_faults(tensors: dict[str, npt.NDArray[Any]], last: int) -> list[str]:
-    faults = []
-    features = tensors["conv1.hops"].shape[1]
-    if len(tensors["conv1.bias"]) != features:
-        faults.append(f"conv1.bias has {len(tensors['conv1.bias'])} values for {features} features")
-    inputs = tensors["fc1.weight"].shape[1]
-    if inputs % features:
-        faults.append(f"fc1.weight has {inputs} inputs, not a whole number of taxels with {features} features each")
-    for i in range(1, last + 1):
-        outputs, inputs = tensors[f"fc{i}.weight"].shape
-        if len(tensors[f"fc{i}.bias"]) != outputs:
-            faults.append(f"fc{i}.bias has {len(tensors[f'fc{i}.bias'])} values for {outputs} neurons")
-        if i > 1 and inputs != tensors[f"fc{i - 1}.weight"].shape[0]:
-            faults.append(
-                f"fc{i}.weight has {inputs} inputs, fc{i - 1} has {tensors[f'fc{i - 1}.weight'].shape[0]} neurons"
-            )
+def _own_faults(arrays: Arrays, taxels: int, classes: int) -> list[str]:
+    stages = max((int(m[1]) for key in arrays if (m := re.fullmatch(r"fc([1-9]\d?)\.weight", key))), default=1)
+    features = size(arrays, "conv1.hops", 3, 1, "features")
+    wanted = {"conv1.hops": ("K + 1", features, "channels"), "conv1.bias": (features,)} | wanted_dense(arrays, stages)
+    faults = faults_of(arrays, wanted)
+    if not faults:
+        assert isinstance(features, int)
+        faults = taxel_faults(arrays, features)
+        made_for = arrays["fc1.weight"].shape[1] // features, len(arrays[f"fc{stages}.bias"])
+        if not faults and made_for != (taxels, classes):
+            faults = [
+                f"made for {made_for[0]} taxels and {made_for[1]} classes, "
+                f"the manifest says {taxels} taxels and {classes} classes"
+            ]
     return faults
+
+
+def _read_npy(content: bytes) -> Float32Array:
+    """Parse the one kind of npy file that we write (version 1.0, float32, C order), trusting no size in it."""
+    header = _NPY.match(content)
+    if header is None or header.end() != 10 + int.from_bytes(content[8:10], "little"):
+        raise ValueError("not an npy file of float32 in C order")
+    shape = tuple(int(length) for length in re.findall(rb"\d+", header[1]))
+    return np.frombuffer(content, "<f4", offset=header.end()).reshape(shape)

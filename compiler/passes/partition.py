@@ -25,6 +25,9 @@ EXACT_CHUNKS = 10
 SPARSE_SHARE = 0.75
 """A list goes sparse when it stores at most this share of what the dense form would store and visit."""
 
+SynapseFormat = tuple[int, int, int]
+"""Weight bits, exponent and index bits (0 if dense)."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, order=True)
 class Chunk:
@@ -145,56 +148,53 @@ class _Costs:
         self.target = target
         self.out_axons = [np.zeros(population.size, np.int64) for population in network.populations]
         self._lists: dict[Chunk, tuple[Lists, ...]] = {}
-        self._words: dict[tuple[Chunk, int, bool], int] = {}
+        self._stored: dict[tuple[Chunk, int, bool], tuple[int, frozenset[SynapseFormat]]] = {}
 
     def lists(self, chunk: Chunk) -> tuple[Lists, ...]:
         if chunk not in self._lists:
             self._lists[chunk] = lists_into(self.network, chunk)
         return self._lists[chunk]
 
-    def words(self, chunk: Chunk, base: int, *, lean: bool = False) -> int:
+    def stored(self, chunk: Chunk, base: int, *, lean: bool = False) -> tuple[int, frozenset[SynapseFormat]]:
+        """Words and synapse formats of a chunk's lists if it starts at compartment `base` of its core."""
         key = (chunk, base, lean)
-        if key not in self._words:
-            parts = [
-                choose_dense(
-                    lists,
-                    self.network.projections[lists.projection],
-                    base,
-                    chunk.size,
-                    lean=lean,
-                    target=self.target,
-                )[1].sum()
-                for lists in self.lists(chunk)
-            ]
-            self._words[key] = int(sum(parts))
-        return self._words[key]
+        if key not in self._stored:
+            words, formats = 0, set()
+            for lists in self.lists(chunk):
+                projection = self.network.projections[lists.projection]
+                dense, taken = choose_dense(lists, projection, base, chunk.size, lean=lean, target=self.target)
+                words += int(taken.sum())
+                index = index_bits(base + chunk.size - 1, self.target)
+                formats |= {(projection.bits, projection.exponent, 0 if flag else index) for flag in np.unique(dense)}
+            self._stored[key] = words, frozenset(formats)
+        return self._stored[key]
 
     def uses(self, chunks: tuple[Chunk, ...], *, lean: bool = False) -> dict[str, int]:
         """Use of each limit by a core that holds these chunks in this order."""
         base = words = 0
         thresholds: set[int] = set()
         decays: set[tuple[int, int]] = set()
-        formats: set[int] = set()
+        formats: set[SynapseFormat] = set()
         for chunk in chunks:
-            words += self.words(chunk, base, lean=lean)
+            more, used = self.stored(chunk, base, lean=lean)
+            words += more
+            formats |= used
             base += chunk.size
             population = self.network.populations[chunk.population]
             thresholds |= set(np.unique(population.threshold[chunk.first : chunk.last]).tolist())
             decays.add((population.decay_u, population.decay_v))
-            formats |= {lists.projection for lists in self.lists(chunk)}
         return {
             "core.compartments": base,
             "core.axons_in": sum(len(lists.source) for chunk in chunks for lists in self.lists(chunk)),
             "core.axons_out": int(sum(self.out_axons[c.population][c.first : c.last].sum() for c in chunks)),
             "core.synapse_words": words,
             "core.threshold_slots": len(thresholds),
-            # a projection may use its dense and its sparse format on a core
-            "core.synapse_formats": 2 * len(formats),
+            "core.synapse_formats": len(formats),
             "core.compartment_configs": len(decays),
         }
 
-    def excess(self, chunks: tuple[Chunk, ...]) -> list[LimitUse]:
-        uses = self.uses(chunks)
+    def excess(self, chunks: tuple[Chunk, ...], *, lean: bool = False) -> list[LimitUse]:
+        uses = self.uses(chunks, lean=lean)
         return [
             LimitUse(name=rule, used=used, allowed=self.target.limit(rule), core=None)
             for rule, used in uses.items()
@@ -210,7 +210,11 @@ class _Costs:
 
 
 def _largest(low: int, high: int, fits: Callable[[int], bool]) -> int:
-    """Largest value in ``low … high`` that fits, given that `low` does and that fitting is monotone."""
+    """Largest value in ``low … high`` that fits, given that `low` does and that fitting is monotone.
+
+    For chunks it is, in every limit but the synapse formats (all lists of the larger chunk may be dense); there a
+    smaller chunk than the largest may come out, which fits as well.
+    """
     while low < high:
         middle = (low + high + 1) // 2
         low, high = (middle, high) if fits(middle) else (low, middle - 1)
@@ -220,14 +224,12 @@ def _largest(low: int, high: int, fits: Callable[[int], bool]) -> int:
 def _cut(costs: _Costs, population: int) -> tuple[list[Chunk], list[Violation]]:
     """Cut one population greedily into chunks that fit an empty core; or say why one neuron does not."""
     size = costs.network.populations[population].size
-    name = costs.network.populations[population].name
     chunks: list[Chunk] = []
     first = 0
     while first < size:
         one = Chunk(population=population, first=first, last=first + 1)
-        if excess := costs.excess((one,)):
-            owner = f"{name} neuron {first}"
-            return [], [violation(use, owner, costs.target) for use in excess]
+        if costs.excess((one,)):
+            return [], _worst(costs, population)
 
         def fits(last: int, first: int = first) -> bool:
             return not costs.excess((Chunk(population=population, first=first, last=last),))
@@ -236,6 +238,17 @@ def _cut(costs: _Costs, population: int) -> tuple[list[Chunk], list[Violation]]:
         chunks.append(Chunk(population=population, first=first, last=_largest(first + 1, most, fits)))
         first = chunks[-1].last
     return chunks, []
+
+
+def _worst(costs: _Costs, population: int) -> list[Violation]:
+    """For each limit that single neurons of a population break: the one that breaks it most."""
+    found: dict[str, tuple[LimitUse, int]] = {}
+    for neuron in range(costs.network.populations[population].size):
+        for use in costs.excess((Chunk(population=population, first=neuron, last=neuron + 1),)):
+            if use.name not in found or use.used > found[use.name][0].used:
+                found[use.name] = use, neuron
+    name = costs.network.populations[population].name
+    return [violation(use, f"{name} neuron {neuron}", costs.target) for use, neuron in found.values()]
 
 
 def _order_on_core(costs: _Costs, chunks: tuple[Chunk, ...]) -> tuple[Chunk, ...]:
@@ -274,7 +287,7 @@ def _pack(costs: _Costs, chunks: list[Chunk], traffic: Callable[[Chunk, Chunk], 
 
     if len(chunks) > EXACT_CHUNKS:
         cores: list[tuple[Chunk, ...]] = []
-        for chunk in sorted(chunks, key=lambda c: (-costs.words(c, 0), c)):
+        for chunk in sorted(chunks, key=lambda c: (-costs.stored(c, 0)[0], c)):
             for i, core in enumerate(cores):
                 if fits((*core, chunk)):
                     cores[i] = (*core, chunk)
@@ -320,7 +333,8 @@ def partition(network: IntegerNetwork, target: Target, rates: tuple[FloatArray, 
     Returns
     -------
     Partition
-        Fewest cores that the cut into full chunks allows, searched exhaustively up to ``EXACT_CHUNKS`` chunks.
+        Fewest cores that the cut into full chunks allows if the densest chunk of a core comes first, searched
+        exhaustively up to ``EXACT_CHUNKS`` chunks.
 
     Raises
     ------
@@ -332,12 +346,12 @@ def partition(network: IntegerNetwork, target: Target, rates: tuple[FloatArray, 
     violations: list[Violation] = []
     for population in reversed(range(len(network.populations))):
         cut, why = _cut(costs, population)
-        violations += why
+        violations = why + violations
         chunks += cut
         for chunk in cut:
             costs.listen(chunk)
     if violations:
-        raise CapacityError(tuple(reversed(violations)))
+        raise CapacityError(tuple(violations))
 
     def traffic(source: Chunk, listener: Chunk) -> float:
         total = 0.0
@@ -358,5 +372,4 @@ def partition(network: IntegerNetwork, target: Target, rates: tuple[FloatArray, 
 
 def lean_fits(network: IntegerNetwork, target: Target, chunks: tuple[Chunk, ...]) -> bool:
     """Whether a core still holds its chunks when lists prefer few visited synapses to few words."""
-    words = _Costs(network, target).uses(chunks, lean=True)["core.synapse_words"]
-    return words <= target.limit("core.synapse_words")
+    return not _Costs(network, target).excess(chunks, lean=True)

@@ -37,6 +37,9 @@ WORTHWHILE = 0.95
 """The largest exponent that leaves this share of the finest weight scale is taken: each step up lets threshold and
 bias round twice as finely (a proof at exponent 0 costs fc1 of the released networks two percent of scale)."""
 
+SCALE_STEPS = 1024
+"""A scale that the accumulator limits is the finest to one part in this many."""
+
 SHORTLIST, SHORTLIST_RATIO = 3, 1.25
 """Scales of a layer that are compared within the whole network, and by how much they may exceed the fewest flips."""
 
@@ -185,22 +188,40 @@ def _fit(
     """Layer with the finest scale up to `mantissa_scale` that stays within the accumulator, and its one-sided sum.
 
     A threshold is a whole number of weight units. Only scales at which it is one exactly are tried, so it carries
-    no rounding at all; that costs at most one unit of scale in ``theta * scale``.
+    no rounding at all; that costs at most one unit of scale in ``theta * scale``. Rounded weights, and so their sum,
+    never shrink when the scale grows: the finest scale (to one part in ``SCALE_STEPS``) is closed in from both sides.
     """
+
+    def tried(units: int) -> tuple[_Layer | None, float]:
+        layer = _round_layer(population, projections, units / (population.theta * 2.0**exponent), exponent, bits)
+        if layer is None:
+            return None, np.inf  # a bias that rounds just out of its register
+        return layer, _proven_sum(layer) if observed is None else observed * layer.population.scale
+
     bias_limit = BIAS_MANTISSA_MAX << BIAS_EXPONENT_MAX
     bias_peak = float(np.abs(population.bias).max(initial=0)) * (1 << MEMBRANE_SHIFT)
     biggest = min(THRESHOLD_MANTISSA_MAX, bias_limit * population.theta / bias_peak if bias_peak else np.inf)
-    units = int(min(population.theta * mantissa_scale * 2.0**exponent, biggest))
-    while units >= 1:
-        layer = _round_layer(population, projections, units / (population.theta * 2.0**exponent), exponent, bits)
-        if layer is not None:
-            reached = _proven_sum(layer) if observed is None else observed * layer.population.scale
-            if reached <= ONE_STEP_SUM_MAX:
-                return layer, reached
-            units = min(units - 1, int(units * ONE_STEP_SUM_MAX / reached))
+    high = int(min(population.theta * mantissa_scale * 2.0**exponent, biggest))
+    if high < 1:
+        return None
+    layer, reached = tried(high)
+    if reached <= ONE_STEP_SUM_MAX and layer is not None:
+        return layer, reached
+    low, best, over = 0, None, reached
+    narrowed = True
+    while high - low > max(1, low // SCALE_STEPS):
+        # in proportion as long as that narrows well, else in the middle: sums of few coarse weights grow in leaps
+        under = best[1] if best is not None else 0.0
+        share = (ONE_STEP_SUM_MAX - under) / (over - under) if narrowed and np.isfinite(over) else 0.5
+        units = min(max(low + int(share * (high - low)), low + 1), high - 1)
+        before = high - low
+        layer, reached = tried(units)
+        if layer is not None and reached <= ONE_STEP_SUM_MAX:
+            low, best = units, (layer, reached)
         else:
-            units -= 1  # a bias that rounds just out of its register
-    return None
+            high, over = units, reached
+        narrowed = not narrowed or 2 * (high - low) <= before
+    return best
 
 
 def _candidate(
@@ -244,7 +265,8 @@ def _shortlist(
     full = (256 - weight_step(bits)) / peak if peak else 1.0 / population.theta
     factors = CLIPPING if calibration is not None else (1.0,)
     fitted = [_candidate(population, projections, bits, full * f, exponents, observed) for f in factors]
-    found = list({c[0].population.scale: c for c in fitted if c is not None}.values())
+    # one scale at two exponents is two candidates: mantissas and clipping differ
+    found = list({(_mantissa_scale(c[0]), c[0].population.scale): c for c in fitted if c is not None}.values())
     if not found:
         raise ModelError(
             f"{population.name}: no scale at {bits} bits keeps its threshold of at least one unit within the "

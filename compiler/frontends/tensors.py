@@ -1,0 +1,76 @@
+"""What the tensors of a TactileSGNet must be: names, shapes, finite values. Every fault is found, not the first."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+Arrays = dict[str, npt.NDArray[Any]]
+
+Shape = tuple[int | str, ...]
+"""A wanted shape; a word stands for any size from 1."""
+
+
+def faults_of(arrays: Mapping[str, npt.NDArray[Any]], wanted: Mapping[str, Shape]) -> list[str]:
+    """Missing, mis-shaped and unknown tensors, and values that are not finite, in that order per tensor.
+
+    Examples
+    --------
+    >>> faults_of({"a": np.ones((2, 3)), "c": np.ones(1)}, {"a": (2, 4), "b": (2,)})
+    ['a is (2, 3), wanted (2, 4)', 'b is missing', 'c is not part of a TactileSGNet']
+    >>> faults_of({"a": np.array([1.0, np.nan])}, {"a": ("features",)})
+    ['a has 1 of 2 values NaN or infinite']
+    """
+    faults = []
+    for name, shape in wanted.items():
+        array = arrays.get(name)
+        if array is None:
+            faults.append(f"{name} is missing")
+        elif not _fits(array.shape, shape):
+            faults.append(f"{name} is {array.shape}, wanted {_shown(shape)}")
+        elif bad := int(np.count_nonzero(~np.isfinite(array))):
+            faults.append(f"{name} has {bad} of {array.size} values NaN or infinite")
+    return faults + [f"{printable(name)} is not part of a TactileSGNet" for name in arrays if name not in wanted]
+
+
+def wanted_dense(arrays: Mapping[str, npt.NDArray[Any]], stages: int) -> dict[str, Shape]:
+    """Shapes of ``fc1`` … as their weights announce them: each takes what the one before gives."""
+    wanted: dict[str, Shape] = {}
+    inputs: int | str = "taxels * features"
+    for stage in range(1, stages + 1):
+        outputs = size(arrays, f"fc{stage}.weight", 2, 0, "outputs")
+        wanted[f"fc{stage}.weight"] = (outputs, inputs)
+        wanted[f"fc{stage}.bias"] = (outputs,)
+        inputs = outputs
+    return wanted
+
+
+def taxel_faults(arrays: Mapping[str, npt.NDArray[Any]], features: int) -> list[str]:
+    """Whether the first dense stage was made for a whole number of taxels."""
+    inputs = arrays["fc1.weight"].shape[1]
+    if inputs % features:
+        return [f"fc1.weight has {inputs} inputs, not a whole number of taxels with {features} features each"]
+    return []
+
+
+def size(arrays: Mapping[str, npt.NDArray[Any]], name: str, dimensions: int, axis: int, word: str) -> int | str:
+    """Length of one axis of a tensor, or `word` where the tensor cannot say."""
+    array = arrays.get(name)
+    return array.shape[axis] if array is not None and array.ndim == dimensions and array.size else word
+
+
+def printable(name: str) -> str:
+    """Name as a message can show it: quoted and escaped where it holds more than letters."""
+    return name if name.isprintable() and len(name) < 100 else repr(name[:100])
+
+
+def _fits(found: tuple[int, ...], wanted: Shape) -> bool:
+    pairs = zip(found, wanted, strict=False)
+    return len(found) == len(wanted) and all(a == b if isinstance(b, int) else a >= 1 for a, b in pairs)
+
+
+def _shown(shape: Shape) -> str:
+    return f"({', '.join(str(length) for length in shape)}{',' if len(shape) == 1 else ''})"

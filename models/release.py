@@ -1,0 +1,79 @@
+"""Write recordings in the released layout: ``SPLIT/sample_N_label_L.npy``, float32 (taxels, 2, steps)."""
+
+from __future__ import annotations
+
+import io
+import os
+import shutil
+import tempfile
+import zipfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from compiler.atomic import write_atomically
+from compiler.errors import OptionError
+from models.events import need_labels
+from models.evtouch import Recordings
+
+_EPOCH = (1980, 1, 1, 0, 0, 0)  # equal recordings give equal zips
+
+
+def write_released(path: str | os.PathLike[str], splits: Sequence[Recordings]) -> None:
+    """Write splits into a new folder, or a zip if the name ends so; all of it or nothing.
+
+    Parameters
+    ----------
+    path : path
+        A zip that exists is replaced, a folder must not exist.
+    splits : sequence of Recordings
+        Each goes into the folder named by its split. Numbers have leading zeros, so that the plain order of the
+        files is the order of the recordings.
+
+    Raises
+    ------
+    OptionError
+        If the folder exists, or there is none to put it in.
+    DataError
+        If a recording has no label.
+    OSError
+        If it cannot be written.
+    """
+    path = Path(path)
+    for recordings in splits:
+        need_labels(recordings, "the released layout")
+    if not path.absolute().parent.is_dir():
+        raise OptionError(f"-o {path}: the folder around it does not exist; make it first")
+    if path.suffix.lower() == ".zip":
+        with write_atomically(path) as target, zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as archive:
+            for name, content in _members(splits):
+                info = zipfile.ZipInfo(name, _EPOCH)
+                info.compress_type = zipfile.ZIP_DEFLATED
+                info.external_attr = 0o644 << 16
+                archive.writestr(info, content)
+        return
+    if path.exists():
+        raise OptionError(f"-o {path}: exists already; choose another name or remove it")
+    beside = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".part", dir=path.absolute().parent))
+    try:
+        for name, content in _members(splits):
+            (beside / name).parent.mkdir(exist_ok=True)
+            (beside / name).write_bytes(content)
+        mask = os.umask(0)  # mkdtemp makes private folders
+        os.umask(mask)
+        beside.chmod(0o777 & ~mask)
+        beside.rename(path)
+    except BaseException:
+        shutil.rmtree(beside, ignore_errors=True)
+        raise
+
+
+def _members(splits: Sequence[Recordings]) -> Iterator[tuple[str, bytes]]:
+    """Name and content of every file."""
+    for recordings in splits:
+        width = len(str(len(recordings) - 1))
+        for index, (events, label) in enumerate(zip(recordings.events, recordings.labels.tolist(), strict=True)):
+            buffer = io.BytesIO()
+            np.lib.format.write_array(buffer, events.astype(np.float32), version=(1, 0), allow_pickle=False)
+            yield f"{recordings.split}/sample_{index:0{width}}_label_{label}.npy", buffer.getvalue()

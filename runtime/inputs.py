@@ -1,0 +1,102 @@
+"""What a user names on the command line: checkpoints, graphs, recordings, and places to write; checked here."""
+
+from __future__ import annotations
+
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+
+from compiler.errors import DataError, ModelError, OptionError
+from compiler.fixedpoint import FloatArray
+from compiler.frontends.checkpoint import Checkpoint
+from models.evtouch import Recordings, load_recordings
+from models.graphs import CHOICES, build_graph, normalised_adjacency
+from models.grasps import synthetic_split
+
+PRETRAINED = "pretrained:"
+SYNTHETIC = "synthetic"
+
+
+def shipped(path: str) -> str:
+    """Resolve ``pretrained:NAME`` to the file that the package ships.
+
+    Raises
+    ------
+    OptionError
+        If there is no such checkpoint.
+    """
+    if not path.startswith(PRETRAINED):
+        return path
+    folder = Path(str(resources.files("models") / "pretrained"))
+    known = {file.stem: file for file in sorted(folder.glob("*.pt"))}
+    name = path.removeprefix(PRETRAINED)
+    if name not in known:
+        raise OptionError(f"{path}: no such shipped checkpoint; allowed: {', '.join(PRETRAINED + n for n in known)}")
+    return str(known[name])
+
+
+def recordings(
+    path: str, split: str, *, limit: int | None = None, classes: int | None, taxels: int | None
+) -> Recordings:
+    """Read recordings, or make the package's own synthetic ones; hold both against the network.
+
+    Raises
+    ------
+    DataError, OptionError
+        If they cannot be used, or do not suit the network.
+    """
+    if path != SYNTHETIC:
+        return load_recordings(path, split, limit=limit, classes=classes, taxels=taxels)
+    grasps = synthetic_split(split, limit=limit)
+    if taxels is not None and grasps.taxels != taxels:
+        raise DataError(
+            f"{SYNTHETIC}: has {grasps.taxels} taxels, the network has {taxels}; use recordings of its sensor"
+        )
+    if classes is not None and grasps.labels.max() >= classes:
+        raise DataError(
+            f"{SYNTHETIC}: label {grasps.labels.max()}, the network has {classes} classes (0..{classes - 1}); "
+            "use the network that was trained on these objects"
+        )
+    return grasps
+
+
+def propagation(checkpoint: Checkpoint, graph: str | None, where: str) -> tuple[str, FloatArray]:
+    """Name and propagation matrix of the graph that was asked for, or of the one in the checkpoint.
+
+    Raises
+    ------
+    OptionError
+        If there is no such graph.
+    ModelError
+        If no graph is known, or another one than the checkpoint was trained on is asked for.
+    """
+    if graph is None:
+        if checkpoint.edges is None:
+            raise ModelError(f"{where}: the graph is not in this file; name it with --graph: {CHOICES}")
+        return str(checkpoint.graph), normalised_adjacency(checkpoint.edges, checkpoint.taxels)
+    built = build_graph(graph)
+    adjacency = normalised_adjacency(built.edges, built.n_taxels)
+    if checkpoint.edges is not None:
+        trained = normalised_adjacency(checkpoint.edges, checkpoint.taxels)
+        if not np.array_equal(trained, adjacency):
+            raise ModelError(
+                f"{where}: graph and weights disagree: it was trained on {checkpoint.graph}, --graph says "
+                f"{built.name}; leave --graph away"
+            )
+    return built.name, adjacency
+
+
+def require_place(path: str, option: str) -> None:
+    """Refuse, before any work is done, a place where a result could not be written.
+
+    Raises
+    ------
+    OptionError
+        If the folder does not exist, or the path is a folder or a device.
+    """
+    place = Path(path)
+    if not place.absolute().parent.is_dir():
+        raise OptionError(f"{option} {path}: the folder does not exist; make it first")
+    if place.exists() and not place.is_file():
+        raise OptionError(f"{option} {path}: is not a regular file; give the name of a file to write")

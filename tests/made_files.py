@@ -1,0 +1,90 @@
+"""Small checkpoints and recordings on disk, for the tests that go through files and the command line."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from compiler.frontends.checkpoint import Checkpoint, read_checkpoint
+from models.checkpoint import save_checkpoint
+from models.graphs import Graph, normalised_adjacency
+
+TAXELS, FEATURES, CLASSES, STEPS = 6, 5, 4, 24
+
+
+def ring(taxels: int = TAXELS) -> Graph:
+    """Each taxel hears its two neighbours."""
+    pairs = [(i, (i + 1) % taxels) for i in range(taxels)]
+    return Graph(
+        name="ring",
+        coordinates=np.arange(taxels, dtype=float)[:, None],
+        edges=np.array(pairs + [(b, a) for a, b in pairs]),
+    )
+
+
+def weights(
+    seed: int = 0, *, taxels: int = TAXELS, features: int = FEATURES, hops: int = 4, sizes=(9, 8, CLASSES), gain=1.6
+) -> dict[str, np.ndarray]:
+    """Random float32 weights of a TactileSGNet under the names of our own format; lively at the default gain."""
+    rng = np.random.default_rng(seed)
+
+    def draw(*shape, spread):
+        return rng.normal(0, spread, shape).astype(np.float32)
+
+    found = {"conv1.hops": draw(hops, features, 2, spread=0.5 * gain), "conv1.bias": draw(features, spread=0.1)}
+    widths = (taxels * features, *sizes)
+    for i, (before, size) in enumerate(zip(widths[:-1], sizes, strict=True), 1):
+        found[f"fc{i}.weight"] = draw(size, before, spread=gain * before**-0.5)
+        found[f"fc{i}.bias"] = draw(size, spread=0.1)
+    return found
+
+
+def state_dict(arrays: dict[str, np.ndarray], *, old: bool = False) -> dict[str, torch.Tensor]:
+    """The same weights with the keys of current torch_geometric, or of old releases."""
+    named = {name: array for name, array in arrays.items() if not name.startswith("conv1")}
+    hops, bias = arrays["conv1.hops"], arrays["conv1.bias"]
+    if old:
+        conv = {"conv1.lin.weight": np.concatenate(list(hops), axis=1), "conv1.lin.bias": bias}
+    else:
+        conv = {"conv1.bias": bias} | {f"conv1.lins.{k}.weight": hop for k, hop in enumerate(hops)}
+    return {name: torch.tensor(array) for name, array in (conv | named).items()}
+
+
+def released(*states: dict[str, torch.Tensor]) -> dict:
+    """What the released training script saves."""
+    return {
+        "net_list": list(states),
+        "num_epochs": 100,
+        "best_acc": torch.tensor([90.2777 - run for run in range(len(states))]),
+    }
+
+
+def own_file(
+    path: Path, *, last=None, best=None, graph: Graph | None = None, beta=0.2, theta=0.5, training=None
+) -> Path:
+    """Write a checkpoint in our own format."""
+    sets = {"last": last or weights()} | ({} if best is None else {"best": best})
+    save_checkpoint(path, sets, graph or ring(), beta=beta, theta=theta, training=training or {"seed": 0})
+    return path
+
+
+def small_checkpoint(folder: Path, **options) -> tuple[Checkpoint, np.ndarray]:
+    """A checkpoint read back from a file, and the propagation matrix of its graph."""
+    checkpoint = read_checkpoint(own_file(folder / "small.pt", **options))
+    return checkpoint, normalised_adjacency(checkpoint.edges, checkpoint.taxels)
+
+
+def events(
+    seed: int = 0, *, samples: int = 6, taxels: int = TAXELS, steps: int = STEPS, rate: float = 0.2
+) -> np.ndarray:
+    """Random recordings, (samples, taxels, 2, steps) uint8."""
+    return (np.random.default_rng(seed).random((samples, taxels, 2, steps)) < rate).astype(np.uint8)
+
+
+def recordings_folder(folder: Path, *, train: np.ndarray | None = None, test: np.ndarray | None = None) -> Path:
+    """Write recordings in the released layout, labels in turn."""
+    for split, made in (("train", train if train is not None else events(1)), ("test", test)):
+        (folder / split).mkdir(parents=True)
+        for i, recording in enumerate(made if made is not None else events(2)):
+            np.save(folder / split / f"sample_{i}_label_{i % CLASSES}.npy", recording.astype(np.float32))
+    return folder

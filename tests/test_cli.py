@@ -1,0 +1,509 @@
+"""The command line: what each command prints, where, under which keys, and with which exit code."""
+
+import hashlib
+import io
+import json
+import os
+import shutil
+import sys
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from made_files import CLASSES, FEATURES, STEPS, TAXELS, events, own_file, recordings_folder, released, state_dict
+from made_files import weights as made_weights
+
+from compiler.errors import ModelError
+from compiler.interpret import channels_last, run_integer
+from compiler.lift import lift
+from compiler.pipeline import STAGES
+from compiler.serialize import read_netlist
+from compiler.targets import load_target
+from compiler.text import text
+from models.graphs import build_graph
+from runtime import cli
+from runtime.inputs import recordings
+
+SIZES = {"conv1": TAXELS * FEATURES, "fc1": 9, "fc2": 8, "fc3": CLASSES}
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """A folder with recordings, a checkpoint and the netlist that was compiled from it."""
+    folder = tmp_path_factory.mktemp("cli")
+    recordings_folder(folder / "data")
+    own_file(folder / "net.pt")
+    words = ["compile", folder / "net.pt", "--calibrate", folder / "data", "-o", folder / "net.loom", "--json"]
+    assert cli.main([str(word) for word in words]) == 0
+    return folder
+
+
+@pytest.fixture
+def spikeloom(capsys, place, monkeypatch):
+    """Run a command in that folder; returns exit code, standard output and standard error."""
+    monkeypatch.chdir(place)
+
+    def command(*words):
+        capsys.readouterr()
+        code = cli.main([str(word) for word in words])
+        return code, *capsys.readouterr()
+
+    return command
+
+
+@pytest.fixture
+def as_json(spikeloom):
+    """Run a command that must succeed with ``--json``; returns the object."""
+
+    def command(*words):
+        code, out, err = spikeloom(*words, "--json")
+        assert (code, err) == (0, "")
+        assert out.count("\n") == 1
+        return json.loads(out)
+
+    return command
+
+
+# -- compile and inspect -----------------------------------------------------------------------------------------------
+
+
+def test_compile_prints_the_promised_keys(as_json, tmp_path, place):
+    report = as_json("compile", "net.pt", "--calibrate", "data", "-o", tmp_path / "out.loom")
+    promised = {"target", "neurons", "synapses", "synapses_stored", "synapses_nonzero", "cores", "layers", "limits"}
+    assert promised | {"sha256"} <= set(report)
+    content = (tmp_path / "out.loom").read_bytes()
+    assert content == (place / "net.loom").read_bytes()
+    assert report["sha256"] == hashlib.sha256(content).hexdigest()
+    assert report["target"] == "loihi1"
+    assert report["neurons"] == sum(SIZES.values())
+    # ring of six taxels with K = 3: every taxel reaches every other
+    fan_in = {"conv1": 2 * TAXELS, "fc1": SIZES["conv1"], "fc2": 9, "fc3": 8}
+    structural = {name: SIZES[name] * fan_in[name] for name in SIZES}
+    assert report["synapses"] == sum(structural.values())
+    keys = ["name", "neurons", "synapses", "max_fan_in", "weight_bits", "scale", "threshold", "cores"]
+    assert [[layer[key] for key in keys[:5]] for layer in report["layers"]] == [
+        [name, SIZES[name], structural[name], fan_in[name], 8] for name in SIZES
+    ]
+    assert all(set(keys) <= set(layer) for layer in report["layers"])
+    assert all(layer["cores"] == [0] for layer in report["layers"])
+    assert report["synapses"] >= report["synapses_stored"] >= report["synapses_nonzero"] > 0
+    assert all(set(limit) == {"name", "used", "allowed", "core"} for limit in report["limits"])
+    assert {limit["name"] for limit in report["limits"]} <= set(load_target("loihi1").limits)
+    assert [limit for limit in report["limits"] if limit["name"] == "chip.cores"] == [
+        {"name": "chip.cores", "used": report["cores"], "allowed": 128, "core": None}
+    ]
+
+
+def test_compile_states_what_was_realised(as_json, tmp_path):
+    for layer in as_json("compile", "net.pt", "-o", tmp_path / "out.loom")["layers"]:
+        assert (layer["beta"], layer["beta_realised"]) == (0.2, 819 / 4096)
+        assert layer["theta"] == 0.5
+        assert layer["theta_realised"] == layer["threshold"] / layer["scale"]
+        assert layer["exponents"][0] >= -1
+
+
+def test_compile_for_people_says_where_scales_come_from(spikeloom, tmp_path):
+    code, out, err = spikeloom("compile", "net.pt", "-o", tmp_path / "out.loom")
+    assert (code, err) == (0, "")
+    assert "scales taken from the weights and the proven bounds; --calibrate chooses them on training data" in out
+    assert "proof: no register overflows for any input" in out
+    _, out, _ = spikeloom("compile", "net.pt", "--calibrate", "data", "-o", tmp_path / "out.loom")
+    assert "scales chosen on training recordings" in out
+    assert f"loihi1: {sum(SIZES.values())} neurons, " in out
+    for name in ("core.axons_in", "core.synapse_words", "chip.cores"):
+        assert name in out
+
+
+def test_observed_ranges_are_said_to_be_unproven(spikeloom, tmp_path):
+    words = ["compile", "net.pt", "--calibrate", "data", "--ranges", "observed", "--margin", "0"]
+    report = json.loads(spikeloom(*words, "-o", tmp_path / "a.loom", "--json")[1])
+    assert (report["provenance"]["ranges"], report["provenance"]["margin"]) == ("observed", 0)
+    _, out, _ = spikeloom(*words, "-o", tmp_path / "b.loom")
+    unproven = [proof["layer"] for proof in report["proofs"] if not proof["holds"]]
+    said = f"no proof of range for {', '.join(unproven)}: the simulator stops at the first overflow"
+    assert (said in out) == bool(unproven)
+    assert ("proof: no register overflows for any input" in out) == (not unproven)
+
+
+@pytest.mark.parametrize("bits", [2, 3, 4, 5, 6, 8])
+def test_every_storage_width(as_json, tmp_path, bits):
+    report = as_json("compile", "net.pt", "--weight-bits", bits, "-o", tmp_path / "out.loom")
+    assert {layer["weight_bits"] for layer in report["layers"]} == {bits}
+    weight = read_netlist(tmp_path / "out.loom").synapse_weight
+    assert not np.any(weight % 2 ** (9 - bits))
+
+
+def test_provenance_names_everything_that_decided(as_json, place):
+    report = as_json("inspect", "net.loom")
+    assert report["provenance"] == {
+        "spikeloom": cli.version(),
+        "checkpoint_sha256": hashlib.sha256((place / "net.pt").read_bytes()).hexdigest(),
+        "run": 0,
+        "weights": "last",
+        "graph": "ring",
+        "weight_bits": 8,
+        "ranges": "proven",
+        "margin": 0.1,
+        "calibrated": True,
+    }
+
+
+def test_inspect_shows_a_netlist_as_compile_did(as_json, spikeloom, tmp_path):
+    compiled = as_json("compile", "net.pt", "-o", tmp_path / "out.loom")
+    inspected = as_json("inspect", tmp_path / "out.loom")
+    assert inspected == {key: compiled[key] for key in inspected}
+    _, compiled_text, _ = spikeloom("compile", "net.pt", "-o", tmp_path / "out.loom")
+    code, inspected_text, err = spikeloom("inspect", tmp_path / "out.loom")
+    assert (code, err) == (0, "")
+    assert compiled_text.startswith(inspected_text.rstrip("\n"))
+
+
+def test_inspect_knows_a_netlist_by_its_content(as_json, tmp_path, place):
+    shutil.copy(place / "net.loom", tmp_path / "renamed")
+    assert as_json("inspect", tmp_path / "renamed") == as_json("inspect", "net.loom")
+
+
+def test_inspect_shows_what_a_released_file_leaves_open(as_json, spikeloom, tmp_path):
+    torch = pytest.importorskip("torch")
+    torch.save(released(state_dict(made_weights())), tmp_path / "net.t7")
+    report = as_json("inspect", tmp_path / "net.t7", "--theta", "0.25")
+    assert (report["beta"], report["theta"], report["assumed"]) == (0.2, 0.25, ["beta"])
+    assert (report["taxels"], report["classes"], report["hops"]) == (TAXELS, CLASSES, 3)
+    assert {layer["name"]: layer["neurons"] for layer in report["layers"]} == SIZES
+    assert (report["layout"], report["graph"]) == ("released", None)
+    assert report["sha256"] == hashlib.sha256((tmp_path / "net.t7").read_bytes()).hexdigest()
+    _, out, _ = spikeloom("inspect", tmp_path / "net.t7", "--theta", "0.25")
+    assert "  graph: not in the file; name it with --graph\n" in out
+    assert "  beta: 0.2 (assumed; override with --beta)\n" in out
+    assert "  theta: 0.25 (given)\n" in out
+
+
+def test_inspect_shows_an_own_file(as_json, spikeloom):
+    report = as_json("inspect", "net.pt")
+    assert (report["layout"], report["graph"], report["assumed"]) == ("spikeloom", "ring", [])
+    assert report["training"] == {"seed": 0}
+    _, out, _ = spikeloom("inspect", "net.pt")
+    assert "  graph: ring\n  beta: 0.2 (read from the file)\n  theta: 0.5 (read from the file)\n  seed: 0\n" in out
+
+
+def test_dumps_go_to_standard_error(spikeloom, tmp_path):
+    words = [word for stage in STAGES for word in ("--dump-after", stage)]
+    code, out, err = spikeloom("compile", "net.pt", *words, "-o", tmp_path / "out.loom", "--json")
+    assert code == 0
+    json.loads(out)
+    netlist = text(read_netlist(tmp_path / "out.loom"))
+    assert err.endswith(netlist)
+    assert err.startswith("(float network (input 6 taxels x 2) (classes 4)\n")
+    assert "(integer network (input 6 taxels x 2) (classes 4)\n" in err
+    _, _, err = spikeloom("compile", "net.pt", "--dump-after", "place", "-o", tmp_path / "out.loom")
+    assert err == netlist
+
+
+def test_the_graph_of_a_released_file_comes_from_the_user(as_json, tmp_path):
+    torch = pytest.importorskip("torch")
+    torch.save(state_dict(made_weights(taxels=39, sizes=(6, 5, 4))), tmp_path / "net.pt")
+    structural = {}
+    for name in ("manual", "knn:2", "released:mst:2.0"):
+        report = as_json("compile", tmp_path / "net.pt", "--graph", name, "-o", tmp_path / "out.loom")
+        graph = build_graph(name)
+        assert report["provenance"]["graph"] == graph.name
+        hops = np.eye(39, dtype=int)
+        step = np.eye(39, dtype=int)
+        step[graph.edges[:, 1], graph.edges[:, 0]] = 1
+        for _ in range(3):
+            hops = step @ hops  # eye plus one step, three times: all paths of up to three
+        structural[name] = 2 * FEATURES * int(np.count_nonzero(hops))
+        assert report["layers"][0]["synapses"] == structural[name]
+    assert len(set(structural.values())) == 3
+
+
+def test_a_graph_that_agrees_with_the_checkpoint_may_be_named(as_json, tmp_path):
+    own_file(tmp_path / "net.pt", last=made_weights(taxels=39, sizes=(4, 4, 4)), graph=build_graph("manual"))
+    named = as_json("compile", tmp_path / "net.pt", "--graph", "manual", "-o", tmp_path / "a.loom")
+    assert named["sha256"] == as_json("compile", tmp_path / "net.pt", "-o", tmp_path / "b.loom")["sha256"]
+
+
+def test_last_and_best_weights(as_json, tmp_path):
+    own_file(tmp_path / "both.pt", last=made_weights(1), best=made_weights(2))
+    own_file(tmp_path / "second.pt", last=made_weights(2))
+    found = {
+        name: as_json("compile", tmp_path / f"{file}.pt", *words, "-o", tmp_path / f"{name}.loom")
+        for name, file, words in (
+            ("last", "both", []),
+            ("best", "both", ["--weights", "best"]),
+            ("second", "second", []),
+        )
+    }
+    scales = {name: [layer["scale"] for layer in report["layers"]] for name, report in found.items()}
+    assert scales["best"] == scales["second"] != scales["last"]
+    assert found["best"]["provenance"]["weights"] == "best"
+
+
+# -- run ---------------------------------------------------------------------------------------------------------------
+
+
+def test_run_prints_the_promised_keys(as_json):
+    report = as_json("run", "net.loom", "--data", "data")
+    assert set(report) == {"samples", "accuracy", "files", "labels", "predictions", "counts"}
+    assert report["samples"] == 6
+    assert report["files"] == [f"sample_{i}_label_{i % CLASSES}.npy" for i in range(6)]
+    assert report["labels"] == [i % CLASSES for i in range(6)]
+    assert np.shape(report["counts"]) == (6, CLASSES)
+    assert report["predictions"] == [counts.index(max(counts)) for counts in report["counts"]]
+    right = [a == b for a, b in zip(report["labels"], report["predictions"], strict=True)]
+    assert report["accuracy"] == sum(right) / 6
+
+
+def test_run_for_people_lists_wrong_decisions(spikeloom, as_json):
+    report = as_json("run", "net.loom", "--data", "data")
+    code, out, err = spikeloom("run", "net.loom", "--data", "data")
+    assert (code, err) == (0, "")
+    right = round(6 * report["accuracy"])
+    assert 0 < right < 6
+    assert out.startswith(f"chip accuracy: {100 * right / 6:.2f} % ({right} of 6; 95 % interval ")
+    for file, label, found in zip(report["files"], report["labels"], report["predictions"], strict=True):
+        assert (file in out) == (label != found)
+
+
+def test_limit_takes_the_first_recordings(as_json):
+    everything = as_json("run", "net.loom", "--data", "data")
+    two = as_json("run", "net.loom", "--data", "data", "--limit", 2)
+    assert two["samples"] == 2
+    for key in ("files", "labels", "predictions", "counts"):
+        assert two[key] == everything[key][:2]
+    assert as_json("run", "net.loom", "--data", "data", "--limit", 100) == everything
+
+
+def test_split_chooses_the_recordings(as_json):
+    assert as_json("run", "net.loom", "--data", "data", "--split", "test") == as_json(
+        "run", "net.loom", "--data", "data"
+    )
+    train = as_json("run", "net.loom", "--data", "data", "--split", "train")
+    assert train["files"] == as_json("run", "net.loom", "--data", "data")["files"]
+    assert train["counts"] != as_json("run", "net.loom", "--data", "data")["counts"]
+
+
+def test_a_zip_is_read_like_a_folder(as_json, tmp_path, place):
+    with zipfile.ZipFile(tmp_path / "data.zip", "w", zipfile.ZIP_DEFLATED) as archive:
+        for file in sorted((place / "data").rglob("*.npy")):
+            archive.write(file, f"Set/{file.relative_to(place / 'data')}")
+    assert as_json("run", "net.loom", "--data", tmp_path / "data.zip") == as_json("run", "net.loom", "--data", "data")
+
+
+def test_spikes_are_written_aligned_with_the_data(as_json, tmp_path, place):
+    report = as_json("run", "net.loom", "--data", "data", "--spikes", tmp_path / "out.npz")
+    netlist = read_netlist(place / "net.loom")
+    expected = run_integer(lift(netlist), channels_last(events(2))).spikes
+    with np.load(tmp_path / "out.npz", allow_pickle=False) as archive:
+        assert archive.files == list(SIZES)
+        for name, spikes in zip(SIZES, expected, strict=True):
+            assert archive[name].dtype == np.bool_
+            assert archive[name].shape == (6, STEPS, SIZES[name])
+            np.testing.assert_array_equal(archive[name], spikes)
+            assert spikes.any()
+        assert archive["fc3"].sum(axis=1).tolist() == report["counts"]
+    first = (tmp_path / "out.npz").read_bytes()
+    as_json("run", "net.loom", "--data", "data", "--spikes", tmp_path / "out.npz")
+    assert (tmp_path / "out.npz").read_bytes() == first
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["out.npz"]
+
+
+# -- verify and estimate -----------------------------------------------------------------------------------------------
+
+
+def test_verify_prints_the_promised_keys(spikeloom):
+    code, out, err = spikeloom("verify", "net.loom", "--checkpoint", "net.pt", "--data", "data", "--json")
+    assert err == ""
+    report = json.loads(out)
+    promised = {"samples", "accuracy", "decision_agreement", "spikes", "spec_equals_engine", "first_divergence"}
+    assert promised | {"ladder"} <= set(report)
+    assert code == (0 if report["decision_agreement"] >= 0.95 else 1)
+    assert report["samples"] == 6
+    assert set(report["accuracy"]) == {"float", "chip"}
+    assert list(report["spikes"]) == list(SIZES)
+    for layer in report["spikes"].values():
+        assert {"float", "chip", "different"} <= set(layer)
+    assert report["spec_equals_engine"] is True
+    assert report["spec_samples"] == 3
+    assert report["same_checkpoint"] is True
+    assert [rung["stage"] for rung in report["ladder"]] == [
+        "float64",
+        "beta",
+        "weights",
+        "bias_threshold",
+        "rounding",
+        "saturation",
+    ]
+    assert all(list(rung["different"]) == list(SIZES) for rung in report["ladder"])
+    assert report["ladder"][-1]["different"] == {name: layer["different"] for name, layer in report["spikes"].items()}
+
+
+def test_verify_fails_when_decisions_agree_too_rarely(spikeloom, tmp_path):
+    coarse = tmp_path / "coarse.loom"
+    assert spikeloom("compile", "net.pt", "--weight-bits", "3", "-o", coarse)[0] == 0
+    words = ["verify", coarse, "--checkpoint", "net.pt", "--data", "data", "--spec-samples", "1", "--json"]
+    found = {share: spikeloom(*words, "--min-agreement", share)[:2] for share in (0, 1)}
+    agreement = json.loads(found[0][1])["decision_agreement"]
+    assert 0 < agreement < 1
+    assert {share: code for share, (code, _) in found.items()} == {0: 0, 1: 1}
+    # the verdict is printed either way, and agreement exactly at the bound passes
+    assert found[0][1] == found[1][1]
+    assert spikeloom(*words, "--min-agreement", agreement)[0] == 0
+
+
+def test_verify_for_people(spikeloom):
+    words = ["verify", "net.loom", "--checkpoint", "net.pt", "--data", "data"]
+    report = json.loads(spikeloom(*words, "--json")[1])
+    code, out, err = spikeloom(*words, "--min-agreement", "0")
+    assert (code, err) == (0, "")
+    assert f"decisions equal:   {round(6 * report['decision_agreement'])} of 6\n" in out
+    assert "spec = engine:     yes, every spike and membrane of 3 recordings\n" in out
+    first = report["first_divergence"]
+    assert f"first divergence: {first['file']}, step {first['step']}, {first['layer']} " in out
+    assert "another checkpoint" not in out
+
+
+def test_verify_says_when_the_checkpoint_is_another_one(spikeloom, tmp_path):
+    own_file(tmp_path / "other.pt", last=made_weights(5))
+    words = ["verify", "net.loom", "--checkpoint", tmp_path / "other.pt", "--data", "data", "--min-agreement", "0"]
+    assert json.loads(spikeloom(*words, "--json")[1])["same_checkpoint"] is False
+    assert "note: the netlist was compiled from another checkpoint file than this one\n" in spikeloom(*words)[1]
+
+
+def test_verify_at_most_all_recordings_by_the_specification(spikeloom):
+    words = ["verify", "net.loom", "--checkpoint", "net.pt", "--data", "data", "--min-agreement", "0", "--json"]
+    assert json.loads(spikeloom(*words, "--spec-samples", "99")[1])["spec_samples"] == 6
+    assert json.loads(spikeloom(*words, "--limit", "2")[1])["spec_samples"] == 2
+
+
+def test_estimate_prints_the_promised_keys(as_json):
+    report = as_json("estimate", "net.loom", "--data", "data")
+    assert {"per_inference", "min", "max", "layers", "not_modelled"} <= set(report)
+    keys = {"synaptic_operations", "spikes", "neuron_updates", "energy_j"}
+    for part in (report["per_inference"], report["min"], report["max"], *report["layers"]):
+        assert keys <= set(part)
+        assert set(part["energy_j"]) == {"davies2018", "sanafe"}
+        assert all(isinstance(value, float) for key, value in part.items() if key not in ("energy_j", "name"))
+        assert all(isinstance(value, float) for value in part["energy_j"].values())
+    assert [layer["name"] for layer in report["layers"]] == list(SIZES)
+    assert report["not_modelled"] == []
+    flat = [
+        {key: value for key, value in report[part].items() if key != "energy_j"} | report[part]["energy_j"]
+        for part in ("min", "per_inference", "max")
+    ]
+    assert all(low[key] <= mean[key] <= high[key] for low, mean, high in [flat] for key in low)
+    for key in keys - {"energy_j"}:
+        assert sum(layer[key] for layer in report["layers"]) == pytest.approx(report["per_inference"][key], rel=1e-12)
+
+
+def test_estimate_agrees_with_run(as_json, tmp_path):
+    as_json("run", "net.loom", "--data", "data", "--spikes", tmp_path / "out.npz")
+    with np.load(tmp_path / "out.npz") as archive:
+        spikes = {name: archive[name].sum(axis=(1, 2)) for name in archive.files}
+    report = as_json("estimate", "net.loom", "--data", "data")
+    assert {layer["name"]: layer["spikes"] for layer in report["layers"]} == {k: v.mean() for k, v in spikes.items()}
+    total = sum(spikes.values())
+    assert (report["min"]["spikes"], report["max"]["spikes"]) == (total.min(), total.max())
+    assert report["chip_steps"] == STEPS + 3
+
+
+def test_estimate_for_people_names_what_it_leaves_out(spikeloom):
+    code, out, err = spikeloom("estimate", "net.loom", "--data", "data", "--limit", "2")
+    assert (code, err) == (0, "")
+    assert out.startswith(f"per inference of {STEPS + 3} chip steps, over 2 recordings:\n")
+    assert "energy, davies2018" in out
+    assert "energy, sanafe" in out
+    assert "\nnot priced: injection of input events into the mesh (no public figure per event)\n" in out
+
+
+# -- demo, and everything around a command -----------------------------------------------------------------------------
+
+
+@pytest.fixture
+def shipped_grasps(monkeypatch, tmp_path):
+    """A made-up network in place of the shipped one, and few grasps."""
+    last = made_weights(taxels=39, sizes=(6, 5, 6))
+    path = str(own_file(tmp_path / "grasps.pt", last=last, graph=build_graph("manual")))
+    monkeypatch.setattr(cli, "shipped", lambda name: path if name == "pretrained:grasps" else name)
+    monkeypatch.setattr(cli, "recordings", lambda *words, **options: recordings(*words, **options | {"limit": 6}))
+
+
+@pytest.mark.usefixtures("shipped_grasps")
+def test_demo_runs_the_main_job(spikeloom, tmp_path):
+    code, out, err = spikeloom("demo", "--json")
+    assert err == ""
+    reports = json.loads(out)
+    assert list(reports) == ["compile", "verify", "estimate"]
+    assert reports["verify"]["samples"] == reports["estimate"]["samples"] == 6
+    assert code == (0 if reports["verify"]["decision_agreement"] >= 0.95 else 1)
+    again, out, err = spikeloom("demo")
+    assert (again, err) == (code, "")
+    for command in cli.DEMO:
+        assert f"$ spikeloom {' '.join(command).replace('{folder}/', '')}\n" in out
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["grasps.pt"]
+
+
+def test_version(capsys):
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["--version"])
+    assert stop.value.code == 0
+    assert capsys.readouterr().out == f"spikeloom {cli.version()}\n"
+
+
+def test_help_names_every_command(capsys):
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["--help"])
+    assert stop.value.code == 0
+    out = capsys.readouterr().out
+    for name in ("compile", "inspect", "run", "verify", "estimate", "train", "demo"):
+        assert f"\n    {name} " in out
+
+
+def test_debug_shows_where_it_happened(capsys):
+    with pytest.raises(ModelError) as failure:
+        cli.main(["inspect", "--debug", "nowhere.pt"])
+    assert str(failure.value).startswith("nowhere.pt: no such file")
+    assert capsys.readouterr() == ("", "")
+
+
+def test_progress_goes_to_a_terminal_only(spikeloom, monkeypatch):
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    code, out, _ = spikeloom("run", "net.loom", "--data", "data", "--json")
+    assert code == 0
+    json.loads(out)
+    assert "\r\x1b[Krunning …" in terminal.getvalue()
+    assert terminal.getvalue().endswith("\r\x1b[K")  # and cleared
+
+
+def test_a_reader_that_leaves_early_is_no_mistake(spikeloom, monkeypatch):
+    reader, writer = os.pipe()
+    os.close(reader)
+    with os.fdopen(writer, "w") as pipe:
+        monkeypatch.setattr(sys, "stdout", pipe)
+        assert cli.main(["inspect", "net.loom"]) == 0
+        monkeypatch.undo()
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no device that is always full")
+def test_a_full_disk_behind_standard_output(spikeloom, monkeypatch, capsys):
+    with Path("/dev/full").open("w") as full:
+        monkeypatch.setattr(sys, "stdout", full)
+        assert cli.main(["inspect", "net.loom"]) == 2
+    assert capsys.readouterr().err == (
+        "spikeloom: standard output: No space left on device; check space and permissions, nothing was changed\n"
+    )
+
+
+def test_a_terminal_without_greek_letters(spikeloom, monkeypatch):
+    plain = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    monkeypatch.setattr(sys, "stdout", plain)
+    assert cli.main(["inspect", "net.loom"]) == 0
+    out = plain.buffer.getvalue().decode("ascii")
+    assert out.startswith("loihi1: 51 neurons, ")
+    assert "?" in out

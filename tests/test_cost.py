@@ -1,0 +1,273 @@
+"""Costs, counted a second time spike by spike and synapse by synapse, and priced by hand."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from made_files import events, small_checkpoint
+from random_netlists import Axon, Neuron, build
+from random_networks import LOIHI, small_target
+
+from compiler.passes.emit import emit
+from compiler.passes.expand import expand
+from compiler.passes.partition import partition
+from compiler.passes.place import core_traffic, place
+from compiler.passes.quantize import quantize
+from compiler.targets import EnergyTable, Quantity
+from runtime import cost, engine, render, spec
+
+PICOJOULES = {
+    "davies2018": {
+        "synaptic_operation_dense": 23.6,
+        "synaptic_operation_sparse": 23.6,
+        "neuron_idle": 52.0,
+        "neuron_active": 81.0,
+        "spike": 0.0,  # part of the active update
+        "packet": 1.7,
+        "hop_east_west": 3.0,
+        "hop_north_south": 4.0,
+    },
+    "sanafe": {
+        "synaptic_operation_dense": 35.5,
+        "synaptic_operation_sparse": 33.6,
+        "neuron_idle": 51.2,
+        "neuron_active": 72.8,
+        "spike": 69.3,
+        "packet": 111.0,
+        "hop_east_west": 3.0,
+        "hop_north_south": 4.2,
+    },
+}
+"""The published prices, typed a second time."""
+
+
+def brute_force(netlist, recording):
+    """Amounts per layer as plain lists, by visiting every synapse for every spike of the specification's run."""
+    trace = spec.simulate(netlist, recording)
+    steps = recording.shape[1]
+    layers = range(len(netlist.layers))
+    found = {name: [0] * len(layers) for name in (*cost.EVENTS, "zeros")}
+    core_of_axon, core_of = netlist.core_of_axon(), netlist.core_of_compartment()
+    for t in range(steps + netlist.max_depth):
+        channels = np.flatnonzero(recording[:, t]) if t < steps else []
+        fired = np.flatnonzero(trace.spikes[t])
+        for compartment in fired:
+            found["spike"][netlist.layer[compartment]] += 1
+        for source in [*channels, *(fired + netlist.n_inputs)]:
+            for axon in np.flatnonzero(netlist.axon_source == source):
+                core = core_of_axon[axon]
+                form = "sparse" if netlist.format_index_bits[netlist.axon_format[axon]] else "dense"
+                for synapse in range(netlist.axon_synapses[axon], netlist.axon_synapses[axon + 1]):
+                    into = netlist.layer[netlist.core_compartments[core] + netlist.synapse_target[synapse]]
+                    found[f"synaptic_operation_{form}"][into] += 1
+                    found["zeros"][into] += int(netlist.synapse_weight[synapse] == 0)
+                if source >= netlist.n_inputs:
+                    sender = source - netlist.n_inputs
+                    here, there = (divmod(int(netlist.core_tile[c]), 8) for c in (core_of[sender], core))
+                    found["packet"][netlist.layer[sender]] += 1
+                    found["hop_east_west"][netlist.layer[sender]] += abs(here[1] - there[1])
+                    found["hop_north_south"][netlist.layer[sender]] += abs(here[0] - there[0])
+    for layer in layers:
+        found["neuron_active"][layer] = int(trace.counts.updates[layer])
+        found["neuron_idle"][layer] = sum(
+            netlist.layers[layer].neurons for _ in range(steps + netlist.max_depth)
+        ) - int(trace.counts.updates[layer])
+    return found
+
+
+def check(netlist, recordings):
+    """Hold the counts and energies of a batch against the brute force; returns the costs."""
+    trace = engine.simulate(netlist, recordings)
+    costs = cost.estimate(netlist, LOIHI, trace.counts, recordings.shape[2])
+    for sample, recording in enumerate(recordings):
+        expected = brute_force(netlist, recording)
+        for name in cost.EVENTS:
+            assert costs.events[name][sample].tolist() == expected[name], name
+        assert costs.zeros[sample].tolist() == expected["zeros"]
+        for table, prices in PICOJOULES.items():
+            for layer in range(len(netlist.layers)):
+                by_hand = sum(amount * expected[name][layer] for name, amount in prices.items()) * 1e-12
+                assert costs.energy[table][sample, layer] == pytest.approx(by_hand, rel=1e-12)
+    assert set(costs.energy) == set(PICOJOULES)
+    assert costs.unpriced == {}
+    assert costs.steps == recordings.shape[2] + netlist.max_depth
+    return costs
+
+
+def test_against_brute_force_on_many_cores(tmp_path):
+    checkpoint, adjacency = small_checkpoint(tmp_path)
+    target = small_target(core_compartments=7, mesh_tile_cores=1, mesh_width=8)
+    integer, _ = quantize(expand(checkpoint, adjacency), target, bits=4)
+    parts = partition(integer, target)
+    netlist = emit(integer, parts, place(core_traffic(integer, parts, None), target).tiles, target, {})
+    assert netlist.n_cores >= 8
+    recordings = events(5, samples=2).reshape(2, netlist.n_inputs, -1)
+    costs = check(netlist, recordings)
+    for name in cost.EVENTS:  # each of them happens here, so each comparison says something
+        assert costs.events[name].sum() > 0, name
+    assert costs.zeros.sum() > 0
+    assert np.all(costs.synaptic_operations.sum(axis=1) > costs.zeros.sum(axis=1))
+
+
+def test_against_brute_force_on_one_core(tmp_path):
+    checkpoint, adjacency = small_checkpoint(tmp_path, theta=0.3)
+    integer, _ = quantize(expand(checkpoint, adjacency), LOIHI)
+    parts = partition(integer, LOIHI)
+    netlist = emit(integer, parts, place(core_traffic(integer, parts, None), LOIHI).tiles, LOIHI, {})
+    costs = check(netlist, events(6, samples=2).reshape(2, netlist.n_inputs, -1))
+    assert netlist.n_cores == 1
+    assert costs.events["hop_east_west"].sum() == costs.events["hop_north_south"].sum() == 0
+    assert costs.events["packet"].sum() > 0
+
+
+def counted_by_hand():
+    """Two inputs, a neuron on core 0, two listeners on core 9 steps east and 2 south: all numbers fit on paper."""
+    neurons = [Neuron(layer=0, core=0, threshold=1), Neuron(layer=1, core=1), Neuron(layer=1, core=1)]
+    axons = [
+        Axon(core=0, source=0, targets=((0, 200),)),
+        Axon(core=0, source=1, targets=((0, 0),)),
+        Axon(core=1, source=2, targets=((0, 2), (1, 0))),
+        Axon(core=1, source=2, targets=((1, 2),)),
+    ]
+    netlist = build(neurons, axons, n_inputs=2, depths=[0, 1])
+    return dataclasses.replace(netlist, core_tile=np.array([0, 19]))  # (3, 2) on a mesh eight wide
+
+
+def test_counted_by_hand():
+    netlist = counted_by_hand()
+    recording = np.zeros((1, 2, 5), np.uint8)
+    recording[0, 0, [0, 2]] = 1  # the first neuron fires in steps 0 and 2
+    recording[0, 1, [1, 2, 3]] = 1  # synapses of weight zero are visited all the same
+    costs = check(netlist, recording)
+    assert costs.steps == 6
+    assert costs.events["spike"].tolist() == [[2, 0]]
+    assert costs.events["synaptic_operation_sparse"].tolist() == [[2 + 3, 2 * 3]]
+    assert costs.events["synaptic_operation_dense"].tolist() == [[0, 0]]
+    assert costs.zeros.tolist() == [[3, 2]]
+    assert costs.events["packet"].tolist() == [[2 * 2, 0]]
+    assert costs.events["hop_east_west"].tolist() == [[2 * 2 * 3, 0]]
+    assert costs.events["hop_north_south"].tolist() == [[2 * 2 * 2, 0]]
+    # the first neuron is reached in steps 0 to 3; each listener in steps 1 and 3 of its window 1 to 5, and its membrane
+    # of 128, of which a fifth is kept a step, is not zero before any of the others
+    assert costs.events["neuron_active"].tolist() == [[4, 2 * 5]]
+    assert costs.events["neuron_idle"].tolist() == [[6 - 4, 12 - 10]]
+    pico = 1e12 * np.concatenate([costs.energy["davies2018"], costs.energy["sanafe"]])
+    expected = [
+        [5 * 23.6 + 2 * 52 + 4 * 81 + 4 * 1.7 + 12 * 3.0 + 8 * 4.0, 6 * 23.6 + 2 * 52 + 10 * 81],
+        [5 * 33.6 + 2 * 51.2 + 4 * 72.8 + 2 * 69.3 + 4 * 111 + 12 * 3.0 + 8 * 4.2, 6 * 33.6 + 2 * 51.2 + 10 * 72.8],
+    ]
+    np.testing.assert_allclose(pico, expected, rtol=1e-12)
+
+
+def test_nothing_happens():
+    netlist = counted_by_hand()
+    costs = check(netlist, np.zeros((1, 2, 4), np.uint8))
+    assert costs.synaptic_operations.tolist() == [[0, 0]]
+    assert costs.events["neuron_idle"].tolist() == [[5, 10]]  # silence costs too
+
+
+# -- tables that do not know everything --------------------------------------------------------------------------------
+
+
+def table(name, **prices):
+    return EnergyTable(
+        name=name,
+        title=name,
+        prices={event: Quantity(value=value, unit="pJ", source="made up") for event, value in prices.items()},
+    )
+
+
+FULL = dict.fromkeys(cost.EVENTS, 1.0)
+
+
+def priced_by(*tables, silent=False):
+    netlist = counted_by_hand()
+    recording = np.zeros((2, 2, 5), np.uint8)
+    if not silent:
+        recording[:, 0, 0] = 1
+    counts = engine.simulate(netlist, recording).counts
+    return netlist, cost.estimate(netlist, dataclasses.replace(LOIHI, energy=tables), counts, 5)
+
+
+@pytest.mark.parametrize("event", [name for name in cost.EVENTS if name not in ("synaptic_operation_dense", "spike")])
+def test_a_table_without_a_price_is_left_out(event):
+    lacking = {name: price for name, price in FULL.items() if name != event}
+    netlist, costs = priced_by(table("lacking", **lacking), table("full", **FULL))
+    assert set(costs.energy) == {"full"}
+    assert costs.unpriced == {"lacking": (event,)}
+    report = render.estimate_json(netlist, costs)
+    assert report["not_modelled"] == [f"lacking: no price for {event}"]
+    for part in (report["per_inference"], report["min"], report["max"], *report["layers"]):
+        assert set(part["energy_j"]) == {"full"}
+    assert f"not modelled: lacking: no price for {event}\n" in render.estimate_text(report)
+
+
+def test_every_lacking_price_is_named():
+    _, costs = priced_by(table("poor", packet=1.0))
+    assert costs.energy == {}
+    # nothing was stored dense here, and a spike may be priced with its neuron's update
+    assert costs.unpriced == {
+        "poor": (
+            "synaptic_operation_sparse",
+            "neuron_idle",
+            "neuron_active",
+            "hop_east_west",
+            "hop_north_south",
+        )
+    }
+
+
+def test_no_table_at_all():
+    netlist, costs = priced_by()
+    report = render.estimate_json(netlist, costs)
+    assert report["per_inference"]["energy_j"] == report["min"]["energy_j"] == {}
+    assert report["not_modelled"] == []
+    assert "synaptic operations" in render.estimate_text(report)
+
+
+def test_what_did_not_happen_needs_no_price():
+    _, costs = priced_by(table("idle", neuron_idle=50.0), silent=True)
+    # 3 compartments in 6 steps
+    np.testing.assert_allclose(costs.energy["idle"].sum(axis=1), [18 * 50e-12] * 2)
+
+
+def test_one_price_for_both_forms_of_a_list():
+    both = {name: price for name, price in FULL.items() if not name.startswith("synaptic")}
+    _, costs = priced_by(table("one", **both, synaptic_operation=7.0), table("two", **FULL))
+    extra = (costs.energy["one"] - costs.energy["two"]).sum(axis=1)
+    np.testing.assert_allclose(extra, [6e-12 * (1 + 3)] * 2)
+
+
+def test_what_no_table_covers_is_always_listed():
+    netlist, costs = priced_by(table("full", **FULL))
+    report = render.estimate_json(netlist, costs)
+    assert report["not_priced"] == list(cost.NOT_PRICED)
+    assert len(cost.NOT_PRICED) == 3
+
+
+# -- the report --------------------------------------------------------------------------------------------------------
+
+
+def test_report_has_means_and_extremes_over_recordings(tmp_path):
+    checkpoint, adjacency = small_checkpoint(tmp_path)
+    integer, _ = quantize(expand(checkpoint, adjacency), LOIHI)
+    parts = partition(integer, LOIHI)
+    netlist = emit(integer, parts, place(core_traffic(integer, parts, None), LOIHI).tiles, LOIHI, {})
+    recordings = events(7, samples=5).reshape(5, netlist.n_inputs, -1)
+    report = render.estimate_json(
+        netlist, cost.estimate(netlist, LOIHI, engine.simulate(netlist, recordings).counts, recordings.shape[2])
+    )
+    samples = [brute_force(netlist, recording) for recording in recordings]
+    operations = [sum(s["synaptic_operation_dense"]) + sum(s["synaptic_operation_sparse"]) for s in samples]
+    assert len(set(operations)) > 1
+    found = [report[part]["synaptic_operations"] for part in ("min", "per_inference", "max")]
+    assert found == [min(operations), pytest.approx(np.mean(operations)), max(operations)]
+    layers = [layer["synaptic_operations"] for layer in report["layers"]]
+    expected = np.mean([np.add(s["synaptic_operation_dense"], s["synaptic_operation_sparse"]) for s in samples], axis=0)
+    np.testing.assert_allclose(layers, expected)
+    updates = [sum(s["neuron_active"]) for s in samples]
+    assert report["max"]["neuron_updates"] == max(updates)
+    accesses = netlist.n_compartments * (recordings.shape[2] + 3)
+    assert report["per_inference"]["neuron_accesses"] == accesses
+    assert report["min"]["synaptic_operations_on_zeros"] == min(sum(s["zeros"]) for s in samples)
+    assert report["samples"] == 5

@@ -1,0 +1,332 @@
+import argparse
+import hashlib
+import json
+import struct
+import threading
+from http.server import BaseHTTPRequestHandler, HTTPServer
+
+import numpy as np
+import pytest
+
+from compiler.errors import DataError, OptionError
+from models import fetch
+from models.events import load_data
+from models.fetch import DataSet
+from runtime.data_commands import add_bin_option, add_data_commands, show_counts
+
+
+def start(*words):
+    """Report, text and exit code of a command."""
+    parser = argparse.ArgumentParser(prog="spikeloom")
+    add_data_commands(parser.add_subparsers(dest="command", required=True))
+    arguments = parser.parse_args(["data", *map(str, words)])
+    report, as_text, code = arguments.action(arguments)
+    assert json.loads(json.dumps(report)) == report
+    return report, as_text(report), code
+
+
+def message(*words, error=DataError) -> str:
+    with pytest.raises(error) as caught:
+        start(*words)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.fixture
+def own(tmp_path, monkeypatch):
+    """Recordings of a sensor with four taxels, the last of them dead."""
+    monkeypatch.chdir(tmp_path)
+    files = {
+        "own/train/a_label_0.csv": "time_s,taxel,polarity\n0,0,1\n0.03,1,-1\n0.01,2,1\n0.031,1,-1\n0.7,0,1\n",
+        "own/train/b_label_1.csv": "0,0,1\n0.5,2,1\n",
+        "own/test/c_label_1.csv": "0,0,1\n0.1,1,0\n",
+        "coords.csv": "x,y\n0,0\n4,0\n0,4\n4,4\n",
+    }
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    return tmp_path
+
+
+# describe
+
+
+def test_describe(own):
+    report, text, code = start("describe", "own", "--split", "train", "--taxels", "coords.csv")
+    assert code == 0
+    assert text == "\n".join(
+        [
+            "own, train: 2 recordings, 4 taxels, 0.52 … 0.72 s (median 0.62 s) in bins of 0.02 s",
+            "  labels: 2 classes, 1 recording each",
+            "  events: 6 after binning; 0.8 falling and 4.0 rising per second",
+            "  found: 7 events read, 1 out of order, 1 duplicate in a bin, 1 gap over 0.5 s, "
+            "1 recording padded at the end",
+            "  dead taxels: 3 (no event in any of these recordings)",
+            "  one-sided taxels: 0, 1, 2 (events of one polarity only)",
+            "  hot taxels: none (more than 5 times the median rate of the taxels that are not dead)",
+            "",
+            "  taxel  falling/s  rising/s      looks",
+            "  0           0.00      2.42  one-sided",
+            "  1           0.81      0.00  one-sided",
+            "  2           0.00      1.61  one-sided",
+            "  3           0.00      0.00       dead",
+        ]
+    )
+    assert report["found"] == {
+        "events": 7,
+        "out_of_order": 1,
+        "duplicates": 1,
+        "gaps": 1,
+        "gap_s": 0.5,
+        "padded": 1,
+    }
+    assert report["dead"] == [3]
+    assert report["one_sided"] == [0, 1, 2]
+    assert report["labels"] == {"0": 1, "1": 1}
+    assert report["rate"]["taxels"][1] == {"falling": pytest.approx(1 / 1.24), "rising": 0.0}
+
+
+def test_describe_one_recording_without_a_label(own):
+    (own / "grasp.csv").write_text("0,0,1\n0.1,1,0\n0.1,1,1\n")
+    report, text, _ = start("describe", "grasp.csv", "--bin", "0.05")
+    assert text.splitlines()[:3] == [
+        "grasp.csv, test: 1 recording, 2 taxels, 0.15 s in bins of 0.05 s",
+        "  labels: none",
+        "  events: 3 after binning; 6.7 falling and 13.3 rising per second",
+    ]
+    assert (report["labels"], report["unlabelled"]) == ({}, 1)
+
+
+def test_describe_some_labels(own):
+    (own / "own" / "test" / "d.csv").write_text("0,0,1\n")
+    _, text, _ = start("describe", "own")
+    assert text.splitlines()[1] == "  labels: 1 class, 1 recording each; 1 recording without"
+
+
+def test_describe_synthetic_grasps():
+    report, text, _ = start("describe", "synthetic")
+    assert (report["recordings"], report["taxels"], report["found"]) == (144, 39, None)
+    assert "found" not in text
+
+
+def png_size(path):
+    data = path.read_bytes()
+    assert data[:8] == b"\x89PNG\r\n\x1a\n"
+    return struct.unpack(">II", data[16:24])
+
+
+def test_pictures(own):
+    _, text, _ = start("describe", "synthetic", "--picture", "map.png")
+    assert "  picture: map.png" in text.splitlines()
+    assert png_size(own / "map.png") == (1650, 810)
+    start("describe", "synthetic", "--picture", "again.png")
+    assert (own / "again.png").read_bytes() == (own / "map.png").read_bytes()
+    start("describe", "own", "--picture", "plain.png")
+    assert png_size(own / "plain.png") == (1050, 810)
+    start("describe", "own", "--taxels", "coords.csv", "--picture", "own.png")
+    assert png_size(own / "own.png") == (1650, 810)
+    start("describe", "own", "--taxels", "4", "--picture", "plain4.png")
+    assert png_size(own / "plain4.png") == (1050, 810)
+    assert (own / "plain4.png").read_bytes() != (own / "plain.png").read_bytes()
+
+
+@pytest.mark.parametrize("coords", ["0,0\n0,0,1\n", "0,0\n"])
+def test_pictures_need_coordinates_that_fit(own, coords):
+    (own / "coords.csv").write_text(coords)
+    with pytest.raises(DataError):
+        start("describe", "own", "--taxels", "coords.csv", "--picture", "own.png")
+    assert not (own / "own.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("rows", "taxels", "coords"),
+    [
+        ("0,0,1\n", "1", "0,0\n"),  # a sensor of one taxel, a recording of one bin
+        ("".join(f"{i / 999},{i % 2},{i % 3 % 2}\n" for i in range(999)), "2", "0,0,1\n0,0,2\n"),  # one above the other
+        ("0,0,1\n" * 3 + "".join(f"{i / 50},7,1\n" for i in range(50)), "9", "".join(f"{i},0\n" for i in range(9))),
+    ],
+)
+def test_pictures_of_odd_sensors(own, rows, taxels, coords):
+    (own / "odd $x_$ é\n.csv").write_text(rows)
+    (own / "coords.csv").write_text(coords)
+    start("describe", "odd $x_$ é\n.csv", "--taxels", "coords.csv", "--picture", "odd.png")
+    assert png_size(own / "odd.png") == (1650, 810)
+    start("describe", "odd $x_$ é\n.csv", "--taxels", taxels, "--bin", "0.0001", "--picture", "odd.png")
+    assert png_size(own / "odd.png") == (1050, 810)
+
+
+def test_pictures_have_a_place(own):
+    assert message("describe", "own", "--picture", "own.svg", error=OptionError) == (
+        "--picture own.svg: allowed is a PNG; give a name that ends in .png"
+    )
+    assert message("describe", "own", "--picture", "no/own.png", error=OptionError) == (
+        "--picture no/own.png: the folder does not exist; make it first"
+    )
+
+
+def test_describe_mistakes(own):
+    assert message("describe", "own", "--bin", "0", error=OptionError) == (
+        "--bin 0: not a duration; give seconds above 0, for example 0.02"
+    )
+    assert message("describe", "own", "--split", "train", "--taxels", "2") == (
+        "own: train/a_label_0.csv: line 4: taxel 2, allowed are whole numbers 0..1; "
+        "count from 0 and use recordings of this sensor"
+    )
+
+
+# convert
+
+
+@pytest.mark.parametrize("output", ["out", "out.zip"])
+def test_convert(own, output):
+    report, text, code = start("convert", "own", "-o", output)
+    assert code == 0
+    assert text == "\n".join(
+        [
+            f"{output}: 3 taxels, 36 bins",
+            "  test: 1 recording",
+            "    found: 2 events read, 0 out of order, 0 duplicates in a bin, 0 gaps over 0.5 s, "
+            "1 recording padded at the end",
+            "  train: 2 recordings",
+            "    found: 7 events read, 1 out of order, 1 duplicate in a bin, 1 gap over 0.5 s, "
+            "1 recording padded at the end",
+        ]
+    )
+    assert report["splits"]["test"]["found"]["padded"] == 1
+    for split in ("train", "test"):
+        made, counts = load_data(own / output, split)
+        before, _ = load_data(own / "own", split, taxels=3)
+        assert counts is None
+        assert made.events.shape[1:] == (3, 2, 36)
+        assert np.array_equal(made.events[..., : before.steps], before.events)
+        assert made.events.sum() == before.events.sum()
+        assert made.labels.tolist() == before.labels.tolist()
+    if output == "out":
+        values = np.load(own / "out" / "train" / "sample_0_label_0.npy")
+        assert (values.dtype, values.shape) == (np.float32, (3, 2, 36))
+
+
+def test_convert_to_more_taxels_and_other_bins(own):
+    report, _, _ = start("convert", "own", "-o", "out", "--taxels", "coords.csv", "--bin", "0.1")
+    assert (report["taxels"], report["steps"]) == (4, 7 + 1)
+
+
+def test_convert_flat_recordings(own):
+    start("convert", "own/train", "-o", "out", "--split", "train")
+    assert sorted(path.name for path in (own / "out" / "train").iterdir()) == [
+        "sample_0_label_0.npy",
+        "sample_1_label_1.npy",
+    ]
+
+
+def test_convert_what_is_converted(own):
+    start("convert", "own", "-o", "out.zip")
+    start("convert", "out.zip", "-o", "again.zip")
+    assert (own / "again.zip").read_bytes() == (own / "out.zip").read_bytes()
+
+
+def test_convert_synthetic_grasps(own):
+    report, _, _ = start("convert", "synthetic", "-o", "grasps")
+    assert {split: made["recordings"] for split, made in report["splits"].items()} == {"train": 360, "test": 144}
+    assert load_data(own / "grasps", "test")[0].events.shape == (144, 39, 2, 100)
+
+
+def test_convert_mistakes(own):
+    (own / "a.csv").write_text("0,0,1\n")
+    assert message("convert", "a.csv", "-o", "out") == (
+        "a.csv: a.csv: no label, the released layout needs one for every recording; "
+        "add a label column or name the file like grasp_7_label_3.csv"
+    )
+    (own / "own" / "train" / "c.csv").write_text("0,0,1\n0,0,up\n")
+    assert message("convert", "own", "-o", "out.zip") == (
+        "own: train/c.csv: line 2: polarity is 'up', not a number; write plain numbers"
+    )
+    assert message("convert", "own", "-o", "coords.csv", "--bin", "nan", error=OptionError) == (
+        "--bin nan: not a duration; give seconds above 0, for example 0.02"
+    )
+    assert sorted(path.name for path in own.iterdir()) == ["a.csv", "coords.csv", "own"]
+
+
+# fetch
+
+
+@pytest.fixture
+def url(monkeypatch, tmp_path):
+    """Address of a server that has the Objects, or what goes for them here."""
+    content = b"recordings"
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(200 if self.path == "/Ev-Objects.zip" else 404)
+            self.send_header("Content-Length", str(len(content)))
+            self.end_headers()
+            self.wfile.write(content)
+
+        def log_message(self, *words) -> None:
+            pass
+
+    monkeypatch.setenv("no_proxy", "127.0.0.1")
+    monkeypatch.setenv("SPIKELOOM_DATA", str(tmp_path / "data"))
+    with HTTPServer(("127.0.0.1", 0), Handler) as server:
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+        thread.start()
+        address = f"http://127.0.0.1:{server.server_address[1]}/Ev-Objects.zip"
+        made = DataSet(file="Ev-Objects.zip", url=address, size=10, sha256=hashlib.sha256(content).hexdigest())
+        monkeypatch.setitem(fetch.DATA_SETS, "objects", made)
+        yield address
+        server.shutdown()
+        thread.join()
+
+
+def test_fetch(url, tmp_path):
+    path = tmp_path / "data" / "Ev-Objects.zip"
+    report, text, code = start("fetch", "objects")
+    assert code == 0
+    assert text == (f"objects: fetched, 10 bytes, sha256 as released\n  {path}\n  use it with --data objects")
+    assert report["new"] is True
+    report, text, _ = start("fetch", "objects")
+    assert text.splitlines()[0] == "objects: already there, 10 bytes, sha256 as released"
+    other = tmp_path / "other" / "Ev-Objects.zip"
+    _, text, _ = start("fetch", "objects", "--dir", other.parent, "--url", url)
+    assert text.splitlines()[2] == f"  use it with --data {other}"
+
+
+def test_fetch_mistakes(url, tmp_path):
+    assert message("fetch", "objects", "--url", f"{url}x") == (
+        f"{url}x: the server answers 404 Not Found; try later, or give another address with --url"
+    )
+    assert message("fetch", "objects", "--url", "objects.zip", error=OptionError) == (
+        "--url objects.zip: not a web address; give one that starts with http:// or https://"
+    )
+
+
+# For the other commands
+
+
+def test_counts_on_stderr(own, capsys):
+    show_counts(*load_data(own / "own", "train"))
+    start("convert", "own", "-o", "out")
+    show_counts(*load_data(own / "out", "train"))
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    assert shown.err == (
+        "own: 7 events read, 1 out of order, 1 duplicate in a bin, 1 gap over 0.5 s, 1 recording padded at the end\n"
+    )
+
+
+def test_the_bin_option():
+    parser = argparse.ArgumentParser()
+    add_bin_option(parser)
+    assert parser.parse_args([]).bin == 0.02
+    assert parser.parse_args(["--bin", "0.05"]).bin == 0.05
+
+
+def test_matplotlib_is_loaded_for_pictures_only():
+    import subprocess
+    import sys
+
+    code = (
+        "import sys, runtime.data_commands, runtime.data_picture\n"
+        "assert not {'matplotlib', 'torch'} & set(sys.modules), 'loaded early'"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)

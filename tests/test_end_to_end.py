@@ -1,0 +1,266 @@
+"""The main job on the released checkpoint and the real recordings of both data sets."""
+
+import hashlib
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from made_files import own_file, recordings_folder, weights
+
+from compiler.frontends.checkpoint import read_checkpoint
+from compiler.netlist import Netlist
+from compiler.pipeline import compile_checkpoint
+from compiler.serialize import netlist_bytes, read_netlist
+from models.evtouch import load_recordings
+from models.graphs import build_graph, normalised_adjacency
+from models.reference import float_spikes
+from runtime import cli, engine, spec
+
+RIGHT = 127  # of 144, by the released code's own outputs
+SAMPLES = 3  # recordings that the specification runs too
+
+
+def command(*words) -> tuple[int, dict]:
+    """Run a command with ``--json`` in this process; exit code and object."""
+    printed = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cli, "show", printed.append)
+        code = cli.main([*map(str, words), "--json"])
+    return code, json.loads(printed[0])
+
+
+@pytest.fixture(scope="module")
+def compiled(tmp_path_factory, released_checkpoint, objects_zip) -> tuple[Path, dict]:
+    """Netlist of the released checkpoint as a user compiles it, and what the command said."""
+    path = tmp_path_factory.mktemp("objects") / "objects.loom"
+    words = ["--graph", "manual", "--target", "loihi1", "--weight-bits", 8, "--calibrate", objects_zip, "-o", path]
+    code, report = command("compile", released_checkpoint, *words)
+    assert code == 0
+    return path, report
+
+
+@pytest.fixture(scope="module")
+def objects(objects_zip) -> np.ndarray:
+    """Objects test recordings, (144, 39, 2, 250)."""
+    return load_recordings(objects_zip, "test").events
+
+
+@pytest.fixture(scope="module")
+def containers(containers_zip) -> np.ndarray:
+    """Containers test recordings, (60, 39, 2, 325)."""
+    return load_recordings(containers_zip, "test").events
+
+
+def assert_twins_agree(netlist: Netlist, events: np.ndarray) -> np.ndarray:
+    """Every spike, membrane and count of both simulators is equal; returns the spikes of each layer."""
+    flat = events.reshape(len(events), netlist.n_inputs, -1)
+    fast = engine.simulate(netlist, flat, spikes=True, membranes=True)
+    for sample, recording in enumerate(flat):
+        slow = spec.simulate(netlist, recording)
+        np.testing.assert_array_equal(fast.spikes[sample], slow.spikes)
+        np.testing.assert_array_equal(fast.membranes[sample], slow.membranes)
+        for name in ("inputs", "spikes", "updates", "saturations"):
+            np.testing.assert_array_equal(getattr(fast.counts, name)[sample], getattr(slow.counts, name))
+    return np.array([fast.counts.spikes[:, netlist.compartments_of(i)].sum() for i in range(len(netlist.layers))])
+
+
+# -- the released checkpoint -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.recordings
+def test_the_netlist_has_the_published_size(compiled):
+    path, report = compiled
+    layers = {layer["name"]: layer for layer in report["layers"]}
+    assert {name: layer["neurons"] for name, layer in layers.items()} == {
+        "conv1": 2496,
+        "fc1": 128,
+        "fc2": 256,
+        "fc3": 36,
+    }
+    assert {name: layer["synapses"] for name, layer in layers.items()} == {
+        "conv1": 97_920,
+        "fc1": 319_488,
+        "fc2": 32_768,
+        "fc3": 9_216,
+    }
+    assert report["synapses"] == 459_392
+    assert report["neurons"] == 2916
+    assert report["cores"] <= 9
+    assert report["sha256"] == hashlib.sha256(path.read_bytes()).hexdigest()
+    assert all(limit["used"] <= limit["allowed"] for limit in report["limits"])
+    assert all(proof["holds"] for proof in report["proofs"])
+
+
+@pytest.mark.recordings
+def test_every_limit_is_kept_when_counted_again(compiled):
+    netlist = read_netlist(compiled[0])
+    core_of = netlist.core_of_compartment()
+    out_axons = np.zeros(netlist.n_cores, int)
+    for source in netlist.axon_source[netlist.axon_source >= netlist.n_inputs]:
+        out_axons[core_of[source - netlist.n_inputs]] += 1
+    assert out_axons.max() <= 4096
+    for core in range(netlist.n_cores):
+        held = range(*netlist.core_compartments[core : core + 2])
+        axons = range(*netlist.core_axons[core : core + 2])
+        words = 0
+        for axon in axons:
+            form = netlist.axon_format[axon]
+            bits = int(netlist.format_weight_bits[form] + netlist.format_index_bits[form])
+            left = int(netlist.axon_synapses[axon + 1] - netlist.axon_synapses[axon])
+            while left > 0:  # blocks of up to 64 synapses, each with a header of ten bits, in words of 64 bits
+                words += -(-(min(left, 64) * bits + 10) // 64)
+                left -= 64
+        assert len(held) <= 1024
+        assert len(axons) <= 4096
+        assert words <= 16_384
+        assert len(set(netlist.threshold[held].tolist())) <= 8
+        assert len(set(netlist.axon_format[axons].tolist())) <= 7
+        assert len(set(zip(netlist.decay_u[held].tolist(), netlist.decay_v[held].tolist(), strict=True))) <= 32
+    tiles, used = np.unique(netlist.core_tile, return_counts=True)
+    assert used.max() <= 4
+    assert tiles.max() < 32
+    assert np.all(netlist.synapse_weight % 2 == 0)
+    assert -256 <= netlist.synapse_weight.min() < netlist.synapse_weight.max() <= 254
+    assert netlist.format_exponent.min() >= -1
+    assert set(netlist.decay_v.tolist()) == {3277}
+    assert set(netlist.decay_u.tolist()) == {4095}
+
+
+@pytest.mark.recordings
+def test_the_chip_is_within_one_sample_of_the_float_model(compiled, objects_zip, shared_dir):
+    code, report = command("run", compiled[0], "--data", objects_zip)
+    expected = json.loads((shared_dir / "checkpoints" / "objects_manual.expected.json").read_text())
+    assert code == 0
+    assert report["samples"] == 144
+    assert (report["files"], report["labels"]) == (expected["files"], expected["labels"])
+    right = sum(a == b for a, b in zip(report["predictions"], report["labels"], strict=True))
+    assert abs(right - RIGHT) <= 1
+    assert report["accuracy"] == right / 144
+    agreeing = sum(a == b for a, b in zip(report["predictions"], expected["predictions"], strict=True))
+    assert agreeing >= 0.95 * 144
+
+
+@pytest.mark.recordings
+def test_verify_passes(compiled, released_checkpoint, objects_zip, shared_dir):
+    words = ["--checkpoint", released_checkpoint, "--graph", "manual", "--data", objects_zip, "--limit", 16]
+    code, report = command("verify", compiled[0], *words, "--spec-samples", 1)
+    expected = json.loads((shared_dir / "checkpoints" / "objects_manual.expected.json").read_text())
+    assert code == 0
+    assert report["spec_equals_engine"] is True
+    assert report["same_checkpoint"] is True
+    right = np.equal(expected["predictions"][:16], expected["labels"][:16])
+    assert report["accuracy"]["float"] == right.mean()
+    assert report["decision_agreement"] >= 0.95
+    ladder = {rung["stage"]: rung["different"] for rung in report["ladder"]}
+    assert ladder["saturation"] == {name: layer["different"] for name, layer in report["spikes"].items()}
+    # rounded weights cost what there is to lose; the realised decay is a hair beside them
+    for name, layer in report["spikes"].items():
+        assert ladder["beta"][name] < layer["different"] / 20
+        assert 0.5 < ladder["weights"][name] / layer["different"] < 2
+        assert layer["different"] < layer["float"]
+    first = report["first_divergence"]
+    assert first["file"] == expected["files"][0]
+    assert (first["float_membrane"] > first["theta"]) != (first["chip_membrane"] > first["chip_theta"])
+
+
+@pytest.mark.recordings
+def test_estimate_prices_both_tables(compiled, objects_zip):
+    code, report = command("estimate", compiled[0], "--data", objects_zip, "--limit", 4)
+    assert code == 0
+    assert report["not_modelled"] == []
+    mean = report["per_inference"]
+    assert mean["neuron_accesses"] == 2916 * 253
+    # idle neurons alone cost 2916 * 253 * 51.2 pJ, and synapses come on top
+    for table, floor in (("davies2018", 52.0e-12), ("sanafe", 51.2e-12)):
+        assert report["min"]["energy_j"][table] > 2916 * 253 * floor
+        assert 10e-6 < mean["energy_j"][table] < 2e-3
+
+
+@pytest.mark.recordings
+def test_specification_equals_engine_on_objects(compiled, objects):
+    assert objects.shape == (144, 39, 2, 250)
+    spikes = assert_twins_agree(read_netlist(compiled[0]), objects[[0, 50, 143]])
+    assert np.all(spikes > 0)
+
+
+@pytest.mark.recordings
+def test_compiled_again_the_bytes_are_the_same(compiled, released_checkpoint, objects_zip):
+    path, _ = compiled
+    first = read_netlist(path)
+    graph = build_graph("manual")
+    again = compile_checkpoint(
+        read_checkpoint(released_checkpoint),
+        normalised_adjacency(graph.edges, graph.n_taxels),
+        training_events=load_recordings(objects_zip, "train").events,
+        provenance=first.provenance,
+    )
+    assert netlist_bytes(again.netlist) == path.read_bytes()
+
+
+# -- Containers, for which no checkpoint was released ------------------------------------------------------------------
+
+
+@pytest.mark.recordings
+def test_specification_equals_engine_on_containers(tmp_path, containers):
+    assert containers.shape == (60, 39, 2, 325)
+    arrays = weights(20, taxels=39, features=64, sizes=(128, 256, 20), gain=1.2)
+    own_file(tmp_path / "random.pt", last=arrays, graph=build_graph("manual"))
+    code, report = command("compile", tmp_path / "random.pt", "-o", tmp_path / "random.loom")
+    assert code == 0
+    assert report["layers"][-1]["neurons"] == 20
+    netlist, some = read_netlist(tmp_path / "random.loom"), containers[[0, 30, 59]]
+    spikes = assert_twins_agree(netlist, some)
+    assert np.all(spikes > 1000)
+    # and the chip does what the float model does, by and large
+    checkpoint = read_checkpoint(tmp_path / "random.pt")
+    adjacency = normalised_adjacency(checkpoint.edges, checkpoint.taxels)
+    for found, reference in zip(spikes, float_spikes(checkpoint, adjacency, some).values(), strict=True):
+        assert found == pytest.approx(reference.sum(), rel=0.1)
+
+
+# -- without the recordings --------------------------------------------------------------------------------------------
+
+WITHOUT_TORCH = """
+import sys
+from runtime.cli import main
+code = main(sys.argv[1:])
+unwanted = sorted({name.partition(".")[0] for name in sys.modules} & {"torch", "networkx", "pandas"})
+sys.exit(f"imported: {unwanted}" if "torch" in unwanted else code)
+"""
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory) -> Path:
+    """A folder with recordings, a checkpoint of our own and its netlist."""
+    folder = tmp_path_factory.mktemp("small")
+    recordings_folder(folder / "data")
+    own_file(folder / "net.pt")
+    assert cli.main(["compile", f"{folder}/net.pt", "-o", f"{folder}/net.loom"]) == 0
+    return folder
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["run", "net.loom", "--data", "data", "--spikes", "out.npz"],
+        ["estimate", "net.loom", "--data", "data"],
+    ],
+    ids=["run", "estimate"],
+)
+def test_run_and_estimate_never_import_torch(small, words):
+    done = subprocess.run(
+        [sys.executable, "-c", WITHOUT_TORCH, *words], cwd=small, capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_started_as_a_program(small):
+    words = [sys.executable, "-m", "runtime"]
+    done = subprocess.run([*words, "inspect", "nowhere.pt"], cwd=small, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == (
+        "spikeloom: nowhere.pt: no such file; give a file of spikeloom train or of the released layout\n"
+    )

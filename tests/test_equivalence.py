@@ -1,0 +1,379 @@
+"""The verdict: every number in it a second time, by the specification and by plain loops."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from made_files import STEPS, events, own_file, recordings_folder, small_checkpoint, weights
+from random_netlists import Neuron, build
+
+from compiler.errors import DataError, ModelError
+from compiler.interpret import channels_last, run_float
+from compiler.lift import lift
+from compiler.netlist import read_only
+from compiler.passes.expand import expand
+from compiler.pipeline import compile_checkpoint
+from models.reference import float_membranes, float_spikes
+from runtime import cli, engine, equivalence, spec
+from runtime.equivalence import LADDER, realised, verify
+from runtime.intervals import wilson
+from runtime.votes import class_counts, predictions
+
+LAYERS = ["conv1", "fc1", "fc2", "fc3"]
+LABELS = np.array([0, 1, 2, 3, 0, 1])
+FILES = tuple("abcdef")
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    """A checkpoint, its propagation matrix and a coarse netlist that often strays from it."""
+    checkpoint, adjacency = small_checkpoint(tmp_path_factory.mktemp("small"))
+    netlist = compile_checkpoint(checkpoint, adjacency, weight_bits=4).netlist
+    return checkpoint, adjacency, netlist
+
+
+@pytest.fixture(scope="module")
+def verdict(small):
+    checkpoint, adjacency, netlist = small
+    return verify(netlist, checkpoint, adjacency, events(2), LABELS, FILES)
+
+
+def by_specification(netlist, recordings):
+    """Spikes and membranes of each layer on the chip, (samples, steps, neurons), shifted back by hand."""
+    traces = [spec.simulate(netlist, recording.reshape(netlist.n_inputs, -1)) for recording in recordings]
+    steps = recordings.shape[3]
+    spikes, membranes = [], []
+    for index, layer in enumerate(netlist.layers):
+        window = slice(layer.depth, layer.depth + steps)
+        ids = netlist.compartments_of(index)
+        spikes.append(np.array([trace.spikes[window][:, ids] for trace in traces]))
+        membranes.append(np.array([trace.membranes[window][:, ids] for trace in traces]))
+    return spikes, membranes
+
+
+def test_spikes_and_decisions(small, verdict):
+    checkpoint, adjacency, netlist = small
+    narrow = list(float_spikes(checkpoint, adjacency, events(2)).values())
+    wide = list(float_spikes(checkpoint, adjacency, events(2), dtype="float64").values())
+    chip, _ = by_specification(netlist, events(2))
+    assert list(verdict.spikes) == LAYERS
+    for name, a, b, c in zip(LAYERS, narrow, chip, wide, strict=True):
+        found = verdict.spikes[name]
+        assert (found.float, found.chip) == (int(a.sum()), int(b.sum()))
+        assert found.different == int((a ^ b).sum()) > 0
+        assert found.ill_posed == int((a ^ c).sum())
+    decisions = [spikes[-1].sum(axis=1).argmax(axis=1) for spikes in (narrow, chip)]
+    assert verdict.float_predictions.tolist() == decisions[0].tolist()
+    assert verdict.chip_predictions.tolist() == decisions[1].tolist()
+    assert verdict.float_accuracy == np.mean(decisions[0] == LABELS)
+    assert verdict.chip_accuracy == np.mean(decisions[1] == LABELS)
+    assert verdict.decision_agreement == np.mean(decisions[0] == decisions[1])
+    assert (verdict.files, verdict.labels.tolist()) == (FILES, LABELS.tolist())
+    assert verdict.spec_equals_engine
+    assert verdict.spec_samples == 3
+
+
+def test_the_first_divergence_is_the_first(small, verdict):
+    checkpoint, adjacency, netlist = small
+    reference = list(float_spikes(checkpoint, adjacency, events(2)).values())
+    chip, registers = by_specification(netlist, events(2))
+    membranes = list(float_membranes(checkpoint, adjacency, events(2)).values())
+    first = next(
+        (sample, step, layer, neuron)
+        for sample in range(6)
+        for step in range(STEPS)
+        for layer in range(4)
+        for neuron in range(reference[layer].shape[2])
+        if reference[layer][sample, step, neuron] != chip[layer][sample, step, neuron]
+    )
+    sample, step, layer, neuron = first
+    found, held = verdict.first_divergence, netlist.layers[layer]
+    assert (found.file, found.step, found.layer, found.neuron) == (FILES[sample], step, LAYERS[layer], neuron)
+    assert (found.taxel, found.feature) == ((neuron // 5, neuron % 5) if layer == 0 else (None, None))
+    assert found.float_membrane == membranes[layer][sample, step, neuron]
+    assert found.chip_register == registers[layer][sample, step, neuron]
+    assert found.chip_membrane == found.chip_register / (64 * held.scale)
+    assert (found.theta, found.chip_theta) == (
+        0.5,
+        netlist.threshold[netlist.compartments_of(layer)[neuron]] / held.scale,
+    )
+    # one side fired, the other did not
+    assert (found.float_membrane > found.theta) != (found.chip_membrane > found.chip_theta)
+    assert not found.ill_posed
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_first_divergence_of_other_networks(tmp_path, seed):
+    checkpoint, adjacency = small_checkpoint(tmp_path, last=weights(seed))
+    netlist = compile_checkpoint(checkpoint, adjacency, weight_bits=6).netlist
+    recordings = events(seed, samples=3)
+    found = verify(netlist, checkpoint, adjacency, recordings, LABELS[:3], FILES[:3], spec_samples=1).first_divergence
+    reference = list(float_spikes(checkpoint, adjacency, recordings).values())
+    chip, _ = by_specification(netlist, recordings)
+    different = [a != b for a, b in zip(reference, chip, strict=True)]
+    sample, index = FILES.index(found.file), LAYERS.index(found.layer)
+    assert different[index][sample, found.step, found.neuron]
+    assert not any(d[:sample].any() or d[sample, : found.step].any() for d in different)
+    assert not any(d[sample, found.step].any() for d in different[:index])
+    assert not different[index][sample, found.step, : found.neuron].any()
+    assert (found.taxel is None) == (index > 0)
+
+
+# -- the ladder --------------------------------------------------------------------------------------------------------
+
+
+def test_the_ladder_ends_at_the_chip(verdict):
+    assert tuple(stage for stage, _ in verdict.ladder) == LADDER
+    ladder = dict(verdict.ladder)
+    assert ladder["float64"] == {name: layer.ill_posed for name, layer in verdict.spikes.items()}
+    assert ladder["saturation"] == {name: layer.different for name, layer in verdict.spikes.items()}
+    assert sum(ladder["weights"].values()) > sum(ladder["beta"].values())
+
+
+def test_each_rung_adds_one_deviation(small):
+    checkpoint, adjacency, netlist = small
+    network, integer = expand(checkpoint, adjacency), lift(netlist)
+    beta, scaled, full = realised(network, integer)
+    for index, layer in enumerate(netlist.layers):
+        ids = netlist.compartments_of(index)
+        plain, decayed, weighed, shifted = (n.populations[index] for n in (network, beta, scaled, full))
+        assert (plain.beta, decayed.beta, weighed.beta, shifted.beta) == (0.2, 819 / 4096, 819 / 4096, 819 / 4096)
+        assert decayed.theta == weighed.theta == plain.theta == 0.5
+        assert shifted.theta == netlist.threshold[ids[0]] / layer.scale
+        np.testing.assert_array_equal(weighed.bias, plain.bias)
+        register = netlist.bias_mantissa[ids] * 2.0 ** netlist.bias_exponent[ids]
+        np.testing.assert_allclose(shifted.bias, register / (64 * layer.scale), rtol=1e-15)
+        np.testing.assert_allclose(shifted.bias, plain.bias, atol=0.51 / (64 * layer.scale) * 2**7)
+        exact, rounded = (n.projections[index].weight.toarray() for n in (network, scaled))
+        np.testing.assert_array_equal(beta.projections[index].weight.toarray(), exact)
+        step = 2.0 ** (9 - 4) * 2.0 ** int(netlist.format_exponent.max())
+        assert 0 < np.abs(rounded - exact).max() <= step / layer.scale
+
+
+def test_saturation_is_a_rung_of_its_own(tmp_path):
+    # a bias pulls the membrane below its register for thirty steps, then input pulls it up again: the register, which
+    # stopped at its end, is back earlier than a number without an end
+    arrays = {name: np.zeros_like(array) for name, array in weights(sizes=(2, 2, 2)).items()}
+    arrays["conv1.hops"][0] = 1.0
+    arrays["fc1.weight"][:] = 0.5
+    arrays["fc1.bias"][:] = -8.0
+    checkpoint, adjacency = small_checkpoint(tmp_path, last=arrays, beta=4095 / 4096)
+    recordings = np.zeros((1, 6, 2, 80), np.uint8)
+    recordings[:, :, :, 30:] = 1
+    netlist = compile_checkpoint(checkpoint, adjacency).netlist
+    found = verify(netlist, checkpoint, adjacency, recordings, LABELS[:1], FILES[:1])
+    ladder = dict(found.ladder)
+    assert ladder["rounding"]["fc1"] < ladder["saturation"]["fc1"] == found.spikes["fc1"].different
+    assert found.first_divergence.layer == "fc1"
+    # the other way round than in the register: it clipped what the float model holds
+    assert found.spikes["fc1"].chip > found.spikes["fc1"].float > 0
+
+
+def exact_network(folder):
+    """Weights of one half, a decay of one half, no bias: eight steps of it fit the registers without any rounding."""
+    arrays = {name: np.sign(array) * np.float32(0.5) for name, array in weights(3).items()}
+    arrays |= {name: np.zeros_like(array) for name, array in arrays.items() if name.endswith("bias")}
+    arrays["conv1.hops"][1:] = 0
+    return small_checkpoint(folder, last=arrays, beta=0.5)
+
+
+def test_no_divergence_at_all(tmp_path):
+    checkpoint, adjacency = exact_network(tmp_path)
+    netlist = compile_checkpoint(checkpoint, adjacency).netlist
+    found = verify(netlist, checkpoint, adjacency, events(2, steps=8), LABELS, FILES)
+    assert found.first_divergence is None
+    assert all(layer.float == layer.chip > 0 for layer in found.spikes.values())
+    assert all(set(different.values()) == {0} for _, different in found.ladder)
+    assert found.decision_agreement == 1
+
+
+def test_ill_posed_spikes_are_told_from_faults(tmp_path):
+    # one plus 2**-25 rounds to one in float32, which is not above the threshold of one; in float64 it is
+    arrays = {name: np.zeros_like(array) for name, array in weights(sizes=(8, 8, 2)).items()}
+    arrays["fc1.bias"][:] = 2.0
+    arrays["fc2.weight"][:, :2] = [1.0, 2.0**-25]
+    checkpoint, adjacency = small_checkpoint(tmp_path, last=arrays, beta=0.0, theta=1.0)
+    netlist = compile_checkpoint(checkpoint, adjacency).netlist
+    found = verify(netlist, checkpoint, adjacency, events(0), LABELS, FILES)
+    assert found.spikes["fc2"].float == 0
+    assert found.spikes["fc2"].ill_posed == 6 * STEPS * 8
+    assert found.spikes["fc1"].ill_posed == 0
+    assert dict(found.ladder)["float64"] == {"conv1": 0, "fc1": 0, "fc2": 6 * STEPS * 8, "fc3": 0}
+    # a finer chip would have sided with float64; this one stands for it
+    finer = dataclasses.replace(netlist, threshold=read_only(netlist.threshold - (netlist.layer == 2)))
+    first = verify(finer, checkpoint, adjacency, events(0), LABELS, FILES).first_divergence
+    assert (first.layer, first.step, first.neuron, first.ill_posed) == ("fc2", 0, 0, True)
+
+
+# -- specification and engine ------------------------------------------------------------------------------------------
+
+
+def test_an_engine_of_another_netlist_is_found_out(small, monkeypatch):
+    checkpoint, adjacency, netlist = small
+    weight = netlist.synapse_weight.copy()
+    weight[np.argmax(np.abs(weight))] = 0
+    altered = dataclasses.replace(netlist, synapse_weight=read_only(weight))
+    prepare = engine.prepare
+    monkeypatch.setattr(engine, "prepare", lambda _netlist: prepare(altered))
+    found = verify(netlist, checkpoint, adjacency, events(2), LABELS, FILES)
+    assert not found.spec_equals_engine
+
+
+@pytest.mark.parametrize("field", ["spikes", "membranes", "inputs", "counted spikes", "updates", "saturations"])
+def test_a_single_wrong_bit_is_found_out(small, monkeypatch, field):
+    checkpoint, adjacency, netlist = small
+    simulate = engine.simulate
+
+    def wrong(*words, **options):
+        trace = simulate(*words, **options)
+        if trace.membranes is not None and trace.spikes is not None:
+            if field in ("spikes", "membranes"):
+                getattr(trace, field)[0, -1, -1] ^= 1
+            else:
+                getattr(trace.counts, field.removeprefix("counted "))[0, -1] += 1
+        return trace
+
+    assert verify(netlist, checkpoint, adjacency, events(2), LABELS, FILES, spec_samples=1).spec_equals_engine
+    monkeypatch.setattr(equivalence.engine, "simulate", wrong)
+    assert not verify(netlist, checkpoint, adjacency, events(2), LABELS, FILES, spec_samples=1).spec_equals_engine
+
+
+def test_every_asked_for_recording_is_compared(small, monkeypatch):
+    checkpoint, adjacency, netlist = small
+    plain, seen = spec.simulate, []
+
+    def watched(given, recording):
+        seen.append(recording)
+        return plain(given, recording)
+
+    monkeypatch.setattr(equivalence.spec, "simulate", watched)
+    for asked, compared in ((1, 1), (4, 4), (9, 6)):
+        seen.clear()
+        found = verify(netlist, checkpoint, adjacency, events(2), LABELS, FILES, spec_samples=asked)
+        assert len(seen) == found.spec_samples == compared
+        np.testing.assert_array_equal(seen[-1], events(2)[compared - 1].reshape(12, STEPS))
+
+
+def test_a_disagreement_ends_with_exit_code_one(tmp_path, monkeypatch, capsys):
+    own_file(tmp_path / "net.pt")
+    recordings_folder(tmp_path / "data")
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["compile", "net.pt", "-o", "net.loom"]) == 0
+    words = ["verify", "net.loom", "--checkpoint", "net.pt", "--data", "data", "--min-agreement", "0"]
+    assert cli.main(words) == 0
+    monkeypatch.setattr(equivalence, "_same_run", lambda *_: False)
+    capsys.readouterr()
+    assert cli.main([*words, "--json"]) == 1
+    out, err = capsys.readouterr()
+    assert (json.loads(out)["spec_equals_engine"], err) == (False, "")
+    assert cli.main(words) == 1
+    assert "spec = engine:     NO, every spike and membrane of 3 recordings\n" in capsys.readouterr().out
+
+
+# -- parts that do not belong together ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "theirs"),
+    [
+        ({"sizes": (9, 7, 4)}, "taxels 6, channels 2, conv1 30, fc1 9, fc2 7, fc3 4"),
+        ({"sizes": (9, 8, 4, 4)}, "taxels 6, channels 2, conv1 30, fc1 9, fc2 8, fc3 4, fc4 4"),
+        ({"features": 4}, "taxels 6, channels 2, conv1 24, fc1 9, fc2 8, fc3 4"),
+    ],
+)
+def test_another_architecture(small, tmp_path, options, theirs):
+    _, _, netlist = small
+    checkpoint, adjacency = small_checkpoint(tmp_path, last=weights(**options))
+    with pytest.raises(ModelError) as failure:
+        verify(netlist, checkpoint, adjacency, events(2), LABELS, FILES)
+    assert str(failure.value) == (
+        "netlist and checkpoint disagree: the netlist has taxels 6, channels 2, conv1 30, fc1 9, fc2 8, fc3 4, "
+        f"the checkpoint {theirs}; give the checkpoint that the netlist was compiled from"
+    )
+
+
+def test_other_weights_of_the_same_architecture(small, tmp_path):
+    _, adjacency, netlist = small
+    other, _ = small_checkpoint(tmp_path, last=weights(9))
+    found = verify(netlist, other, adjacency, events(2), LABELS, FILES)
+    assert not found.same_checkpoint
+    assert found.spec_equals_engine
+    assert found.spikes["fc1"].different > 0
+
+
+def test_same_checkpoint_is_told_by_its_hash(small):
+    checkpoint, adjacency, netlist = small
+    marked = dataclasses.replace(netlist, provenance={"checkpoint_sha256": checkpoint.sha256})
+    assert verify(marked, checkpoint, adjacency, events(2), LABELS, FILES).same_checkpoint
+
+
+def test_graph_recordings_and_number_of_samples(small):
+    checkpoint, adjacency, netlist = small
+    with pytest.raises(ModelError, match=r"^graph and weights disagree: the graph has 3 taxels, "):
+        verify(netlist, checkpoint, adjacency[:3, :3], events(2), LABELS, FILES)
+    with pytest.raises(DataError, match=r"^recordings: 10 input channels found, the netlist has 12; "):
+        verify(netlist, checkpoint, adjacency, events(2, taxels=5), LABELS, FILES)
+    with pytest.raises(DataError, match=r"^--spec-samples 0: at least 1 recording is needed; "):
+        verify(netlist, checkpoint, adjacency, events(2), LABELS, FILES, spec_samples=0)
+
+
+def test_several_thresholds_in_a_layer_have_no_ladder(small):
+    checkpoint, adjacency, netlist = small
+    threshold = netlist.threshold.copy()
+    threshold[0] += 1
+    with pytest.raises(ModelError) as failure:
+        verify(
+            dataclasses.replace(netlist, threshold=read_only(threshold)),
+            checkpoint,
+            adjacency,
+            events(2),
+            LABELS,
+            FILES,
+        )
+    assert str(failure.value) == (
+        "the ladder: a layer has several thresholds, one is allowed; compile with one scale per layer"
+    )
+
+
+def test_the_expanded_network_is_the_float_model(small):
+    checkpoint, adjacency, _ = small
+    expanded = run_float(expand(checkpoint, adjacency), channels_last(events(2))).spikes
+    for a, b in zip(expanded, float_spikes(checkpoint, adjacency, events(2), dtype="float64").values(), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+# -- votes and intervals -----------------------------------------------------------------------------------------------
+
+
+def test_votes_of_several_neurons_add_up():
+    netlist = build([Neuron()] * 5, [], n_inputs=1, depths=[0])
+    netlist = dataclasses.replace(netlist, classes=3, readout_class=read_only([2, 0, -1, 2, 1]))
+    spikes = np.array([[3, 5, 100, 4, 7], [1, 2, 0, 1, 2], [0, 0, 9, 0, 0]])
+    assert class_counts(netlist, spikes).tolist() == [[5, 7, 7], [2, 2, 2], [0, 0, 0]]
+    assert predictions(netlist, spikes).tolist() == [1, 0, 0]  # ties go to the lowest class
+
+
+def test_wilson_of_published_examples():
+    # Newcombe, Statistics in Medicine 17, 1998, table I, method 3
+    for successes, trials, interval in (
+        (81, 263, (0.2553, 0.3662)),
+        (15, 148, (0.0624, 0.1605)),
+        (0, 20, (0.0000, 0.1611)),
+        (1, 29, (0.0061, 0.1718)),
+    ):
+        assert wilson(successes, trials) == pytest.approx(interval, abs=5e-5)
+
+
+@given(st.integers(1, 500), st.data())
+def test_wilson_solves_its_equation(trials, data):
+    successes = data.draw(st.integers(0, trials))
+    z, share = 1.959963984540054, successes / trials
+    low, high = wilson(successes, trials)
+    assert 0 <= low <= share <= high <= 1
+    for bound in {low, high} - {0.0, 1.0}:  # the ends of the interval lie z standard deviations from the share
+        assert abs(share - bound) == pytest.approx(z * (bound * (1 - bound) / trials) ** 0.5, abs=1e-9)
+    mirrored = wilson(trials - successes, trials)
+    assert (1 - mirrored[1], 1 - mirrored[0]) == pytest.approx((low, high), abs=1e-12)

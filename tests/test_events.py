@@ -1,0 +1,622 @@
+import hashlib
+import io
+import time
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from compiler.errors import DataError, OptionError
+from models import events, fetch
+from models.describe import describe
+from models.eventfiles import UNLABELLED, read_stream
+from models.events import BIN_S, GAP_S, MAX_STEPS, bin_events, data_splits, load_data, need_labels
+from models.evtouch import load_recordings
+from models.fetch import DataSet
+from models.grasps import synthetic_grasps
+from models.release import write_released
+
+HEADER = "time_s,taxel,polarity\n"
+
+
+@pytest.fixture
+def write(tmp_path):
+    def write(name: str, text: str) -> Path:
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+        return path
+
+    return write
+
+
+@pytest.fixture
+def save(tmp_path):
+    def save(name: str, **arrays) -> Path:
+        path = tmp_path / name
+        np.savez(path, **arrays)
+        return path
+
+    return save
+
+
+def message(function, *arguments, error=DataError, **options) -> str:
+    with pytest.raises(error) as caught:
+        function(*arguments, **options)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def one(path, **options):
+    """Events of one recording as (taxel, polarity, bin), and the counts."""
+    recordings, counts = load_data(path, **options)
+    return np.argwhere(recordings.events[0]).tolist(), counts
+
+
+# One recording
+
+
+def test_events_fall_into_bins(write):
+    found, counts = one(write("a.csv", f"{HEADER}0,0,0\n0.0199,1,1\n0.02,1,0\n0.0999,0,1\n"))
+    assert found == [[0, 0, 0], [0, 1, 4], [1, 0, 1], [1, 1, 0]]
+    assert counts.steps == (5,)
+    found, counts = one(write("a.csv", f"{HEADER}0,0,0\n0.0199,1,1\n0.02,1,0\n0.0999,0,1\n"), bin_s=0.05)
+    assert found == [[0, 0, 0], [0, 1, 1], [1, 0, 0], [1, 1, 0]]
+
+
+@pytest.mark.parametrize("bin_s", ["0.02", "0.001", "0.1", "0.03", "0.7", "1"])
+def test_decimal_times_on_an_edge_begin_their_bin(write, bin_s):
+    from decimal import Decimal
+
+    steps = [*range(0, 2000, 7), MAX_STEPS - 1]
+    text = "".join(f"{Decimal(bin_s) * step},0,1\n" for step in steps)
+    stream = read_stream(write("a.csv", text))
+    grid, counts = bin_events(stream, float(bin_s))
+    assert np.flatnonzero(grid[0, 1]).tolist() == steps
+    assert counts.duplicates == 0
+
+
+def test_what_is_odd_is_counted(write):
+    rows = "0.00,0,1\n0.30,0,1\n0.10,1,0\n0.31,0,1\n0.305,0,1\n0.31,1,1\n0.25,1,1\n0.8001,0,0\n1.3,0,0\n1.81,0,0\n"
+    found, counts = one(write("a.csv", HEADER + rows))
+    assert (counts.events, counts.out_of_order, counts.duplicates, counts.gaps) == (10, 3, 2, 1)
+    assert len(found) == 8
+    assert GAP_S == 0.5  # 0.31 to 0.8001 and on to 1.3 are shorter, 1.3 to 1.81 is longer
+
+
+def test_order_does_not_change_the_bins(write, save):
+    rng = np.random.default_rng(0)
+    time_s, taxel, polarity = rng.random(500) * 3, rng.integers(0, 9, 500), rng.integers(0, 2, 500)
+    order = np.argsort(time_s)
+    mixed, odd = load_data(save("mixed.npz", time_s=time_s, taxel=taxel, polarity=polarity))
+    straight, even = load_data(save("s.npz", time_s=time_s[order], taxel=taxel[order], polarity=polarity[order]))
+    assert np.array_equal(mixed.events, straight.events)
+    assert (odd.duplicates, odd.gaps) == (even.duplicates, even.gaps)
+    assert odd.out_of_order > even.out_of_order == 0
+
+
+@pytest.mark.parametrize("falling", [0, -1])
+def test_both_codes_of_polarity(write, falling):
+    found, _ = one(write("a.csv", f"0,0,1\n0.02,0,{falling}\n"))
+    assert found == [[0, 0, 1], [0, 1, 0]]
+
+
+def test_one_polarity_alone(write):
+    assert one(write("a.csv", "0,0,-1\n"))[0] == [[0, 0, 0]]
+    assert one(write("a.csv", "0,0,1\n"))[0] == [[0, 1, 0]]
+
+
+@pytest.mark.parametrize(
+    ("rows", "found"),
+    [
+        (
+            "0,0,1\nnan,0,1\n",
+            "a.csv: line 3: time nan s, allowed are finite times from 0; count from the start of the recording",
+        ),
+        (
+            "0,0,1\n-0.1,0,1\n",
+            "a.csv: line 3: time -0.1 s, allowed are finite times from 0; count from the start of the recording",
+        ),
+        (
+            "inf,0,1\n",
+            "a.csv: line 2: time inf s, allowed are finite times from 0; count from the start of the recording",
+        ),
+        (
+            "1600000000,0,1\n",
+            "a.csv: line 2: time 1.6e+09 s is past 1000000 bins of 0.02 s, the limit of a recording; "
+            "count from the start of the recording or use wider bins",
+        ),
+        (
+            "0,0,1\n0,39,1\n",
+            "a.csv: line 3: taxel 39, allowed are whole numbers 0..38; count from 0 and use recordings of this sensor",
+        ),
+        (
+            "0,-1,1\n",
+            "a.csv: line 2: taxel -1, allowed are whole numbers 0..38; count from 0 and use recordings of this sensor",
+        ),
+        (
+            "0,1.5,1\n",
+            "a.csv: line 2: taxel 1.5, allowed are whole numbers 0..38; count from 0 and use recordings of this sensor",
+        ),
+        (
+            "0,nan,1\n",
+            "a.csv: line 2: taxel nan, allowed are whole numbers 0..38; count from 0 and use recordings of this sensor",
+        ),
+        ("0,0,1\n0,0,2\n", "a.csv: line 3: polarity 2, allowed are 0 and 1, or -1 and 1; 1 is rising"),
+        ("0,0,nan\n", "a.csv: line 2: polarity nan, allowed are 0 and 1, or -1 and 1; 1 is rising"),
+        (
+            "0,0,1\n0,0,0\n0,0,-1\n",
+            "a.csv: polarities -1 and 0 in one file, allowed are 0 and 1, or -1 and 1; write one code",
+        ),
+        ("0,0,up\n", "a.csv: line 2: polarity is 'up', not a number; write plain numbers"),
+        ("", "a.csv: no rows, expected are lines of time_s, taxel, polarity[, label]; check how the file was written"),
+    ],
+)
+def test_events_that_cannot_be(write, rows, found):
+    path = write("a.csv", HEADER + rows)
+    assert message(load_data, path, taxels=39) == found
+    inside = message(load_data, path.parent, taxels=39)
+    assert inside == f"{path.parent.name}: {found}"
+
+
+def test_taxels_have_a_limit_of_their_own(write):
+    assert message(load_data, write("a.csv", "0,4096,1\n")) == (
+        "a.csv: line 1: taxel 4096, allowed are whole numbers 0..4095; count from 0 and use recordings of this sensor"
+    )
+
+
+@pytest.mark.parametrize("bin_s", [0.0, -0.02, float("nan"), float("inf")])
+def test_bins_that_cannot_be(write, bin_s):
+    assert message(load_data, write("a.csv", "0,0,1\n"), bin_s=bin_s, error=OptionError) == (
+        f"--bin {bin_s:g}: not a duration; give seconds above 0, for example 0.02"
+    )
+
+
+def test_tiny_bins_are_too_many_bins(write):
+    assert message(load_data, write("a.csv", "1,0,1\n"), bin_s=5e-324) == (
+        "a.csv: line 1: time 1 s is past 1000000 bins of 4.94066e-324 s, the limit of a recording; "
+        "count from the start of the recording or use wider bins"
+    )
+
+
+def test_memory_is_checked_first(write, monkeypatch):
+    monkeypatch.setattr("models.evtouch.MAX_TOTAL_BYTES", 1000)
+    path = write("d/a.csv", "19.99,0,1\n")
+    assert message(load_data, path) == "a.csv: recordings of 2000 bytes, limit 1000; split the data set"
+    path.write_text("4,0,1\n")
+    write("d/b.csv", "0,1,1\n")
+    assert message(load_data, path.parent) == "d: recordings of 1608 bytes, limit 1000; split the data set"
+
+
+# Labels
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "label"),
+    [
+        ("a.csv", "time_s,taxel,polarity,label\n0,0,1,4\n0.1,0,1,4\n", 4),
+        ("a.csv", "0,0,1,4\n0.1,0,1,4\n", 4),
+        ("sample_3_label_17.csv", "0,0,1\n", 17),
+        ("grasp_label_2_left.csv", "0,0,1\n", 2),
+        ("grasp_label_2.csv", "0,0,1,2\n", 2),
+        ("a.csv", "0,0,1\n", UNLABELLED),
+        ("label_2.csv", "0,0,1\n", UNLABELLED),
+    ],
+)
+def test_labels(write, name, text, label):
+    recordings, _ = load_data(write(name, text))
+    assert recordings.labels.tolist() == [label]
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "found"),
+    [
+        (
+            "a.csv",
+            "0,0,1,4\n0,0,1,5\n",
+            "a.csv: labels 4 and 5 in one file, allowed is one; write one file for each recording",
+        ),
+        (
+            "a_label_3.csv",
+            "0,0,1,4\n",
+            "a_label_3.csv: label 4 in the file and 3 in its name; mend one of them",
+        ),
+        ("a.csv", "0,0,1,-1\n", "a.csv: label -1, allowed are whole numbers 0..999999; number the classes"),
+        ("a.csv", "0,0,1,1.5\n", "a.csv: label 1.5, allowed are whole numbers 0..999999; number the classes"),
+        ("a.csv", "0,0,1,nan\n", "a.csv: label nan, allowed are whole numbers 0..999999; number the classes"),
+        (
+            "a.csv",
+            "0,0,1,6\n",
+            "a.csv: label 6, the network has 6 classes (0..5); use the network that was trained on these objects",
+        ),
+    ],
+)
+def test_labels_that_cannot_be(write, name, text, found):
+    assert message(load_data, write(name, text), classes=6) == found
+
+
+def test_who_needs_labels_says_so(write):
+    write("d/a_label_1.csv", "0,0,1\n")
+    recordings, _ = load_data(write("d/b.csv", "0,0,1\n").parent)
+    assert recordings.labels.tolist() == [1, UNLABELLED]
+    assert message(need_labels, recordings, "training") == (
+        "d: b.csv: no label, training needs one for every recording; "
+        "add a label column or name the file like grasp_7_label_3.csv"
+    )
+    recordings, _ = load_data(write("d/b.csv", "0,0,1,1\n").parent)
+    assert need_labels(recordings, "training") is recordings
+
+
+# npz
+
+
+@pytest.mark.parametrize("dtype", ["f8", "f4", "i4", ">i2", "u1"])
+def test_npz(save, dtype):
+    path = save("a.npz", time_s=np.array([0.5, 0.1]), taxel=np.array([2, 0], dtype), polarity=np.array([1, 0], dtype))
+    found, counts = one(path)
+    assert found == [[0, 0, 5], [2, 1, 25]]
+    assert counts.out_of_order == 1
+
+
+@pytest.mark.parametrize("label", [3, [3], [3, 3]])
+def test_npz_labels(save, label):
+    recordings, _ = load_data(save("a.npz", time_s=[0.5, 0.1], taxel=[2, 0], polarity=[1, 0], label=label))
+    assert recordings.labels.tolist() == [3]
+
+
+def test_compressed_npz(tmp_path):
+    np.savez_compressed(tmp_path / "a.npz", time_s=[0.5], taxel=[2], polarity=[True])
+    assert one(tmp_path / "a.npz")[0] == [[2, 1, 25]]
+
+
+@pytest.mark.parametrize(
+    ("arrays", "found"),
+    [
+        (
+            {"time_s": [0.1], "taxel": [0]},
+            "a.npz: holds taxel, time_s, expected are time_s, taxel, polarity[, label]; name the arrays so",
+        ),
+        (
+            {"time_s": [0.1], "taxel": [0, 1], "polarity": [1]},
+            "a.npz: shapes time_s (1,), taxel (2,), polarity (1,), allowed is one number per event in each; "
+            "save flat arrays",
+        ),
+        (
+            {"time_s": [[0.1]], "taxel": [[0]], "polarity": [[1]]},
+            "a.npz: shapes time_s (1, 1), taxel (1, 1), polarity (1, 1), allowed is one number per event in each; "
+            "save flat arrays",
+        ),
+        (
+            {"time_s": [], "taxel": [], "polarity": []},
+            "a.npz: no events, a recording needs one or more; remove the file",
+        ),
+        (
+            {"time_s": [0.1], "taxel": [0], "polarity": ["up"]},
+            "a.npz: polarity: dtype '<U2', allowed are numbers; convert it",
+        ),
+        (
+            {"time_s": [0.1], "taxel": np.array([0], dtype=object), "polarity": [1]},
+            "a.npz: taxel: dtype '|O', allowed are numbers; convert it",
+        ),
+        (
+            {"time_s": [0.1, 0.2, 0.3], "taxel": [0, 0, 0], "polarity": [1, 1, 1], "label": [1, 1]},
+            "a.npz: 2 labels for 3 events, allowed is one; save one number",
+        ),
+        (
+            {"time_s": [0.1, -1], "taxel": [0, 0], "polarity": [1, 1]},
+            "a.npz: event 1: time -1 s, allowed are finite times from 0; count from the start of the recording",
+        ),
+    ],
+)
+def test_npz_that_cannot_be(save, arrays, found):
+    assert message(load_data, save("a.npz", **arrays)) == found
+
+
+def test_npz_that_lie(save, tmp_path):
+    path = tmp_path / "a.npz"
+    path.write_text("0,0,1\n")
+    assert message(load_data, path) == "a.npz: not an npz file; save it with numpy.savez"
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (10**12,)})
+    with zipfile.ZipFile(path, "w") as archive:
+        for name in ("time_s", "taxel", "polarity"):
+            archive.writestr(f"{name}.npy", header.getvalue() + bytes(8))
+    assert message(load_data, path) == (
+        "a.npz: time_s: 8 bytes of data, its header announces 8000000000000; truncated or damaged; copy it again"
+    )
+    save("a.npz", time_s=np.arange(9.0), taxel=[0] * 9, polarity=[1] * 9)
+    data = path.read_bytes()
+    path.write_bytes(data[:200] + bytes([data[200] ^ 255]) + data[201:])
+    assert message(load_data, path) == "a.npz: time_s: truncated or damaged; copy or download it again"
+
+
+# Folders
+
+
+def test_flat_folders_stand_for_any_split(write, save, tmp_path):
+    write("d/b_label_1.csv", "0.1,1,1\n")
+    write("d/a_label_0.CSV", "0.5,0,0\n")
+    write("d/.hidden.csv", "no")
+    write("d/notes.txt", "no")
+    save("d/c.npz", time_s=[0.0], taxel=[0], polarity=[0], label=2)
+    np.save(tmp_path / "d" / "sample_4_label_5.npy", np.ones((2, 2, 3), dtype=np.float32))
+    for split in ("train", "test", "third"):
+        recordings, counts = load_data(tmp_path / "d", split)
+        assert recordings.files == ("a_label_0.CSV", "b_label_1.csv", "c.npz", "sample_4_label_5.npy")
+        assert recordings.labels.tolist() == [0, 1, 2, 5]
+        assert recordings.split == split
+        assert recordings.events.shape == (4, 2, 2, 26)
+        assert counts.steps == (26, 6, 1, 3)
+        assert counts.events == 3 + 12
+        assert recordings.events[3].sum(axis=(0, 1)).tolist() == [4] * 3 + [0] * 23  # padded at the end
+    assert data_splits(tmp_path / "d") == ()
+    first, counts = load_data(tmp_path / "d", limit=2, taxels=7)
+    assert first.events.shape == (2, 7, 2, 26)
+    assert len(counts.steps) == 2
+
+
+def test_folders_with_splits(write, tmp_path):
+    write("d/train/a_label_0.csv", "0.1,1,1\n")
+    write("d/test/b_label_1.csv", "0.3,0,1\n")
+    write("d/coords.csv", "0,0\n1,1\n")  # beside the splits anything may lie
+    assert load_data(tmp_path / "d", "train")[0].files == ("a_label_0.csv",)
+    assert load_data(tmp_path / "d", "test")[0].labels.tolist() == [1]
+    assert data_splits(tmp_path / "d") == ("test", "train")
+    assert message(load_data, tmp_path / "d", "dev") == (
+        "d: split 'dev' is missing or empty; splits with recordings: test, train"
+    )
+    assert load_data(tmp_path / "d" / "train")[0].files == ("a_label_0.csv",)
+
+
+def test_bins_and_events_do_not_mix(write, tmp_path):
+    write("d/train/a_label_0.csv", "0.1,1,1\n")
+    write("d/test/sample_0_label_1.npy", "")
+    assert message(load_data, tmp_path / "d") == (
+        "d: .npy beside .csv in train/ and test/, allowed are bins or events; keep one kind"
+    )
+
+
+def test_one_released_recording(tmp_path):
+    grasps = synthetic_grasps(per_class=1, steps=40, seed=0)
+    np.save(tmp_path / "sample_0_label_3.npy", grasps.events[3].astype(np.float32))
+    np.save(tmp_path / "grasp.npy", grasps.events[3])
+    for name, label in (("sample_0_label_3.npy", 3), ("grasp.npy", UNLABELLED)):
+        recordings, counts = load_data(tmp_path / name, taxels=39, classes=6)
+        assert np.array_equal(recordings.events, grasps.events[3:4])
+        assert recordings.labels.tolist() == [label]
+        assert (counts.events, counts.duplicates, counts.steps) == (grasps.events[3].sum(), 0, (40,))
+    np.save(tmp_path / "bad.npy", np.full((3, 2, 4), 0.5))
+    assert message(load_data, tmp_path / "bad.npy") == (
+        "bad.npy: value 0.5 at taxel 0, polarity 0, step 0, allowed are 0 and 1; recordings are events, not pressures"
+    )
+
+
+def test_silence_in_bins_is_a_gap(tmp_path):
+    grid = np.zeros((1, 2, 100), dtype=np.uint8)
+    grid[0, 0, [0, 26, 53]] = 1  # 25 empty bins are half a second, 26 are more
+    np.save(tmp_path / "a.npy", grid)
+    assert load_data(tmp_path / "a.npy")[1].gaps == 1
+
+
+def test_what_is_no_recording(write, tmp_path):
+    path = write("a.txt", "0,0,1\n")
+    assert message(load_data, path) == (
+        f"{path}: not a recording; give a folder, a released zip, or a .csv, .npz or .npy file"
+    )
+    missing = tmp_path / "none.csv"
+    assert message(load_data, missing) == (
+        f"{missing}: no such file or folder; give the folder or zip that holds train/ and test/"
+    )
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    assert message(load_data, empty) == (
+        "empty: no recordings (train/ or test/ with sample_N_label_L.npy); "
+        "give the folder or zip that holds train/ and test/"
+    )
+    assert message(load_data, path, limit=0, error=OptionError) == (
+        "--limit 0: at least 1 recording is needed; give a positive number"
+    )
+
+
+def test_the_released_layout_goes_its_own_way(tmp_path):
+    grasps = synthetic_grasps(per_class=2, steps=30, seed=1)
+    split = type(grasps)(
+        events=grasps.events, labels=grasps.labels, files=grasps.files, split="test", source=grasps.source
+    )
+    for name in ("d", "d.zip"):
+        write_released(tmp_path / name, [split])
+        recordings, counts = load_data(tmp_path / name, classes=6, taxels=39)
+        assert counts is None
+        assert np.array_equal(recordings.events, grasps.events)
+        assert recordings.files == tuple(f"sample_{i:02}_label_{i % 6}.npy" for i in range(12))
+        assert data_splits(tmp_path / name) == ("test",)
+
+
+def test_names_of_fetched_data(tmp_path, monkeypatch):
+    monkeypatch.setenv("SPIKELOOM_DATA", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    grasps = synthetic_grasps(per_class=1, steps=30, seed=1)
+    test = type(grasps)(
+        events=grasps.events, labels=grasps.labels, files=grasps.files, split="test", source=grasps.source
+    )
+    path = tmp_path / "Ev-Objects.zip"
+    assert message(load_data, "objects") == (
+        f"objects: not on this machine (no {path}); run 'spikeloom data fetch objects', "
+        "or write ./objects for a folder of that name"
+    )
+    write_released(path, [test])
+    sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
+    data = DataSet(file="Ev-Objects.zip", url="", size=path.stat().st_size, sha256=sha256)
+    monkeypatch.setitem(fetch.DATA_SETS, "objects", data)
+    assert np.array_equal(load_data("objects")[0].events, grasps.events)
+    assert data_splits("objects") == ("test",)
+    (tmp_path / "objects").mkdir()
+    (tmp_path / "objects" / "a_label_1.csv").write_text("0,0,1\n")
+    assert len(load_data("objects")[0]) == 6
+    assert len(load_data("./objects")[0]) == 1
+
+
+# Any events
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_any_recording_survives_as_events(tmp_path, data):
+    """Bins to event lines, in any order and with repeats, and back."""
+    taxels, steps = data.draw(st.integers(1, 5)), data.draw(st.integers(1, 60))
+    rng = np.random.default_rng(data.draw(st.integers(0, 2**32)))
+    grid = rng.random((taxels, 2, steps)) < data.draw(st.sampled_from([0.02, 0.3, 0.9]))
+    grid[0, 0, 0] = grid[-1, 0, -1] = True
+    found = np.argwhere(grid)
+    rows = np.concatenate([found, found[: len(found) // 2]])
+    rng.shuffle(rows)
+    inside = rng.random(len(rows)) * rng.integers(0, 2) * 0.0199
+    falling = data.draw(st.sampled_from([0, -1]))
+    text = "".join(
+        f"{step * BIN_S + late:.6f},{taxel},{polarity or falling}\n"
+        for (taxel, polarity, step), late in zip(rows.tolist(), inside.tolist(), strict=True)
+    )
+    path = tmp_path / "a.csv"
+    path.write_text(text)
+    recordings, counts = load_data(path)
+    assert np.array_equal(recordings.events[0], grid)
+    assert (counts.events, counts.duplicates) == (len(rows), len(found) // 2)
+
+
+@pytest.mark.recordings
+def test_a_released_recording_survives_as_events(objects_zip, tmp_path):
+    released = load_recordings(objects_zip, "test", limit=8)
+    for index, name in enumerate(released.files):
+        rows = np.argwhere(released.events[index])
+        rows[:, 1] = 2 * rows[:, 1] - 1
+        lines = [f"{step * 0.02:.2f},{taxel},{sign}" for taxel, sign, step in rows.tolist()]
+        (tmp_path / name).with_suffix(".csv").write_text("\n".join(lines))
+    recordings, _ = load_data(tmp_path, taxels=39, classes=36)
+    assert recordings.labels.tolist() == released.labels.tolist()
+    last = recordings.steps
+    assert np.array_equal(recordings.events, released.events[..., :last])
+    assert not released.events[..., last:].any()
+
+
+def test_a_million_events_take_about_a_second(tmp_path):
+    rng = np.random.default_rng(0)
+    n = 1_000_000
+    columns = np.sort(rng.random(n) * 100), rng.integers(0, 39, n), rng.integers(0, 2, n)
+    path = tmp_path / "a.csv"
+    path.write_text("".join(f"{t:.6f},{x},{p}\n" for t, x, p in zip(*(c.tolist() for c in columns), strict=True)))
+    begin = time.process_time()
+    recordings, counts = load_data(path, taxels=39)
+    assert time.process_time() - begin < 5  # about 1.2 s where nothing else runs
+    assert counts.events == n
+    assert counts.duplicates == n - int(recordings.events.sum())
+
+
+# What recordings hold
+
+
+def test_description():
+    grasps = synthetic_grasps(per_class=2, steps=20, seed=1)
+    grid = np.zeros((2, 5, 2, 10), dtype=np.uint8)
+    grid[:, :4, :, ::5] = 1
+    grid[:, 1] = 0
+    grid[:, 2, 1] = 0
+    grid[1, :, :, 5:] = 0  # the second recording has 5 steps
+    recordings = type(grasps)(
+        events=grid, labels=np.array([3, -1]), files=("a", "b"), split="test", source="made for this"
+    )
+    found = describe(recordings, 0.1, steps=(10, 5))
+    assert found.duration_s == (0.5, 0.75, 1.0)
+    assert (found.recordings, found.events, found.classes) == (2, 15, {-1: 1, 3: 1})
+    assert found.rate.tolist() == [[2, 2], [0, 0], [2, 0], [2, 2], [0, 0]]  # 3 events in 1.5 s
+    assert found.course[0].tolist() == [30, 20]
+    assert found.course[5].tolist() == [30, 20]  # of the recording that is left
+    assert found.course[[1, 2, 3, 4, 6, 7, 8, 9]].sum() == 0
+    assert (found.dead, found.one_sided, found.hot) == ((1, 4), (2,), ())
+
+
+def test_hot_taxels_exceed_five_times_the_median():
+    grasps = synthetic_grasps(per_class=1, steps=20, seed=1)
+    grid = np.zeros((1, 6, 2, 100), dtype=np.uint8)
+    grid[0, :3, :, :5] = 1
+    grid[0, 3, :, :25] = 1
+    grid[0, 4, :, :26] = 1  # taxel 5 is dead and does not lower the median
+    recordings = type(grasps)(events=grid, labels=np.array([0]), files=("a",), split="test", source="x")
+    found = describe(recordings, 0.02)
+    assert (found.dead, found.hot) == ((5,), (4,))
+
+
+def test_silence_is_described():
+    grasps = synthetic_grasps(per_class=1, steps=20, seed=1)
+    recordings = type(grasps)(
+        events=np.zeros((1, 3, 2, 4), dtype=np.uint8), labels=np.array([0]), files=("a",), split="test", source="x"
+    )
+    found = describe(recordings, 0.02)
+    assert (found.dead, found.hot, found.events) == ((0, 1, 2), (), 0)
+
+
+@pytest.mark.recordings
+def test_the_released_taxel_that_never_rises(objects_zip):
+    """A fact about the released Objects: taxel 38 has falling events only."""
+    found = describe(load_recordings(objects_zip, "train"), BIN_S)
+    assert (found.dead, found.one_sided, found.hot) == ((), (38,), ())
+    assert found.events == 1_436_943
+
+
+# Writing
+
+
+def test_writing_is_all_or_nothing(tmp_path, monkeypatch):
+    grasps = synthetic_grasps(per_class=1, steps=20, seed=1)
+    calls = []
+    original = np.lib.format.write_array
+
+    def breaks(*arguments, **options):
+        calls.append(1)
+        if len(calls) == 4:
+            raise OSError(28, "No space left on device")
+        original(*arguments, **options)
+
+    monkeypatch.setattr(np.lib.format, "write_array", breaks)
+    for name in ("d", "d.zip"):
+        calls.clear()
+        with pytest.raises(OSError, match="No space left on device"):
+            write_released(tmp_path / name, [grasps])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_equal_recordings_give_equal_zips(tmp_path):
+    grasps = synthetic_grasps(per_class=1, steps=20, seed=1)
+    write_released(tmp_path / "a.zip", [grasps])
+    write_released(tmp_path / "b.zip", [grasps])
+    assert (tmp_path / "a.zip").read_bytes() == (tmp_path / "b.zip").read_bytes()
+
+
+def test_places_to_write(tmp_path, write):
+    grasps = synthetic_grasps(per_class=1, steps=20, seed=1)
+    (tmp_path / "d").mkdir()
+    assert message(write_released, tmp_path / "d", [grasps], error=OptionError) == (
+        f"-o {tmp_path / 'd'}: exists already; choose another name or remove it"
+    )
+    assert message(write_released, tmp_path / "e" / "f", [grasps], error=OptionError) == (
+        f"-o {tmp_path / 'e' / 'f'}: the folder around it does not exist; make it first"
+    )
+    unlabelled, _ = load_data(write("a.csv", "0,0,1\n"))
+    assert message(write_released, tmp_path / "g", [unlabelled]) == (
+        "a.csv: a.csv: no label, the released layout needs one for every recording; "
+        "add a label column or name the file like grasp_7_label_3.csv"
+    )
+
+
+def test_written_folders_are_as_open_as_others(tmp_path):
+    grasps = synthetic_grasps(per_class=1, steps=20, seed=1)
+    write_released(tmp_path / "d", [grasps])
+    (tmp_path / "other").mkdir()
+    assert (tmp_path / "d").stat().st_mode == (tmp_path / "other").stat().st_mode
+
+
+def test_module_constants_agree():
+    assert events.BIN_S == 0.02
+    assert MAX_STEPS * 3.4e-16 < events._EDGE  # three roundings of a quotient, relative 2**-53 each

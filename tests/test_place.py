@@ -1,0 +1,197 @@
+import itertools
+import time
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from random_networks import LOIHI, integer_chain, integer_networks, small_target
+
+from compiler.passes import place as place_module
+from compiler.passes.emit import emit
+from compiler.passes.partition import Chunk, Partition, partition
+from compiler.passes.place import core_traffic, hops, place
+
+
+def cost(traffic, tiles, width):
+    """Spikes times hops, pair by pair."""
+    return sum(
+        traffic[a, b] * sum(hops(tiles[a], tiles[b], width)) for a in range(len(tiles)) for b in range(len(tiles))
+    )
+
+
+def brute_force(traffic, width, height, tile_cores):
+    """Least cost of all layouts; the first core may sit in one quarter, the others are its mirror images."""
+    cores = len(traffic)
+    best = np.inf
+    quarter = [y * width + x for y in range((height + 1) // 2) for x in range((width + 1) // 2)]
+    for first in quarter:
+        for rest in itertools.product(range(width * height), repeat=cores - 1):
+            tiles = (first, *rest)
+            if max(tiles.count(tile) for tile in tiles) <= tile_cores:
+                best = min(best, cost(traffic, tiles, width))
+    return best
+
+
+def layered(seed, cores):
+    """Three groups of cores that talk from one to the next, as the layers of a network do."""
+    rng = np.random.default_rng(seed)
+    group = np.sort(rng.integers(0, 3, cores))
+    return np.where(group[:, None] + 1 == group, rng.random((cores, cores)), 0.0)
+
+
+@pytest.mark.parametrize(("a", "b", "expected"), [(0, 0, (0, 0)), (0, 17, (1, 2)), (7, 24, (7, 3)), (31, 0, (7, 3))])
+def test_hops_under_xy_routing(a, b, expected):
+    assert hops(a, b, 8) == expected
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    st.integers(1, 5),
+    st.sampled_from([(3, 2, 1), (3, 3, 2), (2, 2, 2), (5, 1, 1), (1, 5, 2)]),
+    st.integers(0, 2**32 - 1),
+    st.sampled_from(["random", "whole", "layered"]),
+)
+def test_the_optimum_of_small_cases(cores, mesh, seed, kind):
+    width, height, tile_cores = mesh
+    cores = min(cores, width * height * tile_cores)
+    rng = np.random.default_rng(seed)
+    traffic = {
+        "random": rng.random((cores, cores)),
+        "whole": rng.integers(0, 3, (cores, cores)).astype(float),
+        "layered": layered(seed, cores),
+    }[kind]
+    target = small_target(mesh_width=width, mesh_height=height, mesh_tile_cores=tile_cores)
+    placement = place(traffic, target)
+    assert placement.spike_hops == pytest.approx(brute_force(traffic, width, height, tile_cores), rel=1e-9, abs=1e-12)
+    assert placement.bound == placement.spike_hops
+    assert placement.spike_hops == pytest.approx(cost(traffic, placement.tiles, width), abs=1e-12)
+    assert max(placement.tiles.count(tile) for tile in placement.tiles) <= tile_cores
+    assert set(placement.tiles) <= set(range(width * height))
+
+
+def test_cores_that_talk_share_a_tile():
+    traffic = np.zeros((8, 8))
+    traffic[[0, 1, 2], [5, 5, 6]] = traffic[3, 7] = 1.0
+    placement = place(traffic, LOIHI)
+    assert placement.spike_hops == placement.bound == 0
+    assert placement.tiles[0] == placement.tiles[1] == placement.tiles[5]
+    assert placement.tiles[3] == placement.tiles[7]
+
+
+def test_traffic_within_a_core_is_free():
+    assert place(np.diag([5.0, 7.0]), LOIHI).spike_hops == 0
+
+
+def test_of_equal_layouts_the_one_with_more_east_west_hops_is_taken():
+    """Two cores on tiles for one: side by side, not one above the other."""
+    placement = place(np.array([[0.0, 1.0], [0.0, 0.0]]), small_target(mesh_tile_cores=1))
+    assert abs(placement.tiles[0] - placement.tiles[1]) == 1
+
+
+def test_a_slightly_better_layout_is_not_given_up_for_cheaper_hops():
+    """On a mesh of two rows the heavier pair sits side by side even if that costs more vertical hops."""
+    traffic = np.zeros((3, 3))
+    traffic[0, 1], traffic[0, 2], traffic[1, 2] = 1.0, 1.0 + 1e-6, 1.0 + 2e-6
+    placement = place(traffic, small_target(mesh_tile_cores=1, mesh_width=2, mesh_height=2))
+    # one pair is two hops apart: the lightest
+    assert placement.spike_hops == pytest.approx(3 + 3e-6 + 1.0, rel=1e-12)
+
+
+@pytest.mark.parametrize("cores", range(1, 10))
+@pytest.mark.parametrize("kind", ["random", "layered", "equal"])
+def test_up_to_nine_cores_are_solved_with_a_proof(cores, kind):
+    rng = np.random.default_rng(cores)
+    traffic = {
+        "random": rng.random((cores, cores)),
+        "layered": layered(cores, cores),
+        "equal": np.ones((cores, cores)),
+    }[kind]
+    start = time.perf_counter()
+    placement = place(traffic, LOIHI)
+    assert placement.bound == placement.spike_hops
+    assert time.perf_counter() - start < 10
+
+
+@pytest.mark.parametrize("kind", ["random", "layered", "star"])
+@pytest.mark.parametrize("cores", [12, 40, 128])
+def test_many_cores_are_placed_well_and_bounded(cores, kind):
+    rng = np.random.default_rng(0)
+    star = np.zeros((cores, cores))
+    star[0] = 1.0
+    traffic = {"random": rng.random((cores, cores)), "layered": layered(1, cores), "star": star}[kind]
+    start = time.perf_counter()
+    placement = place(traffic, LOIHI)
+    assert time.perf_counter() - start < 10  # measured: below 2 s
+    assert max(placement.tiles.count(tile) for tile in placement.tiles) <= 4
+    assert 0 < placement.bound <= placement.spike_hops
+    assert placement.spike_hops == pytest.approx(cost(traffic, placement.tiles, 8))
+    shuffled = [cost(traffic, rng.permutation(128)[:cores] // 4, 8) for _ in range(50)]
+    in_order = cost(traffic, np.arange(cores) // 4, 8)
+    assert placement.spike_hops <= min(shuffled)
+    assert placement.spike_hops <= in_order * (1 + 1e-9)
+
+
+def test_a_search_that_is_cut_short_says_so(monkeypatch):
+    traffic = np.random.default_rng(3).random((8, 8))
+    full = place(traffic, LOIHI)
+    monkeypatch.setattr(place_module, "EXACT_STEPS", 20)
+    cut = place(traffic, LOIHI)
+    assert full.bound == full.spike_hops
+    assert cut.bound < full.spike_hops <= cut.spike_hops * (1 + 1e-12)
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.integers(1, 8), st.integers(0, 2**32 - 1), st.integers(1, 60))
+def test_the_bound_never_exceeds_the_optimum(cores, seed, steps):
+    traffic = np.random.default_rng(seed).random((cores, cores)) ** 3
+    optimum = place(traffic, LOIHI).spike_hops
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(place_module, "EXACT_STEPS", steps)
+        cut = place(traffic, LOIHI)
+    assert cut.bound <= optimum * (1 + 1e-9) <= cut.spike_hops * (1 + 2e-9)
+
+
+def test_a_full_mesh_has_a_place_for_every_core():
+    placement = place(np.zeros((128, 128)), LOIHI)
+    assert sorted(placement.tiles) == sorted(list(range(32)) * 4)
+    assert placement.spike_hops == placement.bound == 0
+
+
+@pytest.mark.parametrize("cores", [3, 8, 12])
+def test_two_placements_are_equal(cores):
+    traffic = layered(2, cores)
+    assert place(traffic, LOIHI) == place(traffic.copy(), LOIHI)
+
+
+# --- traffic
+
+
+def test_traffic_by_hand():
+    """fc1 is split; each half of fc2 hears what has a weight into it."""
+    second = np.array([[2, 0, 2, 0], [0, 0, 4, 0]])
+    network = integer_chain(np.full((4, 3), 2), second)
+    chunks = [Chunk(population=0, first=0, last=2), Chunk(population=0, first=2, last=4)]
+    listeners = [Chunk(population=1, first=0, last=1), Chunk(population=1, first=1, last=2)]
+    parts = Partition(cores=((chunks[0],), (chunks[1], listeners[1]), (listeners[0],)), bound=1)
+    rates = (np.array([0.5, 9.0, 0.25, 9.0]), np.zeros(2))
+    assert core_traffic(network, parts, rates).tolist() == [[0, 0, 0.5], [0, 0.25, 0.25], [0, 0, 0]]
+    assert core_traffic(network, parts, None).tolist() == [[0, 0, 1], [0, 1, 1], [0, 0, 0]]
+
+
+@settings(deadline=None, max_examples=40)
+@given(integer_networks(), st.integers(1, 8), st.integers(0, 2**32 - 1))
+def test_traffic_is_a_packet_per_listening_axon(network, compartments, seed):
+    rng = np.random.default_rng(seed)
+    rates = tuple(rng.random(population.size) for population in network.populations)
+    target = small_target(core_compartments=compartments)
+    parts = partition(network, target, rates)
+    netlist = emit(network, parts, tuple(range(len(parts.cores))), target, {})
+    expected = np.zeros((netlist.n_cores,) * 2)
+    core_of_axon, core_of_compartment = netlist.core_of_axon(), netlist.core_of_compartment()
+    for axon, source in enumerate(netlist.axon_source.tolist()):
+        if source >= netlist.n_inputs:
+            compartment = source - netlist.n_inputs
+            rate = rates[netlist.layer[compartment]][netlist.neuron[compartment]]
+            expected[core_of_compartment[compartment], core_of_axon[axon]] += rate
+    np.testing.assert_allclose(core_traffic(network, parts, rates), expected, rtol=1e-12)

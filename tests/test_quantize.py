@@ -1,0 +1,340 @@
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from random_networks import BITS, LOIHI, chain, dense_weights, float_networks, recordings_for
+
+from compiler.errors import DataError, ModelError, OptionError
+from compiler.fixedpoint import ONE_STEP_SUM_MAX, weight_step
+from compiler.interpret import run_float, run_integer
+from compiler.ir import INPUT
+from compiler.passes import quantize as quantize_module
+from compiler.passes.bounds import prove_ranges
+from compiler.passes.calibrate import calibrate, evenly_spaced
+from compiler.passes.quantize import decay_registers, quantize
+from compiler.text import text
+from compiler.verify import verify
+
+
+def recordings(network, seed, *, samples=4, steps=30, rate=0.3):
+    return np.random.default_rng(seed).random((samples, steps, network.input.size)) < rate
+
+
+def noisy_layer(seed=0, *, inputs=40, outputs=30, outlier=0.0):
+    """One layer of normal weights, the first of them an outlier."""
+    rng = np.random.default_rng(seed)
+    weight = rng.normal(0, 0.1, (outputs, inputs))
+    weight[0, 0] = outlier
+    return chain(weight, biases=[rng.normal(0, 0.05, outputs)])
+
+
+def one_sided_sums(network, post):
+    weights = np.concatenate(list(dense_weights(network, post).values()), axis=1)
+    return np.maximum(weights, 0).sum(axis=1), np.maximum(-weights, 0).sum(axis=1)
+
+
+# --- registers
+
+
+@pytest.mark.parametrize(
+    ("beta", "decay_v"), [(0.2, 3277), (0.0, 4095), (1.0, 0), (0.5, 2048), (0.9, 410), (819 / 4096, 3277)]
+)
+def test_decay_registers(beta, decay_v):
+    assert decay_registers(beta) == (4095, decay_v)
+
+
+def test_the_realised_beta_is_819_4096ths():
+    population = quantize(noisy_layer(), LOIHI)[0].populations[0]
+    assert (population.beta, population.realised_beta) == (0.2, 819 / 4096)
+    assert (population.decay_u, population.decay_v) == (4095, 3277)
+
+
+@settings(deadline=None)
+@given(float_networks(), st.sampled_from(BITS), st.booleans(), st.data())
+def test_every_network_is_rounded_to_registers(network, bits, calibrated, data):
+    events = data.draw(recordings_for(network.input.size))
+    calibration = calibrate(network, events) if calibrated else None
+    integer, choices = quantize(network, LOIHI, bits=bits, calibration=calibration)
+    verify(integer)
+    assert [choice.layer for choice in choices] == [population.name for population in network.populations]
+    for post, (population, model, choice) in enumerate(
+        zip(integer.populations, network.populations, choices, strict=True)
+    ):
+        # The threshold carries no rounding.
+        assert len(set(population.threshold.tolist())) == 1
+        assert population.realised_theta[0] == pytest.approx(model.theta, rel=1e-15)
+        assert population.scale == choice.scale
+        # A bias is off by half a unit of its register at most.
+        error = population.bias / (64 * population.scale) - model.bias
+        assert np.all(np.abs(error) <= 0.5 * 2.0**population.bias_exponent / (64 * population.scale) * (1 + 1e-9))
+        up, down = one_sided_sums(integer, post)
+        reached = max(up.max(), down.max())
+        assert reached <= ONE_STEP_SUM_MAX
+        assert choice.headroom == pytest.approx(1 - reached / ONE_STEP_SUM_MAX, abs=1e-12)
+    for projection in integer.projections:
+        step = weight_step(bits)
+        assert projection.bits == bits
+        assert projection.exponent in LOIHI.choices["synapse.exponent"]
+        assert not np.any(projection.weight.data % step)
+        assert np.all(np.abs(projection.weight.data) <= 256 - step)
+        original = next(p for p in network.projections if (p.pre, p.post) == (projection.pre, projection.post))
+        assert np.array_equal(original.weight.indices, projection.weight.indices)
+        assert np.array_equal(original.weight.indptr, projection.weight.indptr)
+        # Each weight is the nearest of its grid, or the end of the range.
+        scale = integer.populations[projection.post].scale / 2.0**projection.exponent
+        wanted = np.clip(original.weight.data * scale, -(256 - step), 256 - step)
+        assert np.all(np.abs(projection.weight.data - wanted) <= step / 2 * (1 + 1e-9))
+
+
+@settings(deadline=None)
+@given(float_networks(), st.sampled_from(BITS))
+def test_a_network_and_its_negation_have_opposite_weights(network, bits):
+    mirrored = dataclasses.replace(
+        network, projections=tuple(dataclasses.replace(p, weight=-p.weight) for p in network.projections)
+    )
+    left, right = quantize(network, LOIHI, bits=bits)[0], quantize(mirrored, LOIHI, bits=bits)[0]
+    for p, q in zip(left.projections, right.projections, strict=True):
+        assert np.array_equal(p.weight.data, -q.weight.data)
+
+
+@settings(deadline=None)
+@given(st.data())
+def test_no_input_brings_more_than_the_stated_worst_case(data):
+    network = data.draw(float_networks())
+    integer, choices = quantize(network, LOIHI, bits=data.draw(st.sampled_from(BITS)))
+    proofs = prove_ranges(integer)
+    for post, (proof, choice) in enumerate(zip(proofs, choices, strict=True)):
+        weights = np.concatenate(list(dense_weights(integer, post).values()), axis=1)
+        events = data.draw(recordings_for(weights.shape[1]))
+        sums = np.abs(events.reshape(-1, weights.shape[1]).astype(np.int64) @ weights.T)
+        assert 64 * sums.max() <= proof.accumulator <= 2**21 - 1
+        # The worst case is reached by the input that hits just the positive or just the negative synapses.
+        worst = max(np.abs((sign * weights[i] > 0) @ weights[i]) for i in range(len(weights)) for sign in (1, -1))
+        assert proof.accumulator == 64 * worst
+        assert choice.headroom == pytest.approx(1 - worst / ONE_STEP_SUM_MAX, abs=1e-12)
+
+
+def test_a_large_layer_gives_up_scale_for_the_proof():
+    """2000 equal weights: only their sum, not the largest of them, limits the scale."""
+    integer, (choice,) = quantize(chain(np.full((1, 2000), 0.5)), LOIHI)
+    assert choice.headroom >= 0
+    assert int(integer.projections[0].effective().sum()) <= ONE_STEP_SUM_MAX
+    # One unit of threshold more would not fit.
+    finer = quantize_module._round_layer(
+        chain(np.full((1, 2000), 0.5)).populations[0],
+        chain(np.full((1, 2000), 0.5)).projections,
+        (integer.populations[0].threshold[0] + 1) / 0.5 / 2.0**choice.exponent,
+        choice.exponent,
+        8,
+    )
+    assert quantize_module._proven_sum(finer) > ONE_STEP_SUM_MAX
+
+
+def test_a_small_layer_uses_the_full_range():
+    integer, (choice,) = quantize(chain([[0.5, -0.25, 0.125]]), LOIHI)
+    assert integer.projections[0].weight.toarray().tolist() == [[254, -128, 64]]
+    # the largest exponent: threshold and bias are finest there
+    assert (choice.exponent, choice.scale, choice.clipped) == (7, 508 * 128, 0)
+    assert (choice.candidates, choice.flips, choice.spikes) == (1, None, None)
+
+
+def test_an_outlier_is_clipped_if_that_saves_spikes():
+    network = noisy_layer(outlier=20.0)
+    calibration = calibrate(network, recordings(network, 1))
+    _, (plain,) = quantize(network, LOIHI, bits=4)
+    chosen, (choice,) = quantize(network, LOIHI, bits=4, calibration=calibration)
+    assert plain.clipped == 0
+    assert choice.clipped == 1
+    assert choice.scale > plain.scale
+    assert chosen.projections[0].weight.toarray()[0, 0] == 224
+    unclipped = run_integer(quantize(network, LOIHI, bits=4)[0], calibration.events).spikes[0]
+    clipped = run_integer(chosen, calibration.events).spikes[0]
+    assert np.count_nonzero(clipped != calibration.spikes[0]) < np.count_nonzero(unclipped != calibration.spikes[0])
+
+
+@pytest.mark.parametrize("bits", BITS)
+@pytest.mark.parametrize("theta", [0.5, 49.0])
+def test_a_layer_of_zeros_is_silent(bits, theta):
+    integer, (choice,) = quantize(chain(np.zeros((2, 3)), theta=theta), LOIHI, bits=bits)
+    assert not integer.projections[0].weight.data.any()
+    assert choice.headroom == 1
+    assert integer.populations[0].threshold.tolist() in [[127, 127], [128, 128]]
+    assert not run_integer(integer, np.ones((1, 5, 3), bool)).spikes[0].any()
+
+
+def test_a_layer_of_zeros_with_biases_spikes_by_them():
+    network = chain(np.zeros((3, 2)), biases=[[0.6, 0.45, 0.3]])
+    events = np.ones((1, 20, 2), bool)
+    integer, _ = quantize(network, LOIHI)
+    np.testing.assert_array_equal(run_integer(integer, events).spikes[0], run_float(network, events).spikes[0])
+
+
+@pytest.mark.parametrize("weight", [100.0, 300.0, 4000.0])
+@pytest.mark.parametrize("bits", [2, 8])
+def test_weights_far_above_the_threshold_take_a_larger_exponent(weight, bits):
+    integer, (choice,) = quantize(chain([[weight, -weight / 2]]), LOIHI, bits=bits)
+    assert choice.exponent > 0
+    assert integer.populations[0].threshold[0] >= 1
+    largest = integer.projections[0].weight.data[0] * 2**choice.exponent / choice.scale
+    # half a unit of threshold, or half a step of the weight
+    assert largest == pytest.approx(weight, rel=0.3)
+
+
+def test_weights_too_large_for_any_scale():
+    with pytest.raises(ModelError) as caught:
+        quantize(chain([[1e6, 1.0]]), LOIHI, bits=6)
+    assert str(caught.value) == (
+        "fc1: no scale at 6 bits keeps its threshold of at least one unit within the accumulator (32767 units a step); "
+        "use more bits or smaller weights"
+    )
+
+
+def test_tiny_weights_take_the_largest_threshold():
+    integer, (choice,) = quantize(chain([[1e-9, -1e-12]]), LOIHI)
+    assert integer.populations[0].threshold.tolist() == [131071]
+    assert choice.exponent == -1
+
+
+def test_a_large_bias_takes_the_finest_scale_that_its_register_holds():
+    integer, (choice,) = quantize(chain([[0.5, -0.5]], biases=[[100.0]]), LOIHI)
+    (threshold,) = integer.populations[0].threshold.tolist()
+    assert threshold / 0.5 * 64 * 100 <= 4095 * 2**7 < (threshold + 1) / 0.5 * 64 * 100
+    assert choice.scale == 2 * threshold
+
+
+# --- calibration
+
+
+def candidates(network, calibration, monkeypatch, **options):
+    """Integer network of each candidate, by scale and exponent."""
+    found = {}
+    for factor in quantize_module.CLIPPING:
+        with monkeypatch.context() as patch:
+            patch.setattr(quantize_module, "CLIPPING", (factor,))
+            integer, (choice,) = quantize(network, LOIHI, calibration=calibration, **options)
+            found[choice.scale, choice.exponent] = integer
+    return found
+
+
+@pytest.mark.parametrize("bits", [2, 3, 4, 8])
+@pytest.mark.parametrize("seed", range(3))
+def test_calibration_prefers_scales_that_keep_spikes_then_those_that_keep_class_counts(bits, seed, monkeypatch):
+    network = noisy_layer(seed, outlier=1.0)
+    calibration = calibrate(network, recordings(network, seed))
+    found = candidates(network, calibration, monkeypatch, bits=bits)
+
+    def flips_and_distance(integer):
+        spikes = run_integer(integer, calibration.events).spikes[0]
+        flips = int(np.count_nonzero(spikes != calibration.spikes[0]))
+        counts = spikes.sum(axis=1) - calibration.spikes[0].sum(axis=1).astype(int)
+        return flips, int(np.abs(counts).sum())
+
+    scored = {key: flips_and_distance(integer) for key, integer in found.items()}
+    fewest = min(flips for flips, _ in scored.values())
+    _, (choice,) = quantize(network, LOIHI, bits=bits, calibration=calibration)
+    assert choice.candidates == len(found) > 8
+    assert choice.spikes == np.count_nonzero(calibration.spikes[0])
+    flips, distance = scored[choice.scale, choice.exponent]
+    assert choice.flips == flips <= 1.25 * fewest
+    best = sorted(scored.values(), key=lambda pair: pair[0])[:3]
+    assert distance == min(distance for flips, distance in best if flips <= 1.25 * fewest)
+
+
+def test_two_runs_are_equal():
+    network = noisy_layer(outlier=1.0)
+    calibration = calibrate(network, recordings(network, 2))
+    for options in ({}, {"calibration": calibration}, {"calibration": calibration, "ranges": "observed"}):
+        one, two = (quantize(network, LOIHI, bits=4, **options) for _ in range(2))
+        assert text(one[0]) == text(two[0])
+        assert one[1] == two[1]
+
+
+def test_observed_ranges_allow_a_finer_scale():
+    """2000 equal inputs of which a recording hits few at once."""
+    network = chain(np.full((3, 2000), 0.5))
+    events = recordings(network, 0, rate=0.01)
+    calibration = calibrate(network, events)
+    _, (proven,) = quantize(network, LOIHI, calibration=calibration)
+    integer, (observed,) = quantize(network, LOIHI, calibration=calibration, ranges="observed", margin=0.5)
+    assert observed.scale > proven.scale
+    assert np.abs(integer.projections[0].weight.data).max() == 254
+    most = int(events.sum(axis=2).max())
+    assert observed.headroom == pytest.approx(1 - 0.5 * most * 1.5 * observed.scale / ONE_STEP_SUM_MAX)
+    assert observed.headroom >= 0
+    # The proof does not hold for it, and says so.
+    assert [proof.holds for proof in prove_ranges(integer)] == [False]
+
+
+def test_a_margin_makes_observed_scales_coarser():
+    network = chain(np.full((3, 2000), 0.5))
+    calibration = calibrate(network, recordings(network, 0, rate=0.2))
+    scales = [
+        quantize(network, LOIHI, calibration=calibration, ranges="observed", margin=margin)[1][0].scale
+        for margin in (0.0, 0.5, 2.0)
+    ]
+    assert scales == sorted(scales, reverse=True)
+    assert scales[0] > scales[2]
+
+
+def test_calibration_runs_the_float64_model():
+    network = chain([[0.3, 0.3], [0.6, -0.6]], [[1.0, 1.0]])
+    events = recordings(network, 3)
+    calibration = calibrate(network, events)
+    for found, expected in zip(calibration.spikes, run_float(network, events).spikes, strict=True):
+        np.testing.assert_array_equal(found, expected)
+    assert calibration.source(INPUT) is events
+    assert calibration.source(1) is calibration.spikes[1]
+
+
+@pytest.mark.parametrize(
+    ("samples", "picked"), [(1, [0]), (4, [0, 1, 2, 3]), (5, [0, 1, 3, 4]), (100, [0, 33, 66, 99])]
+)
+def test_recordings_are_evenly_spaced(samples, picked):
+    events = np.arange(samples)[:, None, None]
+    assert evenly_spaced(events, 4)[:, 0, 0].tolist() == picked
+
+
+def test_at_most_32_recordings_are_used():
+    assert len(evenly_spaced(np.zeros((576, 1, 1), bool))) == 32
+
+
+# --- bad options
+
+
+@pytest.mark.parametrize("bits", [-1, 0, 1, 7, 9])
+def test_widths_that_the_chip_does_not_store(bits):
+    with pytest.raises(OptionError) as caught:
+        quantize(chain([[1.0]]), LOIHI, bits=bits)
+    assert str(caught.value) == (
+        f"--weight-bits {bits}: Intel Loihi 1 does not store that width; allowed: 2, 3, 4, 5, 6, 8"
+    )
+
+
+def test_ranges_that_do_not_exist():
+    with pytest.raises(OptionError) as caught:
+        quantize(chain([[1.0]]), LOIHI, ranges="guessed")
+    assert str(caught.value) == "--ranges guessed: unknown; allowed: proven, observed"
+
+
+def test_observed_ranges_without_recordings():
+    with pytest.raises(OptionError) as caught:
+        quantize(chain([[1.0]]), LOIHI, ranges="observed")
+    message = "--ranges observed: nothing was observed; give --calibrate, or use --ranges proven"
+    assert str(caught.value) == message
+
+
+def test_calibration_on_an_empty_split():
+    with pytest.raises(DataError) as caught:
+        calibrate(chain([[1.0]]), np.zeros((0, 5, 1), bool))
+    assert str(caught.value) == "calibration: the split is empty; give recordings with a train split"
+
+
+def test_calibration_on_another_sensor():
+    with pytest.raises(DataError) as caught:
+        calibrate(chain([[1.0, 1.0]]), np.zeros((1, 5, 3), bool))
+    assert str(caught.value) == (
+        "calibration: the recordings have 3 channels, the network has 2; "
+        "give recordings of the sensor that it was trained on"
+    )

@@ -1,0 +1,285 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from compiler.errors import DataError, OptionError
+from models.csvtable import read_table
+from models.graphs import build_graph, normalised_adjacency
+from models.sensors import MAX_TAXELS, read_edges, read_layout, read_taxels, sensor_graph
+
+SQUARE = "x,y\n" + "".join(f"{4 * (i % 5)},{4 * (i // 5)}\n" for i in range(25))
+
+
+@pytest.fixture
+def write(tmp_path):
+    def write(name: str, text: str) -> Path:
+        path = tmp_path / name
+        path.write_text(text, newline="")
+        return path
+
+    return write
+
+
+def message(function, *arguments, error=DataError, **options) -> str:
+    with pytest.raises(error) as caught:
+        function(*arguments, **options)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+# Tables
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "1,2\n3,4\n",
+        "a,b\n1,2\n3,4",
+        "B, A\n2,1\n4,3\n",
+        "\ufeffa,b\r\n1,2\r\n3,4\r\n",
+        "# a, b\n1,2\n3,4\n",
+        "# made on Monday\n\n  \n1, 2  # first\n \n  # more\n3.0,4e0\n  ",
+        "1,2\r3,4\r",
+        " 1 ,\t2\n+3,04\n",
+    ],
+)
+def test_tables_with_and_without_names(write, text):
+    table = read_table(write("t.csv", text), ("a", "b"), ("c",))
+    assert {name: column.tolist() for name, column in table.columns.items()} == {"a": [1, 3], "b": [2, 4]}
+
+
+def test_optional_columns_and_places(write):
+    table = read_table(write("t.csv", "\nc,a,b\n\n1,2,3\n# no\n4,5,6\n"), ("a", "b"), ("c",))
+    assert table.columns["c"].tolist() == [1, 4]
+    assert [table.at(0), table.at(1)] == ["t.csv: line 4", "t.csv: line 6"]
+    table = read_table(write("t.csv", "1,2,3\r\r4,5,6"), ("a", "b"), ("c",))
+    assert table.columns["c"].tolist() == [3, 6]
+    assert table.at(1) == "t.csv: line 3"
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("", "t.csv: no rows, expected are lines of a, b[, c]; check how the file was written"),
+        ("\n# nothing\n", "t.csv: no rows, expected are lines of a, b[, c]; check how the file was written"),
+        ("a,b\n", "t.csv: no rows, expected are lines of a, b[, c]; check how the file was written"),
+        ("a,d\n1,2\n", "t.csv: line 1: columns a, d, expected are a, b[, c]; name them so"),
+        ("a,b,b\n1,2,3\n", "t.csv: line 1: columns a, b, b, expected are a, b[, c]; name them so"),
+        ("a;b\n1;2\n", "t.csv: line 1: columns a;b, expected are a, b[, c]; name them so"),
+        ("1\n2\n", "t.csv: 1 column in its first row, expected are a, b[, c]; separate by commas"),
+        ("1,2,3,4\n", "t.csv: 4 columns in its first row, expected are a, b[, c]; separate by commas"),
+        ("a,b\n1,2,3\n", "t.csv: line 2: 3 columns, expected are 2 (a, b); separate by commas"),
+        ("1,2\n\n3\n", "t.csv: line 3: 1 column, expected are 2 (a, b); separate by commas"),
+        ("1,2\n3,x\n", "t.csv: line 2: b is 'x', not a number; write plain numbers"),
+        ("1,x\n3,4\n", "t.csv: line 1: b is 'x', not a number; write plain numbers"),
+        ("a,b\n1_0,2\n", "t.csv: line 2: a is '1_0', not a number; write plain numbers"),
+        ("a,b\n1,\u0661\n", "t.csv: line 2: b is '\u0661', not a number; write plain numbers"),
+        ("a,b\n1,\n", "t.csv: line 2: b is '', not a number; write plain numbers"),
+        ('a,b\n1,"2"\n', "t.csv: line 2: b is '\"2\"', not a number; write plain numbers"),
+        (f"1,{'x' * 99}\n", f"t.csv: line 1: b is '{'x' * 40}', not a number; write plain numbers"),
+        ("1,2\n\x1c\n3,4\n", "t.csv: cannot be read as numbers; write plain numbers between commas"),
+        ("1,2\0\n", "t.csv: not text (a zero byte); save it as CSV"),
+    ],
+)
+def test_tables_name_the_fault(write, text, found):
+    assert message(read_table, write("t.csv", text), ("a", "b"), ("c",)) == found
+
+
+def test_files_that_are_no_tables(write, tmp_path, monkeypatch):
+    path = tmp_path / "t.csv"
+    assert message(read_table, path, ("a",)) == (
+        f"{path}: cannot be read (No such file or directory); check the path and the disk"
+    )
+    path.write_bytes(b"1,2\n\xff")
+    assert message(read_table, path, ("a",)) == "t.csv: not text in UTF-8 (byte 4); save it as CSV"
+    monkeypatch.setattr("models.csvtable.MAX_TABLE_BYTES", 3)
+    assert message(read_table, path, ("a",)) == "t.csv: more than 3 bytes, the limit of a table; split it"
+
+
+# Taxels
+
+
+def test_positions(write):
+    assert read_taxels(write("c.csv", "0,0\n1.5,-2\n")).tolist() == [[0, 0], [1.5, -2]]
+    assert read_taxels(write("c.csv", "z,y,x\n1,2,3\n")).tolist() == [[3, 2, 1]]
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("x,y\n0,0\n1,nan\n", "c.csv: line 3: y is nan, allowed are -1e+06 to 1e+06; give millimetres"),
+        ("inf,0\n", "c.csv: line 1: x is inf, allowed are -1e+06 to 1e+06; give millimetres"),
+        ("0,0,0\n0,0,2e6\n", "c.csv: line 2: z is 2e+06, allowed are -1e+06 to 1e+06; give millimetres"),
+        (
+            "x,y\n0,0\n1,1\n0,0\n1,1\n",
+            "c.csv: line 4: taxels 0 and 2 share one position; give each taxel its own, in order",
+        ),
+        ("x,y\n0,left\n", "c.csv: line 2: y is 'left', not a number; write plain numbers"),
+        ("x\n0\n", "c.csv: line 1: columns x, expected are x, y[, z]; name them so"),
+        (
+            "".join(f"{i},0\n" for i in range(MAX_TAXELS + 1)),
+            f"c.csv: {MAX_TAXELS + 1} taxels, the limit is {MAX_TAXELS}; give a part of the sensor",
+        ),
+    ],
+)
+def test_positions_that_cannot_be(write, text, found):
+    assert message(read_taxels, write("c.csv", text)) == found
+
+
+def test_layouts(write):
+    n, places = read_layout(write("c.csv", SQUARE))
+    assert (n, places.shape) == (25, (25, 2))
+    assert read_layout("25") == (25, None)
+    assert read_layout(str(MAX_TAXELS)) == (MAX_TAXELS, None)
+
+
+@pytest.mark.parametrize("word", ["0", str(MAX_TAXELS + 1), "9" * 5000])
+def test_numbers_of_taxels_that_cannot_be(word):
+    assert message(read_layout, word, error=OptionError) == (
+        f"--taxels {word}: allowed are 1..{MAX_TAXELS} taxels; give another number, or a CSV file"
+    )
+
+
+# Edges
+
+
+def test_edges_count_in_both_directions(write):
+    path = write("e.csv", "source,target\n2,0\n0,1\n1,0\n")
+    edges, warnings = read_edges(path, 3)
+    assert edges.tolist() == [[0, 1], [0, 2], [1, 0], [2, 0]]
+    assert warnings == ()  # a list that has both directions repeats nothing
+    edges, warnings = read_edges(path, 3, directed=True)
+    assert edges.tolist() == [[0, 1], [1, 0], [2, 0]]
+    assert warnings == ()
+    assert read_edges(write("e.csv", "target,source\n1,0\n"), 2, directed=True)[0].tolist() == [[0, 1]]
+
+
+@pytest.mark.parametrize("directed", [False, True])
+def test_repeated_edges_count_once(write, directed):
+    edges, warnings = read_edges(write("e.csv", "0,1\n1,2\n0,1\n"), 3, directed=directed)
+    assert len(edges) == (2 if directed else 4)
+    assert warnings == ("e.csv: 1 line repeats an edge (first 0,1 at line 3); each counts once",)
+    _, warnings = read_edges(write("e.csv", "source,target\n0,1\n0,1\n0,1\n"), 3, directed=directed)
+    assert warnings == ("e.csv: 2 lines repeat edges (first 0,1 at line 3); each counts once",)
+
+
+@pytest.mark.parametrize(
+    ("row", "found"),
+    [
+        ("0,3", "target 3, taxels are whole numbers 0..2"),
+        ("-1,0", "source -1, taxels are whole numbers 0..2"),
+        ("0.5,1", "source 0.5, taxels are whole numbers 0..2"),
+        ("0,nan", "target nan, taxels are whole numbers 0..2"),
+        ("0,1e300", "target 1e+300, taxels are whole numbers 0..2"),
+    ],
+)
+def test_edges_to_nowhere(write, row, found):
+    path = write("e.csv", f"source,target\n0,1\n{row}\n")
+    rest = "; count from 0 and use the layout that the edges were drawn on"
+    assert message(read_edges, path, 3) == f"e.csv: line 3: {found}{rest}"
+
+
+def test_self_loops(write):
+    assert message(read_edges, write("e.csv", "0,1\n2,2\n"), 3) == (
+        "e.csv: line 2: joins taxel 2 to itself, allowed are two taxels; remove the line "
+        "(every taxel hears itself anyway)"
+    )
+
+
+def test_edges_with_text(write):
+    assert message(read_edges, write("e.csv", "0,1\na,b\n"), 3) == (
+        "e.csv: line 2: source is 'a', not a number; write plain numbers"
+    )
+
+
+# Graphs
+
+
+def test_named_graphs_of_the_neutouch_are_unchanged():
+    graph, warnings = sensor_graph(graph="released:knn:3")
+    assert graph.edges.tolist() == build_graph("released:knn:3").edges.tolist()
+    assert warnings == ()
+
+
+def test_named_graph_on_another_sensor(write):
+    graph, warnings = sensor_graph(graph="mst:4.1", taxels=write("c.csv", SQUARE))
+    assert (graph.name, graph.n_taxels, len(graph.edges)) == ("mst:4.1", 25, 2 * 40)  # the grid has 40 links
+    assert warnings == ()
+
+
+def test_a_named_graph_may_fall_apart(write):
+    path = write("c.csv", "0,0\n1,0\n50,0\n51,0\n52,0\n")
+    _, warnings = sensor_graph(graph="knn:1", taxels=path)
+    assert warnings == (
+        "c.csv, knn:1: the graph has 2 parts, of 3 and 2 taxels (with taxels 2 and 0); touch does not spread "
+        "between them",
+    )
+
+
+def test_edges_from_a_file(write):
+    edges = write("e.csv", "0,1\n1,2\n")
+    graph, warnings = sensor_graph(edges=edges)
+    assert (graph.name, graph.n_taxels, graph.edges.tolist()) == ("edges:e.csv", 3, [[0, 1], [1, 0], [1, 2], [2, 1]])
+    assert warnings == ()
+    graph, warnings = sensor_graph(edges=edges, taxels="5", directed=True)
+    assert (graph.n_taxels, graph.edges.tolist()) == (5, [[0, 1], [1, 2]])
+    assert warnings == ("e.csv: taxels 3 and 4 have no edges, each hears only itself; add edges if they should not",)
+    graph, _ = sensor_graph(edges=edges, taxels=write("c.csv", SQUARE))
+    assert graph.coordinates[6].tolist() == [4, 4]
+
+
+def test_all_warnings_come(write):
+    text = "0,1\n1,0\n2,3\n0,1\n" + "".join(f"{i},{i + 1}\n" for i in range(4, 8))
+    _, warnings = sensor_graph(edges=write("e.csv", text), taxels="30")
+    assert warnings == (
+        "e.csv: 1 line repeats an edge (first 0,1 at line 4); each counts once",
+        "e.csv: taxels 9, 10, 11, 12, 13, 14, 15, 16 and 13 more have no edges, each hears only itself; add edges if "
+        "they should not",
+        "e.csv: the graph has 3 parts, of 5, 2 and 2 taxels (with taxels 4, 0 and 2); touch does not spread "
+        "between them",
+    )
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_parts_agree_with_networkx(seed):
+    import networkx
+
+    from models.sensors import _parts
+
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(2, 80))
+    edges = rng.integers(0, n, (int(rng.integers(1, n)), 2))
+    network = networkx.Graph(edges.tolist())
+    network.add_nodes_from(range(n))
+    expected = np.empty(n, dtype=np.int64)
+    for part in networkx.connected_components(network):
+        expected[list(part)] = min(part)
+    assert _parts(edges, n).tolist() == expected.tolist()
+
+
+def test_the_order_of_lines_does_not_matter(write):
+    rows = ["0,1", "1,2", "2,3", "3,0", "0,2"]
+    forward, _ = sensor_graph(edges=write("e.csv", "\n".join(rows)))
+    backward, _ = sensor_graph(edges=write("e.csv", "\n".join(reversed(rows))))
+    assert np.array_equal(normalised_adjacency(forward.edges, 4), normalised_adjacency(backward.edges, 4))
+
+
+def test_options_that_exclude_each_other(write):
+    coords, edges = write("c.csv", SQUARE), write("e.csv", "0,1\n")
+    choices = "knn:K (K 1..8) or mst:SIGMA (mm, 0 = tree only), each also as released:NAME"
+    assert message(sensor_graph, error=OptionError) == (
+        f"--graph and --edges: neither was given, allowed is one of them; --graph takes manual, {choices}"
+    )
+    assert message(sensor_graph, graph="manual", edges=edges, error=OptionError) == (
+        f"--graph and --edges: both were given, allowed is one of them; --graph takes manual, {choices}"
+    )
+    assert message(sensor_graph, graph="manual", directed=True, error=OptionError) == (
+        "--directed: only edges from a file have directions; give --edges or leave it away"
+    )
+    assert message(sensor_graph, graph="knn:2", taxels="25", error=OptionError) == (
+        "--taxels 25: --graph knn:2 needs positions; give a CSV file with x,y in mm"
+    )
+    assert message(sensor_graph, graph="manual", taxels=coords, error=OptionError) == (
+        "graph 'manual': drawn by hand for the NeuTouch layout, not for this one of 25 taxels; use knn:K or mst:SIGMA"
+    )

@@ -1,0 +1,259 @@
+"""The training loop: the released protocol, repeatable to the byte."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from numpy.testing import assert_allclose, assert_array_equal
+
+import models.train
+from compiler.errors import DataError, ModelError, OptionError
+from models.checkpoint import checkpoint_bytes, training_record
+from models.evtouch import Recordings
+from models.graphs import build_graph, normalised_adjacency
+from models.grasps import synthetic_grasps
+from models.networks import Architecture, TactileSGNet
+from models.protocols import state_files, train_both, validation_split
+from models.train import Epoch, evaluate, train
+
+GRAPH = build_graph("manual")
+ADJACENCY = normalised_adjacency(GRAPH.edges, 39)
+SMALL = Architecture(taxels=39, classes=6, hops=2, features=4, hidden=(16, 8))
+
+
+def grasps(seed: int, per_class: int = 2, steps: int = 30) -> Recordings:
+    return synthetic_grasps(per_class=per_class, steps=steps, seed=seed)
+
+
+def file_bytes(**options: object) -> bytes:
+    training, test = grasps(0), grasps(1)
+    reported = train_both(training, test, ADJACENCY, SMALL, **{"epochs": 1, "seed": 3} | options)
+    record = training_record(reported, training, test, command="spikeloom train", seed=3)
+    trained = reported.trained
+    return checkpoint_bytes(
+        {"last": trained.last, "best": trained.best, "clean": trained.kept},
+        GRAPH,
+        beta=SMALL.beta,
+        theta=SMALL.theta,
+        training=record,
+    )
+
+
+def test_one_epoch_twice_gives_the_same_bytes_whatever_the_threads_and_the_global_random_state():
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(1)
+        torch.manual_seed(1)
+        np.random.seed(1)  # noqa: NPY002 - the global state is what this test moves
+        first = file_bytes()
+        torch.set_num_threads(2)
+        torch.manual_seed(2)
+        np.random.seed(2)  # noqa: NPY002
+        second = file_bytes()
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(threads)
+    assert first == second
+    assert file_bytes(seed=4) != first
+    assert float(torch.tensor([1e-40]) * 1.0) > 0, "subnormal numbers are still flushed"
+
+
+def test_steps_equal_adam_on_the_released_loss():
+    training, seed = grasps(0), 5
+    trained = train(training, grasps(1), ADJACENCY, SMALL, epochs=2, seed=seed)
+    network = TactileSGNet(SMALL, ADJACENCY, seed=seed)
+    optimizer = torch.optim.Adam(network.parameters(), lr=1e-3, amsgrad=True, foreach=False)
+    order = np.random.default_rng(seed)
+    for epoch in range(2):
+        losses = []
+        for index in order.permutation(len(training)):
+            optimizer.zero_grad()
+            output = network(torch.tensor(training.events[index], dtype=torch.float32).permute(2, 0, 1)[:, None])[0]
+            label = torch.zeros(SMALL.classes)
+            label[training.labels[index]] = 1
+            loss = torch.nn.MSELoss()(output, label)
+            loss.backward()
+            optimizer.step()
+            losses.append(loss.item())
+        assert trained.history[epoch].training_loss == pytest.approx(np.mean(losses), rel=1e-6)
+    for name, array in network.export_weights().items():
+        assert_allclose(trained.last[name], array, rtol=1e-4, atol=1e-6)
+
+
+def test_the_learning_rate_falls_after_the_first_epoch_of_a_block_of_forty():
+    one = synthetic_grasps(per_class=1, steps=10, seed=0, classes=("sphere",))
+    tiny = Architecture(taxels=39, classes=1, hops=0, features=1, hidden=(1,))
+    seen: list[Epoch] = []
+    trained = train(one, one, ADJACENCY, tiny, epochs=82, after_epoch=seen.append)
+    rates = [epoch.learning_rate for epoch in trained.history]
+    assert_allclose(rates, [1e-3] * 41 + [1e-4] * 40 + [1e-5], rtol=1e-12)
+    assert [epoch.epoch for epoch in trained.history] == list(range(1, 83))
+    assert tuple(seen) == trained.history
+
+
+def test_best_weights_are_those_of_the_first_epoch_with_the_most_right(monkeypatch):
+    right = iter([2, 5, 5, 3])
+    kept = []
+
+    def fake(network: TactileSGNet, recordings: Recordings) -> tuple[float, int]:
+        kept.append(network.export_weights())
+        return 0.5, next(right)
+
+    monkeypatch.setattr(models.train, "evaluate", fake)
+    trained = train(grasps(0), grasps(1), ADJACENCY, SMALL, epochs=4)
+    assert trained.best_epoch == 2
+    assert [epoch.accuracy for epoch in trained.history] == [2 / 12, 5 / 12, 5 / 12, 3 / 12]
+    for name in trained.last:
+        assert_array_equal(trained.best[name], kept[1][name])
+        assert_array_equal(trained.last[name], kept[3][name])
+    assert (trained.best["fc1.weight"] != trained.last["fc1.weight"]).any()
+
+
+def test_it_learns_the_synthetic_grasps():
+    trained = train(grasps(0, per_class=10, steps=60), grasps(1, per_class=5, steps=60), ADJACENCY, SMALL, epochs=10)
+    first, last = trained.history[0], trained.history[-1]
+    assert last.training_loss < 0.8 * first.training_loss
+    assert trained.history[trained.best_epoch - 1].correct >= 12  # of 30; 5 by chance
+
+
+def test_evaluation_counts_the_lowest_of_equal_classes_and_averages_over_recordings():
+    silent = TactileSGNet(SMALL, ADJACENCY)
+    with torch.no_grad():
+        for parameter in silent.parameters():
+            parameter.zero_()
+    loss, correct = evaluate(silent, grasps(0))
+    assert correct == 2  # the two of class 0: all rates are equal
+    assert loss == pytest.approx(1 / SMALL.classes)
+
+
+def test_numbers_that_are_too_small():
+    with pytest.raises(OptionError) as caught:
+        train(grasps(0), grasps(1), ADJACENCY, SMALL, epochs=0)
+    assert str(caught.value) == "epochs: 0, allowed are 1 or more; choose another"
+    with pytest.raises(OptionError) as caught:
+        train(grasps(0), grasps(1), ADJACENCY, SMALL, seed=-1)
+    assert str(caught.value) == "seed: -1, allowed are 0 or more; choose another"
+
+
+def test_recordings_that_the_network_was_not_made_for():
+    other = synthetic_grasps(coordinates=np.random.default_rng(0).random((5, 2)), per_class=1, steps=10, seed=0)
+    with pytest.raises(DataError) as caught:
+        train(grasps(0), other, ADJACENCY, SMALL)
+    assert str(caught.value) == (
+        "synthetic grasps, seed 0: split 'synthetic': 5 taxels and 2 polarities, the network has 39 and 2; "
+        "use the graph of this sensor"
+    )
+    with pytest.raises(DataError) as caught:
+        train(grasps(0), grasps(1), ADJACENCY, Architecture(taxels=39, classes=5))
+    assert str(caught.value) == (
+        "synthetic grasps, seed 0: split 'synthetic': label 5, the network has 5 classes (0..4); "
+        "train it with more classes"
+    )
+
+
+def test_history_can_be_stored_as_json():
+    reported = train_both(grasps(0), grasps(1), ADJACENCY, SMALL, epochs=1, seed=0)
+    record = training_record(reported, grasps(0), grasps(1), command="spikeloom train", seed=0)
+    assert json.loads(json.dumps(record, allow_nan=False)) == record
+    assert record["last"]["correct"] == reported.trained.history[-1].correct
+
+
+class KilledError(Exception):
+    """Stands in for a kill between two epochs."""
+
+
+def killer(epoch: int):
+    def stop(done: Epoch) -> None:
+        if done.epoch == epoch:
+            raise KilledError
+
+    return stop
+
+
+def same(a: object, b: object) -> bool:
+    return all(np.array_equal(a[name], b[name]) for name in a) and set(a) == set(b)
+
+
+@pytest.mark.parametrize("epoch", [1, 3, 4])
+def test_a_killed_training_resumes_to_the_same_weights(tmp_path, epoch):
+    training, test, state = grasps(0), grasps(1), tmp_path / "x.state"
+    whole = train(training, test, ADJACENCY, SMALL, epochs=4, seed=2, keep_epoch=2)
+    with pytest.raises(KilledError):
+        train(training, test, ADJACENCY, SMALL, epochs=4, seed=2, keep_epoch=2, state=state, after_epoch=killer(epoch))
+    resumed = train(training, test, ADJACENCY, SMALL, epochs=4, seed=2, keep_epoch=2, state=state, resume=True)
+    assert same(resumed.last, whole.last)
+    assert same(resumed.best, whole.best)
+    assert same(resumed.kept, whole.kept)
+    assert resumed.history == whole.history
+    assert resumed.best_epoch == whole.best_epoch
+
+
+def test_resuming_with_other_options_or_data_is_refused(tmp_path):
+    state = tmp_path / "x.state"
+    train(grasps(0), grasps(1), ADJACENCY, SMALL, epochs=1, state=state)
+    with pytest.raises(OptionError) as refused:
+        train(grasps(2), grasps(1), ADJACENCY, SMALL, epochs=2, state=state, resume=True)
+    assert str(refused.value) == (
+        f"{state}: was written with another epochs, training data; give the same options and data, "
+        "or leave --resume away"
+    )
+
+
+def test_a_damaged_state_is_refused(tmp_path):
+    state = tmp_path / "x.state"
+    train(grasps(0), grasps(1), ADJACENCY, SMALL, epochs=1, state=state)
+    state.write_bytes(state.read_bytes()[:-100])
+    with pytest.raises(ModelError) as refused:
+        train(grasps(0), grasps(1), ADJACENCY, SMALL, epochs=1, state=state, resume=True)
+    assert str(refused.value) == f"{state}: is not a training state or is damaged; delete it and train anew"
+
+
+def test_a_loss_that_is_no_number_stops_and_keeps_the_state(tmp_path, monkeypatch):
+    state = tmp_path / "x.state"
+    train(grasps(0), grasps(1), ADJACENCY, SMALL, epochs=1, state=state)
+    kept = state.read_bytes()
+    monkeypatch.setattr(models.train, "_train_epoch", lambda *_: float("nan"))
+    with pytest.raises(DataError) as stopped:
+        train(grasps(0), grasps(1), ADJACENCY, SMALL, epochs=1, seed=1, state=state)
+    assert str(stopped.value) == (
+        "epoch 1: the loss is nan, a finite number is needed; the state of the epoch before is kept, "
+        "try a lower learning rate"
+    )
+    assert state.read_bytes() == kept
+
+
+def test_a_gpu_that_is_absent_or_unknown_is_refused():
+    if torch.cuda.is_available():
+        pytest.skip("this machine has a GPU")
+    for device, message in (
+        ("cuda", "--device cuda: this machine has no usable GPU; leave --device away"),
+        ("tpu", "--device tpu: unknown; allowed: cpu, cuda"),
+    ):
+        with pytest.raises(OptionError) as refused:
+            train(grasps(0), grasps(1), ADJACENCY, SMALL, epochs=1, device=device)
+        assert str(refused.value) == message
+
+
+def test_the_clean_epoch_is_chosen_without_the_test_split(tmp_path):
+    training, state = grasps(0, per_class=5), tmp_path / "x"
+    reported = train_both(training, grasps(1), ADJACENCY, SMALL, epochs=3, seed=1, state=state)
+    other = train_both(training, grasps(9), ADJACENCY, SMALL, epochs=3, seed=1)
+    assert reported.clean_epoch == other.clean_epoch
+    assert same(reported.trained.kept, other.trained.kept)
+    assert reported.validation.history == other.validation.history
+    assert all(file.exists() for file in state_files(state))
+
+
+def test_the_validation_part_is_a_fifth_of_every_class_and_disjoint():
+    training = grasps(0, per_class=10)
+    fitted, held = validation_split(training)
+    assert np.bincount(held.labels).tolist() == [2] * 6
+    assert np.bincount(fitted.labels).tolist() == [8] * 6
+    assert not set(fitted.files) & set(held.files)
+    with pytest.raises(DataError) as refused:
+        validation_split(grasps(0, per_class=1))
+    assert str(refused.value) == (
+        "synthetic grasps, seed 0: class 0 has one training recording, the clean protocol needs 2 of each; "
+        "record more or drop the class"
+    )

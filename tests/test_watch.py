@@ -1,0 +1,462 @@
+"""The command ``watch`` decides as ``run`` does, whatever the order, codes, pace and breaks of its lines."""
+
+import argparse
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from random_netlists import Axon, Neuron, build, large_netlist
+
+from compiler.errors import DataError, ModelError, OptionError
+from compiler.frontends.checkpoint import read_checkpoint
+from compiler.netlist import Netlist, read_only
+from compiler.pipeline import compile_checkpoint
+from compiler.serialize import write_netlist
+from models.events import load_data
+from models.evtouch import load_recordings
+from models.graphs import build_graph, normalised_adjacency
+from runtime import engine, watch
+from runtime.votes import class_counts
+
+HEADER = "time_s,taxel,polarity"
+TAXELS = "found, allowed are 0 to 9; use events of the sensor that the network was compiled for"
+GIVE = "give one event 'time_s,taxel,polarity' a line"
+
+
+def parser() -> argparse.ArgumentParser:
+    options = argparse.ArgumentParser()
+    options.add_argument("--json", action="store_true")
+    watch.add_arguments(options)
+    return options
+
+
+def command(*words: object) -> tuple[dict, str]:
+    """Run the command; its summary as values and as text."""
+    report, as_text, code = watch.watch(parser().parse_args([str(word) for word in words]))
+    assert code == 0
+    return report, as_text(report)
+
+
+@pytest.fixture
+def objects(capsys):
+    """Run the command with --json; all objects by kind."""
+
+    def run(*words: object) -> dict[str, list[dict]]:
+        report, _ = command(*words, "--json")
+        values = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+        return {kind: [v for v in values if v["kind"] == kind] for kind in ("bin", "grasp")} | {"end": [report]}
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def lively() -> Netlist:
+    """Some hundred compartments, 10 taxels with two polarities, a lag of three steps."""
+    netlist = large_netlist(10, proved=True)
+    votes = read_only(np.arange(netlist.n_compartments) % 4 - 1)
+    return replace(netlist, taxels=10, polarities=2, classes=3, readout_class=votes)
+
+
+@pytest.fixture(scope="module")
+def lively_file(lively, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("lively") / "net.loom"
+    write_netlist(lively, path)
+    return path
+
+
+@pytest.fixture
+def pair_file(tmp_path) -> Path:
+    """One taxel; every event of polarity p in a bin is one vote for class p, at once."""
+    netlist = build(
+        [Neuron(), Neuron()],
+        [Axon(source=0, targets=((0, 110),)), Axon(source=1, targets=((1, 110),))],
+        n_inputs=2,
+        depths=[0],
+    )
+    netlist = replace(netlist, taxels=1, polarities=2, classes=2, readout_class=read_only([0, 1]))
+    write_netlist(netlist, tmp_path / "pair.loom")
+    return tmp_path / "pair.loom"
+
+
+@pytest.fixture
+def lines(tmp_path):
+    """Write event lines to a file."""
+
+    def write(content: str | bytes) -> Path:
+        path = tmp_path / "events.csv"
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        return path
+
+    return write
+
+
+def votes_of_run(netlist: Netlist, events: np.ndarray) -> list[int]:
+    """Votes that `run` counts for a recording (n_inputs, T) or (taxels, 2, T)."""
+    flat = events.reshape(1, netlist.n_inputs, -1)
+    return class_counts(netlist, engine.simulate(netlist, flat, threads=1).counts.spikes)[0].tolist()
+
+
+def as_lines(events: np.ndarray, seed: int = 0, *, low: int = 0, inside: int = 0) -> str:
+    """Event lines of a recording (taxels, 2, T), in any order within each bin of 20 ms.
+
+    `inside` is how far, at most, in microseconds, an event lies behind the beginning of its bin.
+    """
+    rng = np.random.default_rng(seed)
+    text = []
+    for t, bin_events in enumerate(np.moveaxis(events, -1, 0)):
+        for taxel, polarity in rng.permutation(np.argwhere(bin_events)):
+            micros = 20_000 * t + rng.integers(inside + 1)
+            text.append(f"{micros // 10**6}.{micros % 10**6:06},{taxel},{polarity or low}\n")
+    return "".join(text)
+
+
+def random_events(seed: int, length: int = 40) -> np.ndarray:
+    """A recording (10, 2, length) whose last bin is not empty."""
+    events = (np.random.default_rng(seed).random((10, 2, length)) < 0.1).astype(np.uint8)
+    events[3, 1, -1] = 1
+    return events
+
+
+@pytest.mark.parametrize("low", [0, -1])
+@pytest.mark.parametrize("inside", [0, 19_999])
+def test_any_recording_is_a_run(lively, lively_file, lines, objects, low, inside):
+    for seed in range(5):
+        events = random_events(seed)
+        found = objects(lively_file, "--input", lines(as_lines(events, seed, low=low, inside=inside)))
+        assert [grasp["counts"] for grasp in found["grasp"]] == [votes_of_run(lively, events)]
+        assert len(found["bin"]) == 40
+        total = {"kind": "end", "grasps": 1, "bins": 40, "events": int(events.sum()), "repeated": 0, "late": 0}
+        assert found["end"] == [total | {"interrupted": False}]
+
+
+def test_every_bin_is_told(lively, lively_file, lines, objects):
+    events = random_events(7)
+    found = objects(lively_file, "--input", lines(as_lines(events)))
+    trace = engine.simulate(lively, events.reshape(1, 20, -1), spikes=True, threads=1)
+    counts = class_counts(lively, np.cumsum(trace.spikes[0], axis=0))
+    for t, told in enumerate(found["bin"]):
+        best = np.sort(counts[t])
+        assert told == {
+            "kind": "bin",
+            "grasp": 1,
+            "bins": t + 1,
+            "time_s": pytest.approx((t + 1) * 0.02, abs=1e-12),
+            "decision": counts[t].argmax(),
+            "margin": best[-1] - best[-2],
+            "counts": counts[t].tolist(),
+        }
+
+
+def test_several_grasps_are_runs_of_their_own(lively, lively_file, lines, objects):
+    grasps = [random_events(seed, length) for seed, length in ((1, 40), (2, 25), (3, 33))]
+    first, second, third = (as_lines(events) for events in grasps)
+    header = f"{HEADER}\n"
+    content = (
+        f"\ufeff# first\n\n# {header}# {header}{first}\n{header}{second}# pause\nreset\n\n   \nreset\n{third.rstrip()}"
+    )
+    for text in (content, content.replace("\n", "\r\n"), content.replace(",", " ,  ")):
+        found = objects(lively_file, "--input", lines(text))
+        assert [grasp["counts"] for grasp in found["grasp"]] == [votes_of_run(lively, events) for events in grasps]
+        assert [grasp["bins"] for grasp in found["grasp"]] == [40, 25, 33]
+        assert [grasp["grasp"] for grasp in found["grasp"]] == [1, 2, 3]
+
+
+@pytest.mark.recordings
+def test_the_released_network_on_its_recordings(released_checkpoint, objects_zip, tmp_path, lines, objects):
+    graph = build_graph("manual")
+    adjacency = normalised_adjacency(graph.edges, graph.n_taxels)
+    netlist = compile_checkpoint(read_checkpoint(str(released_checkpoint)), adjacency).netlist
+    write_netlist(netlist, tmp_path / "net.loom")
+    data = load_recordings(objects_zip, "test", limit=3).events
+    path = lines("\n".join(as_lines(recording, inside=19_999) for recording in data))
+    found = objects(tmp_path / "net.loom", "--input", path, "--bins", data.shape[-1])
+    assert [grasp["counts"] for grasp in found["grasp"]] == [votes_of_run(netlist, recording) for recording in data]
+    assert [grasp["bins"] for grasp in found["grasp"]] == [250, 250, 250]
+    assert found["end"][0]["events"] == data.sum()
+
+
+def test_exact_edges_of_bins(pair_file, lines, objects):
+    # 0.58 / 0.02 is below 29 in binary floating point
+    found = objects(pair_file, "--input", lines("0.579999,0,0\n0.58,0,0\n5.8e-1,0,1\n0.60,0,1\n"))
+    assert [told["counts"] for told in found["bin"][28:]] == [[1, 0], [2, 1], [2, 2]]
+    found = objects(pair_file, "--bin", "0.003", "--input", lines("0.0089,0,0\n0.009,0,1\n"))
+    assert [told["counts"] for told in found["bin"]] == [[0, 0], [0, 0], [1, 0], [1, 1]]
+
+
+def test_a_file_is_read_as_recordings_are(lively, lively_file, lines, objects):
+    # a sensor that counts in binary floating point misses half of the edges by a little
+    rng = np.random.default_rng(0)
+    rows = sorted((k * 0.01 * (1 - e), *rng.integers([10, 2])) for k in range(200) for e in (0, 1e-15, 1e-10, 1e-7))
+    path = lines("taxel,time_s,label,polarity\n" + "".join(f"{x},{t!r},4,{p}  # {p}\n" for t, x, p in rows))
+    read, _ = load_data(path, taxels=10)
+    found = objects(lively_file, "--input", path)
+    assert found["grasp"][0]["bins"] == read.steps == 100
+    assert found["grasp"][0]["counts"] == votes_of_run(lively, read.events[0])
+    assert found["end"][0]["late"] == 0
+
+
+def test_late_and_repeated_events_are_counted_and_not_used(lively, lively_file, lines, objects):
+    events = random_events(4)
+    rows = as_lines(events).splitlines()
+    rows.insert(len(rows) // 2, "0.0,3,1")
+    rows.insert(len(rows) * 3 // 4, "0.01,3,0")
+    rows[-1:] = rows[-1:] * 3
+    found = objects(lively_file, "--input", lines("\n".join(rows)))
+    assert found["grasp"][0]["counts"] == votes_of_run(lively, events)
+    end = found["end"][0]
+    assert (end["late"], end["repeated"], end["events"]) == (2, 2, events.sum() + 4)
+
+
+def test_grasps_of_a_given_length(lively, lively_file, lines, objects):
+    long, short = random_events(5, 40), random_events(6, 20)
+    path = lines(as_lines(long) + "\n" + as_lines(short))
+    found = objects(lively_file, "--input", path, "--bins", 30)
+    padded = np.concatenate([short, np.zeros((10, 2, 10), np.uint8)], axis=2)
+    assert [grasp["counts"] for grasp in found["grasp"]] == [
+        votes_of_run(lively, long[:, :, :30]),
+        votes_of_run(lively, padded),
+    ]
+    assert found["end"][0]["late"] == long[:, :, 30:].sum()
+    assert found["end"][0]["bins"] == 60
+
+
+def test_origin(lively, lively_file, lines, objects):
+    events = random_events(8)
+    events[0, 0, 0] = 1
+    moved = np.concatenate([np.zeros((10, 2, 50), np.uint8), events], axis=2)
+    path = lines(as_lines(moved))
+    counts = [objects(lively_file, "--input", path, "--origin", o)["grasp"][0]["counts"] for o in ("zero", "first")]
+    assert counts == [votes_of_run(lively, moved), votes_of_run(lively, events)]
+    assert counts[0] != counts[1]
+
+
+def test_times_before_the_first_event_are_late(pair_file, lines, objects):
+    found = objects(pair_file, "--origin", "first", "--input", lines("7.005,0,1\n7.0049,0,0\n7.0249,0,1\n7.025,0,0\n"))
+    assert [told["counts"] for told in found["bin"]] == [[0, 1], [1, 1]]
+    assert (found["end"][0]["late"], found["end"][0]["repeated"]) == (1, 1)
+
+
+def test_text(pair_file, lines, capsys):
+    content = "0.0,0,1\n0.02,0,1\n0.04,0,0\n0.06,0,0\n0.08,0,0\n0.06,0,1\n\n0.1,0,1\n0.1,0,1\n"
+    _, summary = command(pair_file, "--input", lines(content))
+    assert capsys.readouterr().out.splitlines() == [
+        "    0.02 s  class 1, 1 vote, 1 ahead",
+        "    0.08 s  class 0, 2 votes, a tie",
+        "grasp 1: class 0, 3 votes, 1 ahead, after 5 bins (0.10 s)",
+        "    0.12 s  class 1, 1 vote, 1 ahead",
+        "grasp 2: class 1, 1 vote, 1 ahead, after 6 bins (0.12 s)",
+    ]
+    assert summary == "2 grasps, 11 bins, 8 events, 1 repeated within a bin, 1 late"
+
+
+def test_a_grasp_without_votes(lively_file, lines, capsys, tmp_path):
+    netlist = build([Neuron()], [], n_inputs=2, depths=[2])
+    write_netlist(replace(netlist, taxels=1, polarities=2, readout_class=read_only([0])), tmp_path / "mute.loom")
+    command(tmp_path / "mute.loom", "--input", lines("0.01,0,1"))
+    assert capsys.readouterr().out == "grasp 1: class 0, no votes, after 1 bin (0.02 s)\n"
+
+
+def test_terminal(pair_file, lines, capsys, monkeypatch):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    monkeypatch.setattr(watch, "REFRESH_S", 0.0)
+    command(pair_file, "--input", lines("0.0,0,1\n0.02,0,1\n"))
+    captured = capsys.readouterr()
+    assert (
+        captured.out
+        == "    0.02 s  class 1, 1 vote, 1 ahead\ngrasp 1: class 1, 2 votes, 2 ahead, after 2 bins (0.04 s)\n"
+    )
+    assert captured.err == "\r\x1b[K\r\x1b[K    0.04 s  class 1, 2 votes, 2 ahead\r\x1b[K"
+
+
+def test_timing(lively_file, lines, objects):
+    found = objects(lively_file, "--timing", "--input", lines(as_lines(random_events(1))))
+    step = found["end"][0]["step"]
+    assert 0 < step["median_ms"] <= step["p99_ms"]
+    assert step["p99_share_of_bin"] == pytest.approx(step["p99_ms"] / 20)
+    _, summary = command(lively_file, "--timing", "--input", lines("0,0,0"))
+    assert summary.splitlines()[1].startswith("step: median 0.")
+
+
+def test_real_time_keeps_the_pace(lively, lively_file, lines, objects):
+    events = random_events(2, 15)
+    path = lines(as_lines(events, inside=19_999) + "\n" + as_lines(events))
+    begun = time.monotonic()
+    found = objects(lively_file, "--input", path, "--speed", "real")
+    # the last bin of a grasp ends with the grasp; an event may lie up to a bin behind the clock that it sets
+    assert time.monotonic() - begun > 2 * 13 * 0.02
+    assert [grasp["counts"] for grasp in found["grasp"]] == [votes_of_run(lively, events)] * 2
+    assert found["end"][0]["late"] == 0
+
+
+def feed(descriptor: int, *parts: tuple[str, float]) -> threading.Thread:
+    """Write parts to a pipe, each followed by a pause, and close it."""
+
+    def write() -> None:
+        for text, pause_s in parts:
+            os.write(descriptor, text.encode())
+            time.sleep(pause_s)
+        os.close(descriptor)
+
+    thread = threading.Thread(target=write)
+    thread.start()
+    return thread
+
+
+@pytest.mark.parametrize("speed", ["real", "full"])
+def test_silence(pair_file, objects, speed):
+    read_end, write_end = os.pipe()
+    thread = feed(write_end, ("0.0,0,1\n", 0.1), ("# nothing\n0.0", 0.3), ("1,0,1\n", 0))
+    found = objects(pair_file, "--input", f"/dev/fd/{read_end}", "--speed", speed)
+    thread.join()
+    os.close(read_end)
+    end = found["end"][0]
+    if speed == "real":  # the clock went on, and the second event came long after its bin
+        assert end["bins"] >= 10
+        assert (end["late"], found["grasp"][0]["counts"]) == (1, [0, 1])
+    else:
+        assert end["bins"] == 1
+        assert end["repeated"] == 1
+
+
+@pytest.mark.parametrize(
+    ("content", "line", "message"),
+    [
+        ("0,0,0\nhello\n", 2, f"'hello' found; {GIVE}, three numbers"),
+        ("t,taxel,p\n", 1, f"'t,taxel,p' found; {GIVE}, three numbers"),
+        (f"{HEADER}\n# x\n{HEADER}\n", 3, f"'{HEADER}' found; {GIVE}, three numbers"),
+        (f"# {HEADER}\n0,0,0,4\n", 2, f"'0,0,0,4' found; {GIVE}, three numbers"),
+        ("time_s,taxel,polarity,label,label\n", 1, f"'time_s,taxel,polarity,label,label' found; {GIVE}, three numbers"),
+        ("0,0,0,1,2\n", 1, f"'0,0,0,1,2' found; {GIVE}, three numbers"),
+        ("0;0;0\n", 1, f"'0;0;0' found; {GIVE}, three numbers"),
+        ("0,,0\n", 1, f"'0,,0' found; {GIVE}, three numbers"),
+        (b"\xff\xfe\x00\n", 1, f"'\ufffd\ufffd\\x00' found; {GIVE}, three numbers"),
+        ("-0.1,0,0\n", 1, "time -0.1 found, allowed are 0 to 1e+12; give seconds"),
+        ("\n\nnan,0,0\n", 3, "time nan found, allowed are 0 to 1e+12; give seconds"),
+        ("1e13,0,0\n", 1, "time 1e13 found, allowed are 0 to 1e+12; give seconds"),
+        ("0,10,0\n", 1, f"taxel 10 {TAXELS}"),
+        ("0,-1,0\n", 1, f"taxel -1 {TAXELS}"),
+        ("0,1.5,0\n", 1, f"taxel 1.5 {TAXELS}"),
+        ("0,inf,0\n", 1, f"taxel inf {TAXELS}"),
+        ("0,1,2\n", 1, "polarity 2 found; write 0 and 1, or -1 and 1"),
+        ("0,1,snan\n", 1, "polarity snan found; write 0 and 1, or -1 and 1"),
+        ("0,1,0\n0,1,1\n0,2,-1\n", 3, "polarity -1 found after polarity 0; write 0 and 1, or -1 and 1, not both"),
+        ("0,1,-1\n\n0,2,0", 3, "polarity 0 found after polarity -1; write 0 and 1, or -1 and 1, not both"),
+        ("0,1,0\n" + "7" * 1500, 2, f"longer than 1000 bytes; {GIVE}"),
+        (
+            "0,1,0\n2000.02,1,0\n",
+            2,
+            "time 2000.02 s leaves 100001 bins without an event, allowed are 100000; give seconds, end a grasp with an "
+            "empty line, or let it begin at its first event (--origin first)",
+        ),
+    ],
+)  # fmt: skip
+def test_bad_lines(lively_file, lines, content, line, message):
+    path = lines(content)
+    with pytest.raises(DataError) as caught:
+        command(lively_file, "--input", path)
+    assert str(caught.value) == f"{path}, line {line}: {message}"
+
+
+@pytest.mark.parametrize("content", ["", "\n\n", "# nothing\n", "time_s,taxel,polarity\n", "reset"])
+def test_empty_stream(lively_file, lines, content):
+    path = lines(content)
+    with pytest.raises(DataError) as caught:
+        command(lively_file, "--input", path)
+    assert str(caught.value) == f"{path}: empty stream, no event found; give lines 'time_s,taxel,polarity'"
+
+
+def test_numbers_as_programs_write_them(pair_file, lines, objects):
+    content = "0.000000000000000000e+00,0.000e+00,1.000e+00\n+0.02,+0,+1\n4E-2,0,-1\n"
+    assert objects(pair_file, "--input", lines(content))["grasp"][0]["counts"] == [1, 2]
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "rest"),
+    [
+        *(("--bin", v, "not a duration; give seconds from 0.000001 to 1000, such as 0.02")
+          for v in ("0", "-0.02", "nan", "inf", "20ms", "1e-7", "1001")),
+        ("--bins", "0", "not a length; give 1 or more, or leave it out"),
+    ],
+)  # fmt: skip
+def test_bad_options(lively_file, lines, option, value, rest):
+    with pytest.raises(OptionError) as caught:
+        command(lively_file, "--input", lines("0,0,0"), f"{option}={value}")
+    assert str(caught.value) == f"{option} {value}: {rest}"
+
+
+def test_a_network_without_polarities(lively, lines, tmp_path):
+    path = tmp_path / "net.loom"
+    write_netlist(replace(lively, taxels=20, polarities=1), path)
+    with pytest.raises(ModelError) as caught:
+        command(path, "--input", lines("0,0,0"))
+    assert str(caught.value) == (
+        f"{path}: 1 polarities per taxel found, event lines have 2; watch a network for events of two polarities"
+    )
+
+
+def test_no_such_file(lively_file, tmp_path):
+    with pytest.raises(FileNotFoundError):
+        command(lively_file, "--input", tmp_path / "none.csv")
+
+
+def test_a_reader_that_goes_away_ends_it(pair_file, lines, monkeypatch):
+    class Gone(io.StringIO):
+        def write(self, _text: str) -> int:
+            raise BrokenPipeError
+
+    path = lines("0,0,0\n0.02,0,0\nnot reached\n")
+    monkeypatch.setattr(sys, "stdout", Gone())
+    report, _ = command(pair_file, "--input", path)
+    assert report["interrupted"]
+
+
+SCRIPT = """
+import argparse, sys
+from runtime import watch
+parser = argparse.ArgumentParser()
+parser.add_argument("--json", action="store_true")
+watch.add_arguments(parser)
+report, as_text, code = watch.watch(parser.parse_args())
+print(as_text(report))
+sys.exit(code)
+"""
+
+
+@pytest.mark.parametrize("end", [signal.SIGINT, None])
+def test_standard_input_and_interruption(pair_file, end):
+    process = subprocess.Popen(
+        [sys.executable, "-c", SCRIPT, pair_file],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=Path(watch.__file__).parents[1],
+    )
+    with process:
+        process.stdin.write("0.00,0,0\n0.02,0,1\n0.04,0,1\n0.06,0,1\n")
+        process.stdin.flush()
+        told = [process.stdout.readline() for _ in range(2)]
+        if end is not None:
+            process.send_signal(end)
+        out, err = process.communicate(timeout=60)
+    assert told == ["    0.02 s  class 0, 1 vote, 1 ahead\n", "    0.06 s  class 1, 2 votes, 1 ahead\n"]
+    assert (process.returncode, err) == (0, "")
+    if end is None:
+        assert out == (
+            "grasp 1: class 1, 3 votes, 2 ahead, after 4 bins (0.08 s)\n"
+            "1 grasp, 4 bins, 4 events, 0 repeated within a bin, 0 late\n"
+        )
+    else:  # the open bin does not count
+        assert out == (
+            "grasp 1: class 1, 2 votes, 1 ahead, after 3 bins (0.06 s)\n"
+            "1 grasp, 3 bins, 4 events, 0 repeated within a bin, 0 late\ninterrupted\n"
+        )
