@@ -29,9 +29,18 @@ from compiler.serialize import is_netlist, read_netlist, write_netlist
 from compiler.targets import load_target
 from compiler.text import text
 from models.evtouch import Recordings
-from models.graphs import CHOICES, build_graph, normalised_adjacency
-from runtime import render
-from runtime.inputs import SYNTHETIC, propagation, recordings, require_place, shipped
+from models.graphs import CHOICES
+from runtime import render, watch
+from runtime.data_commands import add_bin_option, add_data_commands
+from runtime.inputs import (
+    SYNTHETIC,
+    asked_graph,
+    propagation,
+    recordings,
+    require_place,
+    shipped,
+)
+from runtime.options import add_model, add_recordings, add_training
 from runtime.tables import show
 
 Arguments = argparse.Namespace
@@ -69,7 +78,7 @@ def _checkpoint(path: str, arguments: Arguments) -> Checkpoint:
     )
 
 
-def _recordings(arguments: Arguments, netlist: Netlist) -> Recordings:
+def _recordings(arguments: Arguments, netlist: Netlist, *, labels_for: str | None = None) -> Recordings:
     _progress("reading the recordings")
     return recordings(
         arguments.data,
@@ -77,6 +86,8 @@ def _recordings(arguments: Arguments, netlist: Netlist) -> Recordings:
         limit=arguments.limit,
         classes=netlist.classes,
         taxels=netlist.taxels,
+        bin_s=arguments.bin,
+        labels_for=labels_for,
     )
 
 
@@ -84,11 +95,17 @@ def _compile(arguments: Arguments) -> Outcome:
     require_place(arguments.output, "-o")
     load_target(arguments.target)
     checkpoint = _checkpoint(arguments.checkpoint, arguments)
-    name, adjacency = propagation(checkpoint, arguments.graph, arguments.checkpoint)
+    name, adjacency = propagation(checkpoint, asked_graph(arguments), arguments.checkpoint)
     training = None
     if arguments.calibrate is not None:
         _progress("reading the recordings")
-        training = recordings(arguments.calibrate, "train", classes=checkpoint.classes, taxels=checkpoint.taxels).events
+        training = recordings(
+            arguments.calibrate,
+            "train",
+            classes=checkpoint.classes,
+            taxels=checkpoint.taxels,
+            bin_s=arguments.bin,
+        ).events
     _progress("compiling")
 
     def dump(stage: str, artefact: Any) -> None:
@@ -107,7 +124,7 @@ def _compile(arguments: Arguments) -> Outcome:
             "spikeloom": version(),
             "checkpoint_sha256": checkpoint.sha256,
             "run": arguments.run,
-            "weights": arguments.weights,
+            "weights": checkpoint.weights,
             "graph": name,
             "weight_bits": arguments.weight_bits,
             "ranges": arguments.ranges,
@@ -157,8 +174,8 @@ def _verify(arguments: Arguments) -> Outcome:
         raise OptionError(f"--min-agreement {arguments.min_agreement}: not a share; give a number from 0 to 1")
     netlist = read_netlist(arguments.netlist)
     checkpoint = _checkpoint(arguments.checkpoint, arguments)
-    _, adjacency = propagation(checkpoint, arguments.graph, arguments.checkpoint)
-    data = _recordings(arguments, netlist)
+    _, adjacency = propagation(checkpoint, asked_graph(arguments), arguments.checkpoint)
+    data = _recordings(arguments, netlist, labels_for="verify")
     verdict = verify(
         netlist,
         checkpoint,
@@ -186,37 +203,53 @@ def _estimate(arguments: Arguments) -> Outcome:
 
 
 def _train(arguments: Arguments) -> Outcome:
-    from models.checkpoint import save_checkpoint, training_record
-    from models.networks import Architecture
-    from models.train import train
+    from runtime.training import (
+        PROTOCOLS,
+        Job,
+        check_seeds,
+        draw_training,
+        output_of,
+        summary,
+        train_seeds,
+        training_text,
+    )
 
+    check_seeds(arguments.seeds)
     require_place(arguments.output, "-o")
-    graph = build_graph(arguments.graph)
+    if arguments.picture is not None:
+        require_place(arguments.picture, "--picture")
+    graph = asked_graph(arguments)
+    if graph is None:
+        raise OptionError(f"train: no graph; name it with --graph: {CHOICES}, or give --edges")
     _progress("reading the recordings")
-    training = recordings(arguments.data, "train", classes=None, taxels=graph.n_taxels)
-    test = recordings(arguments.data, "test", classes=int(training.labels.max()) + 1, taxels=graph.n_taxels)
+    shared: dict[str, Any] = {"taxels": graph.n_taxels, "bin_s": arguments.bin, "labels_for": "training"}
+    training = recordings(arguments.data, "train", classes=None, **shared)
+    test = recordings(arguments.data, "test", classes=int(training.labels.max()) + 1, **shared)
     _progress("")
-    architecture = Architecture(taxels=graph.n_taxels, classes=int(training.labels.max()) + 1)
-    trained = train(
-        training,
-        test,
-        normalised_adjacency(graph.edges, graph.n_taxels),
-        architecture,
-        epochs=arguments.epochs,
-        seed=arguments.seed,
-    )
     data = arguments.data if arguments.data == SYNTHETIC else training.source
-    command = f"spikeloom train --data {data} --graph {graph.name} --epochs {arguments.epochs}"
-    record = training_record(trained, training, test, command=f"{command} --seed {arguments.seed}", seed=arguments.seed)
-    save_checkpoint(
-        arguments.output,
-        {"last": trained.last, "best": trained.best},
-        graph,
-        beta=architecture.beta,
-        theta=architecture.theta,
-        training=record | {"spikeloom": version()},
-    )
-    return record | {"sha256": _sha256(arguments.output)}, render.training_text, 0
+    keep = tuple(dict.fromkeys(arguments.keep or PROTOCOLS))
+    jobs = [
+        Job(
+            training=training,
+            test=test,
+            graph=graph,
+            epochs=arguments.epochs,
+            seed=seed,
+            device=arguments.device,
+            resume=arguments.resume,
+            output=output_of(arguments.output, seed, arguments.seeds),
+            keep=keep,
+            command=f"spikeloom train --data {data} --graph {graph.name} --epochs {arguments.epochs} --seed {seed}",
+            facts={"spikeloom": version(), "device": arguments.device},
+            position=position,
+        )
+        for position, seed in enumerate(range(arguments.seed, arguments.seed + arguments.seeds))
+    ]
+    results = train_seeds(jobs)
+    records = [record for record, _ in results]
+    if arguments.picture is not None:
+        draw_training(arguments.picture, records, test.labels, [predicted for _, predicted in results])
+    return {"runs": records, "protocols": summary(records)}, training_text, 0
 
 
 def _demo(_arguments: Arguments) -> Outcome:
@@ -232,36 +265,6 @@ def _demo(_arguments: Arguments) -> Outcome:
             sections.append(f"$ spikeloom {typed}\n{as_text(reports[step.command])}")
             worst = max(worst, code)
     return reports, lambda _: "\n\n".join(sections), worst
-
-
-def _inputs(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--data", required=True, metavar="PATH", help="folder or zip in the released layout, or 'synthetic'"
-    )
-    parser.add_argument("--split", default="test", help="split to read (default: test)")
-    parser.add_argument("--limit", type=int, metavar="N", help="first N recordings only")
-
-
-def _inputs_of_training(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--data", required=True, metavar="PATH", help="folder, zip, or 'synthetic'")
-    parser.add_argument("--graph", required=True, help=f"taxel graph: {CHOICES}")
-    parser.add_argument("--epochs", type=int, default=100, metavar="N", help="default: 100, as released")
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of weights and order (default: 0)")
-    parser.add_argument("-o", "--output", required=True, metavar="OUT.pt")
-
-
-def _model(parser: argparse.ArgumentParser, *, graph: bool = True) -> None:
-    if graph:
-        parser.add_argument("--graph", help=f"taxel graph that it was trained on: {CHOICES}")
-    parser.add_argument("--run", type=int, default=0, metavar="N", help="which run of a released file (default: 0)")
-    parser.add_argument(
-        "--weights",
-        choices=("last", "best"),
-        default="last",
-        help="epoch, where a checkpoint holds both (default: last)",
-    )
-    parser.add_argument("--beta", type=float, help="membrane decay, where the file does not say (default: 0.2)")
-    parser.add_argument("--theta", type=float, help="threshold, where the file does not say (default: 0.5)")
 
 
 class _Parser(argparse.ArgumentParser):
@@ -290,12 +293,13 @@ def build_parser() -> argparse.ArgumentParser:
 
     sub = command("compile", _compile, "lower a checkpoint to a netlist that obeys every limit of the chip")
     sub.add_argument("checkpoint")
-    _model(sub)
+    add_model(sub)
     sub.add_argument("--target", default="loihi1", help="chip (default: loihi1)")
     sub.add_argument(
         "--weight-bits", type=int, default=8, help="storage width of the weights: 2 to 6 or 8 (default: 8)"
     )
     sub.add_argument("--calibrate", metavar="PATH", help="recordings whose train split chooses the scales")
+    add_bin_option(sub)
     sub.add_argument(
         "--ranges", default="proven", help=f"how overflow is excluded: {' or '.join(RANGES)} (default: proven)"
     )
@@ -307,18 +311,18 @@ def build_parser() -> argparse.ArgumentParser:
 
     sub = command("inspect", _inspect, "show a netlist (layers, scales, cores, fill of every limit) or a checkpoint")
     sub.add_argument("path")
-    _model(sub, graph=False)
+    add_model(sub, graph=False)
 
     sub = command("run", _run, "run a netlist exactly as the chip would")
     sub.add_argument("netlist")
-    _inputs(sub)
+    add_recordings(sub)
     sub.add_argument("--spikes", metavar="OUT.npz", help="write the spikes of every layer, aligned with the data")
 
     sub = command("verify", _verify, "compare chip and float model, spike for spike")
     sub.add_argument("netlist")
     sub.add_argument("--checkpoint", required=True)
-    _model(sub)
-    _inputs(sub)
+    add_model(sub)
+    add_recordings(sub)
     sub.add_argument(
         "--spec-samples", type=int, default=3, metavar="N", help="recordings for spec = engine (default: 3)"
     )
@@ -332,10 +336,12 @@ def build_parser() -> argparse.ArgumentParser:
 
     sub = command("estimate", _estimate, "synaptic operations, spikes, neuron updates and energy of an inference")
     sub.add_argument("netlist")
-    _inputs(sub)
+    add_recordings(sub)
 
-    sub = command("train", _train, "train a network by the released protocol; keeps the last and the best epoch")
-    _inputs_of_training(sub)
+    sub = command("train", _train, "train a network by the released protocol, reported by the paper's and a clean one")
+    add_training(sub)
+    watch.add_arguments(command("watch", watch.watch, watch.SUMMARY))
+    add_data_commands(commands)
     command("demo", _demo, "the main job on a shipped checkpoint and synthetic grasps; needs no file and no network")
     return parser
 

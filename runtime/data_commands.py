@@ -46,14 +46,14 @@ def add_bin_option(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_data_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_data_commands(commands: argparse._SubParsersAction[Any]) -> None:
     """Add ``data`` and the commands under it."""
     summary = "fetch recordings, describe them, convert events to the released layout"
     below = commands.add_parser("data", help=summary, description=summary)
     actions = below.add_subparsers(dest="data_command", required=True, metavar="COMMAND")
 
     def command(name: str, action: Callable[[Arguments], Outcome], summary: str) -> argparse.ArgumentParser:
-        sub = actions.add_parser(name, help=summary, description=summary)
+        sub: argparse.ArgumentParser = actions.add_parser(name, help=summary, description=summary)
         sub.set_defaults(action=action)
         sub.add_argument("--json", action="store_true", help="print the result as one JSON object")
         sub.add_argument("--debug", action="store_true", help="show a traceback on errors")

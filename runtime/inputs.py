@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import argparse
+import sys
 from importlib import resources
 from pathlib import Path
 
@@ -10,9 +12,12 @@ import numpy as np
 from compiler.errors import DataError, ModelError, OptionError
 from compiler.fixedpoint import FloatArray
 from compiler.frontends.checkpoint import Checkpoint
-from models.evtouch import Recordings, load_recordings
-from models.graphs import CHOICES, build_graph, normalised_adjacency
+from models.events import BIN_S, load_data, need_labels
+from models.evtouch import Recordings
+from models.graphs import CHOICES, Graph, normalised_adjacency
 from models.grasps import synthetic_split
+from models.sensors import sensor_graph
+from runtime.data_commands import show_counts
 
 PRETRAINED = "pretrained:"
 SYNTHETIC = "synthetic"
@@ -37,9 +42,18 @@ def shipped(path: str) -> str:
 
 
 def recordings(
-    path: str, split: str, *, limit: int | None = None, classes: int | None, taxels: int | None
+    path: str,
+    split: str,
+    *,
+    limit: int | None = None,
+    classes: int | None,
+    taxels: int | None,
+    bin_s: float = BIN_S,
+    labels_for: str | None = None,
 ) -> Recordings:
-    """Read recordings, or make the package's own synthetic ones; hold both against the network.
+    """Read recordings of any form, or make the package's own synthetic ones; hold both against the network.
+
+    Counts of disorder in event files go to stderr. `labels_for` names what needs the label of every recording.
 
     Raises
     ------
@@ -47,7 +61,11 @@ def recordings(
         If they cannot be used, or do not suit the network.
     """
     if path != SYNTHETIC:
-        return load_recordings(path, split, limit=limit, classes=classes, taxels=taxels)
+        data, counts = load_data(path, split, bin_s=bin_s, limit=limit, classes=classes, taxels=taxels)
+        show_counts(data, counts)
+        if labels_for is not None:
+            need_labels(data, labels_for)
+        return data
     grasps = synthetic_split(split, limit=limit)
     if taxels is not None and grasps.taxels != taxels:
         raise DataError(
@@ -61,30 +79,44 @@ def recordings(
     return grasps
 
 
-def propagation(checkpoint: Checkpoint, graph: str | None, where: str) -> tuple[str, FloatArray]:
+def asked_graph(arguments: argparse.Namespace) -> Graph | None:
+    """Graph that the options name, or None if they name none; warnings go to stderr.
+
+    Raises
+    ------
+    OptionError, ModelError
+        If there is no such graph, or its files are wrong.
+    """
+    if not (arguments.graph or arguments.taxels or arguments.edges or arguments.directed):
+        return None
+    graph, warnings = sensor_graph(
+        graph=arguments.graph, taxels=arguments.taxels, edges=arguments.edges, directed=arguments.directed
+    )
+    sys.stderr.writelines(f"spikeloom: warning: {warning}\n" for warning in warnings)
+    return graph
+
+
+def propagation(checkpoint: Checkpoint, asked: Graph | None, where: str) -> tuple[str, FloatArray]:
     """Name and propagation matrix of the graph that was asked for, or of the one in the checkpoint.
 
     Raises
     ------
-    OptionError
-        If there is no such graph.
     ModelError
         If no graph is known, or another one than the checkpoint was trained on is asked for.
     """
-    if graph is None:
+    if asked is None:
         if checkpoint.edges is None:
             raise ModelError(f"{where}: the graph is not in this file; name it with --graph: {CHOICES}")
         return str(checkpoint.graph), normalised_adjacency(checkpoint.edges, checkpoint.taxels)
-    built = build_graph(graph)
-    adjacency = normalised_adjacency(built.edges, built.n_taxels)
+    adjacency = normalised_adjacency(asked.edges, asked.n_taxels)
     if checkpoint.edges is not None:
         trained = normalised_adjacency(checkpoint.edges, checkpoint.taxels)
         if not np.array_equal(trained, adjacency):
             raise ModelError(
                 f"{where}: graph and weights disagree: it was trained on {checkpoint.graph}, --graph says "
-                f"{built.name}; leave --graph away"
+                f"{asked.name}; leave --graph away"
             )
-    return built.name, adjacency
+    return asked.name, adjacency
 
 
 def require_place(path: str, option: str) -> None:

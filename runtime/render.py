@@ -211,18 +211,6 @@ def checkpoint_text(report: Json) -> str:
     return "\n".join(lines)
 
 
-def training_text(report: Json) -> str:
-    """A finished training for people."""
-    last, best, total = report["last"], report["best"], report["test_samples"]
-    return "\n".join(
-        [
-            report["command"],
-            f"  last epoch ({last['epoch']}): {percent(last['correct'], total)}",
-            f"  best epoch ({best['epoch']}, chosen on test): {percent(best['correct'], total)}",
-        ]
-    )
-
-
 # -- runs --------------------------------------------------------------------------------------------------------------
 
 
@@ -230,7 +218,7 @@ def run_json(files: tuple[str, ...], labels: IntArray, counts: IntArray, predict
     """Predictions and class spike counts of a run."""
     return {
         "samples": len(files),
-        "accuracy": float(np.mean(labels == predictions)),
+        "accuracy": None if np.any(labels < 0) else float(np.mean(labels == predictions)),
         "files": list(files),
         "labels": labels.tolist(),
         "predictions": predictions.tolist(),
@@ -239,8 +227,11 @@ def run_json(files: tuple[str, ...], labels: IntArray, counts: IntArray, predict
 
 
 def run_text(report: Json) -> str:
-    """Accuracy, and the recordings that went wrong."""
+    """Accuracy, and the recordings that went wrong; decisions alone where a label is unknown."""
     rows = list(zip(report["files"], report["labels"], report["predictions"], report["counts"], strict=True))
+    if report["accuracy"] is None:
+        decided = [[file, str(found), str(counts[found])] for file, _, found, counts in rows]
+        return table(["recording", "decision", "votes"], decided)
     wrong = [
         [file, str(label), str(found), str(counts[label]), str(counts[found])]
         for file, label, found, counts in rows

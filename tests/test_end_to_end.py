@@ -213,7 +213,7 @@ def test_specification_equals_engine_on_containers(tmp_path, containers):
     assert report["layers"][-1]["neurons"] == 20
     netlist, some = read_netlist(tmp_path / "random.loom"), containers[[0, 30, 59]]
     spikes = assert_twins_agree(netlist, some)
-    assert np.all(spikes > 1000)
+    assert np.all(spikes > 500)
     # and the chip does what the float model does, by and large
     checkpoint = read_checkpoint(tmp_path / "random.pt")
     adjacency = normalised_adjacency(checkpoint.edges, checkpoint.taxels)
@@ -227,8 +227,8 @@ WITHOUT_TORCH = """
 import sys
 from runtime.cli import main
 code = main(sys.argv[1:])
-unwanted = sorted({name.partition(".")[0] for name in sys.modules} & {"torch", "networkx", "pandas"})
-sys.exit(f"imported: {unwanted}" if "torch" in unwanted else code)
+unwanted = "torch" in sys.modules
+sys.exit("torch was imported" if unwanted else code)
 """
 
 

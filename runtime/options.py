@@ -1,0 +1,61 @@
+"""Options that several commands share."""
+
+from __future__ import annotations
+
+import argparse
+
+from compiler.frontends.checkpoint import WEIGHTS
+from models.graphs import CHOICES
+from runtime.data_commands import add_bin_option
+
+DATA_HELP = "recordings: released layout, event files (csv, npz), one recording, 'synthetic', 'objects' or 'containers'"
+
+
+def add_graph_options(parser: argparse.ArgumentParser, purpose: str) -> None:
+    """Add the options that name a taxel graph: the built-in sensor's, or one of the user's own."""
+    parser.add_argument("--graph", help=f"taxel graph {purpose}: {CHOICES}")
+    parser.add_argument("--taxels", metavar="N|COORDS.csv", help="your own sensor: positions x,y[,z] in mm")
+    parser.add_argument("--edges", metavar="EDGES.csv", help="your own graph: source,target")
+    parser.add_argument("--directed", action="store_true", help="take --edges as they are, one way")
+
+
+def add_recordings(parser: argparse.ArgumentParser) -> None:
+    """Add the options that name recordings to run."""
+    parser.add_argument("--data", required=True, metavar="PATH", help=DATA_HELP)
+    add_bin_option(parser)
+    parser.add_argument("--split", default="test", help="split to read (default: test)")
+    parser.add_argument("--limit", type=int, metavar="N", help="first N recordings only")
+
+
+def add_training(parser: argparse.ArgumentParser) -> None:
+    """Add the options of a training."""
+    parser.add_argument("--data", required=True, metavar="PATH", help=DATA_HELP)
+    add_bin_option(parser)
+    add_graph_options(parser, "to train on")
+    parser.add_argument("--epochs", type=int, default=100, metavar="N", help="default: 100, as released")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of weights and order (default: 0)")
+    parser.add_argument("--seeds", type=int, default=1, metavar="N", help="train N seeds side by side (default: 1)")
+    parser.add_argument("--resume", action="store_true", help="go on with an interrupted training of the same options")
+    parser.add_argument("--device", default="cpu", help="cpu or cuda (default: cpu)")
+    parser.add_argument(
+        "--keep",
+        action="append",
+        choices=WEIGHTS,
+        help="epoch to store: last, best (on test) or clean (on validation); may be repeated (default: all three)",
+    )
+    parser.add_argument("--picture", metavar="OUT.png", help="draw learning curves and confusion matrix")
+    parser.add_argument("-o", "--output", required=True, metavar="OUT.pt")
+
+
+def add_model(parser: argparse.ArgumentParser, *, graph: bool = True) -> None:
+    """Add the options that say how to read a checkpoint."""
+    if graph:
+        add_graph_options(parser, "that it was trained on")
+    parser.add_argument("--run", type=int, default=0, metavar="N", help="which run of a released file (default: 0)")
+    parser.add_argument(
+        "--weights",
+        choices=WEIGHTS,
+        help="epoch, where a checkpoint holds several (default: the first of these that it holds)",
+    )
+    parser.add_argument("--beta", type=float, help="membrane decay, where the file does not say (default: 0.2)")
+    parser.add_argument("--theta", type=float, help="threshold, where the file does not say (default: 0.5)")
