@@ -47,8 +47,10 @@ SPLITS = {"train": (60, 1), "test": (24, 2)}
 SPLIT_STEPS = 100
 
 
-def synthetic_split(split: str, *, limit: int | None = None) -> Recordings:
+def synthetic_split(split: str, *, limit: int | None = None, coordinates: ArrayLike = NEUTOUCH) -> Recordings:
     """Draw the split of the fixed synthetic data set that the shipped checkpoint was trained and tested on.
+
+    With `coordinates` the same grasps touch another sensor.
 
     Parameters
     ----------
@@ -67,7 +69,7 @@ def synthetic_split(split: str, *, limit: int | None = None) -> Recordings:
     if limit is not None and limit < 1:
         raise OptionError(f"--limit {limit}: at least 1 recording is needed; give a positive number")
     per_class, seed = SPLITS[split]
-    grasps = synthetic_grasps(per_class=per_class, steps=SPLIT_STEPS, seed=seed)
+    grasps = synthetic_grasps(coordinates=coordinates, per_class=per_class, steps=SPLIT_STEPS, seed=seed)
     return Recordings(
         events=grasps.events[:limit],
         labels=grasps.labels[:limit],

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from compiler.atomic import write_atomically
-from compiler.errors import OptionError
+from compiler.errors import DataError, OptionError
 from models.events import need_labels
 from models.evtouch import Recordings
 
@@ -77,3 +77,34 @@ def _members(splits: Sequence[Recordings]) -> Iterator[tuple[str, bytes]]:
             buffer = io.BytesIO()
             np.lib.format.write_array(buffer, events.astype(np.float32), version=(1, 0), allow_pickle=False)
             yield f"{recordings.split}/sample_{index:0{width}}_label_{label}.npy", buffer.getvalue()
+
+
+def write_event_lines(path: str | os.PathLike[str], splits: Sequence[Recordings], bin_s: float) -> None:
+    """Write one recording as lines ``time_s,taxel,polarity``, each event at the middle of its bin.
+
+    Parameters
+    ----------
+    path : path
+        CSV file; replaced if it exists.
+    splits : sequence of Recordings
+        One recording in all.
+    bin_s : float
+        Seconds per step.
+
+    Raises
+    ------
+    DataError
+        If there are several recordings.
+    OSError
+        If it cannot be written.
+    """
+    count = sum(len(recordings) for recordings in splits)
+    if count != 1:
+        raise DataError(
+            f"-o {path}: {count} recordings, a .csv holds one; give one recording, or a folder or zip to -o"
+        )
+    step, taxel, polarity = np.nonzero(splits[0].events[0].transpose(2, 0, 1))
+    times = (step + 0.5) * bin_s
+    lines = [f"{t:.9g},{n},{p}\n" for t, n, p in zip(times.tolist(), taxel.tolist(), polarity.tolist(), strict=True)]
+    with write_atomically(path) as file:
+        file.write(("time_s,taxel,polarity\n" + "".join(lines)).encode())

@@ -20,7 +20,7 @@ from models.evtouch import Recordings
 from models.fetch import DATA_SETS, data_folder, fetch_data
 from models.graphs import NEUTOUCH
 from models.grasps import SPLITS, synthetic_split
-from models.release import write_released
+from models.release import write_event_lines, write_released
 from models.sensors import read_layout
 from runtime.tables import table
 
@@ -72,7 +72,13 @@ def add_data_commands(commands: argparse._SubParsersAction[Any]) -> None:
     sub = command("convert", _convert, "write the released layout: SPLIT/sample_N_label_L.npy")
     _source(sub)
     sub.add_argument("--split", default="test", help="split of recordings that have none (default: test)")
-    sub.add_argument("-o", "--output", required=True, metavar="OUT", help="new folder, or a zip if it ends in .zip")
+    sub.add_argument(
+        "-o",
+        "--output",
+        required=True,
+        metavar="OUT",
+        help="new folder, or a zip; or a .csv of event lines, of one recording",
+    )
 
 
 def _source(parser: argparse.ArgumentParser) -> None:
@@ -195,12 +201,15 @@ def _description_text(report: Json) -> str:
 
 
 def _convert(arguments: Arguments) -> Outcome:
-    count, _ = _layout(arguments.taxels)
+    count, places = _layout(arguments.taxels)
     present = tuple(SPLITS) if arguments.source == SYNTHETIC else data_splits(arguments.source)
-    loaded = [_load(arguments.source, split, arguments.bin, count) for split in present or (arguments.split,)]
+    loaded = [_load(arguments.source, split, arguments.bin, count, places) for split in present or (arguments.split,)]
     taxels = max(recordings.taxels for recordings, _ in loaded)
     steps = max(recordings.steps for recordings, _ in loaded)
-    write_released(arguments.output, [_grown(recordings, taxels, steps) for recordings, _ in loaded])
+    if arguments.output.lower().endswith(".csv"):
+        write_event_lines(arguments.output, [recordings for recordings, _ in loaded], arguments.bin)
+    else:
+        write_released(arguments.output, [_grown(recordings, taxels, steps) for recordings, _ in loaded])
     report = {
         "source": arguments.source,
         "output": arguments.output,
@@ -239,9 +248,11 @@ def _grown(recordings: Recordings, taxels: int, steps: int) -> Recordings:
     )
 
 
-def _load(source: str, split: str, bin_s: float, taxels: int | None) -> tuple[Recordings, EventCounts | None]:
+def _load(
+    source: str, split: str, bin_s: float, taxels: int | None, places: FloatArray | None = None
+) -> tuple[Recordings, EventCounts | None]:
     if source == SYNTHETIC:
-        return synthetic_split(split), None
+        return (synthetic_split(split) if places is None else synthetic_split(split, coordinates=places)), None
     return load_data(source, split, bin_s=bin_s, taxels=taxels)
 
 

@@ -2,11 +2,14 @@
 
 import dataclasses
 import itertools
+import math
 
 import numpy as np
+from hypothesis import assume
 from hypothesis import strategies as st
 from scipy import sparse
 
+from compiler.errors import CapacityError
 from compiler.fixedpoint import weight_step
 from compiler.frontends.checkpoint import Checkpoint, Dense
 from compiler.ir import (
@@ -20,6 +23,8 @@ from compiler.ir import (
     Projection,
     Readout,
 )
+from compiler.passes.emit import emit
+from compiler.passes.partition import partition
 from compiler.targets import Quantity, Target, load_target
 
 LOIHI = load_target("loihi1")
@@ -247,3 +252,86 @@ def dense_weights(network: IntegerNetwork, post: int) -> dict[int, np.ndarray]:
             assert not np.any(effective % 2)
             found[p.pre] = found.get(p.pre, 0) + effective // 2
     return found
+
+
+def compiled(network, target=LOIHI):
+    """Netlist with core k on tile k."""
+    parts = partition(network, target)
+    return emit(network, parts, tuple(range(len(parts.cores))), target, {})
+
+
+def words_of_list(entries, weight_bits, index):
+    """Blocks of up to 64 entries, ten header bits each, in whole words of 64 bits."""
+    total = 0
+    while entries > 0:
+        block = min(entries, 64)
+        total += math.ceil((block * (weight_bits + index) + 10) / 64)
+        entries -= block
+    return total
+
+
+def counted(netlist):
+    """Use of each limit by each core, counted one compartment and one axon at a time."""
+    cores = []
+    for core in range(netlist.n_cores):
+        compartments = range(*netlist.core_compartments[core : core + 2])
+        axons = range(*netlist.core_axons[core : core + 2])
+        words, formats, base = 0, set(), 0
+        for axon in axons:
+            first, last = (int(bound) for bound in netlist.axon_synapses[axon : axon + 2])
+            form = int(netlist.axon_format[axon])
+            index = int(netlist.format_index_bits[form])
+            words += words_of_list(last - first, int(netlist.format_weight_bits[form]), index)
+            formats.add(form)
+            if index == 0:
+                base = max(base, int(netlist.synapse_target[first]))
+        cores.append(
+            {
+                "core.compartments": len(compartments),
+                "core.axons_in": len(axons),
+                "core.axons_out": sum(int(s) - netlist.n_inputs in compartments for s in netlist.axon_source),
+                "core.synapse_words": words,
+                "core.threshold_slots": len({int(netlist.threshold[c]) for c in compartments}),
+                "core.synapse_formats": len(formats),
+                "core.compartment_configs": len(
+                    {(int(netlist.decay_u[c]), int(netlist.decay_v[c])) for c in compartments}
+                ),
+                "core.dense_base": base,
+            }
+        )
+    return cores
+
+
+@st.composite
+def tight_targets(draw):
+    """Chips so small that ten neurons need several cores."""
+    return small_target(
+        core_compartments=draw(st.integers(1, 8)),
+        core_axons_in=draw(st.integers(4, 30)),
+        core_axons_out=draw(st.integers(2, 30)),
+        core_synapse_words=draw(st.integers(6, 40)),
+        core_threshold_slots=draw(st.integers(1, 4)),
+        core_synapse_formats=draw(st.integers(2, 5)),
+        core_compartment_configs=draw(st.integers(1, 3)),
+        core_dense_base=draw(st.sampled_from([0, 3, 256])),
+    )
+
+
+@st.composite
+def roomy_targets(draw):
+    """Chips on which a core holds several small layers, whatever their order: dense lists may start anywhere."""
+    return small_target(
+        core_compartments=draw(st.integers(4, 10)),
+        core_axons_in=draw(st.integers(10, 40)),
+        core_axons_out=draw(st.integers(6, 40)),
+        core_synapse_words=draw(st.integers(10, 50)),
+        core_threshold_slots=draw(st.integers(4, 8)),
+        core_compartment_configs=draw(st.integers(1, 3)),
+    )
+
+
+def legal_partition(network, target):
+    try:
+        return partition(network, target)
+    except CapacityError:
+        assume(False)

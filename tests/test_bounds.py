@@ -89,21 +89,21 @@ def check(network, events, proofs):
         assert np.abs(activity.membranes[post]).max() <= proof.membrane
 
 
-@settings(deadline=None)
+@settings(deadline=None, max_examples=50)
 @given(st.data())
 def test_bounds_hold_on_random_registers(data):
     network = data.draw(integer_networks())
     check(network, data.draw(recordings_for(network.input.size, most=30)), prove_ranges(network))
 
 
-@settings(deadline=None)
+@settings(deadline=None, max_examples=50)
 @given(st.data())
 def test_bounds_hold_on_quantised_networks(data):
     network, _ = quantize(data.draw(float_networks()), LOIHI, bits=data.draw(st.sampled_from([2, 8])))
     check(network, data.draw(recordings_for(network.input.size, most=30)), prove_ranges(network))
 
 
-@settings(deadline=None)
+@settings(deadline=None, max_examples=50)
 @given(st.data())
 def test_a_proof_means_that_saturation_changes_nothing(data):
     network = data.draw(integer_networks())

@@ -12,6 +12,8 @@ from compiler.errors import DataError, OptionError
 from models import fetch
 from models.events import load_data
 from models.fetch import DataSet
+from models.grasps import synthetic_split
+from models.release import write_event_lines, write_released
 from runtime.data_commands import add_bin_option, add_data_commands, show_counts
 
 
@@ -330,3 +332,36 @@ def test_matplotlib_is_loaded_for_pictures_only():
         "assert not {'matplotlib', 'torch'} & set(sys.modules), 'loaded early'"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+
+
+def test_one_recording_becomes_event_lines_that_read_back_the_same(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    grasps = synthetic_split("test", limit=2)
+    write_released(tmp_path / "two", [grasps])
+    source = sorted((tmp_path / "two" / "test").iterdir())[1]
+    report, _, code = start("convert", str(source), "-o", "one.csv")
+    assert code == 0
+    assert report["splits"]["test"]["recordings"] == 1
+    lines = (tmp_path / "one.csv").read_text().splitlines()
+    assert lines[0] == "time_s,taxel,polarity"
+    assert len(lines) - 1 == int(grasps.events[1].sum())
+    back, _ = load_data(tmp_path / "one.csv", taxels=39)
+    steps = back.steps
+    assert np.array_equal(back.events[0], grasps.events[1][:, :, :steps])
+    assert not grasps.events[1][:, :, steps:].any()
+
+
+def test_event_lines_hold_one_recording(tmp_path):
+    with pytest.raises(DataError) as refused:
+        write_event_lines("x.csv", [synthetic_split("test", limit=3)], 0.02)
+    assert str(refused.value) == (
+        "-o x.csv: 3 recordings, a .csv holds one; give one recording, or a folder or zip to -o"
+    )
+
+
+def test_synthetic_grasps_touch_the_sensor_that_is_given(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "coords.csv").write_text("x,y\n" + "".join(f"{3 * i},{3 * j}\n" for j in range(3) for i in range(3)))
+    report, _, _ = start("convert", "synthetic", "--taxels", "coords.csv", "-o", "grasps")
+    assert report["taxels"] == 9
+    assert {split: made["recordings"] for split, made in report["splits"].items()} == {"train": 360, "test": 144}

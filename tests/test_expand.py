@@ -219,6 +219,7 @@ def test_the_expanded_network_spikes_like_the_checkpoint(seed, beta):
     convolution = factored(adjacency, checkpoint.hops.astype(np.float64))
     for sample in range(2):
         signal = convolution(events[sample].astype(float)) + np.tile(checkpoint.conv_bias.astype(np.float64), 5)
+        fired = events[sample]
         for layer in range(4):
             if layer:
                 dense = checkpoint.dense[layer - 1]

@@ -1,5 +1,4 @@
 import dataclasses
-import math
 import time
 
 import numpy as np
@@ -8,114 +7,30 @@ from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from random_networks import (
     LOIHI,
-    dense_weights,
-    float_networks,
+    compiled,
+    counted,
     integer_chain,
     integer_networks,
     integer_population,
-    recordings_for,
+    legal_partition,
+    roomy_targets,
     small_target,
     stored,
+    tight_targets,
+    words_of_list,
 )
 
 from compiler.errors import CapacityError
-from compiler.interpret import run_integer
 from compiler.ir import INPUT, Input, IntegerNetwork, IntegerProjection, Readout
 from compiler.passes.emit import emit
 from compiler.passes.legalize import LimitUse, list_words, measure, require_legal
 from compiler.passes.partition import Chunk, Partition, index_bits, partition
-from compiler.passes.quantize import quantize
-from runtime import spec
-from runtime.trace import aligned
 
 MIXED = [8, 6, 4, 2]
 
 
-def compiled(network, target=LOIHI):
-    """Netlist with core k on tile k."""
-    parts = partition(network, target)
-    return emit(network, parts, tuple(range(len(parts.cores))), target, {})
-
-
 def sizes(parts):
     return [[(chunk.population, chunk.first, chunk.last) for chunk in core] for core in parts.cores]
-
-
-def words_of_list(entries, weight_bits, index):
-    """Blocks of up to 64 entries, ten header bits each, in whole words of 64 bits."""
-    total = 0
-    while entries > 0:
-        block = min(entries, 64)
-        total += math.ceil((block * (weight_bits + index) + 10) / 64)
-        entries -= block
-    return total
-
-
-def counted(netlist):
-    """Use of each limit by each core, counted one compartment and one axon at a time."""
-    cores = []
-    for core in range(netlist.n_cores):
-        compartments = range(*netlist.core_compartments[core : core + 2])
-        axons = range(*netlist.core_axons[core : core + 2])
-        words, formats, base = 0, set(), 0
-        for axon in axons:
-            first, last = (int(bound) for bound in netlist.axon_synapses[axon : axon + 2])
-            form = int(netlist.axon_format[axon])
-            index = int(netlist.format_index_bits[form])
-            words += words_of_list(last - first, int(netlist.format_weight_bits[form]), index)
-            formats.add(form)
-            if index == 0:
-                base = max(base, int(netlist.synapse_target[first]))
-        cores.append(
-            {
-                "core.compartments": len(compartments),
-                "core.axons_in": len(axons),
-                "core.axons_out": sum(int(s) - netlist.n_inputs in compartments for s in netlist.axon_source),
-                "core.synapse_words": words,
-                "core.threshold_slots": len({int(netlist.threshold[c]) for c in compartments}),
-                "core.synapse_formats": len(formats),
-                "core.compartment_configs": len(
-                    {(int(netlist.decay_u[c]), int(netlist.decay_v[c])) for c in compartments}
-                ),
-                "core.dense_base": base,
-            }
-        )
-    return cores
-
-
-@st.composite
-def tight_targets(draw):
-    """Chips so small that ten neurons need several cores."""
-    return small_target(
-        core_compartments=draw(st.integers(1, 8)),
-        core_axons_in=draw(st.integers(4, 30)),
-        core_axons_out=draw(st.integers(2, 30)),
-        core_synapse_words=draw(st.integers(6, 40)),
-        core_threshold_slots=draw(st.integers(1, 4)),
-        core_synapse_formats=draw(st.integers(2, 5)),
-        core_compartment_configs=draw(st.integers(1, 3)),
-        core_dense_base=draw(st.sampled_from([0, 3, 256])),
-    )
-
-
-@st.composite
-def roomy_targets(draw):
-    """Chips on which a core holds several small layers, whatever their order: dense lists may start anywhere."""
-    return small_target(
-        core_compartments=draw(st.integers(4, 10)),
-        core_axons_in=draw(st.integers(10, 40)),
-        core_axons_out=draw(st.integers(6, 40)),
-        core_synapse_words=draw(st.integers(10, 50)),
-        core_threshold_slots=draw(st.integers(4, 8)),
-        core_compartment_configs=draw(st.integers(1, 3)),
-    )
-
-
-def legal_partition(network, target):
-    try:
-        return partition(network, target)
-    except CapacityError:
-        assume(False)
 
 
 # --- words
@@ -264,7 +179,7 @@ def test_index_widths_count_as_formats():
 # --- every limit
 
 
-@settings(deadline=None)
+@settings(deadline=None, max_examples=60)
 @given(integer_networks(), tight_targets())
 def test_every_limit_is_kept(network, target):
     parts = legal_partition(network, target)
@@ -283,7 +198,7 @@ def test_every_limit_is_kept(network, target):
     assert require_legal(netlist, target) == measure(netlist, target)
 
 
-@settings(deadline=None)
+@settings(deadline=None, max_examples=60)
 @given(integer_networks(), tight_targets())
 def test_every_neuron_sits_on_one_core(network, target):
     parts = legal_partition(network, target)
@@ -307,7 +222,7 @@ def groupings(items):
             yield [*rest[:i], [head, *group], *rest[i + 1 :]]
 
 
-@settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.filter_too_much])
+@settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.filter_too_much])
 @given(integer_networks(exponents=(0,), bits=(8,)), roomy_targets())
 def test_no_grouping_of_the_chunks_needs_fewer_cores(network, target):
     parts = legal_partition(network, target)
@@ -489,126 +404,3 @@ def test_a_dense_list_that_starts_too_high_is_refused():
     assert str(caught.value) == (
         "core 0 (fc1, fc2): 300 used, 256 allowed (loihi1.core.dense_base); place the dense layer first on its core"
     )
-
-
-# --- the netlist is the network
-
-
-@settings(deadline=None)
-@given(integer_networks(), tight_targets())
-def test_the_netlist_holds_exactly_the_network(network, target):
-    parts = legal_partition(network, target)
-    netlist = emit(network, parts, tuple(range(len(parts.cores))), target, {})
-    core_of_axon, core_of_compartment = [], []
-    for core in range(netlist.n_cores):
-        core_of_axon += [core] * int(np.diff(netlist.core_axons)[core])
-        core_of_compartment += [core] * int(np.diff(netlist.core_compartments)[core])
-    dense = {
-        (p.pre, p.post): np.zeros(
-            (
-                network.populations[p.post].size,
-                network.input.size if p.pre == INPUT else network.populations[p.pre].size,
-            ),
-            np.int64,
-        )
-        for p in network.projections
-    }
-    nonzero = 0
-    for axon in range(netlist.n_axons):
-        source, form = int(netlist.axon_source[axon]), int(netlist.axon_format[axon])
-        pre, column = INPUT, source
-        if source >= netlist.n_inputs:
-            compartment = source - netlist.n_inputs
-            pre, column = int(netlist.layer[compartment]), int(netlist.neuron[compartment])
-        exponent = int(netlist.format_exponent[form])
-        entries = range(*netlist.axon_synapses[axon : axon + 2])
-        targets = [int(netlist.synapse_target[s]) for s in entries]
-        weights = [int(netlist.synapse_weight[s]) for s in entries]
-        if netlist.format_index_bits[form] == 0:
-            # A dense list has no indices: its targets are consecutive, and it begins and ends with a synapse.
-            assert targets == list(range(targets[0], targets[0] + len(targets)))
-            assert weights[0] != 0
-            assert weights[-1] != 0
-        else:
-            assert targets == sorted(set(targets))
-            assert 0 not in weights
-            assert targets[-1] < 2 ** int(netlist.format_index_bits[form])
-        for where, weight in zip(targets, weights, strict=True):
-            assert weight % 2 ** (9 - int(netlist.format_weight_bits[form])) == 0
-            target_id = int(netlist.core_compartments[core_of_axon[axon]]) + where
-            assert core_of_compartment[target_id] == core_of_axon[axon]
-            if weight:
-                nonzero += 1
-                row, post = int(netlist.neuron[target_id]), int(netlist.layer[target_id])
-                dense[pre, post][row, column] += weight * 2**exponent if exponent >= 0 else weight // 2
-    assert nonzero == sum(np.count_nonzero(p.weight.data) for p in network.projections)
-    for post in range(len(network.populations)):
-        for pre, weight in dense_weights(network, post).items():
-            np.testing.assert_array_equal(dense[pre, post], weight)
-
-
-@settings(deadline=None)
-@given(integer_networks(), tight_targets())
-def test_compartments_hold_the_registers_of_their_neurons(network, target):
-    parts = legal_partition(network, target)
-    netlist = emit(network, parts, tuple(range(len(parts.cores))), target, {"seed": 1})
-    for index, population in enumerate(network.populations):
-        ids = netlist.compartments_of(index)
-        assert netlist.neuron[ids].tolist() == list(range(population.size))
-        for field in ("threshold", "bias_mantissa", "bias_exponent"):
-            np.testing.assert_array_equal(getattr(netlist, field)[ids], getattr(population, field))
-        assert set(netlist.decay_u[ids].tolist()) == {population.decay_u}
-        assert set(netlist.decay_v[ids].tolist()) == {population.decay_v}
-        voting = index == network.readout.population
-        expected = network.readout.label.tolist() if voting else [-1] * population.size
-        assert netlist.readout_class[ids].tolist() == expected
-        layer = netlist.layers[index]
-        into = [p for p in network.projections if p.post == index]
-        assert (layer.name, layer.neurons, layer.scale) == (population.name, population.size, population.scale)
-        assert layer.synapses == sum(p.weight.nnz for p in into)
-        assert layer.max_fan_in == max(sum(np.diff(p.weight.indptr) for p in into))
-        assert layer.weight_bits == max(p.bits for p in into)
-    assert (netlist.taxels, netlist.polarities) == (network.input.taxels, network.input.polarities)
-    assert (netlist.classes, netlist.provenance, netlist.target) == (network.classes, {"seed": 1}, "loihi1")
-    assert all(not getattr(netlist, name).flags.writeable for name in ("neuron", "axon_source", "synapse_weight"))
-
-
-@settings(deadline=None, max_examples=50)
-@given(st.data())
-def test_the_chip_spikes_like_the_network(data):
-    """Partition and emission change no spike: the specified chip step against the integer network."""
-    network, _ = quantize(data.draw(float_networks()), LOIHI, bits=data.draw(st.sampled_from(MIXED)))
-    target = data.draw(tight_targets())
-    parts = legal_partition(network, target)
-    netlist = emit(network, parts, tuple(range(len(parts.cores))), target, {})
-    events = data.draw(recordings_for(network.input.size, samples=1))
-    expected = run_integer(network, events, membranes=True)
-    trace = spec.simulate(netlist, events[0].T)
-    for layer in range(len(network.populations)):
-        np.testing.assert_array_equal(aligned(netlist, trace.spikes, layer), expected.spikes[layer][0])
-        np.testing.assert_array_equal(aligned(netlist, trace.membranes, layer), expected.membranes[layer][0])
-
-
-def test_lists_are_sparse_where_that_saves_visits():
-    """Four of ten neurons: sparse although dense would save no word; eight of ten: dense."""
-    few, many = np.zeros((10, 1), int), np.full((10, 1), 2)
-    few[[0, 3, 6, 9]] = 2
-    many[[4, 5]] = 0
-    assert compiled(integer_chain(few)).n_synapses == 4
-    netlist = compiled(integer_chain(many))
-    assert netlist.synapse_weight.tolist() == [2, 2, 2, 2, 0, 0, 2, 2, 2, 2]
-
-
-def test_lists_are_dense_where_memory_is_short():
-    """48 of 64 neurons: 11 words sparse, 9 dense."""
-    weights = np.full((64, 1), 2)
-    weights[1:33:2] = 0
-    network = integer_chain(weights)
-    assert compiled(network).n_synapses == 48
-    assert compiled(network, small_target(core_synapse_words=9)).n_synapses == 64
-
-
-def test_a_network_of_zeros_has_cores_but_no_axons():
-    netlist = compiled(integer_chain(np.zeros((3, 2)), np.zeros((2, 3))))
-    assert (netlist.n_cores, netlist.n_compartments, netlist.n_axons, netlist.n_synapses) == (1, 5, 0, 0)
-    require_legal(netlist, LOIHI)

@@ -47,7 +47,7 @@ def test_the_passes_run_in_order_and_hand_on_what_they_make():
     assert done.netlist.provenance == {}
 
 
-@pytest.mark.parametrize("bits", [2, 3, 4, 5, 6, 8])
+@pytest.mark.parametrize("bits", [2, 5, 8])
 @pytest.mark.parametrize("calibrated", [False, True])
 def test_two_compiles_give_the_same_bytes(bits, calibrated):
     def compiled():

@@ -114,7 +114,7 @@ def test_up_to_nine_cores_are_solved_with_a_proof(cores, kind):
 
 
 @pytest.mark.parametrize("kind", ["random", "layered", "star"])
-@pytest.mark.parametrize("cores", [12, 40, 128])
+@pytest.mark.parametrize("cores", [12, 128])
 def test_many_cores_are_placed_well_and_bounded(cores, kind):
     rng = np.random.default_rng(0)
     star = np.zeros((cores, cores))
