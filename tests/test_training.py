@@ -30,9 +30,7 @@ def data(tmp_path, monkeypatch) -> Path:
     splits = []
     for split, seed in (("train", 1), ("test", 2)):
         grasps = synthetic_grasps(per_class=3, steps=12, seed=seed)
-        splits.append(
-            type(grasps)(**{n: getattr(grasps, n) for n in ("events", "labels", "files", "source")}, split=split)
-        )
+        splits.append(replace(grasps, split=split))
     write_released(tmp_path / "data", splits)
     return tmp_path
 
