@@ -81,7 +81,7 @@ class Netlist:
     taxels, polarities, classes : int
         Sensor size and number of classes; ``n_inputs = taxels * polarities``.
     layers : tuple of Layer
-        In order of depth; the last one is read out.
+        In order of depth; ``readout_class`` says which of them votes.
     core_tile : (cores,) int64
         Tile of each core, row-major on the mesh (``x = tile % width``, ``y = tile // width``).
     core_compartments, core_axons : (cores + 1,) int64

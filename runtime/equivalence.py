@@ -109,7 +109,7 @@ class Verdict:
     ladder : tuple of (stage, mapping of layer to different entries)
         Differences from the float32 reference with one deviation more on each rung.
     same_checkpoint : bool
-        Whether the netlist was compiled from this very checkpoint file.
+        Whether the netlist was compiled from this very checkpoint file and epoch.
     """
 
     files: tuple[str, ...]
@@ -371,5 +371,8 @@ def verify(
         spec_equals_engine=equal,
         first_divergence=divergence,
         ladder=tuple(ladder),
-        same_checkpoint=netlist.provenance.get("checkpoint_sha256") == checkpoint.sha256,
+        same_checkpoint=(
+            netlist.provenance.get("checkpoint_sha256") == checkpoint.sha256
+            and netlist.provenance.get("weights") == checkpoint.weights
+        ),
     )

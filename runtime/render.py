@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
@@ -76,7 +77,10 @@ def compilation_json(compilation: Compilation, sha256: str) -> Json:
     """A netlist with the reasons for its scales, the proofs and the placement."""
     return netlist_json(compilation.netlist, compilation.uses, sha256) | {
         "calibration": [asdict(choice) for choice in compilation.choices],
-        "proofs": [asdict(proof) | {"holds": proof.holds} for proof in compilation.proofs],
+        "proofs": [
+            {key: value if value != math.inf else None for key, value in asdict(proof).items()} | {"holds": proof.holds}
+            for proof in compilation.proofs
+        ],
         "core_bound": compilation.core_bound,
         "placement": asdict(compilation.placement),
     }

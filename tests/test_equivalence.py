@@ -306,7 +306,7 @@ def test_other_weights_of_the_same_architecture(small, tmp_path):
 
 def test_same_checkpoint_is_told_by_its_hash(small):
     checkpoint, adjacency, netlist = small
-    marked = dataclasses.replace(netlist, provenance={"checkpoint_sha256": checkpoint.sha256})
+    marked = dataclasses.replace(netlist, provenance={"checkpoint_sha256": checkpoint.sha256, "weights": "last"})
     assert verify(marked, checkpoint, adjacency, events(2), LABELS, FILES).same_checkpoint
 
 
