@@ -34,7 +34,7 @@ def shipped(path: str) -> str:
     if not path.startswith(PRETRAINED):
         return path
     folder = Path(str(resources.files("models") / "pretrained"))
-    known = {file.stem: file for file in sorted(folder.glob("*.pt"))}
+    known = {file.stem: file for file in sorted(folder.glob("*.pt"), key=lambda file: file.stem)}
     name = path.removeprefix(PRETRAINED)
     if name not in known:
         raise OptionError(f"{path}: no such shipped checkpoint; allowed: {', '.join(PRETRAINED + n for n in known)}")
