@@ -35,6 +35,7 @@ from runtime.data_commands import add_bin_option, add_data_commands
 from runtime.inputs import (
     SYNTHETIC,
     asked_graph,
+    graph_words,
     propagation,
     recordings,
     require_place,
@@ -169,9 +170,13 @@ def _run(arguments: Arguments) -> Outcome:
 
 def _verify(arguments: Arguments) -> Outcome:
     from runtime.equivalence import verify
+    from runtime.levels import levels_of, parse_requirements, unmet
 
     if not 0 <= arguments.min_agreement <= 1:
         raise OptionError(f"--min-agreement {arguments.min_agreement}: not a share; give a number from 0 to 1")
+    required = {"E0": 1.0, "E3": arguments.min_agreement}
+    if arguments.require is not None:
+        required = parse_requirements(arguments.require)
     netlist = read_netlist(arguments.netlist)
     checkpoint = _checkpoint(arguments.checkpoint, arguments)
     _, adjacency = propagation(checkpoint, asked_graph(arguments), arguments.checkpoint)
@@ -186,8 +191,9 @@ def _verify(arguments: Arguments) -> Outcome:
         spec_samples=arguments.spec_samples,
         progress=_progress,
     )
-    good = verdict.spec_equals_engine and verdict.decision_agreement >= arguments.min_agreement
-    return render.verify_json(verdict), render.verify_text, 0 if good else 1
+    levels = levels_of(verdict)
+    missed = unmet(levels, required)
+    return render.verify_json(verdict, levels, missed), render.verify_text, 1 if missed else 0
 
 
 def _estimate(arguments: Arguments) -> Outcome:
@@ -227,6 +233,7 @@ def _train(arguments: Arguments) -> Outcome:
     test = recordings(arguments.data, "test", classes=int(training.labels.max()) + 1, **shared)
     _progress("")
     data = arguments.data if arguments.data == SYNTHETIC else training.source
+    command = f"spikeloom train --data {data} {graph_words(arguments)} --epochs {arguments.epochs}"
     keep = tuple(dict.fromkeys(arguments.keep or PROTOCOLS))
     jobs = [
         Job(
@@ -239,7 +246,7 @@ def _train(arguments: Arguments) -> Outcome:
             resume=arguments.resume,
             output=output_of(arguments.output, seed, arguments.seeds),
             keep=keep,
-            command=f"spikeloom train --data {data} --graph {graph.name} --epochs {arguments.epochs} --seed {seed}",
+            command=f"{command} --seed {seed}",
             facts={"spikeloom": version(), "device": arguments.device},
             position=position,
         )
@@ -332,6 +339,11 @@ def build_parser() -> argparse.ArgumentParser:
         default=0.95,
         metavar="X",
         help="share of equal decisions to pass (default: 0.95)",
+    )
+    sub.add_argument(
+        "--require",
+        metavar="E0,E2=X,E3=X",
+        help="levels to pass instead: E0 specification = engine, E2 share of spikes in every layer, E3 of decisions",
     )
 
     sub = command("estimate", _estimate, "synaptic operations, spikes, neuron updates and energy of an inference")

@@ -22,7 +22,7 @@ from compiler.netlist import Netlist
 from compiler.passes.expand import expand
 from runtime import engine, spec
 from runtime.trace import aligned, check_channels
-from runtime.votes import predictions
+from runtime.votes import class_counts
 
 LADDER = ("float64", "beta", "weights", "bias_threshold", "rounding", "saturation")
 """Deviations in the order in which they are added; the last one is the chip."""
@@ -98,6 +98,8 @@ class Verdict:
         Recordings.
     labels, float_predictions, chip_predictions : (samples,) int64
         Classes.
+    float_counts, chip_counts : (samples, classes) int64
+        Votes per class.
     spikes : mapping of str to LayerSpikes
         Per layer.
     spec_samples : int
@@ -116,6 +118,8 @@ class Verdict:
     labels: IntArray
     float_predictions: IntArray
     chip_predictions: IntArray
+    float_counts: IntArray
+    chip_counts: IntArray
     spikes: Mapping[str, LayerSpikes]
     spec_samples: int
     spec_equals_engine: bool
@@ -353,11 +357,15 @@ def verify(
         files,
         lambda sample, layer: float_membranes(checkpoint, adjacency, events[sample : sample + 1])[names[layer]][0],
     )
+    float_counts = reference[-1].sum(axis=1, dtype=np.int64)
+    chip_counts = class_counts(netlist, trace.counts.spikes)
     return Verdict(
         files=files,
         labels=labels,
-        float_predictions=vote(reference[-1].sum(axis=1)),
-        chip_predictions=predictions(netlist, trace.counts.spikes),
+        float_predictions=vote(float_counts),
+        chip_predictions=vote(chip_counts),
+        float_counts=float_counts,
+        chip_counts=chip_counts,
         spikes={
             name: LayerSpikes(
                 float=int(np.count_nonzero(reference[i])),

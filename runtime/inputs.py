@@ -96,6 +96,14 @@ def asked_graph(arguments: argparse.Namespace) -> Graph | None:
     return graph
 
 
+def graph_words(arguments: argparse.Namespace) -> str:
+    """Options that name the graph, as they would be typed beside the files."""
+    files = {"--taxels": arguments.taxels, "--edges": arguments.edges}
+    words = [f"--graph {arguments.graph}"] if arguments.graph else []
+    words += [f"{option} {Path(name).name}" for option, name in files.items() if name]
+    return " ".join([*words, *(["--directed"] if arguments.directed else [])])
+
+
 def propagation(checkpoint: Checkpoint, asked: Graph | None, where: str) -> tuple[str, FloatArray]:
     """Name and propagation matrix of the graph that was asked for, or of the one in the checkpoint.
 

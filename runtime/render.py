@@ -16,6 +16,7 @@ from compiler.passes.legalize import LimitUse
 from compiler.pipeline import Compilation
 from runtime.cost import NOT_PRICED, Costs
 from runtime.equivalence import Verdict
+from runtime.levels import Level
 from runtime.tables import percent, si, table
 
 Json = dict[str, Any]
@@ -247,8 +248,8 @@ def run_text(report: Json) -> str:
     return "\n".join(lines)
 
 
-def verify_json(verdict: Verdict) -> Json:
-    """A verdict under the keys that scripts rely on."""
+def verify_json(verdict: Verdict, levels: Sequence[Level], missed: Sequence[str]) -> Json:
+    """A verdict under the keys that scripts rely on, its levels, and the required ones that were missed."""
     return {
         "samples": len(verdict.files),
         "accuracy": {"float": verdict.float_accuracy, "chip": verdict.chip_accuracy},
@@ -259,6 +260,8 @@ def verify_json(verdict: Verdict) -> Json:
         "first_divergence": None if verdict.first_divergence is None else asdict(verdict.first_divergence),
         "ladder": [{"stage": stage, "different": dict(different)} for stage, different in verdict.ladder],
         "same_checkpoint": verdict.same_checkpoint,
+        "levels": [asdict(level) for level in levels],
+        "missed": list(missed),
     }
 
 
@@ -266,13 +269,11 @@ def verify_text(report: Json) -> str:
     """A verdict for people."""
     samples = report["samples"]
     right = {side: round(share * samples) for side, share in report["accuracy"].items()}
-    equal = round(report["decision_agreement"] * samples)
     lines = [
-        f"float accuracy:    {percent(right['float'], samples)}",
-        f"chip accuracy:     {percent(right['chip'], samples)}",
-        f"decisions equal:   {equal} of {samples}",
-        f"spec = engine:     {'yes' if report['spec_equals_engine'] else 'NO'}, every spike and membrane of "
-        f"{report['spec_samples']} recordings",
+        f"float accuracy:  {percent(right['float'], samples)}",
+        f"chip accuracy:   {percent(right['chip'], samples)}",
+        *(f"{level['name']}  {level['text']}" for level in report["levels"]),
+        *(f"missed: {line}" for line in report["missed"]),
     ]
     if not report["same_checkpoint"]:
         lines.append("note: the netlist was compiled from another checkpoint file than this one")

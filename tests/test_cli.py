@@ -348,7 +348,10 @@ def test_verify_fails_when_decisions_agree_too_rarely(spikeloom, tmp_path):
     assert 0 < agreement < 1
     assert {share: code for share, (code, _) in found.items()} == {0: 0, 1: 1}
     # the verdict is printed either way, and agreement exactly at the bound passes
-    assert found[0][1] == found[1][1]
+    reports = [json.loads(out) for _, out in found.values()]
+    missed = [report.pop("missed") for report in reports]
+    assert reports[0] == reports[1]
+    assert missed == [[], [f"E3: {agreement:.4f} reached, 1 required"]]
     assert spikeloom(*words, "--min-agreement", agreement)[0] == 0
 
 
@@ -357,8 +360,8 @@ def test_verify_for_people(spikeloom):
     report = json.loads(spikeloom(*words, "--json")[1])
     code, out, err = spikeloom(*words, "--min-agreement", "0")
     assert (code, err) == (0, "")
-    assert f"decisions equal:   {round(6 * report['decision_agreement'])} of 6\n" in out
-    assert "spec = engine:     yes, every spike and membrane of 3 recordings\n" in out
+    assert f"E3  {round(6 * report['decision_agreement'])} of 6 decisions equal; " in out
+    assert "E0  specification = engine in every spike, membrane and count of 3 recordings\n" in out
     first = report["first_divergence"]
     assert f"first divergence: {first['file']}, step {first['step']}, {first['layer']} " in out
     assert "another checkpoint" not in out

@@ -270,7 +270,9 @@ def test_a_disagreement_ends_with_exit_code_one(tmp_path, monkeypatch, capsys):
     out, err = capsys.readouterr()
     assert (json.loads(out)["spec_equals_engine"], err) == (False, "")
     assert cli.main(words) == 1
-    assert "spec = engine:     NO, every spike and membrane of 3 recordings\n" in capsys.readouterr().out
+    assert (
+        "E0  specification = engine NOT in every spike, membrane and count of 3 recordings\n" in capsys.readouterr().out
+    )
 
 
 # -- parts that do not belong together ---------------------------------------------------------------------------------

@@ -30,6 +30,6 @@ def test_the_square_sensor_example_reaches_a_decision(tmp_path):
     made = tmp_path / "made"
     for name in ("coords.csv", "grasps.png", "training.png", "square.pt", "square.loom", "grasp.csv"):
         assert (made / name).stat().st_size > 0
-    assert "spec = engine:     yes" in done.stdout
+    assert "E0  specification = engine in every" in done.stdout
     assert "grasp 1: class " in done.stdout
     assert "1 grasp, 100 bins" in done.stdout

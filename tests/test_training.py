@@ -134,7 +134,9 @@ def test_isolated_taxels_warn_and_train_all_the_same(data, capsys):
     Path("edges.csv").write_text("source,target\n0,1\n1,2\n")
     words = ["train", "--data", "data", "--taxels", "39", "--edges", "edges.csv", "--epochs", "1", "-o", "x.pt"]
     assert main(words) == 0
-    assert "warning: " in capsys.readouterr().err
+    out, err = capsys.readouterr()
+    assert "warning: " in err
+    assert out.startswith("spikeloom train --data data --taxels 39 --edges edges.csv --epochs 1 --seed 0\n")
     assert read_checkpoint("x.pt").graph == "edges:edges.csv"
 
 
