@@ -179,7 +179,7 @@ def _verify(arguments: Arguments) -> Outcome:
         required = parse_requirements(arguments.require)
     netlist = read_netlist(arguments.netlist)
     checkpoint = _checkpoint(arguments.checkpoint, arguments)
-    _, adjacency = propagation(checkpoint, asked_graph(arguments), arguments.checkpoint)
+    name, adjacency = propagation(checkpoint, asked_graph(arguments), arguments.checkpoint)
     data = _recordings(arguments, netlist, labels_for="verify")
     verdict = verify(
         netlist,
@@ -191,6 +191,9 @@ def _verify(arguments: Arguments) -> Outcome:
         spec_samples=arguments.spec_samples,
         progress=_progress,
     )
+    compiled_for = netlist.provenance.get("graph", name)
+    if compiled_for != name:
+        sys.stderr.write(f"spikeloom: warning: the netlist was compiled for graph {compiled_for}, this is {name}\n")
     levels = levels_of(verdict)
     missed = unmet(levels, required)
     return render.verify_json(verdict, levels, missed), render.verify_text, 1 if missed else 0
@@ -210,6 +213,7 @@ def _estimate(arguments: Arguments) -> Outcome:
 
 def _train(arguments: Arguments) -> Outcome:
     from runtime.training import (
+        PICTURES,
         PROTOCOLS,
         Job,
         check_seeds,
@@ -224,6 +228,8 @@ def _train(arguments: Arguments) -> Outcome:
     require_place(arguments.output, "-o")
     if arguments.picture is not None:
         require_place(arguments.picture, "--picture")
+        if Path(arguments.picture).suffix not in PICTURES:
+            raise OptionError(f"--picture {arguments.picture}: allowed are {', '.join(PICTURES)}; name one of these")
     graph = asked_graph(arguments)
     if graph is None:
         raise OptionError(f"train: no graph; name it with --graph: {CHOICES}, or give --edges")

@@ -170,7 +170,7 @@ def compilation_text(report: Json) -> str:
     optimal = "optimal" if placement["spike_hops"] <= placement["bound"] else f"bound {placement['bound']:.1f}"
     lines.append(
         f"cores: {report['cores']} used, {report['core_bound']} at least; "
-        f"spike-hops a step: {placement['spike_hops']:.1f} ({optimal})"
+        f"spike-hops a step{'' if calibrated else ' if every neuron spiked'}: {placement['spike_hops']:.1f} ({optimal})"
     )
     return "\n".join(lines)
 

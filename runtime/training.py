@@ -19,6 +19,9 @@ from models.evtouch import Recordings
 from models.graphs import Graph, normalised_adjacency
 from runtime.tables import percent, table
 
+PICTURES = (".png", ".svg", ".pdf")
+"""Kinds of picture that `draw_training` writes."""
+
 PROTOCOLS = ("last", "best", "clean")
 
 

@@ -113,6 +113,7 @@ def test_pictures_of_equal_trainings_are_equal(tmp_path):
         (["--seeds", "0"], "--seeds 0: at least 1 is needed; give a positive number"),
         (["--epochs", "0"], "epochs: 0, allowed are 1 or more; choose another"),
         (["--device", "tpu"], "--device tpu: unknown; allowed: cpu, cuda"),
+        (["--picture", "x.jpg"], "--picture x.jpg: allowed are .png, .svg, .pdf; name one of these"),
         (["--picture", "none/x.png"], "--picture none/x.png: the folder does not exist; make it first"),
     ],
 )
