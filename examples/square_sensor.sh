@@ -24,6 +24,6 @@ say spikeloom compile square.pt --calibrate grasps -o square.loom
 say spikeloom verify square.loom --checkpoint square.pt --data grasps --min-agreement 0.9
 
 # 5. One grasp as it would arrive from the sensor, line by line, and the decision while it runs.
-first="$(find grasps/test -name '*.npy' | sort | head -n 1)"
+first="$(find grasps/test -name '*.npy' | sort | sed -n 1p)"
 say spikeloom data convert "$first" -o grasp.csv
 say spikeloom watch square.loom --input grasp.csv --bins 100
