@@ -114,7 +114,7 @@ class IntegerPopulation:
         Unique in the network.
     beta, theta : float
         What the float model asked for.
-    scale : float
+    scale : (neurons,) float64
         Weight units per membrane unit of the float model.
     decay_u, decay_v : int
         Decay registers.
@@ -127,7 +127,7 @@ class IntegerPopulation:
     name: str
     beta: float
     theta: float
-    scale: float
+    scale: FloatArray
     decay_u: int
     decay_v: int
     threshold: IntArray
@@ -223,9 +223,15 @@ def to_networkx(network: Network | IntegerNetwork) -> nx.MultiDiGraph:
 
 
 def fan_in(network: Network | IntegerNetwork, post: int) -> IntArray:
-    """Structural synapses into each neuron of a population; shape (neurons,)."""
-    total = np.zeros(network.populations[post].size, np.int64)
-    for projection in network.projections:
+    """Structural synapses into each neuron of a population, planes of one synapse counted once; shape (neurons,)."""
+    pattern: dict[int, Sparse] = {}
+    projections: tuple[Projection | IntegerProjection, ...] = network.projections
+    for projection in projections:
         if projection.post == post:
-            total += np.diff(projection.weight.indptr)
+            ones = projection.weight.astype(np.int64)
+            ones.data = np.ones_like(ones.data)
+            pattern[projection.pre] = pattern[projection.pre] + ones if projection.pre in pattern else ones
+    total = np.zeros(network.populations[post].size, np.int64)
+    for weight in pattern.values():
+        total += np.diff(weight.indptr)
     return total

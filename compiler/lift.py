@@ -40,7 +40,7 @@ def lift(netlist: Netlist) -> IntegerNetwork:
                 name=layer.name,
                 beta=layer.beta,
                 theta=layer.theta,
-                scale=layer.scale,
+                scale=netlist.scale[ids],
                 decay_u=_one(netlist, index, "decay_u"),
                 decay_v=_one(netlist, index, "decay_v"),
                 threshold=netlist.threshold[ids],

@@ -31,7 +31,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from compiler.fixedpoint import IntArray
+from compiler.fixedpoint import FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,9 +46,6 @@ class Layer:
         Number of compartments of this layer, over all cores.
     depth : int
         Steps that the layer lags behind the data.
-    scale : float
-        Weight units (mantissa times 2**exponent) per unit of the float model's membrane; a membrane register
-        holds 64 of these units' 64ths, so float membrane = register / (64 * scale).
     beta, theta : float
         Decay and threshold of the float model.
     weight_bits : int
@@ -62,7 +59,6 @@ class Layer:
     name: str
     neurons: int
     depth: int
-    scale: float
     beta: float
     theta: float
     weight_bits: int
@@ -94,6 +90,9 @@ class Netlist:
         Mantissa; a spike needs ``v > 64 * threshold``.
     bias_mantissa, bias_exponent : (compartments,) int64
         ``mantissa * 2**exponent`` is added to the membrane, unshifted.
+    scale : (compartments,) float64
+        Weight units (mantissa times 2**exponent) per unit of the float model's membrane; a membrane register
+        holds 64ths of a weight unit, so float membrane = register / (64 * scale). No register of the chip.
     readout_class : (compartments,) int64
         Class that a spike votes for, -1 for none.
     axon_source, axon_format : (axons,) int64
@@ -123,6 +122,7 @@ class Netlist:
     threshold: IntArray
     bias_mantissa: IntArray
     bias_exponent: IntArray
+    scale: FloatArray
     readout_class: IntArray
     axon_source: IntArray
     axon_format: IntArray
@@ -213,7 +213,14 @@ def one_step_bounds(netlist: Netlist) -> tuple[IntArray, IntArray]:
 
 
 def read_only(array: npt.ArrayLike) -> IntArray:
-    """Copy to a read-only int64 array, as every field of a netlist is."""
+    """Copy to a read-only int64 array, as every field of a netlist but ``scale`` is."""
     copy = np.array(array, dtype=np.int64)
+    copy.flags.writeable = False
+    return copy
+
+
+def read_only_float(array: npt.ArrayLike) -> FloatArray:
+    """Copy to a read-only float64 array."""
+    copy = np.array(array, dtype=np.float64)
     copy.flags.writeable = False
     return copy

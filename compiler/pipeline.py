@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,7 +22,7 @@ from compiler.passes.expand import expand
 from compiler.passes.legalize import LimitUse, require_legal
 from compiler.passes.partition import partition
 from compiler.passes.place import Placement, core_traffic, place
-from compiler.passes.quantize import Choice, quantize
+from compiler.passes.quantize import Choice, Recipe, quantize
 from compiler.targets import load_target
 from compiler.verify import verify
 
@@ -69,7 +69,7 @@ def compile_checkpoint(
     adjacency: FloatArray,
     *,
     target: str = "loihi1",
-    weight_bits: int = 8,
+    recipes: Sequence[Recipe] = (Recipe(),),
     training_events: npt.NDArray[Any] | None = None,
     ranges: str = "proven",
     margin: float = 0.1,
@@ -86,8 +86,8 @@ def compile_checkpoint(
         Normalised propagation matrix of the graph that it was trained on.
     target : str
         Chip.
-    weight_bits : int
-        Storage width of the weights.
+    recipes : sequence of Recipe
+        Storage of each layer, or one for all; a fine-tuned checkpoint brings its own.
     training_events : (samples, taxels, polarities, steps), optional
         Training recordings for calibration; at most 32, evenly spaced, are used.
     ranges : {"proven", "observed"}
@@ -119,7 +119,7 @@ def compile_checkpoint(
         calibration = calibrate(network, evenly_spaced(channels_last(training_events)))
         rates = tuple(spikes.mean(axis=(0, 1)) for spikes in calibration.spikes)
 
-    integer, choices = quantize(network, chip, bits=weight_bits, calibration=calibration, ranges=ranges, margin=margin)
+    integer, choices = quantize(network, chip, recipes=recipes, calibration=calibration, ranges=ranges, margin=margin)
     verify(integer)
     publish("quantize", integer)
 

@@ -1,6 +1,6 @@
 """Netlist to one file and back: an uncompressed ``.npz`` that numpy alone can read, without pickle.
 
-Members, format version 1
+Members, format version 2
 -------------------------
 ``manifest``
     JSON text (0-d string): ``format`` ("spikeloom-netlist"), ``version``, ``target``, ``taxels``, ``polarities``,
@@ -8,7 +8,7 @@ Members, format version 1
 ``sha256``
     Hex digest (0-d string) over all other members in the order below: name, dtype, shape and bytes of each.
 every array field of :class:`compiler.netlist.Netlist`
-    Under its own name and meaning, in the narrowest little-endian signed type that holds it.
+    Under its own name and meaning, in the narrowest little-endian signed type that holds it; ``scale`` as float64.
 
 Equal netlists give equal bytes: members are stored, not compressed, in a fixed order and with a fixed date.
 """
@@ -30,13 +30,16 @@ import numpy as np
 
 from compiler.atomic import write_atomically
 from compiler.errors import FormatError
-from compiler.netlist import Layer, Netlist, read_only
+from compiler.netlist import Layer, Netlist, read_only, read_only_float
 from compiler.targets import known_targets
 
 FORMAT = "spikeloom-netlist"
-VERSION = 1
+VERSION = 2
 SIZE_LIMIT = 2**32
 """Bytes that a netlist file may have, 4 GiB: some hundred times the synapses of a whole chip."""
+
+FLOATS = frozenset({"scale"})
+"""Array members of real numbers."""
 
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 _ZIP_ERRORS = (zipfile.BadZipFile, struct.error, ValueError, EOFError, OverflowError, MemoryError, RuntimeError)
@@ -46,7 +49,9 @@ ARRAYS = tuple(field.name for field in fields(Netlist) if field.name not in _SCA
 """Array members in file order."""
 
 
-def _narrow(array: np.ndarray[Any, np.dtype[np.int64]]) -> np.ndarray[Any, Any]:
+def _narrow(array: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    if array.dtype.kind == "f":
+        return array.astype("<f8")
     for dtype in ("<i1", "<i2", "<i4"):
         info = np.iinfo(dtype)
         if not array.size or (info.min <= array.min() and array.max() <= info.max):
@@ -170,7 +175,8 @@ def read_netlist(path: str | os.PathLike[str]) -> Netlist:
         classes=manifest["classes"],
         layers=tuple(Layer(**layer) for layer in manifest["layers"]),
         provenance=manifest["provenance"],
-        **{name: read_only(members[name]) for name in ARRAYS},
+        scale=read_only_float(members["scale"]),
+        **{name: read_only(members[name]) for name in ARRAYS if name not in FLOATS},
     )
     faults = inconsistencies(netlist)
     if faults:
@@ -200,9 +206,9 @@ def _type_faults(manifest: dict[str, Any], members: dict[str, np.ndarray[Any, An
     entries |= {name: _is(manifest.get(name), "int", 1) for name in ("taxels", "polarities", "classes")}
     faults = [f"the manifest has no usable {name}" for name, good in entries.items() if not good]
     return faults + [
-        f"{name} is no list of integers"
+        f"{name} is no list of {'numbers' if name in FLOATS else 'integers'}"
         for name in ARRAYS
-        if members[name].ndim != 1 or members[name].dtype.kind != "i"
+        if members[name].ndim != 1 or members[name].dtype.kind != ("f" if name in FLOATS else "i")
     ]
 
 
@@ -218,7 +224,7 @@ def _is_layer(entry: Any) -> bool:
     wanted = {field.name: str(field.type) for field in fields(Layer)}
     if not isinstance(entry, dict) or set(entry) != set(wanted):
         return False
-    return all(_is(entry[name], kind, 0) for name, kind in wanted.items()) and entry["scale"] > 0
+    return all(_is(entry[name], kind, 0) for name, kind in wanted.items())
 
 
 def _bounds_fault(name: str, bounds: np.ndarray[Any, Any], parts: int, total: int) -> str | None:
@@ -234,7 +240,8 @@ def inconsistencies(netlist: Netlist) -> list[str]:
         _bounds_fault("core_axons", netlist.core_axons, netlist.n_cores, axons),
         _bounds_fault("axon_synapses", netlist.axon_synapses, axons, synapses),
     ]
-    for name in ("neuron", "decay_u", "decay_v", "threshold", "bias_mantissa", "bias_exponent", "readout_class"):
+    per_compartment = ("neuron", "decay_u", "decay_v", "threshold", "bias_mantissa", "bias_exponent", "scale")
+    for name in (*per_compartment, "readout_class"):
         if len(getattr(netlist, name)) != compartments:
             found.append(f"{name} has {len(getattr(netlist, name))} entries for {compartments} compartments")
     if len(netlist.axon_format) != axons or len(netlist.synapse_target) != synapses:
@@ -268,6 +275,8 @@ def inconsistencies(netlist: Netlist) -> list[str]:
         for name, (a, low, high) in ranges.items()
         if outside(a, low, high)
     ]
+    if not np.all(np.isfinite(netlist.scale) & (netlist.scale > 0)):
+        found.append("scale has values that are not positive numbers")
     on_core = np.diff(netlist.core_compartments)[netlist.core_of_axon()][netlist.axon_of_synapse()]
     if outside(netlist.synapse_target, 0, 2**31) or np.any(netlist.synapse_target >= on_core):
         found.append("synapse_target points beyond its core")

@@ -19,6 +19,7 @@ _COMPARTMENT_FIELDS = (
     "threshold",
     "bias_mantissa",
     "bias_exponent",
+    "scale",
     "readout_class",
 )
 
@@ -47,7 +48,8 @@ def _population(population: Population | IntegerPopulation) -> str:
     if isinstance(population, Population):
         return f"{head} (bias {_span(population.bias)} #{_digest(population.bias)})"
     return (
-        f"{head} (scale {population.scale!r}) (decay_u {population.decay_u}) (decay_v {population.decay_v}) "
+        f"{head} (scale {_span(population.scale)} #{_digest(population.scale)}) "
+        f"(decay_u {population.decay_u}) (decay_v {population.decay_v}) "
         f"(threshold {_span(population.threshold)} #{_digest(population.threshold)}) "
         f"(bias {_span(population.bias)} #{_digest(population.bias_mantissa, population.bias_exponent)})"
     )
@@ -77,7 +79,7 @@ def _netlist_lines(netlist: Netlist) -> Iterator[str]:
     for layer in netlist.layers:
         yield (
             f"  (layer {layer.name} (neurons {layer.neurons}) (depth {layer.depth}) (beta {layer.beta!r}) "
-            f"(theta {layer.theta!r}) (scale {layer.scale!r}) (bits {layer.weight_bits}) "
+            f"(theta {layer.theta!r}) (bits {layer.weight_bits}) "
             f"(synapses {layer.synapses}) (fan_in {layer.max_fan_in}))"
         )
     formats = zip(netlist.format_weight_bits, netlist.format_exponent, netlist.format_index_bits, strict=True)

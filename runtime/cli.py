@@ -23,7 +23,7 @@ from compiler.errors import OptionError, SpikeloomError
 from compiler.frontends.checkpoint import Checkpoint, read_checkpoint
 from compiler.netlist import Netlist
 from compiler.passes.legalize import measure
-from compiler.passes.quantize import RANGES
+from compiler.passes.quantize import RANGES, Recipe
 from compiler.pipeline import STAGES, compile_checkpoint
 from compiler.serialize import is_netlist, read_netlist, write_netlist
 from compiler.targets import load_target
@@ -117,7 +117,7 @@ def _compile(arguments: Arguments) -> Outcome:
         checkpoint,
         adjacency,
         target=arguments.target,
-        weight_bits=arguments.weight_bits,
+        recipes=(Recipe(bits=arguments.weight_bits),),
         training_events=training,
         ranges=arguments.ranges,
         margin=arguments.margin,

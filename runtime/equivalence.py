@@ -16,7 +16,7 @@ from compiler.errors import DataError, ModelError
 from compiler.fixedpoint import MEMBRANE_SHIFT, FloatArray, IntArray
 from compiler.frontends.checkpoint import Checkpoint
 from compiler.interpret import BoolArray, channels_last, run_float, run_integer, vote
-from compiler.ir import IntegerNetwork, Network, Projection
+from compiler.ir import IntegerNetwork, Network, Projection, Sparse
 from compiler.lift import lift
 from compiler.netlist import Netlist
 from compiler.passes.expand import expand
@@ -200,29 +200,32 @@ def realised(network: Network, integer: IntegerNetwork) -> tuple[Network, Networ
             Projection(
                 pre=projection.pre,
                 post=projection.post,
-                weight=projection.effective().astype(np.float64) / integer.populations[projection.post].scale,
+                weight=_rows_scaled(projection.effective(), 1 / integer.populations[projection.post].scale),
             )
             for projection in integer.projections
         ),
     )
+    # A neuron with another threshold fires as one with the model's threshold whose weights and bias are scaled to it.
+    stretch = [population.theta / np.maximum(population.realised_theta, 1e-300) for population in integer.populations]
     bias_threshold = replace(
         weights,
         populations=tuple(
-            replace(
-                population,
-                bias=chip.bias / (chip.scale * (1 << MEMBRANE_SHIFT)),
-                theta=_uniform(chip.realised_theta),
-            )
-            for population, chip in zip(beta.populations, integer.populations, strict=True)
+            replace(population, bias=chip.bias / (chip.scale * (1 << MEMBRANE_SHIFT)) * factor)
+            for population, chip, factor in zip(beta.populations, integer.populations, stretch, strict=True)
+        ),
+        projections=tuple(
+            replace(projection, weight=_rows_scaled(projection.weight, stretch[projection.post]))
+            for projection in weights.projections
         ),
     )
     return beta, weights, bias_threshold
 
 
-def _uniform(theta: FloatArray) -> float:
-    if np.ptp(theta) != 0:
-        raise ModelError("the ladder: a layer has several thresholds, one is allowed; compile with one scale per layer")
-    return float(theta[0])
+def _rows_scaled(weight: Sparse, factor: FloatArray) -> Sparse:
+    """Multiply each row of a csr_array by a factor of its own; float64."""
+    scaled = weight.astype(np.float64)
+    scaled.data *= np.repeat(factor, np.diff(weight.indptr))
+    return scaled
 
 
 def _first_divergence(
@@ -249,8 +252,8 @@ def _first_divergence(
     trace = engine.simulate(prepared, events[sample : sample + 1], membranes=True)
     assert trace.membranes is not None, "membranes were asked for"
     register = int(aligned(netlist, trace.membranes, index)[0, step, neuron])
-    unit = layer.scale * (1 << MEMBRANE_SHIFT)
-    threshold = int(netlist.threshold[netlist.compartments_of(index)[neuron]])
+    compartment = int(netlist.compartments_of(index)[neuron])
+    scale, threshold = float(netlist.scale[compartment]), int(netlist.threshold[compartment])
     graph = layer.depth == 0 and layer.neurons % netlist.taxels == 0
     features = layer.neurons // netlist.taxels
     return Divergence(
@@ -261,10 +264,10 @@ def _first_divergence(
         taxel=neuron // features if graph else None,
         feature=neuron % features if graph else None,
         float_membrane=float(membrane(sample, index)[step, neuron]),
-        chip_membrane=register / unit,
+        chip_membrane=register / (scale * (1 << MEMBRANE_SHIFT)),
         chip_register=register,
         theta=layer.theta,
-        chip_theta=threshold / layer.scale,
+        chip_theta=threshold / scale,
         ill_posed=bool(wide[index][sample, step, neuron] != reference[index][sample, step, neuron]),
     )
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from hypothesis import strategies as st
 
-from compiler.netlist import Layer, Netlist, read_only
+from compiler.netlist import Layer, Netlist, read_only, read_only_float
 from runtime import engine, spec
 from runtime.trace import Counts, Trace
 
@@ -62,7 +62,6 @@ def build(neurons: list[Neuron], axons: list[Axon], *, n_inputs: int, depths: li
                 name=f"layer{i}",
                 neurons=sum(neuron.layer == i for neuron in neurons),
                 depth=depth,
-                scale=1.0,
                 beta=0.2,
                 theta=0.5,
                 weight_bits=8,
@@ -81,6 +80,7 @@ def build(neurons: list[Neuron], axons: list[Axon], *, n_inputs: int, depths: li
         threshold=column("threshold"),
         bias_mantissa=column("bias"),
         bias_exponent=column("bias_exponent"),
+        scale=read_only_float([1.0] * len(neurons)),
         readout_class=read_only([-1] * len(neurons)),
         axon_source=read_only([axon.source for axon in axons]),
         axon_format=read_only([exponents.index(axon.exponent) for axon in axons]),

@@ -157,7 +157,7 @@ def test_newer_checkpoint(refusal, tmp_path):
     path = tmp_path / "net.pt"
     with zipfile.ZipFile(path, "w") as made:
         made.writestr("manifest.json", json.dumps({"format": "spikeloom-checkpoint", "version": 2}))
-    assert refusal("inspect", path) == f"{path}: has format version 2, this program reads 1; update spikeloom"
+    assert refusal("inspect", path) == f"{path}: has format version 3, this program reads 2; update spikeloom"
 
 
 def test_checkpoint_zip_bomb(refusal, tmp_path):
@@ -594,7 +594,7 @@ def test_flipped_bits_of_a_netlist(refusal, tmp_path, place):
     [
         (
             lambda manifest, _: manifest.update(version=2),
-            "has format version 2, this program reads 1; compile it again or update spikeloom",
+            "has format version 3, this program reads 2; compile it again or update spikeloom",
         ),
         (lambda manifest, _: manifest.update(format="x"), "is not a netlist; write one with spikeloom compile"),
         (
@@ -605,7 +605,7 @@ def test_flipped_bits_of_a_netlist(refusal, tmp_path, place):
         (lambda manifest, _: manifest.update(taxels="6"), "the manifest has no usable taxels; compile it again"),
         (lambda manifest, _: manifest.update(layers=[]), "the manifest has no usable layers; compile it again"),
         (
-            lambda manifest, _: manifest["layers"][0].update(scale=0),
+            lambda manifest, _: manifest["layers"][0].update(neurons=-1),
             "the manifest has no usable layers; compile it again",
         ),
         (

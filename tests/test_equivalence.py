@@ -15,6 +15,7 @@ from compiler.interpret import channels_last, run_float
 from compiler.lift import lift
 from compiler.netlist import read_only
 from compiler.passes.expand import expand
+from compiler.passes.quantize import Recipe
 from compiler.pipeline import compile_checkpoint
 from models.reference import float_membranes, float_spikes
 from runtime import cli, engine, equivalence, spec
@@ -31,7 +32,7 @@ FILES = tuple("abcdef")
 def small(tmp_path_factory):
     """A checkpoint, its propagation matrix and a coarse netlist that often strays from it."""
     checkpoint, adjacency = small_checkpoint(tmp_path_factory.mktemp("small"))
-    netlist = compile_checkpoint(checkpoint, adjacency, weight_bits=4).netlist
+    netlist = compile_checkpoint(checkpoint, adjacency, recipes=(Recipe(bits=4),)).netlist
     return checkpoint, adjacency, netlist
 
 
@@ -108,7 +109,7 @@ def test_the_first_divergence_is_the_first(small, verdict):
 @pytest.mark.parametrize("seed", range(6))
 def test_the_first_divergence_of_other_networks(tmp_path, seed):
     checkpoint, adjacency = small_checkpoint(tmp_path, last=weights(seed))
-    netlist = compile_checkpoint(checkpoint, adjacency, weight_bits=6).netlist
+    netlist = compile_checkpoint(checkpoint, adjacency, recipes=(Recipe(bits=6),)).netlist
     recordings = events(seed, samples=3)
     found = verify(netlist, checkpoint, adjacency, recordings, LABELS[:3], FILES[:3], spec_samples=1).first_divergence
     reference = list(float_spikes(checkpoint, adjacency, recordings).values())

@@ -10,6 +10,7 @@ from compiler.ir import IntegerNetwork, Network, fan_in
 from compiler.lift import lift
 from compiler.netlist import Netlist, one_step_bounds
 from compiler.passes.bounds import prove_ranges
+from compiler.passes.quantize import Recipe
 from compiler.pipeline import STAGES, compile_checkpoint
 from compiler.serialize import netlist_bytes, read_netlist, write_netlist
 from compiler.text import text
@@ -53,7 +54,7 @@ def test_two_compiles_give_the_same_bytes(bits, calibrated):
     def compiled():
         events = grasps() if calibrated else None
         return compile_checkpoint(
-            random_checkpoint(), ring(5), weight_bits=bits, training_events=events, provenance={"seed": 1}
+            random_checkpoint(), ring(5), recipes=(Recipe(bits=bits),), training_events=events, provenance={"seed": 1}
         )
 
     one, two = compiled(), compiled()

@@ -8,12 +8,14 @@ from random_networks import BITS, LOIHI, chain, dense_weights, float_networks, r
 
 from compiler.errors import DataError, ModelError, OptionError
 from compiler.fixedpoint import ONE_STEP_SUM_MAX, weight_step
+from compiler.forms import Form, decay_registers, round_population
+from compiler.forms import one_sided_sums as proven_sums
 from compiler.interpret import run_float, run_integer
 from compiler.ir import INPUT
 from compiler.passes import quantize as quantize_module
 from compiler.passes.bounds import prove_ranges
 from compiler.passes.calibrate import calibrate, evenly_spaced
-from compiler.passes.quantize import decay_registers, quantize
+from compiler.passes.quantize import Recipe, quantize
 from compiler.text import text
 from compiler.verify import verify
 
@@ -56,7 +58,7 @@ def test_the_realised_beta_is_819_4096ths():
 def test_every_network_is_rounded_to_registers(network, bits, calibrated, data):
     events = data.draw(recordings_for(network.input.size))
     calibration = calibrate(network, events) if calibrated else None
-    integer, choices = quantize(network, LOIHI, bits=bits, calibration=calibration)
+    integer, choices = quantize(network, LOIHI, recipes=(Recipe(bits=bits),), calibration=calibration)
     verify(integer)
     assert [choice.layer for choice in choices] == [population.name for population in network.populations]
     for post, (population, model, choice) in enumerate(
@@ -65,7 +67,7 @@ def test_every_network_is_rounded_to_registers(network, bits, calibrated, data):
         # The threshold carries no rounding.
         assert len(set(population.threshold.tolist())) == 1
         assert population.realised_theta[0] == pytest.approx(model.theta, rel=1e-15)
-        assert population.scale == choice.scale
+        assert set(population.scale.tolist()) == {choice.scale}
         # A bias is off by half a unit of its register at most.
         error = population.bias / (64 * population.scale) - model.bias
         assert np.all(np.abs(error) <= 0.5 * 2.0**population.bias_exponent / (64 * population.scale) * (1 + 1e-9))
@@ -83,7 +85,7 @@ def test_every_network_is_rounded_to_registers(network, bits, calibrated, data):
         assert np.array_equal(original.weight.indices, projection.weight.indices)
         assert np.array_equal(original.weight.indptr, projection.weight.indptr)
         # Each weight is the nearest of its grid, or the end of the range.
-        scale = integer.populations[projection.post].scale / 2.0**projection.exponent
+        scale = integer.populations[projection.post].scale[0] / 2.0**projection.exponent
         wanted = np.clip(original.weight.data * scale, -(256 - step), 256 - step)
         assert np.all(np.abs(projection.weight.data - wanted) <= step / 2 * (1 + 1e-9))
 
@@ -94,7 +96,10 @@ def test_a_network_and_its_negation_have_opposite_weights(network, bits):
     mirrored = dataclasses.replace(
         network, projections=tuple(dataclasses.replace(p, weight=-p.weight) for p in network.projections)
     )
-    left, right = quantize(network, LOIHI, bits=bits)[0], quantize(mirrored, LOIHI, bits=bits)[0]
+    left, right = (
+        quantize(network, LOIHI, recipes=(Recipe(bits=bits),))[0],
+        quantize(mirrored, LOIHI, recipes=(Recipe(bits=bits),))[0],
+    )
     for p, q in zip(left.projections, right.projections, strict=True):
         assert np.array_equal(p.weight.data, -q.weight.data)
 
@@ -103,7 +108,7 @@ def test_a_network_and_its_negation_have_opposite_weights(network, bits):
 @given(st.data())
 def test_no_input_brings_more_than_the_stated_worst_case(data):
     network = data.draw(float_networks())
-    integer, choices = quantize(network, LOIHI, bits=data.draw(st.sampled_from(BITS)))
+    integer, choices = quantize(network, LOIHI, recipes=(Recipe(bits=data.draw(st.sampled_from(BITS))),))
     proofs = prove_ranges(integer)
     for post, (proof, choice) in enumerate(zip(proofs, choices, strict=True)):
         weights = np.concatenate(list(dense_weights(integer, post).values()), axis=1)
@@ -122,14 +127,10 @@ def test_a_large_layer_gives_up_scale_for_the_proof():
     assert choice.headroom >= 0
     assert int(integer.projections[0].effective().sum()) <= ONE_STEP_SUM_MAX
     # One unit of threshold more would not fit.
-    finer = quantize_module._round_layer(
-        chain(np.full((1, 2000), 0.5)).populations[0],
-        chain(np.full((1, 2000), 0.5)).projections,
-        (integer.populations[0].threshold[0] + 1) / 0.5 / 2.0**choice.exponent,
-        choice.exponent,
-        8,
-    )
-    assert quantize_module._proven_sum(finer) > ONE_STEP_SUM_MAX
+    network = chain(np.full((1, 2000), 0.5))
+    form = Form(bits=8, exponents=(choice.exponent,), threshold=integer.populations[0].threshold + 1)
+    _, finer = round_population(network.populations[0], network.projections, form)
+    assert proven_sums(finer, 1)[0] > ONE_STEP_SUM_MAX
 
 
 def test_a_small_layer_uses_the_full_range():
@@ -143,13 +144,13 @@ def test_a_small_layer_uses_the_full_range():
 def test_an_outlier_is_clipped_if_that_saves_spikes():
     network = noisy_layer(outlier=20.0)
     calibration = calibrate(network, recordings(network, 1))
-    _, (plain,) = quantize(network, LOIHI, bits=4)
-    chosen, (choice,) = quantize(network, LOIHI, bits=4, calibration=calibration)
+    _, (plain,) = quantize(network, LOIHI, recipes=(Recipe(bits=4),))
+    chosen, (choice,) = quantize(network, LOIHI, recipes=(Recipe(bits=4),), calibration=calibration)
     assert plain.clipped == 0
     assert choice.clipped == 1
     assert choice.scale > plain.scale
     assert chosen.projections[0].weight.toarray()[0, 0] == 224
-    unclipped = run_integer(quantize(network, LOIHI, bits=4)[0], calibration.events).spikes[0]
+    unclipped = run_integer(quantize(network, LOIHI, recipes=(Recipe(bits=4),))[0], calibration.events).spikes[0]
     clipped = run_integer(chosen, calibration.events).spikes[0]
     assert np.count_nonzero(clipped != calibration.spikes[0]) < np.count_nonzero(unclipped != calibration.spikes[0])
 
@@ -157,7 +158,7 @@ def test_an_outlier_is_clipped_if_that_saves_spikes():
 @pytest.mark.parametrize("bits", BITS)
 @pytest.mark.parametrize("theta", [0.5, 49.0])
 def test_a_layer_of_zeros_is_silent(bits, theta):
-    integer, (choice,) = quantize(chain(np.zeros((2, 3)), theta=theta), LOIHI, bits=bits)
+    integer, (choice,) = quantize(chain(np.zeros((2, 3)), theta=theta), LOIHI, recipes=(Recipe(bits=bits),))
     assert not integer.projections[0].weight.data.any()
     assert choice.headroom == 1
     assert integer.populations[0].threshold.tolist() in [[127, 127], [128, 128]]
@@ -174,7 +175,7 @@ def test_a_layer_of_zeros_with_biases_spikes_by_them():
 @pytest.mark.parametrize("weight", [100.0, 300.0, 4000.0])
 @pytest.mark.parametrize("bits", [2, 8])
 def test_weights_far_above_the_threshold_take_a_larger_exponent(weight, bits):
-    integer, (choice,) = quantize(chain([[weight, -weight / 2]]), LOIHI, bits=bits)
+    integer, (choice,) = quantize(chain([[weight, -weight / 2]]), LOIHI, recipes=(Recipe(bits=bits),))
     assert choice.exponent > 0
     assert integer.populations[0].threshold[0] >= 1
     largest = integer.projections[0].weight.data[0] * 2**choice.exponent / choice.scale
@@ -184,7 +185,7 @@ def test_weights_far_above_the_threshold_take_a_larger_exponent(weight, bits):
 
 def test_weights_too_large_for_any_scale():
     with pytest.raises(ModelError) as caught:
-        quantize(chain([[1e6, 1.0]]), LOIHI, bits=6)
+        quantize(chain([[1e6, 1.0]]), LOIHI, recipes=(Recipe(bits=6),))
     assert str(caught.value) == (
         "fc1: no scale at 6 bits keeps its threshold of at least one unit within the accumulator (32767 units a step); "
         "use more bits or smaller weights"
@@ -223,7 +224,7 @@ def candidates(network, calibration, monkeypatch, **options):
 def test_calibration_prefers_scales_that_keep_spikes_then_those_that_keep_class_counts(bits, seed, monkeypatch):
     network = noisy_layer(seed, outlier=1.0)
     calibration = calibrate(network, recordings(network, seed))
-    found = candidates(network, calibration, monkeypatch, bits=bits)
+    found = candidates(network, calibration, monkeypatch, recipes=(Recipe(bits=bits),))
 
     def flips_and_distance(integer):
         spikes = run_integer(integer, calibration.events).spikes[0]
@@ -233,7 +234,7 @@ def test_calibration_prefers_scales_that_keep_spikes_then_those_that_keep_class_
 
     scored = {key: flips_and_distance(integer) for key, integer in found.items()}
     fewest = min(flips for flips, _ in scored.values())
-    _, (choice,) = quantize(network, LOIHI, bits=bits, calibration=calibration)
+    _, (choice,) = quantize(network, LOIHI, recipes=(Recipe(bits=bits),), calibration=calibration)
     assert choice.candidates == len(found) > 8
     assert choice.spikes == np.count_nonzero(calibration.spikes[0])
     flips, distance = scored[choice.scale, choice.exponent]
@@ -246,7 +247,7 @@ def test_two_runs_are_equal():
     network = noisy_layer(outlier=1.0)
     calibration = calibrate(network, recordings(network, 2))
     for options in ({}, {"calibration": calibration}, {"calibration": calibration, "ranges": "observed"}):
-        one, two = (quantize(network, LOIHI, bits=4, **options) for _ in range(2))
+        one, two = (quantize(network, LOIHI, recipes=(Recipe(bits=4),), **options) for _ in range(2))
         assert text(one[0]) == text(two[0])
         assert one[1] == two[1]
 
@@ -306,7 +307,7 @@ def test_at_most_32_recordings_are_used():
 @pytest.mark.parametrize("bits", [-1, 0, 1, 7, 9])
 def test_widths_that_the_chip_does_not_store(bits):
     with pytest.raises(OptionError) as caught:
-        quantize(chain([[1.0]]), LOIHI, bits=bits)
+        quantize(chain([[1.0]]), LOIHI, recipes=(Recipe(bits=bits),))
     assert str(caught.value) == (
         f"--weight-bits {bits}: Intel Loihi 1 does not store that width; allowed: 2, 3, 4, 5, 6, 8"
     )

@@ -148,7 +148,7 @@ def test_numpy_alone_reads_the_file(path, netlist):
         assert archive["threshold"].dtype == np.dtype("<i4")
         manifest = json.loads(str(archive["manifest"]))
     assert manifest["format"] == "spikeloom-netlist"
-    assert manifest["version"] == 1
+    assert manifest["version"] == 2
     assert manifest["layers"][0] == dataclasses.asdict(netlist.layers[0])
     assert manifest["provenance"] == netlist.provenance
 
@@ -293,8 +293,8 @@ def test_an_array_that_announces_more_than_memory_holds(path):
 
 
 def test_a_newer_version(path):
-    rewrite_manifest(path, version=2)
-    assert refused(path) == "has format version 2, this program reads 1; compile it again or update spikeloom"
+    rewrite_manifest(path, version=3)
+    assert refused(path) == "has format version 3, this program reads 2; compile it again or update spikeloom"
 
 
 @pytest.mark.parametrize("text", ["{", "[" * 100_000])

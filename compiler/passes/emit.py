@@ -13,7 +13,7 @@ import numpy as np
 
 from compiler.fixedpoint import IntArray
 from compiler.ir import INPUT, IntegerNetwork, depths, fan_in
-from compiler.netlist import Layer, Netlist, read_only
+from compiler.netlist import Layer, Netlist, read_only, read_only_float
 from compiler.passes.partition import Chunk, Lists, Partition, choose_dense, index_bits, lean_fits, lists_into
 from compiler.targets import Target
 
@@ -47,7 +47,6 @@ def _layers(network: IntegerNetwork) -> tuple[Layer, ...]:
             name=population.name,
             neurons=population.size,
             depth=depth,
-            scale=population.scale,
             beta=population.beta,
             theta=population.theta,
             weight_bits=max(p.bits for p in network.projections if p.post == post),
@@ -138,6 +137,7 @@ def emit(
         threshold=read_only(np.concatenate([p.threshold[n] for p, n in rows])),
         bias_mantissa=read_only(np.concatenate([p.bias_mantissa[n] for p, n in rows])),
         bias_exponent=read_only(np.concatenate([p.bias_exponent[n] for p, n in rows])),
+        scale=read_only_float(np.concatenate([p.scale[n] for p, n in rows])),
         readout_class=read_only(np.concatenate(votes)),
         axon_source=read_only(np.concatenate(parts["source"])),
         axon_format=read_only(np.concatenate(parts["format"])),

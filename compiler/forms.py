@@ -1,0 +1,199 @@
+"""How a population is stored: width and exponents of its weights, threshold of each neuron; and rounding to that.
+
+This is the one place where weights become mantissas, for the compiler and for quantisation-aware training alike.
+
+A scale is never stored beside a threshold: a neuron whose threshold is ``T`` weight units has ``T / theta`` weight
+units to each membrane unit of the float model, so the threshold carries no rounding at all.
+
+*Planes.* A synapse may be stored several times, with different exponents; the chip adds them up. Two planes of eight
+bits are one weight of up to 16 bits. Only a weight that the finest plane cannot hold uses the next one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from compiler.fixedpoint import MEMBRANE_SHIFT, FloatArray, IntArray, encode_bias, round_half_even, weight_step
+from compiler.ir import IntegerPopulation, IntegerProjection, Population, Projection, Sparse
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Form:
+    """How one population is stored.
+
+    Parameters
+    ----------
+    bits : int
+        Storage width of a mantissa.
+    exponents : tuple of int
+        Exponent of each plane, finest first.
+    threshold : (neurons,) int64
+        Threshold mantissas, at least 1.
+    """
+
+    bits: int
+    exponents: tuple[int, ...]
+    threshold: IntArray
+
+
+def decay_registers(beta: float) -> tuple[int, int]:
+    """Registers of a current-less neuron: ``decay_u`` that forgets all, and the ``decay_v`` nearest to `beta`.
+
+    Examples
+    --------
+    >>> decay_registers(0.2)
+    (4095, 3277)
+    """
+    return 4095, min(4095, max(0, round(4096 * (1 - beta))))
+
+
+def plane_distance(bits: int) -> int:
+    """Largest difference of exponents at which two planes leave no gap between their values.
+
+    Examples
+    --------
+    >>> [plane_distance(bits) for bits in (8, 4, 2)]
+    [7, 3, 1]
+    """
+    codes = (256 - weight_step(bits)) // weight_step(bits)
+    return (2 * codes + 1).bit_length() - 1
+
+
+def reach(bits: int, exponents: tuple[int, ...]) -> int:
+    """Largest magnitude that planes hold together, in steps of the finest one.
+
+    Examples
+    --------
+    >>> reach(8, (0,)), reach(8, (-1, 6)), reach(2, (0, 1))
+    (127, 16383, 3)
+    """
+    codes = (256 - weight_step(bits)) // weight_step(bits)
+    return codes * sum(1 << (exponent - exponents[0]) for exponent in exponents)
+
+
+def step_units(bits: int, exponents: tuple[int, ...]) -> float:
+    """Weight units of one step of the finest plane."""
+    return float(weight_step(bits) * 2.0 ** exponents[0])
+
+
+def round_steps(weight: FloatArray, scale: FloatArray | float, bits: int, exponents: tuple[int, ...]) -> IntArray:
+    """Round weights to whole steps of the finest plane and clip them to what the planes hold.
+
+    Parameters
+    ----------
+    weight : (...) float64
+        Real weights.
+    scale : (...) float64
+        Weight units per real unit; broadcasts against `weight`.
+
+    Examples
+    --------
+    >>> round_steps(np.array([1.0, -0.3, 100.0]), 254.0, 8, (0,)).tolist()
+    [127, -38, 127]
+    """
+    limit = reach(bits, exponents)
+    return np.clip(round_half_even(weight * (scale / step_units(bits, exponents))), -limit, limit)
+
+
+def split_planes(steps: IntArray, bits: int, exponents: tuple[int, ...]) -> list[IntArray]:
+    """Mantissas of each plane, finest first, which add up to given steps of the finest one.
+
+    A coarser plane is zero wherever the finer ones hold the value.
+
+    Examples
+    --------
+    >>> [plane.tolist() for plane in split_planes(np.array([5, 127, 128, -300]), 8, (-1, 6))]
+    [[10, 254, 0, -88], [0, 0, 2, -4]]
+    """
+    codes = (256 - weight_step(bits)) // weight_step(bits)
+    rest, mantissas = steps, []
+    for k in range(len(exponents) - 1, 0, -1):
+        ratio = 1 << (exponents[k] - exponents[0])
+        code = np.clip(round_half_even(rest / ratio), -codes, codes)
+        code = np.where(np.abs(rest) <= reach(bits, exponents[:k]), 0, code)
+        rest = rest - code * ratio
+        mantissas.append(code * weight_step(bits))
+    return [rest * weight_step(bits), *reversed(mantissas)]
+
+
+def scales(population: Population, form: Form) -> FloatArray:
+    """Weight units per membrane unit of the float model; shape (neurons,)."""
+    found: FloatArray = form.threshold / population.theta
+    return found
+
+
+def round_projection(projection: Projection, scale: FloatArray, form: Form) -> tuple[IntegerProjection, ...]:
+    """Mantissas of one projection, an integer projection for each plane in use; the finest holds every synapse.
+
+    Parameters
+    ----------
+    scale : (neurons of post,) float64
+        Weight units per unit of the float model.
+    """
+    per_synapse = np.repeat(scale, np.diff(projection.weight.indptr))
+    steps = round_steps(projection.weight.data, per_synapse, form.bits, form.exponents)
+    rounded = []
+    for plane, mantissa in enumerate(split_planes(steps, form.bits, form.exponents)):
+        weight = _with(projection.weight, mantissa)
+        if plane:
+            weight.eliminate_zeros()
+        if not plane or weight.nnz:
+            rounded.append(
+                IntegerProjection(
+                    pre=projection.pre,
+                    post=projection.post,
+                    weight=weight,
+                    exponent=form.exponents[plane],
+                    bits=form.bits,
+                )
+            )
+    return tuple(rounded)
+
+
+def _with(weight: Sparse, data: IntArray) -> Sparse:
+    """A csr_array of the same structure with other numbers."""
+    changed = weight.astype(np.int64)
+    changed.data = data.copy()
+    return changed
+
+
+def round_population(
+    population: Population, projections: tuple[Projection, ...], form: Form
+) -> tuple[IntegerPopulation, tuple[IntegerProjection, ...]]:
+    """Registers of one population and its synapses.
+
+    Raises
+    ------
+    ValueError
+        If a bias has no register value at this scale.
+    """
+    scale = scales(population, form)
+    mantissa, exponent = encode_bias(population.bias * scale * (1 << MEMBRANE_SHIFT))
+    decay_u, decay_v = decay_registers(population.beta)
+    rounded = IntegerPopulation(
+        name=population.name,
+        beta=population.beta,
+        theta=population.theta,
+        scale=scale,
+        decay_u=decay_u,
+        decay_v=decay_v,
+        threshold=form.threshold,
+        bias_mantissa=mantissa,
+        bias_exponent=exponent,
+    )
+    return rounded, tuple(plane for p in projections for plane in round_projection(p, scale, form))
+
+
+def one_sided_sums(projections: tuple[IntegerProjection, ...], neurons: int) -> IntArray:
+    """Largest one-sided synaptic sum that any input can bring to each neuron, weight units; shape (neurons,).
+
+    Planes count one by one, which covers every order of their arrival.
+    """
+    up, down = np.zeros(neurons, np.int64), np.zeros(neurons, np.int64)
+    for projection in projections:
+        weight = projection.effective()
+        up += np.asarray(weight.maximum(0).sum(axis=1), np.int64)
+        down -= np.asarray(weight.minimum(0).sum(axis=1), np.int64)
+    return np.maximum(up, down)
