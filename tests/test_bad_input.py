@@ -157,7 +157,7 @@ def test_newer_checkpoint(refusal, tmp_path):
     path = tmp_path / "net.pt"
     with zipfile.ZipFile(path, "w") as made:
         made.writestr("manifest.json", json.dumps({"format": "spikeloom-checkpoint", "version": 2}))
-    assert refusal("inspect", path) == f"{path}: has format version 3, this program reads 2; update spikeloom"
+    assert refusal("inspect", path) == f"{path}: has format version 2, this program reads 1; update spikeloom"
 
 
 def test_checkpoint_zip_bomb(refusal, tmp_path):
@@ -593,7 +593,7 @@ def test_flipped_bits_of_a_netlist(refusal, tmp_path, place):
     ("change", "why"),
     [
         (
-            lambda manifest, _: manifest.update(version=2),
+            lambda manifest, _: manifest.update(version=3),
             "has format version 3, this program reads 2; compile it again or update spikeloom",
         ),
         (lambda manifest, _: manifest.update(format="x"), "is not a netlist; write one with spikeloom compile"),

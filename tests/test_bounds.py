@@ -15,7 +15,7 @@ from random_networks import (
 
 from compiler.interpret import run_integer
 from compiler.passes.bounds import prove_ranges
-from compiler.passes.quantize import quantize
+from compiler.passes.quantize import Recipe, quantize
 
 
 def with_registers(network, **changes):
@@ -99,7 +99,8 @@ def test_bounds_hold_on_random_registers(data):
 @settings(deadline=None, max_examples=50)
 @given(st.data())
 def test_bounds_hold_on_quantised_networks(data):
-    network, _ = quantize(data.draw(float_networks()), LOIHI, bits=data.draw(st.sampled_from([2, 8])))
+    recipe = Recipe(bits=data.draw(st.sampled_from([2, 8])))
+    network, _ = quantize(data.draw(float_networks()), LOIHI, recipes=(recipe,))
     check(network, data.draw(recordings_for(network.input.size, most=30)), prove_ranges(network))
 
 

@@ -12,7 +12,7 @@ from compiler.passes.emit import emit
 from compiler.passes.expand import expand
 from compiler.passes.partition import partition
 from compiler.passes.place import core_traffic, place
-from compiler.passes.quantize import quantize
+from compiler.passes.quantize import Recipe, quantize
 from compiler.targets import EnergyTable, Quantity
 from runtime import cost, engine, render, spec
 
@@ -97,7 +97,7 @@ def check(netlist, recordings):
 def test_against_brute_force_on_many_cores(tmp_path):
     checkpoint, adjacency = small_checkpoint(tmp_path)
     target = small_target(core_compartments=7, mesh_tile_cores=1, mesh_width=8)
-    integer, _ = quantize(expand(checkpoint, adjacency), target, bits=4)
+    integer, _ = quantize(expand(checkpoint, adjacency), target, recipes=(Recipe(bits=4),))
     parts = partition(integer, target)
     netlist = emit(integer, parts, place(core_traffic(integer, parts, None), target).tiles, target, {})
     assert netlist.n_cores >= 8

@@ -15,10 +15,10 @@ from random_networks import (
 )
 
 from compiler.interpret import run_integer
-from compiler.ir import INPUT
+from compiler.ir import INPUT, fan_in
 from compiler.passes.emit import emit
 from compiler.passes.legalize import require_legal
-from compiler.passes.quantize import quantize
+from compiler.passes.quantize import Recipe, quantize
 from runtime import spec
 from runtime.trace import aligned
 
@@ -84,7 +84,7 @@ def test_compartments_hold_the_registers_of_their_neurons(network, target):
     for index, population in enumerate(network.populations):
         ids = netlist.compartments_of(index)
         assert netlist.neuron[ids].tolist() == list(range(population.size))
-        for field in ("threshold", "bias_mantissa", "bias_exponent"):
+        for field in ("threshold", "bias_mantissa", "bias_exponent", "scale"):
             np.testing.assert_array_equal(getattr(netlist, field)[ids], getattr(population, field))
         assert set(netlist.decay_u[ids].tolist()) == {population.decay_u}
         assert set(netlist.decay_v[ids].tolist()) == {population.decay_v}
@@ -93,9 +93,9 @@ def test_compartments_hold_the_registers_of_their_neurons(network, target):
         assert netlist.readout_class[ids].tolist() == expected
         layer = netlist.layers[index]
         into = [p for p in network.projections if p.post == index]
-        assert (layer.name, layer.neurons, layer.scale) == (population.name, population.size, population.scale)
-        assert layer.synapses == sum(p.weight.nnz for p in into)
-        assert layer.max_fan_in == max(sum(np.diff(p.weight.indptr) for p in into))
+        assert (layer.name, layer.neurons) == (population.name, population.size)
+        assert layer.synapses == fan_in(network, index).sum()
+        assert layer.max_fan_in == fan_in(network, index).max()
         assert layer.weight_bits == max(p.bits for p in into)
     assert (netlist.taxels, netlist.polarities) == (network.input.taxels, network.input.polarities)
     assert (netlist.classes, netlist.provenance, netlist.target) == (network.classes, {"seed": 1}, "loihi1")
@@ -106,7 +106,8 @@ def test_compartments_hold_the_registers_of_their_neurons(network, target):
 @given(st.data())
 def test_the_chip_spikes_like_the_network(data):
     """Partition and emission change no spike: the specified chip step against the integer network."""
-    network, _ = quantize(data.draw(float_networks()), LOIHI, bits=data.draw(st.sampled_from([8, 6, 4, 2])))
+    recipe = Recipe(bits=data.draw(st.sampled_from([8, 6, 4, 2])), planes=data.draw(st.integers(1, 2)))
+    network, _ = quantize(data.draw(float_networks()), LOIHI, recipes=(recipe,))
     target = data.draw(tight_targets())
     parts = legal_partition(network, target)
     netlist = emit(network, parts, tuple(range(len(parts.cores))), target, {})

@@ -91,16 +91,13 @@ def test_the_first_divergence_is_the_first(small, verdict):
         if reference[layer][sample, step, neuron] != chip[layer][sample, step, neuron]
     )
     sample, step, layer, neuron = first
-    found, held = verdict.first_divergence, netlist.layers[layer]
+    found, compartment = verdict.first_divergence, netlist.compartments_of(layer)[neuron]
     assert (found.file, found.step, found.layer, found.neuron) == (FILES[sample], step, LAYERS[layer], neuron)
     assert (found.taxel, found.feature) == ((neuron // 5, neuron % 5) if layer == 0 else (None, None))
     assert found.float_membrane == membranes[layer][sample, step, neuron]
     assert found.chip_register == registers[layer][sample, step, neuron]
-    assert found.chip_membrane == found.chip_register / (64 * held.scale)
-    assert (found.theta, found.chip_theta) == (
-        0.5,
-        netlist.threshold[netlist.compartments_of(layer)[neuron]] / held.scale,
-    )
+    assert found.chip_membrane == found.chip_register / (64 * netlist.scale[compartment])
+    assert (found.theta, found.chip_theta) == (0.5, netlist.threshold[compartment] / netlist.scale[compartment])
     # one side fired, the other did not
     assert (found.float_membrane > found.theta) != (found.chip_membrane > found.chip_theta)
     assert not found.ill_posed
@@ -138,20 +135,21 @@ def test_each_rung_adds_one_deviation(small):
     checkpoint, adjacency, netlist = small
     network, integer = expand(checkpoint, adjacency), lift(netlist)
     beta, scaled, full = realised(network, integer)
-    for index, layer in enumerate(netlist.layers):
+    for index in range(len(netlist.layers)):
         ids = netlist.compartments_of(index)
         plain, decayed, weighed, shifted = (n.populations[index] for n in (network, beta, scaled, full))
         assert (plain.beta, decayed.beta, weighed.beta, shifted.beta) == (0.2, 819 / 4096, 819 / 4096, 819 / 4096)
         assert decayed.theta == weighed.theta == plain.theta == 0.5
-        assert shifted.theta == netlist.threshold[ids[0]] / layer.scale
+        assert shifted.theta == 0.5
+        scale = netlist.scale[ids[0]]
         np.testing.assert_array_equal(weighed.bias, plain.bias)
         register = netlist.bias_mantissa[ids] * 2.0 ** netlist.bias_exponent[ids]
-        np.testing.assert_allclose(shifted.bias, register / (64 * layer.scale), rtol=1e-15)
-        np.testing.assert_allclose(shifted.bias, plain.bias, atol=0.51 / (64 * layer.scale) * 2**7)
+        np.testing.assert_allclose(shifted.bias, register / (64 * scale), rtol=1e-15)
+        np.testing.assert_allclose(shifted.bias, plain.bias, atol=0.51 / (64 * scale) * 2**7)
         exact, rounded = (n.projections[index].weight.toarray() for n in (network, scaled))
         np.testing.assert_array_equal(beta.projections[index].weight.toarray(), exact)
         step = 2.0 ** (9 - 4) * 2.0 ** int(netlist.format_exponent.max())
-        assert 0 < np.abs(rounded - exact).max() <= step / layer.scale
+        assert 0 < np.abs(rounded - exact).max() <= step / scale
 
 
 def test_saturation_is_a_rung_of_its_own(tmp_path):
@@ -323,22 +321,19 @@ def test_graph_recordings_and_number_of_samples(small):
         verify(netlist, checkpoint, adjacency, events(2), LABELS, FILES, spec_samples=0)
 
 
-def test_several_thresholds_in_a_layer_have_no_ladder(small):
+def test_the_ladder_carries_thresholds_that_differ(small):
+    """A threshold that is off counts on the rung of thresholds, whatever the other neurons of the layer have."""
     checkpoint, adjacency, netlist = small
     threshold = netlist.threshold.copy()
-    threshold[0] += 1
-    with pytest.raises(ModelError) as failure:
-        verify(
-            dataclasses.replace(netlist, threshold=read_only(threshold)),
-            checkpoint,
-            adjacency,
-            events(2),
-            LABELS,
-            FILES,
-        )
-    assert str(failure.value) == (
-        "the ladder: a layer has several thresholds, one is allowed; compile with one scale per layer"
-    )
+    threshold[netlist.compartments_of(0)[:2]] += 40
+    changed = dataclasses.replace(netlist, threshold=read_only(threshold))
+    network, recordings = expand(checkpoint, adjacency), channels_last(events(2))
+    rungs = [run_float(rung, recordings).spikes[0] for rung in realised(network, lift(changed))]
+    plain = [run_float(rung, recordings).spikes[0] for rung in realised(network, lift(netlist))]
+    np.testing.assert_array_equal(rungs[1], plain[1])
+    moved = (rungs[2] != plain[2]).any(axis=(0, 1))
+    assert moved.any()
+    assert not moved[2:].any()
 
 
 def test_the_expanded_network_is_the_float_model(small):

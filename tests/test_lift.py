@@ -37,9 +37,9 @@ def assert_same_network(found: IntegerNetwork, expected: IntegerNetwork) -> None
     assert found.readout.population == expected.readout.population
     np.testing.assert_array_equal(found.readout.label, expected.readout.label)
     for ours, theirs in zip(found.populations, expected.populations, strict=True):
-        for name in ("name", "beta", "theta", "scale", "decay_u", "decay_v"):
+        for name in ("name", "beta", "theta", "decay_u", "decay_v"):
             assert getattr(ours, name) == getattr(theirs, name), name
-        for name in ("threshold", "bias_mantissa", "bias_exponent"):
+        for name in ("scale", "threshold", "bias_mantissa", "bias_exponent"):
             np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name), err_msg=name)
     for post in range(len(expected.populations)):
         ours, theirs = dense_weights(found, post), dense_weights(expected, post)
