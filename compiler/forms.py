@@ -11,6 +11,7 @@ bits are one weight of up to 16 bits. Only a weight that the finest plane cannot
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -124,23 +125,21 @@ def scales(population: Population, form: Form) -> FloatArray:
     return found
 
 
-def round_projection(projection: Projection, scale: FloatArray, form: Form) -> tuple[IntegerProjection, ...]:
-    """Mantissas of one projection, an integer projection for each plane in use; the finest holds every synapse.
+def store_steps(projection: Projection, steps: IntArray, form: Form) -> tuple[IntegerProjection, ...]:
+    """One integer projection for each plane in use; the finest holds every structural synapse.
 
     Parameters
     ----------
-    scale : (neurons of post,) float64
-        Weight units per unit of the float model.
+    steps : (synapses,) int64
+        Weights in steps of the finest plane, in the order of the projection's synapses.
     """
-    per_synapse = np.repeat(scale, np.diff(projection.weight.indptr))
-    steps = round_steps(projection.weight.data, per_synapse, form.bits, form.exponents)
-    rounded = []
+    stored = []
     for plane, mantissa in enumerate(split_planes(steps, form.bits, form.exponents)):
         weight = _with(projection.weight, mantissa)
         if plane:
             weight.eliminate_zeros()
         if not plane or weight.nnz:
-            rounded.append(
+            stored.append(
                 IntegerProjection(
                     pre=projection.pre,
                     post=projection.post,
@@ -149,7 +148,7 @@ def round_projection(projection: Projection, scale: FloatArray, form: Form) -> t
                     bits=form.bits,
                 )
             )
-    return tuple(rounded)
+    return tuple(stored)
 
 
 def _with(weight: Sparse, data: IntArray) -> Sparse:
@@ -159,10 +158,27 @@ def _with(weight: Sparse, data: IntArray) -> Sparse:
     return changed
 
 
-def round_population(
-    population: Population, projections: tuple[Projection, ...], form: Form
+def nearest_steps(population: Population, projection: Projection, form: Form) -> IntArray:
+    """Weights of a projection in whole steps of the finest plane, each rounded to the nearest; shape (synapses,)."""
+    scale = np.repeat(scales(population, form), np.diff(projection.weight.indptr))
+    return round_steps(projection.weight.data, scale, form.bits, form.exponents)
+
+
+def store(
+    population: Population,
+    projections: tuple[Projection, ...],
+    form: Form,
+    steps: Sequence[IntArray],
+    bias: FloatArray | None = None,
 ) -> tuple[IntegerPopulation, tuple[IntegerProjection, ...]]:
-    """Registers of one population and its synapses.
+    """Registers of one population and its synapses, whose weights are given in steps.
+
+    Parameters
+    ----------
+    steps : sequence of (synapses,) int64
+        One array per projection.
+    bias : (neurons,) float64, optional
+        Instead of the population's, model units.
 
     Raises
     ------
@@ -170,9 +186,10 @@ def round_population(
         If a bias has no register value at this scale.
     """
     scale = scales(population, form)
-    mantissa, exponent = encode_bias(population.bias * scale * (1 << MEMBRANE_SHIFT))
+    wanted = population.bias if bias is None else bias
+    mantissa, exponent = encode_bias(wanted * scale * (1 << MEMBRANE_SHIFT))
     decay_u, decay_v = decay_registers(population.beta)
-    rounded = IntegerPopulation(
+    integer = IntegerPopulation(
         name=population.name,
         beta=population.beta,
         theta=population.theta,
@@ -183,7 +200,15 @@ def round_population(
         bias_mantissa=mantissa,
         bias_exponent=exponent,
     )
-    return rounded, tuple(plane for p in projections for plane in round_projection(p, scale, form))
+    pairs = zip(projections, steps, strict=True)
+    return integer, tuple(plane for p, data in pairs for plane in store_steps(p, data, form))
+
+
+def round_population(
+    population: Population, projections: tuple[Projection, ...], form: Form
+) -> tuple[IntegerPopulation, tuple[IntegerProjection, ...]]:
+    """Registers of one population and its synapses, everything rounded to the nearest; raises as :func:`store`."""
+    return store(population, projections, form, [nearest_steps(population, p, form) for p in projections])
 
 
 def one_sided_sums(projections: tuple[IntegerProjection, ...], neurons: int) -> IntArray:

@@ -18,12 +18,13 @@ from compiler.netlist import Netlist
 from compiler.passes.bounds import RangeProof, prove_ranges
 from compiler.passes.calibrate import Calibration, calibrate, evenly_spaced
 from compiler.passes.emit import emit
+from compiler.passes.exact import Exactness, make_exact
 from compiler.passes.expand import expand
 from compiler.passes.legalize import LimitUse, require_legal
 from compiler.passes.partition import partition
 from compiler.passes.place import Placement, core_traffic, place
-from compiler.passes.quantize import Choice, Recipe, quantize
-from compiler.targets import load_target
+from compiler.passes.quantize import Choice, Recipe, check_recipes, quantize
+from compiler.targets import Target, load_target
 from compiler.verify import verify
 
 STAGES = ("expand", "quantize", "place")
@@ -44,6 +45,8 @@ class Compilation:
         The result.
     choices : tuple of Choice
         Scale of each layer and why.
+    exactness : tuple of Exactness
+        What is in the way of equal spikes, where these were asked for; else empty.
     proofs : tuple of RangeProof
         Worst-case register values of each layer.
     uses : tuple of LimitUse
@@ -58,6 +61,7 @@ class Compilation:
     integer: IntegerNetwork
     netlist: Netlist
     choices: tuple[Choice, ...]
+    exactness: tuple[Exactness, ...]
     proofs: tuple[RangeProof, ...]
     uses: tuple[LimitUse, ...]
     placement: Placement
@@ -70,6 +74,7 @@ def compile_checkpoint(
     *,
     target: str = "loihi1",
     recipes: Sequence[Recipe] = (Recipe(),),
+    spike_exact: bool = False,
     training_events: npt.NDArray[Any] | None = None,
     ranges: str = "proven",
     margin: float = 0.1,
@@ -88,6 +93,9 @@ def compile_checkpoint(
         Chip.
     recipes : sequence of Recipe
         Storage of each layer, or one for all; a fine-tuned checkpoint brings its own.
+    spike_exact : bool
+        Add planes and scales until every spike on the training recordings, all of them, is the float64 model's, see
+        :mod:`compiler.passes.exact`; takes the width from `recipes` and nothing else.
     training_events : (samples, taxels, polarities, steps), optional
         Training recordings for calibration; at most 32, evenly spaced, are used.
     ranges : {"proven", "observed"}
@@ -116,10 +124,17 @@ def compile_checkpoint(
     calibration: Calibration | None = None
     rates: tuple[FloatArray, ...] | None = None
     if training_events is not None:
-        calibration = calibrate(network, evenly_spaced(channels_last(training_events)))
+        events = channels_last(training_events)
+        calibration = calibrate(network, events if spike_exact else evenly_spaced(events))
         rates = tuple(spikes.mean(axis=(0, 1)) for spikes in calibration.spikes)
 
-    integer, choices = quantize(network, chip, recipes=recipes, calibration=calibration, ranges=ranges, margin=margin)
+    exactness: tuple[Exactness, ...] = ()
+    if spike_exact:
+        integer, choices, exactness = _exact(network, chip, recipes, calibration, ranges)
+    else:
+        integer, choices = quantize(
+            network, chip, recipes=recipes, calibration=calibration, ranges=ranges, margin=margin
+        )
     verify(integer)
     publish("quantize", integer)
 
@@ -133,8 +148,24 @@ def compile_checkpoint(
         integer=integer,
         netlist=netlist,
         choices=choices,
+        exactness=exactness,
         proofs=prove_ranges(integer),
         uses=uses,
         placement=placement,
         core_bound=parts.bound,
     )
+
+
+def _exact(
+    network: Network, chip: Target, recipes: Sequence[Recipe], calibration: Calibration | None, ranges: str
+) -> tuple[IntegerNetwork, tuple[Choice, ...], tuple[Exactness, ...]]:
+    if calibration is None:
+        raise OptionError("--spike-exact: nothing to be exact on; give --calibrate")
+    if ranges != "proven":
+        raise OptionError(f"--spike-exact: needs proven ranges, --ranges says {ranges}; leave --ranges away")
+    if len(recipes) > 1 or recipes[0] != Recipe(bits=recipes[0].bits):
+        raise OptionError(
+            "--spike-exact: finds planes and scales itself; give one width, no --planes or --scale-groups"
+        )
+    check_recipes(recipes, len(network.populations), chip)
+    return make_exact(network, chip, calibration, bits=recipes[0].bits)

@@ -92,9 +92,35 @@ def _recordings(arguments: Arguments, netlist: Netlist, *, labels_for: str | Non
     )
 
 
+def _numbers(text: str, option: str) -> list[int]:
+    try:
+        return [int(part) for part in text.split(",")]
+    except ValueError:
+        raise OptionError(f"{option} {text}: not a number; give one, or one for each layer as in 8,4,4,8") from None
+
+
+def _recipes(arguments: Arguments) -> tuple[Recipe, ...]:
+    asked = {
+        "--weight-bits": _numbers(arguments.weight_bits, "--weight-bits"),
+        "--planes": _numbers(arguments.planes, "--planes"),
+        "--scale-groups": _numbers(arguments.scale_groups, "--scale-groups"),
+    }
+    layers = max(len(values) for values in asked.values())
+    for option, values in asked.items():
+        if len(values) not in (1, layers):
+            raise OptionError(f"{option}: {len(values)} numbers, another option gives {layers}; give as many, or one")
+    columns = [values if len(values) == layers else values * layers for values in asked.values()]
+    return tuple(Recipe(bits=b, planes=p, groups=g) for b, p, g in zip(*columns, strict=True))
+
+
+def _one_or_list(values: list[int]) -> int | list[int]:
+    return values[0] if len(set(values)) == 1 else values
+
+
 def _compile(arguments: Arguments) -> Outcome:
     require_place(arguments.output, "-o")
     load_target(arguments.target)
+    recipes = _recipes(arguments)
     checkpoint = _checkpoint(arguments.checkpoint, arguments)
     name, adjacency = propagation(checkpoint, asked_graph(arguments), arguments.checkpoint)
     training = None
@@ -117,7 +143,8 @@ def _compile(arguments: Arguments) -> Outcome:
         checkpoint,
         adjacency,
         target=arguments.target,
-        recipes=(Recipe(bits=arguments.weight_bits),),
+        recipes=recipes,
+        spike_exact=arguments.spike_exact,
         training_events=training,
         ranges=arguments.ranges,
         margin=arguments.margin,
@@ -127,7 +154,10 @@ def _compile(arguments: Arguments) -> Outcome:
             "run": arguments.run,
             "weights": checkpoint.weights,
             "graph": name,
-            "weight_bits": arguments.weight_bits,
+            "weight_bits": _one_or_list([recipe.bits for recipe in recipes]),
+            "planes": _one_or_list([recipe.planes for recipe in recipes]),
+            "scale_groups": _one_or_list([recipe.groups for recipe in recipes]),
+            "spike_exact": arguments.spike_exact,
             "ranges": arguments.ranges,
             "margin": arguments.margin,
             "calibrated": training is not None,
@@ -309,7 +339,17 @@ def build_parser() -> argparse.ArgumentParser:
     add_model(sub)
     sub.add_argument("--target", default="loihi1", help="chip (default: loihi1)")
     sub.add_argument(
-        "--weight-bits", type=int, default=8, help="storage width of the weights: 2 to 6 or 8 (default: 8)"
+        "--weight-bits",
+        default="8",
+        metavar="N[,N]",
+        help="storage width, one or one a layer: 2 to 6 or 8 (default: 8)",
+    )
+    sub.add_argument("--planes", default="1", metavar="N[,N]", help="times a synapse is stored, 1 to 3 (default: 1)")
+    sub.add_argument("--scale-groups", default="1", metavar="N[,N]", help="scales in a layer, 1 to 8 (default: 1)")
+    sub.add_argument(
+        "--spike-exact",
+        action="store_true",
+        help="add planes and scales until the training spikes are the float model's",
     )
     sub.add_argument("--calibrate", metavar="PATH", help="recordings whose train split chooses the scales")
     add_bin_option(sub)

@@ -2,7 +2,8 @@
 
 Spikes change. Which scale is best is decided on the calibration recordings: first by the spikes of a layer that differ
 from the float64 model's when it gets the float model's own input; among the few best by how far the class counts of
-the whole integer network move. Without calibration the weights alone decide.
+the whole integer network move. Weights are then rounded so that their errors cancel, where that keeps more spikes.
+Without calibration the weights alone decide.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from compiler.forms import Form, reach, step_units
 from compiler.interpret import run_integer
 from compiler.ir import IntegerNetwork, Network, Projection
 from compiler.passes.calibrate import Calibration
+from compiler.passes.compensate import compensated
 from compiler.passes.scales import Rounded, candidate, flips, grouped, observed_sums, rounded
 from compiler.targets import Target
 
@@ -69,6 +71,8 @@ class Choice:
         group.
     clipped : int
         Weights that the range cuts off.
+    compensated : bool
+        Whether weights were rounded so that their errors cancel, rather than each to the nearest.
     candidates : int
         Scales that were compared.
     flips, spikes : int or None
@@ -85,6 +89,7 @@ class Choice:
     scale: float
     finest_scale: float
     clipped: int
+    compensated: bool
     candidates: int
     flips: int | None
     spikes: int | None
@@ -93,11 +98,12 @@ class Choice:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Candidate:
-    """A layer at one scale, its calibration flips, and how many scales were compared."""
+    """A layer at one scale, its calibration flips, how many scales were compared, and how it was rounded."""
 
     layer: Rounded
     flips: int | None
     tried: int
+    compensated: bool = False
 
 
 def incoming(network: Network, post: int) -> tuple[Projection, ...]:
@@ -143,7 +149,13 @@ def shortlist(
             moved = None if calibration is None else int(flips(best, post, calibration).sum())
             counted.insert(0, Candidate(layer=best, flips=moved, tried=counted[0].tried))
             counted.sort(key=lambda c: c.flips or 0)
-            return counted[:1]
+            counted = counted[:1]
+    if calibration is not None:
+        form, tried = counted[0].layer.form, counted[0].tried
+        other = compensated(population, projections, form, calibration, observed)
+        moved = None if other is None else int(flips(other, post, calibration).sum())
+        if other is not None and moved is not None and moved < (counted[0].flips or 0):
+            counted.insert(0, Candidate(layer=other, flips=moved, tried=tried, compensated=True))
     worst = SHORTLIST_RATIO * (counted[0].flips or 0)
     return [c for c in counted[:SHORTLIST] if (c.flips or 0) <= worst]
 
@@ -191,6 +203,7 @@ def explain_choice(network: Network, post: int, chosen: Candidate, calibration: 
         scale=float(scale.min()),
         finest_scale=float(scale.max()),
         clipped=clipped,
+        compensated=chosen.compensated,
         candidates=chosen.tried,
         flips=chosen.flips,
         spikes=None if calibration is None else int(np.count_nonzero(calibration.spikes[post])),
@@ -208,7 +221,8 @@ def check_recipes(recipes: Sequence[Recipe], layers: int, target: Target) -> tup
     """
     if len(recipes) not in (1, layers):
         raise OptionError(
-            f"--weight-bits: {len(recipes)} widths, the network has {layers} layers; give one width, or one for each"
+            f"--weight-bits: {len(recipes)} layers are described, the network has {layers}; "
+            "give one number, or one for each layer"
         )
     allowed = target.choices["synapse.weight_bits"]
     for recipe in recipes:

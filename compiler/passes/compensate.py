@@ -1,0 +1,108 @@
+"""Round the weights of a layer so that the errors of its synapses cancel on what the layer usually gets.
+
+Nearest rounding treats synapses one by one. Here they are rounded one after the other, and what one gains or loses is
+made up for by those still to come, as far as their inputs spike together; the bias takes up the mean that is left.
+No register, width or count changes.
+
+References
+----------
+.. [1] B. Hassibi, D. Stork, "Second order derivatives for network pruning: Optimal Brain Surgeon", NIPS 1992.
+.. [2] E. Frantar et al., "GPTQ: Accurate post-training quantization for generative pre-trained transformers", 2022,
+   arXiv:2210.17323: the order-by-order update through a Cholesky factor.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from compiler.fixedpoint import ONE_STEP_SUM_MAX, FloatArray, IntArray
+from compiler.forms import Form, one_sided_sums, reach, scales, step_units, store
+from compiler.ir import Population, Projection
+from compiler.passes.calibrate import Calibration
+from compiler.passes.scales import Rounded
+
+DAMPING = 1e-3
+"""Share of the mean activity that is added to each input's own: inputs that never spiked are rounded to nearest."""
+
+
+def compensated(
+    population: Population,
+    projections: tuple[Projection, ...],
+    form: Form,
+    calibration: Calibration,
+    observed: FloatArray | None = None,
+) -> Rounded | None:
+    """Round one population with compensation; None where a bias has no register value.
+
+    Weights that the range cuts off stay at its end: their errors are not passed on. A neuron whose sums would leave
+    the accumulator is rounded to nearest instead. `observed` as for :func:`compiler.passes.scales.rounded`.
+    """
+    scale, step = scales(population, form), step_units(form.bits, form.exponents)
+    offset, width = 0, sum(p.weight.shape[1] for p in projections)
+    wanted, stored = np.zeros((2, population.size, width))
+    places, sources = [], []
+    limit = reach(form.bits, form.exponents)
+    for p in projections:
+        row = np.repeat(np.arange(population.size), np.diff(p.weight.indptr))
+        place = row, offset + p.weight.indices
+        wanted[place] = p.weight.data * scale[row] / step
+        stored[place] = 1
+        places.append(place)
+        sources.append(calibration.source(p.pre).reshape(-1, p.weight.shape[1]))
+        offset += p.weight.shape[1]
+    held = np.clip(wanted, -limit, limit)
+    active = np.concatenate(sources, axis=1).astype(np.float32)
+    together = (active.T @ active).astype(np.float64) / len(active)
+    rate = active.mean(axis=0, dtype=np.float64)
+    steps = np.zeros(wanted.shape, np.int64)
+    for rows, columns in _alike(stored):
+        part = np.ix_(rows, columns)
+        steps[part] = np.clip(_round_in_turn(held[part], together[np.ix_(columns, columns)]), -limit, limit)
+
+    def stored_as(steps: IntArray) -> Rounded | None:
+        bias = population.bias + (held - steps) @ rate * step / scale
+        try:
+            integer, planes = store(population, projections, form, [steps[place] for place in places], bias)
+        except ValueError:
+            return None
+        sums = one_sided_sums(planes, population.size) if observed is None else observed * scale
+        return Rounded(form=form, population=integer, projections=planes, reached=float(np.max(sums, initial=0)))
+
+    layer = stored_as(steps)
+    if layer is not None and layer.reached > ONE_STEP_SUM_MAX:
+        over = one_sided_sums(layer.projections, population.size) > ONE_STEP_SUM_MAX
+        steps[over] = np.rint(held[over])
+        layer = stored_as(steps)
+    return layer
+
+
+def _alike(stored: FloatArray) -> list[tuple[IntArray, IntArray]]:
+    """Neurons with synapses from the same inputs, and these inputs."""
+    groups: dict[bytes, list[int]] = {}
+    for row in range(len(stored)):
+        groups.setdefault(stored[row].tobytes(), []).append(row)
+    return [(np.array(rows), np.flatnonzero(stored[rows[0]])) for rows in groups.values()]
+
+
+def _round_in_turn(weight: FloatArray, together: FloatArray) -> FloatArray:
+    """Round columns one after the other, the most active first, each error passed on to the columns that follow.
+
+    Parameters
+    ----------
+    weight : (neurons, inputs) float64
+        In steps.
+    together : (inputs, inputs) float64
+        Mean of ``x x^T``.
+    """
+    inputs = weight.shape[1]
+    damped = together + np.eye(inputs) * (DAMPING * np.trace(together) / max(inputs, 1) + 1e-12)
+    order = np.argsort(-np.diag(damped), kind="stable")
+    follow = np.linalg.cholesky(np.linalg.inv(damped[np.ix_(order, order)])).T
+    left = weight[:, order]
+    rounded = np.empty_like(left)
+    for j in range(inputs):
+        rounded[:, j] = np.rint(left[:, j])
+        left[:, j + 1 :] -= np.outer((left[:, j] - rounded[:, j]) / follow[j, j], follow[j, j + 1 :])
+    back = np.empty_like(rounded)
+    back[:, order] = rounded
+    return back
