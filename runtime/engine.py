@@ -145,10 +145,11 @@ def prepare(netlist: Netlist, *, checked: bool = False) -> Engine:
         np.add.at(packed, entry, np.where(weight >= 0, (weight << shift) + 1, 0))
         np.add.at(negative, entry, np.where(weight < 0, (-weight << shift) + 1, 0))
 
-    shared = np.stack([netlist.layer, netlist.decay_u, netlist.decay_v, netlist.threshold])[:, compartment]
+    shared = np.stack([netlist.layer, netlist.decay_u, netlist.decay_v])[:, compartment]
     begins = np.append(True, np.any(np.diff(shared) != 0, axis=0))
-    layer, decay_u, decay_v, threshold = np.ascontiguousarray(shared[:, begins])
-    bias = np.zeros(_padded(len(compartment)), np.int32)
+    layer, decay_u, decay_v = np.ascontiguousarray(shared[:, begins])
+    bias, threshold = np.zeros((2, _padded(len(compartment))), np.int32)
+    threshold[: len(compartment)] = (netlist.threshold << MEMBRANE_SHIFT)[compartment]
     bias[: len(compartment)] = (netlist.bias_mantissa << netlist.bias_exponent)[compartment]
     tables = Tables(
         **geometry,
@@ -159,7 +160,7 @@ def prepare(netlist: Netlist, *, checked: bool = False) -> Engine:
         run_depth=np.array([part.depth for part in netlist.layers])[layer],
         keep_u=(2**DECAY_BITS - 1 - decay_u).astype(np.int32),
         keep_v=(2**DECAY_BITS - decay_v).astype(np.int32),
-        threshold=(threshold << MEMBRANE_SHIFT).astype(np.int32),
+        threshold=threshold,
         bias=bias,
         compartment=compartment,
     )

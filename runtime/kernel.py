@@ -7,7 +7,7 @@ at once.
 *Packing.* A row entry is ``weight << shift | 1`` for a synapse, so that one addition also counts arrivals: the low
 bits of an accumulator say whether any synapse reached the compartment, which the count of neuron updates needs.
 
-*Runs.* The compartments of a layer that follow each other and share decays and threshold are one vector loop.
+*Runs.* The compartments of a layer that follow each other and share decays are one vector loop.
 
 *Decay in 32 bits.* With ``m = 4096 a + b``, ``floor(m f / 4096) = a f + floor(b f / 4096)``; for ``m < 2**23`` and
 ``f <= 4096`` nothing exceeds 2**24.
@@ -56,9 +56,7 @@ class Tables(NamedTuple):
         Layer of a run and its depth.
     keep_u, keep_v : (runs,) int32
         What current and membrane keep in a step, in 1/4096.
-    threshold : (runs,) int32
-        In membrane units.
-    bias : (padded positions,) int32
+    threshold, bias : (padded positions,) int32
         In membrane units.
     compartment : (positions,) int64
         Compartment id of each position.
@@ -255,9 +253,9 @@ def _sweep(
     current: AnyArray,
     membrane: AnyArray,
     bias: AnyArray,
+    threshold: AnyArray,
     keep_u: Any,
     keep_v: Any,
-    threshold: Any,
     flags: AnyArray,
 ) -> tuple[Any, Any]:
     """Let a run integrate; membranes are left before reset. All is int32: wider numbers would halve the speed."""
@@ -277,7 +275,7 @@ def _sweep(
         compared = np.int32(min(max(v, np.int32(-MEMBRANE_MAX)), np.int32(MEMBRANE_MAX)))
         saturations = np.int32(saturations + (np.int32(1) if compared != v else np.int32(0)))
         # compare
-        flags[i] = np.uint8(compared > threshold)
+        flags[i] = np.uint8(compared > threshold[i])
         current[i] = u
         membrane[i] = compared
     return updates, saturations
@@ -295,9 +293,9 @@ def _integrate(tables: Tables, state: State, shift: Any, step: int, length: int)
                 state.current[run],
                 state.membrane[run],
                 tables.bias[run],
+                tables.threshold[run],
                 tables.keep_u[r],
                 tables.keep_v[r],
-                tables.threshold[r],
                 state.flags[run],
             )
             state.updates[tables.run_layer[r]] += updates
