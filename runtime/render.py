@@ -82,6 +82,7 @@ def compilation_json(compilation: Compilation, sha256: str) -> Json:
             {key: value if value != math.inf else None for key, value in asdict(proof).items()} | {"holds": proof.holds}
             for proof in compilation.proofs
         ],
+        "exactness": [asdict(layer) for layer in compilation.exactness],
         "core_bound": compilation.core_bound,
         "placement": asdict(compilation.placement),
     }
@@ -96,8 +97,8 @@ def netlist_text(report: Json) -> str:
             f"{layer['synapses']:,}",
             f"{layer['synapses_stored']:,}",
             str(layer["max_fan_in"]),
-            str(layer["weight_bits"]),
-            f"{layer['scale']:.6g}",
+            _width(layer),
+            _text(layer["scale"]),
             _text(layer["threshold"]),
             _text(layer["theta_realised"]),
             _text(layer["beta_realised"]),
@@ -132,9 +133,16 @@ def netlist_text(report: Json) -> str:
     )
 
 
+def _width(layer: Json) -> str:
+    """Storage width of a synapse: bits, times planes where there are several."""
+    planes = len(layer["exponents"])
+    return f"{planes}×{layer['weight_bits']}" if planes > 1 else str(layer["weight_bits"])
+
+
 def _text(value: Any, *, brief: bool = True) -> str:
     if isinstance(value, list):
-        return f"{min(value):.6g}…{max(value):.6g}" if brief and value else " ".join(map(str, value))
+        ends = f"{min(value):.6g}", f"{max(value):.6g}"
+        return ("…".join(ends) if ends[0] != ends[1] else ends[0]) if brief and value else " ".join(map(str, value))
     return f"{value:.6g}"
 
 
@@ -148,13 +156,15 @@ def compilation_text(report: Json) -> str:
                 choice["layer"],
                 str(choice["candidates"]),
                 f"{choice['clipped']:,}",
+                "cancel" if choice["compensated"] else "nearest",
                 f"{choice['flips']:,}",
                 f"{choice['spikes']:,}",
             ]
             for choice in report["calibration"]
         ]
-        lines.append("scales chosen on training recordings (each layer on the float model's own input):")
-        lines.append(table(["layer", "tried", "weights clipped", "spikes moved", "of"], rows))
+        lines.append("storage chosen on training recordings (each layer on the float model's own input):")
+        lines.append(table(["layer", "tried", "weights clipped", "errors", "spikes moved", "of"], rows))
+        lines += _exactness_lines(report["exactness"])
     else:
         lines.append("scales taken from the weights and the proven bounds; --calibrate chooses them on training data")
     worst = max(report["proofs"], key=lambda proof: proof["accumulator"])
@@ -173,6 +183,26 @@ def compilation_text(report: Json) -> str:
         f"spike-hops a step{'' if calibrated else ' if every neuron spiked'}: {placement['spike_hops']:.1f} ({optimal})"
     )
     return "\n".join(lines)
+
+
+def _exactness_lines(layers: list[Json]) -> list[str]:
+    """What was tried for equal spikes, and what is in the way."""
+    if not layers:
+        return []
+    if not any(layer["flips"] for layer in layers):
+        return ["spike-exact: every spike of every layer on all training recordings is the float64 model's"]
+    rows = [
+        [
+            layer["layer"],
+            "  ".join(f"{planes}×{groups}: {moved:,}" for planes, groups, moved in layer["tried"]),
+            f"{layer['flips']:,} of {layer['spikes']:,}",
+            ", ".join(f"{name} {count:,}" for name, count in layer["limits"]),
+            f"{layer['decay']:,}",
+        ]
+        for layer in layers
+    ]
+    head = ["layer", "planes×groups: moved on 32", "moved on all", "limited by", "12-bit decay alone"]
+    return ["spike-exact: not reached; spikes that still move on the training recordings", table(head, rows)]
 
 
 def checkpoint_json(checkpoint: Checkpoint, given: tuple[str, ...]) -> Json:

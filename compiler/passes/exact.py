@@ -102,7 +102,7 @@ def make_exact(
         for recipe in ladder:
             if recipe.planes > 2 and best is not None and not len(_full_range(network, post, best)):
                 break  # the planes hold every weight already
-            candidate = shortlist(network, post, recipe, exponents, few, None)[0]
+            candidate = shortlist(network, post, recipe, exponents, few, None, clip=False)[0]
             if recipe == ladder[-2] or recipe == ladder[-1]:
                 candidate = _compensate_with_more(network, post, candidate, many, few)
             moved = candidate.flips or 0

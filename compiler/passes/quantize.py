@@ -118,8 +118,12 @@ def shortlist(
     exponents: tuple[int, ...],
     calibration: Calibration | None,
     observed: FloatArray | None,
+    *,
+    clip: bool = True,
 ) -> list[Candidate]:
     """Scales of one population worth a closer look, best first; a single one without calibration.
+
+    Without `clip` every weight must fit its planes.
 
     Raises
     ------
@@ -127,7 +131,7 @@ def shortlist(
         If there is none.
     """
     population, projections = network.populations[post], incoming(network, post)
-    factors = CLIPPING if calibration is not None and recipe.planes == 1 else (1.0,)
+    factors = CLIPPING if clip and calibration is not None and recipe.planes == 1 else (1.0,)
     fitted = [candidate(population, projections, recipe.bits, recipe.planes, f, exponents, observed) for f in factors]
     # one scale at two exponents is two candidates: mantissas and clipping differ
     found = list({(c.form.exponents, int(c.form.threshold[0])): c for c in fitted if c is not None}.values())
