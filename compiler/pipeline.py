@@ -23,7 +23,7 @@ from compiler.passes.expand import expand
 from compiler.passes.legalize import LimitUse, require_legal
 from compiler.passes.partition import partition
 from compiler.passes.place import Placement, core_traffic, place
-from compiler.passes.quantize import Choice, Recipe, check_recipes, quantize
+from compiler.passes.quantize import Choice, Recipe, check_recipes, quantize, round_to_forms
 from compiler.targets import Target, load_target
 from compiler.verify import verify
 
@@ -73,7 +73,7 @@ def compile_checkpoint(
     adjacency: FloatArray,
     *,
     target: str = "loihi1",
-    recipes: Sequence[Recipe] = (Recipe(),),
+    recipes: Sequence[Recipe] | None = None,
     spike_exact: bool = False,
     training_events: npt.NDArray[Any] | None = None,
     ranges: str = "proven",
@@ -92,7 +92,7 @@ def compile_checkpoint(
     target : str
         Chip.
     recipes : sequence of Recipe
-        Storage of each layer, or one for all; a fine-tuned checkpoint brings its own.
+        Storage of each layer, or one for all; 8 bits by default. A fine-tuned checkpoint brings its own and takes none.
     spike_exact : bool
         Add planes and scales until every spike on the training recordings, all of them, is the float64 model's, see
         :mod:`compiler.passes.exact`; takes the width from `recipes` and nothing else.
@@ -129,11 +129,18 @@ def compile_checkpoint(
         rates = tuple(spikes.mean(axis=(0, 1)) for spikes in calibration.spikes)
 
     exactness: tuple[Exactness, ...] = ()
-    if spike_exact:
-        integer, choices, exactness = _exact(network, chip, recipes, calibration, ranges)
+    if checkpoint.forms is not None:
+        if recipes is not None or spike_exact or ranges != "proven":
+            raise OptionError(
+                "compile: the checkpoint was fine-tuned for its own storage; leave --weight-bits, --planes, "
+                "--scale-groups, --spike-exact and --ranges away"
+            )
+        integer, choices = round_to_forms(network, checkpoint.forms, calibration)
+    elif spike_exact:
+        integer, choices, exactness = _exact(network, chip, recipes or (Recipe(),), calibration, ranges)
     else:
         integer, choices = quantize(
-            network, chip, recipes=recipes, calibration=calibration, ranges=ranges, margin=margin
+            network, chip, recipes=recipes or (Recipe(),), calibration=calibration, ranges=ranges, margin=margin
         )
     verify(integer)
     publish("quantize", integer)

@@ -6,7 +6,7 @@ import io
 import json
 import os
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,8 @@ import numpy.typing as npt
 import torch
 
 from compiler.atomic import write_atomically
-from compiler.frontends.checkpoint import FORMAT, VERSION, arrays_digest, content_digest
+from compiler.forms import Form
+from compiler.frontends.checkpoint import FORMAT, VERSIONS, arrays_digest, content_digest
 from models.evtouch import Recordings
 from models.graphs import Graph
 from models.protocols import Reported
@@ -74,6 +75,7 @@ def checkpoint_bytes(
     beta: float,
     theta: float,
     training: Mapping[str, Any],
+    forms: Sequence[Form] | None = None,
 ) -> bytes:
     """File content of a checkpoint; equal input gives equal bytes.
 
@@ -87,6 +89,8 @@ def checkpoint_bytes(
         Decay and threshold.
     training : mapping
         JSON values: how it was made and what it reached.
+    forms : sequence of Form, optional
+        How the chip stores each layer, conv1 first, where the network was fine-tuned for it.
     """
     tensors_of_one = next(iter(weights.values()))
     stages = sum(name.startswith("fc") and name.endswith(".weight") for name in tensors_of_one)
@@ -97,7 +101,7 @@ def checkpoint_bytes(
     }
     manifest: dict[str, Any] = {
         "format": FORMAT,
-        "version": VERSION,
+        "version": VERSIONS[0] if forms is None else VERSIONS[1],
         "architecture": "tactilesgnet",
         "taxels": graph.n_taxels,
         "classes": len(tensors_of_one[f"fc{stages}.bias"]),
@@ -107,6 +111,17 @@ def checkpoint_bytes(
         "weights": list(weights),
         "training": dict(training),
     }
+    if forms is not None:
+        layers = ["conv1", *(f"fc{stage}" for stage in range(1, stages + 1))]
+        manifest["forms"] = [
+            {
+                "layer": layer,
+                "bits": form.bits,
+                "exponents": list(form.exponents),
+                "threshold": form.threshold.tolist(),
+            }
+            for layer, form in zip(layers, forms, strict=True)
+        ]
     manifest["sha256"] = content_digest(manifest, arrays)
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
@@ -128,6 +143,7 @@ def save_checkpoint(
     beta: float,
     theta: float,
     training: Mapping[str, Any],
+    forms: Sequence[Form] | None = None,
 ) -> None:
     """Write a checkpoint, whole or not at all; parameters as :func:`checkpoint_bytes`.
 
@@ -136,6 +152,6 @@ def save_checkpoint(
     OSError
         If the file cannot be written; an older file is left as it was.
     """
-    content = checkpoint_bytes(weights, graph, beta=beta, theta=theta, training=training)
+    content = checkpoint_bytes(weights, graph, beta=beta, theta=theta, training=training, forms=forms)
     with write_atomically(path) as file:
         file.write(content)

@@ -106,7 +106,7 @@ class _Lif(torch.autograd.Function):
         current = current.contiguous()
         spikes, membrane = torch.empty_like(current), torch.empty_like(current)
         kind = _kind(current)
-        _integrate(_rows(current), kind(beta), kind(theta), _rows(spikes), _rows(membrane))
+        _integrate(rows_of(current), kind(beta), kind(theta), rows_of(spikes), rows_of(membrane))
         ctx.save_for_backward(membrane)
         ctx.mark_non_differentiable(membrane)
         ctx.set_materialize_grads(False)
@@ -119,7 +119,7 @@ class _Lif(torch.autograd.Function):
         out = torch.empty_like(membrane)
         kind = _kind(membrane)
         beta, theta, half_width = kind(ctx.beta), kind(ctx.theta), kind(SURROGATE_HALF_WIDTH)
-        _differentiate(_rows(spikes_gradient), _rows(membrane), beta, theta, half_width, _rows(out))
+        differentiate(rows_of(spikes_gradient), rows_of(membrane), beta, theta, half_width, rows_of(out))
         return out, None, None
 
 
@@ -184,9 +184,9 @@ class _SpikeLinear(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, spikes: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
         rows = spikes.reshape(-1, spikes.shape[-1]).contiguous()
-        source, bounds = _events(rows.numpy())
+        source, bounds = events_of(rows.numpy())
         out = bias.repeat(len(rows), 1)
-        _gather(source, bounds, weight.detach().contiguous().numpy(), out.numpy())
+        gather(source, bounds, weight.detach().contiguous().numpy(), out.numpy())
         ctx.events = source, bounds
         ctx.save_for_backward(weight)
         return out.view(*spikes.shape[:-1], -1)
@@ -198,11 +198,11 @@ class _SpikeLinear(torch.autograd.Function):
         rows = above.view(-1, above.shape[-1])
         out = torch.zeros_like(weight)
         source, bounds = ctx.events
-        _scatter(source, bounds, rows.numpy(), out.numpy())
+        scatter(source, bounds, rows.numpy(), out.numpy())
         return above @ weight.t(), out, rows.sum(0)
 
 
-def _rows(tensor: Tensor) -> np.ndarray[Any, Any]:
+def rows_of(tensor: Tensor) -> np.ndarray[Any, Any]:
     """View as (steps, everything else)."""
     view: np.ndarray[Any, Any] = tensor.detach().view(len(tensor), -1).numpy()
     return view
@@ -247,7 +247,8 @@ def _differentiate_step(
 
 
 @numba.njit(cache=True)
-def _differentiate(spikes_gradient: Any, membrane: Any, beta: Any, theta: Any, half_width: Any, out: Any) -> None:
+def differentiate(spikes_gradient: Any, membrane: Any, beta: Any, theta: Any, half_width: Any, out: Any) -> None:
+    """Gradient of the current from that of the spikes, both (steps, neurons), through decay and reset."""
     steps, size = membrane.shape
     later = np.zeros(size, membrane.dtype)
     for t in range(steps - 1, -1, -1):
@@ -256,7 +257,7 @@ def _differentiate(spikes_gradient: Any, membrane: Any, beta: Any, theta: Any, h
 
 
 @numba.njit(cache=True)
-def _events(spikes: Any) -> Any:
+def events_of(spikes: Any) -> Any:
     """Inputs that spiked, row after row, and where each row's begin: int32 (spikes,), int64 (rows + 1,)."""
     rows, inputs = spikes.shape
     source = np.empty(spikes.size, np.int32)
@@ -277,14 +278,16 @@ def _add(total: Any, term: Any) -> None:
 
 
 @numba.njit(cache=True)
-def _gather(source: Any, bounds: Any, weight: Any, out: Any) -> None:
+def gather(source: Any, bounds: Any, weight: Any, out: Any) -> None:
+    """Add to each row the weights (inputs, outputs) of its inputs that spiked."""
     for row in range(len(out)):
         for event in range(bounds[row], bounds[row + 1]):
             _add(out[row], weight[source[event]])
 
 
 @numba.njit(cache=True)
-def _scatter(source: Any, bounds: Any, rows: Any, out: Any) -> None:
+def scatter(source: Any, bounds: Any, rows: Any, out: Any) -> None:
+    """Add each row to the weights (inputs, outputs) of its inputs that spiked: the gradient of :func:`gather`."""
     for row in range(len(rows)):
         for event in range(bounds[row], bounds[row + 1]):
             _add(out[source[event]], rows[row])

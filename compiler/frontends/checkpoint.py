@@ -1,6 +1,6 @@
 """Read trained TactileSGNet checkpoints: our own files, the released layout and bare state dicts.
 
-Our own format, version 1, is a plain zip (members stored, not compressed) that needs neither pickle nor torch:
+Our own format is a plain zip (members stored, not compressed) that needs neither pickle nor torch:
 
 ``manifest.json``
     ``format`` ("spikeloom-checkpoint"), ``version``, ``architecture`` ("tactilesgnet"), ``taxels``, ``classes``,
@@ -9,6 +9,9 @@ Our own format, version 1, is a plain zip (members stored, not compressed) that 
     kept), ``training`` (how it was made and what it reached) and ``sha256`` over all of these and all arrays.
 ``last/NAME.npy``, ``best/NAME.npy``
     float32: ``conv1.hops`` (K + 1, features, channels), ``conv1.bias``, ``weight`` and ``bias`` of ``fc1``, ``fc2`` …
+
+Version 2 adds ``forms`` to the manifest: how the chip stores each layer that the network was fine-tuned for, an
+object per layer with ``layer``, ``bits``, ``exponents`` and ``threshold`` (one integer a neuron).
 
 Files of ``torch.save`` are read by :mod:`compiler.frontends.released`.
 """
@@ -24,6 +27,7 @@ import re
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -31,12 +35,15 @@ import numpy as np
 import numpy.typing as npt
 
 from compiler.errors import ModelError, OptionError
-from compiler.fixedpoint import IntArray
+from compiler.fixedpoint import THRESHOLD_MANTISSA_MAX, IntArray
+from compiler.forms import Form, plane_distance
 from compiler.frontends.released import DAMAGED, GIVE, NOT_A_CHECKPOINT, read_released
 from compiler.frontends.tensors import Arrays, faults_of, size, taxel_faults, wanted_dense
 
 FORMAT = "spikeloom-checkpoint"
-VERSION = 1
+VERSIONS = (1, 2)
+"""Of a plain file, and of one that holds the forms of a fine-tuning."""
+
 BETA, THETA = 0.2, 0.5
 """Decay and threshold of the released code; files in its layout do not hold them."""
 
@@ -98,6 +105,8 @@ class Checkpoint:
         Trainings that the file holds; this is one of them.
     training : mapping or None
         JSON values: how it was made and what it reached.
+    forms : tuple of Form, or None
+        How the chip stores each layer, where the network was fine-tuned for it.
     sha256 : str
         Of the file.
     """
@@ -114,6 +123,7 @@ class Checkpoint:
     weights: str
     runs: int
     training: Mapping[str, Any] | None
+    forms: tuple[Form, ...] | None
     sha256: str
 
     @property
@@ -184,11 +194,12 @@ def read_checkpoint(
         if weights not in (None, "last"):
             raise ModelError(f"{where}: --weights {weights}: the file holds the last epoch only; leave --weights away")
         graph, edges, chosen, held = None, None, "last", {"beta": BETA, "theta": THETA}
+        forms = None
         assumed = tuple(name for name, value in given.items() if value is None)
     else:
         if run != 0:
             raise ModelError(f"{where}: --run {run}: the file holds only run 0; leave --run away")
-        arrays, chosen, (graph, edges, held, training) = _own_arrays(where, members, weights)
+        arrays, chosen, (graph, edges, held, training), forms = _own_arrays(where, members, weights)
         layout, runs, assumed = "spikeloom", 1, ()
     stages = sorted({key.split(".")[0] for key in arrays if key.startswith("fc")}, key=lambda name: int(name[2:]))
     return Checkpoint(
@@ -207,6 +218,7 @@ def read_checkpoint(
         weights=chosen,
         runs=runs,
         training=training,
+        forms=forms,
         sha256=hashlib.sha256(content).hexdigest(),
     )
 
@@ -269,17 +281,18 @@ def _manifest(where: str, content: bytes) -> dict[str, Any]:
         raise ModelError(f"{where}: {DAMAGED}") from error
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
         raise ModelError(f"{where}: {NOT_A_CHECKPOINT}")
-    if manifest.get("version") != VERSION:
+    if manifest.get("version") not in VERSIONS:
         raise ModelError(
-            f"{where}: has format version {manifest.get('version')!r}, this program reads {VERSION}; update spikeloom"
+            f"{where}: has format version {manifest.get('version')!r}, this program reads up to {VERSIONS[-1]}; "
+            "update spikeloom"
         )
     return manifest
 
 
 def _own_arrays(
     where: str, members: dict[str, bytes], weights: str | None
-) -> tuple[Arrays, str, tuple[str, IntArray, dict[str, float], dict[str, Any]]]:
-    """Arrays of one set, its name, and graph name, edges, neuron constants and training record."""
+) -> tuple[Arrays, str, tuple[str, IntArray, dict[str, float], dict[str, Any]], tuple[Form, ...] | None]:
+    """Arrays of one set, its name, then graph name, edges, neuron constants and training record, and the forms."""
     manifest = _manifest(where, members.pop("manifest.json"))
     try:
         arrays: Arrays = {name.removesuffix(".npy"): _read_npy(content) for name, content in members.items()}
@@ -308,7 +321,37 @@ def _own_arrays(
         faults.append(f"the graph joins taxels outside 0..{taxels - 1}")
     if faults:
         raise ModelError(f"{where}: {'; '.join(faults)}; {_AGAIN}")
-    return chosen, weights, facts
+    return chosen, weights, facts, _forms(where, manifest, chosen, taxels)
+
+
+def _forms(where: str, manifest: dict[str, Any], arrays: Arrays, taxels: int) -> tuple[Form, ...] | None:
+    """Storage of every layer of a fine-tuned network; None for a plain file."""
+    if manifest["version"] == VERSIONS[0]:
+        return None
+    sizes = {"conv1": taxels * len(arrays["conv1.bias"])}
+    stages = sum(key.endswith(".weight") for key in arrays)
+    sizes |= {f"fc{stage}": len(arrays[f"fc{stage}.bias"]) for stage in range(1, stages + 1)}
+    found = []
+    try:
+        for name, size, entry in zip(sizes, sizes.values(), manifest["forms"], strict=True):
+            threshold = np.array(entry["threshold"], np.int64)
+            bits, exponents = int(entry["bits"]), tuple(int(e) for e in entry["exponents"])
+            good = (
+                entry["layer"] == name
+                and threshold.shape == (size,)
+                and bool(np.all((threshold >= 1) & (threshold <= THRESHOLD_MANTISSA_MAX)))
+                and bits in range(2, 9)
+                and bool(exponents)
+                and all(-1 <= e <= 7 for e in exponents)
+                and all(0 < b - a <= plane_distance(bits) for a, b in pairwise(exponents))
+            )
+            if not good:
+                raise ValueError(f"layer {name}")
+            threshold.flags.writeable = False
+            found.append(Form(bits=bits, exponents=exponents, threshold=threshold))
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise ModelError(f"{where}: has unusable forms of a fine-tuning ({error}); {_AGAIN}") from error
+    return tuple(found)
 
 
 def _own_faults(arrays: Arrays, taxels: int, classes: int) -> list[str]:

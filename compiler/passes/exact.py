@@ -24,6 +24,9 @@ from compiler.targets import Target
 FEW, MANY = 32, 128
 """Recordings on which storage is chosen, and on which rounding errors are made to cancel; all of them are the judge."""
 
+SHARED = 0.8
+"""A neuron whose threshold is below this share of its own finest is held back by those it shares the threshold with."""
+
 AT_LIMIT = 0.99
 """A register counts as full from this share on."""
 
@@ -166,7 +169,7 @@ def _limits(
     cause = np.full(population.size, "21-bit accumulator", dtype=object)
     cause[_full_range(network, post, candidate)] = "range of the planes"
     cause[form.threshold >= AT_LIMIT * THRESHOLD_MANTISSA_MAX] = "17-bit threshold"
-    cause[form.threshold < AT_LIMIT * finest] = f"{slots} thresholds a core"
+    cause[form.threshold < SHARED * finest] = f"{slots} thresholds a core"
     counted = {str(name): int(moved[cause == name].sum()) for name in sorted(set(cause))}
     return tuple((name, count) for name, count in sorted(counted.items(), key=lambda pair: -pair[1]) if count)
 

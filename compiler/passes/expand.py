@@ -24,6 +24,23 @@ AFFINE_TOLERANCE = 1e-9
 """Largest deviation from affinity, relative to the stage's largest response, that rounding in float64 explains."""
 
 
+def hop_powers(adjacency: FloatArray, hops: int) -> FloatArray:
+    """Powers 0 … `hops` - 1 of a propagation matrix; shape (hops, taxels, taxels)."""
+    powers = [np.eye(len(adjacency))]
+    for _ in range(1, hops):
+        powers.append(adjacency @ powers[-1])
+    return np.stack(powers)
+
+
+def effective_weight(powers: FloatArray, hops: FloatArray) -> FloatArray:
+    """``W[i, f, j, c] = sum_k powers[k, i, j] * hops[k, f, c]``; shape (taxels, features, taxels, channels)."""
+    _, features, channels = hops.shape
+    weight = np.zeros((powers.shape[1], features, powers.shape[1], channels))
+    for power, hop in zip(powers, hops, strict=True):
+        weight += np.einsum("ij,fc->ifjc", power, hop)
+    return weight
+
+
 def expand_graph_convolution(adjacency: FloatArray, hops: FloatArray) -> Sparse:
     """Effective weights ``W[(i, f), (j, c)] = sum_k (A^k)[i, j] * g[k, f, c]``.
 
@@ -43,12 +60,10 @@ def expand_graph_convolution(adjacency: FloatArray, hops: FloatArray) -> Sparse:
     taxels = len(adjacency)
     n_hops, features, channels = hops.shape
     reach = np.zeros((taxels, taxels), np.bool_)
-    weight = np.zeros((taxels, features, taxels, channels))
-    power, pattern = np.eye(taxels), np.eye(taxels, dtype=np.bool_)
-    for k in range(n_hops):
-        weight += np.einsum("ij,fc->ifjc", power, hops[k])
+    weight = effective_weight(hop_powers(adjacency, n_hops), hops)
+    pattern = np.eye(taxels, dtype=np.bool_)
+    for _ in range(n_hops):
         reach |= pattern
-        power = adjacency @ power
         pattern = (adjacency != 0).astype(np.int64) @ pattern.astype(np.int64) > 0
     structure = np.broadcast_to(reach[:, None, :, None], weight.shape)
     shape = (taxels * features, taxels * channels)

@@ -1,0 +1,154 @@
+"""The ``finetune`` command: train a network on, on the integers of the chip."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from compiler.errors import ModelError, OptionError
+from compiler.frontends.checkpoint import Checkpoint, arrays_digest, read_checkpoint
+from compiler.passes.expand import expand
+from compiler.passes.quantize import round_to_forms
+from compiler.serialize import is_netlist
+from compiler.targets import load_target
+from models.graphs import Graph
+from runtime.data_commands import add_bin_option
+from runtime.inputs import asked_graph, graph_words, propagation, recordings, require_place, shipped
+from runtime.options import DATA_HELP, add_model
+from runtime.tables import percent, table
+
+SUMMARY = "train a network on, on the very integers of the chip, down to ternary weights"
+
+Report = dict[str, Any]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    parser.add_argument("checkpoint")
+    add_model(parser)
+    parser.add_argument("--data", required=True, metavar="PATH", help=DATA_HELP)
+    add_bin_option(parser)
+    parser.add_argument("--target", default="loihi1", help="chip (default: loihi1)")
+    parser.add_argument(
+        "--weight-bits", required=True, metavar="N[,N]", help="storage width, one or one a layer: 2 to 6 or 8"
+    )
+    parser.add_argument("--scale-groups", type=int, default=8, metavar="N", help="scales in a layer (default: 8)")
+    parser.add_argument("--epochs", type=int, default=40, metavar="N", help="default: 40")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of the order of recordings (default: 0)")
+    parser.add_argument("--resume", action="store_true", help="go on with an interrupted one of the same options")
+    parser.add_argument("-o", "--output", required=True, metavar="OUT.pt")
+
+
+def _widths(words: str) -> list[int]:
+    try:
+        return [int(word) for word in words.split(",")]
+    except ValueError:
+        raise OptionError(
+            f"--weight-bits {words}: not a number; give one, or one for each layer as in 8,4,4,8"
+        ) from None
+
+
+def _graph(checkpoint: Checkpoint, asked: Graph | None, name: str) -> Graph:
+    """Graph to store: the one in the checkpoint, or the one that was asked for; `propagation` has compared them."""
+    if checkpoint.edges is None:
+        assert asked is not None, "propagation needs a graph"
+        return asked
+    coordinates = [[float(taxel), 0.0] for taxel in range(checkpoint.taxels)]  # only edges are stored
+    return Graph(name=name, coordinates=coordinates, edges=checkpoint.edges)  # type: ignore[arg-type]
+
+
+def finetune(arguments: argparse.Namespace) -> tuple[Report, Callable[[Report], str], int]:
+    """Fine-tune, write the checkpoint, report."""
+    require_place(arguments.output, "-o")
+    target = load_target(arguments.target)
+    widths = _widths(arguments.weight_bits)
+    path = shipped(arguments.checkpoint)
+    if Path(path).is_file() and is_netlist(path):
+        raise ModelError(f"{path}: is a netlist, its weights are rounded already; give the checkpoint it was made from")
+    checkpoint = read_checkpoint(
+        path, run=arguments.run, weights=arguments.weights, beta=arguments.beta, theta=arguments.theta
+    )
+    if checkpoint.forms is not None:
+        raise ModelError(f"{path}: was fine-tuned already; give the network that it was made from")
+    asked = asked_graph(arguments)
+    name, adjacency = propagation(checkpoint, asked, arguments.checkpoint)
+    training, test = (
+        recordings(
+            arguments.data,
+            split,
+            classes=checkpoint.classes,
+            taxels=checkpoint.taxels,
+            bin_s=arguments.bin,
+            labels_for="fine-tuning",
+        )
+        for split in ("train", "test")
+    )
+    from models.checkpoint import save_checkpoint
+    from models.finetune import finetune as tune
+
+    output = Path(arguments.output)
+    state = output.with_name(f"{output.name}.state")
+    if state.exists() and not arguments.resume:
+        raise OptionError(
+            f"{state}: an interrupted fine-tuning is kept there; go on with --resume, or delete the file to start anew"
+        )
+    if arguments.resume and not state.exists():
+        raise OptionError(f"--resume: {state} does not exist, so nothing was interrupted; leave --resume away")
+    tuned = tune(
+        checkpoint,
+        adjacency,
+        training,
+        test,
+        target,
+        bits=widths,
+        groups=arguments.scale_groups,
+        epochs=arguments.epochs,
+        seed=arguments.seed,
+        state=state,
+        resume=arguments.resume,
+    )
+    words = graph_words(arguments)
+    record = {
+        "command": f"spikeloom finetune {Path(arguments.checkpoint).name} {words + ' ' if words else ''}--data "
+        f"{training.source} --weight-bits {arguments.weight_bits} --scale-groups {arguments.scale_groups} "
+        f"--epochs {arguments.epochs} --seed {arguments.seed}",
+        "fine_tuned_from": checkpoint.sha256,
+        "weight_bits": widths,
+        "seed": arguments.seed,
+        "epochs": arguments.epochs,
+        "data": training.source,
+        "data_sha256": arrays_digest({"train": training.events, "train_labels": training.labels}),
+        "test_samples": len(test),
+        "before": {"correct": tuned.before, "accuracy": tuned.before / len(test)},
+        "last": {"correct": tuned.after, "accuracy": tuned.after / len(test), "chosen_on": "nothing"},
+        "history": [[epoch.loss, epoch.correct] for epoch in tuned.history],
+    }
+    save_checkpoint(
+        output,
+        {"last": tuned.weights},
+        _graph(checkpoint, asked, name),
+        beta=checkpoint.beta,
+        theta=checkpoint.theta,
+        training=record,
+        forms=tuned.forms,
+    )
+    round_to_forms(expand(read_checkpoint(output), adjacency), tuned.forms)  # it compiles, or says why not
+    state.unlink(missing_ok=True)
+    sha256 = hashlib.sha256(output.read_bytes()).hexdigest()
+    return record | {"file": output.name, "sha256": sha256}, finetune_text, 0
+
+
+def finetune_text(report: Report) -> str:
+    """A finished fine-tuning for people."""
+    total = report["test_samples"]
+    first, last = report["history"][0], report["history"][-1]
+    rows = [
+        ["rounded", "", "", percent(report["before"]["correct"], total)],
+        ["epoch 1", f"{first[0]:.5f}", f"{first[1]:,}", ""],
+        [f"epoch {report['epochs']}", f"{last[0]:.5f}", f"{last[1]:,}", percent(report["last"]["correct"], total)],
+    ]
+    head = ["on chip integers", "loss", "training right", "test"]
+    return f"{report['command']}\n{table(head, rows)}\n  written: {report['file']}"
