@@ -155,7 +155,8 @@ def initial_forms(
 def _nearest_steps(weight: NDArray[np.float64], rate: NDArray[np.float64], codes: int) -> NDArray[np.float64]:
     """Step of each neuron at which its rounded weights are nearest, in squares weighted by `rate`; shape (neurons,)."""
     peak = np.maximum(np.abs(weight).max(axis=1), 1e-9)
-    best, chosen = np.full(len(weight), np.inf), peak / codes
+    best = np.full(len(weight), np.inf)
+    chosen: NDArray[np.float64] = peak / codes
     for share in np.geomspace(1, 1 / 30, SHARES):
         step = peak * share / codes
         rounded = np.clip(np.rint(weight / step[:, None]), -codes, codes) * step[:, None]

@@ -112,6 +112,9 @@ class Verdict:
         Differences from the float32 reference with one deviation more on each rung.
     same_checkpoint : bool
         Whether the netlist was compiled from this very checkpoint file and epoch.
+    quantised_different : int or None
+        Spikes of all layers in which a fine-tuned checkpoint's torch model, on chip integers, and the chip differ;
+        None where the checkpoint was not fine-tuned.
     """
 
     files: tuple[str, ...]
@@ -126,6 +129,7 @@ class Verdict:
     first_divergence: Divergence | None
     ladder: tuple[tuple[str, Mapping[str, int]], ...]
     same_checkpoint: bool
+    quantised_different: int | None
 
     @property
     def float_accuracy(self) -> float:
@@ -280,6 +284,7 @@ def verify(
     labels: IntArray,
     files: tuple[str, ...],
     *,
+    original: Checkpoint | None = None,
     spec_samples: int = 3,
     progress: Callable[[str], None] | None = None,
 ) -> Verdict:
@@ -299,6 +304,8 @@ def verify(
         Their classes.
     files : tuple of str
         Their names.
+    original : Checkpoint, optional
+        Float model to compare with; by default the weights of `checkpoint` itself.
     spec_samples : int
         Recordings on which the specification runs beside the engine.
     progress : callable, optional
@@ -314,17 +321,19 @@ def verify(
     if not 1 <= spec_samples:
         raise DataError(f"--spec-samples {spec_samples}: at least 1 recording is needed; give a positive number")
     tell = progress or (lambda _part: None)
+    model = checkpoint if original is None else original
     require_match(netlist, checkpoint)
-    network, integer = expand(checkpoint, adjacency), lift(netlist)
+    require_match(netlist, model)
+    network, integer = expand(model, adjacency), lift(netlist)
     names = [layer.name for layer in netlist.layers]
     flat = events.reshape(len(events), -1, events.shape[3])
     check_channels(netlist, flat.shape[1])
 
     tell("float32 reference")
-    narrow = float_spikes(checkpoint, adjacency, events, dtype="float32")
+    narrow = float_spikes(model, adjacency, events, dtype="float32")
     reference = [narrow[name] for name in names]
     tell("float64 beside it")
-    double = float_spikes(checkpoint, adjacency, events, dtype="float64")
+    double = float_spikes(model, adjacency, events, dtype="float64")
     wide = [double[name] for name in names]
 
     tell("chip")
@@ -332,6 +341,16 @@ def verify(
     trace = engine.simulate(prepared, flat, spikes=True)
     assert trace.spikes is not None, "spikes were asked for"
     chip = [aligned(netlist, trace.spikes, layer) for layer in range(len(names))]
+
+    quantised_different = None
+    if checkpoint.forms is not None:
+        from models.quantised import quantised_spikes
+
+        tell("fine-tuned model")
+        tuned = quantised_spikes(checkpoint, adjacency, events)
+        quantised_different = sum(
+            int(np.count_nonzero(tuned[name] != ours)) for name, ours in zip(names, chip, strict=True)
+        )
 
     tell("specification")
     checked = min(spec_samples, len(flat))
@@ -358,7 +377,7 @@ def verify(
         wide,
         flat,
         files,
-        lambda sample, layer: float_membranes(checkpoint, adjacency, events[sample : sample + 1])[names[layer]][0],
+        lambda sample, layer: float_membranes(model, adjacency, events[sample : sample + 1])[names[layer]][0],
     )
     float_counts = reference[-1].sum(axis=1, dtype=np.int64)
     chip_counts = class_counts(netlist, trace.counts.spikes)
@@ -386,4 +405,5 @@ def verify(
             netlist.provenance.get("checkpoint_sha256") == checkpoint.sha256
             and netlist.provenance.get("weights") == checkpoint.weights
         ),
+        quantised_different=quantised_different,
     )

@@ -62,7 +62,7 @@ def _graph(checkpoint: Checkpoint, asked: Graph | None, name: str) -> Graph:
 
 def finetune(arguments: argparse.Namespace) -> tuple[Report, Callable[[Report], str], int]:
     """Fine-tune, write the checkpoint, report."""
-    require_place(arguments.output, "-o")
+    require_place(arguments.output, "-o", arguments)
     target = load_target(arguments.target)
     widths = _widths(arguments.weight_bits)
     path = shipped(arguments.checkpoint)

@@ -95,7 +95,7 @@ def levels_of(verdict: Verdict) -> tuple[Level, ...]:
             text=f"specification = engine {'in' if verdict.spec_equals_engine else 'NOT in'} every spike, membrane and "
             f"count of {verdict.spec_samples} recordings",
         ),
-        Level(name="E1", share=None, text="not applicable: the checkpoint was not fine-tuned on the chip's integers"),
+        _quantised_level(verdict),
         Level(
             name="E2",
             share=agreement[worst],
@@ -108,6 +108,19 @@ def levels_of(verdict: Verdict) -> tuple[Level, ...]:
             text=f"{equal} of {len(verdict.files)} decisions equal; right on float only {only_float}, on chip only "
             f"{only_chip} (exact McNemar p = {p:.3g}); class votes moved: {moved:,} of {verdict.float_counts.sum():,}",
         ),
+    )
+
+
+def _quantised_level(verdict: Verdict) -> Level:
+    different = verdict.quantised_different
+    if different is None:
+        text = "not applicable: the checkpoint was not fine-tuned on the chip's integers"
+        return Level(name="E1", share=None, text=text)
+    spikes = sum(layer.chip for layer in verdict.spikes.values())
+    return Level(
+        name="E1",
+        share=float(different == 0),
+        text=f"fine-tuned model = chip: {different:,} differing spikes of {spikes:,} on {len(verdict.files)} recordings",
     )
 
 

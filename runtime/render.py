@@ -290,6 +290,7 @@ def verify_json(verdict: Verdict, levels: Sequence[Level], missed: Sequence[str]
         "first_divergence": None if verdict.first_divergence is None else asdict(verdict.first_divergence),
         "ladder": [{"stage": stage, "different": dict(different)} for stage, different in verdict.ladder],
         "same_checkpoint": verdict.same_checkpoint,
+        "quantised_different": verdict.quantised_different,
         "levels": [asdict(level) for level in levels],
         "missed": list(missed),
     }

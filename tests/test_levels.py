@@ -30,6 +30,7 @@ def verdict(**changes):
         "spec_samples": 3,
         "spec_equals_engine": True,
         "decision_agreement": 0.5,
+        "quantised_different": None,
     }
     return SimpleNamespace(**(base | changes))
 
@@ -46,6 +47,14 @@ def test_levels_of_a_verdict():
     broken = levels_of(verdict(spec_equals_engine=False))[0]
     assert broken.share == 0.0
     assert "NOT in every spike" in broken.text
+
+
+@pytest.mark.parametrize(("different", "share"), [(0, 1.0), (3, 0.0)])
+def test_a_fine_tuned_model_is_the_chip_or_is_not(different, share):
+    level = levels_of(verdict(quantised_different=different))[1]
+    assert (level.name, level.share) == ("E1", share)
+    assert level.text == f"fine-tuned model = chip: {different} differing spikes of 50 on 4 recordings"
+    assert bool(unmet((level,), {"E1": 1.0})) == bool(different)
 
 
 def test_silent_layers_agree_and_disjoint_ones_do_not():

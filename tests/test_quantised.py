@@ -1,0 +1,341 @@
+"""The torch model on chip integers, fine-tuning on it, and the checkpoints that come out."""
+
+import json
+import zipfile
+
+import numpy as np
+import pytest
+import torch
+from made_files import ring, small_checkpoint, weights
+
+from compiler.errors import DataError, ModelError, OptionError
+from compiler.fixedpoint import ONE_STEP_SUM_MAX
+from compiler.frontends.checkpoint import content_digest, read_checkpoint
+from compiler.interpret import channels_last, run_integer
+from compiler.lift import lift
+from compiler.passes.calibrate import calibrate
+from compiler.passes.expand import expand
+from compiler.passes.quantize import Recipe, round_to_forms
+from compiler.pipeline import compile_checkpoint
+from compiler.targets import load_target
+from models.checkpoint import save_checkpoint
+from models.evtouch import Recordings, load_recordings
+from models.finetune import finetune, initial_forms
+from models.graphs import build_graph, normalised_adjacency
+from models.quantised import QuantisedNet, quantised_spikes, time_first
+from runtime import engine
+from runtime.cli import main
+from runtime.trace import aligned
+
+LOIHI = load_target("loihi1")
+EXPONENTS = LOIHI.choices["synapse.exponent"]
+
+
+def recordings(checkpoint, seed, *, samples=12, steps=20, split="train"):
+    rng = np.random.default_rng(seed)
+    labels = rng.integers(0, checkpoint.classes, samples)
+    rate = 0.05 + 0.3 * (labels[:, None, None, None] / max(1, checkpoint.classes - 1))
+    events = (rng.random((samples, checkpoint.taxels, 2, steps)) < rate).astype(np.uint8)
+    files = tuple(f"sample_{i}.npy" for i in range(samples))
+    return Recordings(source="made", split=split, events=events, labels=labels, files=files)
+
+
+def tuned_forms(checkpoint, adjacency, events, bits):
+    network = expand(checkpoint, adjacency)
+    layers = len(network.populations)
+    return initial_forms(network, calibrate(network, channels_last(events)), [bits] * layers, 8, EXPONENTS)
+
+
+@pytest.mark.parametrize("bits", [2, 3, 4, 8])
+@pytest.mark.parametrize("seed", range(3))
+def test_the_model_computes_what_the_compiled_network_computes(tmp_path, bits, seed):
+    checkpoint, adjacency = small_checkpoint(tmp_path, last=weights(seed))
+    data = recordings(checkpoint, seed)
+    forms = tuned_forms(checkpoint, adjacency, data.events, bits)
+    model = QuantisedNet(checkpoint, adjacency, forms)
+    integer, _ = round_to_forms(expand(checkpoint, adjacency), forms)
+    found = model.spikes_of(time_first(data.events))
+    expected = run_integer(integer, channels_last(data.events)).spikes
+    for ours, theirs in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(ours.detach().bool().numpy().transpose(1, 0, 2), theirs)
+    assert sum(int(spikes.sum()) for spikes in expected) > 0
+
+
+def test_batches_do_not_mix(tmp_path):
+    checkpoint, adjacency = small_checkpoint(tmp_path)
+    data = recordings(checkpoint, 0, samples=5)
+    model = QuantisedNet(checkpoint, adjacency, tuned_forms(checkpoint, adjacency, data.events, 4))
+    together = model(time_first(data.events))
+    alone = torch.cat([model(time_first(data.events[i : i + 1])) for i in range(5)])
+    assert torch.equal(together, alone)
+
+
+def test_gradients_are_those_of_the_rounded_float_model(tmp_path):
+    """At 8 bits and with scales this fine the straight-through gradient is the float model's, to a few parts in 100."""
+    from models.networks import Architecture, TactileSGNet
+
+    checkpoint, adjacency = small_checkpoint(tmp_path)
+    data = recordings(checkpoint, 1, samples=3)
+    model = QuantisedNet(checkpoint, adjacency, tuned_forms(checkpoint, adjacency, data.events, 8))
+    model(time_first(data.events)).square().sum().backward()
+    sizes = [len(dense.bias) for dense in checkpoint.dense]
+    architecture = Architecture(
+        taxels=checkpoint.taxels,
+        classes=sizes[-1],
+        hops=len(checkpoint.hops) - 1,
+        features=checkpoint.hops.shape[1],
+        hidden=tuple(sizes[:-1]),
+        beta=819 / 4096,
+    )
+    plain = TactileSGNet(architecture, adjacency)
+    exact = {"conv1.hops": model.hops, "conv1.bias": model.conv_bias}
+    for dense, weight, bias in zip(plain.dense, model.weights, model.biases, strict=True):
+        exact |= {f"{dense}.weight": weight, f"{dense}.bias": bias}
+    plain.load_weights({name: parameter.detach().numpy() for name, parameter in exact.items()})
+    events = torch.tensor(data.events.transpose(3, 0, 1, 2), dtype=torch.float32)
+    plain(events).square().sum().backward()
+    ours, theirs = model.hops.grad, plain.conv1.hops.grad
+    assert theirs.abs().max() > 0
+    assert torch.nn.functional.cosine_similarity(ours.flatten(), theirs.flatten(), dim=0) > 0.9
+    last, reference = model.weights[-1].grad, getattr(plain, plain.dense[-1]).weight.grad.t()
+    assert torch.nn.functional.cosine_similarity(last.flatten(), reference.flatten(), dim=0) > 0.9
+
+
+def test_weights_that_would_overflow_are_shrunk(tmp_path):
+    checkpoint, adjacency = small_checkpoint(tmp_path)
+    data = recordings(checkpoint, 0)
+    forms = tuned_forms(checkpoint, adjacency, data.events, 8)
+    model = QuantisedNet(checkpoint, adjacency, forms)
+    with torch.no_grad():
+        model.hops *= 40
+        model.weights[0] *= 40
+        model.biases[0] += 1e9
+    model.make_legal()
+    for integers in model.integers:
+        assert np.maximum(integers.units, 0).sum(axis=0).max() <= ONE_STEP_SUM_MAX
+        assert np.maximum(-integers.units, 0).sum(axis=0).max() <= ONE_STEP_SUM_MAX
+
+
+# --- fine-tuning
+
+
+@pytest.mark.parametrize("bits", [2, 4])
+def test_a_fine_tuned_checkpoint_compiles_to_what_was_trained(tmp_path, bits):
+    checkpoint, adjacency = small_checkpoint(tmp_path)
+    train, test = recordings(checkpoint, 0, samples=24), recordings(checkpoint, 1, split="test")
+    tuned = finetune(checkpoint, adjacency, train, test, LOIHI, bits=[bits], epochs=3)
+    assert bits == 2 or tuned.history[-1].loss < tuned.history[0].loss
+    path = tmp_path / "tuned.pt"
+    graph = ring(checkpoint.taxels)
+    save_checkpoint(path, {"last": tuned.weights}, graph, beta=0.2, theta=0.5, training={}, forms=tuned.forms)
+    again = read_checkpoint(path)
+    for ours, theirs in zip(again.forms, tuned.forms, strict=True):
+        assert (ours.bits, ours.exponents) == (theirs.bits, theirs.exponents) == (bits, theirs.exponents)
+        np.testing.assert_array_equal(ours.threshold, theirs.threshold)
+    netlist = compile_checkpoint(again, adjacency).netlist
+    trace = engine.simulate(netlist, test.events.reshape(len(test), -1, test.steps), spikes=True)
+    model = quantised_spikes(again, adjacency, test.events)
+    for index, layer in enumerate(netlist.layers):
+        np.testing.assert_array_equal(aligned(netlist, trace.spikes, index), model[layer.name])
+    right = int((model[netlist.layers[-1].name].sum(axis=1).argmax(axis=1) == test.labels).sum())
+    assert right == tuned.after
+    assert {projection.bits for projection in lift(netlist).projections} == {bits}
+
+
+def test_a_fine_tuned_checkpoint_brings_its_own_storage(tmp_path):
+    checkpoint, adjacency = small_checkpoint(tmp_path)
+    train = recordings(checkpoint, 0)
+    tuned = finetune(checkpoint, adjacency, train, train, LOIHI, bits=[4], epochs=1)
+    path = tmp_path / "tuned.pt"
+    graph = ring(checkpoint.taxels)
+    save_checkpoint(path, {"last": tuned.weights}, graph, beta=0.2, theta=0.5, training={}, forms=tuned.forms)
+    for options in ({"recipes": (Recipe(),)}, {"spike_exact": True}, {"ranges": "observed"}):
+        with pytest.raises(OptionError) as caught:
+            compile_checkpoint(read_checkpoint(path), adjacency, training_events=train.events, **options)
+        assert str(caught.value) == (
+            "compile: the checkpoint was fine-tuned for its own storage; leave --weight-bits, --planes, "
+            "--scale-groups, --spike-exact and --ranges away"
+        )
+
+
+def test_an_interrupted_fine_tuning_goes_on_to_the_same_bytes(tmp_path):
+    checkpoint, adjacency = small_checkpoint(tmp_path)
+    train, test = recordings(checkpoint, 0), recordings(checkpoint, 1)
+    whole = finetune(checkpoint, adjacency, train, test, LOIHI, bits=[2], epochs=4, seed=3)
+
+    class StoppedError(Exception):
+        pass
+
+    def stop(epoch):
+        if epoch.epoch == 2:
+            raise StoppedError
+
+    state = tmp_path / "x.state"
+    options = {"bits": [2], "epochs": 4, "seed": 3, "state": state}
+    with pytest.raises(StoppedError):
+        finetune(checkpoint, adjacency, train, test, LOIHI, after_epoch=stop, **options)
+    rest = finetune(checkpoint, adjacency, train, test, LOIHI, resume=True, **options)
+    assert rest.history == whole.history
+    for name, array in whole.weights.items():
+        np.testing.assert_array_equal(rest.weights[name], array)
+    with pytest.raises(OptionError) as caught:
+        finetune(checkpoint, adjacency, train, test, LOIHI, resume=True, **(options | {"epochs": 5}))
+    assert "epochs" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"bits": [7]}, "--weight-bits 7: Intel Loihi 1 does not store that width; allowed: 2, 3, 4, 5, 6, 8"),
+        ({"bits": [4, 4]}, "--weight-bits: 2 widths, the network has 4 layers; give one, or one for each"),
+        ({"bits": [4], "epochs": 0}, "--epochs 0: allowed are 1 or more; choose another"),
+        ({"bits": [4], "seed": -1}, "--seed -1: allowed are 0 or more; choose another"),
+        ({"bits": [4], "groups": 9}, "--scale-groups 9: allowed are 1 to 8, the thresholds of a core; choose one"),
+    ],
+)
+def test_options_that_cannot_be(tmp_path, options, message):
+    checkpoint, adjacency = small_checkpoint(tmp_path)
+    data = recordings(checkpoint, 0)
+    with pytest.raises(OptionError) as caught:
+        finetune(checkpoint, adjacency, data, data, LOIHI, **options)
+    assert str(caught.value) == message
+
+
+def test_a_loss_that_is_no_number(tmp_path, monkeypatch):
+    checkpoint, adjacency = small_checkpoint(tmp_path)
+    data = recordings(checkpoint, 0)
+    monkeypatch.setattr("models.finetune.rate_loss", lambda rates, _labels: rates.sum() * float("nan"))
+    monkeypatch.setattr("models.finetune.QuantisedNet.make_legal", lambda _self: None)
+    with pytest.raises(DataError) as caught:
+        finetune(checkpoint, adjacency, data, data, LOIHI, bits=[4], epochs=2)
+    assert str(caught.value) == (
+        "epoch 1: the loss is nan, a finite number is needed; the state of the epoch before is kept"
+    )
+
+
+# --- files
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda forms: forms.pop(),
+        lambda forms: forms[0].update(layer="fc9"),
+        lambda forms: forms[0].update(bits=9),
+        lambda forms: forms[0].update(exponents=[]),
+        lambda forms: forms[0].update(exponents=[0, 8]),
+        lambda forms: forms[1]["threshold"].pop(),
+        lambda forms: forms[1]["threshold"].__setitem__(0, 0),
+        lambda forms: forms[1].pop("threshold"),
+    ],
+)
+def test_forms_that_cannot_be_used(tmp_path, change):
+    checkpoint, adjacency = small_checkpoint(tmp_path)
+    data = recordings(checkpoint, 0)
+    forms = tuned_forms(checkpoint, adjacency, data.events, 4)
+    path = tmp_path / "tuned.pt"
+    graph = ring(checkpoint.taxels)
+    save_checkpoint(path, {"last": weights()}, graph, beta=0.2, theta=0.5, training={}, forms=forms)
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    manifest = json.loads(members["manifest.json"])
+    change(manifest["forms"])
+    arrays = {f"last/{name}": np.asarray(array, "<f4") for name, array in weights().items()}
+    manifest["sha256"] = content_digest(manifest, arrays)
+    members["manifest.json"] = json.dumps(manifest).encode()
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+    with pytest.raises(ModelError) as caught:
+        read_checkpoint(path)
+    assert str(caught.value).startswith(f"{path}: has unusable forms of a fine-tuning (")
+
+
+def test_biases_beyond_their_register(tmp_path):
+    """Tiny weights beside a large bias: no exponent makes both fit, and the compiler's message says where."""
+    arrays = {name: array * 1e-7 if name.endswith("weight") else array + 100 for name, array in weights().items()}
+    checkpoint, adjacency = small_checkpoint(tmp_path, last=arrays)
+    data = recordings(checkpoint, 0)
+    with pytest.raises(ModelError) as caught:
+        tuned_forms(checkpoint, adjacency, data.events, 8)
+    assert str(caught.value).endswith(
+        "its weights are too small for its threshold or biases at 8 bits: the registers overflow; give it more bits"
+    )
+
+
+# --- the command
+
+
+def test_the_command_on_real_recordings(tmp_path, objects_zip, capsys):
+    """A few recordings, one epoch: the result compiles, and the torch model is the chip on all of the test split."""
+    source, output = "pretrained:objects", tmp_path / "tuned.pt"
+    words = ["finetune", source, "--data", str(objects_zip), "--weight-bits", "2", "--epochs", "1", "-o", str(output)]
+    assert main([*words, "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["before"]["correct"] < report["last"]["correct"]
+    netlist = tmp_path / "tuned.loom"
+    assert main(["compile", str(output), "-o", str(netlist)]) == 0
+    capsys.readouterr()
+    verify = ["verify", str(netlist), "--checkpoint", str(output), "--original", source, "--data", str(objects_zip)]
+    assert main([*verify, "--require", "E0,E1", "--limit", "40", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["quantised_different"] == 0
+    assert not (tmp_path / "tuned.pt.state").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.recordings
+def test_the_model_is_the_chip_on_every_recording(tmp_path, objects_zip, containers_zip):
+    adjacency = normalised_adjacency(build_graph("manual").edges, 39)
+    for name, place in (("objects", objects_zip), ("containers", containers_zip)):
+        output = tmp_path / f"{name}.pt"
+        words = ["finetune", f"pretrained:{name}", "--data", str(place), "--weight-bits", "4", "--epochs", "2"]
+        assert main([*words, "-o", str(output)]) == 0
+        checkpoint = read_checkpoint(output)
+        netlist = compile_checkpoint(checkpoint, adjacency).netlist
+        for split in ("train", "test"):
+            data = load_recordings(place, split)
+            model = quantised_spikes(checkpoint, adjacency, data.events)
+            trace = engine.simulate(netlist, data.events.reshape(len(data), -1, data.steps), spikes=True)
+            for index, layer in enumerate(netlist.layers):
+                np.testing.assert_array_equal(aligned(netlist, trace.spikes, index), model[layer.name])
+
+
+@pytest.fixture
+def refusal(tmp_path, capsys):
+    def run(*words):
+        code = main(["finetune", *map(str, words), "--data", "synthetic", "-o", str(tmp_path / "out.pt")])
+        out, err = capsys.readouterr()
+        assert (code, out) == (2, "")
+        assert not (tmp_path / "out.pt").exists()
+        return err.removeprefix("spikeloom: ").rstrip("\n")
+
+    return run
+
+
+def test_what_cannot_be_fine_tuned(refusal, tmp_path, capsys):
+    net = tmp_path / "net.loom"
+    assert main(["compile", "pretrained:grasps", "-o", str(net)]) == 0
+    capsys.readouterr()
+    assert refusal(net, "--weight-bits", "4") == (
+        f"{net}: is a netlist, its weights are rounded already; give the checkpoint it was made from"
+    )
+    assert refusal("pretrained:grasps", "--weight-bits", "four") == (
+        "--weight-bits four: not a number; give one, or one for each layer as in 8,4,4,8"
+    )
+    assert refusal("pretrained:grasps", "--weight-bits", "4", "--resume") == (
+        f"--resume: {tmp_path / 'out.pt.state'} does not exist, so nothing was interrupted; leave --resume away"
+    )
+    (tmp_path / "out.pt.state").write_bytes(b"")
+    assert refusal("pretrained:grasps", "--weight-bits", "4") == (
+        f"{tmp_path / 'out.pt.state'}: an interrupted fine-tuning is kept there; go on with --resume, "
+        "or delete the file to start anew"
+    )
+    (tmp_path / "out.pt.state").unlink()
+    checkpoint, _ = small_checkpoint(tmp_path)
+    assert refusal(tmp_path / "small.pt", "--weight-bits", "4") == (
+        f"synthetic: has 39 taxels, the network has {checkpoint.taxels}; use recordings of its sensor"
+    )
+    assert refusal("pretrained:grasps", "--weight-bits", "7") == (
+        "--weight-bits 7: Intel Loihi 1 does not store that width; allowed: 2, 3, 4, 5, 6, 8"
+    )
