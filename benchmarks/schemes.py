@@ -28,7 +28,7 @@ from models.reference import float_spikes
 from runtime import cost, engine
 from runtime.intervals import wilson
 from runtime.levels import mcnemar
-from runtime.trace import aligned
+from runtime.trace import aligned, heard
 from runtime.votes import predictions
 
 Options = dict[str, Any]
@@ -36,15 +36,12 @@ Options = dict[str, Any]
 SCHEMES: dict[str, tuple[str, Options]] = {
     "8 bits, from the weights": ("", {"calibrated": False}),
     "8 bits": ("", {}),
-    "8 bits, 8 scales": ("", {"recipes": (Recipe(groups=8),)}),
     "2 × 8 bits": ("", {"recipes": (Recipe(planes=2),)}),
     "2 × 8 bits, 8 scales": ("", {"recipes": (Recipe(planes=2, groups=8),)}),
-    "spike-exact": ("", {"spike_exact": True}),
     "6 bits": ("", {"recipes": (Recipe(bits=6),)}),
     "4 bits": ("", {"recipes": (Recipe(bits=4),)}),
     "4 bits, 8 scales": ("", {"recipes": (Recipe(bits=4, groups=8),)}),
     "4 bits, fine-tuned": ("-4bit", {"calibrated": False}),
-    "3 bits, 8 scales": ("", {"recipes": (Recipe(bits=3, groups=8),)}),
     "ternary, 8 scales": ("", {"recipes": (Recipe(bits=2, groups=8),)}),
     "ternary, fine-tuned": ("-2bit", {"calibrated": False}),
 }
@@ -61,7 +58,9 @@ def measure(
     assert trace.spikes is not None
     costs = cost.estimate(netlist, load_target(netlist.target), trace.counts, test.steps)
     different = {
-        layer.name: int(np.count_nonzero(aligned(netlist, trace.spikes, i) != reference[layer.name]))
+        layer.name: int(
+            np.count_nonzero((aligned(netlist, trace.spikes, i) != reference[layer.name])[..., heard(netlist, i)])
+        )
         for i, layer in enumerate(netlist.layers)
     }
     return {
@@ -89,7 +88,7 @@ def fill(arguments: argparse.Namespace) -> tuple[Options, Recordings]:
         reference = None
         for scheme, (suffix, options) in SCHEMES.items():
             source = path.with_name(f"{path.stem}{suffix}.pt")
-            if scheme in found["schemes"] or not source.exists():
+            if scheme in found["schemes"] or not source.exists() or scheme not in (arguments.schemes or SCHEMES):
                 continue
             if reference is None:
                 reference = float_spikes(original, adjacency, test.events)
@@ -148,6 +147,7 @@ def main() -> None:
     parser.add_argument("checkpoints", nargs="+")
     parser.add_argument("--results", required=True)
     parser.add_argument("--graph", default="manual")
+    parser.add_argument("--schemes", nargs="+", choices=SCHEMES, help="measure these only (default: all)")
     arguments = parser.parse_args()
     results, test = fill(arguments)
     floats = np.concatenate([net["float"] for net in results.values()])

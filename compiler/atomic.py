@@ -6,8 +6,12 @@ import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from glob import escape
 from pathlib import Path
 from typing import BinaryIO
+
+RANDOM = 8
+"""Letters that `tempfile.mkstemp` draws for a name."""
 
 
 @contextmanager
@@ -27,6 +31,13 @@ def write_atomically(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         yield from _write_beside(path)
     except OSError as error:
         raise OSError(error.errno, error.strerror or str(error), str(path)) from error
+
+
+def remove_leftovers(path: str | os.PathLike[str]) -> None:
+    """Remove what a killed process left half-written beside `path`; for a `path` that nobody else is writing."""
+    path = Path(path)
+    for file in path.parent.glob(f".{escape(path.name)}.{'?' * RANDOM}.part"):
+        file.unlink(missing_ok=True)
 
 
 def _write_beside(path: Path) -> Iterator[BinaryIO]:

@@ -200,6 +200,24 @@ def channels_last(events: npt.NDArray[Any]) -> BoolArray:
     return np.ascontiguousarray(flat.transpose(0, 2, 1)).astype(np.bool_)
 
 
+def cut(spikes: BoolArray, lengths: IntArray | None) -> BoolArray:
+    """Take away what a recording does after its own length, where it was filled up with silence.
+
+    Parameters
+    ----------
+    spikes : (samples, steps, neurons) bool
+        Of one population.
+    lengths : (samples,) int64, or None
+        Steps of each recording; None where all have `steps`.
+
+    Examples
+    --------
+    >>> cut(np.ones((2, 3, 1), bool), np.array([3, 1])).sum(axis=1).ravel().tolist()
+    [3, 1]
+    """
+    return spikes if lengths is None else spikes & (np.arange(spikes.shape[1]) < lengths[:, None])[:, :, None]
+
+
 def vote(counts: IntArray) -> IntArray:
     """Class of each sample from its spike counts (samples, classes): most spikes, lowest index on a tie.
 

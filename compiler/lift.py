@@ -1,15 +1,20 @@
 """Read a netlist back as an integer network: the inverse of :mod:`compiler.passes.emit`, cores forgotten.
 
 Synapses of weight zero are stored by chance (inside dense lists) and are left out. A layer whose weights all rounded
-to zero stores no synapse; it is given an empty projection from where it would listen.
+to zero stores no synapse; it is given an empty projection from where it would listen. Neurons that the chip does not
+hold come back without synapses or bias, so that they never fire.
 """
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+import numpy.typing as npt
 from scipy import sparse
 
 from compiler.errors import FormatError
+from compiler.fixedpoint import THRESHOLD_MANTISSA_MAX, IntArray
 from compiler.ir import INPUT, Input, IntegerNetwork, IntegerPopulation, IntegerProjection, Readout
 from compiler.netlist import Netlist
 
@@ -35,17 +40,24 @@ def lift(netlist: Netlist) -> IntegerNetwork:
     populations = []
     for index, layer in enumerate(netlist.layers):
         ids = netlist.compartments_of(index)
+        held = netlist.neuron[ids]
+
+        def whole(values: npt.NDArray[Any], missing: float, held: IntArray = held, size: int = layer.neurons) -> Any:
+            array = np.full(size, missing, values.dtype)
+            array[held] = values
+            return array
+
         populations.append(
             IntegerPopulation(
                 name=layer.name,
                 beta=layer.beta,
                 theta=layer.theta,
-                scale=netlist.scale[ids],
+                scale=whole(netlist.scale[ids], 1.0),
                 decay_u=_one(netlist, index, "decay_u"),
                 decay_v=_one(netlist, index, "decay_v"),
-                threshold=netlist.threshold[ids],
-                bias_mantissa=netlist.bias_mantissa[ids],
-                bias_exponent=netlist.bias_exponent[ids],
+                threshold=whole(netlist.threshold[ids], THRESHOLD_MANTISSA_MAX),
+                bias_mantissa=whole(netlist.bias_mantissa[ids], 0),
+                bias_exponent=whole(netlist.bias_exponent[ids], 0),
             )
         )
     axon = netlist.axon_of_synapse()
@@ -59,7 +71,8 @@ def lift(netlist: Netlist) -> IntegerNetwork:
     kinds = np.stack([post, pre, exponent, bits])
     sizes = {INPUT: netlist.n_inputs} | {i: layer.neurons for i, layer in enumerate(netlist.layers)}
     projections = []
-    for kind in np.unique(kinds, axis=1).T:
+    code = ((post * (len(netlist.layers) + 1) + pre + 1) * 64 + exponent + 32) * 16 + bits  # one number sorts faster
+    for kind in kinds[:, np.unique(code, return_index=True)[1]].T:
         held = np.all(kinds == kind[:, None], axis=0) & (netlist.synapse_weight != 0)
         weight = sparse.csr_array(
             (netlist.synapse_weight[held], (row[held], column[held])), shape=(sizes[int(kind[0])], sizes[int(kind[1])])

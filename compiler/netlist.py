@@ -43,7 +43,9 @@ class Layer:
     name : str
         ``conv1``, ``fc1`` …
     neurons : int
-        Number of compartments of this layer, over all cores.
+        Neurons of the float model's layer; the chip may hold fewer compartments.
+    unheard : tuple of int
+        Neurons left out although they fire, because nobody hears them; any other that is missing cannot fire.
     depth : int
         Steps that the layer lags behind the data.
     beta, theta : float
@@ -58,6 +60,7 @@ class Layer:
 
     name: str
     neurons: int
+    unheard: tuple[int, ...]
     depth: int
     beta: float
     theta: float
@@ -165,7 +168,7 @@ class Netlist:
         return max(layer.depth for layer in self.layers)
 
     def compartments_of(self, layer: int) -> IntArray:
-        """Compartment ids of a layer, ordered by neuron; shape (neurons,)."""
+        """Compartment ids of a layer, ordered by neuron; shape (compartments of the layer,)."""
         ids = np.flatnonzero(self.layer == layer)
         return ids[np.argsort(self.neuron[ids], kind="stable")]
 

@@ -11,18 +11,30 @@ import numpy.typing as npt
 
 from compiler.errors import OptionError
 from compiler.fixedpoint import FloatArray
+from compiler.forms import Form
 from compiler.frontends.checkpoint import Checkpoint
 from compiler.interpret import channels_last
 from compiler.ir import IntegerNetwork, Network
 from compiler.netlist import Netlist
 from compiler.passes.bounds import RangeProof, prove_ranges
-from compiler.passes.calibrate import Calibration, calibrate, evenly_spaced
-from compiler.passes.emit import emit
+from compiler.passes.calibrate import Calibration, calibrate, evenly_spaced, fewer
+from compiler.passes.emit import Origin, emit
 from compiler.passes.exact import Exactness, make_exact
 from compiler.passes.expand import expand
 from compiler.passes.legalize import LimitUse, require_legal
 from compiler.passes.partition import partition
 from compiler.passes.place import Placement, core_traffic, place
+from compiler.passes.prune import (
+    Removal,
+    compact,
+    disconnect,
+    either,
+    never_fired,
+    never_fires,
+    nobody,
+    removable,
+    removals,
+)
 from compiler.passes.quantize import Choice, Recipe, check_recipes, quantize, round_to_forms
 from compiler.targets import Target, load_target
 from compiler.verify import verify
@@ -51,6 +63,8 @@ class Compilation:
         Worst-case register values of each layer.
     uses : tuple of LimitUse
         Use of every limit by every core.
+    removals : tuple of Removal
+        What was left out of each layer.
     placement : Placement
         Tiles and what they cost.
     core_bound : int
@@ -64,6 +78,7 @@ class Compilation:
     exactness: tuple[Exactness, ...]
     proofs: tuple[RangeProof, ...]
     uses: tuple[LimitUse, ...]
+    removals: tuple[Removal, ...]
     placement: Placement
     core_bound: int
 
@@ -75,6 +90,8 @@ def compile_checkpoint(
     target: str = "loihi1",
     recipes: Sequence[Recipe] | None = None,
     spike_exact: bool = False,
+    keep_all: bool = False,
+    prune_unused: bool = False,
     training_events: npt.NDArray[Any] | None = None,
     ranges: str = "proven",
     margin: float = 0.1,
@@ -96,6 +113,10 @@ def compile_checkpoint(
     spike_exact : bool
         Add planes and scales until every spike on the training recordings, all of them, is the float64 model's, see
         :mod:`compiler.passes.exact`; takes the width from `recipes` and nothing else.
+    keep_all : bool
+        Keep neurons that provably do nothing, too.
+    prune_unused : bool
+        Leave out neurons that did not fire on any training recording, too.
     training_events : (samples, taxels, polarities, steps), optional
         Training recordings for calibration; at most 32, evenly spaced, are used.
     ranges : {"proven", "observed"}
@@ -125,8 +146,20 @@ def compile_checkpoint(
     rates: tuple[FloatArray, ...] | None = None
     if training_events is not None:
         events = channels_last(training_events)
-        calibration = calibrate(network, events if spike_exact else evenly_spaced(events))
+        calibration = calibrate(network, events if spike_exact or prune_unused else evenly_spaced(events))
         rates = tuple(spikes.mean(axis=(0, 1)) for spikes in calibration.spikes)
+    unused = nobody(network)
+    if prune_unused:
+        if calibration is None or keep_all or checkpoint.forms is not None:
+            raise OptionError(
+                "--prune-unused: needs --calibrate, and neither --keep-all nor a fine-tuned checkpoint; "
+                "change the options"
+            )
+        unused = never_fired(network, calibration)
+        calibration = calibration if spike_exact else fewer(calibration)
+    whole = network
+    if not keep_all and checkpoint.forms is None:
+        network = disconnect(network, either(never_fires(network), unused))
 
     exactness: tuple[Exactness, ...] = ()
     if checkpoint.forms is not None:
@@ -135,6 +168,7 @@ def compile_checkpoint(
                 "compile: the checkpoint was fine-tuned for its own storage; leave --weight-bits, --planes, "
                 "--scale-groups, --spike-exact and --ranges away"
             )
+        _require_stored(network, checkpoint.forms, chip)
         integer, choices = round_to_forms(network, checkpoint.forms, calibration)
     elif spike_exact:
         integer, choices, exactness = _exact(network, chip, recipes or (Recipe(),), calibration, ranges)
@@ -145,22 +179,38 @@ def compile_checkpoint(
     verify(integer)
     publish("quantize", integer)
 
-    parts = partition(integer, chip, rates)
-    placement = place(core_traffic(integer, parts, rates), chip)
-    netlist = emit(integer, parts, placement.tiles, chip, provenance or {})
+    silent, unheard = (nobody(network), nobody(network)) if keep_all else removable(integer)
+    laid, identity = compact(integer, either(silent, unheard))
+    if rates is not None:
+        rates = tuple(rate[ids] for rate, ids in zip(rates, identity, strict=True))
+    parts = partition(laid, chip, rates)
+    placement = place(core_traffic(laid, parts, rates), chip)
+    origin = Origin(network=integer, identity=identity, unheard=unheard)
+    netlist = emit(laid, parts, placement.tiles, chip, provenance or {}, origin)
     uses = require_legal(netlist, chip)
     publish("place", netlist)
     return Compilation(
-        network=network,
+        network=whole,
         integer=integer,
         netlist=netlist,
         choices=choices,
         exactness=exactness,
         proofs=prove_ranges(integer),
         uses=uses,
+        removals=removals(whole, silent, unheard, unused),
         placement=placement,
         core_bound=parts.bound,
     )
+
+
+def _require_stored(network: Network, forms: Sequence[Form], chip: Target) -> None:
+    allowed = {what: chip.choices[f"synapse.{what}"] for what in ("weight_bits", "exponent")}
+    for population, form in zip(network.populations, forms, strict=True):
+        if form.bits not in allowed["weight_bits"] or not set(form.exponents) <= set(allowed["exponent"]):
+            raise OptionError(
+                f"{population.name}: was fine-tuned for weights of {form.bits} bits with exponent "
+                f"{', '.join(map(str, form.exponents))}, which {chip.title} does not store; fine-tune for this target"
+            )
 
 
 def _exact(

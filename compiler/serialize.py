@@ -173,7 +173,7 @@ def read_netlist(path: str | os.PathLike[str]) -> Netlist:
         taxels=manifest["taxels"],
         polarities=manifest["polarities"],
         classes=manifest["classes"],
-        layers=tuple(Layer(**layer) for layer in manifest["layers"]),
+        layers=tuple(Layer(**(layer | {"unheard": tuple(layer["unheard"])})) for layer in manifest["layers"]),
         provenance=manifest["provenance"],
         scale=read_only_float(members["scale"]),
         **{name: read_only(members[name]) for name in ARRAYS if name not in FLOATS},
@@ -224,7 +224,10 @@ def _is_layer(entry: Any) -> bool:
     wanted = {field.name: str(field.type) for field in fields(Layer)}
     if not isinstance(entry, dict) or set(entry) != set(wanted):
         return False
-    return all(_is(entry[name], kind, 0) for name, kind in wanted.items())
+    listed = entry["unheard"]
+    if not isinstance(listed, list) or not all(_is(neuron, "int", 0) for neuron in listed):
+        return False
+    return all(_is(entry[name], kind, 0) for name, kind in wanted.items() if name != "unheard")
 
 
 def _bounds_fault(name: str, bounds: np.ndarray[Any, Any], parts: int, total: int) -> str | None:
@@ -282,6 +285,8 @@ def inconsistencies(netlist: Netlist) -> list[str]:
         found.append("synapse_target points beyond its core")
     for index, layer in enumerate(netlist.layers):
         neurons = np.sort(netlist.neuron[netlist.layer == index])
-        if not np.array_equal(neurons, np.arange(layer.neurons)):
-            found.append(f"layer {layer.name} does not hold each of its {layer.neurons} neurons once")
+        if outside(neurons, 0, layer.neurons) or len(np.unique(neurons)) != len(neurons) or not len(neurons):
+            found.append(
+                f"layer {layer.name} holds none of its {layer.neurons} neurons, one twice or one that is not there"
+            )
     return [fault for fault in found if fault]

@@ -15,10 +15,10 @@ import torch
 
 from compiler.atomic import write_atomically
 from compiler.forms import Form
-from compiler.frontends.checkpoint import FORMAT, VERSIONS, arrays_digest, content_digest
+from compiler.frontends.checkpoint import FORMAT, VERSIONS, content_digest
 from models.evtouch import Recordings
 from models.graphs import Graph
-from models.protocols import Reported
+from models.protocols import Reported, data_digest
 
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 
@@ -41,14 +41,7 @@ def training_record(
         "seed": seed,
         "epochs": len(history),
         "data": training.source,
-        "data_sha256": arrays_digest(
-            {
-                "train": training.events,
-                "train_labels": training.labels,
-                "test": test.events,
-                "test_labels": test.labels,
-            }
-        ),
+        "data_sha256": data_digest(training, test),
         "test_samples": len(test),
         **{
             name: {

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,7 +56,7 @@ class Description:
     hot: tuple[int, ...]
 
 
-def describe(recordings: Recordings, bin_s: float, steps: Sequence[int] | None = None) -> Description:
+def describe(recordings: Recordings, bin_s: float) -> Description:
     """Count events.
 
     Parameters
@@ -65,10 +65,8 @@ def describe(recordings: Recordings, bin_s: float, steps: Sequence[int] | None =
         One split.
     bin_s : float
         Width of its bins, seconds.
-    steps : sequence of int, optional
-        Length of each recording where some were padded.
     """
-    lengths = np.full(len(recordings), recordings.steps) if steps is None else np.asarray(steps)
+    lengths = np.array([recordings.steps_of(index) for index in range(len(recordings))])
     per_taxel = recordings.events.sum(axis=(0, 3), dtype=np.int64)
     per_step = recordings.events.sum(axis=(0, 1), dtype=np.int64).T
     running = (lengths[:, None] > np.arange(recordings.steps)).sum(axis=0)

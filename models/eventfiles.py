@@ -27,6 +27,12 @@ SUFFIXES = (".csv", ".npz")
 MAX_LABEL = 999_999
 UNLABELLED = -1
 
+UNITS = (("nanoseconds", 5e5), ("microseconds", 5e2), ("milliseconds", 0.5))
+"""Units that times may have by mistake, and what half of the events then leave between them, at least."""
+
+UNIT_EVENTS, UNIT_SPAN = 8, 60.0
+"""Different times, and what lies between first and last, below which no unit is guessed."""
+
 _REQUIRED = ("time_s", "taxel", "polarity")
 _COLUMNS = "time_s, taxel, polarity[, label]"
 _LABEL = re.compile(r"_label_([0-9]{1,6})(?![0-9])")
@@ -93,10 +99,10 @@ def read_stream(path: str | os.PathLike[str], *, taxels: int | None = None, wher
     wrong = ~((taxel >= 0) & (taxel < most) & (taxel == np.floor(taxel)))  # true for NaN too
     if wrong.any():
         row = int(np.argmax(wrong))
-        raise DataError(
-            f"{at(row)}: taxel {taxel[row]:g}, allowed are whole numbers 0..{most - 1}; "
-            "count from 0 and use recordings of this sensor"
-        )
+        from_one = taxel.min() == 1 and taxel.max() == taxels  # false for NaN
+        mend = "they seem to count from 1" if from_one else "use recordings of this sensor"
+        plain = f"{at(row)}: taxel {taxel[row]:g}, allowed are whole numbers 0..{most - 1}; count from 0"
+        raise DataError(f"{plain}, {mend}" if from_one else f"{plain} and {mend}")
     return EventStream(
         name=path.name,
         time_s=time_s,
@@ -117,6 +123,24 @@ def label_in_name(name: str) -> int:
     """
     match = _LABEL.search(name)
     return UNLABELLED if match is None else int(match[1])
+
+
+def likely_unit(times: NDArray[np.float64]) -> str | None:
+    """Unit that times seem to have if it is not seconds.
+
+    A sensor that is touched sends several events a second. Times that are further apart, over a minute or more, are
+    some smaller unit: that in which they are half a millisecond to half a second apart.
+
+    Examples
+    --------
+    >>> likely_unit(np.arange(0, 3000, 7.0)), likely_unit(np.arange(0, 3, 0.007)), likely_unit(np.array([0.0, 90.0]))
+    ('milliseconds', None, None)
+    """
+    distinct = np.unique(times)
+    if len(distinct) < UNIT_EVENTS or distinct[-1] - distinct[0] < UNIT_SPAN:
+        return None
+    apart = float(np.median(np.diff(distinct)))
+    return next((unit for unit, least in UNITS if apart > least), None)
 
 
 def _polarity(where: str, values: FloatArray, at: Callable[[int], str]) -> NDArray[np.uint8]:

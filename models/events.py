@@ -1,7 +1,7 @@
 """Recordings in any form that we read: the released layout, files of events, single recordings, or a name.
 
 Events are put into time bins of one width. Nothing is mended in silence: what came out of order, what fell on an
-event of the same taxel, polarity and bin, long silences and padding are counted.
+event of the same taxel, polarity and bin, and long silences are counted. Each recording counts for its own length.
 """
 
 from __future__ import annotations
@@ -16,9 +16,11 @@ from numpy.typing import NDArray
 
 from compiler.errors import DataError, OptionError
 from models import evtouch
-from models.eventfiles import SUFFIXES, UNLABELLED, EventStream, label_in_name, read_stream
+from models.eventfiles import SUFFIXES, UNLABELLED, EventStream, label_in_name, likely_unit, read_stream
 from models.evtouch import Recordings, load_recordings
 from models.fetch import DATA_SETS, find_data
+from models.labels import NAME as TABLE
+from models.labels import is_table, labels_beside
 
 BIN_S = 0.02
 """Width of a time bin in the released recordings, seconds."""
@@ -48,7 +50,10 @@ class EventCounts:
     gaps : int
         Silences longer than `GAP_S` between two events of a recording.
     steps : tuple of int
-        Bins of each recording, before the shorter ones were padded at the end with silence.
+        Bins of each recording.
+    notes : tuple of str
+        What is worth a second look: times that look like another unit, taxels that seem to count from 1, a table of
+        labels.
     """
 
     events: int
@@ -56,6 +61,7 @@ class EventCounts:
     duplicates: int
     gaps: int
     steps: tuple[int, ...]
+    notes: tuple[str, ...] = ()
 
 
 def load_data(
@@ -78,7 +84,7 @@ def load_data(
     split : str
         Which split to read.
     bin_s : float
-        Width of a time bin, seconds; the released layout has its bins already.
+        Width of a time bin, seconds. The released layout and ``.npy`` files have bins already: see `require_events`.
     taxels, classes : int, optional
         What the network expects. Without `taxels` the highest taxel with an event decides.
     limit : int, optional
@@ -96,7 +102,7 @@ def load_data(
     DataError
         If a recording cannot be used; the message names file and place.
     OptionError
-        If `bin_s` is not a duration or `limit` is below 1.
+        If `bin_s` is not a duration, or given for what has bins already; if `limit` is below 1.
     """
     if not (math.isfinite(bin_s) and bin_s > 0):
         raise OptionError(f"--bin {bin_s:g}: not a duration; give seconds above 0, for example {BIN_S:g}")
@@ -105,6 +111,8 @@ def load_data(
     path = find_data(str(path)) if str(path) in DATA_SETS else Path(path)
     found = _event_files(path)
     if found is None:
+        _require_released(path, split)
+        require_events(path.name or str(path), bin_s)
         return load_recordings(path, split, limit=limit, classes=classes, taxels=taxels), None
     source = path.name or str(path)
     if split not in found and "" not in found:
@@ -112,22 +120,28 @@ def load_data(
             f"{source}: split {split!r} is missing or empty; splits with recordings: {', '.join(sorted(found))}"
         )
     files = sorted(found[split if split in found else ""], key=lambda file: file.name)[:limit]
-    grids, labels, counts = [], [], []
+    table, notes = labels_beside(path, files, source)
+    grids, labels, counts, places = [], [], [], []
     held = 0
     for file in files:
         where = source if file == path else f"{source}: {file.relative_to(path).as_posix()}"
+        if file.suffix.lower() == ".npy":
+            require_events(where, bin_s)
         grid, label, count = _read(file, where, bin_s, taxels)
+        label = _merged(where, label, table.get(file))
         if classes is not None and label >= classes:
             raise DataError(
                 f"{where}: label {label}, the network has {classes} classes (0..{classes - 1}); "
                 "use the network that was trained on these objects"
             )
         grids.append(grid)
+        places.append(where)
         labels.append(label)
         counts.append(count)
         held += grid.size
         evtouch._check_total(source, held)
-    shape = max(grid.shape[0] for grid in grids), 2, max(grid.shape[2] for grid in grids)
+    steps = tuple(grid.shape[2] for grid in grids)
+    shape = max(grid.shape[0] for grid in grids), 2, max(steps)
     evtouch._check_total(source, len(grids) * math.prod(shape))
     events = np.zeros((len(grids), *shape), dtype=np.uint8)
     for index, grid in enumerate(grids):
@@ -138,14 +152,28 @@ def load_data(
         files=tuple(file.name for file in files),
         split=split,
         source=source,
+        lengths=None if len(set(steps)) == 1 else np.array(steps, dtype=np.int64),
     )
     return recordings, EventCounts(
         events=sum(count.events for count in counts),
         out_of_order=sum(count.out_of_order for count in counts),
         duplicates=sum(count.duplicates for count in counts),
         gaps=sum(count.gaps for count in counts),
-        steps=tuple(grid.shape[2] for grid in grids),
+        steps=steps,
+        notes=(*notes, *_unit_notes(places, counts), *(_taxel_notes(source, events) if taxels is None else ())),
     )
+
+
+def require_events(where: str, bin_s: float) -> None:
+    """Refuse a width of bins for what has bins already.
+
+    Raises
+    ------
+    OptionError
+        If it is another one than the default.
+    """
+    if bin_s != BIN_S:
+        raise OptionError(f"--bin {bin_s:g}: {where} holds bins, not times; leave --bin away")
 
 
 def data_splits(path: str | os.PathLike[str]) -> tuple[str, ...]:
@@ -160,6 +188,7 @@ def data_splits(path: str | os.PathLike[str]) -> tuple[str, ...]:
     found = _event_files(path)
     if found is not None:
         return tuple(sorted(filter(None, found)))
+    _require_released(path, "test")
     with evtouch._opened(path, {"train", "test"}) as (names, _):
         return tuple(sorted(evtouch._splits(path.name or str(path), names, {"train", "test"})))
 
@@ -217,10 +246,14 @@ def bin_events(
         If an event is later than `MAX_STEPS` bins.
     """
     latest = int(np.argmax(stream.time_s))
+    unit = likely_unit(stream.time_s)
     if float(stream.time_s[latest]) / bin_s >= MAX_STEPS:
+        mend = "count from the start of the recording or use wider bins"
+        if unit:
+            mend = f"the times look like {unit}, write seconds"
         raise DataError(
             f"{stream.at(latest)}: time {stream.time_s[latest]:g} s is past {MAX_STEPS} bins of {bin_s:g} s, the limit "
-            "of a recording; count from the start of the recording or use wider bins"
+            f"of a recording; {mend}"
         )
     step = np.floor(stream.time_s / bin_s + _EDGE).astype(np.int64)
     steps = int(step.max()) + 1
@@ -235,6 +268,7 @@ def bin_events(
         duplicates=sent - int(np.count_nonzero(grid)),
         gaps=int(np.count_nonzero(np.diff(np.sort(stream.time_s)) > GAP_S)),
         steps=(steps,),
+        notes=(f"times up to {stream.time_s[latest]:g} look like {unit}; write seconds",) if unit else (),
     )
 
 
@@ -271,7 +305,42 @@ def _event_files(path: Path) -> dict[str, list[Path]] | None:
 
 
 def _counts(file: Path, suffixes: tuple[str, ...]) -> bool:
-    return file.suffix.lower() in suffixes and not file.name.startswith(".") and file.is_file()
+    plain = not (file.name.startswith(".") or is_table(file))
+    return file.suffix.lower() in suffixes and plain and file.is_file()
+
+
+def _require_released(path: Path, split: str) -> None:
+    """Say everything that a folder may hold if it holds nothing of it."""
+    splits = {"train", "test", split}
+    if path.is_dir() and not any(name.endswith(".npy") for name in evtouch._list_folder(path, splits)):
+        raise DataError(
+            f"{path.name or path}: no recordings; give a folder with event files (.csv, .npz) or bins (.npy), "
+            "together or in train/ and test/, or a released zip"
+        )
+
+
+def _merged(where: str, label: int, listed: int | None) -> int:
+    """Class of a recording that may stand in a table too."""
+    if listed is None:
+        return label
+    if label not in (UNLABELLED, listed):
+        raise DataError(f"{where}: label {label}, and {listed} in {TABLE}; mend one of them")
+    return listed
+
+
+def _unit_notes(places: list[str], counts: list[EventCounts]) -> list[str]:
+    """One line for all recordings whose times look wrong."""
+    odd = [(place, note) for place, count in zip(places, counts, strict=True) for note in count.notes]
+    others = f" (and {len(odd) - 1} more)" if len(odd) > 1 else ""
+    return [f"{place}{others}: {note}" for place, note in odd[:1]]
+
+
+def _taxel_notes(source: str, events: NDArray[np.uint8]) -> list[str]:
+    """Taxels that count from 1 leave the first silent, and no other."""
+    alive = np.asarray(events.any(axis=(0, 2, 3)), np.bool_)
+    if len(alive) < 4 or alive[0] or not alive[1:].all():
+        return []
+    return [f"{source}: no event at taxel 0, some at each of 1..{len(alive) - 1}: if these count from 1, count from 0"]
 
 
 def _read(file: Path, where: str, bin_s: float, taxels: int | None) -> tuple[NDArray[np.uint8], int, EventCounts]:

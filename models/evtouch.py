@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,7 +44,7 @@ Read = Callable[[str], bytes]
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Recordings:
-    """Event recordings of one split, all of one shape.
+    """Event recordings of one split, in one array: shorter ones are filled up with silence that does not count.
 
     Parameters
     ----------
@@ -57,6 +58,8 @@ class Recordings:
         For example ``test``.
     source : str
         Name of the folder, zip or generator.
+    lengths : (samples,) int64, or None
+        Steps of each recording; read-only. None where all have as many as the array, as in the released layout.
     """
 
     events: NDArray[np.uint8]
@@ -64,12 +67,15 @@ class Recordings:
     files: tuple[str, ...]
     split: str
     source: str
+    lengths: NDArray[np.int64] | None = None
 
     def __post_init__(self) -> None:
-        for name, array in (("events", self.events), ("labels", self.labels)):
-            view = np.ascontiguousarray(array).view()
-            view.flags.writeable = False
-            object.__setattr__(self, name, view)
+        for name in ("events", "labels", "lengths"):
+            array = getattr(self, name)
+            if array is not None:
+                view = np.ascontiguousarray(array).view()
+                view.flags.writeable = False
+                object.__setattr__(self, name, view)
 
     def __len__(self) -> int:
         """Return the number of recordings."""
@@ -82,8 +88,17 @@ class Recordings:
 
     @property
     def steps(self) -> int:
-        """Time steps of each recording."""
+        """Time steps of the longest recording."""
         return int(self.events.shape[3])
+
+    def steps_of(self, index: int) -> int:
+        """Time steps of one recording."""
+        return self.steps if self.lengths is None else int(self.lengths[index])
+
+    def identity(self) -> dict[str, NDArray[Any]]:
+        """Arrays that tell these recordings from others, whatever their names."""
+        arrays: dict[str, NDArray[Any]] = {"events": self.events, "labels": self.labels}
+        return arrays if self.lengths is None else arrays | {"lengths": self.lengths}
 
 
 def load_recordings(
@@ -173,10 +188,11 @@ def _opened(path: Path, splits: set[str]) -> Iterator[tuple[list[str], Read]]:
             raise DataError(f"{path}: zip {_COPY_AGAIN}") from error
         raise DataError(f"{path}: neither a folder nor a zip; {_GIVE}") from error
     with archive:
-        infos = [info for info in archive.infolist() if not info.is_dir()]
         for info in archive.infolist():
-            if _UNSAFE.search(info.orig_filename) or not info.orig_filename.isprintable():
-                raise DataError(f"{path.name}: unsafe name {info.orig_filename!r} in the zip; do not trust this file")
+            name = info.orig_filename
+            if not info.filename or _UNSAFE.search(name) or not name.isprintable():  # what a zero byte cuts to nothing
+                raise DataError(f"{path.name}: unsafe name {name!r} in the zip; do not trust this file")
+        infos = [info for info in archive.infolist() if not info.is_dir()]
         wanted = [info for info in infos if info.filename.endswith(".npy")]
         for info in wanted:
             # Other methods cannot be decompressed in bounded steps.

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 from tqdm import tqdm
 
 from compiler.errors import DataError, ModelError, OptionError
@@ -142,7 +143,7 @@ def initial_forms(
             threshold = np.rint(population.theta * step_units(width, (exponent,)) / step).astype(np.int64)
             if threshold.min() >= COARSEST:
                 break
-        largest = threshold.max() / population.theta * np.abs(population.bias).max(initial=0) * (1 << MEMBRANE_SHIFT)
+        largest = np.abs(threshold * population.bias).max(initial=0) / population.theta * (1 << MEMBRANE_SHIFT)
         if threshold.max() > THRESHOLD_MANTISSA_MAX or largest > BIAS_MANTISSA_MAX << BIAS_EXPONENT_MAX:
             raise ModelError(
                 f"{population.name}: its weights are too small for its threshold or biases at {width} bits: the "
@@ -239,8 +240,8 @@ def finetune(
     options = {
         "checkpoint": checkpoint.sha256,
         "graph": arrays_digest({"adjacency": adjacency}),
-        "training data": arrays_digest({"events": training.events, "labels": training.labels}),
-        "test data": arrays_digest({"events": test.events, "labels": test.labels}),
+        "training data": arrays_digest(training.identity()),
+        "test data": arrays_digest(test.identity()),
         "weight bits": list(widths),
         "scale groups": groups,
         "epochs": epochs,
@@ -288,27 +289,37 @@ def _epoch(
         chosen = order[step * BATCH : (step + 1) * BATCH]
         optimizer.zero_grad()
         labels = training.labels[chosen]
-        rates = model(time_first(training.events[chosen]))
+        lengths = None if training.lengths is None else torch.tensor(training.lengths[chosen])
+        rates = model(time_first(training.events[chosen]), lengths)
         loss = rate_loss(rates, labels)
         loss.backward()  # type: ignore[no-untyped-call]
+        _require_finite(model, loss, index + 1)
         optimizer.step()
         model.clip_weights()
         model.make_legal()
         total += float(loss.detach()) * len(chosen)
         correct += int(np.sum(rates.detach().numpy().argmax(axis=1) == labels))
-    if not math.isfinite(total):
-        raise DataError(
-            f"epoch {index + 1}: the loss is {total}, a finite number is needed; the state of the epoch before is kept"
-        )
     return TunedEpoch(epoch=index + 1, loss=total / len(order), correct=correct)
+
+
+def _require_finite(model: QuantisedNet, loss: Tensor, epoch: int) -> None:
+    """Stop before the weights are touched: those that are no numbers cannot be rounded."""
+    gradients = [parameter.grad for parameter in model.parameters() if parameter.grad is not None]
+    for name, values in (("loss", [loss.detach()]), ("gradient", gradients)):
+        found = sum(float(value.sum()) for value in values)
+        if not math.isfinite(found):
+            raise DataError(
+                f"epoch {epoch}: the {name} is {found}, a finite number is needed; the epochs before it are kept"
+            )
 
 
 def count_right(model: QuantisedNet, recordings: Recordings) -> int:
     """Recordings that the quantised model decides right; equal top rates count for the lowest class."""
     right = 0
     with torch.no_grad():
-        for events, label in zip(recordings.events, recordings.labels, strict=True):
-            right += int(model(time_first(events[None])).numpy()[0].argmax() == label)
+        for index, label in enumerate(recordings.labels):
+            events = recordings.events[index : index + 1, ..., : recordings.steps_of(index)]
+            right += int(model(time_first(events)).numpy()[0].argmax() == label)
     return right
 
 

@@ -41,6 +41,9 @@ _JITTER = 0.4  # of a level, in each step under load
 _STRAY = 0.01  # events from nothing
 
 
+SYNTHETIC = "synthetic"
+"""Name of these recordings where data is asked for."""
+
 SPLITS = {"train": (60, 1), "test": (24, 2)}
 """Grasps of each class, and the seed, of the splits that stand in for a data set."""
 

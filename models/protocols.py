@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compiler.errors import DataError
+from compiler.frontends.checkpoint import arrays_digest
 from models.evtouch import Recordings
 from models.networks import Architecture
 from models.train import Trained, train
@@ -70,7 +71,21 @@ def validation_split(training: Recordings) -> tuple[Recordings, Recordings]:
 def _part(recordings: Recordings, chosen: NDArray[np.bool_], split: str) -> Recordings:
     files = tuple(name for name, keep in zip(recordings.files, chosen, strict=True) if keep)
     return replace(
-        recordings, events=recordings.events[chosen], labels=recordings.labels[chosen], files=files, split=split
+        recordings,
+        events=recordings.events[chosen],
+        labels=recordings.labels[chosen],
+        files=files,
+        split=split,
+        lengths=None if recordings.lengths is None else recordings.lengths[chosen],
+    )
+
+
+def data_digest(training: Recordings, test: Recordings) -> str:
+    """Hash over both splits, whatever their names."""
+    splits = {"train": training, "test": test}
+    names = {"events": "", "labels": "_labels", "lengths": "_lengths"}
+    return arrays_digest(
+        {f"{split}{names[key]}": array for split, data in splits.items() for key, array in data.identity().items()}
     )
 
 

@@ -177,9 +177,21 @@ class QuantisedNet(nn.Module):
             found.append(spikes)
         return found
 
-    def forward(self, events: Tensor) -> Tensor:
-        """Spikes per step of each output neuron, (samples, classes)."""
-        return self.spikes_of(events)[-1].mean(0)
+    def forward(self, events: Tensor, lengths: Tensor | None = None) -> Tensor:
+        """Spikes per step of each output neuron, (samples, classes).
+
+        Parameters
+        ----------
+        events : (steps, samples, channels)
+            Zeros and ones.
+        lengths : (samples,) int64, optional
+            Steps of each recording, where some were filled up with silence.
+        """
+        spikes = self.spikes_of(events)[-1]
+        if lengths is None:
+            return spikes.mean(0)
+        inside = torch.arange(len(spikes))[:, None] < lengths
+        return torch.sum(spikes * inside[..., None], dim=0) / lengths[:, None]
 
 
 class _ChipLayer(torch.autograd.Function):

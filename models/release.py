@@ -1,7 +1,11 @@
-"""Write recordings in the released layout: ``SPLIT/sample_N_label_L.npy``, float32 (taxels, 2, steps)."""
+"""Write recordings in the released layout: ``SPLIT/sample_N_label_L.npy``, float32 (taxels, 2, steps).
+
+A table beside the splits says which file each of them was.
+"""
 
 from __future__ import annotations
 
+import csv
 import io
 import os
 import shutil
@@ -16,6 +20,9 @@ from compiler.atomic import write_atomically
 from compiler.errors import DataError, OptionError
 from models.events import need_labels
 from models.evtouch import Recordings
+
+SOURCES = "sources.csv"
+"""Table of split, new name and old name of every recording."""
 
 _EPOCH = (1980, 1, 1, 0, 0, 0)  # equal recordings give equal zips
 
@@ -72,11 +79,27 @@ def write_released(path: str | os.PathLike[str], splits: Sequence[Recordings]) -
 def _members(splits: Sequence[Recordings]) -> Iterator[tuple[str, bytes]]:
     """Name and content of every file."""
     for recordings in splits:
-        width = len(str(len(recordings) - 1))
-        for index, (events, label) in enumerate(zip(recordings.events, recordings.labels.tolist(), strict=True)):
+        for index, events in enumerate(recordings.events):
             buffer = io.BytesIO()
             np.lib.format.write_array(buffer, events.astype(np.float32), version=(1, 0), allow_pickle=False)
-            yield f"{recordings.split}/sample_{index:0{width}}_label_{label}.npy", buffer.getvalue()
+            yield f"{recordings.split}/{_name(recordings, index)}", buffer.getvalue()
+    yield SOURCES, _sources(splits)
+
+
+def _name(recordings: Recordings, index: int) -> str:
+    width = len(str(len(recordings) - 1))
+    return f"sample_{index:0{width}}_label_{recordings.labels[index]}.npy"
+
+
+def _sources(splits: Sequence[Recordings]) -> bytes:
+    """Which file became which."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["split", "file", "source"])
+    for recordings in splits:
+        for index, file in enumerate(recordings.files):
+            writer.writerow([recordings.split, _name(recordings, index), file])
+    return text.getvalue().encode()
 
 
 def write_event_lines(path: str | os.PathLike[str], splits: Sequence[Recordings], bin_s: float) -> None:

@@ -28,11 +28,11 @@ class TrainingState:
     Parameters
     ----------
     options : mapping
-        JSON values that must be equal to go on: data, graph, architecture, seed, rates.
+        JSON values that must be equal to go on: digests of data and graph, architecture, epochs, seed, rates.
     progress : mapping
-        JSON values: history, best epoch, state of the order's generator, learning rate.
+        JSON values, as the training sees fit: history, state of the order's generator, learning rate.
     arrays : mapping of str to arrays
-        Parameters, optimizer moments, kept weights.
+        Parameters, optimizer moments, weights of epochs that are kept.
     """
 
     options: Mapping[str, Any]
@@ -72,8 +72,8 @@ def read_state(path: str | os.PathLike[str], options: Mapping[str, Any]) -> Trai
     differing = sorted(name for name in {*found, *options} if found.get(name) != options.get(name))
     if differing:
         raise OptionError(
-            f"{path}: was written with another {', '.join(differing)}; give the same options and data, "
-            "or leave --resume away"
+            f"{path}: belongs to a training with other {', '.join(differing)}; give the same options and data, "
+            "or delete it to train anew"
         )
     return TrainingState(options=found, progress=progress, arrays=arrays)
 

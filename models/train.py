@@ -156,8 +156,8 @@ def train(
     options = {
         "architecture": repr(architecture),
         "graph": arrays_digest({"adjacency": adjacency}),
-        "training data": arrays_digest({"events": training.events, "labels": training.labels}),
-        "test data": arrays_digest({"events": test.events, "labels": test.labels}),
+        "training data": arrays_digest(training.identity()),
+        "test data": arrays_digest(test.identity()),
         "epochs": epochs,
         "seed": seed,
         "learning rate": learning_rate,
@@ -167,7 +167,7 @@ def train(
     order = np.random.default_rng(seed)
     history: list[Epoch] = []
     weights: dict[str, Weights] = {}
-    with _one_thread():
+    with one_thread():
         network = TactileSGNet(architecture, adjacency, seed=seed).to(device)
         optimizer = torch.optim.Adam(network.parameters(), lr=learning_rate, amsgrad=True, fused=device == "cpu")
         if resume and state is not None and state.exists():
@@ -218,7 +218,7 @@ def train(
 def _check_options(epochs: int, seed: int, device: str) -> None:
     for name, value, least in (("epochs", epochs, 1), ("seed", seed, 0)):
         if value < least:
-            raise OptionError(f"{name}: {value}, allowed are {least} or more; choose another")
+            raise OptionError(f"--{name} {value}: allowed are {least} or more; choose another")
     if device not in DEVICES:
         raise OptionError(f"--device {device}: unknown; allowed: {', '.join(DEVICES)}")
     if device == "cuda" and not torch.cuda.is_available():
@@ -269,11 +269,10 @@ def evaluate(network: TactileSGNet, recordings: Recordings) -> tuple[float, int]
     """Mean loss, and how many recordings are classified correctly; equal top rates count for the lowest class."""
     loss, correct = 0.0, 0
     with torch.no_grad():
-        for start in range(0, len(recordings), TEST_BATCH):
-            chosen = slice(start, start + TEST_BATCH)
+        for chosen, events in _batches(recordings):
             labels = recordings.labels[chosen]
-            rates = _rates(network, recordings.events[chosen])
-            loss += float(_loss(rates, labels)) * len(labels)
+            rates = _rates(network, events)
+            loss += float(rate_loss(rates, labels)) * len(labels)
             correct += int(np.sum(rates.numpy().argmax(axis=1) == labels))
     return loss / len(recordings), correct
 
@@ -281,10 +280,21 @@ def evaluate(network: TactileSGNet, recordings: Recordings) -> tuple[float, int]
 def predict(network: TactileSGNet, recordings: Recordings) -> NDArray[np.int64]:
     """Class of each recording; equal top rates count for the lowest one."""
     found = []
-    with torch.no_grad(), _one_thread():
-        for start in range(0, len(recordings), TEST_BATCH):
-            found.append(_rates(network, recordings.events[start : start + TEST_BATCH]).numpy().argmax(axis=1))
+    with torch.no_grad(), one_thread():
+        for _, events in _batches(recordings):
+            found.append(_rates(network, events).numpy().argmax(axis=1))
     return np.concatenate(found)
+
+
+def _batches(recordings: Recordings) -> Iterator[tuple[slice, NDArray[np.uint8]]]:
+    """All recordings in order, a few of one length at a time: where they stand, and their events without filling."""
+    start = 0
+    while start < len(recordings):
+        steps, stop = recordings.steps_of(start), start + 1
+        while stop < min(start + TEST_BATCH, len(recordings)) and recordings.steps_of(stop) == steps:
+            stop += 1
+        yield slice(start, stop), recordings.events[start:stop, ..., :steps]
+        start = stop
 
 
 def _train_epoch(
@@ -294,14 +304,16 @@ def _train_epoch(
     for index in order:
         chosen = slice(index, index + 1)
         optimizer.zero_grad()
-        loss = _loss(_rates(network, recordings.events[chosen]), recordings.labels[chosen])
+        events = recordings.events[chosen, ..., : recordings.steps_of(int(index))]
+        loss = rate_loss(_rates(network, events), recordings.labels[chosen])
         loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
         total += float(loss.detach())
     return total / len(order)
 
 
-def _loss(rates: Tensor, labels: NDArray[np.int64]) -> Tensor:
+def rate_loss(rates: Tensor, labels: NDArray[np.int64]) -> Tensor:
+    """Mean squared error of spike rates (samples, classes) against zeros and a one."""
     target = torch.zeros_like(rates)
     target[torch.arange(len(labels)), torch.tensor(labels)] = 1.0
     return torch.nn.functional.mse_loss(rates, target)
@@ -335,7 +347,7 @@ def _check(recordings: Recordings, architecture: Architecture) -> None:
 
 
 @contextmanager
-def _one_thread() -> Iterator[None]:
+def one_thread() -> Iterator[None]:
     """One torch thread, subnormal numbers flushed to zero (beta**t decays into them); both undone at the end."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)

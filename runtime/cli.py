@@ -20,28 +20,29 @@ import numpy as np
 
 from compiler.atomic import write_atomically
 from compiler.errors import OptionError, SpikeloomError
-from compiler.frontends.checkpoint import Checkpoint, read_checkpoint
+from compiler.frontends.checkpoint import WEIGHTS, Checkpoint, read_checkpoint
 from compiler.netlist import Netlist
 from compiler.passes.legalize import measure
-from compiler.passes.quantize import RANGES, Recipe
-from compiler.pipeline import STAGES, compile_checkpoint
+from compiler.passes.quantize import Recipe
+from compiler.pipeline import compile_checkpoint
 from compiler.serialize import is_netlist, read_netlist, write_netlist
 from compiler.targets import load_target
 from compiler.text import text
 from models.evtouch import Recordings
 from models.graphs import CHOICES
-from runtime import render, watch
-from runtime.data_commands import add_bin_option, add_data_commands
+from models.grasps import SYNTHETIC
+from runtime import bits, decisions, explain, finetune, render, watch
+from runtime.data_commands import add_data_commands
 from runtime.inputs import (
-    SYNTHETIC,
     asked_graph,
     graph_words,
     propagation,
     recordings,
+    require_inspectable,
     require_place,
     shipped,
 )
-from runtime.options import add_model, add_recordings, add_training
+from runtime.options import MARGIN, add_compile, add_model, add_recordings, add_training
 from runtime.tables import show
 
 Arguments = argparse.Namespace
@@ -55,6 +56,8 @@ DEMO = (
     ("estimate", "{folder}/grasps.loom", "--data", SYNTHETIC),
 )
 """The main job on what the package ships; ``demo`` runs these commands in a temporary folder."""
+
+MIN_AGREEMENT = 0.95
 
 
 def version() -> str:
@@ -99,11 +102,14 @@ def _numbers(text: str, option: str) -> list[int]:
         raise OptionError(f"{option} {text}: not a number; give one, or one for each layer as in 8,4,4,8") from None
 
 
-def _recipes(arguments: Arguments) -> tuple[Recipe, ...]:
+def _recipes(arguments: Arguments) -> tuple[Recipe, ...] | None:
+    """Storage that the options ask for, or None where they do not."""
+    if not (arguments.weight_bits or arguments.planes or arguments.scale_groups):
+        return None
     asked = {
-        "--weight-bits": _numbers(arguments.weight_bits, "--weight-bits"),
-        "--planes": _numbers(arguments.planes, "--planes"),
-        "--scale-groups": _numbers(arguments.scale_groups, "--scale-groups"),
+        "--weight-bits": _numbers(arguments.weight_bits or "8", "--weight-bits"),
+        "--planes": _numbers(arguments.planes or "1", "--planes"),
+        "--scale-groups": _numbers(arguments.scale_groups or "1", "--scale-groups"),
     }
     layers = max(len(values) for values in asked.values())
     for option, values in asked.items():
@@ -113,12 +119,29 @@ def _recipes(arguments: Arguments) -> tuple[Recipe, ...]:
     return tuple(Recipe(bits=b, planes=p, groups=g) for b, p, g in zip(*columns, strict=True))
 
 
+def _storage(recipes: tuple[Recipe, ...] | None, checkpoint: Checkpoint) -> Report:
+    """The same for the provenance of a netlist."""
+    if checkpoint.forms is not None:
+        return {"weight_bits": _one_or_list([form.bits for form in checkpoint.forms]), "fine_tuned": True}
+    known = recipes or (Recipe(),)
+    return {
+        "weight_bits": _one_or_list([recipe.bits for recipe in known]),
+        "planes": _one_or_list([recipe.planes for recipe in known]),
+        "scale_groups": _one_or_list([recipe.groups for recipe in known]),
+    }
+
+
 def _one_or_list(values: list[int]) -> int | list[int]:
     return values[0] if len(set(values)) == 1 else values
 
 
 def _compile(arguments: Arguments) -> Outcome:
-    require_place(arguments.output, "-o")
+    require_place(arguments.output, "-o", arguments)
+    if arguments.margin is not None and arguments.ranges != "observed":
+        raise OptionError(
+            f"--margin {arguments.margin:g}: only observed ranges have one; add --ranges observed or leave it away"
+        )
+    margin = MARGIN if arguments.margin is None else arguments.margin
     load_target(arguments.target)
     recipes = _recipes(arguments)
     checkpoint = _checkpoint(arguments.checkpoint, arguments)
@@ -145,21 +168,23 @@ def _compile(arguments: Arguments) -> Outcome:
         target=arguments.target,
         recipes=recipes,
         spike_exact=arguments.spike_exact,
+        keep_all=arguments.keep_all,
+        prune_unused=arguments.prune_unused,
         training_events=training,
         ranges=arguments.ranges,
-        margin=arguments.margin,
+        margin=margin,
         provenance={
             "spikeloom": version(),
             "checkpoint_sha256": checkpoint.sha256,
             "run": arguments.run,
             "weights": checkpoint.weights,
             "graph": name,
-            "weight_bits": _one_or_list([recipe.bits for recipe in recipes]),
-            "planes": _one_or_list([recipe.planes for recipe in recipes]),
-            "scale_groups": _one_or_list([recipe.groups for recipe in recipes]),
+            **_storage(recipes, checkpoint),
             "spike_exact": arguments.spike_exact,
+            "keep_all": arguments.keep_all,
+            "prune_unused": arguments.prune_unused,
             "ranges": arguments.ranges,
-            "margin": arguments.margin,
+            "margin": margin,
             "calibrated": training is not None,
         },
         after=dump,
@@ -169,7 +194,12 @@ def _compile(arguments: Arguments) -> Outcome:
 
 
 def _inspect(arguments: Arguments) -> Outcome:
+    require_inspectable(arguments.path)
     if is_netlist(arguments.path):
+        for name in ("beta", "theta", "weights", "run"):
+            value = getattr(arguments, name)
+            if value is not None and (name, value) != ("run", 0):
+                raise OptionError(f"--{name} {value}: is for checkpoints, {arguments.path} is a netlist; leave it away")
         netlist = read_netlist(arguments.path)
         uses = measure(netlist, load_target(netlist.target))
         return render.netlist_json(netlist, uses, _sha256(arguments.path)), render.netlist_text, 0
@@ -183,29 +213,34 @@ def _run(arguments: Arguments) -> Outcome:
     from runtime.votes import class_counts, predictions
 
     if arguments.spikes is not None:
-        require_place(arguments.spikes, "--spikes")
+        require_place(arguments.spikes, "--spikes", arguments)
     netlist = read_netlist(arguments.netlist)
     data = _recordings(arguments, netlist)
     _progress("running")
     events = data.events.reshape(len(data), -1, data.steps)
-    trace = engine.simulate(netlist, events, spikes=arguments.spikes is not None)
+    trace = engine.simulate(netlist, events, lengths=data.lengths, spikes=arguments.spikes is not None)
     if trace.spikes is not None:
         layers = {layer.name: aligned(netlist, trace.spikes, i) for i, layer in enumerate(netlist.layers)}
         with write_atomically(arguments.spikes) as file:
             np.savez_compressed(file, **layers)  # type: ignore[arg-type]
     counts = class_counts(netlist, trace.counts.spikes)
-    report = render.run_json(data.files, data.labels, counts, predictions(netlist, trace.counts.spikes))
-    return report, render.run_text, 0
+    report = decisions.run_json(data.files, data.labels, counts, predictions(netlist, trace.counts.spikes))
+    return report, decisions.run_text, 0
 
 
 def _verify(arguments: Arguments) -> Outcome:
     from runtime.equivalence import verify
     from runtime.levels import levels_of, parse_requirements, unmet
 
-    if not 0 <= arguments.min_agreement <= 1:
-        raise OptionError(f"--min-agreement {arguments.min_agreement}: not a share; give a number from 0 to 1")
-    required = {"E0": 1.0, "E3": arguments.min_agreement}
+    agreement = MIN_AGREEMENT if arguments.min_agreement is None else arguments.min_agreement
+    if not 0 <= agreement <= 1:
+        raise OptionError(f"--min-agreement {agreement}: not a share; give a number from 0 to 1")
+    required = {"E0": 1.0, "E3": agreement}
     if arguments.require is not None:
+        if arguments.min_agreement is not None:
+            raise OptionError(
+                f"--min-agreement {agreement:g}: --require replaces it; write E3={agreement:g} into that instead"
+            )
         required = parse_requirements(arguments.require)
     netlist = read_netlist(arguments.netlist)
     checkpoint = _checkpoint(arguments.checkpoint, arguments)
@@ -218,6 +253,7 @@ def _verify(arguments: Arguments) -> Outcome:
         data.events,
         data.labels,
         data.files,
+        original=None if arguments.original is None else _checkpoint(arguments.original, arguments),
         spec_samples=arguments.spec_samples,
         progress=_progress,
     )
@@ -236,28 +272,28 @@ def _estimate(arguments: Arguments) -> Outcome:
     data = _recordings(arguments, netlist)
     _progress("running")
     events = data.events.reshape(len(data), -1, data.steps)
-    trace = engine.simulate(netlist, events)
-    costs = cost.estimate(netlist, load_target(netlist.target), trace.counts, data.steps)
+    trace = engine.simulate(netlist, events, lengths=data.lengths)
+    steps = data.steps if data.lengths is None else data.lengths
+    costs = cost.estimate(netlist, load_target(netlist.target), trace.counts, steps)
     return render.estimate_json(netlist, costs), render.estimate_text, 0
 
 
 def _train(arguments: Arguments) -> Outcome:
+    from runtime.seeds import train_seeds
     from runtime.training import (
         PICTURES,
-        PROTOCOLS,
         Job,
         check_seeds,
         draw_training,
         output_of,
         summary,
-        train_seeds,
         training_text,
     )
 
     check_seeds(arguments.seeds)
-    require_place(arguments.output, "-o")
+    require_place(arguments.output, "-o", arguments)
     if arguments.picture is not None:
-        require_place(arguments.picture, "--picture")
+        require_place(arguments.picture, "--picture", arguments)
         if Path(arguments.picture).suffix not in PICTURES:
             raise OptionError(f"--picture {arguments.picture}: allowed are {', '.join(PICTURES)}; name one of these")
     graph = asked_graph(arguments)
@@ -270,7 +306,7 @@ def _train(arguments: Arguments) -> Outcome:
     _progress("")
     data = arguments.data if arguments.data == SYNTHETIC else training.source
     command = f"spikeloom train --data {data} {graph_words(arguments)} --epochs {arguments.epochs}"
-    keep = tuple(dict.fromkeys(arguments.keep or PROTOCOLS))
+    keep = tuple(dict.fromkeys(arguments.keep or WEIGHTS))
     jobs = [
         Job(
             training=training,
@@ -284,14 +320,16 @@ def _train(arguments: Arguments) -> Outcome:
             keep=keep,
             command=f"{command} --seed {seed}",
             facts={"spikeloom": version(), "device": arguments.device},
+            draws=arguments.picture is not None,
             position=position,
         )
         for position, seed in enumerate(range(arguments.seed, arguments.seed + arguments.seeds))
     ]
-    results = train_seeds(jobs)
+    results = train_seeds(jobs, resume=arguments.resume)
     records = [record for record, _ in results]
     if arguments.picture is not None:
-        draw_training(arguments.picture, records, test.labels, [predicted for _, predicted in results])
+        decided = [predicted for _, predicted in results if predicted is not None]
+        draw_training(arguments.picture, records, test.labels, decided)
     return {"runs": records, "protocols": summary(records)}, training_text, 0
 
 
@@ -335,32 +373,7 @@ def build_parser() -> argparse.ArgumentParser:
         return sub
 
     sub = command("compile", _compile, "lower a checkpoint to a netlist that obeys every limit of the chip")
-    sub.add_argument("checkpoint")
-    add_model(sub)
-    sub.add_argument("--target", default="loihi1", help="chip (default: loihi1)")
-    sub.add_argument(
-        "--weight-bits",
-        default="8",
-        metavar="N[,N]",
-        help="storage width, one or one a layer: 2 to 6 or 8 (default: 8)",
-    )
-    sub.add_argument("--planes", default="1", metavar="N[,N]", help="times a synapse is stored, 1 to 3 (default: 1)")
-    sub.add_argument("--scale-groups", default="1", metavar="N[,N]", help="scales in a layer, 1 to 8 (default: 1)")
-    sub.add_argument(
-        "--spike-exact",
-        action="store_true",
-        help="add planes and scales until the training spikes are the float model's",
-    )
-    sub.add_argument("--calibrate", metavar="PATH", help="recordings whose train split chooses the scales")
-    add_bin_option(sub)
-    sub.add_argument(
-        "--ranges", default="proven", help=f"how overflow is excluded: {' or '.join(RANGES)} (default: proven)"
-    )
-    sub.add_argument("--margin", type=float, default=0.1, help="share added to observed ranges (default: 0.1)")
-    sub.add_argument(
-        "--dump-after", action="append", default=[], choices=STAGES, help="print the network after a stage, on stderr"
-    )
-    sub.add_argument("-o", "--output", required=True, metavar="NET.loom")
+    add_compile(sub)
 
     sub = command("inspect", _inspect, "show a netlist (layers, scales, cores, fill of every limit) or a checkpoint")
     sub.add_argument("path")
@@ -377,14 +390,16 @@ def build_parser() -> argparse.ArgumentParser:
     add_model(sub)
     add_recordings(sub)
     sub.add_argument(
+        "--original", metavar="CKPT", help="float model for E2 and E3 (default: the weights of --checkpoint)"
+    )
+    sub.add_argument(
         "--spec-samples", type=int, default=3, metavar="N", help="recordings for spec = engine (default: 3)"
     )
     sub.add_argument(
         "--min-agreement",
         type=float,
-        default=0.95,
         metavar="X",
-        help="share of equal decisions to pass (default: 0.95)",
+        help=f"share of equal decisions to pass (default: {MIN_AGREEMENT:g})",
     )
     sub.add_argument(
         "--require",
@@ -398,6 +413,9 @@ def build_parser() -> argparse.ArgumentParser:
 
     sub = command("train", _train, "train a network by the released protocol, reported by the paper's and a clean one")
     add_training(sub)
+    bits.add_arguments(command("bits", bits.bits, bits.SUMMARY))
+    explain.add_arguments(command("explain", explain.explain, explain.SUMMARY))
+    finetune.add_arguments(command("finetune", finetune.finetune, finetune.SUMMARY))
     watch.add_arguments(command("watch", watch.watch, watch.SUMMARY))
     add_data_commands(commands)
     command("demo", _demo, "the main job on a shipped checkpoint and synthetic grasps; needs no file and no network")
@@ -429,7 +447,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         sys.stderr.writelines(f"spikeloom: {line}\n" for line in _mistake(error).splitlines())
         return 2
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as interrupt:
         _progress("")
-        sys.stderr.write("spikeloom: interrupted; nothing was written\n")
+        sys.stderr.write(f"spikeloom: interrupted; {str(interrupt) or 'nothing was written'}\n")
         return 2

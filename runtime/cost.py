@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from compiler.fixedpoint import FloatArray
+from compiler.fixedpoint import FloatArray, IntArray
 from compiler.netlist import Netlist
 from compiler.passes.place import hops
 from compiler.targets import EnergyTable, Target
@@ -59,7 +59,7 @@ class Costs:
     zeros : (samples, layers) float64
         Synaptic operations on stored zeros.
     steps : int
-        Chip steps of a recording.
+        Chip steps of the longest recording.
     energy : mapping of str to (samples, layers) float64
         Joules per table.
     unpriced : mapping of str to tuple of str
@@ -101,7 +101,9 @@ def _routes(netlist: Netlist, target: Target) -> FloatArray:
     return routes
 
 
-def count(netlist: Netlist, target: Target, counts: Counts, steps: int) -> tuple[dict[str, FloatArray], FloatArray]:
+def count(
+    netlist: Netlist, target: Target, counts: Counts, steps: int | IntArray
+) -> tuple[dict[str, FloatArray], FloatArray]:
     """Amount of every event per recording and layer, and the visited zeros.
 
     Parameters
@@ -112,19 +114,19 @@ def count(netlist: Netlist, target: Target, counts: Counts, steps: int) -> tuple
         Its chip.
     counts : Counts
         Of a batch: arrays have one leading axis of recordings.
-    steps : int
-        Data steps T of a recording.
+    steps : int or (samples,) int64
+        Data steps T of all recordings, or of each.
     """
     dense = (netlist.format_index_bits[netlist.axon_format] == 0)[netlist.axon_of_synapse()]
     sources = np.concatenate([counts.inputs, counts.spikes], axis=1).astype(np.float64)
     of_layer = np.eye(len(netlist.layers))[netlist.layer]
     sent = [counts.spikes @ (route[:, None] * of_layer) for route in _routes(netlist, target).T]
-    neurons = np.array([layer.neurons for layer in netlist.layers], np.float64)
+    neurons = np.bincount(netlist.layer, minlength=len(netlist.layers)).astype(np.float64)
     active = counts.updates.astype(np.float64)
     events = {
         "synaptic_operation_dense": sources @ _visits(netlist, dense.astype(np.float64)),
         "synaptic_operation_sparse": sources @ _visits(netlist, (~dense).astype(np.float64)),
-        "neuron_idle": neurons * (steps + netlist.max_depth) - active,
+        "neuron_idle": neurons * (np.reshape(steps, (-1, 1)) + netlist.max_depth) - active,
         "neuron_active": active,
         "spike": counts.spikes @ of_layer,
         "packet": sent[0],
@@ -154,7 +156,7 @@ def price(table: EnergyTable, events: Mapping[str, FloatArray]) -> FloatArray | 
     return energy
 
 
-def estimate(netlist: Netlist, target: Target, counts: Counts, steps: int) -> Costs:
+def estimate(netlist: Netlist, target: Target, counts: Counts, steps: int | IntArray) -> Costs:
     """Price a run with every table of its chip.
 
     Parameters
@@ -165,15 +167,15 @@ def estimate(netlist: Netlist, target: Target, counts: Counts, steps: int) -> Co
         Its chip, with energy tables.
     counts : Counts
         Of a batch of recordings, neuron updates included.
-    steps : int
-        Data steps T of a recording.
+    steps : int or (samples,) int64
+        Data steps T of all recordings, or of each.
     """
     events, zeros = count(netlist, target, counts, steps)
     priced = {table.name: price(table, events) for table in target.energy}
     return Costs(
         events=events,
         zeros=zeros,
-        steps=steps + netlist.max_depth,
+        steps=int(np.max(steps)) + netlist.max_depth,
         energy={name: result for name, result in priced.items() if not isinstance(result, tuple)},
         unpriced={name: result for name, result in priced.items() if isinstance(result, tuple)},
     )

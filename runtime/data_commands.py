@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,13 +14,15 @@ from compiler.errors import OptionError
 from compiler.fixedpoint import FloatArray
 from models.describe import RULES, Description, describe
 from models.eventfiles import UNLABELLED
-from models.events import BIN_S, GAP_S, EventCounts, data_splits, load_data
+from models.events import BIN_S, EventCounts, data_splits, load_data, require_events
 from models.evtouch import Recordings
 from models.fetch import DATA_SETS, data_folder, fetch_data
 from models.graphs import NEUTOUCH
-from models.grasps import SPLITS, synthetic_split
-from models.release import write_event_lines, write_released
+from models.grasps import SPLITS, SYNTHETIC, synthetic_split
+from models.release import SOURCES, write_event_lines, write_released
 from models.sensors import read_layout
+from runtime.found import counts_json, counts_text, number, show_notes
+from runtime.inputs import require_place
 from runtime.tables import table
 
 if TYPE_CHECKING:
@@ -30,20 +31,11 @@ if TYPE_CHECKING:
 Arguments = argparse.Namespace
 Json = dict[str, Any]
 
-SYNTHETIC = "synthetic"
-
-
-def show_counts(recordings: Recordings, counts: EventCounts | None) -> None:
-    """Say on stderr what was found while events were put into bins; the released layout has nothing to say."""
-    if counts is not None:
-        sys.stderr.write(f"{recordings.source}: {_counts_text(_counts_json(counts))}\n")
-
 
 def add_bin_option(parser: argparse.ArgumentParser) -> None:
     """Add ``--bin``."""
-    parser.add_argument(
-        "--bin", type=float, default=BIN_S, metavar="S", help=f"width of a time bin for events (default: {BIN_S:g} s)"
-    )
+    what = f"width of a time bin for event files (default: {BIN_S:g} s)"
+    parser.add_argument("--bin", type=float, default=BIN_S, metavar="S", help=what)
 
 
 def add_data_commands(commands: argparse._SubParsersAction[Any]) -> None:
@@ -122,9 +114,11 @@ def _fetch_text(report: Json) -> str:
 def _describe(arguments: Arguments) -> Outcome:
     if arguments.picture is not None:
         _check_picture(arguments.picture)
+        require_place(arguments.picture, "--picture", arguments)
     count, places = _layout(arguments.taxels)
     recordings, counts = _load(arguments.source, arguments.split, arguments.bin, count)
-    description = describe(recordings, arguments.bin, None if counts is None else counts.steps)
+    show_notes(counts)
+    description = describe(recordings, arguments.bin)
     if places is None and recordings.taxels == len(NEUTOUCH):
         places = NEUTOUCH
     if arguments.picture is not None:
@@ -147,7 +141,7 @@ def _description_json(
         "steps": recordings.steps,
         "duration_s": dict(zip(("shortest", "median", "longest"), description.duration_s, strict=True)),
         "events": description.events,
-        "found": None if counts is None else _counts_json(counts),
+        "found": None if counts is None else counts_json(counts),
         "labels": {str(label): number for label, number in description.classes.items() if label != UNLABELLED},
         "unlabelled": description.classes.get(UNLABELLED, 0),
         "rate": {
@@ -170,18 +164,18 @@ def _description_text(report: Json) -> str:
     lasts = f"{long} s" if short == long else f"{short} … {long} s (median {middle} s)"
     labels = report["labels"]
     each = sorted(set(labels.values()))
-    spread = _number(each[0], "recording") if len(each) == 1 else f"{each[0]} … {each[-1]} recordings" if each else ""
+    spread = number(each[0], "recording") if len(each) == 1 else f"{each[0]} … {each[-1]} recordings" if each else ""
     lines = [
-        f"{report['source']}, {report['split']}: {_number(report['recordings'], 'recording')}, "
-        f"{_number(report['taxels'], 'taxel')}, "
+        f"{report['source']}, {report['split']}: {number(report['recordings'], 'recording')}, "
+        f"{number(report['taxels'], 'taxel')}, "
         f"{lasts} in bins of {report['bin_s']:g} s",
-        f"  labels: {_number(len(labels), 'class') + f', {spread} each' if labels else 'none'}"
-        + (f"; {_number(report['unlabelled'], 'recording')} without" if labels and report["unlabelled"] else ""),
+        f"  labels: {number(len(labels), 'class') + f', {spread} each' if labels else 'none'}"
+        + (f"; {number(report['unlabelled'], 'recording')} without" if labels and report["unlabelled"] else ""),
         f"  events: {report['events']:,} after binning; {rate['falling']:.1f} falling and {rate['rising']:.1f} rising "
         "per second",
     ]
     if report["found"] is not None:
-        lines.append(f"  found: {_counts_text(report['found'])}")
+        lines.append(f"  found: {counts_text(report['found'])}")
     broken = {kind: set(report[kind.replace("-", "_")]) for kind in RULES}
     for kind, taxels in broken.items():
         shown = ", ".join(map(str, sorted(taxels))) or "none"
@@ -201,12 +195,17 @@ def _description_text(report: Json) -> str:
 
 
 def _convert(arguments: Arguments) -> Outcome:
+    lines = arguments.output.lower().endswith(".csv")
+    if lines or arguments.output.lower().endswith(".zip"):
+        require_place(arguments.output, "-o", arguments)
     count, places = _layout(arguments.taxels)
     present = tuple(SPLITS) if arguments.source == SYNTHETIC else data_splits(arguments.source)
     loaded = [_load(arguments.source, split, arguments.bin, count, places) for split in present or (arguments.split,)]
     taxels = max(recordings.taxels for recordings, _ in loaded)
     steps = max(recordings.steps for recordings, _ in loaded)
-    if arguments.output.lower().endswith(".csv"):
+    for _, counts in loaded:
+        show_notes(counts)
+    if lines:
         write_event_lines(arguments.output, [recordings for recordings, _ in loaded], arguments.bin)
     else:
         write_released(arguments.output, [_grown(recordings, taxels, steps) for recordings, _ in loaded])
@@ -215,10 +214,11 @@ def _convert(arguments: Arguments) -> Outcome:
         "output": arguments.output,
         "taxels": taxels,
         "steps": steps,
+        "names": None if lines else SOURCES,
         "splits": {
             recordings.split: {
                 "recordings": len(recordings),
-                "found": None if counts is None else _counts_json(counts, steps),
+                "found": None if counts is None else counts_json(counts, steps),
             }
             for recordings, counts in loaded
         },
@@ -227,11 +227,13 @@ def _convert(arguments: Arguments) -> Outcome:
 
 
 def _convert_text(report: Json) -> str:
-    lines = [f"{report['output']}: {_number(report['taxels'], 'taxel')}, {_number(report['steps'], 'bin')}"]
+    lines = [f"{report['output']}: {number(report['taxels'], 'taxel')}, {number(report['steps'], 'bin')}"]
     for split, made in report["splits"].items():
-        lines.append(f"  {split}: {_number(made['recordings'], 'recording')}")
+        lines.append(f"  {split}: {number(made['recordings'], 'recording')}")
         if made["found"] is not None:
-            lines.append(f"    found: {_counts_text(made['found'])}")
+            lines.append(f"    found: {counts_text(made['found'])}")
+    if report["names"] is not None:
+        lines.append(f"  names: {report['names']} in it says which recording became which")
     return "\n".join(lines)
 
 
@@ -252,6 +254,7 @@ def _load(
     source: str, split: str, bin_s: float, taxels: int | None, places: FloatArray | None = None
 ) -> tuple[Recordings, EventCounts | None]:
     if source == SYNTHETIC:
+        require_events(SYNTHETIC, bin_s)
         return (synthetic_split(split) if places is None else synthetic_split(split, coordinates=places)), None
     return load_data(source, split, bin_s=bin_s, taxels=taxels)
 
@@ -265,28 +268,3 @@ def _check_picture(path: str) -> None:
     """Refuse before the work, not after it."""
     if Path(path).suffix.lower() != ".png":
         raise OptionError(f"--picture {path}: allowed is a PNG; give a name that ends in .png")
-    if not Path(path).absolute().parent.is_dir():
-        raise OptionError(f"--picture {path}: the folder does not exist; make it first")
-
-
-def _counts_json(counts: EventCounts, steps: int | None = None) -> Json:
-    """Counts under the keys that scripts rely on; `steps` where all splits were padded to one length."""
-    found = asdict(counts)
-    return {key: found[key] for key in ("events", "out_of_order", "duplicates", "gaps")} | {
-        "gap_s": GAP_S,
-        "padded": sum(own < (steps or max(counts.steps)) for own in counts.steps),
-    }
-
-
-def _counts_text(found: Json) -> str:
-    return (
-        f"{_number(found['events'], 'event')} read, {found['out_of_order']:,} out of order, "
-        f"{_number(found['duplicates'], 'duplicate')} in a bin, "
-        f"{_number(found['gaps'], 'gap')} over {found['gap_s']:g} s, "
-        f"{_number(found['padded'], 'recording')} padded at the end"
-    )
-
-
-def _number(count: int, noun: str) -> str:
-    plural = f"{noun}es" if noun.endswith("s") else f"{noun}s"
-    return f"{count:,} {noun if count == 1 else plural}"

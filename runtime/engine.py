@@ -244,6 +244,7 @@ def simulate(
     netlist: Netlist | Engine,
     events: EventArray,
     *,
+    lengths: IntArray | None = None,
     spikes: bool = False,
     membranes: bool = False,
     threads: int | None = None,
@@ -257,6 +258,8 @@ def simulate(
         The placed network; :func:`prepare` it once to run several batches.
     events : (recordings, n_inputs, T) uint8 or bool
         Input events; any value but zero is an event.
+    lengths : (recordings,) int64, optional
+        Steps of each recording where some are shorter than T. What comes after them is not run: zeros in the trace.
     spikes, membranes : bool
         Whether to keep these per chip step: one and four bytes for each recording, chip step and compartment.
     threads : int, optional
@@ -281,8 +284,7 @@ def simulate(
     netlist = engine.netlist
     check_channels(netlist, events.shape[1])
     recordings, _, length = events.shape
-    chip_length = length + netlist.max_depth
-    shape = (recordings, chip_length, netlist.n_compartments)
+    shape = (recordings, length + netlist.max_depth, netlist.n_compartments)
     kept_spikes = np.zeros(shape, np.bool_) if spikes else None
     kept_membranes = np.zeros(shape, np.int32) if membranes else None
     counts = Counts(
@@ -294,15 +296,17 @@ def simulate(
 
     def run(index: int) -> None:
         state = start(engine)
+        own = length if lengths is None else int(lengths[index])
+        window = own + netlist.max_depth
         try:
             advance(
                 engine,
                 state,
-                events[index],
-                length=length,
-                steps=chip_length,
-                spikes=None if kept_spikes is None else kept_spikes[index],
-                membranes=None if kept_membranes is None else kept_membranes[index],
+                events[index, :, :own],
+                length=own,
+                steps=window,
+                spikes=None if kept_spikes is None else kept_spikes[index, :window],
+                membranes=None if kept_membranes is None else kept_membranes[index, :window],
             )
         except NumericRangeError as error:
             error.add_note(f"recording {index} of {recordings}, counted from 0")

@@ -15,13 +15,14 @@ import numpy.typing as npt
 from compiler.errors import DataError, ModelError
 from compiler.fixedpoint import MEMBRANE_SHIFT, FloatArray, IntArray
 from compiler.frontends.checkpoint import Checkpoint
-from compiler.interpret import BoolArray, channels_last, run_float, run_integer, vote
+from compiler.interpret import BoolArray, channels_last, cut, run_float, run_integer, vote
 from compiler.ir import IntegerNetwork, Network, Projection, Sparse
 from compiler.lift import lift
 from compiler.netlist import Netlist
 from compiler.passes.expand import expand
 from runtime import engine, spec
-from runtime.trace import aligned, check_channels
+from runtime.certificates import Certificate, certify
+from runtime.trace import aligned, check_channels, heard
 from runtime.votes import class_counts
 
 LADDER = ("float64", "beta", "weights", "bias_threshold", "rounding", "saturation")
@@ -115,6 +116,8 @@ class Verdict:
     quantised_different : int or None
         Spikes of all layers in which a fine-tuned checkpoint's torch model, on chip integers, and the chip differ;
         None where the checkpoint was not fine-tuned.
+    certificate : Certificate
+        What of all this holds in whatever order the float model adds, and of registers for any input.
     """
 
     files: tuple[str, ...]
@@ -130,6 +133,7 @@ class Verdict:
     ladder: tuple[tuple[str, Mapping[str, int]], ...]
     same_checkpoint: bool
     quantised_different: int | None
+    certificate: Certificate
 
     @property
     def float_accuracy(self) -> float:
@@ -253,11 +257,15 @@ def _first_divergence(
         for step, neuron in np.argwhere(d[sample])[:1]
     )
     layer = netlist.layers[index]
+    ill_posed = bool(wide[index][sample, step, neuron] != reference[index][sample, step, neuron])
+    neuron = int(np.arange(layer.neurons)[heard(netlist, index)][neuron])
     trace = engine.simulate(prepared, events[sample : sample + 1], membranes=True)
     assert trace.membranes is not None, "membranes were asked for"
     register = int(aligned(netlist, trace.membranes, index)[0, step, neuron])
-    compartment = int(netlist.compartments_of(index)[neuron])
-    scale, threshold = float(netlist.scale[compartment]), int(netlist.threshold[compartment])
+    ids = netlist.compartments_of(index)
+    held = ids[netlist.neuron[ids] == neuron]  # empty where the chip leaves the neuron out, which then stays at zero
+    scale = float(netlist.scale[held[0]]) if len(held) else 1.0
+    chip_theta = int(netlist.threshold[held[0]]) / scale if len(held) else layer.theta
     graph = layer.depth == 0 and layer.neurons % netlist.taxels == 0
     features = layer.neurons // netlist.taxels
     return Divergence(
@@ -271,8 +279,8 @@ def _first_divergence(
         chip_membrane=register / (scale * (1 << MEMBRANE_SHIFT)),
         chip_register=register,
         theta=layer.theta,
-        chip_theta=threshold / scale,
-        ill_posed=bool(wide[index][sample, step, neuron] != reference[index][sample, step, neuron]),
+        chip_theta=chip_theta,
+        ill_posed=ill_posed,
     )
 
 
@@ -284,6 +292,7 @@ def verify(
     labels: IntArray,
     files: tuple[str, ...],
     *,
+    lengths: IntArray | None = None,
     original: Checkpoint | None = None,
     spec_samples: int = 3,
     progress: Callable[[str], None] | None = None,
@@ -304,6 +313,8 @@ def verify(
         Their classes.
     files : tuple of str
         Their names.
+    lengths : (samples,) int64, optional
+        Steps of each recording where some are shorter than the array.
     original : Checkpoint, optional
         Float model to compare with; by default the weights of `checkpoint` itself.
     spec_samples : int
@@ -331,16 +342,17 @@ def verify(
 
     tell("float32 reference")
     narrow = float_spikes(model, adjacency, events, dtype="float32")
-    reference = [narrow[name] for name in names]
+    kept = [heard(netlist, layer) for layer in range(len(names))]
+    reference = [cut(narrow[name], lengths)[..., keep] for name, keep in zip(names, kept, strict=True)]
     tell("float64 beside it")
     double = float_spikes(model, adjacency, events, dtype="float64")
-    wide = [double[name] for name in names]
+    wide = [cut(double[name], lengths)[..., keep] for name, keep in zip(names, kept, strict=True)]
 
     tell("chip")
     prepared = engine.prepare(netlist)
-    trace = engine.simulate(prepared, flat, spikes=True)
+    trace = engine.simulate(prepared, flat, lengths=lengths, spikes=True)
     assert trace.spikes is not None, "spikes were asked for"
-    chip = [aligned(netlist, trace.spikes, layer) for layer in range(len(names))]
+    chip = [aligned(netlist, trace.spikes, layer)[..., keep] for layer, keep in enumerate(kept)]
 
     quantised_different = None
     if checkpoint.forms is not None:
@@ -349,23 +361,28 @@ def verify(
         tell("fine-tuned model")
         tuned = quantised_spikes(checkpoint, adjacency, events)
         quantised_different = sum(
-            int(np.count_nonzero(tuned[name] != ours)) for name, ours in zip(names, chip, strict=True)
+            int(np.count_nonzero(cut(tuned[name], lengths)[..., keep] != ours))
+            for name, keep, ours in zip(names, kept, chip, strict=True)
         )
 
     tell("specification")
     checked = min(spec_samples, len(flat))
-    equal = all(_same_run(netlist, prepared, recording) for recording in flat[:checked])
+    ends = np.full(len(flat), flat.shape[2]) if lengths is None else lengths
+    equal = all(_same_run(netlist, prepared, flat[i, :, : ends[i]]) for i in range(checked))
 
     def differences(stage: list[BoolArray] | tuple[BoolArray, ...]) -> dict[str, int]:
         return {name: int(np.count_nonzero(a != b)) for name, a, b in zip(names, reference, stage, strict=True)}
+
+    def compared(stage: tuple[BoolArray, ...]) -> list[BoolArray]:
+        return [cut(spikes, lengths)[..., keep] for spikes, keep in zip(stage, kept, strict=True)]
 
     inputs = channels_last(events)
     ladder = [("float64", differences(wide))]
     for stage, rung in zip(LADDER[1:4], realised(network, integer), strict=True):
         tell(f"ladder: {stage}")
-        ladder.append((stage, differences(run_float(rung, inputs).spikes)))
+        ladder.append((stage, differences(compared(run_float(rung, inputs).spikes))))
     tell("ladder: rounding")
-    ladder.append(("rounding", differences(run_integer(integer, inputs, saturates=False).spikes)))
+    ladder.append(("rounding", differences(compared(run_integer(integer, inputs, saturates=False).spikes))))
     ladder.append(("saturation", differences(chip)))
 
     tell("first divergence")
@@ -381,6 +398,8 @@ def verify(
     )
     float_counts = reference[-1].sum(axis=1, dtype=np.int64)
     chip_counts = class_counts(netlist, trace.counts.spikes)
+    tell("certificate")
+    certificate = certify(model, adjacency, integer, events, chip, vote(chip_counts), kept=kept, lengths=lengths)
     return Verdict(
         files=files,
         labels=labels,
@@ -406,4 +425,5 @@ def verify(
             and netlist.provenance.get("weights") == checkpoint.weights
         ),
         quantised_different=quantised_different,
+        certificate=certificate,
     )

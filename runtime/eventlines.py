@@ -119,7 +119,7 @@ class EventLines:
 
     def _is_header(self, line: str) -> bool:
         """Whether a line, perhaps a comment, names the columns; if so, note where they stand."""
-        names = [name.strip() for name in line.lstrip("# \t").split(",")]
+        names = [name.strip().lower() for name in line.lstrip("# \t").split(",")]
         if sorted(name for name in names if name != LABEL) != sorted(COLUMNS) or names.count(LABEL) > 1:
             return False
         self._order = [names.index(name) for name in COLUMNS]

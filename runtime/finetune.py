@@ -8,8 +8,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from compiler.atomic import remove_leftovers
 from compiler.errors import ModelError, OptionError
-from compiler.frontends.checkpoint import Checkpoint, arrays_digest, read_checkpoint
+from compiler.frontends.checkpoint import Checkpoint, read_checkpoint
 from compiler.passes.expand import expand
 from compiler.passes.quantize import round_to_forms
 from compiler.serialize import is_netlist
@@ -60,9 +61,33 @@ def _graph(checkpoint: Checkpoint, asked: Graph | None, name: str) -> Graph:
     return Graph(name=name, coordinates=coordinates, edges=checkpoint.edges)  # type: ignore[arg-type]
 
 
+def _state(output: Path, *, resume: bool) -> Path:
+    """File of the epochs so far, of which neither an old one may be lost nor a missing one begun anew in silence."""
+    state = output.with_name(f"{output.name}.state")
+    if state.exists() and not resume:
+        raise OptionError(
+            f"{state}: an interrupted fine-tuning is kept there; go on with --resume, or delete the file to start anew"
+        )
+    if resume and not state.exists():
+        raise OptionError(f"--resume: {state} does not exist, so nothing was interrupted; leave --resume away")
+    for file in (output, state):
+        remove_leftovers(file)
+    return state
+
+
 def finetune(arguments: argparse.Namespace) -> tuple[Report, Callable[[Report], str], int]:
-    """Fine-tune, write the checkpoint, report."""
+    """Fine-tune, write the checkpoint, report.
+
+    Raises
+    ------
+    SpikeloomError
+        If network, recordings or options cannot be used.
+    KeyboardInterrupt
+        On an interrupt; its text says what is kept.
+    """
     require_place(arguments.output, "-o", arguments)
+    output = Path(arguments.output)
+    state = _state(output, resume=arguments.resume)
     target = load_target(arguments.target)
     widths = _widths(arguments.weight_bits)
     path = shipped(arguments.checkpoint)
@@ -88,28 +113,25 @@ def finetune(arguments: argparse.Namespace) -> tuple[Report, Callable[[Report], 
     )
     from models.checkpoint import save_checkpoint
     from models.finetune import finetune as tune
+    from models.protocols import data_digest
 
-    output = Path(arguments.output)
-    state = output.with_name(f"{output.name}.state")
-    if state.exists() and not arguments.resume:
-        raise OptionError(
-            f"{state}: an interrupted fine-tuning is kept there; go on with --resume, or delete the file to start anew"
+    try:
+        tuned = tune(
+            checkpoint,
+            adjacency,
+            training,
+            test,
+            target,
+            bits=widths,
+            groups=arguments.scale_groups,
+            epochs=arguments.epochs,
+            seed=arguments.seed,
+            state=state,
+            resume=arguments.resume,
         )
-    if arguments.resume and not state.exists():
-        raise OptionError(f"--resume: {state} does not exist, so nothing was interrupted; leave --resume away")
-    tuned = tune(
-        checkpoint,
-        adjacency,
-        training,
-        test,
-        target,
-        bits=widths,
-        groups=arguments.scale_groups,
-        epochs=arguments.epochs,
-        seed=arguments.seed,
-        state=state,
-        resume=arguments.resume,
-    )
+    except KeyboardInterrupt:
+        kept = f"the epochs so far are kept in {state}; go on with the same command and --resume"
+        raise KeyboardInterrupt(kept if state.exists() else "") from None
     words = graph_words(arguments)
     record = {
         "command": f"spikeloom finetune {Path(arguments.checkpoint).name} {words + ' ' if words else ''}--data "
@@ -120,7 +142,7 @@ def finetune(arguments: argparse.Namespace) -> tuple[Report, Callable[[Report], 
         "seed": arguments.seed,
         "epochs": arguments.epochs,
         "data": training.source,
-        "data_sha256": arrays_digest({"train": training.events, "train_labels": training.labels}),
+        "data_sha256": data_digest(training, test),
         "test_samples": len(test),
         "before": {"correct": tuned.before, "accuracy": tuned.before / len(test)},
         "last": {"correct": tuned.after, "accuracy": tuned.after / len(test), "chosen_on": "nothing"},

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+import zipfile
 from importlib import resources
 from pathlib import Path
 
@@ -12,15 +13,16 @@ import numpy as np
 from compiler.errors import DataError, ModelError, OptionError
 from compiler.fixedpoint import FloatArray
 from compiler.frontends.checkpoint import Checkpoint
-from models.events import BIN_S, load_data, need_labels
+from models.events import BIN_S, load_data, need_labels, require_events
 from models.evtouch import Recordings
 from models.graphs import CHOICES, Graph, normalised_adjacency
-from models.grasps import synthetic_split
+from models.grasps import SYNTHETIC, synthetic_split
 from models.sensors import sensor_graph
-from runtime.data_commands import show_counts
+from runtime.found import show_counts
+
+_RECORDINGS = "recordings are shown by spikeloom data describe"
 
 PRETRAINED = "pretrained:"
-SYNTHETIC = "synthetic"
 
 
 def shipped(path: str) -> str:
@@ -66,6 +68,7 @@ def recordings(
         if labels_for is not None:
             need_labels(data, labels_for)
         return data
+    require_events(SYNTHETIC, bin_s)
     grasps = synthetic_split(split, limit=limit)
     if taxels is not None and grasps.taxels != taxels:
         raise DataError(
@@ -127,16 +130,56 @@ def propagation(checkpoint: Checkpoint, asked: Graph | None, where: str) -> tupl
     return asked.name, adjacency
 
 
-def require_place(path: str, option: str) -> None:
+INPUTS = ("checkpoint", "original", "netlist", "data", "calibrate", "source", "taxels", "edges")
+"""Arguments that may name a file to read."""
+
+
+def require_place(path: str, option: str, arguments: argparse.Namespace | None = None) -> None:
     """Refuse, before any work is done, a place where a result could not be written.
+
+    Parameters
+    ----------
+    path, option : str
+        The place, and what names it.
+    arguments : Namespace, optional
+        Whose `INPUTS` must not be overwritten.
 
     Raises
     ------
     OptionError
-        If the folder does not exist, or the path is a folder or a device.
+        If the folder does not exist, the path is a folder or a device, or it is one of the inputs.
     """
     place = Path(path)
     if not place.absolute().parent.is_dir():
         raise OptionError(f"{option} {path}: the folder does not exist; make it first")
     if place.exists() and not place.is_file():
         raise OptionError(f"{option} {path}: is not a regular file; give the name of a file to write")
+    for name in INPUTS:
+        given = getattr(arguments, name, None)
+        if isinstance(given, str) and place.exists():
+            read = Path(shipped(given))
+            if read.exists() and place.samefile(read):
+                raise OptionError(f"{option} {path}: is an input of this command ({given}); give another name")
+
+
+def require_inspectable(path: str) -> None:
+    """Refuse what is neither a netlist nor a checkpoint, by what it is instead.
+
+    Raises
+    ------
+    OptionError
+        If it is a folder, or a zip or npz of something else.
+    """
+    if Path(path).is_dir():
+        raise OptionError(f"{path}: is a folder, not a netlist or a checkpoint; {_RECORDINGS}")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = {Path(name) for name in archive.namelist()}
+    except (zipfile.BadZipFile, OSError, ValueError):
+        return  # a released checkpoint is no zip; what else there is, its reader says
+    ours = {"manifest.json", "manifest.npy"} & {name.name for name in names}
+    torch = any(name.suffix == ".pkl" for name in names)
+    if ours or torch or path.endswith(".loom"):
+        return
+    shown = ", ".join(sorted(name.as_posix() for name in names)[:3]) or "nothing"
+    raise OptionError(f"{path}: holds {shown}, not a netlist or a checkpoint; {_RECORDINGS}")

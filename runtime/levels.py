@@ -120,7 +120,8 @@ def _quantised_level(verdict: Verdict) -> Level:
     return Level(
         name="E1",
         share=float(different == 0),
-        text=f"fine-tuned model = chip: {different:,} differing spikes of {spikes:,} on {len(verdict.files)} recordings",
+        text=f"fine-tuned model = chip: {different:,} differing spikes of {spikes:,} "
+        f"on {len(verdict.files)} recordings",
     )
 
 

@@ -5,8 +5,12 @@ from __future__ import annotations
 import argparse
 
 from compiler.frontends.checkpoint import WEIGHTS
+from compiler.passes.quantize import RANGES
+from compiler.pipeline import STAGES
 from models.graphs import CHOICES
 from runtime.data_commands import add_bin_option
+
+MARGIN = 0.1
 
 DATA_HELP = "recordings: released layout, event files (csv, npz), one recording, 'synthetic', 'objects' or 'containers'"
 
@@ -59,3 +63,36 @@ def add_model(parser: argparse.ArgumentParser, *, graph: bool = True) -> None:
     )
     parser.add_argument("--beta", type=float, help="membrane decay, where the file does not say (default: 0.2)")
     parser.add_argument("--theta", type=float, help="threshold, where the file does not say (default: 0.5)")
+
+
+def add_compile(sub: argparse.ArgumentParser) -> None:
+    """Add the options of a compilation."""
+    sub.add_argument("checkpoint")
+    add_model(sub)
+    sub.add_argument("--target", default="loihi1", help="chip (default: loihi1)")
+    sub.add_argument(
+        "--weight-bits",
+        metavar="N[,N]",
+        help="storage width, one or one a layer: 2 to 6 or 8 (default: 8)",
+    )
+    sub.add_argument("--planes", metavar="N[,N]", help="times a synapse is stored, 1 to 3 (default: 1)")
+    sub.add_argument("--scale-groups", metavar="N[,N]", help="scales in a layer, 1 to 8 (default: 1)")
+    sub.add_argument(
+        "--spike-exact",
+        action="store_true",
+        help="add planes and scales until the training spikes are the float model's",
+    )
+    sub.add_argument("--keep-all", action="store_true", help="keep neurons that provably never fire or are never heard")
+    sub.add_argument(
+        "--prune-unused", action="store_true", help="leave out neurons that never fired on the training split, too"
+    )
+    sub.add_argument("--calibrate", metavar="PATH", help="recordings whose train split chooses the scales")
+    add_bin_option(sub)
+    sub.add_argument(
+        "--ranges", default="proven", help=f"how overflow is excluded: {' or '.join(RANGES)} (default: proven)"
+    )
+    sub.add_argument("--margin", type=float, help=f"share added to observed ranges (default: {MARGIN:g})")
+    sub.add_argument(
+        "--dump-after", action="append", default=[], choices=STAGES, help="print the network after a stage, on stderr"
+    )
+    sub.add_argument("-o", "--output", required=True, metavar="NET.loom")

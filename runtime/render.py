@@ -14,6 +14,7 @@ from compiler.frontends.checkpoint import Checkpoint
 from compiler.netlist import Netlist
 from compiler.passes.legalize import LimitUse
 from compiler.pipeline import Compilation
+from runtime.certificates import certificate_json, certificate_text
 from runtime.cost import NOT_PRICED, Costs
 from runtime.equivalence import Verdict
 from runtime.levels import Level
@@ -37,6 +38,7 @@ def netlist_json(netlist: Netlist, uses: Sequence[LimitUse], sha256: str) -> Jso
             {
                 "name": layer.name,
                 "neurons": layer.neurons,
+                "compartments": len(ids),
                 "synapses": layer.synapses,
                 "max_fan_in": layer.max_fan_in,
                 "weight_bits": layer.weight_bits,
@@ -56,7 +58,8 @@ def netlist_json(netlist: Netlist, uses: Sequence[LimitUse], sha256: str) -> Jso
         "target": netlist.target,
         "taxels": netlist.taxels,
         "classes": netlist.classes,
-        "neurons": netlist.n_compartments,
+        "neurons": sum(layer.neurons for layer in netlist.layers),
+        "compartments": netlist.n_compartments,
         "synapses": sum(layer.synapses for layer in netlist.layers),
         "synapses_stored": netlist.n_synapses,
         "synapses_nonzero": int(np.count_nonzero(netlist.synapse_weight)),
@@ -82,6 +85,7 @@ def compilation_json(compilation: Compilation, sha256: str) -> Json:
             {key: value if value != math.inf else None for key, value in asdict(proof).items()} | {"holds": proof.holds}
             for proof in compilation.proofs
         ],
+        "removals": [asdict(layer) for layer in compilation.removals],
         "exactness": [asdict(layer) for layer in compilation.exactness],
         "core_bound": compilation.core_bound,
         "placement": asdict(compilation.placement),
@@ -94,6 +98,7 @@ def netlist_text(report: Json) -> str:
         [
             layer["name"],
             f"{layer['neurons']:,}",
+            f"{layer['compartments']:,}",
             f"{layer['synapses']:,}",
             f"{layer['synapses_stored']:,}",
             str(layer["max_fan_in"]),
@@ -106,7 +111,20 @@ def netlist_text(report: Json) -> str:
         ]
         for layer in report["layers"]
     ]
-    head = ["layer", "neurons", "synapses", "stored", "fan-in", "bits", "scale", "threshold", "θ", "β", "cores"]
+    head = [
+        "layer",
+        "neurons",
+        "on chip",
+        "synapses",
+        "stored",
+        "fan-in",
+        "bits",
+        "scale",
+        "threshold",
+        "θ",
+        "β",
+        "cores",
+    ]
     fullest: dict[str, Json] = {}
     for use in report["limits"]:
         if use["name"] not in fullest or use["used"] > fullest[use["name"]]["used"]:
@@ -123,7 +141,8 @@ def netlist_text(report: Json) -> str:
     ]
     return "\n".join(
         [
-            f"{report['target']}: {report['neurons']:,} neurons, {report['synapses']:,} synapses "
+            f"{report['target']}: {report['neurons']:,} neurons ({report['compartments']:,} on the chip), "
+            f"{report['synapses']:,} synapses "
             f"({report['synapses_stored']:,} stored, {report['synapses_nonzero']:,} non-zero), {report['cores']} cores "
             f"on tiles {', '.join(map(str, report['tiles']))}",
             table(head, layers),
@@ -167,6 +186,7 @@ def compilation_text(report: Json) -> str:
         lines += _exactness_lines(report["exactness"])
     else:
         lines.append("scales taken from the weights and the proven bounds; --calibrate chooses them on training data")
+    lines += _removal_lines(report["removals"])
     worst = max(report["proofs"], key=lambda proof: proof["accumulator"])
     if all(proof["holds"] for proof in report["proofs"]):
         lines.append(
@@ -183,6 +203,21 @@ def compilation_text(report: Json) -> str:
         f"spike-hops a step{'' if calibrated else ' if every neuron spiked'}: {placement['spike_hops']:.1f} ({optimal})"
     )
     return "\n".join(lines)
+
+
+def _removal_lines(layers: list[Json]) -> list[str]:
+    """What the chip does not hold, and why."""
+    words = {
+        "silent": "that no input can make fire",
+        "unheard": "that nobody hears",
+        "unused": "that did not fire in training (by evidence, not by proof)",
+    }
+    lines = []
+    for key, why in words.items():
+        counts = [f"{layer['layer']} {layer[key]:,}" for layer in layers if layer[key]]
+        if counts:
+            lines.append(f"left out, neurons {why}: {', '.join(counts)}")
+    return lines
 
 
 def _exactness_lines(layers: list[Json]) -> list[str]:
@@ -291,6 +326,7 @@ def verify_json(verdict: Verdict, levels: Sequence[Level], missed: Sequence[str]
         "ladder": [{"stage": stage, "different": dict(different)} for stage, different in verdict.ladder],
         "same_checkpoint": verdict.same_checkpoint,
         "quantised_different": verdict.quantised_different,
+        "certificate": certificate_json(verdict.certificate),
         "levels": [asdict(level) for level in levels],
         "missed": list(missed),
     }
@@ -315,7 +351,7 @@ def verify_text(report: Json) -> str:
     ]
     lines += ["", table(["spikes", "float", "chip", "different", "ill-posed"], rows), ""]
     ladder = [[rung["stage"], *(f"{rung['different'][name]:,}" for name in names)] for rung in report["ladder"]]
-    lines += [table(["different, adding", *names], ladder), ""]
+    lines += [table(["different, adding", *names], ladder), "", certificate_text(report["certificate"]), ""]
     first = report["first_divergence"]
     if first is None:
         lines.append("no spike differs")

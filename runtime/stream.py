@@ -82,7 +82,7 @@ class Stream:
     def __init__(self, engine: Engine) -> None:
         self._engine = engine
         # the engine orders compartments by layer and neuron, whatever their cores
-        ends = np.cumsum([layer.neurons for layer in engine.netlist.layers]).tolist()
+        ends = np.cumsum(np.bincount(engine.netlist.layer)).tolist()
         self._bounds = tuple(zip([0, *ends[:-1]], ends, strict=True))
         self._column = np.zeros((engine.netlist.n_inputs, 1), np.uint8)
         self._state = start(engine)

@@ -82,11 +82,23 @@ def aligned(netlist: Netlist, array: npt.NDArray[Any], layer: int) -> npt.NDArra
     Returns
     -------
     (…, T, neurons)
-        Ordered by neuron.
+        Ordered by neuron; zero for neurons that the chip does not hold.
     """
     depth = netlist.layers[layer].depth
     length = array.shape[-2] - netlist.max_depth
-    return array[..., depth : depth + length, netlist.compartments_of(layer)]
+    ids = netlist.compartments_of(layer)
+    held = array[..., depth : depth + length, ids]
+    if len(ids) == netlist.layers[layer].neurons:
+        return held
+    whole = np.zeros((*held.shape[:-1], netlist.layers[layer].neurons), held.dtype)
+    whole[..., netlist.neuron[ids]] = held
+    return whole
+
+
+def heard(netlist: Netlist, layer: int) -> slice | IntArray:
+    """Neurons of a layer whose spikes can be compared: all but those left out because nobody hears them."""
+    unheard = netlist.layers[layer].unheard
+    return np.setdiff1d(np.arange(netlist.layers[layer].neurons), unheard) if unheard else slice(None)
 
 
 def check_channels(netlist: Netlist, channels: int) -> None:

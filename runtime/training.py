@@ -1,13 +1,12 @@
-"""The ``train`` command: one or several seeds side by side, resumable, reported by both protocols, with pictures."""
+"""The ``train`` command: one seed trained and written, reported by both protocols, with pictures."""
 
 from __future__ import annotations
 
-import os
+import hashlib
 import statistics
+import textwrap
 from collections.abc import Mapping
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +14,23 @@ import numpy as np
 
 from compiler.errors import OptionError
 from compiler.fixedpoint import IntArray
+from compiler.frontends.checkpoint import WEIGHTS, read_checkpoint
 from models.evtouch import Recordings
 from models.graphs import Graph, normalised_adjacency
-from runtime.tables import percent, table
+from runtime.intervals import wilson
+from runtime.tables import table
 
 PICTURES = (".png", ".svg", ".pdf")
 """Kinds of picture that `draw_training` writes."""
 
-PROTOCOLS = ("last", "best", "clean")
+TITLES = {
+    "last": "last epoch",
+    "best": "paper protocol: best on test",
+    "clean": "clean protocol: epoch chosen on validation",
+}
+"""What the epochs of ``WEIGHTS`` are called where people read of them."""
+
+WIDTH = 118
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -37,6 +45,8 @@ class Job:
         Which of ``last``, ``best`` and ``clean`` to write.
     facts : mapping
         JSON values to store beside the training record.
+    draws : bool
+        Whether predictions are needed, for a picture.
     position : int
         Row of the progress bar.
     """
@@ -52,6 +62,7 @@ class Job:
     keep: tuple[str, ...]
     command: str
     facts: Mapping[str, Any]
+    draws: bool
     position: int
 
 
@@ -67,35 +78,41 @@ def output_of(output: str, seed: int, seeds: int) -> Path:
     return path if seeds == 1 else path.with_name(f"{path.stem}-seed{seed}{path.suffix}")
 
 
-def run_job(job: Job) -> tuple[dict[str, Any], IntArray]:
+def state_of(job: Job) -> tuple[Path, Path]:
+    """Files that hold the states of its two trainings."""
+    from models.protocols import state_files
+
+    return state_files(_stem(job))
+
+
+def _stem(job: Job) -> Path:
+    return job.output.with_name(f"{job.output.name}.state")
+
+
+def run_job(job: Job) -> tuple[dict[str, Any], IntArray | None]:
     """Train one seed by both protocols and write its checkpoint.
 
     Returns
     -------
     record : dict
         JSON values: the training record, file and hash.
-    predictions : (test samples,) int64
-        Of the last epoch.
+    predictions : (test samples,) int64, or None
+        Of the last epoch, where they are drawn.
     """
-    import hashlib
-
     from models.checkpoint import save_checkpoint, training_record
-    from models.networks import Architecture, TactileSGNet
-    from models.protocols import state_files, train_both
-    from models.train import predict
+    from models.networks import Architecture
+    from models.protocols import train_both
 
     architecture = Architecture(taxels=job.graph.n_taxels, classes=int(job.training.labels.max()) + 1)
-    adjacency = normalised_adjacency(job.graph.edges, job.graph.n_taxels)
-    state = job.output.with_name(f"{job.output.name}.state")
     reported = train_both(
         job.training,
         job.test,
-        adjacency,
+        normalised_adjacency(job.graph.edges, job.graph.n_taxels),
         architecture,
         epochs=job.epochs,
         seed=job.seed,
         device=job.device,
-        state=state,
+        state=_stem(job),
         resume=job.resume,
         position=job.position,
     )
@@ -105,33 +122,69 @@ def run_job(job: Job) -> tuple[dict[str, Any], IntArray]:
     held = {"last": trained.last, "best": trained.best, "clean": trained.kept}
     save_checkpoint(
         job.output,
-        {which: held[which] for which in PROTOCOLS if which in job.keep},
+        {which: held[which] for which in WEIGHTS if which in job.keep},
         job.graph,
         beta=architecture.beta,
         theta=architecture.theta,
         training=record,
     )
-    for file in state_files(state):
+    for file in state_of(job):
         file.unlink(missing_ok=True)
-    network = TactileSGNet(architecture, adjacency)
-    network.load_weights(trained.last)
-    sha256 = hashlib.sha256(job.output.read_bytes()).hexdigest()
-    return record | {"file": job.output.name, "sha256": sha256}, predict(network, job.test)
+    return _with_file(job, record), _predictions(job, trained.last) if job.draws else None
 
 
-def train_seeds(jobs: list[Job]) -> list[tuple[dict[str, Any], IntArray]]:
-    """Run jobs, side by side on the cores where there are several.
+def recall(job: Job) -> tuple[dict[str, Any], IntArray | None]:
+    """What `run_job` returned when it wrote the checkpoint that is there.
 
     Raises
     ------
+    ModelError
+        If the file is no checkpoint.
     OptionError
-        If an output exists whose training is to be resumed though nothing was interrupted, see the jobs.
+        If it holds another training, or lacks the epoch that a picture needs.
     """
-    if len(jobs) == 1:
-        return [run_job(jobs[0])]
-    # spawned, not forked: torch and its thread pools do not survive a fork
-    with ProcessPoolExecutor(min(len(jobs), os.cpu_count() or 1), mp_context=get_context("spawn")) as pool:
-        return list(pool.map(run_job, jobs))
+    from models.protocols import data_digest
+
+    found = read_checkpoint(job.output)
+    record = dict(found.training or {})
+    wanted = {
+        "epochs": job.epochs,
+        "seed": job.seed,
+        "data_sha256": data_digest(job.training, job.test),
+        "device": job.device,
+    }
+    differing = [name.removesuffix("_sha256") for name, value in wanted.items() if record.get(name) != value]
+    if found.graph != job.graph.name:
+        differing.append("graph")
+    if differing:
+        raise OptionError(
+            f"{job.output}: holds another training (other {', '.join(differing)}); give its options, or another -o"
+        )
+    if not job.draws:
+        return _with_file(job, record), None
+    if found.weights != "last":
+        raise OptionError(
+            f"{job.output}: was written without its last epoch, which --picture draws; leave --picture away"
+        )
+    weights = {"conv1.hops": found.hops, "conv1.bias": found.conv_bias}
+    weights |= {f"{dense.name}.weight": dense.weight for dense in found.dense}
+    weights |= {f"{dense.name}.bias": dense.bias for dense in found.dense}
+    return _with_file(job, record), _predictions(job, weights)
+
+
+def _with_file(job: Job, record: Mapping[str, Any]) -> dict[str, Any]:
+    sha256 = hashlib.sha256(job.output.read_bytes()).hexdigest()
+    return dict(record) | {"file": job.output.name, "sha256": sha256}
+
+
+def _predictions(job: Job, weights: Mapping[str, Any]) -> IntArray:
+    from models.networks import Architecture, TactileSGNet
+    from models.train import predict
+
+    architecture = Architecture(taxels=job.graph.n_taxels, classes=int(job.training.labels.max()) + 1)
+    network = TactileSGNet(architecture, normalised_adjacency(job.graph.edges, job.graph.n_taxels))
+    network.load_weights(weights)
+    return predict(network, job.test)
 
 
 def check_seeds(seeds: int) -> None:
@@ -149,7 +202,7 @@ def check_seeds(seeds: int) -> None:
 def summary(records: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
     """Mean and standard deviation of the accuracy over seeds, by protocol."""
     result = {}
-    for protocol in PROTOCOLS:
+    for protocol in WEIGHTS:
         values = [record[protocol]["accuracy"] for record in records]
         spread = statistics.stdev(values) if len(values) > 1 else 0.0
         result[protocol] = {"mean": statistics.fmean(values), "std": spread, "min": min(values), "max": max(values)}
@@ -158,23 +211,29 @@ def summary(records: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
 
 def training_text(report: dict[str, Any]) -> str:
     """A finished training for people: every seed by every protocol, then the means."""
-    total = report["runs"][0]["test_samples"]
-    rows = [
-        [
-            f"seed {run['seed']}",
-            *(f"{percent(run[p]['correct'], total)}, epoch {run[p]['epoch']}" for p in PROTOCOLS),
-            run["file"],
-        ]
-        for run in report["runs"]
-    ]
+    runs = report["runs"]
+    total = runs[0]["test_samples"]
+    rows = []
+    for run in runs:
+        for which in WEIGHTS:
+            right = run[which]["correct"]
+            low, high = wilson(right, total)
+            interval = f"{100 * low:.1f} … {100 * high:.1f}"
+            accuracy = f"{100 * right / total:.2f} %"
+            name = f"seed {run['seed']}, {TITLES[which]}"
+            rows.append([name, str(run[which]["epoch"]), f"{right} of {total}", accuracy, interval])
+    command, seed = runs[0]["command"].rsplit(" --seed ", 1)
+    several = [f"--seeds {len(runs)}"] if len(runs) > 1 else []
+    files = ", ".join(run["file"] for run in runs)
     lines = [
-        report["runs"][0]["command"],
-        table(["", "last epoch", "paper protocol: best on test", "clean: epoch chosen on validation", "file"], rows),
+        " ".join([command, f"--seed {seed}", *several]),
+        table(["", "epoch", "correct", "accuracy", "95 % interval"], rows),
     ]
-    if len(rows) > 1:
+    if len(runs) > 1:
         means = [f"{100 * s['mean']:.2f} % ± {100 * s['std']:.2f}" for s in report["protocols"].values()]
-        lines.append(f"  mean of {len(rows)} seeds: last {means[0]}, paper {means[1]}, clean {means[2]}")
-    return "\n".join(lines)
+        lines.append(f"  mean of {len(runs)} seeds: last {means[0]}, paper {means[1]}, clean {means[2]}")
+    written = textwrap.wrap(f"written: {files}", WIDTH, initial_indent="  ", subsequent_indent="    ")
+    return "\n".join([*lines, *written])
 
 
 def draw_training(path: str, records: list[dict[str, Any]], labels: IntArray, predictions: list[IntArray]) -> None:

@@ -31,9 +31,10 @@ if TYPE_CHECKING:
 
 SUMMARY = "read event lines (time_s,taxel,polarity) and print the running decision"
 NOTES = """\
-What follows a # is a comment, and a grasp may begin with a header that names the columns, in any order. An empty line
-or the line "reset" ends a grasp. Polarity is 0 and 1, or -1 and 1. --json prints one object a line: kind "bin" for
-every bin, "grasp" for every decision, and "end" last.
+Lines come in the order of their times: an event whose bin is over, since a later one came, is counted as late and not
+used. What follows a # is a comment, and a grasp may begin with a header that names the columns, in any order. An empty
+line or the line "reset" ends a grasp. Polarity is 0 and 1, or -1 and 1. --json prints one object a line: kind "bin"
+for every bin, "grasp" for every decision, and "end" last.
 """
 
 MAX_GAP = 100_000
@@ -266,7 +267,7 @@ def watch(arguments: argparse.Namespace) -> tuple[dict[str, Any], Callable[[dict
     stream = live.stream()
     stdin = arguments.input == "-"
     name = "standard input" if stdin else arguments.input
-    with io.FileIO(0 if stdin else arguments.input, closefd=not stdin) as file:
+    with _opened(arguments.input) as file:
         session = Watch(
             stream,
             EventLines(file, name, netlist.taxels),
@@ -316,6 +317,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--timing", action="store_true", help="add the time that steps took to the summary")
     parser.epilog = NOTES
+
+
+def _opened(name: str) -> io.FileIO:
+    """File of event lines, or standard input."""
+    try:
+        return io.FileIO(0 if name == "-" else name, closefd=name != "-")
+    except OSError as error:
+        raise DataError(
+            f"--input {name}: {error.strerror}; give a file of event lines, or - for standard input"
+        ) from error
 
 
 def _duration(text: str) -> Decimal:

@@ -61,6 +61,7 @@ def build(neurons: list[Neuron], axons: list[Axon], *, n_inputs: int, depths: li
             Layer(
                 name=f"layer{i}",
                 neurons=sum(neuron.layer == i for neuron in neurons),
+                unheard=(),
                 depth=depth,
                 beta=0.2,
                 theta=0.5,

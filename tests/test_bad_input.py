@@ -87,9 +87,96 @@ def test_no_checkpoint(refusal, tmp_path):
         made.writestr("notes.txt", "hello")
     for command in (["compile", "-o", "out.loom", "--graph", "manual"], ["inspect"]):
         assert refusal(*command, missing) == f"{missing}: no such file; {GIVE_CHECKPOINT}"
-        assert refusal(*command, tmp_path) == f"{tmp_path}: no such file; {GIVE_CHECKPOINT}"
-        for path in (empty, words, archive):
+        for path in (empty, words):
             assert refusal(*command, path) == f"{path}: is not a checkpoint; {GIVE_CHECKPOINT}"
+    compiling = ["compile", "-o", "out.loom", "--graph", "manual"]
+    assert refusal(*compiling, tmp_path) == f"{tmp_path}: no such file; {GIVE_CHECKPOINT}"
+    assert refusal(*compiling, archive) == f"{archive}: is not a checkpoint; {GIVE_CHECKPOINT}"
+
+
+def test_inspect_says_what_something_else_is(refusal, tmp_path):
+    archive, events, empty = tmp_path / "archive.zip", tmp_path / "events.npz", tmp_path / "empty.zip"
+    with zipfile.ZipFile(archive, "w") as made:
+        made.writestr("a/b/notes.txt", "hello")
+    np.savez(events, time_s=np.zeros(1), taxel=np.zeros(1), polarity=np.ones(1))
+    zipfile.ZipFile(empty, "w").close()
+    for path, holds in (
+        (archive, "a/b/notes.txt"),
+        (events, "polarity.npy, taxel.npy, time_s.npy"),
+        (empty, "nothing"),
+    ):
+        assert refusal("inspect", path) == (
+            f"{path}: holds {holds}, not a netlist or a checkpoint; recordings are shown by spikeloom data describe"
+        )
+    assert refusal("inspect", tmp_path) == (
+        f"{tmp_path}: is a folder, not a netlist or a checkpoint; recordings are shown by spikeloom data describe"
+    )
+
+
+@pytest.mark.parametrize(
+    ("option", "value"), [("--beta", "0.3"), ("--theta", "0.0"), ("--weights", "best"), ("--run", "1")]
+)
+def test_options_of_checkpoints_do_not_suit_a_netlist(refusal, option, value):
+    assert refusal("inspect", "net.loom", option, value) == (
+        f"{option} {value}: is for checkpoints, net.loom is a netlist; leave it away"
+    )
+
+
+def test_options_that_would_not_count(refusal):
+    assert refusal("compile", "net.pt", "-o", "out.loom", "--margin", "0.2") == (
+        "--margin 0.2: only observed ranges have one; add --ranges observed or leave it away"
+    )
+    words = ["verify", "net.loom", "--checkpoint", "net.pt", "--data", "data", "--require", "E0"]
+    assert refusal(*words, "--min-agreement", "0.9") == (
+        "--min-agreement 0.9: --require replaces it; write E3=0.9 into that instead"
+    )
+    for words in (["run", "net.loom"], ["estimate", "net.loom"]):
+        assert refusal(*words, "--data", "data", "--bin", "0.05") == (
+            "--bin 0.05: data holds bins, not times; leave --bin away"
+        )
+        assert refusal(*words, "--data", "synthetic", "--bin", "0.05") == (
+            "--bin 0.05: synthetic holds bins, not times; leave --bin away"
+        )
+    assert refusal("data", "describe", "data", "--bin", "0.05") == (
+        "--bin 0.05: data holds bins, not times; leave --bin away"
+    )
+
+
+@pytest.mark.parametrize(
+    ("words", "option", "read"),
+    [
+        (["compile", "net.pt", "-o", "net.pt"], "-o", "net.pt"),
+        (["compile", "net.pt", "-o", "./link.pt"], "-o", "net.pt"),
+        (["run", "net.loom", "--data", "data", "--spikes", "net.loom"], "--spikes", "net.loom"),
+        (["run", "net.loom", "--data", "one.npy", "--spikes", "one.npy"], "--spikes", "one.npy"),
+        (["train", "--data", "one.npy", "--graph", "manual", "-o", "one.npy"], "-o", "one.npy"),
+        (["data", "convert", "one.csv", "-o", "one.csv"], "-o", "one.csv"),
+        (["data", "describe", "one.png", "--picture", "one.png"], "--picture", "one.png"),
+    ],
+)
+def test_an_output_does_not_overwrite_an_input(refusal, place, words, option, read):
+    made = [place / name for name in ("one.npy", "one.csv", "one.png")]
+    for path in made:
+        path.write_bytes(b"precious")
+    link = place / "link.pt"
+    link.symlink_to(place / "net.pt")
+    before = {path: path.read_bytes() for path in place.iterdir() if path.is_file()}
+    written = words[words.index(option) + 1]
+    try:
+        assert refusal(*words) == f"{option} {written}: is an input of this command ({read}); give another name"
+        assert {path: path.read_bytes() for path in place.iterdir() if path.is_file()} == before
+    finally:
+        for path in (*made, link):
+            path.unlink()
+
+
+def test_a_missing_file_of_event_lines(refusal, tmp_path):
+    assert refusal("watch", "net.loom", "--input", tmp_path / "no.csv") == (
+        f"--input {tmp_path / 'no.csv'}: No such file or directory; give a file of event lines, or - for standard input"
+    )
+    assert refusal("watch", "net.loom", "--input", tmp_path) == (
+        f"--input {tmp_path}: Is a directory; give a file of event lines, or - for standard input"
+    )
 
 
 @pytest.mark.parametrize("zipped", [True, False])
@@ -264,7 +351,10 @@ def test_unreadable_files(refusal, tmp_path, monkeypatch):
         ),
         (["net.pt", "--ranges", "nope"], "--ranges nope: unknown; allowed: proven, observed"),
         *(
-            (["net.pt", "--margin", text], f"--margin {text}: is no share to add to a range; give a number from 0")
+            (
+                ["net.pt", "--ranges", "observed", "--margin", text],
+                f"--margin {text}: is no share to add to a range; give a number from 0",
+            )
             for text in ("-0.1", "nan", "inf")
         ),
         (["net.pt", "--calibrate", "nowhere"], f"nowhere: no such file or folder; {GIVE_DATA}"),
@@ -442,7 +532,8 @@ def test_no_recordings(refusal, tmp_path):
     assert refusal(*run, tmp_path / "nowhere") == f"{tmp_path}/nowhere: no such file or folder; {GIVE_DATA}"
     (tmp_path / "test").mkdir()
     assert refusal(*run, tmp_path) == (
-        f"{tmp_path.name}: no recordings (train/ or test/ with sample_N_label_L.npy); {GIVE_DATA}"
+        f"{tmp_path.name}: no recordings; give a folder with event files (.csv, .npz) or bins (.npy), "
+        "together or in train/ and test/, or a released zip"
     )
     (tmp_path / "train").mkdir()
     np.save(tmp_path / "train" / "sample_0_label_0.npy", GOOD)

@@ -245,7 +245,7 @@ def test_last_and_best_weights(as_json, tmp_path):
 
 def test_run_prints_the_promised_keys(as_json):
     report = as_json("run", "net.loom", "--data", "data")
-    assert set(report) == {"samples", "accuracy", "files", "labels", "predictions", "counts"}
+    assert set(report) == {"samples", "labelled", "accuracy", "files", "labels", "predictions", "counts"}
     assert report["samples"] == 6
     assert report["files"] == [f"sample_{i}_label_{i % CLASSES}.npy" for i in range(6)]
     assert report["labels"] == [i % CLASSES for i in range(6)]

@@ -3,6 +3,7 @@ import hashlib
 import json
 import struct
 import threading
+import zipfile
 from http.server import BaseHTTPRequestHandler, HTTPServer
 
 import numpy as np
@@ -14,7 +15,8 @@ from models.events import load_data
 from models.fetch import DataSet
 from models.grasps import synthetic_split
 from models.release import write_event_lines, write_released
-from runtime.data_commands import add_bin_option, add_data_commands, show_counts
+from runtime.data_commands import add_bin_option, add_data_commands
+from runtime.found import show_counts
 
 
 def start(*words):
@@ -62,7 +64,7 @@ def test_describe(own):
             "  labels: 2 classes, 1 recording each",
             "  events: 6 after binning; 0.8 falling and 4.0 rising per second",
             "  found: 7 events read, 1 out of order, 1 duplicate in a bin, 1 gap over 0.5 s, "
-            "1 recording padded at the end",
+            "1 recording shorter than the longest",
             "  dead taxels: 3 (no event in any of these recordings)",
             "  one-sided taxels: 0, 1, 2 (events of one polarity only)",
             "  hot taxels: none (more than 5 times the median rate of the taxels that are not dead)",
@@ -80,7 +82,7 @@ def test_describe(own):
         "duplicates": 1,
         "gaps": 1,
         "gap_s": 0.5,
-        "padded": 1,
+        "shorter": 1,
     }
     assert report["dead"] == [3]
     assert report["one_sided"] == [0, 1, 2]
@@ -192,6 +194,7 @@ def test_convert(own, output):
             "  train: 2 recordings",
             "    found: 7 events read, 1 out of order, 1 duplicate in a bin, 1 gap over 0.5 s, "
             "1 recording padded at the end",
+            "  names: sources.csv in it says which recording became which",
         ]
     )
     assert report["splits"]["test"]["found"]["padded"] == 1
@@ -204,6 +207,12 @@ def test_convert(own, output):
         assert made.events.sum() == before.events.sum()
         assert made.labels.tolist() == before.labels.tolist()
     if output == "out":
+        assert (own / "out" / "sources.csv").read_text() == (
+            "split,file,source\n"
+            "test,sample_0_label_1.npy,c_label_1.csv\n"
+            "train,sample_0_label_0.npy,a_label_0.csv\n"
+            "train,sample_1_label_1.npy,b_label_1.csv\n"
+        )
         values = np.load(own / "out" / "train" / "sample_0_label_0.npy")
         assert (values.dtype, values.shape) == (np.float32, (3, 2, 36))
 
@@ -224,7 +233,11 @@ def test_convert_flat_recordings(own):
 def test_convert_what_is_converted(own):
     start("convert", "own", "-o", "out.zip")
     start("convert", "out.zip", "-o", "again.zip")
-    assert (own / "again.zip").read_bytes() == (own / "out.zip").read_bytes()
+    start("convert", "again.zip", "-o", "third.zip")
+    assert (own / "third.zip").read_bytes() == (own / "again.zip").read_bytes()
+    with zipfile.ZipFile("out.zip") as once, zipfile.ZipFile("again.zip") as twice:
+        assert once.namelist() == twice.namelist()
+        assert all(once.read(name) == twice.read(name) for name in once.namelist() if name.endswith(".npy"))
 
 
 def test_convert_synthetic_grasps(own):
@@ -312,7 +325,8 @@ def test_counts_on_stderr(own, capsys):
     shown = capsys.readouterr()
     assert shown.out == ""
     assert shown.err == (
-        "own: 7 events read, 1 out of order, 1 duplicate in a bin, 1 gap over 0.5 s, 1 recording padded at the end\n"
+        "own: 7 events read, 1 out of order, 1 duplicate in a bin, 1 gap over 0.5 s, "
+        "1 recording shorter than the longest\n"
     )
 
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from compiler.errors import DataError, OptionError
 from models import events, fetch
 from models.describe import describe
-from models.eventfiles import UNLABELLED, read_stream
+from models.eventfiles import UNLABELLED, likely_unit, read_stream
 from models.events import BIN_S, GAP_S, MAX_STEPS, bin_events, data_splits, load_data, need_labels
 from models.evtouch import load_recordings
 from models.fetch import DataSet
@@ -413,8 +413,8 @@ def test_what_is_no_recording(write, tmp_path):
     empty = tmp_path / "empty"
     empty.mkdir()
     assert message(load_data, empty) == (
-        "empty: no recordings (train/ or test/ with sample_N_label_L.npy); "
-        "give the folder or zip that holds train/ and test/"
+        "empty: no recordings; give a folder with event files (.csv, .npz) or bins (.npy), "
+        "together or in train/ and test/, or a released zip"
     )
     assert message(load_data, path, limit=0, error=OptionError) == (
         "--limit 0: at least 1 recording is needed; give a positive number"
@@ -525,9 +525,14 @@ def test_description():
     grid[:, 2, 1] = 0
     grid[1, :, :, 5:] = 0  # the second recording has 5 steps
     recordings = type(grasps)(
-        events=grid, labels=np.array([3, -1]), files=("a", "b"), split="test", source="made for this"
+        events=grid,
+        labels=np.array([3, -1]),
+        files=("a", "b"),
+        split="test",
+        source="made for this",
+        lengths=np.array([10, 5]),
     )
-    found = describe(recordings, 0.1, steps=(10, 5))
+    found = describe(recordings, 0.1)
     assert found.duration_s == (0.5, 0.75, 1.0)
     assert (found.recordings, found.events, found.classes) == (2, 15, {-1: 1, 3: 1})
     assert found.rate.tolist() == [[2, 2], [0, 0], [2, 0], [2, 2], [0, 0]]  # 3 events in 1.5 s
@@ -620,3 +625,104 @@ def test_written_folders_are_as_open_as_others(tmp_path):
 def test_module_constants_agree():
     assert events.BIN_S == 0.02
     assert MAX_STEPS * 3.4e-16 < events._EDGE  # three roundings of a quotient, relative 2**-53 each
+
+
+# What is worth a second look
+
+
+def warned(path, **options) -> tuple[str, ...]:
+    return load_data(path, **options)[1].notes
+
+
+@pytest.mark.parametrize(
+    ("factor", "unit", "last"),
+    [(1e3, "milliseconds", "1995"), (1e6, "microseconds", "1.995e+06"), (1e9, "nanoseconds", "1.995e+09")],
+)
+def test_times_in_another_unit_are_noticed(write, factor, unit, last):
+    rows = [f"{int(0.005 * factor * i)},{i % 3},1" for i in range(400)]
+    path = write("odd/a.csv", "\n".join([HEADER.strip(), *rows]))
+    write("odd/b.csv", path.read_text())
+    write("odd/c.csv", "0,0,1\n0.7,1,1\n90,2,1\n")
+    if factor <= 1e3:
+        assert warned(path.parent) == (f"odd: a.csv (and 1 more): times up to {last} look like {unit}; write seconds",)
+    elif factor == 1e6:
+        assert message(load_data, path) == (
+            "a.csv: line 401: time 1.995e+06 s is past 1000000 bins of 0.02 s, the limit of a recording; "
+            "the times look like microseconds, write seconds"
+        )
+    assert likely_unit(read_stream(path).time_s) == unit
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(0.5, 600), st.integers(1, 2000))
+@settings(deadline=None)
+def test_a_touch_of_several_events_a_second_is_never_taken_for_another_unit(seed, duration, count):
+    times = np.random.default_rng(seed).random(max(count, int(4 * duration))) * duration
+    assert likely_unit(times) is None
+
+
+def test_taxels_that_count_from_one(write):
+    rows = "".join(f"0.{i},{i},1\n" for i in range(1, 6))
+    path = write("one/a.csv", HEADER + rows)
+    note = "one: no event at taxel 0, some at each of 1..5: if these count from 1, count from 0"
+    assert warned(path.parent) == (note,)
+    assert message(load_data, path, taxels=5) == (
+        "a.csv: line 6: taxel 5, allowed are whole numbers 0..4; count from 0, they seem to count from 1"
+    )
+    assert warned(path, taxels=6) == ()
+    write("one/b.csv", HEADER + "0,0,1\n")
+    assert warned(path.parent) == ()
+
+
+# A table of labels
+
+
+@pytest.fixture
+def listed(write):
+    write("own/a.csv", HEADER + "0,0,1\n")
+    write("own/b_label_2.csv", HEADER + "0,1,1\n")
+    write("own/c.csv", HEADER + "0,2,1\n")
+    return write
+
+
+def test_a_table_gives_labels(listed):
+    folder = listed("own/labels.csv", "File, weight ,LABEL\na.csv,3.5,7\n\nb_label_2.csv,,2\nother.csv,,1\n").parent
+    recordings, counts = load_data(folder)
+    assert recordings.files == ("a.csv", "b_label_2.csv", "c.csv")
+    assert recordings.labels.tolist() == [7, 2, UNLABELLED]
+    assert counts.notes == ("own: labels.csv: gives the labels of 2 of 3 recordings",)
+
+
+def test_a_table_above_the_splits(write):
+    for split in ("train", "test"):
+        write(f"own/{split}/a.csv", HEADER + "0,0,1\n")
+    folder = write("own/Labels.csv", "name,class\ntrain/a.csv,1\ntest/a.csv,0\n").parent
+    assert load_data(folder, "train")[0].labels.tolist() == [1]
+    assert load_data(folder, "test")[0].labels.tolist() == [0]
+    assert data_splits(folder) == ("test", "train")
+
+
+def test_a_table_of_something_else_is_passed_over(listed):
+    folder = listed("own/labels.csv", "object,mass\n1,2\n").parent
+    recordings, counts = load_data(folder)
+    assert recordings.labels.tolist() == [UNLABELLED, 2, UNLABELLED]
+    assert counts.notes == ("own: labels.csv: is not read; a table of labels has columns file and label",)
+
+
+@pytest.mark.parametrize(
+    ("rows", "line"),
+    [
+        ("b_label_2.csv,3\n", "own: b_label_2.csv: label 2, and 3 in labels.csv; mend one of them"),
+        ("a.csv,x\n", "own: labels.csv: row 2: 'a.csv', label 'x'; give a file and a number from 0"),
+        ("a.csv\n", "own: labels.csv: row 2: 'a.csv', label ''; give a file and a number from 0"),
+        ("a.csv,1\na.csv,2\n", "own: labels.csv: row 3: a.csv has labels 1 and 2; keep one"),
+    ],
+)
+def test_a_table_that_cannot_be(listed, rows, line):
+    assert message(load_data, listed("own/labels.csv", f"file,label\n{rows}").parent) == line
+
+
+def test_bins_have_their_width_already(write, tmp_path):
+    np.save(tmp_path / "a.npy", np.ones((3, 2, 4), np.uint8))
+    assert message(load_data, tmp_path / "a.npy", bin_s=0.05, error=OptionError) == (
+        "--bin 0.05: a.npy holds bins, not times; leave --bin away"
+    )

@@ -542,6 +542,16 @@ def test_a_damaged_npy_reads_right_or_not_at_all(tmp_path, data, keep):
         assert recordings.events.max() <= 1
 
 
+def test_a_name_that_a_zero_byte_cuts_to_nothing(tmp_path):
+    data = bytearray(ZIPPED.getvalue())
+    data[data.rindex(b"test/sample_1")] = 0
+    (tmp_path / "cut.zip").write_bytes(data)
+    with pytest.raises(DataError) as caught:
+        load_recordings(tmp_path / "cut.zip")
+    name = "\0est/sample_1_label_1.npy"
+    assert str(caught.value) == f"cut.zip: unsafe name {name!r} in the zip; do not trust this file"
+
+
 def test_recordings_keep_what_they_are_given():
     events = np.zeros((2, 3, 2, 4), dtype=np.uint8)
     recordings = Recordings(events=events, labels=np.array([0, 1]), files=("a", "b"), split="test", source="memory")

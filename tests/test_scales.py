@@ -125,7 +125,7 @@ def test_errors_cancel_on_the_recordings(seed):
     calibration = calibrate(network, np.repeat(cause, 4, axis=2) & (rng.random((6, 60, 48)) < 0.9))
     population, projections = network.populations[0], network.projections
     form = Form(bits=4, exponents=(0,), threshold=np.full(16, 200))
-    nearest, other = rounded(population, projections, form), compensated(population, projections, form, calibration)
+    nearest, other = rounded(population, projections, form), compensated(population, projections, form, 0, calibration)
 
     def error(layer):
         weight = sum(p.effective().toarray() for p in layer.projections) - projections[0].weight.toarray() * 400
@@ -152,7 +152,7 @@ def test_a_neuron_that_would_overflow_is_rounded_to_nearest():
     calibration = calibrate(network, rng.random((4, 50, 300)) < 0.3)
     population, projections = network.populations[0], network.projections
     finest = finest_thresholds(population, projections, 8, (-1, 6), 1.0, None)
-    layer = compensated(population, projections, Form(bits=8, exponents=(-1, 6), threshold=finest), calibration)
+    layer = compensated(population, projections, Form(bits=8, exponents=(-1, 6), threshold=finest), 0, calibration)
     assert ONE_STEP_SUM_MAX * 0.99 < layer.reached <= ONE_STEP_SUM_MAX
 
 

@@ -3,9 +3,10 @@ from importlib import resources
 
 import pytest
 
+from compiler import targets
 from compiler.errors import OptionError
 from compiler.passes.legalize import REMEDIES
-from compiler.targets import known_targets, load_target
+from compiler.targets import known_targets, load_target, read_target
 
 LIMITS = {
     "core.compartments": 1024,
@@ -124,3 +125,74 @@ def test_a_target_that_does_not_exist(name, message):
     with pytest.raises(OptionError) as caught:
         load_target(name)
     assert str(caught.value) == message
+
+
+# -- files that are wrong ----------------------------------------------------------------------------------------------
+
+TEXT = (resources.files("compiler.targets") / "loihi1.toml").read_text("utf-8")
+
+
+def faults(path, text) -> list[str]:
+    path.write_text(text, "utf-8")
+    with pytest.raises(OptionError) as caught:
+        read_target(path)
+    lines = str(caught.value).splitlines()
+    assert all(line.startswith(f"{path}: ") for line in lines)
+    return [line.removeprefix(f"{path}: ") for line in lines]
+
+
+def test_every_fault_is_told_at_once(tmp_path):
+    text = TEXT
+    for old, new in (
+        ('title = "Intel Loihi 1"', 'title = 1\ncolour = "green"'),
+        ("core.axons_in = { value = 4096, unit", "core.axons_in = { value = -1, unt = 2, unit"),
+        ('mesh.width = { value = 8, unit = "tiles", source = "SANA-FE" }', "mesh.width = { value = nan }"),
+        ("mesh.height = { value = 4,", "mesh.heigth = { value = 4.5,"),
+        ("synapse.word_bits = { value = 64,", "synapse.word_bits = {"),
+        ("values = [2, 3, 4, 5, 6, 8]", 'values = [2, "3"]'),
+        ('spike = { value = 69.3, unit = "pJ"', 'spkie = { value = 69.3, unit = "nJ"'),
+        ('neuron_active = { value = 72.8, unit = "pJ", source', 'neuron_active = { value = inf, unit = " ", source'),
+    ):
+        assert text.count(old) == 1
+        text = text.replace(old, new)
+    limits, prices = ", ".join(targets.LIMITS), ", ".join(targets.EVENTS)
+    assert faults(tmp_path / "x.toml", text) == [
+        "unknown key 'colour', allowed are name, title, limits, choices, energy",
+        "title: is 1, a text is needed",
+        "limits.mesh.height: is missing",
+        f"limits.mesh.heigth: unknown, allowed are {limits}",
+        "limits.core.axons_in: unknown key 'unt', allowed are value, unit, source",
+        "limits.core.axons_in: value is -1, a finite number from 0 is needed",
+        "limits.synapse.word_bits: lacks value; give value, unit, source",
+        "limits.mesh.width: lacks unit and source; give value, unit, source",
+        "limits.mesh.width: value is nan, a finite number from 0 is needed",
+        "limits.mesh.heigth: value is 4.5, a whole number is needed",
+        "choices.synapse.weight_bits: values are [2, '3'], a list of whole numbers is needed",
+        "energy.sanafe.neuron_active: unit is ' ', a text is needed",
+        "energy.sanafe.neuron_active: value is inf, a finite number from 0 is needed",
+        "energy.sanafe.neuron_active: unit is ' ', allowed is 'pJ'",
+        f"energy.sanafe.spkie: unknown event, allowed are {prices}",
+        "energy.sanafe.spkie: unit is 'nJ', allowed is 'pJ'",
+    ]
+
+
+def test_a_file_without_its_parts(tmp_path):
+    path = tmp_path / "x.toml"
+    assert faults(path, 'name = "x"') == [f"{key}: is missing" for key in ("title", "limits", "choices", "energy")]
+    assert faults(path, "name = ") == ["is not TOML (Invalid value (at end of document)); mend it"]
+    assert faults(path, TEXT.replace('title = "SANA-FE\'s fit to a Nahuku board"\n', "")) == [
+        "energy.sanafe: lacks its title; give title and prices"
+    ]
+    assert faults(
+        path, TEXT.replace('spike = { value = 69.3, unit = "pJ", source = "SANA-FE: soma spike" }', "spike = 69")
+    ) == ["spike: is 69, not an entry with value, unit and source"]
+    with pytest.raises(OptionError) as caught:
+        read_target(tmp_path / "no.toml")
+    assert str(caught.value) == (
+        f"{tmp_path / 'no.toml'}: cannot be read (No such file or directory); give a target file"
+    )
+
+
+def test_a_target_file_is_read_as_it_is_shipped(tmp_path):
+    (tmp_path / "x.toml").write_text(TEXT, "utf-8")
+    assert read_target(tmp_path / "x.toml") == load_target("loihi1")

@@ -130,10 +130,10 @@ def test_evaluation_counts_the_lowest_of_equal_classes_and_averages_over_recordi
 def test_numbers_that_are_too_small():
     with pytest.raises(OptionError) as caught:
         train(grasps(0), grasps(1), ADJACENCY, SMALL, epochs=0)
-    assert str(caught.value) == "epochs: 0, allowed are 1 or more; choose another"
+    assert str(caught.value) == "--epochs 0: allowed are 1 or more; choose another"
     with pytest.raises(OptionError) as caught:
         train(grasps(0), grasps(1), ADJACENCY, SMALL, seed=-1)
-    assert str(caught.value) == "seed: -1, allowed are 0 or more; choose another"
+    assert str(caught.value) == "--seed -1: allowed are 0 or more; choose another"
 
 
 def test_recordings_that_the_network_was_not_made_for():
@@ -195,8 +195,8 @@ def test_resuming_with_other_options_or_data_is_refused(tmp_path):
     with pytest.raises(OptionError) as refused:
         train(grasps(2), grasps(1), ADJACENCY, SMALL, epochs=2, state=state, resume=True)
     assert str(refused.value) == (
-        f"{state}: was written with another epochs, training data; give the same options and data, "
-        "or leave --resume away"
+        f"{state}: belongs to a training with other epochs, training data; give the same options and data, "
+        "or delete it to train anew"
     )
 
 

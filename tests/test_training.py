@@ -9,15 +9,18 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from compiler.errors import DataError, OptionError
 from compiler.frontends.checkpoint import read_checkpoint
 from models.evtouch import load_recordings
 from models.grasps import synthetic_grasps
 from models.release import write_released
 from runtime.cli import main
+from runtime.seeds import _side_by_side
 from runtime.training import draw_training, summary
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -85,9 +88,10 @@ def test_text_shows_every_seed_and_the_means(data, capsys):
     words = ["train", "--data", "data", "--graph", "manual", "--epochs", "1", "--seeds", "2", "-o", "x.pt"]
     assert main(words) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[1].split("  ")[-1].strip() == "file"
-    assert [line.split()[1] for line in lines[2:4]] == ["0", "1"]
-    assert lines[4].startswith("  mean of 2 seeds: last ")
+    assert lines[1].split() == ["epoch", "correct", "accuracy", "95", "%", "interval"]
+    assert [line.split(", ")[0].strip() for line in lines[2:8]] == ["seed 0"] * 3 + ["seed 1"] * 3
+    assert lines[8].startswith("  mean of 2 seeds: last ")
+    assert lines[9] == "  written: x-seed0.pt, x-seed1.pt"
 
 
 def test_pictures_of_equal_trainings_are_equal(tmp_path):
@@ -111,7 +115,8 @@ def test_pictures_of_equal_trainings_are_equal(tmp_path):
     ("words", "line"),
     [
         (["--seeds", "0"], "--seeds 0: at least 1 is needed; give a positive number"),
-        (["--epochs", "0"], "epochs: 0, allowed are 1 or more; choose another"),
+        (["--epochs", "0"], "--epochs 0: allowed are 1 or more; choose another"),
+        (["--seed", "-1"], "--seed -1: allowed are 0 or more; choose another"),
         (["--device", "tpu"], "--device tpu: unknown; allowed: cpu, cuda"),
         (["--picture", "x.jpg"], "--picture x.jpg: allowed are .png, .svg, .pdf; name one of these"),
         (["--picture", "none/x.png"], "--picture none/x.png: the folder does not exist; make it first"),
@@ -170,3 +175,179 @@ def test_killed_at_random_points_it_resumes_to_the_same_bytes(data):
     assert killed >= 1
     assert Path("parts.pt").read_bytes() == Path("whole.pt").read_bytes()
     assert load_recordings("data", "train").steps == 12
+
+
+WORDS = ("train", "--data", "data", "--graph", "manual")
+
+
+def started(*words, until):
+    """A training in a process of its own, once `until` is true."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "runtime", *WORDS, *words],
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    deadline = time.monotonic() + 120
+    while not until() and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert process.poll() is None, process.communicate()[1]
+    return process
+
+
+def refused(capsys, *words) -> str:
+    capsys.readouterr()
+    assert main([*WORDS, *words]) == 2
+    return capsys.readouterr().err.removeprefix("spikeloom: ").removesuffix("\n")
+
+
+def children(pid: int) -> list[int]:
+    """Processes below another one, all the way down; Linux keeps them under /proc."""
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            words = stat.read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        if int(words[1]) == pid and words[0] != "Z":
+            found += [int(stat.parent.name), *children(int(stat.parent.name))]
+    return found
+
+
+def gone(pids: list[int]) -> bool:
+    deadline = time.monotonic() + 20
+    while any(Path(f"/proc/{pid}").exists() for pid in pids):
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.05)
+    return True
+
+
+def test_an_interrupt_says_what_is_kept_and_a_later_run_does_not_lose_it(data, capsys):
+    process = started("--epochs", "5000", "-o", "x.pt", until=lambda: list(data.glob("x.pt.state.*")))
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 2
+    assert err == (
+        "spikeloom: interrupted; the epochs so far are kept in x.pt.state.validation; go on with the same command "
+        "and --resume\n"
+    )
+    assert not list(data.glob(".*")), "half-written files are left"
+    kept = Path("x.pt.state.validation").read_bytes()
+    assert refused(capsys, "--epochs", "5000", "-o", "x.pt") == (
+        "x.pt.state.validation: an interrupted training is kept here; go on with --resume, or delete it to train anew"
+    )
+    assert Path("x.pt.state.validation").read_bytes() == kept
+    assert refused(capsys, "--epochs", "2", "-o", "x.pt", "--resume") == (
+        "x.pt.state.validation: belongs to a training with other epochs; give the same options and data, "
+        "or delete it to train anew"
+    )
+
+
+def test_an_interrupt_before_the_first_epoch(data, capsys, monkeypatch):
+    def interrupt(*_words, **_options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("models.train._train_epoch", interrupt)
+    assert refused(capsys, "--epochs", "2", "-o", "x.pt") == "interrupted; nothing was written"
+    assert not list(data.glob("x.pt*"))
+
+
+def test_nothing_to_resume_is_said(data, capsys):
+    assert refused(capsys, "--epochs", "1", "-o", "x.pt", "--resume") == (
+        "--resume: nothing was interrupted, neither x.pt nor x.pt.state.validation exists; leave --resume away"
+    )
+    assert not list(data.glob("x.pt*"))
+
+
+def test_resume_leaves_finished_seeds_alone_and_trains_the_rest(data, capsys):
+    whole = as_json(capsys, *WORDS, "--epochs", "1", "--seeds", "2", "-o", "x.pt", "--picture", "a.png")
+    contents = {file.name: file.read_bytes() for file in data.glob("x-seed*.pt")}
+    before = Path("x-seed0.pt").stat().st_mtime_ns
+    Path("x-seed1.pt").unlink()
+    words = [*WORDS, "--epochs", "1", "--seeds", "2", "-o", "x.pt", "--resume", "--picture", "b.png", "--json"]
+    assert main(words) == 0
+    out, err = capsys.readouterr()
+    assert err == (
+        "spikeloom: x-seed0.pt: is finished, not trained again\n"
+        "spikeloom: x-seed1.pt: was not begun, trained from the start\n"
+    )
+    assert json.loads(out) == whole
+    assert Path("x-seed0.pt").stat().st_mtime_ns == before
+    assert {file.name: file.read_bytes() for file in data.glob("x-seed*.pt")} == contents
+    assert Path("a.png").read_bytes() == Path("b.png").read_bytes()
+
+
+def test_resume_does_not_take_another_training_for_this_one(data, capsys):
+    as_json(capsys, *WORDS, "--epochs", "1", "--keep", "best", "-o", "x.pt")
+    assert refused(capsys, "--epochs", "2", "--seed", "3", "-o", "x.pt", "--resume") == (
+        "x.pt: holds another training (other epochs, seed); give its options, or another -o"
+    )
+    assert refused(capsys, "--epochs", "1", "-o", "x.pt", "--resume", "--picture", "x.png") == (
+        "x.pt: was written without its last epoch, which --picture draws; leave --picture away"
+    )
+    Path("x.pt").write_bytes(b"old")
+    assert refused(capsys, "--epochs", "1", "-o", "x.pt", "--resume").startswith("x.pt: ")
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes under /proc")
+@pytest.mark.parametrize("sent", [signal.SIGTERM, signal.SIGKILL, signal.SIGINT])
+def test_no_worker_outlives_the_command(data, capsys, sent):
+    process = started(
+        "--epochs", "5000", "--seeds", "2", "-o", "x.pt", until=lambda: len(list(data.glob("x-seed?.pt.state.*"))) == 2
+    )
+    workers = children(process.pid)
+    assert len(workers) >= 2
+    process.send_signal(sent)
+    _, err = process.communicate(timeout=60)
+    assert gone(workers)
+    if sent != signal.SIGKILL:
+        assert process.returncode == 2
+        assert err.splitlines()[-1] == (
+            "spikeloom: interrupted; the epochs so far are kept in x-seed0.pt.state.validation, "
+            "x-seed1.pt.state.validation; go on with the same command and --resume"
+        )
+    assert not list(data.glob(".*")), "half-written files are left"
+
+
+def test_what_a_killed_training_left_half_written_goes(data, capsys):
+    for name in (".x.pt.abcd_123.part", ".x.pt.state.whole.zzzzzzzz.part"):
+        Path(name).write_bytes(b"half")
+    Path(".xy.pt.abcd_123.part").write_bytes(b"of somebody else")
+    as_json(capsys, *WORDS, "--epochs", "1", "-o", "x.pt")
+    assert [file.name for file in data.glob(".*")] == [".xy.pt.abcd_123.part"]
+
+
+def dies(_job):
+    os._exit(9)
+
+
+def fails(_job):
+    raise DataError("epoch 1: the loss is nan")
+
+
+@pytest.mark.parametrize(
+    ("run", "error", "line"),
+    [
+        (
+            dies,
+            OptionError,
+            "x.pt: its process ended early (exit code 9), perhaps for lack of memory; go on with --resume, "
+            "and with fewer --seeds",
+        ),
+        (fails, DataError, "epoch 1: the loss is nan"),
+    ],
+)
+def test_a_worker_that_fails_ends_all(run, error, line):
+    job = SimpleNamespace(output=Path("x.pt"))
+    with pytest.raises(error) as raised:
+        _side_by_side([job, job], [0, 1], {}, run)
+    assert str(raised.value) == line
+
+
+def test_the_report_fits_a_terminal(data, capsys):
+    assert main([*WORDS, "--epochs", "1", "--seeds", "2", "--seed", "3", "-o", "x.pt"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "spikeloom train --data data --graph manual --epochs 1 --seed 3 --seeds 2"
+    assert max(map(len, lines)) <= 120

@@ -404,8 +404,26 @@ def test_a_network_without_polarities(lively, lines, tmp_path):
 
 
 def test_no_such_file(lively_file, tmp_path):
-    with pytest.raises(FileNotFoundError):
+    with pytest.raises(DataError) as refused:
         command(lively_file, "--input", tmp_path / "none.csv")
+    assert str(refused.value) == (
+        f"--input {tmp_path / 'none.csv'}: No such file or directory; "
+        "give a file of event lines, or - for standard input"
+    )
+
+
+@pytest.mark.parametrize(
+    "header", ["Time_S,Taxel,Polarity", "# TIME_S, TAXEL, POLARITY", "TIME_S,taxel,polarity,Label"]
+)
+def test_headers_may_have_capitals(lively, lively_file, lines, objects, header):
+    events = random_events(4, 20)
+    rows = [row + ",1" if header.endswith("Label") else row for row in as_lines(events).splitlines()]
+    found = objects(lively_file, "--input", lines("\n".join([header, *rows, ""])))
+    assert found["grasp"][0]["counts"] == votes_of_run(lively, events)
+
+
+def test_help_says_that_order_counts():
+    assert "Lines come in the order of their times" in " ".join(parser().format_help().split())
 
 
 def test_a_reader_that_goes_away_ends_it(pair_file, lines, monkeypatch):

@@ -180,7 +180,7 @@ def read_checkpoint(
         If the file is no checkpoint, holds code, is damaged or altered, does not hold what is asked for, or its
         tensors do not make a TactileSGNet; every fault of the tensors is listed.
     OptionError
-        If `weights`, `beta` or `theta` has a value that does not exist.
+        If `weights`, `beta` or `theta` has a value that does not exist, or a fine-tuned network had another one.
     """
     if weights is not None and weights not in WEIGHTS:
         raise OptionError(f"--weights {weights}: unknown; choose from {', '.join(WEIGHTS)}")
@@ -201,6 +201,11 @@ def read_checkpoint(
             raise ModelError(f"{where}: --run {run}: the file holds only run 0; leave --run away")
         arrays, chosen, (graph, edges, held, training), forms = _own_arrays(where, members, weights)
         layout, runs, assumed = "spikeloom", 1, ()
+        for name, value in given.items():
+            if forms is not None and value not in (None, held[name]):
+                raise OptionError(
+                    f"--{name} {value:g}: {where} was fine-tuned with {held[name]:g}; leave --{name} away"
+                )
     stages = sorted({key.split(".")[0] for key in arrays if key.startswith("fc")}, key=lambda name: int(name[2:]))
     return Checkpoint(
         hops=_plain(arrays["conv1.hops"]),
@@ -334,12 +339,12 @@ def _forms(where: str, manifest: dict[str, Any], arrays: Arrays, taxels: int) ->
     found = []
     try:
         for name, size, entry in zip(sizes, sizes.values(), manifest["forms"], strict=True):
-            threshold = np.array(entry["threshold"], np.int64)
-            bits, exponents = int(entry["bits"]), tuple(int(e) for e in entry["exponents"])
+            bits, exponents, thresholds = entry["bits"], entry["exponents"], entry["threshold"]
             good = (
                 entry["layer"] == name
-                and threshold.shape == (size,)
-                and bool(np.all((threshold >= 1) & (threshold <= THRESHOLD_MANTISSA_MAX)))
+                and all(type(number) is int for number in (bits, *exponents, *thresholds))
+                and len(thresholds) == size
+                and all(1 <= threshold <= THRESHOLD_MANTISSA_MAX for threshold in thresholds)
                 and bits in range(2, 9)
                 and bool(exponents)
                 and all(-1 <= e <= 7 for e in exponents)
@@ -347,9 +352,10 @@ def _forms(where: str, manifest: dict[str, Any], arrays: Arrays, taxels: int) ->
             )
             if not good:
                 raise ValueError(f"layer {name}")
+            threshold = np.array(thresholds, np.int64)
             threshold.flags.writeable = False
-            found.append(Form(bits=bits, exponents=exponents, threshold=threshold))
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
+            found.append(Form(bits=bits, exponents=tuple(exponents), threshold=threshold))
+    except (KeyError, TypeError, ValueError) as error:
         raise ModelError(f"{where}: has unusable forms of a fine-tuning ({error}); {_AGAIN}") from error
     return tuple(found)
 

@@ -44,6 +44,14 @@ def evenly_spaced(events: BoolArray, count: int = RECORDINGS) -> BoolArray:
     return events[np.linspace(0, len(events) - 1, count).round().astype(np.int64)]
 
 
+def fewer(calibration: Calibration, count: int = RECORDINGS) -> Calibration:
+    """A calibration on at most `count` of its recordings, evenly spaced."""
+    return Calibration(
+        events=evenly_spaced(calibration.events, count),
+        spikes=tuple(evenly_spaced(spikes, count) for spikes in calibration.spikes),
+    )
+
+
 def calibrate(network: Network, events: BoolArray) -> Calibration:
     """Run the float64 model.
 

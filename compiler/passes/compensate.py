@@ -19,7 +19,7 @@ from compiler.fixedpoint import ONE_STEP_SUM_MAX, FloatArray, IntArray
 from compiler.forms import Form, one_sided_sums, reach, scales, step_units, store
 from compiler.ir import Population, Projection
 from compiler.passes.calibrate import Calibration
-from compiler.passes.scales import Rounded
+from compiler.passes.scales import Rounded, flips
 
 DAMPING = 1e-3
 """Share of the mean activity that is added to each input's own: inputs that never spiked are rounded to nearest."""
@@ -29,13 +29,15 @@ def compensated(
     population: Population,
     projections: tuple[Projection, ...],
     form: Form,
+    post: int,
     calibration: Calibration,
     observed: FloatArray | None = None,
 ) -> Rounded | None:
     """Round one population with compensation; None where a bias has no register value.
 
     Weights that the range cuts off stay at its end: their errors are not passed on. A neuron whose sums would leave
-    the accumulator is rounded to nearest instead. `observed` as for :func:`compiler.passes.scales.rounded`.
+    the accumulator, or that keeps fewer of its spikes (one that fires from its bias alone, say), is rounded to
+    nearest instead. `observed` as for :func:`compiler.passes.scales.rounded`.
     """
     scale, step = scales(population, form), step_units(form.bits, form.exponents)
     offset, width = 0, sum(p.weight.shape[1] for p in projections)
@@ -59,21 +61,26 @@ def compensated(
         part = np.ix_(rows, columns)
         steps[part] = np.clip(_round_in_turn(held[part], together[np.ix_(columns, columns)]), -limit, limit)
 
-    def stored_as(steps: IntArray) -> Rounded | None:
-        bias = population.bias + (held - steps) @ rate * step / scale
+    def stored_as(steps: IntArray, errors: FloatArray) -> Rounded | None:
         try:
+            bias = population.bias + errors
             integer, planes = store(population, projections, form, [steps[place] for place in places], bias)
         except ValueError:
             return None
         sums = one_sided_sums(planes, population.size) if observed is None else observed * scale
         return Rounded(form=form, population=integer, projections=planes, reached=float(np.max(sums, initial=0)))
 
-    layer = stored_as(steps)
-    if layer is not None and layer.reached > ONE_STEP_SUM_MAX:
-        over = one_sided_sums(layer.projections, population.size) > ONE_STEP_SUM_MAX
-        steps[over] = np.rint(held[over])
-        layer = stored_as(steps)
-    return layer
+    nearest = np.rint(held).astype(np.int64)
+    plain = stored_as(nearest, np.zeros(population.size))
+    errors = (held - steps) @ rate * step / scale
+    layer = stored_as(steps, errors)
+    if layer is None or plain is None:
+        return None
+    back = flips(layer, post, calibration) > flips(plain, post, calibration)
+    if observed is None:
+        back |= one_sided_sums(layer.projections, population.size) > ONE_STEP_SUM_MAX
+    steps[back], errors[back] = nearest[back], 0
+    return stored_as(steps, errors)
 
 
 def _alike(stored: FloatArray) -> list[tuple[IntArray, IntArray]]:

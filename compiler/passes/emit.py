@@ -7,9 +7,11 @@ far as the core's memory allows it, because a zero inside a dense list is visite
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from compiler.fixedpoint import IntArray
 from compiler.ir import INPUT, IntegerNetwork, depths, fan_in
@@ -41,11 +43,41 @@ def _entries(
     return length, target, weight
 
 
-def _layers(network: IntegerNetwork) -> tuple[Layer, ...]:
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Origin:
+    """What a network was before neurons were left out.
+
+    Parameters
+    ----------
+    network : IntegerNetwork
+        With all neurons.
+    identity : tuple of (neurons left,) int64
+        For each population, which of its neurons the chip holds.
+    unheard : tuple of (neurons,) bool
+        Neurons left out although they fire, because nobody hears them.
+    """
+
+    network: IntegerNetwork
+    identity: tuple[IntArray, ...]
+    unheard: tuple[npt.NDArray[np.bool_], ...]
+
+
+def unpruned(network: IntegerNetwork) -> Origin:
+    """A network of which nothing was left out."""
+    return Origin(
+        network=network,
+        identity=tuple(np.arange(population.size) for population in network.populations),
+        unheard=tuple(np.zeros(population.size, np.bool_) for population in network.populations),
+    )
+
+
+def _layers(origin: Origin) -> tuple[Layer, ...]:
+    network = origin.network
     return tuple(
         Layer(
             name=population.name,
             neurons=population.size,
+            unheard=tuple(np.flatnonzero(origin.unheard[post]).tolist()),
             depth=depth,
             beta=population.beta,
             theta=population.theta,
@@ -63,6 +95,7 @@ def emit(
     tiles: tuple[int, ...],
     target: Target,
     provenance: Mapping[str, Any],
+    origin: Origin | None = None,
 ) -> Netlist:
     """Assemble the netlist of a partitioned network.
 
@@ -78,7 +111,10 @@ def emit(
         Chip.
     provenance : mapping
         JSON values to remember.
+    origin : Origin, optional
+        What `network` was before neurons were left out; itself by default.
     """
+    origin = origin or unpruned(network)
     compartment_id = [np.zeros(population.size, np.int64) for population in network.populations]
     placed: list[tuple[Chunk, int, int]] = []  # chunk, core, base on it
     counts: list[int] = []
@@ -126,12 +162,14 @@ def emit(
         taxels=network.input.taxels,
         polarities=network.input.polarities,
         classes=network.classes,
-        layers=_layers(network),
+        layers=_layers(origin),
         core_tile=read_only(tiles),
         core_compartments=read_only(np.concatenate([[0], np.cumsum(counts)])),
         core_axons=read_only(np.concatenate([[0], np.cumsum(axons_per_core)])),
         layer=read_only(np.concatenate([np.full(chunk.size, chunk.population) for chunk in order])),
-        neuron=read_only(np.concatenate(neurons)),
+        neuron=read_only(
+            np.concatenate([origin.identity[c.population][n] for c, n in zip(order, neurons, strict=True)])
+        ),
         decay_u=read_only(np.concatenate([np.full(len(n), p.decay_u) for p, n in rows])),
         decay_v=read_only(np.concatenate([np.full(len(n), p.decay_v) for p, n in rows])),
         threshold=read_only(np.concatenate([p.threshold[n] for p, n in rows])),

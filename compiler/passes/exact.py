@@ -15,7 +15,7 @@ from compiler.fixedpoint import THRESHOLD_MANTISSA_MAX, IntArray
 from compiler.forms import decay_registers, reach, step_units
 from compiler.interpret import float_recurrence, product
 from compiler.ir import IntegerNetwork, Network
-from compiler.passes.calibrate import Calibration, evenly_spaced
+from compiler.passes.calibrate import Calibration, fewer
 from compiler.passes.compensate import compensated
 from compiler.passes.quantize import Candidate, Choice, Recipe, assemble, explain_choice, incoming, shortlist
 from compiler.passes.scales import finest_thresholds, flips, in_batches
@@ -96,7 +96,7 @@ def make_exact(
     steps = (1, 1), (2, 1), (2, slots), (3, slots)
     ladder = [Recipe(bits=bits, planes=planes, groups=groups) for planes, groups in steps]
     exponents = target.choices["synapse.exponent"]
-    few, many = _part(calibration, FEW), _part(calibration, MANY)
+    few, many = fewer(calibration, FEW), fewer(calibration, MANY)
     chosen, found = [], []
     for post, population in enumerate(network.populations):
         tell(population.name)
@@ -131,18 +131,11 @@ def make_exact(
     return assemble(network, [c.layer for c in chosen]), choices, tuple(found)
 
 
-def _part(calibration: Calibration, count: int) -> Calibration:
-    return Calibration(
-        events=evenly_spaced(calibration.events, count),
-        spikes=tuple(evenly_spaced(spikes, count) for spikes in calibration.spikes),
-    )
-
-
 def _compensate_with_more(
     network: Network, post: int, candidate: Candidate, many: Calibration, few: Calibration
 ) -> Candidate:
     """Round the same storage with errors that cancel on more recordings, if that keeps more spikes."""
-    layer = compensated(network.populations[post], incoming(network, post), candidate.layer.form, many)
+    layer = compensated(network.populations[post], incoming(network, post), candidate.layer.form, post, many)
     moved = None if layer is None else int(flips(layer, post, few).sum())
     if layer is None or moved is None or moved > (candidate.flips or 0):
         return candidate

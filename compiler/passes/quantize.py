@@ -146,9 +146,7 @@ def shortlist(
         counted = [Candidate(layer=c, flips=int(flips(c, post, calibration).sum()), tried=len(found)) for c in found]
         counted.sort(key=lambda c: c.flips or 0)
     if recipe.groups > 1:
-        best = grouped(
-            population, projections, post, counted[0].layer, recipe.groups, factors, calibration, observed
-        )
+        best = grouped(population, projections, post, counted[0].layer, recipe.groups, factors, calibration, observed)
         if best is not None:
             moved = None if calibration is None else int(flips(best, post, calibration).sum())
             counted.insert(0, Candidate(layer=best, flips=moved, tried=counted[0].tried))
@@ -156,7 +154,7 @@ def shortlist(
             counted = counted[:1]
     if calibration is not None:
         form, tried = counted[0].layer.form, counted[0].tried
-        other = compensated(population, projections, form, calibration, observed)
+        other = compensated(population, projections, form, post, calibration, observed)
         moved = None if other is None else int(flips(other, post, calibration).sum())
         if other is not None and moved is not None and moved < (counted[0].flips or 0):
             counted.insert(0, Candidate(layer=other, flips=moved, tried=tried, compensated=True))

@@ -1,0 +1,229 @@
+"""Leave out what provably does nothing: neurons that can never fire, neurons that nobody hears.
+
+The bounds hold for any input, so every spike that is left is as before. A neuron that cannot fire in the float model
+is taken out before rounding: its weights then no longer take room in the accumulators of its listeners, whose scales
+become finer. Left out on request only: neurons that did not fire on the training recordings.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from compiler.fixedpoint import MEMBRANE_SHIFT, IntArray
+from compiler.ir import INPUT, IntegerNetwork, IntegerPopulation, Network, Sparse
+from compiler.passes.calibrate import Calibration
+
+Mask = npt.NDArray[np.bool_]
+
+FLOAT32_ROUNDING = 2.0**-23
+"""Relative error of one float32 operation, doubled: the float model is silent in that precision and order too."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Removal:
+    """What was left out of one layer.
+
+    Parameters
+    ----------
+    layer : str
+        Population.
+    silent : int
+        Neurons that no input can make fire, in the float model or on the chip.
+    unheard : int
+        Neurons that fire, but without a synapse that is not zero to any that is left, and without a vote.
+    unused : int
+        Neurons that did not fire on the training recordings; on request only.
+    synapses : int
+        Synapses from and to all of these that would not have been zero.
+    """
+
+    layer: str
+    silent: int
+    unheard: int
+    unused: int
+    synapses: int
+
+
+def never_fires(network: Network) -> tuple[Mask, ...]:
+    """Neurons of the float model that no input can make fire, in any order of summation, in float32 or wider.
+
+    Neurons that vote are never among them.
+
+    A neuron that has not fired holds at most ``sum(positive weights) + bias``, added up by the leak.
+    """
+    silent: dict[int, Mask] = {INPUT: np.zeros(network.input.size, np.bool_)}
+    for post, population in enumerate(network.populations):
+        up, total = np.zeros(population.size), np.abs(population.bias)
+        inputs = 0
+        for p in network.projections:
+            if p.post == post:
+                heard = (~silent[p.pre]).astype(np.float64)
+                up += p.weight.maximum(0) @ heard
+                total = total + abs(p.weight) @ heard
+                inputs += p.weight.shape[1]
+        slack = (inputs + 8) * FLOAT32_ROUNDING * total
+        most = np.maximum(up + population.bias + slack, 0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            settled = most / (1 - population.beta) if population.beta < 1 else np.where(most > 0, np.inf, 0)
+        silent[post] = settled <= population.theta * (1 - 8 * FLOAT32_ROUNDING)
+    return _without_voters(network, tuple(silent[post] for post in range(len(network.populations))))
+
+
+def never_fired(network: Network, calibration: Calibration) -> tuple[Mask, ...]:
+    """Neurons that did not fire on the calibration recordings; never among them are those that vote."""
+    fired = [np.asarray(spikes.any(axis=(0, 1)), np.bool_) for spikes in calibration.spikes]
+    return _without_voters(network, tuple(~mask for mask in fired))
+
+
+def nobody(network: Network) -> tuple[Mask, ...]:
+    """No neuron of any population."""
+    return tuple(np.zeros(population.size, np.bool_) for population in network.populations)
+
+
+def either(first: tuple[Mask, ...], second: tuple[Mask, ...]) -> tuple[Mask, ...]:
+    """Neurons of one mask or the other."""
+    return tuple(np.asarray(a | b, np.bool_) for a, b in zip(first, second, strict=True))
+
+
+def disconnect(network: Network, gone: tuple[Mask, ...]) -> Network:
+    """Set the weights from and to some neurons, and their biases, to zero; the structure stays."""
+    return replace(
+        network,
+        populations=tuple(
+            replace(population, bias=np.where(mask, 0.0, population.bias))
+            for population, mask in zip(network.populations, gone, strict=True)
+        ),
+        projections=tuple(
+            replace(p, weight=_zeroed(p.weight, gone[p.post], _of(gone, p.pre, p.weight.shape[1])))
+            for p in network.projections
+        ),
+    )
+
+
+def removable(network: IntegerNetwork) -> tuple[tuple[Mask, ...], tuple[Mask, ...]]:
+    """Neurons that the chip need not hold: those that no input can make fire, and others that nobody hears.
+
+    Neurons that vote are never among them, and every population keeps one neuron.
+
+    Returns
+    -------
+    silent, unheard : tuple of (neurons,) bool
+        One mask per population; no neuron is in both.
+    """
+    silent: dict[int, Mask] = {INPUT: np.zeros(network.input.size, np.bool_)}
+    for post, population in enumerate(network.populations):
+        up = np.zeros(population.size)
+        for p in network.projections:
+            if p.post == post:
+                up += p.effective().maximum(0) @ (~silent[p.pre]).astype(np.float64)
+        silent[post] = _cannot_reach(population, up * (1 << MEMBRANE_SHIFT))
+    unheard: dict[int, Mask] = {}
+    for pre in reversed(range(len(network.populations))):
+        size = network.populations[pre].size
+        votes = pre == network.readout.population
+        if votes:
+            silent[pre] = np.zeros(size, np.bool_)
+        heard = np.full(size, votes)
+        for p in network.projections:
+            if p.pre == pre:
+                listens = ~(silent[p.post] | unheard[p.post])
+                heard |= np.asarray((p.weight[np.flatnonzero(listens)] != 0).sum(axis=0)).ravel() > 0
+        unheard[pre] = ~heard & ~silent[pre]
+        if np.all(silent[pre] | unheard[pre]):
+            silent[pre][0] = unheard[pre][0] = False
+    indices = range(len(network.populations))
+    return tuple(silent[i] for i in indices), tuple(unheard[i] for i in indices)
+
+
+def _cannot_reach(population: IntegerPopulation, inflow: npt.NDArray[np.float64]) -> Mask:
+    """Whether the membrane stays at or below its threshold whatever arrives, register rounding included."""
+    lost_u, lost_v = (population.decay_u + 1) / 4096, population.decay_v / 4096
+    with np.errstate(divide="ignore", invalid="ignore"):
+        current = inflow / lost_u
+        step = np.maximum(current + population.bias, 0)
+        most = np.where(step > 0, step / lost_v if lost_v else np.inf, 0)
+    below: Mask = most <= population.threshold << MEMBRANE_SHIFT
+    return below
+
+
+def compact(network: IntegerNetwork, gone: tuple[Mask, ...]) -> tuple[IntegerNetwork, tuple[IntArray, ...]]:
+    """Take neurons out.
+
+    Returns
+    -------
+    IntegerNetwork
+        The rest, renumbered.
+    tuple of (neurons left,) int64
+        Which neuron of the original each one is.
+    """
+    kept = tuple(np.flatnonzero(~mask) for mask in gone)
+    projections = []
+    for p in network.projections:
+        weight = p.weight[kept[p.post]]
+        if p.pre != INPUT:
+            weight = weight[:, kept[p.pre]]
+        projections.append(replace(p, weight=weight.tocsr()))
+    readout = network.readout
+    return (
+        replace(
+            network,
+            populations=tuple(
+                replace(
+                    population,
+                    scale=population.scale[ids],
+                    threshold=population.threshold[ids],
+                    bias_mantissa=population.bias_mantissa[ids],
+                    bias_exponent=population.bias_exponent[ids],
+                )
+                for population, ids in zip(network.populations, kept, strict=True)
+            ),
+            projections=tuple(projections),
+            readout=replace(readout, label=readout.label[kept[readout.population]]),
+        ),
+        kept,
+    )
+
+
+def removals(
+    network: Network, silent: tuple[Mask, ...], unheard: tuple[Mask, ...], unused: tuple[Mask, ...]
+) -> tuple[Removal, ...]:
+    """Count what was left out of `network`, layer by layer; what no input can make fire does not count as unused."""
+    proven, gone = never_fires(network), either(silent, unheard)
+    found = []
+    for post, population in enumerate(network.populations):
+        by_evidence = unused[post] & ~proven[post] & gone[post]
+        synapses = 0
+        for p in network.projections:
+            if p.post == post:
+                row, column = p.weight.tocoo().coords
+                lost = gone[post][row] | _of(gone, p.pre, p.weight.shape[1])[column]
+                synapses += int((lost & (p.weight.data != 0)).sum())
+        found.append(
+            Removal(
+                layer=population.name,
+                silent=int((silent[post] & ~by_evidence).sum()),
+                unheard=int((unheard[post] & ~by_evidence).sum()),
+                unused=int(by_evidence.sum()),
+                synapses=synapses,
+            )
+        )
+    return tuple(found)
+
+
+def _without_voters(network: Network, masks: tuple[Mask, ...]) -> tuple[Mask, ...]:
+    voting = network.readout.population
+    return tuple(np.zeros_like(mask) if i == voting else mask for i, mask in enumerate(masks))
+
+
+def _of(masks: tuple[Mask, ...], pre: int, size: int) -> Mask:
+    return np.zeros(size, np.bool_) if pre == INPUT else masks[pre]
+
+
+def _zeroed(weight: Sparse, rows: Mask, columns: Mask) -> Sparse:
+    changed = weight.copy()
+    row = np.repeat(np.arange(len(rows)), np.diff(weight.indptr))
+    changed.data = np.where(rows[row] | columns[weight.indices], 0, weight.data)
+    return changed

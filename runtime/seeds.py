@@ -1,0 +1,188 @@
+"""Trainings side by side: one process a seed, all ended together, each continued from where it was interrupted."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from multiprocessing import get_context, parent_process
+from multiprocessing.connection import Connection, wait
+from multiprocessing.context import SpawnProcess
+from pathlib import Path
+from typing import Any
+
+from compiler.atomic import remove_leftovers
+from compiler.errors import OptionError, SpikeloomError
+from compiler.fixedpoint import IntArray
+from runtime.training import Job, recall, run_job, state_of
+
+Result = tuple[dict[str, Any], IntArray | None]
+
+PATIENCE_S = 5.0
+"""How long a process that was told to end may take for it."""
+
+STOPPED = 143
+"""Exit code of a process that a signal ended, as a shell gives it."""
+
+
+def train_seeds(jobs: Sequence[Job], *, resume: bool) -> list[Result]:
+    """Train several seeds, side by side on the cores where there are several.
+
+    Parameters
+    ----------
+    jobs : sequence of Job
+        One for each seed.
+    resume : bool
+        Leave finished seeds alone, go on with interrupted ones, and start the rest.
+
+    Returns
+    -------
+    list of (record, predictions)
+        In the order of the jobs, see :func:`runtime.training.run_job`.
+
+    Raises
+    ------
+    OptionError
+        If there is something to resume and `resume` is false, or the reverse; if a file holds another training; or if
+        a training ended without a result.
+    KeyboardInterrupt
+        On an interrupt or a request to end; its text says what is kept.
+    """
+    results: dict[int, Result] = {}
+    for index, job in enumerate(jobs):
+        if resume and not _states(job) and job.output.exists():
+            results[index] = recall(job)
+    _require_right_start(jobs, resume=resume, finished=bool(results))
+    for index, job in enumerate(jobs):
+        for file in (job.output, *state_of(job)):
+            remove_leftovers(file)
+        if index in results:
+            sys.stderr.write(f"spikeloom: {job.output}: is finished, not trained again\n")
+        elif resume and not _states(job):
+            sys.stderr.write(f"spikeloom: {job.output}: was not begun, trained from the start\n")
+    waiting = [index for index in range(len(jobs)) if index not in results]
+    try:
+        with _ended_by_signal():
+            if len(waiting) == 1:
+                results[waiting[0]] = run_job(jobs[waiting[0]])
+            else:
+                _side_by_side(jobs, waiting, results)
+    except KeyboardInterrupt as interrupt:
+        done = [jobs[index] for index in waiting if index in results]
+        raise KeyboardInterrupt(_kept(done, jobs)) from interrupt
+    return [results[index] for index in range(len(jobs))]
+
+
+def _states(job: Job) -> list[Path]:
+    return [file for file in state_of(job) if file.exists()]
+
+
+def _require_right_start(jobs: Sequence[Job], *, resume: bool, finished: bool) -> None:
+    """Neither lose an interrupted training nor begin anew in silence."""
+    states = [file for job in jobs for file in _states(job)]
+    if states and not resume:
+        raise OptionError(
+            f"{', '.join(map(str, states))}: an interrupted training is kept here; go on with --resume, or delete "
+            f"{'it' if len(states) == 1 else 'them'} to train anew"
+        )
+    if resume and not states and not finished:
+        raise OptionError(
+            f"--resume: nothing was interrupted, neither {jobs[0].output} nor {state_of(jobs[0])[0]} exists; "
+            "leave --resume away"
+        )
+
+
+def _kept(done: Sequence[Job], jobs: Sequence[Job]) -> str:
+    """What an interrupt left, and how to go on; empty if nothing."""
+    written = [str(job.output) for job in done]
+    states = [str(file) for job in jobs for file in _states(job)]
+    parts = [f"{', '.join(written)} {'is' if len(written) == 1 else 'are'} finished"] if written else []
+    if states:
+        parts.append(f"the epochs so far are kept in {', '.join(states)}")
+    return f"{' and '.join(parts)}; go on with the same command and --resume" if parts else ""
+
+
+@contextmanager
+def _ended_by_signal() -> Iterator[None]:
+    """A request to end (SIGTERM) interrupts as Ctrl-C does, so that everything is left tidy."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # only the main thread may say what a signal does
+        return
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _side_by_side(
+    jobs: Sequence[Job],
+    waiting: Sequence[int],
+    results: dict[int, Result],
+    run: Callable[[Job], Result] = run_job,
+) -> None:
+    """Run jobs in processes of their own; whatever ends this ends them all."""
+    # spawned, not forked: torch and its thread pools do not survive a fork
+    context = get_context("spawn")
+    queue = list(waiting)
+    running: dict[Connection, tuple[int, SpawnProcess]] = {}
+    try:
+        while queue or running:
+            while queue and len(running) < (os.cpu_count() or 1):
+                index = queue.pop(0)
+                receiver, sender = context.Pipe(duplex=False)
+                process = context.Process(target=_work, args=(run, jobs[index], sender))
+                process.start()
+                sender.close()
+                running[receiver] = index, process
+            for ready in wait(list(running)):
+                receiver = next(known for known in running if known is ready)
+                index, process = running[receiver]
+                try:
+                    found = receiver.recv()
+                except EOFError:
+                    process.join()
+                    raise OptionError(
+                        f"{jobs[index].output}: its process ended early (exit code {process.exitcode}), perhaps for "
+                        "lack of memory; go on with --resume, and with fewer --seeds"
+                    ) from None
+                if isinstance(found, BaseException):
+                    raise found
+                results[index] = found
+                process.join()
+                del running[receiver]
+    finally:
+        for _, process in running.values():
+            process.terminate()
+        for _, process in running.values():
+            process.join(PATIENCE_S)
+            process.kill()
+            process.join()
+
+
+def _work(run: Callable[[Job], Result], job: Job, sender: Connection) -> None:
+    """One job in its own process, which outlives neither a request to end nor its parent."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent gets it too, and ends us
+    signal.signal(signal.SIGTERM, _stop)
+    threading.Thread(target=_follow_parent, daemon=True).start()
+    try:
+        sender.send(run(job))
+    except (SpikeloomError, OSError, MemoryError) as error:
+        sender.send(error)
+
+
+def _stop(_signal: int, _frame: object) -> None:
+    raise SystemExit(STOPPED)
+
+
+def _follow_parent() -> None:
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(PATIENCE_S)
+        os._exit(STOPPED)

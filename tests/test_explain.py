@@ -1,0 +1,274 @@
+"""The command ``explain``: what it prints, and what it refuses."""
+
+import json
+import time
+
+import numpy as np
+import pytest
+from made_files import CLASSES, FEATURES, STEPS, TAXELS, own_file, recordings_folder, weights
+
+from compiler.frontends.checkpoint import read_checkpoint
+from compiler.interpret import channels_last, run_float
+from compiler.lift import lift
+from compiler.passes.expand import expand
+from compiler.passes.quantize import Recipe
+from compiler.pipeline import compile_checkpoint
+from compiler.serialize import read_netlist
+from models.events import load_data
+from models.graphs import build_graph, normalised_adjacency
+from runtime import cli, engine
+from runtime.causes import Observed, RootCause, explain
+from runtime.explain import left_out, remedy
+from runtime.roots import Root
+from runtime.suspects import BETA, BIAS, CAUSES, LEFT_OUT, SATURATION, THRESHOLD, TIE, TRUNCATION, UNKNOWN, WEIGHTS
+from runtime.trace import aligned
+
+EXPLAIN = ("explain", "net.loom", "--checkpoint", "net.pt", "--data", "data")
+SIZES = {"conv1": TAXELS * FEATURES, "fc1": 9, "fc2": 8, "fc3": CLASSES}
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """A folder with recordings, two checkpoints, and a 4-bit netlist of the first."""
+    folder = tmp_path_factory.mktemp("explain")
+    recordings_folder(folder / "data")
+    own_file(folder / "net.pt")
+    own_file(folder / "other.pt", last=weights(7))
+    own_file(folder / "wide.pt", last=weights(sizes=(10, 8, CLASSES)))
+    words = ["compile", folder / "net.pt", "--weight-bits", "4", "--keep-all", "-o", folder / "net.loom", "--json"]
+    assert cli.main([str(word) for word in words]) == 0
+    return folder
+
+
+@pytest.fixture
+def spikeloom(capsys, place, monkeypatch):
+    """Run a command in that folder; returns exit code, standard output and standard error."""
+    monkeypatch.chdir(place)
+
+    def command(*words):
+        capsys.readouterr()
+        code = cli.main([str(word) for word in words])
+        return code, *capsys.readouterr()
+
+    return command
+
+
+@pytest.fixture
+def report(spikeloom):
+    """Explain with ``--json``; returns the object."""
+
+    def command(*words):
+        code, out, err = spikeloom(*EXPLAIN, *words, "--json")
+        assert (code, err) == (0, "")
+        assert out.count("\n") == 1
+        return json.loads(out)
+
+    return command
+
+
+def test_the_report_counts_what_the_engine_and_the_float64_model_do(report, place):
+    found = report("--sample", "sample_2_label_2.npy")
+    netlist, checkpoint = read_netlist(place / "net.loom"), read_checkpoint(str(place / "net.pt"))
+    recording = np.load(place / "data" / "test" / "sample_2_label_2.npy").astype(np.uint8)[None]
+    network = expand(checkpoint, normalised_adjacency(checkpoint.edges, checkpoint.taxels))
+    truth = run_float(network, channels_last(recording)).spikes
+    trace = engine.simulate(netlist, recording.reshape(1, -1, STEPS), spikes=True)
+    for i, layer in enumerate(found["layers"]):
+        chip = aligned(netlist, trace.spikes, i)
+        assert layer["name"] == netlist.layers[i].name
+        assert (layer["float_spikes"], layer["chip_spikes"]) == (truth[i].sum(), chip.sum())
+        assert layer["different"] == (truth[i] != chip).sum() == layer["roots"] + layer["propagated"]
+    assert found["different"] == sum(layer["different"] for layer in found["layers"])
+    assert found["roots"] == sum(cause["roots"] for cause in found["causes"])
+    assert (found["sample"], found["recording"], found["searched"]) == ("sample_2_label_2.npy", 2, 1)
+    assert (found["split"], found["steps"], found["graph"], found["reference"]) == ("test", STEPS, "ring", "float64")
+
+
+def test_every_root_says_where_how_close_why_and_what_to_do(report):
+    found = report("--top", "1000")
+    assert len(found["top"]) == found["roots"] > 3
+    dragged = [root["dragged"] for root in found["top"]]
+    assert dragged == sorted(dragged, reverse=True)
+    for root in found["top"]:
+        assert 0 <= root["neuron"] < SIZES[root["layer"]]
+        assert 0 <= root["remembers_from_step"] <= root["step"] < STEPS
+        if root["layer"] == "conv1":
+            assert root["taxel"] * FEATURES + root["feature"] == root["neuron"]
+        else:
+            assert (root["taxel"], root["feature"]) == (None, None)
+        assert (root["float_distance"] > 0) == root["float_fires"] == (root["chip_distance"] <= 0)
+        assert (root["chip_register"] > root["chip_threshold_register"]) != root["float_fires"]
+        assert root["float_membrane"] - root["float_distance"] == pytest.approx(root["theta"])
+        assert root["cause"] in CAUSES
+        assert not root["fault"]
+        assert root["change"]
+        assert root["dragged"] >= root["dragged_alone"] >= 0
+
+
+def test_top_shows_the_first_roots(report):
+    found = report("--top", "2")
+    assert found["top"] == report("--top", "1000")["top"][:2]
+
+
+def test_without_a_sample_the_first_that_differs_is_explained(report):
+    first = report("--sample", "sample_0_label_0.npy")
+    assert first["different"]
+    assert report() == first
+
+
+def test_the_text_fits_a_terminal(spikeloom):
+    code, out, err = spikeloom(*EXPLAIN, "--top", "3")
+    assert (code, err) == (0, "")
+    lines = out.splitlines()
+    assert lines[0] == "sample_0_label_0.npy (test split, recording 0 counted from 0)"
+    assert all(len(line) < 120 for line in lines)
+    assert "diagnosis: weight rounding" in lines
+    assert sum(line.startswith("     cause    weight rounding") for line in lines) == 3
+
+
+def test_equal_spikes_are_said_to_be_equal(spikeloom, tmp_path):
+    silent = weights()
+    silent = {name: np.zeros_like(array) if "bias" in name else array for name, array in silent.items()}
+    own_file(tmp_path / "silent.pt", last=silent)
+    recordings_folder(tmp_path / "empty", test=np.zeros((3, TAXELS, 2, STEPS), np.uint8))
+    net = tmp_path / "silent.loom"
+    assert spikeloom("compile", tmp_path / "silent.pt", "-o", net)[0] == 0
+    words = ("explain", net, "--checkpoint", tmp_path / "silent.pt", "--data", tmp_path / "empty")
+    code, out, err = spikeloom(*words)
+    assert (code, err) == (0, "")
+    assert out == (
+        "the first 3 recordings of the test split: every spike of the chip is the float64 model's; nothing to explain\n"
+    )
+    code, out, err = spikeloom(*words, "--sample", "sample_1_label_1.npy")
+    assert out == (
+        "sample_1_label_1.npy (test split, recording 1 counted from 0): every spike of the chip is the float64 "
+        "model's; nothing to explain\n"
+    )
+
+
+def test_a_fault_is_shown_with_what_removes_it(spikeloom, report):
+    code, out, err = spikeloom("explain", "net.loom", "--checkpoint", "other.pt", "--data", "data", "--top", "1")
+    assert code == 0
+    assert err == "spikeloom: warning: the netlist was compiled from another checkpoint file\n"
+    assert all(len(line) < 120 for line in out.splitlines())
+    text = " ".join(out.split())
+    assert "FAULT of the netlist, fc1: weight rounding (" in text
+    assert "the weights of fc1 are not the nearest to the checkpoint's: " in text
+    assert "to remove it: compile it again, with this very checkpoint and the graph that it was trained on" in text
+    assert not report()["faults"]
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["--top", "0"], "--top 0: at least 1 root can be shown; give a positive number"),
+        (
+            ["--sample", "sample_9_label_1.npy"],
+            "--sample sample_9_label_1.npy: no such recording among 6 of split test; near are sample_5_label_1.npy, "
+            "sample_1_label_1.npy, sample_4_label_0.npy; 'spikeloom run --json' lists the names",
+        ),
+        (
+            ["--sample", "sample_5_label_1.npy", "--limit", "1"],
+            "--sample sample_5_label_1.npy: no such recording among 1 of split test; near are sample_0_label_0.npy; "
+            "'spikeloom run --json' lists the names",
+        ),
+        (
+            ["--checkpoint", "wide.pt"],
+            "netlist and checkpoint disagree: the netlist has taxels 6, channels 2, conv1 30, fc1 9, fc2 8, fc3 4, "
+            "the checkpoint taxels 6, channels 2, conv1 30, fc1 10, fc2 8, fc3 4; give the checkpoint that the "
+            "netlist was compiled from",
+        ),
+    ],
+)
+def test_mistakes_are_one_line(spikeloom, words, line):
+    assert spikeloom(*EXPLAIN, *words) == (2, "", f"spikeloom: {line}\n")
+
+
+# -- words -------------------------------------------------------------------------------------------------------------
+
+
+def root_of(cause, *, clipped=False, held=True) -> RootCause:
+    return RootCause(
+        root=Root(layer=0, neuron=0, step=0, begin=0, dragged=0, alone=0),
+        cause=cause,
+        suspect=None,
+        held=held,
+        clipped=clipped,
+        sufficient=(),
+        gap=(),
+        float_fires=True,
+        float_membrane=0.5,
+        chip_membrane=0.5,
+        theta=0.5,
+        chip_theta=0.5,
+        chip_register=1,
+        chip_threshold=1,
+    )
+
+
+@pytest.mark.parametrize(
+    ("root", "bits", "planes", "words"),
+    [
+        (root_of(WEIGHTS), 8, 1, "its weights are too coarse: compile fc1 with --planes 2"),
+        (root_of(WEIGHTS), 4, 1, "its weights are too coarse: compile fc1 with --weight-bits 8 or --planes 2"),
+        (
+            root_of(WEIGHTS),
+            8,
+            3,
+            "its weights are too coarse: compile fc1 with --scale-groups 8, as far as the accumulator lets it",
+        ),
+        (root_of(WEIGHTS, clipped=True), 8, 1, "the range cuts off its largest weights: compile fc1 with --planes 2"),
+        (
+            root_of(WEIGHTS, held=False),
+            8,
+            1,
+            "no input can make it fire with its rounded weights: compile fc1 with --planes 2",
+        ),
+        (root_of(LEFT_OUT, held=False), 8, 1, "compile without --prune-unused"),
+        (root_of(TIE), 8, 1, "none: the order of a sum in float64 decides here, either spike is right"),
+        (root_of(UNKNOWN), 8, 1, "none is known"),
+    ],
+)
+def test_what_would_remove_a_root(root, bits, planes, words):
+    assert remedy(root, "fc1", bits=bits, planes=planes) == words
+
+
+@pytest.mark.parametrize("cause", [BIAS, THRESHOLD, BETA, TRUNCATION, SATURATION, LEFT_OUT])
+def test_every_cause_has_a_change(cause):
+    assert remedy(root_of(cause), "fc1", bits=8, planes=1) != "none is known"
+
+
+# -- the released network ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.recordings
+def test_a_released_recording_is_explained_within_a_second(released_checkpoint, objects_zip):
+    checkpoint = read_checkpoint(released_checkpoint)
+    adjacency = normalised_adjacency(build_graph("manual").edges, checkpoint.taxels)
+    netlist = compile_checkpoint(checkpoint, adjacency, recipes=(Recipe(),)).netlist
+    recording = load_data(objects_zip, "test", limit=4)[0].events[3:4]
+    network, integer, prepared = expand(checkpoint, adjacency), lift(netlist), engine.prepare(netlist)
+    engine.simulate(prepared, recording.reshape(1, 78, -1))  # compiles the kernel where it is not cached
+    absent, unheard = left_out(netlist)
+
+    begun = time.perf_counter()
+    trace = engine.simulate(prepared, recording.reshape(1, 78, -1), spikes=True, membranes=True)
+    observed = Observed(
+        spikes=tuple(aligned(netlist, trace.spikes, i)[0] for i in range(4)),
+        membranes=tuple(aligned(netlist, trace.membranes, i)[0] for i in range(4)),
+    )
+    found = explain(
+        network,
+        integer,
+        channels_last(recording)[0],
+        observed,
+        convolution=(adjacency, checkpoint.hops.astype(np.float64)),
+        absent=absent,
+        unheard=unheard,
+    )
+    assert time.perf_counter() - begun < 1.0
+    assert sum(found.different) > 1000
+    assert found.suspects == ()
+    assert {root.cause for root in found.roots} <= set(CAUSES)
+    weights = sum(root.cause == WEIGHTS for root in found.roots)
+    assert weights > 0.9 * len(found.roots)
