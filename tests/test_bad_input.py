@@ -243,8 +243,8 @@ def test_altered_checkpoint(refusal, tmp_path):
 def test_newer_checkpoint(refusal, tmp_path):
     path = tmp_path / "net.pt"
     with zipfile.ZipFile(path, "w") as made:
-        made.writestr("manifest.json", json.dumps({"format": "spikeloom-checkpoint", "version": 2}))
-    assert refusal("inspect", path) == f"{path}: has format version 2, this program reads 1; update spikeloom"
+        made.writestr("manifest.json", json.dumps({"format": "spikeloom-checkpoint", "version": 3}))
+    assert refusal("inspect", path) == f"{path}: has format version 3, this program reads up to 2; update spikeloom"
 
 
 def test_checkpoint_zip_bomb(refusal, tmp_path):
@@ -344,7 +344,7 @@ def test_unreadable_files(refusal, tmp_path, monkeypatch):
             )
             for bits in ("7", "1", "9", "0", "-8")
         ),
-        (["net.pt", "--weight-bits", "8.0"], "argument --weight-bits: invalid int value: '8.0'; see {help}"),
+        (["net.pt", "--weight-bits", "8.0"], "--weight-bits 8.0: not a number; give one, or one for each layer as in 8,4,4,8"),
         (
             ["net.pt", "--ranges", "observed"],
             "--ranges observed: nothing was observed; give --calibrate, or use --ranges proven",
@@ -781,7 +781,7 @@ def signs(**options) -> dict[str, np.ndarray]:
 )
 def test_every_violated_limit_is_listed(place, capsys, monkeypatch, tmp_path, features, lines):
     torch.save(state_dict(signs(taxels=39, features=features, sizes=(2, 2, 2))), tmp_path / "wide.pt")
-    words = ["compile", f"{tmp_path}/wide.pt", "--graph", "mst:0", "-o", f"{tmp_path}/out.loom"]
+    words = ["compile", f"{tmp_path}/wide.pt", "--graph", "mst:0", "--keep-all", "-o", f"{tmp_path}/out.loom"]
     assert cli.main(words) == 2
     out, err = capsys.readouterr()
     assert out == ""

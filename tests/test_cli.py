@@ -109,7 +109,7 @@ def test_compile_for_people_says_where_scales_come_from(spikeloom, tmp_path):
     assert "scales taken from the weights and the proven bounds; --calibrate chooses them on training data" in out
     assert "proof: no register overflows for any input" in out
     _, out, _ = spikeloom("compile", "net.pt", "--calibrate", "data", "-o", tmp_path / "out.loom")
-    assert "scales chosen on training recordings" in out
+    assert "storage chosen on training recordings" in out
     assert f"loihi1: {sum(SIZES.values())} neurons, " in out
     for name in ("core.axons_in", "core.synapse_words", "chip.cores"):
         assert name in out
@@ -143,6 +143,11 @@ def test_provenance_names_everything_that_decided(as_json, place):
         "weights": "last",
         "graph": "ring",
         "weight_bits": 8,
+        "planes": 1,
+        "scale_groups": 1,
+        "spike_exact": False,
+        "keep_all": False,
+        "prune_unused": False,
         "ranges": "proven",
         "margin": 0.1,
         "calibrated": True,
@@ -508,5 +513,5 @@ def test_a_terminal_without_greek_letters(spikeloom, monkeypatch):
     monkeypatch.setattr(sys, "stdout", plain)
     assert cli.main(["inspect", "net.loom"]) == 0
     out = plain.buffer.getvalue().decode("ascii")
-    assert out.startswith("loihi1: 51 neurons, ")
+    assert out.startswith("loihi1: 51 neurons (51 on the chip), ")
     assert "?" in out

@@ -106,7 +106,7 @@ def test_the_first_divergence_is_the_first(small, verdict):
 @pytest.mark.parametrize("seed", range(6))
 def test_the_first_divergence_of_other_networks(tmp_path, seed):
     checkpoint, adjacency = small_checkpoint(tmp_path, last=weights(seed))
-    netlist = compile_checkpoint(checkpoint, adjacency, recipes=(Recipe(bits=6),)).netlist
+    netlist = compile_checkpoint(checkpoint, adjacency, recipes=(Recipe(bits=6),), keep_all=True).netlist
     recordings = events(seed, samples=3)
     found = verify(netlist, checkpoint, adjacency, recordings, LABELS[:3], FILES[:3], spec_samples=1).first_divergence
     reference = list(float_spikes(checkpoint, adjacency, recordings).values())
@@ -195,7 +195,7 @@ def test_ill_posed_spikes_are_told_from_faults(tmp_path):
     arrays["fc1.bias"][:] = 2.0
     arrays["fc2.weight"][:, :2] = [1.0, 2.0**-25]
     checkpoint, adjacency = small_checkpoint(tmp_path, last=arrays, beta=0.0, theta=1.0)
-    netlist = compile_checkpoint(checkpoint, adjacency).netlist
+    netlist = compile_checkpoint(checkpoint, adjacency, keep_all=True).netlist
     found = verify(netlist, checkpoint, adjacency, events(0), LABELS, FILES)
     assert found.spikes["fc2"].float == 0
     assert found.spikes["fc2"].ill_posed == 6 * STEPS * 8

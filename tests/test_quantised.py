@@ -201,15 +201,23 @@ def test_options_that_cannot_be(tmp_path, options, message):
     assert str(caught.value) == message
 
 
-def test_a_loss_that_is_no_number(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("loss", "name", "found"),
+    [
+        (lambda rates, _labels: rates.sum() * float("nan"), "loss", "nan"),
+        (lambda rates, _labels: (rates.sum() * 1e30 * 1e30).clamp(max=1.0), "loss", "nan"),
+        (lambda rates, _labels: torch.sqrt(0 * rates.sum()), "gradient", "nan"),
+    ],
+    ids=["nan", "overflow", "gradient"],
+)
+def test_a_loss_that_is_no_number(tmp_path, monkeypatch, loss, name, found):
     checkpoint, adjacency = small_checkpoint(tmp_path)
     data = recordings(checkpoint, 0)
-    monkeypatch.setattr("models.finetune.rate_loss", lambda rates, _labels: rates.sum() * float("nan"))
-    monkeypatch.setattr("models.finetune.QuantisedNet.make_legal", lambda _self: None)
+    monkeypatch.setattr("models.finetune.rate_loss", loss)
     with pytest.raises(DataError) as caught:
         finetune(checkpoint, adjacency, data, data, LOIHI, bits=[4], epochs=2)
     assert str(caught.value) == (
-        "epoch 1: the loss is nan, a finite number is needed; the state of the epoch before is kept"
+        f"epoch 1: the {name} is {found}, a finite number is needed; the epochs before it are kept"
     )
 
 
@@ -227,6 +235,12 @@ def test_a_loss_that_is_no_number(tmp_path, monkeypatch):
         lambda forms: forms[1]["threshold"].pop(),
         lambda forms: forms[1]["threshold"].__setitem__(0, 0),
         lambda forms: forms[1].pop("threshold"),
+        lambda forms: forms[1]["threshold"].__setitem__(0, 20.5),
+        lambda forms: forms[1]["threshold"].__setitem__(0, 2**17),
+        lambda forms: forms[1].update(threshold=7),
+        lambda forms: forms[0].update(bits=4.5),
+        lambda forms: forms[0].update(bits=True),
+        lambda forms: forms.__setitem__(0, "conv1"),
     ],
 )
 def test_forms_that_cannot_be_used(tmp_path, change):
