@@ -1,0 +1,124 @@
+"""What provably does nothing is left out, and nothing else."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from made_files import events, small_checkpoint
+from random_networks import chain, float_networks, integer_networks, random_checkpoint, recordings_for
+
+from compiler.errors import OptionError
+from compiler.interpret import channels_last, run_float, run_integer
+from compiler.lift import lift
+from compiler.passes.prune import compact, disconnect, either, never_fires, nobody, removable
+from compiler.pipeline import compile_checkpoint
+from compiler.serialize import read_netlist, write_netlist
+from runtime import engine, spec
+from runtime.equivalence import verify
+from runtime.trace import aligned, heard
+
+
+@settings(deadline=None, max_examples=80)
+@given(float_networks(), st.data())
+def test_what_never_fires_never_fires(network, data):
+    recordings = data.draw(recordings_for(network.input.size))
+    silent = never_fires(network)
+    for dtype in (np.float32, np.float64):
+        for mask, spikes in zip(silent, run_float(network, recordings, dtype=dtype).spikes, strict=True):
+            assert not spikes[..., mask].any()
+    assert not silent[network.readout.population].any()
+    left = run_float(disconnect(network, silent), recordings).spikes
+    for ours, theirs in zip(left, run_float(network, recordings).spikes, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+@settings(deadline=None, max_examples=120)
+@given(integer_networks(), st.data())
+def test_leaving_out_moves_no_spike_that_is_left(network, data):
+    recordings = data.draw(recordings_for(network.input.size))
+    silent, unheard = removable(network)
+    laid, kept = compact(network, either(silent, unheard))
+    whole, rest = run_integer(network, recordings).spikes, run_integer(laid, recordings).spikes
+    for post, ids in enumerate(kept):
+        assert len(ids) >= 1
+        assert not whole[post][..., silent[post]].any()
+        np.testing.assert_array_equal(rest[post], whole[post][..., ids])
+    voting = network.readout.population
+    assert len(kept[voting]) == network.populations[voting].size
+
+
+def test_a_bound_that_is_met_just_so():
+    """Two inputs of 0.2 and a leak of one half add up to 0.8: silent at a threshold of 0.81, not at 0.79."""
+    for theta, silent in ((0.81, True), (0.79, False)):
+        network = chain([[0.2, 0.2]], [[1.0]], beta=0.5, theta=theta)
+        assert never_fires(network)[0].tolist() == [silent]
+    spikes = run_float(chain([[0.2, 0.2]], [[1.0]], beta=0.5, theta=0.79), np.ones((1, 40, 2), bool)).spikes[0]
+    assert spikes.any()
+
+
+def test_silence_spreads_to_listeners():
+    """The second layer hears only a neuron that cannot fire, and has no bias."""
+    network = chain([[0.1], [5.0]], [[9.0, 0.0], [0.0, 9.0]], np.eye(2))
+    silent = never_fires(network)
+    assert [mask.tolist() for mask in silent] == [[True, False], [True, False], [False, False]]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_pruned_netlist_decides_as_the_whole_one(tmp_path, seed):
+    checkpoint, recordings = random_checkpoint(seed=seed), events(seed, taxels=5)
+    flat = recordings.reshape(len(recordings), -1, recordings.shape[3])
+    pruned, whole = (compile_checkpoint(checkpoint, np.eye(5), keep_all=keep) for keep in (False, True))
+    assert sum(r.silent + r.unheard for r in whole.removals) == 0
+    left = sum(layer.neurons for layer in pruned.netlist.layers) - pruned.netlist.n_compartments
+    assert left == sum(r.silent + r.unheard + r.unused for r in pruned.removals)
+    write_netlist(pruned.netlist, tmp_path / "net.loom")
+    netlist = read_netlist(tmp_path / "net.loom")
+    trace = engine.simulate(netlist, flat, spikes=True, membranes=True)
+    for index, recording in enumerate(flat):
+        slow = spec.simulate(netlist, recording)
+        np.testing.assert_array_equal(slow.spikes, trace.spikes[index])
+        np.testing.assert_array_equal(slow.membranes, trace.membranes[index])
+    expected = run_integer(lift(netlist), channels_last(recordings)).spikes
+    for layer in range(len(netlist.layers)):
+        found = aligned(netlist, trace.spikes, layer)
+        assert found.shape[2] == netlist.layers[layer].neurons
+        np.testing.assert_array_equal(found, expected[layer])
+
+
+def test_neurons_that_nobody_hears_are_not_compared(tmp_path):
+    """Their listeners' weights round to zero at two bits: they fire in the float model and are not on the chip."""
+    checkpoint, adjacency = small_checkpoint(tmp_path)
+    weak = checkpoint.dense[0].weight.copy()
+    weak[:, :3] *= 1e-6
+    from dataclasses import replace
+
+    changed = replace(checkpoint, dense=(replace(checkpoint.dense[0], weight=weak), *checkpoint.dense[1:]))
+    compilation = compile_checkpoint(changed, adjacency)
+    netlist, labels = compilation.netlist, np.zeros(6, np.int64)
+    assert netlist.layers[0].unheard == (0, 1, 2)
+    assert isinstance(heard(netlist, 0), np.ndarray)
+    verdict = verify(netlist, changed, adjacency, events(2), labels, tuple("abcdef"))
+    reference = run_float(compilation.network, channels_last(events(2))).spikes[0]
+    assert reference[..., :3].any()
+    assert verdict.spikes["conv1"].float == int(reference[..., 3:].sum())
+
+
+def test_pruning_by_evidence_is_asked_for(tmp_path):
+    checkpoint, adjacency = small_checkpoint(tmp_path)
+    quiet = events(1, rate=0.002)
+    plain = compile_checkpoint(checkpoint, adjacency, training_events=quiet)
+    fewer = compile_checkpoint(checkpoint, adjacency, training_events=quiet, prune_unused=True)
+    assert sum(r.unused for r in plain.removals) == 0
+    assert sum(r.unused for r in fewer.removals) > 0
+    assert fewer.netlist.n_compartments < plain.netlist.n_compartments
+    for options in ({}, {"training_events": quiet, "keep_all": True}):
+        with pytest.raises(OptionError) as caught:
+            compile_checkpoint(checkpoint, adjacency, prune_unused=True, **options)
+        assert str(caught.value) == (
+            "--prune-unused: needs --calibrate, and neither --keep-all nor a fine-tuned checkpoint; change the options"
+        )
+
+
+def test_nobody_is_nobody():
+    network = chain([[1.0]])
+    assert [mask.tolist() for mask in nobody(network)] == [[False]]
