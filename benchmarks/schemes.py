@@ -38,6 +38,7 @@ SCHEMES: dict[str, tuple[str, Options]] = {
     "8 bits": ("", {}),
     "2 × 8 bits": ("", {"recipes": (Recipe(planes=2),)}),
     "2 × 8 bits, 8 scales": ("", {"recipes": (Recipe(planes=2, groups=8),)}),
+    "spike-exact": ("", {"spike_exact": True}),
     "6 bits": ("", {"recipes": (Recipe(bits=6),)}),
     "4 bits": ("", {"recipes": (Recipe(bits=4),)}),
     "4 bits, 8 scales": ("", {"recipes": (Recipe(bits=4, groups=8),)}),

@@ -344,7 +344,10 @@ def test_unreadable_files(refusal, tmp_path, monkeypatch):
             )
             for bits in ("7", "1", "9", "0", "-8")
         ),
-        (["net.pt", "--weight-bits", "8.0"], "--weight-bits 8.0: not a number; give one, or one for each layer as in 8,4,4,8"),
+        (
+            ["net.pt", "--weight-bits", "8.0"],
+            "--weight-bits 8.0: not a number; give one, or one for each layer as in 8,4,4,8",
+        ),
         (
             ["net.pt", "--ranges", "observed"],
             "--ranges observed: nothing was observed; give --calibrate, or use --ranges proven",
