@@ -285,6 +285,8 @@ def inconsistencies(netlist: Netlist) -> list[str]:
         found.append("synapse_target points beyond its core")
     for index, layer in enumerate(netlist.layers):
         neurons = np.sort(netlist.neuron[netlist.layer == index])
+        if np.intersect1d(neurons, layer.unheard).size or max(layer.unheard, default=0) >= layer.neurons:
+            found.append(f"layer {layer.name} holds neurons that it leaves out, or leaves out some that are not there")
         if outside(neurons, 0, layer.neurons) or len(np.unique(neurons)) != len(neurons) or not len(neurons):
             found.append(
                 f"layer {layer.name} holds none of its {layer.neurons} neurons, one twice or one that is not there"

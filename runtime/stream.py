@@ -77,12 +77,15 @@ class Stream:
         The prepared network.
     """
 
-    __slots__ = ("_bounds", "_column", "_ended", "_engine", "_state")
+    __slots__ = ("_bounds", "_column", "_ended", "_engine", "_place", "_state")
 
     def __init__(self, engine: Engine) -> None:
         self._engine = engine
-        # the engine orders compartments by layer and neuron, whatever their cores
-        ends = np.cumsum(np.bincount(engine.netlist.layer)).tolist()
+        netlist = engine.netlist
+        ends = np.cumsum([layer.neurons for layer in netlist.layers]).tolist()
+        # the engine orders compartments by layer and neuron; a chip may hold fewer of them than the layer has neurons
+        compartment = engine.tables.compartment
+        self._place = np.array([0, *ends[:-1]])[netlist.layer[compartment]] + netlist.neuron[compartment]
         self._bounds = tuple(zip([0, *ends[:-1]], ends, strict=True))
         self._column = np.zeros((engine.netlist.n_inputs, 1), np.uint8)
         self._state = start(engine)
@@ -156,8 +159,8 @@ class Stream:
         except NumericRangeError:
             self._ended = True
             raise
-        spikes = np.zeros(netlist.n_compartments, np.bool_)
-        spikes[state.fired[: state.clock[1]] - netlist.n_inputs] = True
+        spikes = np.zeros(self._bounds[-1][1], np.bool_)
+        spikes[self._place[state.fired[: state.clock[1]] - netlist.n_inputs]] = True
         counts = class_counts(netlist, state.spikes[None])[0]
         spikes.flags.writeable = counts.flags.writeable = False
         return Step(index=index, spikes=tuple([spikes[begin:end] for begin, end in self._bounds]), counts=counts)

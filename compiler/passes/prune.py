@@ -67,7 +67,8 @@ def never_fires(network: Network) -> tuple[Mask, ...]:
         slack = (inputs + 8) * FLOAT32_ROUNDING * total
         most = np.maximum(up + population.bias + slack, 0)
         with np.errstate(divide="ignore", invalid="ignore"):
-            settled = most / (1 - population.beta) if population.beta < 1 else np.where(most > 0, np.inf, 0)
+            kept = population.beta * (1 + 8 * FLOAT32_ROUNDING)
+            settled = most / (1 - kept) if kept < 1 else np.where(most > 0, np.inf, 0)
         silent[post] = settled <= population.theta * (1 - 8 * FLOAT32_ROUNDING)
     return _without_voters(network, tuple(silent[post] for post in range(len(network.populations))))
 
