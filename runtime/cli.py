@@ -255,6 +255,7 @@ def _verify(arguments: Arguments) -> Outcome:
         data.files,
         original=None if arguments.original is None else _checkpoint(arguments.original, arguments),
         spec_samples=arguments.spec_samples,
+        lengths=data.lengths,
         progress=_progress,
     )
     compiled_for = netlist.provenance.get("graph", name)

@@ -172,10 +172,12 @@ def test_estimate_prices_both_tables(compiled, objects_zip):
     assert code == 0
     assert report["not_modelled"] == []
     mean = report["per_inference"]
-    assert mean["neuron_accesses"] == 2916 * 253
-    # idle neurons alone cost 2916 * 253 * 51.2 pJ, and synapses come on top
+    # neurons that can never fire are not on the chip; idle ones alone cost 51.2 pJ a step, and synapses come on top
+    accesses = mean["neuron_accesses"]
+    assert 2400 * 253 < accesses < 2916 * 253
+    assert accesses % 253 == 0
     for table, floor in (("davies2018", 52.0e-12), ("sanafe", 51.2e-12)):
-        assert report["min"]["energy_j"][table] > 2916 * 253 * floor
+        assert report["min"]["energy_j"][table] > accesses * floor
         assert 10e-6 < mean["energy_j"][table] < 2e-3
 
 

@@ -25,7 +25,7 @@ from models.graphs import build_graph, normalised_adjacency
 from models.quantised import QuantisedNet, quantised_spikes, time_first
 from runtime import engine
 from runtime.cli import main
-from runtime.trace import aligned
+from runtime.trace import aligned, heard
 
 LOIHI = load_target("loihi1")
 EXPONENTS = LOIHI.choices["synapse.exponent"]
@@ -312,7 +312,9 @@ def test_the_model_is_the_chip_on_every_recording(tmp_path, objects_zip, contain
             model = quantised_spikes(checkpoint, adjacency, data.events)
             trace = engine.simulate(netlist, data.events.reshape(len(data), -1, data.steps), spikes=True)
             for index, layer in enumerate(netlist.layers):
-                np.testing.assert_array_equal(aligned(netlist, trace.spikes, index), model[layer.name])
+                kept = heard(netlist, index)  # the chip leaves out what nobody hears
+                ours = aligned(netlist, trace.spikes, index)[..., kept]
+                np.testing.assert_array_equal(ours, model[layer.name][..., kept])
 
 
 @pytest.fixture
