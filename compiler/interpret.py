@@ -110,9 +110,12 @@ def integer_recurrence(
     inflow = np.empty_like(u)
     for step in range(sums.shape[1]):
         np.multiply(sums[:, step], 1 << MEMBRANE_SHIFT, out=inflow)
-        u *= keep_u
-        np.trunc(u, out=u)
-        u += inflow
+        if keep_u:
+            u *= keep_u
+            np.trunc(u, out=u)
+            u += inflow
+        else:
+            u = inflow
         v *= keep_v
         np.trunc(v, out=v)
         v += u

@@ -17,7 +17,7 @@ from compiler.interpret import channels_last
 from compiler.ir import IntegerNetwork, Network
 from compiler.netlist import Netlist
 from compiler.passes.bounds import RangeProof, prove_ranges
-from compiler.passes.calibrate import Calibration, calibrate, evenly_spaced, fewer
+from compiler.passes.calibrate import FEW, MANY, Calibration, calibrate, evenly_spaced
 from compiler.passes.emit import Origin, emit
 from compiler.passes.exact import Exactness, make_exact
 from compiler.passes.expand import expand
@@ -118,7 +118,7 @@ def compile_checkpoint(
     prune_unused : bool
         Leave out neurons that did not fire on any training recording, too.
     training_events : (samples, taxels, polarities, steps), optional
-        Training recordings for calibration; at most 32, evenly spaced, are used.
+        Training recordings for calibration, of which 32, evenly spaced, are used; with several planes 256.
     ranges : {"proven", "observed"}
         How scales are kept from overflowing, see :func:`compiler.passes.quantize.quantize`.
     margin : float
@@ -146,7 +146,9 @@ def compile_checkpoint(
     rates: tuple[FloatArray, ...] | None = None
     if training_events is not None:
         events = channels_last(training_events)
-        calibration = calibrate(network, events if spike_exact or prune_unused else evenly_spaced(events))
+        several = any(recipe.planes > 1 for recipe in recipes or ())
+        used = events if spike_exact or prune_unused else evenly_spaced(events, MANY if several else FEW)
+        calibration = calibrate(network, used)
         rates = tuple(spikes.mean(axis=(0, 1)) for spikes in calibration.spikes)
     unused = nobody(network)
     if prune_unused:
@@ -156,7 +158,6 @@ def compile_checkpoint(
                 "change the options"
             )
         unused = never_fired(network, calibration)
-        calibration = calibration if spike_exact else fewer(calibration)
     whole = network
     if not keep_all and checkpoint.forms is None:
         network = disconnect(network, either(never_fires(network), unused))

@@ -139,10 +139,10 @@ def netlist_text(report: Json) -> str:
         ]
         for use in fullest.values()
     ]
+    left = "" if report["compartments"] == report["neurons"] else f" ({report['compartments']:,} on the chip)"
     return "\n".join(
         [
-            f"{report['target']}: {report['neurons']:,} neurons ({report['compartments']:,} on the chip), "
-            f"{report['synapses']:,} synapses "
+            f"{report['target']}: {report['neurons']:,} neurons{left}, {report['synapses']:,} synapses "
             f"({report['synapses_stored']:,} stored, {report['synapses_nonzero']:,} non-zero), {report['cores']} cores "
             f"on tiles {', '.join(map(str, report['tiles']))}",
             table(head, layers),

@@ -513,5 +513,5 @@ def test_a_terminal_without_greek_letters(spikeloom, monkeypatch):
     monkeypatch.setattr(sys, "stdout", plain)
     assert cli.main(["inspect", "net.loom"]) == 0
     out = plain.buffer.getvalue().decode("ascii")
-    assert out.startswith("loihi1: 51 neurons (51 on the chip), ")
+    assert out.startswith("loihi1: 51 neurons, ")
     assert "?" in out

@@ -307,6 +307,7 @@ def checkpoint_of(network: TactileSGNet) -> Checkpoint:
         weights="last",
         runs=1,
         training=None,
+        forms=(),
         sha256="",
     )
 

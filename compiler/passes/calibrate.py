@@ -13,8 +13,11 @@ from compiler.errors import DataError
 from compiler.interpret import BoolArray, run_float
 from compiler.ir import INPUT, Network
 
-RECORDINGS = 32
-"""Recordings used at most, evenly spaced over the split: flips are counted on eight thousand steps a neuron."""
+FEW = 32
+"""Recordings on which storage is chosen, evenly spaced over the split: eight thousand steps a neuron."""
+
+MANY = 256
+"""Recordings on which the errors of several planes are made to cancel (one plane gains too little from more)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -37,14 +40,14 @@ class Calibration:
         return self.events if pre == INPUT else self.spikes[pre]
 
 
-def evenly_spaced(events: BoolArray, count: int = RECORDINGS) -> BoolArray:
+def evenly_spaced(events: BoolArray, count: int = FEW) -> BoolArray:
     """At most `count` recordings, evenly spaced over the first axis."""
     if len(events) <= count:
         return events
     return events[np.linspace(0, len(events) - 1, count).round().astype(np.int64)]
 
 
-def fewer(calibration: Calibration, count: int = RECORDINGS) -> Calibration:
+def fewer(calibration: Calibration, count: int = FEW) -> Calibration:
     """A calibration on at most `count` of its recordings, evenly spaced."""
     return Calibration(
         events=evenly_spaced(calibration.events, count),

@@ -14,6 +14,8 @@ References
 from __future__ import annotations
 
 import numpy as np
+from scipy import sparse
+from scipy.linalg import solve_triangular
 
 from compiler.fixedpoint import ONE_STEP_SUM_MAX, FloatArray, IntArray
 from compiler.forms import Form, one_sided_sums, reach, scales, step_units, store
@@ -23,6 +25,9 @@ from compiler.passes.scales import Rounded, flips
 
 DAMPING = 1e-3
 """Share of the mean activity that is added to each input's own: inputs that never spiked are rounded to nearest."""
+
+BLOCK = 64
+"""Columns whose errors are passed on to all later ones at once: the same sums, as one matrix product."""
 
 
 def compensated(
@@ -53,9 +58,9 @@ def compensated(
         sources.append(calibration.source(p.pre).reshape(-1, p.weight.shape[1]))
         offset += p.weight.shape[1]
     held = np.clip(wanted, -limit, limit)
-    active = np.concatenate(sources, axis=1).astype(np.float32)
-    together = (active.T @ active).astype(np.float64) / len(active)
-    rate = active.mean(axis=0, dtype=np.float64)
+    active = sparse.csr_array(np.concatenate(sources, axis=1), dtype=np.float32)
+    together = (active.T @ active).toarray().astype(np.float64) / active.shape[0]
+    rate = np.diag(together)
     steps = np.zeros(wanted.shape, np.int64)
     for rows, columns in _alike(stored):
         part = np.ix_(rows, columns)
@@ -102,14 +107,30 @@ def _round_in_turn(weight: FloatArray, together: FloatArray) -> FloatArray:
         Mean of ``x x^T``.
     """
     inputs = weight.shape[1]
-    damped = together + np.eye(inputs) * (DAMPING * np.trace(together) / max(inputs, 1) + 1e-12)
-    order = np.argsort(-np.diag(damped), kind="stable")
-    follow = np.linalg.cholesky(np.linalg.inv(damped[np.ix_(order, order)])).T
+    order = np.argsort(-np.diag(together), kind="stable")
+    follow = _follow(
+        together[np.ix_(order, order)] + np.eye(inputs) * (DAMPING * np.trace(together) / max(inputs, 1) + 1e-12)
+    )
     left = weight[:, order]
     rounded = np.empty_like(left)
-    for j in range(inputs):
-        rounded[:, j] = np.rint(left[:, j])
-        left[:, j + 1 :] -= np.outer((left[:, j] - rounded[:, j]) / follow[j, j], follow[j, j + 1 :])
+    for start in range(0, inputs, BLOCK):
+        end = min(start + BLOCK, inputs)
+        errors = np.empty((len(left), end - start))
+        for j in range(start, end):
+            rounded[:, j] = np.rint(left[:, j])
+            errors[:, j - start] = left[:, j] - rounded[:, j]
+            left[:, j + 1 : end] -= np.outer(errors[:, j - start], follow[j, j + 1 : end])
+        left[:, end:] -= errors @ follow[start:end, end:]
     back = np.empty_like(rounded)
     back[:, order] = rounded
     return back
+
+
+def _follow(together: FloatArray) -> FloatArray:
+    """Share of each input's error that each later one makes up for: the Cholesky factor of the inverse, rows scaled.
+
+    The factor is that of the reversed matrix, inverted and turned round, so that the inverse itself is never formed.
+    """
+    lower = np.linalg.cholesky(together[::-1, ::-1])
+    upper: FloatArray = solve_triangular(lower, np.eye(len(lower)), lower=True)[::-1, ::-1]
+    return upper / np.diag(upper)[:, None]

@@ -16,13 +16,18 @@ from compiler.forms import decay_registers, reach, step_units
 from compiler.interpret import float_recurrence, product
 from compiler.ir import IntegerNetwork, Network
 from compiler.passes.calibrate import Calibration, fewer
-from compiler.passes.compensate import compensated
-from compiler.passes.quantize import Candidate, Choice, Recipe, assemble, explain_choice, incoming, shortlist
+from compiler.passes.quantize import (
+    Candidate,
+    Choice,
+    Recipe,
+    assemble,
+    explain_choice,
+    incoming,
+    round_with_more,
+    shortlist,
+)
 from compiler.passes.scales import finest_thresholds, flips, in_batches
 from compiler.targets import Target
-
-FEW, MANY = 32, 128
-"""Recordings on which storage is chosen, and on which rounding errors are made to cancel; all of them are the judge."""
 
 SHARED = 0.8
 """A neuron whose threshold is below this share of its own finest is held back by those it shares the threshold with."""
@@ -40,7 +45,7 @@ class Exactness:
     layer : str
         Population.
     tried : tuple of (planes, groups, spikes that move)
-        In order, on ``FEW`` recordings; the best was taken.
+        In order, on ``calibrate.FEW`` recordings; the best was taken, and rounded anew on ``calibrate.MANY``.
     flips, spikes : int
         Spikes that move in what was taken, and all spikes of the float64 model, on all calibration recordings.
     limits : tuple of (limit, spikes that move)
@@ -96,7 +101,7 @@ def make_exact(
     steps = (1, 1), (2, 1), (2, slots), (3, slots)
     ladder = [Recipe(bits=bits, planes=planes, groups=groups) for planes, groups in steps]
     exponents = target.choices["synapse.exponent"]
-    few, many = fewer(calibration, FEW), fewer(calibration, MANY)
+    few = fewer(calibration)
     chosen, found = [], []
     for post, population in enumerate(network.populations):
         tell(population.name)
@@ -106,8 +111,6 @@ def make_exact(
             if recipe.planes > 2 and best is not None and not len(_full_range(network, post, best)):
                 break  # the planes hold every weight already
             candidate = shortlist(network, post, recipe, exponents, few, None, clip=False)[0]
-            if recipe == ladder[-2] or recipe == ladder[-1]:
-                candidate = _compensate_with_more(network, post, candidate, many, few)
             moved = candidate.flips or 0
             tried.append((recipe.planes, recipe.groups, moved))
             if best is None or moved <= (best.flips or 0):
@@ -115,6 +118,8 @@ def make_exact(
             if not moved and not flips(candidate.layer, post, calibration).any():
                 break
         assert best is not None, "the ladder has steps"
+        if best.flips:
+            best = round_with_more(network, post, best, calibration)
         moved_by = flips(best.layer, post, calibration)
         chosen.append(replace(best, flips=int(moved_by.sum())))
         found.append(
@@ -129,17 +134,6 @@ def make_exact(
         )
     choices = tuple(explain_choice(network, post, c, calibration) for post, c in enumerate(chosen))
     return assemble(network, [c.layer for c in chosen]), choices, tuple(found)
-
-
-def _compensate_with_more(
-    network: Network, post: int, candidate: Candidate, many: Calibration, few: Calibration
-) -> Candidate:
-    """Round the same storage with errors that cancel on more recordings, if that keeps more spikes."""
-    layer = compensated(network.populations[post], incoming(network, post), candidate.layer.form, post, many)
-    moved = None if layer is None else int(flips(layer, post, few).sum())
-    if layer is None or moved is None or moved > (candidate.flips or 0):
-        return candidate
-    return replace(candidate, layer=layer, flips=moved, compensated=True)
 
 
 def _full_range(network: Network, post: int, candidate: Candidate) -> IntArray:

@@ -9,7 +9,7 @@ Without calibration the weights alone decide.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from compiler.fixedpoint import ONE_STEP_SUM_MAX, FloatArray
 from compiler.forms import Form, reach, step_units
 from compiler.interpret import run_integer
 from compiler.ir import IntegerNetwork, Network, Projection
-from compiler.passes.calibrate import Calibration
+from compiler.passes.calibrate import MANY, Calibration, fewer
 from compiler.passes.compensate import compensated
 from compiler.passes.scales import Rounded, candidate, flips, grouped, observed_sums, rounded
 from compiler.targets import Target
@@ -162,6 +162,20 @@ def shortlist(
     return [c for c in counted[:SHORTLIST] if (c.flips or 0) <= worst]
 
 
+def round_with_more(
+    network: Network, post: int, candidate: Candidate, calibration: Calibration, observed: FloatArray | None = None
+) -> Candidate:
+    """Let the errors of a layer cancel on ``MANY`` recordings at the storage that was chosen on ``FEW``.
+
+    What keeps fewer spikes there is dropped.
+    """
+    many = fewer(calibration, MANY)
+    layer = compensated(network.populations[post], incoming(network, post), candidate.layer.form, post, many, observed)
+    if layer is None or flips(layer, post, many).sum() > flips(candidate.layer, post, many).sum():
+        return candidate
+    return replace(candidate, layer=layer, flips=int(flips(layer, post, fewer(many)).sum()), compensated=True)
+
+
 def _settle(network: Network, shortlists: list[list[Candidate]], calibration: Calibration) -> list[Candidate]:
     """Pick one scale per population, in order, by how far the whole network's class counts move from float64."""
     wanted = calibration.spikes[network.readout.population].sum(axis=1, dtype=np.int64)
@@ -264,7 +278,8 @@ def quantize(
     recipes : sequence of Recipe
         Storage of each population, or one for all.
     calibration : Calibration, optional
-        Float spikes on training recordings; without it scales come from the weights and the proven bounds alone.
+        Float spikes on training recordings: ``calibrate.FEW`` of them choose, several planes use ``MANY``. Without it
+        scales come from the weights and the proven bounds alone.
     ranges : {"proven", "observed"}
         ``proven`` keeps the accumulator in range for any input; ``observed`` only for what the calibration
         recordings bring, plus `margin`, and leaves the check to the simulator.
@@ -291,17 +306,23 @@ def quantize(
     if ranges == "observed" and calibration is None:
         raise OptionError("--ranges observed: nothing was observed; give --calibrate, or use --ranges proven")
     exponents = target.choices["synapse.exponent"]
-    shortlists = []
-    for post, recipe in enumerate(recipes):
-        observed = None
-        if ranges == "observed" and calibration is not None:
-            observed = observed_sums(incoming(network, post), calibration) * (1 + margin)
-        shortlists.append(shortlist(network, post, recipe, exponents, calibration, observed))
-    if calibration is None:
+    few = None if calibration is None else fewer(calibration)
+    limits: list[FloatArray | None] = [None] * len(recipes)
+    if ranges == "observed" and few is not None:
+        limits = [observed_sums(incoming(network, post), few) * (1 + margin) for post in range(len(recipes))]
+    shortlists = [
+        shortlist(network, post, recipe, exponents, few, observed)
+        for post, (recipe, observed) in enumerate(zip(recipes, limits, strict=True))
+    ]
+    if calibration is None or few is None:
         chosen = [candidates[0] for candidates in shortlists]
     else:
-        chosen = _settle(network, shortlists, calibration)
-    choices = tuple(explain_choice(network, post, c, calibration) for post, c in enumerate(chosen))
+        chosen = _settle(network, shortlists, few)
+        chosen = [
+            candidate if recipe.planes == 1 else round_with_more(network, post, candidate, calibration, observed)
+            for post, (candidate, recipe, observed) in enumerate(zip(chosen, recipes, limits, strict=True))
+        ]
+    choices = tuple(explain_choice(network, post, c, few) for post, c in enumerate(chosen))
     return assemble(network, [c.layer for c in chosen]), choices
 
 

@@ -24,7 +24,7 @@ from compiler.fixedpoint import (
 )
 from compiler.forms import Form, one_sided_sums, plane_distance, reach, round_population, step_units
 from compiler.interpret import BATCH, integer_recurrence, integer_sums, product
-from compiler.ir import IntegerPopulation, IntegerProjection, Population, Projection
+from compiler.ir import IntegerPopulation, IntegerProjection, Population, Projection, Sparse
 from compiler.passes.calibrate import Calibration
 
 WORTHWHILE = 0.95
@@ -98,9 +98,12 @@ def observed_sums(projections: tuple[Projection, ...], calibration: Calibration)
 
 def flips(layer: Rounded, post: int, calibration: Calibration) -> IntArray:
     """Calibration spikes of each neuron that differ from float64, the layer given the float model's own input."""
+    merged: dict[int, Sparse] = {}  # planes of one source carry the same spikes
+    for p in layer.projections:
+        merged[p.pre] = merged[p.pre] + p.effective() if p.pre in merged else p.effective()
 
     def moved(part: slice) -> IntArray:
-        sums = sum(integer_sums(p.effective(), calibration.source(p.pre)[part]) for p in layer.projections)
+        sums = sum(integer_sums(weight, calibration.source(pre)[part]) for pre, weight in merged.items())
         spikes, _ = integer_recurrence(layer.population, np.asarray(sums))
         differ: IntArray = np.count_nonzero(spikes != calibration.spikes[post][part], axis=(0, 1))
         return differ
