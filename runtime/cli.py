@@ -31,7 +31,7 @@ from compiler.text import text
 from models.evtouch import Recordings
 from models.graphs import CHOICES
 from models.grasps import SYNTHETIC
-from runtime import bits, decisions, explain, finetune, render, watch
+from runtime import bits, decisions, explain, finetune, render, verdicts, watch
 from runtime.data_commands import add_data_commands
 from runtime.inputs import (
     asked_graph,
@@ -263,7 +263,7 @@ def _verify(arguments: Arguments) -> Outcome:
         sys.stderr.write(f"spikeloom: warning: the netlist was compiled for graph {compiled_for}, this is {name}\n")
     levels = levels_of(verdict)
     missed = unmet(levels, required)
-    return render.verify_json(verdict, levels, missed), render.verify_text, 1 if missed else 0
+    return verdicts.verify_json(verdict, levels, missed), verdicts.verify_text, 1 if missed else 0
 
 
 def _estimate(arguments: Arguments) -> Outcome:

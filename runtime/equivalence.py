@@ -21,7 +21,9 @@ from compiler.lift import lift
 from compiler.netlist import Netlist
 from compiler.passes.expand import expand
 from runtime import engine, spec
+from runtime.breakdowns import Breakdown, breakdowns
 from runtime.certificates import Certificate, certify
+from runtime.divergence import Divergence, first_divergence
 from runtime.trace import aligned, check_channels, heard
 from runtime.votes import class_counts
 
@@ -47,46 +49,6 @@ class LayerSpikes:
     chip: int
     different: int
     ill_posed: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Divergence:
-    """The first entry in which chip and float model differ: first recording, then step, layer, neuron.
-
-    Parameters
-    ----------
-    file : str
-        Recording.
-    step : int
-        Data step.
-    layer : str
-        Layer.
-    neuron : int
-        Neuron of the layer.
-    taxel, feature : int or None
-        The same in a graph convolution's own terms.
-    float_membrane, chip_membrane : float
-        Membranes before the comparison, in the float model's units.
-    chip_register : int
-        Membrane register before the comparison.
-    theta, chip_theta : float
-        Thresholds in the float model's units.
-    ill_posed : bool
-        Whether the float64 model sides with the chip.
-    """
-
-    file: str
-    step: int
-    layer: str
-    neuron: int
-    taxel: int | None
-    feature: int | None
-    float_membrane: float
-    chip_membrane: float
-    chip_register: int
-    theta: float
-    chip_theta: float
-    ill_posed: bool
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -116,6 +78,10 @@ class Verdict:
     quantised_different : int or None
         Spikes of all layers in which a fine-tuned checkpoint's torch model, on chip integers, and the chip differ;
         None where the checkpoint was not fine-tuned.
+    breakdowns : tuple of Breakdown
+        Known failures that were found.
+    not_compared : mapping of str to int
+        Neurons of each layer that the chip leaves out because nobody hears them, where there are any.
     certificate : Certificate
         What of all this holds in whatever order the float model adds, and of registers for any input.
     """
@@ -133,6 +99,8 @@ class Verdict:
     ladder: tuple[tuple[str, Mapping[str, int]], ...]
     same_checkpoint: bool
     quantised_different: int | None
+    breakdowns: tuple[Breakdown, ...]
+    not_compared: Mapping[str, int]
     certificate: Certificate
 
     @property
@@ -234,54 +202,6 @@ def _rows_scaled(weight: Sparse, factor: FloatArray) -> Sparse:
     scaled = weight.astype(np.float64)
     scaled.data *= np.repeat(factor, np.diff(weight.indptr))
     return scaled
-
-
-def _first_divergence(
-    netlist: Netlist,
-    prepared: engine.Engine,
-    reference: list[BoolArray],
-    chip: list[BoolArray],
-    wide: list[BoolArray],
-    events: npt.NDArray[np.uint8],
-    files: tuple[str, ...],
-    membrane: Callable[[int, int], npt.NDArray[np.floating]],
-) -> Divergence | None:
-    differs = [(a != b) for a, b in zip(reference, chip, strict=True)]
-    broken = np.any([d.any(axis=(1, 2)) for d in differs], axis=0)
-    if not broken.any():
-        return None
-    sample = int(np.argmax(broken))
-    step, index, neuron = min(
-        (int(step), layer, int(neuron))
-        for layer, d in enumerate(differs)
-        for step, neuron in np.argwhere(d[sample])[:1]
-    )
-    layer = netlist.layers[index]
-    ill_posed = bool(wide[index][sample, step, neuron] != reference[index][sample, step, neuron])
-    neuron = int(np.arange(layer.neurons)[heard(netlist, index)][neuron])
-    trace = engine.simulate(prepared, events[sample : sample + 1], membranes=True)
-    assert trace.membranes is not None, "membranes were asked for"
-    register = int(aligned(netlist, trace.membranes, index)[0, step, neuron])
-    ids = netlist.compartments_of(index)
-    held = ids[netlist.neuron[ids] == neuron]  # empty where the chip leaves the neuron out, which then stays at zero
-    scale = float(netlist.scale[held[0]]) if len(held) else 1.0
-    chip_theta = int(netlist.threshold[held[0]]) / scale if len(held) else layer.theta
-    graph = layer.depth == 0 and layer.neurons % netlist.taxels == 0
-    features = layer.neurons // netlist.taxels
-    return Divergence(
-        file=files[sample],
-        step=step,
-        layer=layer.name,
-        neuron=neuron,
-        taxel=neuron // features if graph else None,
-        feature=neuron % features if graph else None,
-        float_membrane=float(membrane(sample, index)[step, neuron]),
-        chip_membrane=register / (scale * (1 << MEMBRANE_SHIFT)),
-        chip_register=register,
-        theta=layer.theta,
-        chip_theta=chip_theta,
-        ill_posed=ill_posed,
-    )
 
 
 def verify(
@@ -386,7 +306,7 @@ def verify(
     ladder.append(("saturation", differences(chip)))
 
     tell("first divergence")
-    divergence = _first_divergence(
+    divergence = first_divergence(
         netlist,
         prepared,
         reference,
@@ -398,6 +318,7 @@ def verify(
     )
     float_counts = reference[-1].sum(axis=1, dtype=np.int64)
     chip_counts = class_counts(netlist, trace.counts.spikes)
+    compared_neurons = [np.arange(layer.neurons)[keep] for layer, keep in zip(netlist.layers, kept, strict=True)]
     tell("certificate")
     certificate = certify(model, adjacency, integer, events, chip, vote(chip_counts), kept=kept, lengths=lengths)
     return Verdict(
@@ -425,5 +346,9 @@ def verify(
             and netlist.provenance.get("weights") == checkpoint.weights
         ),
         quantised_different=quantised_different,
+        breakdowns=breakdowns(
+            names, reference, chip, compared_neurons, (float_counts, chip_counts), flat, files, lengths
+        ),
+        not_compared={layer.name: len(layer.unheard) for layer in netlist.layers if layer.unheard},
         certificate=certificate,
     )

@@ -14,13 +14,13 @@ from compiler.frontends.checkpoint import Checkpoint
 from compiler.netlist import Netlist
 from compiler.passes.legalize import LimitUse
 from compiler.pipeline import Compilation
-from runtime.certificates import certificate_json, certificate_text
 from runtime.cost import NOT_PRICED, Costs
-from runtime.equivalence import Verdict
-from runtime.levels import Level
-from runtime.tables import percent, si, table
+from runtime.tables import si, table
 
 Json = dict[str, Any]
+
+ZEROED = 0.25
+"""Share of a layer's weights from which on it is said that they round to zero."""
 
 
 # -- netlists and checkpoints ------------------------------------------------------------------------------------------
@@ -186,6 +186,12 @@ def compilation_text(report: Json) -> str:
         lines += _exactness_lines(report["exactness"])
     else:
         lines.append("scales taken from the weights and the proven bounds; --calibrate chooses them on training data")
+    lines += [
+        f"{choice['layer']}: {100 * choice['zeroed'] / choice['weights']:.0f} % of its weights round to zero; "
+        "more --planes, --scale-groups or --weight-bits keep them"
+        for choice in report["calibration"]
+        if choice["zeroed"] > ZEROED * choice["weights"]
+    ]
     lines += _removal_lines(report["removals"])
     worst = max(report["proofs"], key=lambda proof: proof["accumulator"])
     if all(proof["holds"] for proof in report["proofs"]):
@@ -281,91 +287,7 @@ def checkpoint_text(report: Json) -> str:
     return "\n".join(lines)
 
 
-# -- runs --------------------------------------------------------------------------------------------------------------
-
-
-def run_json(files: tuple[str, ...], labels: IntArray, counts: IntArray, predictions: IntArray) -> Json:
-    """Predictions and class spike counts of a run."""
-    return {
-        "samples": len(files),
-        "accuracy": None if np.any(labels < 0) else float(np.mean(labels == predictions)),
-        "files": list(files),
-        "labels": labels.tolist(),
-        "predictions": predictions.tolist(),
-        "counts": counts.tolist(),
-    }
-
-
-def run_text(report: Json) -> str:
-    """Accuracy, and the recordings that went wrong; decisions alone where a label is unknown."""
-    rows = list(zip(report["files"], report["labels"], report["predictions"], report["counts"], strict=True))
-    if report["accuracy"] is None:
-        decided = [[file, str(found), str(counts[found])] for file, _, found, counts in rows]
-        return table(["recording", "decision", "votes"], decided)
-    wrong = [
-        [file, str(label), str(found), str(counts[label]), str(counts[found])]
-        for file, label, found, counts in rows
-        if label != found
-    ]
-    lines = [f"chip accuracy: {percent(len(rows) - len(wrong), len(rows))}"]
-    if wrong:
-        lines.append(table(["decided wrongly", "label", "decision", "votes for label", "for decision"], wrong))
-    return "\n".join(lines)
-
-
-def verify_json(verdict: Verdict, levels: Sequence[Level], missed: Sequence[str]) -> Json:
-    """A verdict under the keys that scripts rely on, its levels, and the required ones that were missed."""
-    return {
-        "samples": len(verdict.files),
-        "accuracy": {"float": verdict.float_accuracy, "chip": verdict.chip_accuracy},
-        "decision_agreement": verdict.decision_agreement,
-        "spikes": {name: asdict(layer) for name, layer in verdict.spikes.items()},
-        "spec_equals_engine": verdict.spec_equals_engine,
-        "spec_samples": verdict.spec_samples,
-        "first_divergence": None if verdict.first_divergence is None else asdict(verdict.first_divergence),
-        "ladder": [{"stage": stage, "different": dict(different)} for stage, different in verdict.ladder],
-        "same_checkpoint": verdict.same_checkpoint,
-        "quantised_different": verdict.quantised_different,
-        "certificate": certificate_json(verdict.certificate),
-        "levels": [asdict(level) for level in levels],
-        "missed": list(missed),
-    }
-
-
-def verify_text(report: Json) -> str:
-    """A verdict for people."""
-    samples = report["samples"]
-    right = {side: round(share * samples) for side, share in report["accuracy"].items()}
-    lines = [
-        f"float accuracy:  {percent(right['float'], samples)}",
-        f"chip accuracy:   {percent(right['chip'], samples)}",
-        *(f"{level['name']}  {level['text']}" for level in report["levels"]),
-        *(f"missed: {line}" for line in report["missed"]),
-    ]
-    if not report["same_checkpoint"]:
-        lines.append("note: the netlist was compiled from another checkpoint file than this one")
-    names = list(report["spikes"])
-    rows = [
-        [name, *(f"{layer[key]:,}" for key in ("float", "chip", "different", "ill_posed"))]
-        for name, layer in report["spikes"].items()
-    ]
-    lines += ["", table(["spikes", "float", "chip", "different", "ill-posed"], rows), ""]
-    ladder = [[rung["stage"], *(f"{rung['different'][name]:,}" for name in names)] for rung in report["ladder"]]
-    lines += [table(["different, adding", *names], ladder), "", certificate_text(report["certificate"]), ""]
-    first = report["first_divergence"]
-    if first is None:
-        lines.append("no spike differs")
-    else:
-        where = f"neuron {first['neuron']}"
-        if first["taxel"] is not None:
-            where = f"taxel {first['taxel']}, feature {first['feature']}"
-        lines.append(
-            f"first divergence: {first['file']}, step {first['step']}, {first['layer']} {where}: membrane "
-            f"{first['float_membrane']:.6f} float, {first['chip_membrane']:.6f} chip "
-            f"({first['chip_register']}/64 units); threshold {first['theta']:g} and {first['chip_theta']:.6f}"
-            + (" (ill-posed: float64 sides with the chip)" if first["ill_posed"] else "")
-        )
-    return "\n".join(lines)
+# -- costs -------------------------------------------------------------------------------------------------------------
 
 
 def estimate_json(netlist: Netlist, costs: Costs) -> Json:

@@ -69,8 +69,8 @@ class Choice:
     scale, finest_scale : float
         Weight units (mantissa times 2**exponent) per membrane unit of the model, of the coarsest and of the finest
         group.
-    clipped : int
-        Weights that the range cuts off.
+    clipped, zeroed, weights : int
+        Weights that the range cuts off, those that round to zero, and all that are not zero.
     compensated : bool
         Whether weights were rounded so that their errors cancel, rather than each to the nearest.
     candidates : int
@@ -89,6 +89,8 @@ class Choice:
     scale: float
     finest_scale: float
     clipped: int
+    zeroed: int
+    weights: int
     compensated: bool
     candidates: int
     flips: int | None
@@ -205,8 +207,12 @@ def assemble(network: Network, layers: Sequence[Rounded]) -> IntegerNetwork:
 def explain_choice(network: Network, post: int, chosen: Candidate, calibration: Calibration | None) -> Choice:
     """Say what was chosen for a population."""
     form, scale = chosen.layer.form, chosen.layer.population.scale
-    clipped = 0
+    clipped = zeroed = weights = 0
     for p in incoming(network, post):
+        planes = (abs(plane.effective()) for plane in chosen.layer.projections if plane.pre == p.pre)
+        kept = sum(planes, start=0 * p.weight)
+        weights += p.weight.count_nonzero()
+        zeroed += p.weight.count_nonzero() - kept.multiply(p.weight != 0).count_nonzero()
         units = np.abs(p.weight.data) * np.repeat(scale, np.diff(p.weight.indptr))
         held = reach(form.bits, form.exponents) * step_units(form.bits, form.exponents)
         clipped += int(np.count_nonzero(units > held * (1 + 1e-12)))
@@ -219,6 +225,8 @@ def explain_choice(network: Network, post: int, chosen: Candidate, calibration: 
         scale=float(scale.min()),
         finest_scale=float(scale.max()),
         clipped=clipped,
+        zeroed=zeroed,
+        weights=weights,
         compensated=chosen.compensated,
         candidates=chosen.tried,
         flips=chosen.flips,
