@@ -211,8 +211,8 @@ def explain_choice(network: Network, post: int, chosen: Candidate, calibration: 
     for p in incoming(network, post):
         planes = (abs(plane.effective()) for plane in chosen.layer.projections if plane.pre == p.pre)
         kept = sum(planes, start=0 * p.weight)
-        weights += p.weight.count_nonzero()
-        zeroed += p.weight.count_nonzero() - kept.multiply(p.weight != 0).count_nonzero()
+        weights += int(p.weight.count_nonzero())
+        zeroed += int(p.weight.count_nonzero() - kept.multiply(p.weight != 0).count_nonzero())
         units = np.abs(p.weight.data) * np.repeat(scale, np.diff(p.weight.indptr))
         held = reach(form.bits, form.exponents) * step_units(form.bits, form.exponents)
         clipped += int(np.count_nonzero(units > held * (1 + 1e-12)))
