@@ -46,11 +46,14 @@ class Engine:
         What the kernel reads.
     negative : (entries,) like the tables' weights, or None
         Packed magnitudes of negative weights; None where no register can overflow, whatever the input.
+    drain : int
+        Chip steps that a recording takes beyond its data steps.
     """
 
     netlist: Netlist
     tables: Tables
     negative: npt.NDArray[Any] | None
+    drain: int
 
 
 def _padded(size: int) -> int:
@@ -112,7 +115,7 @@ def _segments(source: IntArray, target: IntArray, n_sources: int) -> tuple[dict[
     return geometry, entry, int(bounds[-1])
 
 
-def prepare(netlist: Netlist, *, checked: bool = False) -> Engine:
+def prepare(netlist: Netlist, *, checked: bool = False, gated: bool = True) -> Engine:
     """Lay a netlist out for the kernel.
 
     Parameters
@@ -121,6 +124,8 @@ def prepare(netlist: Netlist, *, checked: bool = False) -> Engine:
         The placed network.
     checked : bool
         Check registers in every step even where it is proven that they hold any input.
+    gated : bool
+        Whether a layer integrates in its window only, see :func:`runtime.spec.simulate`.
     """
     n_inputs = netlist.n_inputs
     compartment = np.lexsort((netlist.neuron, netlist.layer))
@@ -157,14 +162,14 @@ def prepare(netlist: Netlist, *, checked: bool = False) -> Engine:
         shift=np.int32(shift),
         run_start=np.append(np.flatnonzero(begins), len(compartment)),
         run_layer=layer,
-        run_depth=np.array([part.depth for part in netlist.layers])[layer],
+        run_depth=np.array([part.depth if gated else 0 for part in netlist.layers])[layer],
         keep_u=(2**DECAY_BITS - 1 - decay_u).astype(np.int32),
         keep_v=(2**DECAY_BITS - decay_v).astype(np.int32),
         threshold=threshold,
         bias=bias,
         compartment=compartment,
     )
-    return Engine(netlist=netlist, tables=tables, negative=negative)
+    return Engine(netlist=netlist, tables=tables, negative=negative, drain=netlist.max_depth if gated else 0)
 
 
 def start(engine: Engine) -> State:
@@ -181,6 +186,7 @@ def start(engine: Engine) -> State:
         positive=np.zeros(scratch, engine.tables.weight.dtype),
         negative=np.zeros(scratch, engine.tables.weight.dtype),
         flags=np.zeros(size, np.uint8),
+        worked=np.zeros(size, np.uint8),
         active=np.zeros(netlist.n_inputs + size + 1, np.int64),
         inputs=np.zeros(netlist.n_inputs, np.int64),
         spikes=np.zeros(netlist.n_compartments, np.int64),
@@ -198,6 +204,7 @@ def advance(
     steps: int | None = None,
     spikes: BoolArray | None = None,
     membranes: MembraneArray | None = None,
+    updated: BoolArray | None = None,
 ) -> None:
     """Run some chip steps; any split of a recording into calls gives the same result.
 
@@ -213,7 +220,7 @@ def advance(
         Data steps of the whole recording, which close each layer's window; any large number if it has no end.
     steps : int, optional
         How many chip steps to run; by default one per column.
-    spikes, membranes : (steps, compartments), optional
+    spikes, membranes, updated : (steps, compartments), optional
         Zeroed arrays to fill, see :class:`runtime.trace.Trace`.
 
     Raises
@@ -235,6 +242,7 @@ def advance(
         length,
         np.zeros((0, n), np.bool_) if spikes is None else spikes,
         np.zeros((0, n), np.int32) if membranes is None else membranes,
+        np.zeros((0, n), np.bool_) if updated is None else updated,
     )
     if step >= 0:
         raise range_error(engine.netlist, tuple(REGISTER_LIMITS)[register], compartment, step, value)
@@ -247,6 +255,7 @@ def simulate(
     lengths: IntArray | None = None,
     spikes: bool = False,
     membranes: bool = False,
+    updated: bool = False,
     threads: int | None = None,
     progress: Callable[[int], object] | None = None,
 ) -> Trace:
@@ -260,8 +269,8 @@ def simulate(
         Input events; any value but zero is an event.
     lengths : (recordings,) int64, optional
         Steps of each recording where some are shorter than T. What comes after them is not run: zeros in the trace.
-    spikes, membranes : bool
-        Whether to keep these per chip step: one and four bytes for each recording, chip step and compartment.
+    spikes, membranes, updated : bool
+        Whether to keep these per chip step: one, four and one bytes for each recording, chip step and compartment.
     threads : int, optional
         Recordings that run at the same time, by default one per processor. Results do not depend on it.
     progress : callable, optional
@@ -284,9 +293,10 @@ def simulate(
     netlist = engine.netlist
     check_channels(netlist, events.shape[1])
     recordings, _, length = events.shape
-    shape = (recordings, length + netlist.max_depth, netlist.n_compartments)
+    shape = (recordings, length + engine.drain, netlist.n_compartments)
     kept_spikes = np.zeros(shape, np.bool_) if spikes else None
     kept_membranes = np.zeros(shape, np.int32) if membranes else None
+    kept_updated = np.zeros(shape, np.bool_) if updated else None
     counts = Counts(
         inputs=np.zeros((recordings, netlist.n_inputs), np.int64),
         spikes=np.zeros((recordings, netlist.n_compartments), np.int64),
@@ -297,7 +307,7 @@ def simulate(
     def run(index: int) -> None:
         state = start(engine)
         own = length if lengths is None else int(lengths[index])
-        window = own + netlist.max_depth
+        window = own + engine.drain
         try:
             advance(
                 engine,
@@ -307,6 +317,7 @@ def simulate(
                 steps=window,
                 spikes=None if kept_spikes is None else kept_spikes[index, :window],
                 membranes=None if kept_membranes is None else kept_membranes[index, :window],
+                updated=None if kept_updated is None else kept_updated[index, :window],
             )
         except NumericRangeError as error:
             error.add_note(f"recording {index} of {recordings}, counted from 0")
@@ -320,4 +331,4 @@ def simulate(
         for done, _ in enumerate(pool.map(run, range(recordings)), start=1):
             if progress is not None:
                 progress(done)
-    return Trace(counts=counts, spikes=kept_spikes, membranes=kept_membranes)
+    return Trace(counts=counts, spikes=kept_spikes, membranes=kept_membranes, updated=kept_updated)

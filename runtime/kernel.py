@@ -91,8 +91,8 @@ class State(NamedTuple):
         Sources that spiked in the last step, ``clock[1]`` of them.
     current, membrane : (padded positions,) int32
         The two registers of each position, after any reset.
-    total, positive, negative, flags, active
-        Scratch of one step.
+    total, positive, negative, flags, worked, active
+        Scratch of one step; `flags` and `worked` tell who spiked and who had work to do.
     inputs, spikes, updates, saturations
         See :class:`runtime.trace.Counts`.
     """
@@ -105,6 +105,7 @@ class State(NamedTuple):
     positive: AnyArray
     negative: AnyArray
     flags: AnyArray
+    worked: AnyArray
     active: IntArray
     inputs: IntArray
     spikes: IntArray
@@ -257,6 +258,7 @@ def _sweep(
     keep_u: Any,
     keep_v: Any,
     flags: AnyArray,
+    worked: AnyArray,
 ) -> tuple[Any, Any]:
     """Let a run integrate; membranes are left before reset. All is int32: wider numbers would halve the speed."""
     arrivals = np.int32((1 << shift) - 1)
@@ -265,8 +267,9 @@ def _sweep(
     for i in range(total.size):
         packed, u, v, b = total[i], current[i], membrane[i], bias[i]
         total[i] = 0
-        worked = np.int32(u | v | b | np.int32(packed & arrivals)) != 0
-        updates = np.int32(updates + (np.int32(1) if worked else np.int32(0)))
+        works = np.int32(u | v | b | np.int32(packed & arrivals)) != 0
+        worked[i] = np.uint8(works)
+        updates = np.int32(updates + (np.int32(1) if works else np.int32(0)))
         # gather input, decay current, add
         u = np.int32(_kept(u, keep_u) + np.int32(np.int32(packed >> shift) << MEMBRANE_SHIFT))
         # decay membrane, add bias
@@ -297,6 +300,7 @@ def _integrate(tables: Tables, state: State, shift: Any, step: int, length: int)
                 tables.keep_u[r],
                 tables.keep_v[r],
                 state.flags[run],
+                state.worked[run],
             )
             state.updates[tables.run_layer[r]] += updates
             state.saturations[tables.run_layer[r]] += saturations
@@ -305,6 +309,7 @@ def _integrate(tables: Tables, state: State, shift: Any, step: int, length: int)
             state.current[run] = 0
             state.membrane[run] = 0
             state.flags[run] = 0
+            state.worked[run] = 0
 
 
 @_compiled
@@ -337,10 +342,11 @@ def chip_steps(
     length: int,
     spikes: AnyArray,
     membranes: AnyArray,
+    updated: AnyArray,
 ) -> tuple[int, int, int, int]:
     """Run chip steps; column 0 of `events`, 0 or 1, belongs to the first of them.
 
-    `spikes` and `membranes` have one row per step, or none where they are not wanted. Returns chip step,
+    `spikes`, `membranes` and `updated` have one row per step, or none where they are not wanted. Returns chip step,
     compartment, register and value of the first overflow; the chip step is -1 if there is none.
     """
     for t in range(steps):
@@ -357,5 +363,8 @@ def chip_steps(
         if membranes.shape[0]:
             for i in range(tables.compartment.size):
                 membranes[t, tables.compartment[i]] = state.membrane[i]
+        if updated.shape[0]:
+            for i in range(tables.compartment.size):
+                updated[t, tables.compartment[i]] = state.worked[i] != 0
         _reset_and_count(tables, state, events.shape[0], spikes, t)
     return -1, 0, 0, 0

@@ -161,7 +161,7 @@ def read_synapses(netlist: Netlist) -> list[list[tuple[int, int]]]:
     return lists
 
 
-def simulate(netlist: Netlist, events: npt.NDArray[np.uint8 | np.bool_]) -> Trace:
+def simulate(netlist: Netlist, events: npt.NDArray[np.uint8 | np.bool_], *, gated: bool = True) -> Trace:
     """Run one recording through the chip.
 
     Parameters
@@ -170,11 +170,14 @@ def simulate(netlist: Netlist, events: npt.NDArray[np.uint8 | np.bool_]) -> Trac
         The placed network.
     events : (n_inputs, T) uint8 or bool
         Input events; any value but zero is an event.
+    gated : bool
+        Whether a layer integrates in its window only. Otherwise all layers integrate in each of ``T`` chip steps,
+        biases included, as simulators do that know no windows.
 
     Returns
     -------
     Trace
-        With spikes and membranes, no leading axis.
+        With spikes, membranes and updates, no leading axis.
 
     Raises
     ------
@@ -192,9 +195,10 @@ def simulate(netlist: Netlist, events: npt.NDArray[np.uint8 | np.bool_]) -> Trac
     for axon, source in enumerate(netlist.axon_source.tolist()):
         axons_of[source].append(axon)
 
-    chip_steps = length + netlist.max_depth
+    chip_steps = length + netlist.max_depth if gated else length
     spikes = np.zeros((chip_steps, len(compartments)), np.bool_)
     membranes = np.zeros((chip_steps, len(compartments)), np.int32)
+    updated = np.zeros((chip_steps, len(compartments)), np.bool_)
     inputs = [0] * n_inputs
     spike_counts = [0] * len(compartments)
     updates = [0] * len(netlist.layers)
@@ -224,7 +228,7 @@ def simulate(netlist: Netlist, events: npt.NDArray[np.uint8 | np.bool_]) -> Trac
         # let every neuron whose window is open integrate
         spiked_now = []
         for c, neuron in enumerate(compartments):
-            if not neuron.depth <= t < neuron.depth + length:
+            if gated and not neuron.depth <= t < neuron.depth + length:
                 neuron.current = neuron.membrane = 0
                 continue
             worked = neuron.membrane != 0 or neuron.current != 0 or reached[c] or neuron.bias != 0
@@ -239,6 +243,7 @@ def simulate(netlist: Netlist, events: npt.NDArray[np.uint8 | np.bool_]) -> Trac
                 spikes[t, c] = True
                 spike_counts[c] += 1
                 spiked_now.append(c)
+            updated[t, c] = worked
             updates[neuron.layer] += worked
             saturations[neuron.layer] += saturated
         spiked_before = spiked_now
@@ -249,4 +254,4 @@ def simulate(netlist: Netlist, events: npt.NDArray[np.uint8 | np.bool_]) -> Trac
         updates=np.array(updates, np.int64),
         saturations=np.array(saturations, np.int64),
     )
-    return Trace(counts=counts, spikes=spikes, membranes=membranes)
+    return Trace(counts=counts, spikes=spikes, membranes=membranes, updated=updated)

@@ -60,11 +60,15 @@ class Trace:
     membranes : (…, chip steps, compartments) int32, or None
         The saturated membrane that was compared with the threshold, before a spike resets it, in 1/64 of a weight
         unit; zero outside the layer's window. None where it was not asked for.
+    updated : (…, chip steps, compartments) bool, or None
+        Whether a compartment had work to do in a chip step, as ``Counts.updates`` counts it; None where it was not
+        asked for.
     """
 
     counts: Counts
     spikes: BoolArray | None
     membranes: MembraneArray | None
+    updated: BoolArray | None = None
 
 
 def aligned(netlist: Netlist, array: npt.NDArray[Any], layer: int) -> npt.NDArray[Any]:

@@ -179,15 +179,17 @@ def large_netlist(seed: int, *, proved: bool) -> Netlist:
 
 
 def recording_of(batch: Trace, index: int) -> Trace:
-    """One recording of a batch that kept spikes and membranes, as the plain simulator would hand it back."""
+    """One recording of a batch that kept all it can, as the plain simulator would hand it back."""
     counts = Counts(**{field.name: getattr(batch.counts, field.name)[index] for field in fields(Counts)})
-    return Trace(counts=counts, spikes=batch.spikes[index], membranes=batch.membranes[index])
+    kept = {name: getattr(batch, name)[index] for name in ("spikes", "membranes", "updated")}
+    return Trace(counts=counts, **kept)
 
 
-def by_engine(netlist: Netlist, events: np.ndarray, *, checked: bool = False) -> Trace:
+def by_engine(netlist: Netlist, events: np.ndarray, *, checked: bool = False, gated: bool = True) -> Trace:
     """Run one recording through the fast simulator."""
-    prepared = engine.prepare(netlist, checked=checked)
-    return recording_of(engine.simulate(prepared, events[None], spikes=True, membranes=True, threads=1), 0)
+    prepared = engine.prepare(netlist, checked=checked, gated=gated)
+    kept = {"spikes": True, "membranes": True, "updated": True}
+    return recording_of(engine.simulate(prepared, events[None], threads=1, **kept), 0)
 
 
 def by_checked_engine(netlist: Netlist, events: np.ndarray) -> Trace:
@@ -201,7 +203,7 @@ SIMULATORS = [spec.simulate, by_engine, by_checked_engine]
 
 def assert_equal(left: Trace, right: Trace) -> None:
     """Every spike, membrane and count of two traces is the same."""
-    for name in ("spikes", "membranes"):
+    for name in ("spikes", "membranes", "updated"):
         np.testing.assert_array_equal(getattr(left, name), getattr(right, name), err_msg=name, strict=True)
     for field in fields(left.counts):
         pair = (getattr(trace.counts, field.name) for trace in (left, right))

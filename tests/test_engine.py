@@ -38,10 +38,10 @@ def random_batch(seed: int, channels: int, *, size: int = 6, length: int = 30) -
     return (np.random.default_rng(seed).random((size, channels, length)) < 0.15).astype(np.uint8)
 
 
-def assert_twins_agree(netlist, events) -> None:
-    expected = outcome(spec.simulate, netlist, events)
+def assert_twins_agree(netlist, events, *, gated=True) -> None:
+    expected = outcome(spec.simulate, netlist, events, gated=gated)
     for checked in (False, True):
-        found = outcome(by_engine, netlist, events, checked=checked)
+        found = outcome(by_engine, netlist, events, checked=checked, gated=gated)
         if isinstance(expected, str):
             assert found == expected
         else:
@@ -54,6 +54,13 @@ def assert_twins_agree(netlist, events) -> None:
 def test_any_network(data):
     netlist = data.draw(netlists())
     assert_twins_agree(netlist, data.draw(recordings(netlist)))
+
+
+@REPEATABLE
+@given(st.data())
+def test_any_network_without_windows(data):
+    netlist = data.draw(netlists())
+    assert_twins_agree(netlist, data.draw(recordings(netlist)), gated=False)
 
 
 @REPEATABLE
