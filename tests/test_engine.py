@@ -162,13 +162,13 @@ def test_threads_and_batches_do_not_matter(proved):
     netlist = large_netlist(7, proved=proved)
     prepared = engine.prepare(netlist)
     events = random_batch(8, netlist.n_inputs)
-    one = engine.simulate(prepared, events, spikes=True, membranes=True, threads=1)
-    three = engine.simulate(netlist, events.astype(np.bool_), spikes=True, membranes=True, threads=3)
+    one = engine.simulate(prepared, events, spikes=True, membranes=True, updated=True, threads=1)
+    three = engine.simulate(netlist, events.astype(np.bool_), spikes=True, membranes=True, updated=True, threads=3)
     assert_equal(one, three)
     for index in range(len(events)):  # each alone, so nothing leaks from one into the next
-        alone = engine.simulate(prepared, events[index : index + 1], spikes=True, membranes=True)
+        alone = engine.simulate(prepared, events[index : index + 1], spikes=True, membranes=True, updated=True)
         assert_equal(recording_of(one, index), recording_of(alone, 0))
-    repeated = engine.simulate(prepared, events[[0, 0, 0]], spikes=True, membranes=True, threads=1)
+    repeated = engine.simulate(prepared, events[[0, 0, 0]], spikes=True, membranes=True, updated=True, threads=1)
     for index in range(3):
         assert_equal(recording_of(repeated, index), recording_of(one, 0))
 
@@ -178,21 +178,25 @@ def test_events_of_any_layout():
     events = random_batch(8, netlist.n_inputs)
     transposed = np.ascontiguousarray(events.transpose(2, 1, 0)).transpose(2, 1, 0) * 3
     transposed.flags.writeable = False
-    expected = engine.simulate(netlist, events, spikes=True, membranes=True)
-    assert_equal(engine.simulate(netlist, transposed, spikes=True, membranes=True), expected)
+    expected = engine.simulate(netlist, events, spikes=True, membranes=True, updated=True)
+    assert_equal(engine.simulate(netlist, transposed, spikes=True, membranes=True, updated=True), expected)
 
 
 def test_only_what_is_asked_for_is_kept():
     netlist = large_netlist(7, proved=True)
     events = random_batch(8, netlist.n_inputs)
-    everything = engine.simulate(netlist, events, spikes=True, membranes=True)
+    everything = engine.simulate(netlist, events, spikes=True, membranes=True, updated=True)
     counted = engine.simulate(netlist, events)
     assert counted.spikes is None
     assert counted.membranes is None
+    assert counted.updated is None
     assert everything.spikes.dtype == np.bool_
     assert everything.membranes.dtype == np.int32
     np.testing.assert_array_equal(counted.counts.spikes, everything.spikes.sum(axis=1))
     np.testing.assert_array_equal(counted.counts.inputs, events.sum(axis=2))
+    np.testing.assert_array_equal(
+        counted.counts.updates[:, 0], everything.updated[..., netlist.layer == 0].sum(axis=(1, 2))
+    )
     assert engine.simulate(netlist, events[:0], spikes=True).spikes.shape == (0, 33, 300)
 
 
@@ -202,7 +206,7 @@ def test_any_split_into_steps_is_the_batch(proved, cuts, seed):
     netlist = large_netlist(9, proved=proved)
     events = random_batch(seed, netlist.n_inputs, size=1)
     prepared = engine.prepare(netlist)
-    whole = engine.simulate(prepared, events, spikes=True, membranes=True)
+    whole = engine.simulate(prepared, events, spikes=True, membranes=True, updated=True)
     chip_length = 30 + netlist.max_depth
     bounds = sorted({0, *cuts, chip_length})
     assert_equal(in_pieces(prepared, events[0], bounds), recording_of(whole, 0))
@@ -214,6 +218,7 @@ def in_pieces(prepared: engine.Engine, events: np.ndarray, bounds: list[int]) ->
     state = engine.start(prepared)
     spikes = np.zeros((bounds[-1], n), np.bool_)
     membranes = np.zeros((bounds[-1], n), np.int32)
+    updated = np.zeros((bounds[-1], n), np.bool_)
     for begin, end in itertools.pairwise(bounds):
         engine.advance(
             prepared,
@@ -223,10 +228,11 @@ def in_pieces(prepared: engine.Engine, events: np.ndarray, bounds: list[int]) ->
             steps=end - begin,
             spikes=spikes[begin:end],
             membranes=membranes[begin:end],
+            updated=updated[begin:end],
         )
         assert state.clock[0] == end
     counts = Counts(inputs=state.inputs, spikes=state.spikes, updates=state.updates, saturations=state.saturations)
-    return Trace(counts=counts, spikes=spikes, membranes=membranes)
+    return Trace(counts=counts, spikes=spikes, membranes=membranes, updated=updated)
 
 
 @pytest.mark.parametrize("proved", [True, False])
@@ -234,7 +240,7 @@ def test_one_step_at_a_time_is_the_batch(proved):
     netlist = large_netlist(10, proved=proved)
     events = random_batch(11, netlist.n_inputs, size=1)
     prepared = engine.prepare(netlist)
-    whole = engine.simulate(prepared, events, spikes=True, membranes=True)
+    whole = engine.simulate(prepared, events, spikes=True, membranes=True, updated=True)
     assert_equal(in_pieces(prepared, events[0], list(range(30 + netlist.max_depth + 1))), recording_of(whole, 0))
 
 
