@@ -1,11 +1,12 @@
 """The fast twin of :mod:`runtime.spec`: the same spikes, membranes and counts, bit for bit.
 
-Compartments are renumbered by layer and neuron ("positions"), so that a layer is one contiguous range whatever its
-cores; :mod:`runtime.kernel` tells what is made of them. Where :func:`compiler.netlist.one_step_bounds` proves that
-neither accumulator nor current can overflow, the kernel that checks nothing is used.
+There are two kernels. A network of layers that each hear the one before, in which no register can overflow or saturate,
+is run layer after layer in :mod:`runtime.block_kernel`; whole recordings only.
 
-The kernel knows no whole recordings: :func:`advance` moves a state by any number of chip steps, and :func:`simulate`
-does so once per recording.
+Any other network is run step after step in :mod:`runtime.kernel`, which knows no recordings: :func:`advance` moves a
+state by any number of chip steps. Its compartments are renumbered by layer and neuron ("positions"), so that a layer is
+one contiguous range whatever its cores. Where :func:`compiler.netlist.one_step_bounds` proves that neither accumulator
+nor current can overflow, nothing is checked.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +24,8 @@ import numpy.typing as npt
 from compiler.errors import NumericRangeError
 from compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, DECAY_BITS, MEMBRANE_SHIFT, IntArray
 from compiler.netlist import Netlist, one_step_bounds
+from runtime.block_kernel import Blocks, run_recordings
+from runtime.blocks import lay_out
 from runtime.kernel import State, Tables, chip_steps
 from runtime.trace import REGISTER_LIMITS, BoolArray, Counts, MembraneArray, Trace, check_channels, range_error
 
@@ -29,6 +33,9 @@ EventArray = npt.NDArray[np.uint8 | np.bool_]
 
 BLOCK = 32
 """Segments of a row start and end at multiples of this many positions."""
+
+PART = 4
+"""Recordings that a thread takes at a time."""
 
 MERGED_GAP = 1
 """Blocks without synapses that a segment spans rather than ends at."""
@@ -42,8 +49,10 @@ class Engine:
     ----------
     netlist : Netlist
         What it was made from.
-    tables : Tables
-        What the kernel reads.
+    blocks : Blocks or None
+        What the kernel of layers reads.
+    tables : Tables or None
+        What the kernel of steps reads; None where the other one does.
     negative : (entries,) like the tables' weights, or None
         Packed magnitudes of negative weights; None where no register can overflow, whatever the input.
     drain : int
@@ -51,7 +60,8 @@ class Engine:
     """
 
     netlist: Netlist
-    tables: Tables
+    blocks: Blocks | None
+    tables: Tables | None
     negative: npt.NDArray[Any] | None
     drain: int
 
@@ -115,18 +125,30 @@ def _segments(source: IntArray, target: IntArray, n_sources: int) -> tuple[dict[
     return geometry, entry, int(bounds[-1])
 
 
-def prepare(netlist: Netlist, *, checked: bool = False, gated: bool = True) -> Engine:
-    """Lay a netlist out for the kernel.
+def prepare(netlist: Netlist, *, stepwise: bool = False, checked: bool = False, gated: bool = True) -> Engine:
+    """Lay a netlist out for a kernel.
 
     Parameters
     ----------
     netlist : Netlist
         The placed network.
+    stepwise : bool
+        For :func:`advance`: use the kernel of steps even where that of layers would do.
     checked : bool
-        Check registers in every step even where it is proven that they hold any input.
+        Check registers in every step even where it is proven that they hold any input; so in steps.
     gated : bool
-        Whether a layer integrates in its window only, see :func:`runtime.spec.simulate`.
+        Whether a layer integrates in its window only, see :func:`runtime.spec.simulate`; in steps if not.
     """
+    blocks = lay_out(netlist) if gated and not checked and not stepwise else None
+    drain = netlist.max_depth if gated else 0
+    if blocks is not None:
+        return Engine(netlist=netlist, blocks=blocks, tables=None, negative=None, drain=drain)
+    tables, negative = _tables(netlist, checked=checked, gated=gated)
+    return Engine(netlist=netlist, blocks=None, tables=tables, negative=negative, drain=drain)
+
+
+def _tables(netlist: Netlist, *, checked: bool, gated: bool) -> tuple[Tables, npt.NDArray[Any] | None]:
+    """Lay a netlist out for the kernel of steps."""
     n_inputs = netlist.n_inputs
     compartment = np.lexsort((netlist.neuron, netlist.layer))
     position = np.empty_like(compartment)
@@ -169,7 +191,13 @@ def prepare(netlist: Netlist, *, checked: bool = False, gated: bool = True) -> E
         bias=bias,
         compartment=compartment,
     )
-    return Engine(netlist=netlist, tables=tables, negative=negative, drain=netlist.max_depth if gated else 0)
+    return tables, negative
+
+
+def tables_of(engine: Engine) -> Tables:
+    """Tables of an engine that was prepared for single steps."""
+    assert engine.tables is not None, "single steps need prepare(netlist, stepwise=True)"
+    return engine.tables
 
 
 def start(engine: Engine) -> State:
@@ -183,8 +211,8 @@ def start(engine: Engine) -> State:
         current=np.zeros(size, np.int32),
         membrane=np.zeros(size, np.int32),
         total=np.zeros(size, np.int32),
-        positive=np.zeros(scratch, engine.tables.weight.dtype),
-        negative=np.zeros(scratch, engine.tables.weight.dtype),
+        positive=np.zeros(scratch, tables_of(engine).weight.dtype),
+        negative=np.zeros(scratch, tables_of(engine).weight.dtype),
         flags=np.zeros(size, np.uint8),
         worked=np.zeros(size, np.uint8),
         active=np.zeros(netlist.n_inputs + size + 1, np.int64),
@@ -211,7 +239,7 @@ def advance(
     Parameters
     ----------
     engine : Engine
-        The prepared network.
+        The network, prepared for single steps.
     state : State
         Changed in place. After an error it is of no further use.
     events : (n_inputs, columns) uint8 or bool
@@ -234,7 +262,7 @@ def advance(
     steps = events.shape[1] if steps is None else steps
     n = engine.netlist.n_compartments
     step, compartment, register, value = chip_steps(
-        engine.tables,
+        tables_of(engine),
         engine.negative,
         state,
         np.ascontiguousarray(events != 0).view(np.uint8),
@@ -304,9 +332,27 @@ def simulate(
         saturations=np.zeros((recordings, len(netlist.layers)), np.int64),
     )
 
-    def run(index: int) -> None:
+    ends = np.full(recordings, length) if lengths is None else np.asarray(lengths, np.int64)
+
+    def run_layers(part: slice) -> None:
+        assert engine.blocks is not None, "the network has been laid out in blocks"
+        empty = (0, 0, 0)
+        run_recordings(
+            engine.blocks,
+            events[part].view(np.uint8),
+            ends[part],
+            counts.inputs[part],
+            counts.spikes[part],
+            counts.updates[part],
+            np.zeros(empty, np.bool_) if kept_spikes is None else kept_spikes[part],
+            np.zeros(empty, np.int32) if kept_membranes is None else kept_membranes[part],
+            np.zeros(empty, np.bool_) if kept_updated is None else kept_updated[part],
+        )
+
+    def run_steps(part: slice) -> None:
+        index = part.start
         state = start(engine)
-        own = length if lengths is None else int(lengths[index])
+        own = int(ends[index])
         window = own + engine.drain
         try:
             advance(
@@ -327,8 +373,14 @@ def simulate(
         counts.updates[index] = state.updates
         counts.saturations[index] = state.saturations
 
-    with ThreadPoolExecutor(threads or os.cpu_count()) as pool:
-        for done, _ in enumerate(pool.map(run, range(recordings)), start=1):
+    if engine.blocks is not None:
+        events = np.ascontiguousarray(events)
+    size = 1 if engine.blocks is None else PART
+    parts = [slice(i, min(i + size, recordings)) for i in range(0, recordings, size)]
+    run = run_steps if engine.blocks is None else run_layers
+    workers = min(threads or os.cpu_count() or 1, len(parts))
+    with ThreadPoolExecutor(workers) if workers > 1 else nullcontext() as pool:
+        for part, _ in zip(parts, pool.map(run, parts) if pool else map(run, parts), strict=True):
             if progress is not None:
-                progress(done)
+                progress(part.stop)
     return Trace(counts=counts, spikes=kept_spikes, membranes=kept_membranes, updated=kept_updated)

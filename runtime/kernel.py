@@ -113,12 +113,12 @@ class State(NamedTuple):
     saturations: IntArray
 
 
-def _compiled(function: Function) -> Function:
+def compiled(function: Function) -> Function:
     """Compile a part of the kernel; it is cached with the whole."""
     return cast(Function, njit(nogil=True)(function))
 
 
-def _compiled_and_cached(function: Function) -> Function:
+def compiled_and_cached(function: Function) -> Function:
     """Compile and keep the machine code on disk, if there is any place for it."""
     try:
         return cast(Function, njit(nogil=True, cache=True)(function))
@@ -126,7 +126,7 @@ def _compiled_and_cached(function: Function) -> Function:
         return cast(Function, njit(nogil=True)(function))
 
 
-@_compiled
+@compiled
 def _kept(x: Any, factor: Any) -> Any:
     """``x * factor / 4096`` rounded toward zero; all int32."""
     magnitude = np.int32(abs(x))
@@ -136,13 +136,13 @@ def _kept(x: Any, factor: Any) -> Any:
     return np.int32(-kept) if x < 0 else kept
 
 
-@_compiled
+@compiled
 def _is_open(tables: Tables, run: int, step: int, length: int) -> Any:
     """Whether a run integrates in this chip step."""
     return 0 <= step - tables.run_depth[run] < length
 
 
-@_compiled
+@compiled
 def _list_sources(state: State, events: AnyArray, t: int, length: int) -> int:
     """List the channels with an event in column `t` and the compartments that spiked one step ago."""
     n = 0
@@ -157,7 +157,7 @@ def _list_sources(state: State, events: AnyArray, t: int, length: int) -> int:
     return n
 
 
-@_compiled
+@compiled
 def _deliver(tables: Tables, weight: AnyArray, sources: AnyArray, total: AnyArray) -> None:
     """Add the rows of all sources to the accumulators."""
     k = 0
@@ -190,7 +190,7 @@ def _deliver(tables: Tables, weight: AnyArray, sources: AnyArray, total: AnyArra
             k += 1
 
 
-@_compiled
+@compiled
 def _fold(positive: AnyArray, negative: AnyArray, shift: Any, current: AnyArray, keep_u: Any, total: AnyArray) -> bool:
     """Turn the two sums of a run into one packed accumulator; return whether a register overflows."""
     overflow = False
@@ -204,7 +204,7 @@ def _fold(positive: AnyArray, negative: AnyArray, shift: Any, current: AnyArray,
     return overflow
 
 
-@_compiled
+@compiled
 def _deliver_checked(tables: Tables, negative: AnyArray, state: State, n: int, step: int, length: int) -> bool:
     """Deliver the active sources; return whether a register overflows, and leave the sums in place if so."""
     _deliver(tables, tables.weight, state.active[:n], state.positive)
@@ -227,7 +227,7 @@ def _deliver_checked(tables: Tables, negative: AnyArray, state: State, n: int, s
     return overflow
 
 
-@_compiled
+@compiled
 def _find_overflow(tables: Tables, state: State, step: int, length: int) -> tuple[int, int, int]:
     """Lowest compartment that overflows: its id, its register (0 sum, 1 current) and the value."""
     found, register, value = tables.compartment.size, 0, 0
@@ -247,7 +247,7 @@ def _find_overflow(tables: Tables, state: State, step: int, length: int) -> tupl
     return found, register, value
 
 
-@_compiled
+@compiled
 def _sweep(
     total: AnyArray,
     shift: Any,
@@ -284,7 +284,7 @@ def _sweep(
     return updates, saturations
 
 
-@_compiled
+@compiled
 def _integrate(tables: Tables, state: State, shift: Any, step: int, length: int) -> None:
     """Let all runs integrate whose window is open; hold the others at rest."""
     for r in range(tables.run_layer.size):
@@ -312,7 +312,7 @@ def _integrate(tables: Tables, state: State, shift: Any, step: int, length: int)
             state.worked[run] = 0
 
 
-@_compiled
+@compiled
 def _reset_and_count(tables: Tables, state: State, n_inputs: int, spikes: AnyArray, t: int) -> None:
     """Reset the membranes of the compartments that spiked, count and list them for the next step."""
     fired = 0
@@ -332,7 +332,7 @@ def _reset_and_count(tables: Tables, state: State, n_inputs: int, spikes: AnyArr
     state.clock[1] = fired
 
 
-@_compiled_and_cached
+@compiled_and_cached
 def chip_steps(
     tables: Tables,
     negative: AnyArray | None,

@@ -26,7 +26,7 @@ from compiler.fixedpoint import IntArray
 from compiler.interpret import vote
 from compiler.netlist import Netlist
 from compiler.serialize import read_netlist
-from runtime.engine import Engine, advance, prepare, start
+from runtime.engine import Engine, advance, prepare, start, tables_of
 from runtime.trace import BoolArray
 from runtime.votes import class_counts
 
@@ -84,7 +84,7 @@ class Stream:
         netlist = engine.netlist
         ends = np.cumsum([layer.neurons for layer in netlist.layers]).tolist()
         # the engine orders compartments by layer and neuron; a chip may hold fewer of them than the layer has neurons
-        compartment = engine.tables.compartment
+        compartment = tables_of(engine).compartment
         self._place = np.array([0, *ends[:-1]])[netlist.layer[compartment]] + netlist.neuron[compartment]
         self._bounds = tuple(zip([0, *ends[:-1]], ends, strict=True))
         self._column = np.zeros((engine.netlist.n_inputs, 1), np.uint8)
@@ -196,12 +196,12 @@ def load(path: str | os.PathLike[str]) -> LiveNetlist:
     FormatError
         As :func:`compiler.serialize.read_netlist` does.
     """
-    return LiveNetlist(engine=prepare(read_netlist(path)))
+    return LiveNetlist(engine=prepare(read_netlist(path), stepwise=True))
 
 
 def open_stream(netlist: Netlist | Engine) -> Stream:
     """Open a stream on a netlist in memory; :func:`runtime.engine.prepare` it once to open several."""
-    return Stream(netlist if isinstance(netlist, Engine) else prepare(netlist))
+    return Stream(netlist if isinstance(netlist, Engine) else prepare(netlist, stepwise=True))
 
 
 def _one_bin(netlist: Netlist, events: npt.ArrayLike) -> npt.NDArray[np.generic]:

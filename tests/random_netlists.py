@@ -185,9 +185,9 @@ def recording_of(batch: Trace, index: int) -> Trace:
     return Trace(counts=counts, **kept)
 
 
-def by_engine(netlist: Netlist, events: np.ndarray, *, checked: bool = False, gated: bool = True) -> Trace:
+def by_engine(netlist: Netlist, events: np.ndarray, **options: bool) -> Trace:
     """Run one recording through the fast simulator."""
-    prepared = engine.prepare(netlist, checked=checked, gated=gated)
+    prepared = engine.prepare(netlist, **options)
     kept = {"spikes": True, "membranes": True, "updated": True}
     return recording_of(engine.simulate(prepared, events[None], threads=1, **kept), 0)
 
@@ -197,8 +197,13 @@ def by_checked_engine(netlist: Netlist, events: np.ndarray) -> Trace:
     return by_engine(netlist, events, checked=True)
 
 
-SIMULATORS = [spec.simulate, by_engine, by_checked_engine]
-"""Three ways to run one recording, all the same."""
+def by_steps(netlist: Netlist, events: np.ndarray) -> Trace:
+    """Run one recording through the fast simulator, step by step."""
+    return by_engine(netlist, events, stepwise=True)
+
+
+SIMULATORS = [spec.simulate, by_engine, by_steps, by_checked_engine]
+"""Four ways to run one recording, all the same."""
 
 
 def assert_equal(left: Trace, right: Trace) -> None:

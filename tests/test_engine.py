@@ -40,8 +40,8 @@ def random_batch(seed: int, channels: int, *, size: int = 6, length: int = 30) -
 
 def assert_twins_agree(netlist, events, *, gated=True) -> None:
     expected = outcome(spec.simulate, netlist, events, gated=gated)
-    for checked in (False, True):
-        found = outcome(by_engine, netlist, events, checked=checked, gated=gated)
+    for options in ({}, {"stepwise": True}, {"checked": True}):
+        found = outcome(by_engine, netlist, events, gated=gated, **options)
         if isinstance(expected, str):
             assert found == expected
         else:
@@ -76,11 +76,11 @@ def test_large_networks_reach_every_regime(proved):
     saturations = 0
     for seed in range(4):
         netlist = large_netlist(seed, proved=proved)
-        assert (engine.prepare(netlist).negative is None) == proved
+        assert (engine.prepare(netlist, stepwise=True).negative is None) == proved
         events = random_batch(seed, netlist.n_inputs, size=1)[0]
         trace = spec.simulate(netlist, events)
-        for checked in (False, True):
-            assert_equal(by_engine(netlist, events, checked=checked), trace)
+        for options in ({}, {"stepwise": True}, {"checked": True}):
+            assert_equal(by_engine(netlist, events, **options), trace)
         neuron_steps = netlist.n_compartments * events.shape[1]
         assert neuron_steps // 10 < np.count_nonzero(trace.membranes < 0)
         assert neuron_steps // 10 < trace.counts.spikes.sum() < neuron_steps * 9 // 10
@@ -132,7 +132,7 @@ def test_decay_of_registers_set_by_hand(membrane, kept, checked):
     neuron = spec.Compartment(layer=0, depth=0, decay_u=4095, decay_v=3277, threshold=100000, bias=0, membrane=membrane)
     assert spec.compartment_step(neuron, 0, 0) == (kept, False, False)
     prepared = engine.prepare(
-        build([Neuron(decay_v=3277, threshold=100000)], [], n_inputs=1, depths=[0]), checked=checked
+        build([Neuron(decay_v=3277, threshold=100000)], [], n_inputs=1, depths=[0]), stepwise=True, checked=checked
     )
     state = engine.start(prepared)
     state.membrane[0] = membrane
@@ -205,7 +205,7 @@ def test_only_what_is_asked_for_is_kept():
 def test_any_split_into_steps_is_the_batch(proved, cuts, seed):
     netlist = large_netlist(9, proved=proved)
     events = random_batch(seed, netlist.n_inputs, size=1)
-    prepared = engine.prepare(netlist)
+    prepared = engine.prepare(netlist, stepwise=True)
     whole = engine.simulate(prepared, events, spikes=True, membranes=True, updated=True)
     chip_length = 30 + netlist.max_depth
     bounds = sorted({0, *cuts, chip_length})
@@ -239,7 +239,7 @@ def in_pieces(prepared: engine.Engine, events: np.ndarray, bounds: list[int]) ->
 def test_one_step_at_a_time_is_the_batch(proved):
     netlist = large_netlist(10, proved=proved)
     events = random_batch(11, netlist.n_inputs, size=1)
-    prepared = engine.prepare(netlist)
+    prepared = engine.prepare(netlist, stepwise=True)
     whole = engine.simulate(prepared, events, spikes=True, membranes=True, updated=True)
     assert_equal(in_pieces(prepared, events[0], list(range(30 + netlist.max_depth + 1))), recording_of(whole, 0))
 
@@ -247,7 +247,7 @@ def test_one_step_at_a_time_is_the_batch(proved):
 def test_a_stream_without_end():
     netlist = large_netlist(10, proved=True)
     events = random_batch(12, netlist.n_inputs, size=1)
-    prepared = engine.prepare(netlist)
+    prepared = engine.prepare(netlist, stepwise=True)
     whole = engine.simulate(prepared, events, spikes=True)
     state, spikes = engine.start(prepared), np.zeros((30, 300), np.bool_)
     engine.advance(prepared, state, events[0], length=2**62, spikes=spikes)
@@ -278,7 +278,7 @@ def test_the_kernel_compiles_where_nothing_can_be_cached(monkeypatch):
         return lambda function: (function, options)
 
     monkeypatch.setattr(kernel, "njit", njit)
-    assert kernel._compiled_and_cached(len) == (len, {"nogil": True})
+    assert kernel.compiled_and_cached(len) == (len, {"nogil": True})
 
 
 def test_simulators_do_not_load_torch():

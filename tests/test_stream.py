@@ -136,7 +136,7 @@ def test_reset_forgets_everything():
 
 def test_streams_in_threads_share_nothing():
     netlist = lively()
-    prepared = engine.prepare(netlist)
+    prepared = engine.prepare(netlist, stepwise=True)
     batch = [events_of(netlist, seed, 60) for seed in range(8)]
     with ThreadPoolExecutor(4) as pool:
         for events, steps in zip(batch, pool.map(lambda e: play(open_stream(prepared), e), batch), strict=True):

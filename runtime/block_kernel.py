@@ -1,0 +1,530 @@
+"""The chip step of :mod:`runtime.spec` for 64 compartments at once; :mod:`runtime.blocks` prepares what it reads.
+
+A *block* is 64 neurons of one layer; who spiked in it is one 64-bit word. Its synapses are
+rows of 64 weights, one for each source that reaches it. In each step the rows of the sources that are active are added
+up in registers, and the 64 neurons integrate, compare and reset. A block runs through the whole recording before the
+next one starts, so that its rows and membranes stay in cache: no layer hears a later one.
+
+*Sixteen bits.* :mod:`runtime.blocks` proves that the positive and the negative weights of a step each add up to 32,767
+at most (the accumulator's 21 bits hold them shifted left by six). A sum of some of both lies in between, in whatever
+order they come.
+
+*Decay in 32 bits.* It also proves that no membrane leaves its register and that none times its factor reaches 2**32; so
+the magnitude is multiplied without a sign, and nothing saturates.
+
+*Idle neurons.* A compartment has nothing to do in a step if its membrane, its current, its bias and the number of
+synapses that reach it are all zero. Only those without a bias can be idle, the others are not looked at.
+
+*Vectors.* They are written in LLVM's own terms, as numba leaves no other way to hold 16-bit sums in registers and to
+turn 64 comparisons into one word. LLVM makes of them what the machine has.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+import numpy.typing as npt
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
+
+from compiler.fixedpoint import DECAY_BITS, IntArray
+from runtime.kernel import compiled, compiled_and_cached
+
+AnyArray = npt.NDArray[Any]
+Function = Callable[..., Any]
+
+LANES = 64
+"""Compartments of a block."""
+
+UNROLLED = 4
+"""Rows that are added up without a look at how many are left."""
+
+_BIT, _SUM, _STATE, _WORD = (ir.IntType(bits) for bits in (1, 16, 32, 64))
+_SUMS, _STATES = ir.VectorType(_SUM, LANES), ir.VectorType(_STATE, LANES)
+
+
+class Blocks(NamedTuple):
+    """A netlist as the kernel reads it; nothing in here changes.
+
+    Parameters
+    ----------
+    stage : (stages + 1,) int64
+        Bounds of each stage, the layers of one depth, in the blocks.
+    dense : (stages,) bool
+        Whether every block of a stage has a row for every source; then its sources are listed.
+    first : (blocks + 1,) int64
+        Bounds of each block in the links.
+    word, linked, row : (links,) int64, uint64, int64
+        A word of sources that reach a block, which of them do, and the row of the first of these.
+    weight : (rows * 64,) int8 or int16
+        Net weight of a source for each position of a block, shifted right by what all weights of the block have in
+        common.
+    shift : (blocks,) uint32
+        From a sum of these to membrane units.
+    reached : (rows,) uint64
+        Positions that a source has a synapse to, whatever its weight.
+    restful : (blocks,) uint64
+        Positions without a bias.
+    held : (blocks,) uint64
+        Positions that hold a compartment.
+    bias, threshold : (blocks * 64,) int32
+        In membrane units; a position without a compartment has a threshold that nothing reaches.
+    keep : (blocks,) uint32
+        What a membrane keeps in a step, in 1/4096.
+    depth, layer : (blocks,) int64
+        Depth and layer of each block.
+    compartment : (blocks * 64,) int64
+        Compartment of each position, -1 for none.
+    """
+
+    stage: IntArray
+    dense: AnyArray
+    first: IntArray
+    word: IntArray
+    linked: AnyArray
+    row: IntArray
+    weight: AnyArray
+    shift: AnyArray
+    reached: AnyArray
+    restful: AnyArray
+    held: AnyArray
+    bias: AnyArray
+    threshold: AnyArray
+    keep: AnyArray
+    depth: IntArray
+    layer: IntArray
+    compartment: IntArray
+
+
+class Scratch(NamedTuple):
+    """What a recording leaves behind; made anew for each.
+
+    Parameters
+    ----------
+    words : (steps * words of the inputs,) uint64
+        Channels with an event in each step.
+    raster, idle : (steps * blocks,) uint64
+        Who spiked and who was idle, stage after stage; within a stage step after step.
+    inputs : (words of the inputs * 64,) int64
+        Events of each channel.
+    spikes : (blocks * 64,) int64
+        Spikes of each position.
+    membrane : (blocks * 64,) int32
+        Last membranes.
+    before : (blocks * 64,) int16
+        Synaptic sums of the last step: what the current register still holds.
+    membranes : (steps * blocks * 64,) int32, or empty
+        Membranes before a reset, in the order of `raster`.
+    """
+
+    words: AnyArray
+    raster: AnyArray
+    idle: AnyArray
+    inputs: AnyArray
+    spikes: AnyArray
+    membrane: AnyArray
+    before: AnyArray
+    membranes: AnyArray
+
+
+# -- vectors -----------------------------------------------------------------------------------------------------------
+
+
+def _intrinsic(function: Function) -> Function:
+    """Let compiled functions call what `function` emits, without the typing context that it takes first."""
+    return cast(Function, intrinsic(function))
+
+
+def _number(value: int) -> Any:
+    return ir.Constant(_WORD, value)
+
+
+def _all(kind: Any, value: int) -> Any:
+    return ir.Constant(kind, [value] * LANES)
+
+
+def _arrays(context: Any, builder: Any, kind: Any, value: Any) -> dict[str, Any]:
+    """Where the arrays of a named tuple begin."""
+    return {
+        name: context.make_array(part)(context, builder, builder.extract_value(value, i)).data
+        for i, (name, part) in enumerate(zip(kind.fields, kind.types, strict=True))
+    }
+
+
+def _element(builder: Any, array: Any, index: Any) -> Any:
+    return builder.load(builder.gep(array, [index]))
+
+
+def _vector(builder: Any, array: Any, index: Any, kind: Any) -> tuple[Any, Any]:
+    """Load 64 elements; also returns where they are, to store them again."""
+    place = builder.bitcast(builder.gep(array, [index]), kind.as_pointer())
+    return builder.load(place, align=kind.element.width // 8, typ=kind), place
+
+
+def _row(builder: Any, tables: Any, row: Any) -> Any:
+    """Weights of a row, 8 or 16 bits each, as 16 bits."""
+    array = tables["weight"]
+    kind = ir.VectorType(array.type.pointee, LANES)
+    return builder.sext(_vector(builder, array, builder.mul(row, _number(LANES)), kind)[0], _SUMS)
+
+
+def _store(builder: Any, vector: Any, place: Any) -> None:
+    builder.store(vector, place, align=vector.type.element.width // 8)
+
+
+def _lanes(builder: Any, value: Any) -> Any:
+    """All lanes the same."""
+    nothing = ir.Constant(_STATES, ir.Undefined)
+    one = builder.insert_element(nothing, value, ir.Constant(_STATE, 0))
+    return builder.shuffle_vector(one, nothing, _all(_STATES, 0))
+
+
+def _sum_rows(builder: Any, tables: Any, active: Any, at: Any, block: Any, *, marks: bool) -> tuple[Any, Any]:
+    """Emit the loop over a block's links and, within, over active sources; returns sums and who was reached."""
+    before = builder.block
+    names = ("links", "link", "sources", "source", "link.end", "done")
+    links, link, sources, source, link_end, done = map(builder.append_basic_block, names)
+    begin, end = (_element(builder, tables["first"], builder.add(block, _number(i))) for i in (0, 1))
+    builder.branch(links)
+
+    builder.position_at_end(links)
+    e, total, arrived = builder.phi(_WORD), builder.phi(_SUMS), builder.phi(_WORD)
+    for phi, value in ((e, begin), (total, _all(_SUMS, 0)), (arrived, _number(0))):
+        phi.add_incoming(value, before)
+    builder.cbranch(builder.icmp_signed("<", e, end), link, done)
+
+    builder.position_at_end(link)
+    linked = _element(builder, tables["linked"], e)
+    word = _element(builder, active, builder.add(at, _element(builder, tables["word"], e)))
+    first_row = _element(builder, tables["row"], e)
+    both = builder.and_(word, linked)
+    builder.branch(sources)
+
+    builder.position_at_end(sources)
+    left, part, marked = builder.phi(_WORD), builder.phi(_SUMS), builder.phi(_WORD)
+    for phi, value in ((left, both), (part, total), (marked, arrived)):
+        phi.add_incoming(value, link)
+    builder.cbranch(builder.icmp_unsigned("!=", left, _number(0)), source, link_end)
+
+    builder.position_at_end(source)
+    lowest = builder.and_(left, builder.neg(left))
+    rank = builder.ctpop(builder.and_(linked, builder.sub(lowest, _number(1))))
+    row = builder.add(first_row, rank)
+    part.add_incoming(builder.add(part, _row(builder, tables, row)), source)
+    left.add_incoming(builder.xor(left, lowest), source)
+    marked.add_incoming(builder.or_(marked, _element(builder, tables["reached"], row)) if marks else marked, source)
+    builder.branch(sources)
+
+    builder.position_at_end(link_end)
+    for phi, value in ((e, builder.add(e, _number(1))), (total, part), (arrived, marked)):
+        phi.add_incoming(value, link_end)
+    builder.branch(links)
+
+    builder.position_at_end(done)
+    return total, arrived
+
+
+def _sum_listed(builder: Any, tables: Any, sources: Any, bounds: Any, block: Any, *, marks: bool) -> tuple[Any, Any]:
+    """Emit the same for a block that every source reaches: a loop over listed sources, four at a time, then one."""
+    base = _element(builder, tables["row"], _element(builder, tables["first"], block))
+    k, total, arrived = bounds[0], _all(_SUMS, 0), _number(0)
+    for stride in (UNROLLED, 1):
+        before = builder.block
+        head, body, done = map(builder.append_basic_block, ("head", "body", "done"))
+        builder.branch(head)
+        builder.position_at_end(head)
+        at, part, marked = builder.phi(_WORD), builder.phi(_SUMS), builder.phi(_WORD)
+        for phi, value in ((at, k), (part, total), (marked, arrived)):
+            phi.add_incoming(value, before)
+        builder.cbranch(builder.icmp_signed("<=", builder.add(at, _number(stride)), bounds[1]), body, done)
+        builder.position_at_end(body)
+        added, seen = part, marked
+        for i in range(stride):
+            source = builder.sext(_element(builder, sources, builder.add(at, _number(i))), _WORD)
+            row = builder.add(base, source)
+            added = builder.add(added, _row(builder, tables, row))
+            seen = builder.or_(seen, _element(builder, tables["reached"], row)) if marks else seen
+        for phi, value in ((at, builder.add(at, _number(stride))), (part, added), (marked, seen)):
+            phi.add_incoming(value, body)
+        builder.branch(head)
+        builder.position_at_end(done)
+        k, total, arrived = at, part, marked
+    return total, arrived
+
+
+def _integrate(builder: Any, tables: Any, scratch: Any, sums: Any, block: Any, kept_at: Any) -> tuple[Any, Any]:
+    """Emit one step of the 64 neurons; returns their membranes before it, and who fired."""
+    position = builder.mul(block, _number(LANES))
+    zero = _all(_STATES, 0)
+
+    # decay membrane, rounding toward zero
+    old, place = _vector(builder, scratch["membrane"], position, _STATES)
+    below = builder.icmp_signed("<", old, zero)
+    magnitude = builder.select(below, builder.sub(zero, old), old)
+    magnitude = builder.mul(magnitude, _lanes(builder, _element(builder, tables["keep"], block)))
+    magnitude = builder.lshr(magnitude, _all(_STATES, DECAY_BITS))
+    v = builder.select(below, builder.sub(zero, magnitude), magnitude)
+    # add input and bias
+    v = builder.add(
+        v, builder.shl(builder.sext(sums, _STATES), _lanes(builder, _element(builder, tables["shift"], block)))
+    )
+    v = builder.add(v, _vector(builder, tables["bias"], position, _STATES)[0])
+    # compare
+    fired = builder.icmp_signed(">", v, _vector(builder, tables["threshold"], position, _STATES)[0])
+    with builder.if_then(builder.icmp_signed(">=", kept_at, _number(0))):
+        _store(builder, v, _vector(builder, scratch["membranes"], kept_at, _STATES)[1])
+    # reset
+    _store(builder, builder.select(fired, zero, v), place)
+    return old, fired
+
+
+def _block_step(*, listed: bool, rests: bool) -> Function:
+    """Make one step of one block.
+
+    Sources come as words, or listed where every source reaches the block; it `rests` where compartments can be idle.
+    """
+
+    @_intrinsic
+    def step(
+        typing: Any, tables: Any, active: Any, at: Any, end: Any, block: Any, scratch: Any, place: Any, kept_at: Any
+    ) -> Any:
+        signature = types.uint64(tables, active, *[types.int64] * 3, scratch, *[types.int64] * 2)
+
+        def emit(context: Any, builder: Any, _signature: Any, values: Any) -> Any:
+            table = _arrays(context, builder, tables, values[0])
+            own = _arrays(context, builder, scratch, values[5])
+            sources = context.make_array(active)(context, builder, values[1]).data
+            (at, end, block), (place, kept_at) = values[2:5], values[6:8]
+            if listed:
+                sums, arrived = _sum_listed(builder, table, sources, (at, end), block, marks=rests)
+            else:
+                sums, arrived = _sum_rows(builder, table, sources, at, block, marks=rests)
+            old, fired = _integrate(builder, table, own, sums, block, kept_at)
+            if rests:
+                last, last_at = _vector(builder, own["before"], builder.mul(block, _number(LANES)), _SUMS)
+                _store(builder, sums, last_at)
+                silent = builder.and_(
+                    builder.icmp_signed("==", old, _all(_STATES, 0)), builder.icmp_signed("==", last, _all(_SUMS, 0))
+                )
+                idle = builder.and_(builder.bitcast(silent, _WORD), builder.not_(arrived))
+                idle = builder.and_(idle, _element(builder, table["restful"], block))
+                builder.store(idle, builder.gep(own["idle"], [place]))
+            return builder.bitcast(fired, _WORD)
+
+        return signature, emit
+
+    return step
+
+
+_busy_step, _restful_step = (_block_step(listed=False, rests=rests) for rests in (False, True))
+_busy_listed_step, _restful_listed_step = (_block_step(listed=True, rests=rests) for rests in (False, True))
+
+
+@_intrinsic
+def _lowest(typing: Any, word: Any) -> Any:
+    """Index of the lowest bit of a word that is not zero."""
+
+    def emit(_context: Any, builder: Any, _signature: Any, values: Any) -> Any:
+        return builder.cttz(values[0], ir.Constant(_BIT, 1))
+
+    return types.int64(types.uint64), emit
+
+
+@_intrinsic
+def _bits(typing: Any, word: Any) -> Any:
+    """Bits of a word that are set."""
+
+    def emit(_context: Any, builder: Any, _signature: Any, values: Any) -> Any:
+        return builder.ctpop(values[0])
+
+    return types.int64(types.uint64), emit
+
+
+# -- recordings --------------------------------------------------------------------------------------------------------
+
+
+@compiled
+def _pack(events: AnyArray, steps: int, words: AnyArray) -> None:
+    """Turn the events of a recording into words, channel after channel."""
+    n_words = (events.shape[0] + LANES - 1) // LANES
+    for channel in range(events.shape[0]):
+        place, bit = channel // LANES, np.uint64(channel % LANES)
+        for t in range(steps):
+            words[t * n_words + place] |= np.uint64(events[channel, t] != 0) << bit
+
+
+@compiled
+def _list(words: AnyArray, start: int, width: int, steps: int, bounds: AnyArray, count: AnyArray) -> AnyArray:
+    """List the bits that are set in each step, and count them; fills the bounds of the steps."""
+    total = 0
+    for w in range(start, start + steps * width):
+        total += _bits(words[w])
+    listed = np.empty(total, np.int32)
+    n = 0
+    for t in range(steps):
+        bounds[t] = n
+        for w in range(width):
+            left = words[start + t * width + w]
+            while left:
+                listed[n] = w * LANES + _lowest(left)
+                count[listed[n]] += 1
+                n += 1
+                left &= left - np.uint64(1)
+    bounds[steps] = n
+    return listed
+
+
+@compiled
+def _run_stage(blocks: Blocks, s: int, steps: int, listed: AnyArray, bounds: AnyArray, scratch: Scratch) -> None:
+    """Let a stage integrate on listed sources.
+
+    All blocks of a step come before the next step: their loops over the list are equally long, which the machine
+    learns.
+    """
+    begin, end = blocks.stage[s], blocks.stage[s + 1]
+    place = steps * begin
+    for t in range(steps):
+        for block in range(begin, end):
+            kept = place * LANES if scratch.membranes.size else -1
+            if blocks.restful[block]:
+                fired = _restful_listed_step(blocks, listed, bounds[t], bounds[t + 1], block, scratch, place, kept)
+            else:
+                fired = _busy_listed_step(blocks, listed, bounds[t], bounds[t + 1], block, scratch, place, kept)
+            scratch.raster[place] = fired
+            place += 1
+
+
+@compiled
+def _run_scattered(
+    blocks: Blocks, s: int, steps: int, active: AnyArray, start: int, width: int, scratch: Scratch
+) -> None:
+    """Let a stage integrate on words of sources; a block's rows and membranes stay in cache for all steps."""
+    begin, end = blocks.stage[s], blocks.stage[s + 1]
+    for block in range(begin, end):
+        for t in range(steps):
+            place = steps * begin + t * (end - begin) + block - begin
+            kept = place * LANES if scratch.membranes.size else -1
+            if blocks.restful[block]:
+                fired = _restful_step(blocks, active, start + t * width, 0, block, scratch, place, kept)
+            else:
+                fired = _busy_step(blocks, active, start + t * width, 0, block, scratch, place, kept)
+            scratch.raster[place] = fired
+
+
+@compiled
+def _run_stages(blocks: Blocks, n_words: int, steps: int, scratch: Scratch) -> None:
+    """Let all stages integrate, one after the other, and count spikes and events."""
+    bounds = np.empty(steps + 1, np.int64)
+    active, start, width, count = scratch.words, 0, n_words, scratch.inputs
+    for s in range(blocks.stage.size - 1):
+        listed = _list(active, start, width, steps, bounds, count)
+        if blocks.dense[s]:
+            _run_stage(blocks, s, steps, listed, bounds, scratch)
+        else:
+            _run_scattered(blocks, s, steps, active, start, width, scratch)
+        begin, end = blocks.stage[s], blocks.stage[s + 1]
+        active, start, width, count = scratch.raster, steps * begin, end - begin, scratch.spikes[begin * LANES :]
+    _list(active, start, width, steps, bounds, count)
+
+
+@compiled
+def _unpack(blocks: Blocks, steps: int, words: AnyArray, out: AnyArray, inverse: Any) -> None:
+    """Write bits into a (chip steps, compartments) array; inverted, those of positions that hold a compartment."""
+    for s in range(blocks.stage.size - 1):
+        begin, end = blocks.stage[s], blocks.stage[s + 1]
+        for t in range(steps):
+            for block in range(begin, end):
+                left = words[steps * begin + t * (end - begin) + block - begin]
+                if inverse:
+                    left = ~left & blocks.held[block]
+                while left:
+                    position = block * LANES + _lowest(left)
+                    out[t + blocks.depth[block], blocks.compartment[position]] = True
+                    left &= left - np.uint64(1)
+
+
+@compiled
+def _count_idle(blocks: Blocks, block: int, s: int, steps: int, idle: AnyArray) -> int:
+    """Idle compartment-steps of a block of a stage."""
+    begin, width = blocks.stage[s], blocks.stage[s + 1] - blocks.stage[s]
+    total = 0
+    for t in range(steps):
+        total += _bits(idle[steps * begin + t * width + block - begin])
+    return total
+
+
+@compiled
+def _copy_membranes(blocks: Blocks, steps: int, kept: AnyArray, out: AnyArray) -> None:
+    """Write membranes into a (chip steps, compartments) array."""
+    place = 0
+    for s in range(blocks.stage.size - 1):
+        for t in range(steps):
+            for block in range(blocks.stage[s], blocks.stage[s + 1]):
+                for position in range(block * LANES, (block + 1) * LANES):
+                    if blocks.compartment[position] >= 0:
+                        out[t + blocks.depth[block], blocks.compartment[position]] = kept[place]
+                    place += 1
+
+
+@compiled_and_cached
+def run_recordings(
+    blocks: Blocks,
+    events: AnyArray,
+    lengths: IntArray,
+    inputs: IntArray,
+    spikes: IntArray,
+    updates: IntArray,
+    fired: AnyArray,
+    membranes: AnyArray,
+    updated: AnyArray,
+) -> None:
+    """Run some recordings.
+
+    Parameters
+    ----------
+    blocks : Blocks
+        The network.
+    events : (recordings, channels, columns) uint8
+        Any value but zero is an event.
+    lengths : (recordings,) int64
+        Data steps of each.
+    inputs, spikes, updates : (recordings, channels or compartments or layers) int64
+        Zeros; filled with counts, see :class:`runtime.trace.Counts`.
+    fired, membranes, updated : (recordings, chip steps, compartments) bool, int32, bool
+        Zeros; filled, see :class:`runtime.trace.Trace`. No recordings where it is not wanted.
+    """
+    n_words, n_blocks = (events.shape[1] + LANES - 1) // LANES, blocks.keep.size
+    for r in range(events.shape[0]):
+        steps = lengths[r]
+        scratch = Scratch(
+            np.zeros(steps * n_words, np.uint64),
+            np.empty(steps * n_blocks, np.uint64),
+            np.zeros(steps * n_blocks, np.uint64),
+            np.zeros(n_words * LANES, np.int64),
+            np.zeros(n_blocks * LANES, np.int64),
+            np.zeros(n_blocks * LANES, np.int32),
+            np.zeros(n_blocks * LANES, np.int16),
+            np.empty(steps * n_blocks * LANES if membranes.shape[0] else 0, np.int32),
+        )
+        _pack(events[r], steps, scratch.words)
+        _run_stages(blocks, n_words, steps, scratch)
+
+        inputs[r] = scratch.inputs[: events.shape[1]]
+        for position in range(n_blocks * LANES):
+            if blocks.compartment[position] >= 0:
+                spikes[r, blocks.compartment[position]] = scratch.spikes[position]
+        for s in range(blocks.stage.size - 1):
+            for block in range(blocks.stage[s], blocks.stage[s + 1]):
+                worked = steps * _bits(blocks.held[block])
+                if blocks.restful[block]:
+                    worked -= _count_idle(blocks, block, s, steps, scratch.idle)
+                updates[r, blocks.layer[block]] += worked
+        if fired.shape[0]:
+            _unpack(blocks, steps, scratch.raster, fired[r], False)
+        if updated.shape[0]:
+            _unpack(blocks, steps, scratch.idle, updated[r], True)
+        if membranes.shape[0]:
+            _copy_membranes(blocks, steps, scratch.membranes, membranes[r])

@@ -1,0 +1,221 @@
+"""The kernel of layers is the specification, bit for bit, up to the ends of what it is proven for."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from random_netlists import Axon, Neuron, assert_equal, build, by_engine, by_steps, recording_of
+
+from compiler.errors import NumericRangeError
+from compiler.frontends.checkpoint import read_checkpoint
+from compiler.netlist import Netlist
+from compiler.passes.quantize import Recipe
+from compiler.pipeline import compile_checkpoint
+from runtime import engine, spec
+from runtime.blocks import lay_out
+
+REPEATABLE = settings(max_examples=60, deadline=None, derandomize=True)
+
+KEPT = {"spikes": True, "membranes": True, "updated": True}
+
+
+def pipeline(
+    seed: int, *, inputs: int, sizes: tuple[tuple[int, ...], ...], density: float, largest: int = 6, biases: float = 0.7
+) -> Netlist:
+    """Layers of `sizes`, some at each depth, on random cores; each neuron hears the depth before."""
+    rng = np.random.default_rng(seed)
+    neurons, depths, axons, number = [], [], [], 0
+    cores = int(rng.integers(1, 4))
+    placed: list[tuple[int, int, int]] = []  # layer, core, number in build order
+    for depth, layers in enumerate(sizes):
+        for size in layers:
+            for core in np.sort(rng.integers(0, cores, size)):
+                placed.append((len(depths), int(core), number))
+                number += 1
+            depths.append(depth)
+    for layer, core, _ in placed:
+        neurons.append(
+            Neuron(
+                layer=layer,
+                core=core,
+                decay_v=int(rng.choice([3277, 3277, 3277, 4096, 2048])),
+                threshold=int(rng.integers(0, 12 * largest)),
+                bias=int(rng.integers(-300, 300)) if rng.random() < biases else 0,
+            )
+        )
+    order = sorted(range(len(neurons)), key=lambda i: neurons[i].core)
+    compartment = {index: c for c, index in enumerate(order)}
+    first_of_core = {core: sum(n.core < core for n in neurons) for core in range(cores)}
+    for depth in range(len(sizes)):
+        heard = range(inputs) if depth == 0 else [i for i, n in enumerate(neurons) if depths[n.layer] == depth - 1]
+        for source in heard:
+            for core in range(cores):
+                targets = [
+                    (compartment[i] - first_of_core[core], int(rng.integers(-largest, largest + 1)))
+                    for i, n in enumerate(neurons)
+                    if n.core == core and depths[n.layer] == depth and rng.random() < density
+                ]
+                if targets:
+                    axon = source if depth == 0 else inputs + compartment[source]
+                    exponent = int(rng.integers(0, 2))
+                    axons.append(Axon(source=axon, targets=tuple(targets), core=core, exponent=exponent))
+    return build(neurons, axons, n_inputs=inputs, depths=depths)
+
+
+def assert_kernels_agree(netlist: Netlist, events: np.ndarray) -> None:
+    assert lay_out(netlist) is not None
+    expected = spec.simulate(netlist, events)
+    assert_equal(by_engine(netlist, events), expected)
+    assert_equal(by_steps(netlist, events), expected)
+
+
+SHAPES = (
+    ((3,),),
+    ((64,), (65,)),
+    ((70, 5), (1,), (130,)),
+    ((20,), (2, 3, 4), (6,)),
+)
+
+
+@REPEATABLE
+@given(
+    st.integers(0, 10**6),
+    st.sampled_from([1, 3, 64, 65, 130]),
+    st.sampled_from(SHAPES),
+    st.sampled_from([0.03, 0.3, 1.0]),
+    st.sampled_from([0.0, 0.7, 1.0]),
+    st.sampled_from([0.0, 0.02, 0.3, 1.0]),
+)
+def test_any_pipeline(seed, inputs, sizes, density, biases, rate):
+    netlist = pipeline(seed, inputs=inputs, sizes=sizes, density=density, biases=biases)
+    rng = np.random.default_rng(seed)
+    assert_kernels_agree(netlist, (rng.random((inputs, 12)) < rate).astype(np.uint8))
+
+
+def test_the_random_pipelines_reach_every_way_of_storage():
+    found = [
+        lay_out(pipeline(seed, inputs=130, sizes=SHAPES[2], density=density, largest=largest))
+        for seed, (density, largest) in enumerate([(0.03, 6), (1.0, 6), (1.0, 80)])
+    ]
+    assert [blocks.weight.dtype for blocks in found] == [np.int8, np.int8, np.int16]
+    assert [blocks.dense.tolist() for blocks in found[:2]] == [[False] * 3, [True] * 3]
+    assert any(blocks.restful.any() for blocks in found)
+
+
+def test_recordings_of_any_length_together():
+    netlist = pipeline(3, inputs=20, sizes=SHAPES[3], density=0.5)
+    events = (np.random.default_rng(4).random((9, 20, 16)) < 0.2).astype(np.uint8)
+    lengths = np.array([16, 0, 1, 5, 16, 3, 2, 15, 8])
+    together = engine.simulate(netlist, events, lengths=lengths, **KEPT)
+    for index, length in enumerate(lengths):
+        expected = spec.simulate(netlist, events[index, :, :length])
+        found = recording_of(together, index)
+        window = len(expected.spikes)
+        for name in KEPT:
+            np.testing.assert_array_equal(getattr(found, name)[:window], getattr(expected, name), strict=True)
+            assert not getattr(found, name)[window:].any()
+        np.testing.assert_array_equal(found.counts.updates, expected.counts.updates)
+        np.testing.assert_array_equal(found.counts.spikes, expected.counts.spikes)
+
+
+def test_events_of_any_type_and_layout():
+    netlist = pipeline(5, inputs=20, sizes=SHAPES[3], density=0.5)
+    events = (np.random.default_rng(6).random((3, 20, 16)) < 0.2).astype(np.uint8)
+    expected = engine.simulate(netlist, events, spikes=True)
+    for same in (events * 7, events.astype(bool), np.asfortranarray(events)):
+        np.testing.assert_array_equal(engine.simulate(netlist, same, spikes=True).spikes, expected.spikes)
+
+
+# --- the ends of the ranges -------------------------------------------------------------------------------------------
+
+
+def one_neuron(weights: list[int], **neuron) -> Netlist:
+    axons = [Axon(source=i, targets=((0, weight),), exponent=0) for i, weight in enumerate(weights)]
+    return build([Neuron(**neuron)], axons, n_inputs=len(weights), depths=[0])
+
+
+FULL = [254] * 129 + [1]  # 32,767
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("threshold", [0, 32766, 32767, 40000])
+def test_sums_at_the_end_of_sixteen_bits(sign, threshold):
+    netlist = one_neuron([sign * w for w in FULL] + [-sign * w for w in FULL], threshold=threshold)
+    rng = np.random.default_rng(0)
+    events = np.zeros((260, 12), np.uint8)
+    events[:130, 0] = events[130:, 2] = events[:, 4] = events[:130, 6:9] = 1
+    events[:, 9:] = rng.random((260, 3)) < 0.5
+    assert_kernels_agree(netlist, events)
+    assert np.abs(spec.simulate(netlist, events).membranes).max() >= 32767 * 64
+
+
+def test_a_sum_beyond_sixteen_bits_takes_the_other_kernel():
+    netlist = one_neuron([*FULL, 1])
+    assert lay_out(netlist) is None
+    events = np.ones((131, 2), np.uint8)
+    with pytest.raises(NumericRangeError, match="synaptic sum"):
+        spec.simulate(netlist, events)
+    with pytest.raises(NumericRangeError, match="synaptic sum"):
+        engine.simulate(netlist, events[None])
+
+
+@pytest.mark.parametrize(
+    ("neuron", "fits"),
+    [
+        ({"threshold": 81940, "decay_v": 3277}, True),  # 81,940 * 64 * 819 is just below 2**32
+        ({"threshold": 81941, "decay_v": 3277}, False),
+        ({"threshold": 16000, "decay_v": 0}, True),  # keeps everything, and never goes down
+        ({"threshold": 16384, "decay_v": 0}, False),
+        ({"threshold": 100, "decay_v": 0, "bias": -1}, False),  # without a limit from below
+        ({"threshold": 100, "decay_u": 4094}, False),  # a current with a memory
+    ],
+)
+def test_membranes_at_the_end_of_32_bits(neuron, fits):
+    netlist = one_neuron([127, 127, 126], **neuron)
+    assert (lay_out(netlist) is not None) == fits
+    events = np.ones((3, 400), np.uint8)
+    events[:, 300:] = 0
+    assert_equal(by_engine(netlist, events), spec.simulate(netlist, events))
+
+
+def test_who_hears_more_than_the_depth_before_takes_the_other_kernel():
+    neurons = [Neuron(layer=0), Neuron(layer=1)]
+    for source, depths in ((1, [0, 0]), (0, [0, 1]), (2, [0, 1]), (1, [0, 2])):  # same depth, input, itself, skipped
+        axons = [Axon(source=0, targets=((0, 10),)), Axon(source=source, targets=((1, 10),))]
+        netlist = build(neurons, axons, n_inputs=1, depths=depths)
+        assert lay_out(netlist) is None
+        events = np.ones((1, 9), np.uint8)
+        assert_equal(by_engine(netlist, events), spec.simulate(netlist, events))
+
+
+def test_scattered_synapses_take_the_other_kernel():
+    """One synapse in each of a hundred thousand rows of 64."""
+    rng = np.random.default_rng(0)
+    axons = [
+        Axon(source=source, targets=tuple((int(c), 1) for c in np.unique(rng.integers(0, 1000, 200) // 64 * 64 % 1000)))
+        for source in range(6000)
+    ]
+    assert lay_out(build([Neuron() for _ in range(1000)], axons, n_inputs=6000, depths=[0])) is None
+
+
+# --- real networks ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.recordings
+@pytest.mark.parametrize("recipe", [Recipe(), Recipe(planes=2, groups=8), Recipe(bits=2)])
+def test_the_released_network(released_checkpoint, objects_zip, recipe):
+    from models.evtouch import load_recordings
+    from models.graphs import build_graph, normalised_adjacency
+
+    graph = build_graph("manual")
+    checkpoint = read_checkpoint(released_checkpoint)
+    adjacency = normalised_adjacency(graph.edges, graph.n_taxels)
+    netlist = compile_checkpoint(checkpoint, adjacency, recipes=(recipe,)).netlist
+    recordings = load_recordings(objects_zip, "test")
+    events = recordings.events[::24].reshape(6, -1, recordings.steps)
+    prepared = engine.prepare(netlist)
+    assert prepared.blocks is not None
+    found = engine.simulate(prepared, events, **KEPT)
+    expected = engine.simulate(engine.prepare(netlist, stepwise=True), events, **KEPT)
+    assert_equal(found, expected)
+    assert found.counts.spikes.sum() > 0
