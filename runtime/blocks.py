@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import numpy.typing as npt
 
@@ -66,80 +68,114 @@ def lay_out(netlist: Netlist) -> Blocks | None:
     source, target = netlist.axon_source[axon], netlist.synapse_compartment()
     if np.any(netlist.decay_u != NO_MEMORY) or not _is_pipeline(netlist, source, target) or not _in_range(netlist):
         return None
-
-    # positions: by depth, layer and neuron; each layer begins a block, and so does another decay within
-    depth = np.array([layer.depth for layer in netlist.layers])
-    keep = 2**DECAY_BITS - netlist.decay_v
-    order = np.lexsort((netlist.neuron, keep, netlist.layer, depth[netlist.layer]))
-    groups = np.stack([netlist.layer, keep])[:, order]
-    begins = np.flatnonzero(np.append(True, np.any(np.diff(groups) != 0, axis=0))) if len(order) else np.zeros(0, int)
-    sizes = np.diff(np.append(begins, len(order)))
-    blocks_of = -(-sizes // LANES)
-    group = np.repeat(np.arange(len(sizes)), sizes)
-    position = np.empty(len(order), np.int64)
-    position[order] = (np.cumsum(blocks_of) - blocks_of)[group] * LANES + np.arange(len(order)) - begins[group]
-    n_blocks = int(blocks_of.sum())
-    layer = np.repeat(groups[0, begins], blocks_of)
-    stage = np.searchsorted(depth[layer], np.arange(netlist.max_depth + 2))
+    seats = _seats(netlist)
 
     # rows: one for each block and each source that reaches it
-    first_source = np.append(0, netlist.n_inputs + stage[:-1] * LANES)  # by depth
-    number = np.append(np.arange(netlist.n_inputs), netlist.n_inputs + position)
-    local = number[source] - first_source[depth[netlist.layer[target]]]
-    block, lane = np.divmod(position[target], LANES)
-    width = LANES * max(_words(netlist.n_inputs), n_blocks)
-    pairs = block * width + local
-    known = np.unique(pairs)
-    rows_of = np.searchsorted(known, stage * width)
-    heard = np.append(netlist.n_inputs, np.bincount(depth[netlist.layer], minlength=len(stage) - 1)[:-1])
-    sources_of = np.append(netlist.n_inputs, np.diff(stage)[:-1] * LANES)
-    dense = np.diff(rows_of) >= DENSE * np.diff(stage) * heard
-    filled = [
-        (np.arange(first, last)[:, None] * width + np.arange(sources)).ravel()
-        for first, last, sources, full in zip(stage[:-1], stage[1:], sources_of, dense, strict=True)
-        if full
-    ]
-    known = np.unique(np.concatenate([known, *filled]))
-    row = np.searchsorted(known, pairs)
-    if len(known) * LANES * 2 > SPARE + BYTES_A_SYNAPSE * netlist.n_synapses:
+    first_source = np.append(0, netlist.n_inputs + seats.stage[:-1] * LANES)  # by depth
+    number = np.append(np.arange(netlist.n_inputs), netlist.n_inputs + seats.position)
+    local = number[source] - first_source[seats.depth[netlist.layer[target]]]
+    block, lane = np.divmod(seats.position[target], LANES)
+    width = LANES * max(-(-netlist.n_inputs // LANES), len(seats.layer))
+    rows, dense = _rows(netlist, seats, block * width + local, width)
+    if len(rows) * LANES * 2 > SPARE + BYTES_A_SYNAPSE * netlist.n_synapses:
         return None
-    weight = np.zeros(len(known) * LANES, np.int16)
-    np.add.at(weight, row * LANES + lane, netlist.effective_weight().astype(np.int16))
-    shift, narrow = _narrowed(weight, known // width, n_blocks)
-    reached = np.zeros(len(known), np.uint64)
+    row = np.searchsorted(rows, block * width + local)
+    row_block, row_source = np.divmod(rows, width)
+    shift, weight = _narrowed(_net_weights(netlist, row * LANES + lane, len(rows)), row_block, len(seats.layer))
+    reached = np.zeros(len(rows), np.uint64)
     np.bitwise_or.at(reached, row, _bit(lane))
 
     # links: the rows of a block by words of sources
-    row_block, row_source = np.divmod(known, width)
     words = width // LANES
     links, first_row, link = np.unique(row_block * words + row_source // LANES, return_index=True, return_inverse=True)
     linked = np.zeros(len(links), np.uint64)
     np.bitwise_or.at(linked, link, _bit(row_source % LANES))
 
-    bias, threshold = np.zeros(n_blocks * LANES, np.int32), np.full(n_blocks * LANES, NEVER, np.int32)
-    bias[position] = netlist.bias_mantissa << netlist.bias_exponent
-    threshold[position] = netlist.threshold << MEMBRANE_SHIFT
-    compartment = np.full(n_blocks * LANES, -1)
-    compartment[position] = np.arange(len(position))
+    size = len(seats.layer) * LANES
+    bias, threshold = np.zeros(size, np.int32), np.full(size, NEVER, np.int32)
+    bias[seats.position] = netlist.bias_mantissa << netlist.bias_exponent
+    threshold[seats.position] = netlist.threshold << MEMBRANE_SHIFT
+    compartment = np.full(size, -1)
+    compartment[seats.position] = np.arange(netlist.n_compartments)
     return Blocks(
-        stage=stage,
+        stage=seats.stage,
         dense=dense,
-        first=np.searchsorted(links // words, np.arange(n_blocks + 1)),
+        first=np.searchsorted(links // words, np.arange(len(seats.layer) + 1)),
         word=links % words,
         linked=linked,
         row=first_row,
-        weight=narrow,
+        weight=weight,
         shift=shift + np.uint32(MEMBRANE_SHIFT),
         reached=reached,
         restful=_word((compartment >= 0) & (bias == 0)),
         held=_word(compartment >= 0),
         bias=bias,
         threshold=threshold,
-        keep=np.repeat(groups[1, begins], blocks_of).astype(np.uint32),
-        depth=depth[layer],
-        layer=layer,
+        keep=seats.keep.astype(np.uint32),
+        depth=seats.depth[seats.layer],
+        layer=seats.layer,
         compartment=compartment,
     )
+
+
+class _Seats(NamedTuple):
+    """Where compartments sit.
+
+    Parameters
+    ----------
+    position : (compartments,) int64
+        Block and lane of each.
+    layer, keep : (blocks,) int64
+        Layer of each block, and what its membranes keep, in 1/4096.
+    stage : (stages + 1,) int64
+        Bounds of the stages in the blocks.
+    depth : (layers,) int64
+        Depth of each layer, the number of its stage.
+    """
+
+    position: IntArray
+    layer: IntArray
+    keep: IntArray
+    stage: IntArray
+    depth: IntArray
+
+
+def _seats(netlist: Netlist) -> _Seats:
+    """Seat compartments by depth, layer and neuron; a layer begins a block, and so does another decay within it."""
+    depth = np.array([layer.depth for layer in netlist.layers])
+    keep = 2**DECAY_BITS - netlist.decay_v
+    order = np.lexsort((netlist.neuron, keep, netlist.layer, depth[netlist.layer]))
+    groups = np.stack([netlist.layer, keep])[:, order]
+    begins = np.flatnonzero(np.append(True, np.any(np.diff(groups) != 0, axis=0))[: len(order)])
+    sizes = np.diff(np.append(begins, len(order)))
+    blocks = -(-sizes // LANES)
+    first = np.repeat((np.cumsum(blocks) - blocks) * LANES - begins, sizes)
+    position = np.empty(len(order), np.int64)
+    position[order] = first + np.arange(len(order))
+    layer, keep_of_block = np.repeat(groups[:, begins], blocks, axis=1)
+    stage = np.searchsorted(depth[layer], np.arange(netlist.max_depth + 2))
+    return _Seats(position=position, layer=layer, keep=keep_of_block, stage=stage, depth=depth)
+
+
+def _rows(netlist: Netlist, seats: _Seats, pairs: IntArray, width: int) -> tuple[IntArray, BoolArray]:
+    """Pairs of block and source that get a row, sorted, and whether those of a stage are all that there can be."""
+    rows = np.unique(pairs)
+    blocks = np.diff(seats.stage)
+    heard = np.append(netlist.n_inputs, np.bincount(seats.depth[netlist.layer], minlength=len(blocks))[:-1])
+    places = np.append(netlist.n_inputs, blocks[:-1] * LANES)
+    dense = np.diff(np.searchsorted(rows, seats.stage * width)) >= DENSE * blocks * heard
+    filled = [
+        (np.arange(seats.stage[s], seats.stage[s + 1])[:, None] * width + np.arange(places[s])).ravel()
+        for s in np.flatnonzero(dense)
+    ]
+    return np.unique(np.concatenate([rows, *filled])), dense
+
+
+def _net_weights(netlist: Netlist, entry: IntArray, rows: int) -> npt.NDArray[np.int16]:
+    """Sum of the synapses of each entry; what leaves 16 bits on the way comes back into them."""
+    weight = np.zeros(rows * LANES, np.int16)
+    np.add.at(weight, entry, netlist.effective_weight().astype(np.int16))
+    return weight
 
 
 def _narrowed(
@@ -153,10 +189,6 @@ def _narrowed(
     shifted = weight.reshape(-1, LANES) >> shift[row_block][:, None].astype(np.int16)
     narrow = shifted.astype(np.int8)
     return shift, (narrow if np.array_equal(narrow, shifted) else shifted).reshape(-1)
-
-
-def _words(bits: int) -> int:
-    return -(-bits // LANES)
 
 
 def _bit(lane: IntArray) -> npt.NDArray[np.uint64]:

@@ -143,10 +143,11 @@ def require_match(netlist: Netlist, checkpoint: Checkpoint) -> None:
 def _same_run(netlist: Netlist, prepared: engine.Engine, events: npt.NDArray[np.uint8]) -> bool:
     """Whether specification and engine agree on one recording: every spike, membrane and count."""
     slow = spec.simulate(netlist, events)
-    fast = engine.simulate(prepared, events[None], spikes=True, membranes=True)
+    fast = engine.simulate(prepared, events[None], spikes=True, membranes=True, updated=True)
     pairs = [
         (slow.spikes, fast.spikes),
         (slow.membranes, fast.membranes),
+        (slow.updated, fast.updated),
         (slow.counts.inputs, fast.counts.inputs),
         (slow.counts.spikes, fast.counts.spikes),
         (slow.counts.updates, fast.counts.updates),

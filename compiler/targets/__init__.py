@@ -20,6 +20,9 @@ _NOT_MODELLED = {
 }
 
 PRICE_UNIT = "pJ"
+TIME_UNIT = "ns"
+PICOSECONDS = 1000
+"""In a TIME_UNIT; finer latencies are refused."""
 
 LIMITS = (
     *(f"core.{what}" for what in ("compartments", "axons_in", "axons_out", "synapse_words", "threshold_slots")),
@@ -37,6 +40,16 @@ EVENTS = (
     *("spike", "packet", "hop_east_west", "hop_north_south"),
 )
 """What an energy table may price."""
+
+LINK_BUFFER = "link_buffer"
+BARRIER = "barrier."
+
+LATENCIES = (
+    *("neuron_access", "neuron_update", "spike", "axon_out", "axon_in"),
+    *("synaptic_operation_dense", "synaptic_operation_sparse", "hop_east_west", "hop_north_south"),
+)
+"""What a time table must give in nanoseconds, beside ``link_buffer`` and ``barrier.N``, the barrier from N used tiles
+on."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,14 +75,52 @@ class EnergyTable:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class TimeTable:
+    """Latencies per event; all are whole picoseconds, so that sums of them are exact.
+
+    Parameters
+    ----------
+    name, title : str
+        For humans.
+    latencies : mapping
+        Of each of ``LATENCIES``.
+    barriers : mapping of int to Quantity
+        Length of the barrier that ends a step, by the least number of used tiles that it holds for.
+    link_buffer : Quantity
+        Messages that a link of the mesh holds.
+    """
+
+    name: str
+    title: str
+    latencies: Mapping[str, Quantity]
+    barriers: Mapping[int, Quantity]
+    link_buffer: Quantity
+
+    def picoseconds(self, event: str) -> int:
+        """Latency of one `event`."""
+        return round(self.latencies[event].value * PICOSECONDS)
+
+    def barrier(self, tiles: int) -> int:
+        """Picoseconds of the barrier among so many used tiles, at least one.
+
+        Examples
+        --------
+        >>> [load_target("loihi1").time[0].barrier(tiles) for tiles in (1, 3, 4, 32)]
+        [600000, 1000000, 1400000, 1800000]
+        """
+        return round(self.barriers[max(least for least in self.barriers if least <= tiles)].value * PICOSECONDS)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Target:
-    """A chip: integer limits, permitted values and named energy tables."""
+    """A chip: integer limits, permitted values, named energy tables and named time tables."""
 
     name: str
     title: str
     limits: Mapping[str, Quantity]
     choices: Mapping[str, tuple[int, ...]]
     energy: tuple[EnergyTable, ...]
+    time: tuple[TimeTable, ...]
 
     def limit(self, rule: str) -> int:
         """Largest amount that `rule`, for example ``core.axons_in``, allows."""
@@ -131,6 +182,8 @@ def read_target(path: str | os.PathLike[str]) -> Target:
     choices = _rules(raw, "choices", "values", CHOICES, faults)
     energy = raw.get("energy", {})
     prices = _prices(energy, faults)
+    time = raw.get("time", {})
+    latencies = _latencies(time, faults)
     if faults:
         raise OptionError("\n".join(f"{path}: {fault}" for fault in faults))
     return Target(
@@ -146,11 +199,21 @@ def read_target(path: str | os.PathLike[str]) -> Target:
             )
             for key, found in prices.items()
         ),
+        time=tuple(
+            TimeTable(
+                name=key,
+                title=time[key]["title"],
+                latencies={event: Quantity(**found[event]) for event in LATENCIES},
+                barriers={int(rule[len(BARRIER) :]): Quantity(**found[rule]) for rule in found if _is_barrier(rule)},
+                link_buffer=Quantity(**found[LINK_BUFFER]),
+            )
+            for key, found in latencies.items()
+        ),
     )
 
 
 def _head_faults(raw: Mapping[str, Any]) -> list[str]:
-    known = ("name", "title", "limits", "choices", "energy")
+    known = ("name", "title", "limits", "choices", "energy", "time")
     faults = [f"{key}: is missing" for key in known if key not in raw]
     faults += [f"unknown key {key!r}, allowed are {', '.join(known)}" for key in raw if key not in known]
     texts = [key for key in ("name", "title") if not isinstance(raw.get(key, ""), str)]
@@ -172,23 +235,63 @@ def _rules(
     return found
 
 
+def _tables(raw: Any, kind: str, contents: str, faults: list[str]) -> dict[str, dict[str, dict[str, Any]]]:
+    """Entries by table and name; every table has a title."""
+    tables: dict[str, dict[str, dict[str, Any]]] = {}
+    for key, table in raw.items() if isinstance(raw, dict) else [("", raw)]:
+        if not isinstance(table, dict) or not isinstance(table.get("title"), str):
+            faults.append(f"{kind}.{key}: lacks its title; give title and {contents}")
+            continue
+        entries = {name: entry for name, entry in table.items() if name != "title"}
+        tables[key] = _entries(entries, "value", "", faults)
+    return tables
+
+
 def _prices(energy: Any, faults: list[str]) -> dict[str, dict[str, dict[str, Any]]]:
     """Prices by table and event."""
-    prices: dict[str, dict[str, dict[str, Any]]] = {}
-    for key, table in energy.items() if isinstance(energy, dict) else [("", energy)]:
-        if not isinstance(table, dict) or not isinstance(table.get("title"), str):
-            faults.append(f"energy.{key}: lacks its title; give title and prices")
-            continue
-        entries = {event: price for event, price in table.items() if event != "title"}
-        prices[key] = _entries(entries, "value", "", faults)
-        for event, price in prices[key].items():
+    prices = _tables(energy, "energy", "prices", faults)
+    for key, found in prices.items():
+        for event, price in found.items():
             where = f"energy.{key}.{event}"
             _check_entry(where, price, "value", faults)
             if event not in EVENTS:
                 faults.append(f"{where}: unknown event, allowed are {', '.join(EVENTS)}")
-            if isinstance(price.get("unit"), str) and price["unit"] != PRICE_UNIT:
-                faults.append(f"{where}: unit is {price['unit']!r}, allowed is {PRICE_UNIT!r}")
+            _check_unit(where, price, PRICE_UNIT, faults)
     return prices
+
+
+def _is_barrier(rule: str) -> bool:
+    """Whether `rule` is a barrier and says from how many tiles on it holds."""
+    tiles = rule.removeprefix(BARRIER)
+    return rule.startswith(BARRIER) and tiles.isdecimal() and tiles.isascii() and not tiles.startswith("0")
+
+
+def _latencies(time: Any, faults: list[str]) -> dict[str, dict[str, dict[str, Any]]]:
+    """Latencies, barriers and link buffers by table; nothing may be missing, for no latency is zero unless it says."""
+    latencies = _tables(time, "time", "latencies", faults)
+    wanted = (*LATENCIES, LINK_BUFFER, f"{BARRIER}1")
+    allowed = ", ".join((*LATENCIES, LINK_BUFFER, f"{BARRIER}N with a number of tiles N"))
+    for key, found in latencies.items():
+        faults += [f"time.{key}.{rule}: is missing" for rule in wanted if rule not in found]
+        for rule, entry in found.items():
+            where = f"time.{key}.{rule}"
+            _check_entry(where, entry, "value", faults)
+            if rule not in wanted and not _is_barrier(rule):
+                faults.append(f"{where}: unknown, allowed are {allowed}")
+            value: Any = entry.get("value")
+            if rule == LINK_BUFFER:
+                if _is_number(value) and value != int(value):
+                    faults.append(f"{where}: value is {value!r}, a whole number is needed")
+                continue
+            _check_unit(where, entry, TIME_UNIT, faults)
+            if _is_number(value) and abs(value * PICOSECONDS - round(value * PICOSECONDS)) > 1e-6:
+                faults.append(f"{where}: value is {value!r}, a multiple of {1 / PICOSECONDS} is needed")
+    return latencies
+
+
+def _check_unit(where: str, entry: Mapping[str, Any], unit: str, faults: list[str]) -> None:
+    if isinstance(entry.get("unit"), str) and entry["unit"] != unit:
+        faults.append(f"{where}: unit is {entry['unit']!r}, allowed is {unit!r}")
 
 
 def known_targets() -> tuple[str, ...]:
