@@ -39,6 +39,9 @@ Function = Callable[..., Any]
 LANES = 64
 """Compartments of a block."""
 
+CHARGES = 16
+"""Charges of a source are padded to a multiple of this."""
+
 UNROLLED = 4
 """Rows that are added up without a look at how many are left."""
 
@@ -97,6 +100,24 @@ class Blocks(NamedTuple):
     depth: IntArray
     layer: IntArray
     compartment: IntArray
+
+
+class ChargeRows(NamedTuple):
+    """What events add to sums of each chip step; see :class:`runtime.trace.Charges`.
+
+    Parameters
+    ----------
+    width : int
+        Sums, padded to a multiple of `CHARGES`; 0 if there are none.
+    source : ((words of the inputs + blocks) * 64 * width,) int32
+        What an event of each channel, then a spike of each position adds.
+    update : (blocks * 64 * width,) int32
+        What an update of each position adds.
+    """
+
+    width: int
+    source: AnyArray
+    update: AnyArray
 
 
 class Scratch(NamedTuple):
@@ -227,31 +248,41 @@ def _sum_rows(builder: Any, tables: Any, active: Any, at: Any, block: Any, *, ma
     return total, arrived
 
 
-def _sum_listed(builder: Any, tables: Any, sources: Any, bounds: Any, block: Any, *, marks: bool) -> tuple[Any, Any]:
-    """Emit the same for a block that every source reaches: a loop over listed sources, four at a time, then one."""
-    base = _element(builder, tables["row"], _element(builder, tables["first"], block))
-    k, total, arrived = bounds[0], _all(_SUMS, 0), _number(0)
+def _each_listed(builder: Any, sources: Any, bounds: Any, values: Any, add: Function) -> Any:
+    """Emit a loop over listed sources, four at a time, then one; `add` emits what each does to the values."""
+    k = bounds[0]
     for stride in (UNROLLED, 1):
         before = builder.block
         head, body, done = map(builder.append_basic_block, ("head", "body", "done"))
         builder.branch(head)
         builder.position_at_end(head)
-        at, part, marked = builder.phi(_WORD), builder.phi(_SUMS), builder.phi(_WORD)
-        for phi, value in ((at, k), (part, total), (marked, arrived)):
+        phis = [builder.phi(value.type) for value in (k, *values)]
+        for phi, value in zip(phis, (k, *values), strict=True):
             phi.add_incoming(value, before)
-        builder.cbranch(builder.icmp_signed("<=", builder.add(at, _number(stride)), bounds[1]), body, done)
+        k, *values = phis
+        builder.cbranch(builder.icmp_signed("<=", builder.add(k, _number(stride)), bounds[1]), body, done)
         builder.position_at_end(body)
-        added, seen = part, marked
+        added = values
         for i in range(stride):
-            source = builder.sext(_element(builder, sources, builder.add(at, _number(i))), _WORD)
-            row = builder.add(base, source)
-            added = builder.add(added, _row(builder, tables, row))
-            seen = builder.or_(seen, _element(builder, tables["reached"], row)) if marks else seen
-        for phi, value in ((at, builder.add(at, _number(stride))), (part, added), (marked, seen)):
+            added = add(builder.sext(_element(builder, sources, builder.add(k, _number(i))), _WORD), added)
+        for phi, value in zip(phis, (builder.add(k, _number(stride)), *added), strict=True):
             phi.add_incoming(value, body)
         builder.branch(head)
         builder.position_at_end(done)
-        k, total, arrived = at, part, marked
+    return values
+
+
+def _sum_listed(builder: Any, tables: Any, sources: Any, bounds: Any, block: Any, *, marks: bool) -> tuple[Any, Any]:
+    """Emit the same for a block that every source reaches, on listed sources."""
+    base = _element(builder, tables["row"], _element(builder, tables["first"], block))
+
+    def add(source: Any, values: Any) -> Any:
+        row = builder.add(base, source)
+        total, arrived = values
+        total = builder.add(total, _row(builder, tables, row))
+        return total, builder.or_(arrived, _element(builder, tables["reached"], row)) if marks else arrived
+
+    total, arrived = _each_listed(builder, sources, bounds, (_all(_SUMS, 0), _number(0)), add)
     return total, arrived
 
 
@@ -321,6 +352,32 @@ def _block_step(*, listed: bool, rests: bool) -> Function:
 
 _busy_step, _restful_step = (_block_step(listed=False, rests=rests) for rests in (False, True))
 _busy_listed_step, _restful_listed_step = (_block_step(listed=True, rests=rests) for rests in (False, True))
+
+
+@_intrinsic
+def _charge(
+    typing: Any, listed: Any, begin: Any, end: Any, charges: Any, at: Any, width: Any, out: Any, to: Any
+) -> Any:
+    """Add up some charges of all sources that are listed from `begin` to `end`; `at` is that of source 0."""
+    signature = types.void(listed, types.int64, types.int64, charges, *[types.int64] * 2, out, types.int64)
+    narrow, wide = ir.VectorType(_STATE, CHARGES), ir.VectorType(_WORD, CHARGES)
+
+    def emit(context: Any, builder: Any, _signature: Any, values: Any) -> Any:
+        sources, rows, sums = (
+            context.make_array(kind)(context, builder, value).data
+            for kind, value in ((listed, values[0]), (charges, values[3]), (out, values[6]))
+        )
+
+        def add(source: Any, totals: Any) -> Any:
+            row = builder.add(values[4], builder.mul(source, values[5]))
+            return (builder.add(totals[0], builder.sext(_vector(builder, rows, row, narrow)[0], wide)),)
+
+        before, place = _vector(builder, sums, values[7], wide)
+        (total,) = _each_listed(builder, sources, values[1:3], (before,), add)
+        _store(builder, total, place)
+        return context.get_dummy_value()
+
+    return signature, emit
 
 
 @_intrinsic
@@ -415,19 +472,63 @@ def _run_scattered(
 
 
 @compiled
-def _run_stages(blocks: Blocks, n_words: int, steps: int, scratch: Scratch) -> None:
+def _charge_all(
+    listed: AnyArray, bounds: IntArray, steps: int, charges: ChargeRows, at: int, delay: int, sums: IntArray
+) -> None:
+    """Add what listed sources, the first of them with its charges at `at`, bring to the sums of each chip step."""
+    for t in range(steps):
+        for part in range(0, charges.width, CHARGES):
+            to = (t + delay) * charges.width + part
+            _charge(listed, bounds[t], bounds[t + 1], charges.source, at + part, charges.width, sums, to)
+
+
+@compiled
+def _charge_updates(blocks: Blocks, steps: int, idle: AnyArray, charges: ChargeRows, sums: IntArray) -> None:
+    """Add what updates bring: those of all compartments, less those that are idle."""
+    width = charges.width
+    everyone = np.zeros(width, np.int64)
+    for s in range(blocks.stage.size - 1):
+        begin, end = blocks.stage[s], blocks.stage[s + 1]
+        everyone[:] = 0
+        for position in range(begin * LANES, end * LANES):
+            for i in range(width):
+                everyone[i] += charges.update[position * width + i]
+        for t in range(steps):
+            at = (t + s) * width
+            for i in range(width):
+                sums[at + i] += everyone[i]
+            for block in range(begin, end):
+                if blocks.restful[block]:
+                    left = idle[steps * begin + t * (end - begin) + block - begin]
+                    while left:
+                        position = block * LANES + _lowest(left)
+                        for i in range(width):
+                            sums[at + i] -= charges.update[position * width + i]
+                        left &= left - np.uint64(1)
+
+
+@compiled
+def _run_stages(
+    blocks: Blocks, n_words: int, steps: int, scratch: Scratch, charges: ChargeRows, sums: IntArray
+) -> None:
     """Let all stages integrate, one after the other, and count spikes and events."""
     bounds = np.empty(steps + 1, np.int64)
     active, start, width, count = scratch.words, 0, n_words, scratch.inputs
+    at, delay = 0, 0  # of the charges of the sources; of their steps
     for s in range(blocks.stage.size - 1):
         listed = _list(active, start, width, steps, bounds, count)
+        _charge_all(listed, bounds, steps, charges, at * LANES * charges.width, delay, sums)
         if blocks.dense[s]:
             _run_stage(blocks, s, steps, listed, bounds, scratch)
         else:
             _run_scattered(blocks, s, steps, active, start, width, scratch)
         begin, end = blocks.stage[s], blocks.stage[s + 1]
         active, start, width, count = scratch.raster, steps * begin, end - begin, scratch.spikes[begin * LANES :]
-    _list(active, start, width, steps, bounds, count)
+        at, delay = n_words + begin, s
+    listed = _list(active, start, width, steps, bounds, count)
+    _charge_all(listed, bounds, steps, charges, at * LANES * charges.width, delay, sums)
+    if charges.width:
+        _charge_updates(blocks, steps, scratch.idle, charges, sums)
 
 
 @compiled
@@ -480,6 +581,8 @@ def run_recordings(
     fired: AnyArray,
     membranes: AnyArray,
     updated: AnyArray,
+    charges: ChargeRows,
+    charged: IntArray,
 ) -> None:
     """Run some recordings.
 
@@ -495,6 +598,10 @@ def run_recordings(
         Zeros; filled with counts, see :class:`runtime.trace.Counts`.
     fired, membranes, updated : (recordings, chip steps, compartments) bool, int32, bool
         Zeros; filled, see :class:`runtime.trace.Trace`. No recordings where it is not wanted.
+    charges : ChargeRows
+        What events add to the sums of each chip step.
+    charged : (recordings, chip steps * sums) int64
+        Zeros; filled with these sums.
     """
     n_words, n_blocks = (events.shape[1] + LANES - 1) // LANES, blocks.keep.size
     for r in range(events.shape[0]):
@@ -510,7 +617,7 @@ def run_recordings(
             np.empty(steps * n_blocks * LANES if membranes.shape[0] else 0, np.int32),
         )
         _pack(events[r], steps, scratch.words)
-        _run_stages(blocks, n_words, steps, scratch)
+        _run_stages(blocks, n_words, steps, scratch, charges, charged[r])
 
         inputs[r] = scratch.inputs[: events.shape[1]]
         for position in range(n_blocks * LANES):

@@ -9,8 +9,8 @@ import numpy.typing as npt
 
 from compiler.fixedpoint import DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT, IntArray
 from compiler.netlist import Netlist, one_step_bounds
-from runtime.block_kernel import LANES, Blocks
-from runtime.trace import BoolArray
+from runtime.block_kernel import CHARGES, LANES, Blocks, ChargeRows
+from runtime.trace import BoolArray, Charges
 
 SUM_MAX = 2**15 - 1
 """Largest sum that the kernel holds."""
@@ -116,6 +116,23 @@ def lay_out(netlist: Netlist) -> Blocks | None:
         layer=seats.layer,
         compartment=compartment,
     )
+
+
+def charge_rows(netlist: Netlist, blocks: Blocks, charges: Charges | None) -> ChargeRows:
+    """Lay charges out for the kernel: padded, by channel and position."""
+    if charges is None:
+        nothing = np.zeros(0, np.int32)
+        return ChargeRows(width=0, source=nothing, update=nothing)
+    sums = charges.spikes.shape[1]
+    width = -(-sums // CHARGES) * CHARGES
+    channels = -(-netlist.n_inputs // LANES) * LANES
+    seated = np.flatnonzero(blocks.compartment >= 0)
+    source = np.zeros((channels + len(blocks.compartment), width), np.int32)
+    update = np.zeros((len(blocks.compartment), width), np.int32)
+    source[: netlist.n_inputs, :sums] = charges.channels
+    source[channels + seated, :sums] = charges.spikes[blocks.compartment[seated]]
+    update[seated, :sums] = charges.updates[blocks.compartment[seated]]
+    return ChargeRows(width=width, source=source.reshape(-1), update=update.reshape(-1))
 
 
 class _Seats(NamedTuple):

@@ -25,9 +25,9 @@ from compiler.errors import NumericRangeError
 from compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, DECAY_BITS, MEMBRANE_SHIFT, IntArray
 from compiler.netlist import Netlist, one_step_bounds
 from runtime.block_kernel import Blocks, run_recordings
-from runtime.blocks import lay_out
+from runtime.blocks import charge_rows, lay_out
 from runtime.kernel import State, Tables, chip_steps
-from runtime.trace import REGISTER_LIMITS, BoolArray, Counts, MembraneArray, Trace, check_channels, range_error
+from runtime.trace import REGISTER_LIMITS, BoolArray, Charges, Counts, MembraneArray, Trace, check_channels, range_error
 
 EventArray = npt.NDArray[np.uint8 | np.bool_]
 
@@ -284,6 +284,7 @@ def simulate(
     spikes: bool = False,
     membranes: bool = False,
     updated: bool = False,
+    charges: Charges | None = None,
     threads: int | None = None,
     progress: Callable[[int], object] | None = None,
 ) -> Trace:
@@ -299,6 +300,8 @@ def simulate(
         Steps of each recording where some are shorter than T. What comes after them is not run: zeros in the trace.
     spikes, membranes, updated : bool
         Whether to keep these per chip step: one, four and one bytes for each recording, chip step and compartment.
+    charges : Charges, optional
+        What events add to the sums of each chip step that are wanted.
     threads : int, optional
         Recordings that run at the same time, by default one per processor. Results do not depend on it.
     progress : callable, optional
@@ -332,10 +335,13 @@ def simulate(
         saturations=np.zeros((recordings, len(netlist.layers)), np.int64),
     )
 
+    rows = None if engine.blocks is None else charge_rows(netlist, engine.blocks, charges)
+    sums = 0 if charges is None else charges.spikes.shape[1]
+    charged = np.zeros((*shape[:2], sums if rows is None else rows.width), np.int64)
     ends = np.full(recordings, length) if lengths is None else np.asarray(lengths, np.int64)
 
     def run_layers(part: slice) -> None:
-        assert engine.blocks is not None, "the network has been laid out in blocks"
+        assert engine.blocks is not None and rows is not None, "the network has been laid out in blocks"
         empty = (0, 0, 0)
         run_recordings(
             engine.blocks,
@@ -347,6 +353,8 @@ def simulate(
             np.zeros(empty, np.bool_) if kept_spikes is None else kept_spikes[part],
             np.zeros(empty, np.int32) if kept_membranes is None else kept_membranes[part],
             np.zeros(empty, np.bool_) if kept_updated is None else kept_updated[part],
+            rows,
+            charged[part].reshape(part.stop - part.start, -1),
         )
 
     def run_steps(part: slice) -> None:
@@ -354,6 +362,11 @@ def simulate(
         state = start(engine)
         own = int(ends[index])
         window = own + engine.drain
+        fired = kept_spikes[index, :window] if kept_spikes is not None else None
+        worked = kept_updated[index, :window] if kept_updated is not None else None
+        if charges is not None:
+            both = np.zeros((2, window, netlist.n_compartments), np.bool_)
+            fired, worked = both[0] if fired is None else fired, both[1] if worked is None else worked
         try:
             advance(
                 engine,
@@ -361,9 +374,9 @@ def simulate(
                 events[index, :, :own],
                 length=own,
                 steps=window,
-                spikes=None if kept_spikes is None else kept_spikes[index, :window],
+                spikes=fired,
                 membranes=None if kept_membranes is None else kept_membranes[index, :window],
-                updated=None if kept_updated is None else kept_updated[index, :window],
+                updated=worked,
             )
         except NumericRangeError as error:
             error.add_note(f"recording {index} of {recordings}, counted from 0")
@@ -372,6 +385,11 @@ def simulate(
         counts.spikes[index] = state.spikes
         counts.updates[index] = state.updates
         counts.saturations[index] = state.saturations
+        if charges is not None and fired is not None and worked is not None:
+            # float64 products of integers below 2**53 are exact
+            found = fired.astype(np.float64) @ charges.spikes + worked.astype(np.float64) @ charges.updates
+            found[:own] += (events[index, :, :own] != 0).T.astype(np.float64) @ charges.channels
+            charged[index, :window] = np.rint(found).astype(np.int64)
 
     if engine.blocks is not None:
         events = np.ascontiguousarray(events)
@@ -383,4 +401,10 @@ def simulate(
         for part, _ in zip(parts, pool.map(run, parts) if pool else map(run, parts), strict=True):
             if progress is not None:
                 progress(part.stop)
-    return Trace(counts=counts, spikes=kept_spikes, membranes=kept_membranes, updated=kept_updated)
+    return Trace(
+        counts=counts,
+        spikes=kept_spikes,
+        membranes=kept_membranes,
+        updated=kept_updated,
+        charged=None if charges is None else charged[..., : charges.spikes.shape[1]],
+    )

@@ -48,6 +48,25 @@ class Counts:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Charges:
+    """What events add to some sums of each chip step: times, energies, anything that is linear in them.
+
+    Parameters
+    ----------
+    channels : (n_inputs, sums) int64
+        By an input event of each channel.
+    spikes : (compartments, sums) int64
+        By a spike of each compartment.
+    updates : (compartments, sums) int64
+        By an update of each compartment. All three are below 2**31 in magnitude.
+    """
+
+    channels: IntArray
+    spikes: IntArray
+    updates: IntArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Trace:
     """Result of a simulation.
 
@@ -63,12 +82,15 @@ class Trace:
     updated : (…, chip steps, compartments) bool, or None
         Whether a compartment had work to do in a chip step, as ``Counts.updates`` counts it; None where it was not
         asked for.
+    charged : (…, chip steps, sums) int64, or None
+        What the events of each chip step add up to under the charges that were given.
     """
 
     counts: Counts
     spikes: BoolArray | None
     membranes: MembraneArray | None
     updated: BoolArray | None = None
+    charged: IntArray | None = None
 
 
 def aligned(netlist: Netlist, array: npt.NDArray[Any], layer: int) -> npt.NDArray[Any]:

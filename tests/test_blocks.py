@@ -13,6 +13,7 @@ from compiler.passes.quantize import Recipe
 from compiler.pipeline import compile_checkpoint
 from runtime import engine, spec
 from runtime.blocks import lay_out
+from runtime.trace import Charges
 
 REPEATABLE = settings(max_examples=60, deadline=None, derandomize=True)
 
@@ -67,6 +68,16 @@ def assert_kernels_agree(netlist: Netlist, events: np.ndarray) -> None:
     expected = spec.simulate(netlist, events)
     assert_equal(by_engine(netlist, events), expected)
     assert_equal(by_steps(netlist, events), expected)
+    rng = np.random.default_rng(events.size)
+    rows = {"channels": netlist.n_inputs, "spikes": netlist.n_compartments, "updates": netlist.n_compartments}
+    sums = int(rng.choice([1, 16, 17]))
+    charges = Charges(**{name: rng.integers(-(2**31), 2**31, (size, sums)) for name, size in rows.items()})
+    wanted = expected.spikes.astype(np.int64) @ charges.spikes + expected.updated.astype(np.int64) @ charges.updates
+    wanted[: events.shape[1]] += events.T.astype(np.int64) @ charges.channels
+    for stepwise in (False, True):
+        prepared = engine.prepare(netlist, stepwise=stepwise)
+        found = engine.simulate(prepared, events[None], charges=charges).charged
+        np.testing.assert_array_equal(found[0], wanted, strict=True)
 
 
 SHAPES = (
