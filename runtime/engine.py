@@ -341,7 +341,8 @@ def simulate(
     ends = np.full(recordings, length) if lengths is None else np.asarray(lengths, np.int64)
 
     def run_layers(part: slice) -> None:
-        assert engine.blocks is not None and rows is not None, "the network has been laid out in blocks"
+        assert engine.blocks is not None, "the network has been laid out in blocks"
+        assert rows is not None, "and so have the charges"
         empty = (0, 0, 0)
         run_recordings(
             engine.blocks,
