@@ -24,7 +24,7 @@ import numpy.typing as npt
 from compiler.errors import NumericRangeError
 from compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, DECAY_BITS, MEMBRANE_SHIFT, IntArray
 from compiler.netlist import Netlist, one_step_bounds
-from runtime.block_kernel import Blocks, run_recordings
+from runtime.block_kernel import Blocks, ChargeRows, run_recordings
 from runtime.blocks import charge_rows, lay_out
 from runtime.kernel import State, Tables, chip_steps
 from runtime.trace import REGISTER_LIMITS, BoolArray, Charges, Counts, MembraneArray, Trace, check_channels, range_error
@@ -325,87 +325,93 @@ def simulate(
     check_channels(netlist, events.shape[1])
     recordings, _, length = events.shape
     shape = (recordings, length + engine.drain, netlist.n_compartments)
-    kept_spikes = np.zeros(shape, np.bool_) if spikes else None
-    kept_membranes = np.zeros(shape, np.int32) if membranes else None
-    kept_updated = np.zeros(shape, np.bool_) if updated else None
-    counts = Counts(
-        inputs=np.zeros((recordings, netlist.n_inputs), np.int64),
-        spikes=np.zeros((recordings, netlist.n_compartments), np.int64),
-        updates=np.zeros((recordings, len(netlist.layers)), np.int64),
-        saturations=np.zeros((recordings, len(netlist.layers)), np.int64),
-    )
-
-    rows = None if engine.blocks is None else charge_rows(netlist, engine.blocks, charges)
     sums = 0 if charges is None else charges.spikes.shape[1]
+    rows = None if engine.blocks is None else charge_rows(netlist, engine.blocks, charges)
     charged = np.zeros((*shape[:2], sums if rows is None else rows.width), np.int64)
+    trace = Trace(
+        counts=Counts(
+            inputs=np.zeros((recordings, netlist.n_inputs), np.int64),
+            spikes=np.zeros((recordings, netlist.n_compartments), np.int64),
+            updates=np.zeros((recordings, len(netlist.layers)), np.int64),
+            saturations=np.zeros((recordings, len(netlist.layers)), np.int64),
+        ),
+        spikes=np.zeros(shape, np.bool_) if spikes else None,
+        membranes=np.zeros(shape, np.int32) if membranes else None,
+        updated=np.zeros(shape, np.bool_) if updated else None,
+        charged=None if charges is None else charged[..., :sums],
+    )
     ends = np.full(recordings, length) if lengths is None else np.asarray(lengths, np.int64)
 
-    def run_layers(part: slice) -> None:
-        assert engine.blocks is not None, "the network has been laid out in blocks"
-        assert rows is not None, "and so have the charges"
-        empty = (0, 0, 0)
-        run_recordings(
-            engine.blocks,
-            events[part].view(np.uint8),
-            ends[part],
-            counts.inputs[part],
-            counts.spikes[part],
-            counts.updates[part],
-            np.zeros(empty, np.bool_) if kept_spikes is None else kept_spikes[part],
-            np.zeros(empty, np.int32) if kept_membranes is None else kept_membranes[part],
-            np.zeros(empty, np.bool_) if kept_updated is None else kept_updated[part],
-            rows,
-            charged[part].reshape(part.stop - part.start, -1),
-        )
-
-    def run_steps(part: slice) -> None:
-        index = part.start
-        state = start(engine)
-        own = int(ends[index])
-        window = own + engine.drain
-        fired = kept_spikes[index, :window] if kept_spikes is not None else None
-        worked = kept_updated[index, :window] if kept_updated is not None else None
-        if charges is not None:
-            both = np.zeros((2, window, netlist.n_compartments), np.bool_)
-            fired, worked = both[0] if fired is None else fired, both[1] if worked is None else worked
-        try:
-            advance(
-                engine,
-                state,
-                events[index, :, :own],
-                length=own,
-                steps=window,
-                spikes=fired,
-                membranes=None if kept_membranes is None else kept_membranes[index, :window],
-                updated=worked,
-            )
-        except NumericRangeError as error:
-            error.add_note(f"recording {index} of {recordings}, counted from 0")
-            raise
-        counts.inputs[index] = state.inputs
-        counts.spikes[index] = state.spikes
-        counts.updates[index] = state.updates
-        counts.saturations[index] = state.saturations
-        if charges is not None and fired is not None and worked is not None:
-            # float64 products of integers below 2**53 are exact
-            found = fired.astype(np.float64) @ charges.spikes + worked.astype(np.float64) @ charges.updates
-            found[:own] += (events[index, :, :own] != 0).T.astype(np.float64) @ charges.channels
-            charged[index, :window] = np.rint(found).astype(np.int64)
+    def run(part: slice) -> None:
+        if engine.blocks is not None and rows is not None:
+            _run_layers(engine.blocks, rows, events[part], ends[part], trace, charged, part)
+        else:
+            for index in range(part.start, part.stop):
+                _run_steps(engine, events[index], int(ends[index]), trace, charges, index)
 
     if engine.blocks is not None:
         events = np.ascontiguousarray(events)
     size = 1 if engine.blocks is None else PART
     parts = [slice(i, min(i + size, recordings)) for i in range(0, recordings, size)]
-    run = run_steps if engine.blocks is None else run_layers
     workers = min(threads or os.cpu_count() or 1, len(parts))
     with ThreadPoolExecutor(workers) if workers > 1 else nullcontext() as pool:
         for part, _ in zip(parts, pool.map(run, parts) if pool else map(run, parts), strict=True):
             if progress is not None:
                 progress(part.stop)
-    return Trace(
-        counts=counts,
-        spikes=kept_spikes,
-        membranes=kept_membranes,
-        updated=kept_updated,
-        charged=None if charges is None else charged[..., : charges.spikes.shape[1]],
+    return trace
+
+
+def _run_layers(
+    blocks: Blocks, rows: ChargeRows, events: EventArray, ends: IntArray, trace: Trace, charged: IntArray, part: slice
+) -> None:
+    """Run some recordings layer after layer; `part` is where they belong in the trace."""
+    nothing = (0, 0, 0)
+    run_recordings(
+        blocks,
+        events.view(np.uint8),
+        ends,
+        trace.counts.inputs[part],
+        trace.counts.spikes[part],
+        trace.counts.updates[part],
+        np.zeros(nothing, np.bool_) if trace.spikes is None else trace.spikes[part],
+        np.zeros(nothing, np.int32) if trace.membranes is None else trace.membranes[part],
+        np.zeros(nothing, np.bool_) if trace.updated is None else trace.updated[part],
+        rows,
+        charged[part].reshape(len(events), -1),
     )
+
+
+def _run_steps(
+    engine: Engine, events: EventArray, length: int, trace: Trace, charges: Charges | None, index: int
+) -> None:
+    """Run one recording step after step; `index` is its place in the trace."""
+    state, window = start(engine), length + engine.drain
+    fired = None if trace.spikes is None else trace.spikes[index, :window]
+    worked = None if trace.updated is None else trace.updated[index, :window]
+    if charges is not None:
+        size = (window, engine.netlist.n_compartments)
+        fired = np.zeros(size, np.bool_) if fired is None else fired
+        worked = np.zeros(size, np.bool_) if worked is None else worked
+    try:
+        advance(
+            engine,
+            state,
+            events[:, :length],
+            length=length,
+            steps=window,
+            spikes=fired,
+            membranes=None if trace.membranes is None else trace.membranes[index, :window],
+            updated=worked,
+        )
+    except NumericRangeError as error:
+        error.add_note(f"recording {index} of {len(trace.counts.inputs)}, counted from 0")
+        raise
+    trace.counts.inputs[index] = state.inputs
+    trace.counts.spikes[index] = state.spikes
+    trace.counts.updates[index] = state.updates
+    trace.counts.saturations[index] = state.saturations
+    if charges is not None and trace.charged is not None and fired is not None and worked is not None:
+        # float64 products of integers below 2**53 are exact
+        found = fired.astype(np.float64) @ charges.spikes + worked.astype(np.float64) @ charges.updates
+        found[:length] += (events[:, :length] != 0).T.astype(np.float64) @ charges.channels
+        trace.charged[index, :window] = np.rint(found).astype(np.int64)

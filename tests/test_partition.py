@@ -24,7 +24,8 @@ from compiler.errors import CapacityError
 from compiler.ir import INPUT, Input, IntegerNetwork, IntegerProjection, Readout
 from compiler.passes.emit import emit
 from compiler.passes.legalize import LimitUse, list_words, measure, require_legal
-from compiler.passes.partition import Chunk, Partition, index_bits, partition
+from compiler.passes.needs import Chunk, index_bits
+from compiler.passes.partition import Partition, partition
 
 MIXED = [8, 6, 4, 2]
 

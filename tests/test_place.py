@@ -9,7 +9,8 @@ from random_networks import LOIHI, integer_chain, integer_networks, small_target
 
 from compiler.passes import place as place_module
 from compiler.passes.emit import emit
-from compiler.passes.partition import Chunk, Partition, partition
+from compiler.passes.needs import Chunk
+from compiler.passes.partition import Partition, partition
 from compiler.passes.place import core_traffic, hops, place
 
 

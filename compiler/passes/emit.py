@@ -16,7 +16,8 @@ import numpy.typing as npt
 from compiler.fixedpoint import IntArray
 from compiler.ir import INPUT, IntegerNetwork, depths, fan_in
 from compiler.netlist import Layer, Netlist, read_only, read_only_float
-from compiler.passes.partition import Chunk, Lists, Partition, choose_dense, index_bits, lean_fits, lists_into
+from compiler.passes.needs import Chunk, Lists, choose_dense, index_bits, lean_fits, lists_into
+from compiler.passes.partition import Partition
 from compiler.targets import Target
 
 

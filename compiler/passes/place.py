@@ -16,7 +16,8 @@ import numpy as np
 
 from compiler.fixedpoint import FloatArray, IntArray
 from compiler.ir import INPUT, IntegerNetwork
-from compiler.passes.partition import Partition, lists_into
+from compiler.passes.needs import lists_into
+from compiler.passes.partition import Partition
 from compiler.targets import Target
 
 EXACT_STEPS = 30_000
