@@ -55,7 +55,7 @@ def _is_pipeline(netlist: Netlist, source: IntArray, target: IntArray) -> bool:
     return bool(np.all(heard == depth[target] - 1))
 
 
-def lay_out(netlist: Netlist) -> Blocks | None:
+def lay_out_blocks(netlist: Netlist) -> Blocks | None:
     """Make blocks of a netlist.
 
     Returns

@@ -4,9 +4,7 @@ There are two kernels. A network of layers that each hear the one before, in whi
 is run layer after layer in :mod:`runtime.block_kernel`; whole recordings only.
 
 Any other network is run step after step in :mod:`runtime.kernel`, which knows no recordings: :func:`advance` moves a
-state by any number of chip steps. Its compartments are renumbered by layer and neuron ("positions"), so that a layer is
-one contiguous range whatever its cores. Where :func:`compiler.netlist.one_step_bounds` proves that neither accumulator
-nor current can overflow, nothing is checked.
+state by any number of chip steps.
 """
 
 from __future__ import annotations
@@ -22,23 +20,18 @@ import numpy as np
 import numpy.typing as npt
 
 from compiler.errors import NumericRangeError
-from compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, DECAY_BITS, MEMBRANE_SHIFT, IntArray
-from compiler.netlist import Netlist, one_step_bounds
+from compiler.fixedpoint import IntArray
+from compiler.netlist import Netlist
 from runtime.block_kernel import Blocks, ChargeRows, run_recordings
-from runtime.blocks import charge_rows, lay_out
+from runtime.blocks import charge_rows, lay_out_blocks
 from runtime.kernel import State, Tables, chip_steps
+from runtime.segments import lay_out_segments, padded
 from runtime.trace import REGISTER_LIMITS, BoolArray, Charges, Counts, MembraneArray, Trace, check_channels, range_error
 
 EventArray = npt.NDArray[np.uint8 | np.bool_]
 
-BLOCK = 32
-"""Segments of a row start and end at multiples of this many positions."""
-
 PART = 4
 """Recordings that a thread takes at a time."""
-
-MERGED_GAP = 1
-"""Blocks without synapses that a segment spans rather than ends at."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -66,65 +59,6 @@ class Engine:
     drain: int
 
 
-def _padded(size: int) -> int:
-    """Next multiple of a block."""
-    return -(-size // BLOCK) * BLOCK
-
-
-def _registers_hold(netlist: Netlist) -> bool:
-    """Whether no input whatever can make an accumulator or a current overflow."""
-    positive, negative = one_step_bounds(netlist)
-    worst = np.maximum(positive, negative) << MEMBRANE_SHIFT
-    # a current that loses lost/4096 a step and gains `worst` cannot climb beyond worst * 4096 / lost
-    highest = (worst << DECAY_BITS) // (netlist.decay_u + 1)
-    return bool(np.all(worst <= ACCUMULATOR_MAX) and np.all(highest <= CURRENT_MAX))
-
-
-def _segments(source: IntArray, target: IntArray, n_sources: int) -> tuple[dict[str, IntArray], IntArray, int]:
-    """Cut each source's targets into segments.
-
-    Returns
-    -------
-    geometry : dict
-        ``shape``, ``base``, ``first``, ``start``, ``stop`` and ``offset`` of :class:`runtime.kernel.Tables`.
-    entry : (synapses,) int64
-        Index of each synapse in the array of weights.
-    size : int
-        Length of that array.
-    """
-    blocks = int(target.max(initial=0)) // BLOCK + 1
-    used = np.unique(source * blocks + target // BLOCK)
-    of_source, block = np.divmod(used, blocks)
-    begins = np.ones(len(used), np.bool_)
-    begins[1:] = (np.diff(of_source) != 0) | (np.diff(block) > MERGED_GAP + 1)
-    ends = np.append(begins[1:], True)[: len(used)]
-    of_source, start, stop = of_source[begins], block[begins] * BLOCK, (block[ends] + 1) * BLOCK
-    bounds = np.append(0, np.cumsum(stop - start))
-    segment = np.searchsorted(of_source * blocks * BLOCK + start, source * blocks * BLOCK + target, side="right") - 1
-    entry = bounds[segment] + target - start[segment]
-
-    rows = np.searchsorted(of_source, np.arange(n_sources + 1))
-    shapes: dict[bytes, int] = {}
-    shape, first, members = np.zeros(n_sources, np.int64), [0], []
-    for s, (begin, end) in enumerate(zip(rows[:-1].tolist(), rows[1:].tolist(), strict=True)):
-        known = len(shapes)
-        shape[s] = shapes.setdefault(start[begin:end].tobytes() + stop[begin:end].tobytes(), known)
-        if shape[s] == known:
-            members.append(np.arange(begin, end))
-            first.append(first[-1] + end - begin)
-    member = np.concatenate(members)
-    base = bounds[rows[:-1]]
-    geometry = {
-        "shape": shape,
-        "base": base,
-        "first": np.array(first),
-        "start": start[member],
-        "stop": stop[member],
-        "offset": bounds[member] - base[of_source[member]],
-    }
-    return geometry, entry, int(bounds[-1])
-
-
 def prepare(netlist: Netlist, *, stepwise: bool = False, checked: bool = False, gated: bool = True) -> Engine:
     """Lay a netlist out for a kernel.
 
@@ -139,59 +73,12 @@ def prepare(netlist: Netlist, *, stepwise: bool = False, checked: bool = False, 
     gated : bool
         Whether a layer integrates in its window only, see :func:`runtime.spec.simulate`; in steps if not.
     """
-    blocks = lay_out(netlist) if gated and not checked and not stepwise else None
+    blocks = lay_out_blocks(netlist) if gated and not checked and not stepwise else None
     drain = netlist.max_depth if gated else 0
     if blocks is not None:
         return Engine(netlist=netlist, blocks=blocks, tables=None, negative=None, drain=drain)
-    tables, negative = _tables(netlist, checked=checked, gated=gated)
+    tables, negative = lay_out_segments(netlist, checked=checked, gated=gated)
     return Engine(netlist=netlist, blocks=None, tables=tables, negative=negative, drain=drain)
-
-
-def _tables(netlist: Netlist, *, checked: bool, gated: bool) -> tuple[Tables, npt.NDArray[Any] | None]:
-    """Lay a netlist out for the kernel of steps."""
-    n_inputs = netlist.n_inputs
-    compartment = np.lexsort((netlist.neuron, netlist.layer))
-    position = np.empty_like(compartment)
-    position[compartment] = np.arange(len(compartment))
-
-    source_id = np.append(np.arange(n_inputs), n_inputs + position)
-    source = source_id[netlist.axon_source][netlist.axon_of_synapse()]
-    target = position[netlist.synapse_compartment()]
-    weight = netlist.effective_weight()
-    geometry, entry, size = _segments(source, target, len(source_id))
-
-    shift = int(np.bincount(target).max(initial=0)).bit_length()
-    largest = int(np.maximum(*one_step_bounds(netlist)).max(initial=0))
-    narrow = (largest + 1) << shift < 2**31
-    checked = checked or not narrow or not _registers_hold(netlist)
-    packed = np.zeros(size, np.int32 if narrow else np.int64)
-    negative = np.zeros(size, packed.dtype) if checked else None
-    if negative is None:
-        np.add.at(packed, entry, (weight << shift) + 1)
-    else:
-        np.add.at(packed, entry, np.where(weight >= 0, (weight << shift) + 1, 0))
-        np.add.at(negative, entry, np.where(weight < 0, (-weight << shift) + 1, 0))
-
-    shared = np.stack([netlist.layer, netlist.decay_u, netlist.decay_v])[:, compartment]
-    begins = np.append(True, np.any(np.diff(shared) != 0, axis=0))
-    layer, decay_u, decay_v = np.ascontiguousarray(shared[:, begins])
-    bias, threshold = np.zeros((2, _padded(len(compartment))), np.int32)
-    threshold[: len(compartment)] = (netlist.threshold << MEMBRANE_SHIFT)[compartment]
-    bias[: len(compartment)] = (netlist.bias_mantissa << netlist.bias_exponent)[compartment]
-    tables = Tables(
-        **geometry,
-        weight=packed,
-        shift=np.int32(shift),
-        run_start=np.append(np.flatnonzero(begins), len(compartment)),
-        run_layer=layer,
-        run_depth=np.array([part.depth if gated else 0 for part in netlist.layers])[layer],
-        keep_u=(2**DECAY_BITS - 1 - decay_u).astype(np.int32),
-        keep_v=(2**DECAY_BITS - decay_v).astype(np.int32),
-        threshold=threshold,
-        bias=bias,
-        compartment=compartment,
-    )
-    return tables, negative
 
 
 def tables_of(engine: Engine) -> Tables:
@@ -203,7 +90,7 @@ def tables_of(engine: Engine) -> Tables:
 def start(engine: Engine) -> State:
     """State of a chip before the first chip step of a recording."""
     netlist = engine.netlist
-    size = _padded(netlist.n_compartments)
+    size = padded(netlist.n_compartments)
     scratch = 0 if engine.negative is None else size
     return State(
         clock=np.zeros(2, np.int64),

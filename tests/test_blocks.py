@@ -12,7 +12,7 @@ from compiler.netlist import Netlist
 from compiler.passes.quantize import Recipe
 from compiler.pipeline import compile_checkpoint
 from runtime import engine, spec
-from runtime.blocks import lay_out
+from runtime.blocks import lay_out_blocks
 from runtime.trace import Charges
 
 REPEATABLE = settings(max_examples=60, deadline=None, derandomize=True)
@@ -64,7 +64,7 @@ def pipeline(
 
 
 def assert_kernels_agree(netlist: Netlist, events: np.ndarray) -> None:
-    assert lay_out(netlist) is not None
+    assert lay_out_blocks(netlist) is not None
     expected = spec.simulate(netlist, events)
     assert_equal(by_engine(netlist, events), expected)
     assert_equal(by_steps(netlist, events), expected)
@@ -105,7 +105,7 @@ def test_any_pipeline(seed, inputs, sizes, density, biases, rate):
 
 def test_the_random_pipelines_reach_every_way_of_storage():
     found = [
-        lay_out(pipeline(seed, inputs=130, sizes=SHAPES[2], density=density, largest=largest))
+        lay_out_blocks(pipeline(seed, inputs=130, sizes=SHAPES[2], density=density, largest=largest))
         for seed, (density, largest) in enumerate([(0.03, 6), (1.0, 6), (1.0, 80)])
     ]
     assert [blocks.weight.dtype for blocks in found] == [np.int8, np.int8, np.int16]
@@ -162,7 +162,7 @@ def test_sums_at_the_end_of_sixteen_bits(sign, threshold):
 
 def test_a_sum_beyond_sixteen_bits_takes_the_other_kernel():
     netlist = one_neuron([*FULL, 1])
-    assert lay_out(netlist) is None
+    assert lay_out_blocks(netlist) is None
     events = np.ones((131, 2), np.uint8)
     with pytest.raises(NumericRangeError, match="synaptic sum"):
         spec.simulate(netlist, events)
@@ -183,7 +183,7 @@ def test_a_sum_beyond_sixteen_bits_takes_the_other_kernel():
 )
 def test_membranes_at_the_end_of_32_bits(neuron, fits):
     netlist = one_neuron([127, 127, 126], **neuron)
-    assert (lay_out(netlist) is not None) == fits
+    assert (lay_out_blocks(netlist) is not None) == fits
     events = np.ones((3, 400), np.uint8)
     events[:, 300:] = 0
     assert_equal(by_engine(netlist, events), spec.simulate(netlist, events))
@@ -194,7 +194,7 @@ def test_who_hears_more_than_the_depth_before_takes_the_other_kernel():
     for source, depths in ((1, [0, 0]), (0, [0, 1]), (2, [0, 1]), (1, [0, 2])):  # same depth, input, itself, skipped
         axons = [Axon(source=0, targets=((0, 10),)), Axon(source=source, targets=((1, 10),))]
         netlist = build(neurons, axons, n_inputs=1, depths=depths)
-        assert lay_out(netlist) is None
+        assert lay_out_blocks(netlist) is None
         events = np.ones((1, 9), np.uint8)
         assert_equal(by_engine(netlist, events), spec.simulate(netlist, events))
 
@@ -206,7 +206,7 @@ def test_scattered_synapses_take_the_other_kernel():
         Axon(source=source, targets=tuple((int(c), 1) for c in np.unique(rng.integers(0, 1000, 200) // 64 * 64 % 1000)))
         for source in range(6000)
     ]
-    assert lay_out(build([Neuron() for _ in range(1000)], axons, n_inputs=6000, depths=[0])) is None
+    assert lay_out_blocks(build([Neuron() for _ in range(1000)], axons, n_inputs=6000, depths=[0])) is None
 
 
 # --- real networks ----------------------------------------------------------------------------------------------------
