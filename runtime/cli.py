@@ -20,6 +20,7 @@ import numpy as np
 
 from compiler.atomic import write_atomically
 from compiler.errors import OptionError, SpikeloomError
+from compiler.fixedpoint import IntArray
 from compiler.frontends.checkpoint import WEIGHTS, Checkpoint, read_checkpoint
 from compiler.netlist import Netlist
 from compiler.passes.legalize import measure
@@ -42,7 +43,7 @@ from runtime.inputs import (
     require_place,
     shipped,
 )
-from runtime.options import MARGIN, add_compile, add_model, add_recordings, add_training
+from runtime.options import MARGIN, add_compile, add_detail, add_model, add_recordings, add_training
 from runtime.tables import show
 
 Arguments = argparse.Namespace
@@ -218,14 +219,19 @@ def _run(arguments: Arguments) -> Outcome:
     data = _recordings(arguments, netlist)
     _progress("running")
     events = data.events.reshape(len(data), -1, data.steps)
-    trace = engine.simulate(netlist, events, lengths=data.lengths, spikes=arguments.spikes is not None)
-    if trace.spikes is not None:
-        layers = {layer.name: aligned(netlist, trace.spikes, i) for i, layer in enumerate(netlist.layers)}
-        with write_atomically(arguments.spikes) as file:
-            np.savez_compressed(file, **layers)  # type: ignore[arg-type]
-    counts = class_counts(netlist, trace.counts.spikes)
-    report = decisions.run_json(data.files, data.labels, counts, predictions(netlist, trace.counts.spikes))
-    return report, decisions.run_text, 0
+    found: Report | None = None
+    if arguments.detail == "spikes" or arguments.spikes is not None:
+        trace = engine.simulate(netlist, events, lengths=data.lengths, spikes=arguments.spikes is not None)
+        spikes = trace.counts.spikes
+        if trace.spikes is not None:
+            layers = {layer.name: aligned(netlist, trace.spikes, i) for i, layer in enumerate(netlist.layers)}
+            with write_atomically(arguments.spikes) as file:
+                np.savez_compressed(file, **layers)  # type: ignore[arg-type]
+    if arguments.detail != "spikes":
+        spikes, found = _costs(arguments, netlist, data)
+    decided = predictions(netlist, spikes)
+    report = decisions.run_json(data.files, data.labels, class_counts(netlist, spikes), decided)
+    return report | ({} if found is None else {"costs": found}), decisions.run_text, 0
 
 
 def _verify(arguments: Arguments) -> Outcome:
@@ -267,16 +273,28 @@ def _verify(arguments: Arguments) -> Outcome:
 
 
 def _estimate(arguments: Arguments) -> Outcome:
-    from runtime import cost, engine
+    from runtime.estimates import estimate_text
 
     netlist = read_netlist(arguments.netlist)
-    data = _recordings(arguments, netlist)
+    _, report = _costs(arguments, netlist, _recordings(arguments, netlist))
+    return report, estimate_text, 0
+
+
+def _costs(arguments: Arguments, netlist: Netlist, data: Recordings) -> tuple[IntArray, Report]:
+    """Spikes of each compartment, and what the recordings cost at the detail that was asked for."""
+    from runtime.estimate import estimate
+    from runtime.estimates import estimate_json
+
     _progress("running")
-    events = data.events.reshape(len(data), -1, data.steps)
-    trace = engine.simulate(netlist, events, lengths=data.lengths)
-    steps = data.steps if data.lengths is None else data.lengths
-    costs = cost.estimate(netlist, load_target(netlist.target), trace.counts, steps)
-    return render.estimate_json(netlist, costs), render.estimate_text, 0
+    counts, found = estimate(
+        netlist,
+        load_target(netlist.target),
+        data.events.reshape(len(data), -1, data.steps),
+        lengths=data.lengths,
+        detail=arguments.detail,
+        progress=lambda done: _progress(f"running: {done} of {len(data)}"),
+    )
+    return counts.spikes, estimate_json(netlist, found, bin_s=arguments.bin)
 
 
 def _train(arguments: Arguments) -> Outcome:
@@ -383,6 +401,7 @@ def build_parser() -> argparse.ArgumentParser:
     sub = command("run", _run, "run a netlist exactly as the chip would")
     sub.add_argument("netlist")
     add_recordings(sub)
+    add_detail(sub, ("spikes", "counts", "cycle"), "spikes")
     sub.add_argument("--spikes", metavar="OUT.npz", help="write the spikes of every layer, aligned with the data")
 
     sub = command("verify", _verify, "compare chip and float model, spike for spike")
@@ -408,9 +427,10 @@ def build_parser() -> argparse.ArgumentParser:
         help="levels to pass instead: E0 specification = engine, E2 share of spikes in every layer, E3 of decisions",
     )
 
-    sub = command("estimate", _estimate, "synaptic operations, spikes, neuron updates and energy of an inference")
+    sub = command("estimate", _estimate, "synaptic operations, energy and time of an inference")
     sub.add_argument("netlist")
     add_recordings(sub)
+    add_detail(sub, ("counts", "cycle"), "counts")
 
     sub = command("train", _train, "train a network by the released protocol, reported by the paper's and a clean one")
     add_training(sub)

@@ -31,6 +31,17 @@ def add_recordings(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--limit", type=int, metavar="N", help="first N recordings only")
 
 
+def add_detail(parser: argparse.ArgumentParser, choices: tuple[str, ...], default: str) -> None:
+    """Add the option that says how deep a run is simulated."""
+    what = {
+        "spikes": "decisions only",
+        "counts": "events, energy, simple time model",
+        "cycle": "the time of every message too",
+    }
+    told = "; ".join(f"{choice}: {what[choice]}" for choice in choices)
+    parser.add_argument("--detail", choices=choices, default=default, help=f"{told} (default: {default})")
+
+
 def add_training(parser: argparse.ArgumentParser) -> None:
     """Add the options of a training."""
     parser.add_argument("--data", required=True, metavar="PATH", help=DATA_HELP)

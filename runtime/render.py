@@ -14,8 +14,7 @@ from compiler.frontends.checkpoint import Checkpoint
 from compiler.netlist import Netlist
 from compiler.passes.legalize import LimitUse
 from compiler.pipeline import Compilation
-from runtime.cost import NOT_PRICED, Costs
-from runtime.tables import si, table
+from runtime.tables import table
 
 Json = dict[str, Any]
 
@@ -284,72 +283,4 @@ def checkpoint_text(report: Json) -> str:
         text = str(value)
         lines.append(f"  {key}: {text if len(text) <= 100 else text[:97] + '…'}")
     lines.append(f"  sha256: {report['sha256']}")
-    return "\n".join(lines)
-
-
-# -- costs -------------------------------------------------------------------------------------------------------------
-
-
-def estimate_json(netlist: Netlist, costs: Costs) -> Json:
-    """Costs per inference and per layer under the keys that scripts rely on."""
-    per_sample: dict[str, FloatArray] = {
-        "synaptic_operations": costs.synaptic_operations,
-        "synaptic_operations_on_zeros": costs.zeros,
-        "spikes": costs.events["spike"],
-        "neuron_updates": costs.events["neuron_active"],
-        "neuron_accesses": costs.events["neuron_active"] + costs.events["neuron_idle"],
-        "packets": costs.events["packet"],
-        "hops": costs.events["hop_east_west"] + costs.events["hop_north_south"],
-    }
-
-    def summary(reduce: Any) -> Json:
-        values: Json = {key: float(reduce(amount.sum(axis=1))) for key, amount in per_sample.items()}
-        return values | {"energy_j": {name: float(reduce(e.sum(axis=1))) for name, e in costs.energy.items()}}
-
-    layers = []
-    for index, layer in enumerate(netlist.layers):
-        means: Json = {key: float(amount[:, index].mean()) for key, amount in per_sample.items()}
-        means["energy_j"] = {name: float(energy[:, index].mean()) for name, energy in costs.energy.items()}
-        layers.append({"name": layer.name} | means)
-    return {
-        "samples": len(costs.zeros),
-        "chip_steps": costs.steps,
-        "per_inference": summary(np.mean),
-        "min": summary(np.min),
-        "max": summary(np.max),
-        "layers": layers,
-        "not_modelled": [f"{name}: no price for {', '.join(events)}" for name, events in costs.unpriced.items()],
-        "not_priced": list(NOT_PRICED),
-    }
-
-
-def estimate_text(report: Json) -> str:
-    """Costs for people: the mean inference, its range, its layers."""
-    columns = [report["per_inference"], report["min"], report["max"]]
-    rows = [
-        [key.replace("_", " "), *(f"{column[key]:,.0f}" for column in columns)]
-        for key in columns[0]
-        if key != "energy_j"
-    ]
-    rows += [[f"energy, {name}", *(si(c["energy_j"][name], "J") for c in columns)] for name in columns[0]["energy_j"]]
-    tables = list(columns[0]["energy_j"])
-    layers = [
-        [
-            layer["name"],
-            f"{layer['synaptic_operations']:,.0f}",
-            f"{layer['spikes']:,.0f}",
-            f"{layer['neuron_updates']:,.0f}",
-            *(si(layer["energy_j"][name], "J") for name in tables),
-        ]
-        for layer in report["layers"]
-    ]
-    lines = [
-        f"per inference of {report['chip_steps']} chip steps, over {report['samples']} recordings:",
-        table(["", "mean", "min", "max"], rows),
-        "",
-        table(["layer (mean)", "synaptic operations", "spikes", "neuron updates", *tables], layers),
-        "",
-        *(f"not modelled: {line}" for line in report["not_modelled"]),
-        *(f"not priced: {line}" for line in report["not_priced"]),
-    ]
     return "\n".join(lines)

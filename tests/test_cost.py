@@ -14,7 +14,9 @@ from compiler.passes.partition import partition
 from compiler.passes.place import core_traffic, place
 from compiler.passes.quantize import Recipe, quantize
 from compiler.targets import EnergyTable, Quantity
-from runtime import cost, engine, render, spec
+from runtime import cost, engine, spec
+from runtime.estimate import estimate
+from runtime.estimates import estimate_json, estimate_text
 
 PICOJOULES = {
     "davies2018": {
@@ -185,25 +187,24 @@ def priced_by(*tables, silent=False):
     recording = np.zeros((2, 2, 5), np.uint8)
     if not silent:
         recording[:, 0, 0] = 1
-    counts = engine.simulate(netlist, recording).counts
-    return netlist, cost.estimate(netlist, dataclasses.replace(LOIHI, energy=tables), counts, 5)
+    _, found = estimate(netlist, dataclasses.replace(LOIHI, energy=tables), recording)
+    return found.costs, estimate_json(netlist, found, bin_s=0.02)
 
 
 @pytest.mark.parametrize("event", [name for name in cost.EVENTS if name not in ("synaptic_operation_dense", "spike")])
 def test_a_table_without_a_price_is_left_out(event):
     lacking = {name: price for name, price in FULL.items() if name != event}
-    netlist, costs = priced_by(table("lacking", **lacking), table("full", **FULL))
+    costs, report = priced_by(table("lacking", **lacking), table("full", **FULL))
     assert set(costs.energy) == {"full"}
     assert costs.unpriced == {"lacking": (event,)}
-    report = render.estimate_json(netlist, costs)
     assert report["not_modelled"] == [f"lacking: no price for {event}"]
     for part in (report["per_inference"], report["min"], report["max"], *report["layers"]):
         assert set(part["energy_j"]) == {"full"}
-    assert f"not modelled: lacking: no price for {event}\n" in render.estimate_text(report)
+    assert f"not modelled: lacking: no price for {event}\n" in estimate_text(report)
 
 
 def test_every_lacking_price_is_named():
-    _, costs = priced_by(table("poor", packet=1.0))
+    costs, _ = priced_by(table("poor", packet=1.0))
     assert costs.energy == {}
     # nothing was stored dense here, and a spike may be priced with its neuron's update
     assert costs.unpriced == {
@@ -218,29 +219,27 @@ def test_every_lacking_price_is_named():
 
 
 def test_no_table_at_all():
-    netlist, costs = priced_by()
-    report = render.estimate_json(netlist, costs)
+    _, report = priced_by()
     assert report["per_inference"]["energy_j"] == report["min"]["energy_j"] == {}
     assert report["not_modelled"] == []
-    assert "synaptic operations" in render.estimate_text(report)
+    assert "synaptic operations" in estimate_text(report)
 
 
 def test_what_did_not_happen_needs_no_price():
-    _, costs = priced_by(table("idle", neuron_idle=50.0), silent=True)
+    costs, _ = priced_by(table("idle", neuron_idle=50.0), silent=True)
     # 3 compartments in 6 steps
     np.testing.assert_allclose(costs.energy["idle"].sum(axis=1), [18 * 50e-12] * 2)
 
 
 def test_one_price_for_both_forms_of_a_list():
     both = {name: price for name, price in FULL.items() if not name.startswith("synaptic")}
-    _, costs = priced_by(table("one", **both, synaptic_operation=7.0), table("two", **FULL))
+    costs, _ = priced_by(table("one", **both, synaptic_operation=7.0), table("two", **FULL))
     extra = (costs.energy["one"] - costs.energy["two"]).sum(axis=1)
     np.testing.assert_allclose(extra, [6e-12 * (1 + 3)] * 2)
 
 
 def test_what_no_table_covers_is_always_listed():
-    netlist, costs = priced_by(table("full", **FULL))
-    report = render.estimate_json(netlist, costs)
+    _, report = priced_by(table("full", **FULL))
     assert report["not_priced"] == list(cost.NOT_PRICED)
     assert len(cost.NOT_PRICED) == 3
 
@@ -254,9 +253,7 @@ def test_report_has_means_and_extremes_over_recordings(tmp_path):
     parts = partition(integer, LOIHI)
     netlist = emit(integer, parts, place(core_traffic(integer, parts, None), LOIHI).tiles, LOIHI, {})
     recordings = events(7, samples=5).reshape(5, netlist.n_inputs, -1)
-    report = render.estimate_json(
-        netlist, cost.estimate(netlist, LOIHI, engine.simulate(netlist, recordings).counts, recordings.shape[2])
-    )
+    report = estimate_json(netlist, estimate(netlist, LOIHI, recordings)[1], bin_s=0.02)
     samples = [brute_force(netlist, recording) for recording in recordings]
     operations = [sum(s["synaptic_operation_dense"]) + sum(s["synaptic_operation_sparse"]) for s in samples]
     assert len(set(operations)) > 1

@@ -1,0 +1,166 @@
+"""What a run costs, as deep as it was asked for: spikes alone, events and simple times, or every message of every step.
+
+==========  ==========================================================================================================
+``spikes``  decisions only
+``counts``  events, energy by table, part and layer, and the simple time model: next to no work more
+``cycle``   the detailed time model too, and energy by core
+==========  ==========================================================================================================
+
+Spikes are the same in all three.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from compiler.fixedpoint import FloatArray, IntArray
+from compiler.netlist import Netlist
+from compiler.targets import Target
+from runtime import charges, cost, energy, engine, timing
+from runtime.cost import Costs
+from runtime.timing import DetailedTimes, SimpleTimes
+from runtime.trace import Charges, Counts
+
+DETAILS = ("spikes", "counts", "cycle")
+
+PART = 16
+"""Recordings whose spikes are kept at a time in detail ``cycle``."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Estimate:
+    """Costs of a batch of recordings.
+
+    Parameters
+    ----------
+    costs : Costs
+        Events and energies by layer.
+    parts : mapping of table to mapping of part to (samples, layers) float64
+        Joules.
+    steps : (samples,) int64
+        Data steps of each recording.
+    simple : mapping of time table to SimpleTimes
+    detailed : mapping of time table to DetailedTimes
+        Empty unless the detail is ``cycle``.
+    cores : mapping of energy table to (samples, cores) float64
+        Joules; empty unless the detail is ``cycle``.
+    """
+
+    costs: Costs
+    parts: Mapping[str, Mapping[str, FloatArray]]
+    steps: IntArray
+    simple: Mapping[str, SimpleTimes]
+    detailed: Mapping[str, DetailedTimes]
+    cores: Mapping[str, FloatArray]
+
+
+def estimate(
+    netlist: Netlist,
+    target: Target,
+    events: engine.EventArray,
+    *,
+    lengths: IntArray | None = None,
+    detail: str = "counts",
+    progress: Callable[[int], object] | None = None,
+) -> tuple[Counts, Estimate]:
+    """Run recordings and say what they cost.
+
+    Parameters
+    ----------
+    netlist : Netlist
+        What runs.
+    target : Target
+        Its chip, with energy and time tables.
+    events : (samples, n_inputs, T) uint8 or bool
+        Recordings.
+    lengths : (samples,) int64, optional
+        Data steps of each where some are shorter than T.
+    detail : {"counts", "cycle"}
+        How deep.
+    progress : callable, optional
+        Told the number of recordings that are done.
+
+    Raises
+    ------
+    DataError, NumericRangeError
+        As the engine says.
+    """
+    prepared = engine.prepare(netlist)
+    clocks = {times.name: timing.prepare(netlist, target, times) for times in target.time}
+    steps = np.full(len(events), events.shape[2]) if lengths is None else np.asarray(lengths, np.int64)
+    counts, simple = _quick(prepared, clocks, events, steps)
+    costs = cost.estimate(netlist, target, counts, steps)
+    parts = {prices.name: energy.by_part(prices, costs.events) for prices in target.energy}
+    detailed: dict[str, DetailedTimes] = {}
+    cores: dict[str, FloatArray] = {}
+    if detail == "cycle":
+        detailed, updates = _deep(prepared, clocks, events, steps, progress)
+        by_core = energy.count_by_core(netlist, target, counts, updates, steps + netlist.max_depth)
+        for prices in target.energy:
+            found = cost.price(prices, by_core)
+            if not isinstance(found, tuple):
+                cores[prices.name] = found
+    return counts, Estimate(
+        costs=costs,
+        parts={name: found for name, found in parts.items() if not isinstance(found, tuple)},
+        steps=steps,
+        simple=simple,
+        detailed=detailed,
+        cores=cores,
+    )
+
+
+def _quick(
+    prepared: engine.Engine, clocks: Mapping[str, timing.Clock], events: engine.EventArray, steps: IntArray
+) -> tuple[Counts, dict[str, SimpleTimes]]:
+    """Counts, and simple times from what the engine adds up on the way."""
+    if not clocks:
+        return engine.simulate(prepared, events, lengths=steps).counts, {}
+    each = [charges.charges(clock) for clock in clocks.values()]
+    wanted = Charges(
+        channels=np.concatenate([found.channels for found in each], axis=1),
+        spikes=np.concatenate([found.spikes for found in each], axis=1),
+        updates=np.concatenate([found.updates for found in each], axis=1),
+    )
+    trace = engine.simulate(prepared, events, lengths=steps, charges=wanted)
+    assert trace.charged is not None, "sums were asked for"
+    bounds = np.cumsum([found.spikes.shape[1] for found in each])[:-1]
+    simple = {
+        name: charges.simple_from(clock, charged, steps + prepared.drain)
+        for (name, clock), charged in zip(clocks.items(), np.split(trace.charged, bounds, axis=2), strict=True)
+    }
+    return trace.counts, simple
+
+
+def _deep(
+    prepared: engine.Engine,
+    clocks: Mapping[str, timing.Clock],
+    events: engine.EventArray,
+    steps: IntArray,
+    progress: Callable[[int], object] | None,
+) -> tuple[dict[str, DetailedTimes], IntArray]:
+    """Detailed times, and updates of each core; some recordings at a time, as their spikes have to be kept."""
+    found: dict[str, list[DetailedTimes]] = {name: [] for name in clocks}
+    updates = []
+    for first in range(0, len(events), PART):
+        part = slice(first, first + PART)
+        trace = engine.simulate(prepared, events[part], lengths=steps[part], spikes=True, updated=True)
+        assert trace.spikes is not None, "spikes were asked for"
+        assert trace.updated is not None, "updates were asked for"
+        updates.append(energy.updates_by_core(prepared.netlist, trace.updated))
+        own = steps[part] + prepared.drain
+        heard = events[part] * (np.arange(events.shape[2]) < steps[part, None, None])  # nothing after a recording's end
+        for name, clock in clocks.items():
+            found[name].append(timing.detailed(clock, trace.spikes, trace.updated, heard, steps=own))
+        if progress is not None:
+            progress(min(first + PART, len(events)))
+    joined = {
+        name: DetailedTimes(
+            **{f.name: np.concatenate([getattr(t, f.name) for t in times]) for f in fields(DetailedTimes)}
+        )
+        for name, times in found.items()
+    }
+    return joined, np.concatenate(updates)
