@@ -57,7 +57,7 @@ def measure(
     netlist = compile_checkpoint(checkpoint, adjacency, training_events=events, **options).netlist
     trace = engine.simulate(netlist, test.events.reshape(len(test), -1, test.steps), spikes=True)
     assert trace.spikes is not None
-    costs = cost.estimate(netlist, load_target(netlist.target), trace.counts, test.steps)
+    costs = cost.estimate(cost.prepare(netlist, load_target(netlist.target)), trace.counts, test.steps)
     different = {
         layer.name: int(
             np.count_nonzero((aligned(netlist, trace.spikes, i) != reference[layer.name])[..., heard(netlist, i)])

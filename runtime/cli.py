@@ -23,16 +23,17 @@ from compiler.errors import OptionError, SpikeloomError
 from compiler.fixedpoint import IntArray
 from compiler.frontends.checkpoint import WEIGHTS, Checkpoint, read_checkpoint
 from compiler.netlist import Netlist
+from compiler.passes.layout import require_goal
 from compiler.passes.legalize import measure
 from compiler.passes.quantize import Recipe
 from compiler.pipeline import compile_checkpoint
 from compiler.serialize import is_netlist, read_netlist, write_netlist
-from compiler.targets import load_target
+from compiler.targets import load_target, with_tables
 from compiler.text import text
 from models.evtouch import Recordings
 from models.graphs import CHOICES
 from models.grasps import SYNTHETIC
-from runtime import bits, decisions, explain, finetune, render, verdicts, watch
+from runtime import bits, decisions, explain, export, finetune, render, verdicts, watch
 from runtime.data_commands import add_data_commands
 from runtime.inputs import (
     asked_graph,
@@ -43,7 +44,7 @@ from runtime.inputs import (
     require_place,
     shipped,
 )
-from runtime.options import MARGIN, add_compile, add_detail, add_model, add_recordings, add_training
+from runtime.options import MARGIN, add_compile, add_detail, add_model, add_recordings, add_training, cores_asked
 from runtime.tables import show
 
 Arguments = argparse.Namespace
@@ -143,8 +144,10 @@ def _compile(arguments: Arguments) -> Outcome:
             f"--margin {arguments.margin:g}: only observed ranges have one; add --ranges observed or leave it away"
         )
     margin = MARGIN if arguments.margin is None else arguments.margin
-    load_target(arguments.target)
+    chip = load_target(arguments.target)
     recipes = _recipes(arguments)
+    cores_for = cores_asked(arguments.cores_for)
+    require_goal(arguments.optimize, cores_for, chip, calibrated=arguments.calibrate is not None)
     checkpoint = _checkpoint(arguments.checkpoint, arguments)
     name, adjacency = propagation(checkpoint, asked_graph(arguments), arguments.checkpoint)
     training = None
@@ -174,6 +177,8 @@ def _compile(arguments: Arguments) -> Outcome:
         training_events=training,
         ranges=arguments.ranges,
         margin=margin,
+        cores_for=cores_for,
+        optimize=arguments.optimize,
         provenance={
             "spikeloom": version(),
             "checkpoint_sha256": checkpoint.sha256,
@@ -187,6 +192,8 @@ def _compile(arguments: Arguments) -> Outcome:
             "ranges": arguments.ranges,
             "margin": margin,
             "calibrated": training is not None,
+            **({"cores_for": cores_for} if cores_for else {}),
+            **({"optimize": arguments.optimize} if arguments.optimize != "cores" else {}),
         },
         after=dump,
     )
@@ -286,15 +293,17 @@ def _costs(arguments: Arguments, netlist: Netlist, data: Recordings) -> tuple[In
     from runtime.estimates import estimate_json
 
     _progress("running")
+    target = load_target(netlist.target)
+    target = target if arguments.table is None else with_tables(target, arguments.table)
     counts, found = estimate(
         netlist,
-        load_target(netlist.target),
+        target,
         data.events.reshape(len(data), -1, data.steps),
         lengths=data.lengths,
         detail=arguments.detail,
         progress=lambda done: _progress(f"running: {done} of {len(data)}"),
     )
-    return counts.spikes, estimate_json(netlist, found, bin_s=arguments.bin)
+    return counts.spikes, estimate_json(netlist, target, found, bin_s=arguments.bin)
 
 
 def _train(arguments: Arguments) -> Outcome:
@@ -436,6 +445,7 @@ def build_parser() -> argparse.ArgumentParser:
     add_training(sub)
     bits.add_arguments(command("bits", bits.bits, bits.SUMMARY))
     explain.add_arguments(command("explain", explain.explain, explain.SUMMARY))
+    export.add_arguments(command("export", export.export, export.SUMMARY))
     finetune.add_arguments(command("finetune", finetune.finetune, finetune.SUMMARY))
     watch.add_arguments(command("watch", watch.watch, watch.SUMMARY))
     add_data_commands(commands)

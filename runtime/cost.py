@@ -42,7 +42,6 @@ OPTIONAL = frozenset({"spike"})
 NOT_PRICED = (
     "injection of input events into the mesh (no public figure per event)",
     "reset of each compartment at the start of its layer's window (one register write each; no public figure)",
-    "static power (depends on time; a run at full speed and one at 20 ms a step differ)",
 )
 """What no table covers; always listed, never counted as zero."""
 
@@ -101,39 +100,79 @@ def _routes(netlist: Netlist, target: Target) -> FloatArray:
     return routes
 
 
-def count(
-    netlist: Netlist, target: Target, counts: Counts, steps: int | IntArray
-) -> tuple[dict[str, FloatArray], FloatArray]:
-    """Amount of every event per recording and layer, and the visited zeros.
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Meter:
+    """What one event of each source causes, prepared by :func:`prepare` for any number of runs.
 
     Parameters
     ----------
     netlist : Netlist
-        What ran.
+        What runs.
     target : Target
         Its chip.
+    caused : mapping of str to (sources, layers) float64
+        Amount of an event, or of visited ``zeros``, for each layer by a spike of each source: input channels, then
+        compartments.
+    neurons : (layers,) float64
+        Compartments of each layer.
+    """
+
+    netlist: Netlist
+    target: Target
+    caused: Mapping[str, FloatArray]
+    neurons: FloatArray
+
+
+def prepare(netlist: Netlist, target: Target) -> Meter:
+    """Look up what spikes cause.
+
+    Parameters
+    ----------
+    netlist : Netlist
+        What runs.
+    target : Target
+        Its chip, with energy tables.
+    """
+    dense = (netlist.format_index_bits[netlist.axon_format] == 0)[netlist.axon_of_synapse()]
+    of_layer = np.eye(len(netlist.layers))[netlist.layer]
+    silent = np.zeros((netlist.n_inputs, len(netlist.layers)))
+    sent = {
+        event: np.concatenate([silent, route[:, None] * of_layer])
+        for event, route in zip(("packet", "hop_east_west", "hop_north_south"), _routes(netlist, target).T, strict=True)
+    }
+    return Meter(
+        netlist=netlist,
+        target=target,
+        caused={
+            "synaptic_operation_dense": _visits(netlist, dense.astype(np.float64)),
+            "synaptic_operation_sparse": _visits(netlist, (~dense).astype(np.float64)),
+            "spike": np.concatenate([silent, of_layer]),
+            **sent,
+            "zeros": _visits(netlist, (netlist.synapse_weight == 0).astype(np.float64)),
+        },
+        neurons=np.bincount(netlist.layer, minlength=len(netlist.layers)).astype(np.float64),
+    )
+
+
+def count(meter: Meter, counts: Counts, steps: int | IntArray) -> tuple[dict[str, FloatArray], FloatArray]:
+    """Amount of every event per recording and layer, and the visited zeros.
+
+    Parameters
+    ----------
+    meter : Meter
+        The prepared netlist.
     counts : Counts
         Of a batch: arrays have one leading axis of recordings.
     steps : int or (samples,) int64
         Data steps T of all recordings, or of each.
     """
-    dense = (netlist.format_index_bits[netlist.axon_format] == 0)[netlist.axon_of_synapse()]
     sources = np.concatenate([counts.inputs, counts.spikes], axis=1).astype(np.float64)
-    of_layer = np.eye(len(netlist.layers))[netlist.layer]
-    sent = [counts.spikes @ (route[:, None] * of_layer) for route in _routes(netlist, target).T]
-    neurons = np.bincount(netlist.layer, minlength=len(netlist.layers)).astype(np.float64)
+    sums = sources @ np.concatenate(list(meter.caused.values()), axis=1)
+    amounts = dict(zip(meter.caused, np.split(sums, len(meter.caused), axis=1), strict=True))
     active = counts.updates.astype(np.float64)
-    events = {
-        "synaptic_operation_dense": sources @ _visits(netlist, dense.astype(np.float64)),
-        "synaptic_operation_sparse": sources @ _visits(netlist, (~dense).astype(np.float64)),
-        "neuron_idle": neurons * (np.reshape(steps, (-1, 1)) + netlist.max_depth) - active,
-        "neuron_active": active,
-        "spike": counts.spikes @ of_layer,
-        "packet": sent[0],
-        "hop_east_west": sent[1],
-        "hop_north_south": sent[2],
-    }
-    return events, sources @ _visits(netlist, (netlist.synapse_weight == 0).astype(np.float64))
+    amounts["neuron_active"] = active
+    amounts["neuron_idle"] = meter.neurons * (np.reshape(steps, (-1, 1)) + meter.netlist.max_depth) - active
+    return {event: amounts[event] for event in EVENTS}, amounts["zeros"]
 
 
 def price(table: EnergyTable, events: Mapping[str, FloatArray]) -> FloatArray | tuple[str, ...]:
@@ -156,26 +195,24 @@ def price(table: EnergyTable, events: Mapping[str, FloatArray]) -> FloatArray | 
     return energy
 
 
-def estimate(netlist: Netlist, target: Target, counts: Counts, steps: int | IntArray) -> Costs:
+def estimate(meter: Meter, counts: Counts, steps: int | IntArray) -> Costs:
     """Price a run with every table of its chip.
 
     Parameters
     ----------
-    netlist : Netlist
-        What ran.
-    target : Target
-        Its chip, with energy tables.
+    meter : Meter
+        The prepared netlist.
     counts : Counts
         Of a batch of recordings, neuron updates included.
     steps : int or (samples,) int64
         Data steps T of all recordings, or of each.
     """
-    events, zeros = count(netlist, target, counts, steps)
-    priced = {table.name: price(table, events) for table in target.energy}
+    events, zeros = count(meter, counts, steps)
+    priced = {table.name: price(table, events) for table in meter.target.energy}
     return Costs(
         events=events,
         zeros=zeros,
-        steps=int(np.max(steps)) + netlist.max_depth,
+        steps=int(np.max(steps)) + meter.netlist.max_depth,
         energy={name: result for name, result in priced.items() if not isinstance(result, tuple)},
         unpriced={name: result for name, result in priced.items() if isinstance(result, tuple)},
     )

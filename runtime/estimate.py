@@ -92,7 +92,7 @@ def estimate(
     clocks = {times.name: timing.prepare(netlist, target, times) for times in target.time}
     steps = np.full(len(events), events.shape[2]) if lengths is None else np.asarray(lengths, np.int64)
     counts, simple = _quick(prepared, clocks, events, steps)
-    costs = cost.estimate(netlist, target, counts, steps)
+    costs = cost.estimate(cost.prepare(netlist, target), counts, steps)
     parts = {prices.name: energy.by_part(prices, costs.events) for prices in target.energy}
     detailed: dict[str, DetailedTimes] = {}
     cores: dict[str, FloatArray] = {}

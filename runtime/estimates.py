@@ -8,6 +8,7 @@ import numpy as np
 
 from compiler.fixedpoint import FloatArray
 from compiler.netlist import Netlist
+from compiler.targets import Target
 from runtime.cost import NOT_PRICED
 from runtime.estimate import Estimate
 from runtime.tables import si, table
@@ -16,13 +17,15 @@ from runtime.timing import DetailedTimes, SimpleTimes
 Json = dict[str, Any]
 
 
-def estimate_json(netlist: Netlist, found: Estimate, *, bin_s: float) -> Json:
+def estimate_json(netlist: Netlist, target: Target, found: Estimate, *, bin_s: float) -> Json:
     """Costs per inference, by part, by layer and by core, and how long an inference takes.
 
     Parameters
     ----------
     netlist : Netlist
         What ran.
+    target : Target
+        Its chip.
     found : Estimate
         What it cost.
     bin_s : float
@@ -63,6 +66,22 @@ def estimate_json(netlist: Netlist, found: Estimate, *, bin_s: float) -> Json:
         "cores": _cores_json(netlist, found),
         "time": _times_json(found),
         "pace": _pace_json(found, bin_s),
+        "static": [
+            {
+                "source": name,
+                "chip_w": power.value * 1e-3,
+                "real_time_j": float((power.value * 1e-3 * found.steps * bin_s).mean()),
+                "full_speed_j": [
+                    {
+                        "time_table": of,
+                        "model": model,
+                        "energy_j": float((power.value * 1e-3 * times.duration_ns.sum(axis=1) * 1e-9).mean()),
+                    }
+                    for (of, model), times in _models(found).items()
+                ],
+            }
+            for name, power in target.static.items()
+        ],
         "not_modelled": [f"{name}: no price for {', '.join(events)}" for name, events in costs.unpriced.items()],
         "not_priced": list(NOT_PRICED),
     }
@@ -225,4 +244,10 @@ def _pace_lines(report: Json) -> list[str]:
                 f"mesh ({entry['table']}): senders blocked for {si(entry['blocked_s'], 's')} an inference; at most "
                 f"{entry['peak_link_load']:.1f} messages on a link"
             )
+    for static in report["static"]:
+        full = ", ".join(f"{si(e['energy_j'], 'J')} ({e['time_table']}, {e['model']})" for e in static["full_speed_j"])
+        lines.append(
+            f"static, not in the above: {si(static['chip_w'], 'W')} a chip ({static['source']}), so an inference takes "
+            f"{si(static['real_time_j'], 'J')} at the sensor's pace" + (f", at full speed {full}" if full else "")
+        )
     return lines

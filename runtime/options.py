@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import argparse
 
+from compiler.errors import OptionError
 from compiler.frontends.checkpoint import WEIGHTS
+from compiler.passes.layout import GOALS
 from compiler.passes.quantize import RANGES
 from compiler.pipeline import STAGES
 from models.graphs import CHOICES
@@ -40,6 +42,7 @@ def add_detail(parser: argparse.ArgumentParser, choices: tuple[str, ...], defaul
     }
     told = "; ".join(f"{choice}: {what[choice]}" for choice in choices)
     parser.add_argument("--detail", choices=choices, default=default, help=f"{told} (default: {default})")
+    parser.add_argument("--table", metavar="NAME|FILE.toml", help="price and time by this table only, or by your own")
 
 
 def add_training(parser: argparse.ArgumentParser) -> None:
@@ -76,6 +79,32 @@ def add_model(parser: argparse.ArgumentParser, *, graph: bool = True) -> None:
     parser.add_argument("--theta", type=float, help="threshold, where the file does not say (default: 0.5)")
 
 
+def cores_asked(words: str | None) -> dict[str, int] | None:
+    """Least number of cores by layer, from the words of ``--cores-for``.
+
+    Examples
+    --------
+    >>> cores_asked("conv1=8,fc1=6")
+    {'conv1': 8, 'fc1': 6}
+
+    Raises
+    ------
+    OptionError
+        If they are none.
+    """
+    if words is None:
+        return None
+    found: dict[str, int] = {}
+    for word in words.split(","):
+        layer, _, count = word.strip().partition("=")
+        if not layer or not (count.isascii() and count.isdecimal()) or int(count) == 0:
+            raise OptionError(f"--cores-for {words}: {word!r} is not LAYER=N, N from 1; write for example fc1=6")
+        if layer in found:
+            raise OptionError(f"--cores-for {words}: names {layer} twice; give it once")
+        found[layer] = int(count)
+    return found
+
+
 def add_compile(sub: argparse.ArgumentParser) -> None:
     """Add the options of a compilation."""
     sub.add_argument("checkpoint")
@@ -103,6 +132,17 @@ def add_compile(sub: argparse.ArgumentParser) -> None:
         "--ranges", default="proven", help=f"how overflow is excluded: {' or '.join(RANGES)} (default: proven)"
     )
     sub.add_argument("--margin", type=float, help=f"share added to observed ranges (default: {MARGIN:g})")
+    sub.add_argument(
+        "--cores-for",
+        metavar="LAYER=N[,…]",
+        help="at least N cores for a layer, which it shares with none, as in conv1=4,fc1=6",
+    )
+    sub.add_argument(
+        "--optimize",
+        default="cores",
+        metavar="GOAL",
+        help=f"choose the cores for {', '.join(GOALS)}; the last two need --calibrate (default: cores)",
+    )
     sub.add_argument(
         "--dump-after", action="append", default=[], choices=STAGES, help="print the network after a stage, on stderr"
     )

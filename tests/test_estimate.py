@@ -89,7 +89,7 @@ def test_the_detailed_model_takes_at_least_the_work_of_the_busiest_core(found):
 def test_the_report_says_power_and_pace(small, found):
     netlist, _ = small
     _, cost = found["cycle"]
-    report = estimate_json(netlist, cost, bin_s=0.02)
+    report = estimate_json(netlist, LOIHI, cost, bin_s=0.02)
     energy, seconds = cost.costs.energy["sanafe"].sum(axis=1), cost.simple["sanafe"].duration_ns.sum(axis=1) * 1e-9
     (entry,) = [e for e in report["pace"]["full_speed"] if (e["energy_table"], e["model"]) == ("sanafe", "simple")]
     assert entry["power_w"] == pytest.approx((energy / seconds).mean())
@@ -108,6 +108,6 @@ def test_the_report_says_power_and_pace(small, found):
 def test_a_chip_without_tables(small):
     netlist, recordings = small
     _, cost = estimate(netlist, dataclasses.replace(LOIHI, energy=(), time=()), recordings, detail="cycle")
-    report = estimate_json(netlist, cost, bin_s=0.02)
+    report = estimate_json(netlist, LOIHI, cost, bin_s=0.02)
     assert (report["time"], report["energy_by_part_j"], report["pace"]["full_speed"]) == ([], {}, [])
     assert "synaptic operations" in estimate_text(report)

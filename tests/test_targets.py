@@ -6,7 +6,7 @@ import pytest
 from compiler import targets
 from compiler.errors import OptionError
 from compiler.passes.legalize import REMEDIES
-from compiler.targets import known_targets, load_target, read_target
+from compiler.targets import known_targets, load_target, read_target, with_tables
 
 LIMITS = {
     "core.compartments": 1024,
@@ -48,6 +48,18 @@ SANAFE = {
     "hop_east_west": 3.0,
     "hop_north_south": 4.2,
 }
+TIME = {
+    "neuron_access": 6.0,
+    "neuron_update": 3.7,
+    "spike": 30.0,
+    "axon_out": 5.1,
+    "axon_in": 16.0,
+    "synaptic_operation_dense": 3.8,
+    "synaptic_operation_sparse": 4.7,
+    "hop_east_west": 4.1,
+    "hop_north_south": 6.5,
+}
+BARRIERS = {1: 600, 2: 1000, 4: 1400, 29: 1800}
 
 
 def test_limits_are_the_published_ones():
@@ -83,6 +95,27 @@ def test_an_event_without_a_price_is_unknown_not_free():
         davies.joule("spike")
 
 
+def test_latencies_are_the_published_ones():
+    (table,) = load_target("loihi1").time
+    assert table.name == "sanafe"
+    assert set(TIME) == set(targets.LATENCIES)
+    assert {event: entry.value for event, entry in table.latencies.items()} == TIME
+    assert {least: entry.value for least, entry in table.barriers.items()} == BARRIERS
+    assert {entry.unit for entry in (*table.latencies.values(), *table.barriers.values())} == {"ns"}
+    assert (table.link_buffer.value, table.link_buffer.unit) == (16, "messages per link")
+    assert {event: table.picoseconds(event) for event in TIME} == {
+        event: round(1000 * nanoseconds) for event, nanoseconds in TIME.items()
+    }
+
+
+@pytest.mark.parametrize(
+    ("tiles", "nanoseconds"), [(1, 600), (2, 1000), (3, 1000), (4, 1400), (28, 1400), (29, 1800), (32, 1800)]
+)
+def test_the_barrier_grows_with_the_tiles(tiles, nanoseconds):
+    (table,) = load_target("loihi1").time
+    assert table.barrier(tiles) == 1000 * nanoseconds
+
+
 def test_every_number_has_unit_and_source():
     raw = tomllib.loads((resources.files("compiler.targets") / "loihi1.toml").read_text("utf-8"))
 
@@ -94,7 +127,8 @@ def test_every_number_has_unit_and_source():
                 yield value
 
     found = list(leaves(raw))
-    assert len(found) == len(LIMITS) + len(CHOICES) + len(DAVIES) + len(SANAFE)
+    times = len(TIME) + len(BARRIERS) + 1
+    assert len(found) == len(LIMITS) + len(CHOICES) + len(DAVIES) + len(SANAFE) + times + 1  # static power
     assert all(entry["unit"] and entry["source"] for entry in found)
 
 
@@ -152,12 +186,18 @@ def test_every_fault_is_told_at_once(tmp_path):
         ("values = [2, 3, 4, 5, 6, 8]", 'values = [2, "3"]'),
         ('spike = { value = 69.3, unit = "pJ"', 'spkie = { value = 69.3, unit = "nJ"'),
         ('neuron_active = { value = 72.8, unit = "pJ", source', 'neuron_active = { value = inf, unit = " ", source'),
+        ('neuron_access = { value = 6.0, unit = "ns"', 'neuron_acess = { value = -6.0, unit = "us"'),
+        ('axon_out = { value = 5.1, unit = "ns",', "axon_out = { value = 5.10001,"),
+        ('link_buffer = { value = 16, unit = "messages per link"', 'link_buffer = { value = 1.5, unit = "messages"'),
+        ("barrier.1 = { value = 600,", "barrier.0 = { value = 600,"),
+        ("barrier.2 = { value = 1000,", "barrier.two = { value = 1000, tiles = 2,"),
     ):
         assert text.count(old) == 1
         text = text.replace(old, new)
     limits, prices = ", ".join(targets.LIMITS), ", ".join(targets.EVENTS)
+    latencies = f"{', '.join(targets.LATENCIES)}, link_buffer, barrier.N with a number of tiles N"
     assert faults(tmp_path / "x.toml", text) == [
-        "unknown key 'colour', allowed are name, title, limits, choices, energy",
+        "unknown key 'colour', allowed are name, title, limits, choices, energy, time, static",
         "title: is 1, a text is needed",
         "limits.mesh.height: is missing",
         f"limits.mesh.heigth: unknown, allowed are {limits}",
@@ -173,19 +213,36 @@ def test_every_fault_is_told_at_once(tmp_path):
         "energy.sanafe.neuron_active: unit is ' ', allowed is 'pJ'",
         f"energy.sanafe.spkie: unknown event, allowed are {prices}",
         "energy.sanafe.spkie: unit is 'nJ', allowed is 'pJ'",
+        "time.sanafe.neuron_access: is missing",
+        "time.sanafe.barrier.1: is missing",
+        "time.sanafe.neuron_acess: value is -6.0, a finite number from 0 is needed",
+        f"time.sanafe.neuron_acess: unknown, allowed are {latencies}",
+        "time.sanafe.neuron_acess: unit is 'us', allowed is 'ns'",
+        "time.sanafe.axon_out: lacks unit; give value, unit, source",
+        "time.sanafe.axon_out: value is 5.10001, a multiple of 0.001 is needed",
+        "time.sanafe.link_buffer: value is 1.5, a whole number is needed",
+        f"time.sanafe.barrier.0: unknown, allowed are {latencies}",
+        "time.sanafe.barrier.two: unknown key 'tiles', allowed are value, unit, source",
+        f"time.sanafe.barrier.two: unknown, allowed are {latencies}",
     ]
 
 
 def test_a_file_without_its_parts(tmp_path):
     path = tmp_path / "x.toml"
-    assert faults(path, 'name = "x"') == [f"{key}: is missing" for key in ("title", "limits", "choices", "energy")]
+    assert faults(path, 'name = "x"') == [
+        f"{key}: is missing" for key in ("title", "limits", "choices", "energy", "time")
+    ]
     assert faults(path, "name = ") == ["is not TOML (Invalid value (at end of document)); mend it"]
     assert faults(path, TEXT.replace('title = "SANA-FE\'s fit to a Nahuku board"\n', "")) == [
-        "energy.sanafe: lacks its title; give title and prices"
+        "energy.sanafe: lacks its title; give title and prices",
+        "time.sanafe: lacks its title; give title and latencies",
+    ]
+    assert faults(path, TEXT[: TEXT.index("[time.sanafe]")] + "[time]\nsanafe = 1") == [
+        "time.sanafe: lacks its title; give title and latencies"
     ]
     assert faults(
         path, TEXT.replace('spike = { value = 69.3, unit = "pJ", source = "SANA-FE: soma spike" }', "spike = 69")
-    ) == ["spike: is 69, not an entry with value, unit and source"]
+    ) == ["energy.sanafe.spike: is 69, not an entry with value, unit and source"]
     with pytest.raises(OptionError) as caught:
         read_target(tmp_path / "no.toml")
     assert str(caught.value) == (
@@ -196,3 +253,55 @@ def test_a_file_without_its_parts(tmp_path):
 def test_a_target_file_is_read_as_it_is_shipped(tmp_path):
     (tmp_path / "x.toml").write_text(TEXT, "utf-8")
     assert read_target(tmp_path / "x.toml") == load_target("loihi1")
+
+
+# -- tables of one's own -----------------------------------------------------------------------------------------------
+
+MINE = """
+[energy.mine]
+title = "Measured in our lab"
+neuron_active = { value = 80.0, unit = "pJ", source = "board 7" }
+"""
+
+
+def test_tables_by_name_or_from_a_file(tmp_path):
+    chip = load_target("loihi1")
+    assert [table.name for table in with_tables(chip, "davies2018").energy] == ["davies2018"]
+    assert with_tables(chip, "davies2018").time == chip.time
+    (tmp_path / "mine.toml").write_text(MINE)
+    found = with_tables(chip, str(tmp_path / "mine.toml"))
+    assert [(table.name, table.joule("neuron_active")) for table in found.energy] == [("mine", 80e-12)]
+    assert (found.time, found.limits, found.static) == (chip.time, chip.limits, chip.static)
+
+
+def test_tables_that_are_not_there_or_wrong(tmp_path):
+    chip, path = load_target("loihi1"), tmp_path / "mine.toml"
+
+    def told(name):
+        with pytest.raises(OptionError) as caught:
+            with_tables(chip, str(name))
+        return str(caught.value).splitlines()
+
+    assert told("davis") == ["--table davis: unknown; allowed: davies2018, sanafe, or a file that ends in .toml"]
+    assert told(path) == [f"{path}: cannot be read (No such file or directory); give a file of tables"]
+    path.write_text("limits = 3")
+    assert told(path) == [
+        f"{path}: unknown key 'limits', allowed are energy, time",
+        f"{path}: holds no table; give [energy.NAME] or [time.NAME] with title and entries",
+    ]
+    path.write_text(
+        MINE.replace("80.0", "-80.0").replace('unit = "pJ", ', "").replace("[energy.mine]", "[energy.mine]\nhopp = 1")
+    )
+    assert told(path) == [
+        f"{path}: energy.mine.hopp: is 1, not an entry with value, unit and source",
+        f"{path}: energy.mine.neuron_active: lacks unit; give value, unit, source",
+        f"{path}: energy.mine.neuron_active: value is -80.0, a finite number from 0 is needed",
+    ]
+
+
+def test_static_power_has_its_unit(tmp_path):
+    path = tmp_path / "x.toml"
+    assert faults(path, TEXT.replace('value = 104.4, unit = "mW"', 'value = 104.4, unit = "W"')) == [
+        "static.frady2020: unit is 'W', allowed is 'mW'"
+    ]
+    assert load_target("loihi1").static["frady2020"].value == 104.4

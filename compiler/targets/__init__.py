@@ -6,7 +6,7 @@ import math
 import os
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib import resources
 from pathlib import Path
@@ -20,6 +20,7 @@ _NOT_MODELLED = {
 }
 
 PRICE_UNIT = "pJ"
+POWER_UNIT = "mW"
 TIME_UNIT = "ns"
 PICOSECONDS = 1000
 """In a TIME_UNIT; finer latencies are refused."""
@@ -113,7 +114,7 @@ class TimeTable:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Target:
-    """A chip: integer limits, permitted values, named energy tables and named time tables."""
+    """A chip: integer limits, permitted values, named energy and time tables, static power by source (of a chip)."""
 
     name: str
     title: str
@@ -121,6 +122,7 @@ class Target:
     choices: Mapping[str, tuple[int, ...]]
     energy: tuple[EnergyTable, ...]
     time: tuple[TimeTable, ...]
+    static: Mapping[str, Quantity]
 
     def limit(self, rule: str) -> int:
         """Largest amount that `rule`, for example ``core.axons_in``, allows."""
@@ -170,20 +172,15 @@ def read_target(path: str | os.PathLike[str]) -> Target:
     OptionError
         If it cannot be read, or entries are wrong: one line for each.
     """
-    path = Path(path)
-    try:
-        raw = tomllib.loads(path.read_text("utf-8"))
-    except OSError as error:
-        raise OptionError(f"{path}: cannot be read ({error.strerror or error}); give a target file") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise OptionError(f"{path}: is not TOML ({error}); mend it") from error
+    raw = _read(path, "a target file")
     faults = _head_faults(raw)
     limits = _rules(raw, "limits", "value", LIMITS, faults)
     choices = _rules(raw, "choices", "values", CHOICES, faults)
-    energy = raw.get("energy", {})
-    prices = _prices(energy, faults)
-    time = raw.get("time", {})
-    latencies = _latencies(time, faults)
+    energy, time = _cost_tables(raw, faults)
+    static = _entries(raw.get("static", {}), "value", "", faults)
+    for name, entry in static.items():
+        _check_entry(f"static.{name}", entry, "value", faults)
+        _check_unit(f"static.{name}", entry, POWER_UNIT, faults)
     if faults:
         raise OptionError("\n".join(f"{path}: {fault}" for fault in faults))
     return Target(
@@ -191,31 +188,84 @@ def read_target(path: str | os.PathLike[str]) -> Target:
         title=raw["title"],
         limits={rule: Quantity(**entry) for rule, entry in limits.items()},
         choices={rule: tuple(entry["values"]) for rule, entry in choices.items()},
-        energy=tuple(
-            EnergyTable(
-                name=key,
-                title=energy[key]["title"],
-                prices={event: Quantity(**price) for event, price in found.items()},
-            )
-            for key, found in prices.items()
-        ),
-        time=tuple(
-            TimeTable(
-                name=key,
-                title=time[key]["title"],
-                latencies={event: Quantity(**found[event]) for event in LATENCIES},
-                barriers={int(rule[len(BARRIER) :]): Quantity(**found[rule]) for rule in found if _is_barrier(rule)},
-                link_buffer=Quantity(**found[LINK_BUFFER]),
-            )
-            for key, found in latencies.items()
-        ),
+        energy=energy,
+        time=time,
+        static={name: Quantity(**entry) for name, entry in static.items()},
+    )
+
+
+def with_tables(target: Target, name: str) -> Target:
+    """Choose the tables that price and time a run: one of the target's by name, or those of a file.
+
+    Parameters
+    ----------
+    target : Target
+        Chip.
+    name : str
+        Of a table, or of a TOML file with ``[energy.NAME]`` or ``[time.NAME]`` sections as a target file has them.
+        What a file lacks of the two kinds stays that of the target.
+
+    Raises
+    ------
+    OptionError
+        If there is no such table, or the file is wrong: one line for each fault.
+    """
+    energy = tuple(table for table in target.energy if table.name == name)
+    time = tuple(table for table in target.time if table.name == name)
+    if not energy and not time:
+        names = sorted({table.name for table in target.energy} | {table.name for table in target.time})
+        if not name.endswith(".toml"):
+            raise OptionError(f"--table {name}: unknown; allowed: {', '.join(names)}, or a file that ends in .toml")
+        raw = _read(name, "a file of tables")
+        faults = [f"unknown key {key!r}, allowed are energy, time" for key in raw if key not in ("energy", "time")]
+        if not {"energy", "time"} & raw.keys():
+            faults.append("holds no table; give [energy.NAME] or [time.NAME] with title and entries")
+        energy, time = _cost_tables(raw, faults)
+        if faults:
+            raise OptionError("\n".join(f"{name}: {fault}" for fault in faults))
+    return replace(target, energy=energy or target.energy, time=time or target.time)
+
+
+def _read(path: str | os.PathLike[str], what: str) -> dict[str, Any]:
+    try:
+        return tomllib.loads(Path(path).read_text("utf-8"))
+    except OSError as error:
+        raise OptionError(f"{path}: cannot be read ({error.strerror or error}); give {what}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise OptionError(f"{path}: is not TOML ({error}); mend it") from error
+
+
+def _cost_tables(raw: Mapping[str, Any], faults: list[str]) -> tuple[tuple[EnergyTable, ...], tuple[TimeTable, ...]]:
+    """Energy and time tables; none of a kind that has a fault."""
+    energy, time = raw.get("energy", {}), raw.get("time", {})
+    before = len(faults)
+    prices, latencies = _prices(energy, faults), _latencies(time, faults)
+    if len(faults) > before:
+        return (), ()
+    return tuple(
+        EnergyTable(
+            name=key,
+            title=energy[key]["title"],
+            prices={event: Quantity(**price) for event, price in found.items()},
+        )
+        for key, found in prices.items()
+    ), tuple(
+        TimeTable(
+            name=key,
+            title=time[key]["title"],
+            latencies={event: Quantity(**found[event]) for event in LATENCIES},
+            barriers={int(rule[len(BARRIER) :]): Quantity(**found[rule]) for rule in found if _is_barrier(rule)},
+            link_buffer=Quantity(**found[LINK_BUFFER]),
+        )
+        for key, found in latencies.items()
     )
 
 
 def _head_faults(raw: Mapping[str, Any]) -> list[str]:
     known = ("name", "title", "limits", "choices", "energy", "time")
     faults = [f"{key}: is missing" for key in known if key not in raw]
-    faults += [f"unknown key {key!r}, allowed are {', '.join(known)}" for key in raw if key not in known]
+    allowed = (*known, "static")
+    faults += [f"unknown key {key!r}, allowed are {', '.join(allowed)}" for key in raw if key not in allowed]
     texts = [key for key in ("name", "title") if not isinstance(raw.get(key, ""), str)]
     return faults + [f"{key}: is {raw[key]!r}, a text is needed" for key in texts]
 
@@ -243,7 +293,9 @@ def _tables(raw: Any, kind: str, contents: str, faults: list[str]) -> dict[str, 
             faults.append(f"{kind}.{key}: lacks its title; give title and {contents}")
             continue
         entries = {name: entry for name, entry in table.items() if name != "title"}
-        tables[key] = _entries(entries, "value", "", faults)
+        own: list[str] = []
+        tables[key] = _entries(entries, "value", "", own)
+        faults += [f"{kind}.{key}.{fault}" for fault in own]
     return tables
 
 

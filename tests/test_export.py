@@ -1,0 +1,165 @@
+"""The command ``export`` and the files that it writes, without the programs that read them."""
+
+import argparse
+import hashlib
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from random_netlists import Axon, Neuron, build
+from test_timing import LOIHI, six_steps
+
+from compiler.errors import ModelError, OptionError
+from compiler.netlist import read_only
+from compiler.serialize import write_netlist
+from runtime import export, sanafe
+
+SIX_STEPS = """\
+# spikeloom netlist for SANA-FE 2.2.9 and its loihi.yaml; give the neurons of group input 'spikes'
+network:
+  name: spikeloom
+  groups:
+    - name: input
+      attributes: {log_spikes: false}
+      neurons:
+        - 0: {soma_hw_name: 'loihi_inputs[0]'}
+        - 1: {soma_hw_name: 'loihi_inputs[1]'}
+    - name: layer0
+      attributes: {soma_hw_name: loihi_lif, reset: 0.0, input_decay: 0.0, log_spikes: true}
+      neurons:
+        - 0: {threshold: 80.0, leak_decay: 0.199951171875, bias: 0.0, synapse_hw_name: loihi_dense_synapse}
+        - 1: {threshold: 80.0, leak_decay: 0.199951171875, bias: 0.0, synapse_hw_name: loihi_dense_synapse}
+    - name: layer1
+      attributes: {soma_hw_name: loihi_lif, reset: 0.0, input_decay: 0.0, log_spikes: true}
+      neurons:
+        - 0: {threshold: 80.0, leak_decay: 0.199951171875, bias: 0.0, synapse_hw_name: loihi_dense_synapse}
+  edges:
+    - input -> layer0:
+        type: sparse
+        source_target_pairs: [[0, 0], [0, 1], [1, 0], [1, 1]]
+        weight: [60.0, -30.0, 50.0, 90.0]
+    - layer0 -> layer1:
+        type: sparse
+        source_target_pairs: [[0, 0], [1, 0]]
+        weight: [100.0, 70.0]
+mappings:
+  - input.0..1: {core: '1.1'}
+  - layer0.0..1: {core: '1.0'}
+  - layer1.0..0: {core: '5.0'}
+"""
+
+
+def run(*words):
+    """What the command reports and prints."""
+    parser = argparse.ArgumentParser()
+    export.add_arguments(parser)
+    report, text, code = export.export(parser.parse_args([str(word) for word in words]))
+    assert code == 0
+    return report, text(report)
+
+
+def lines(netlist):
+    return list(sanafe.export(netlist, LOIHI))
+
+
+def test_the_whole_file(tmp_path):
+    netlist, _, _ = six_steps()
+    write_netlist(netlist, tmp_path / "net.loom")
+    path = tmp_path / "net.yaml"
+    report, text = run(tmp_path / "net.loom", "--to", "sanafe", "-o", path)
+    assert path.read_text("utf-8") == SIX_STEPS
+    assert report == {
+        "path": str(path),
+        "format": "sanafe",
+        "bytes": len(SIX_STEPS),
+        "sha256": hashlib.sha256(SIX_STEPS.encode()).hexdigest(),
+        "neurons": 3,
+        "synapses": 6,
+        "groups": ["input", "layer0", "layer1"],
+        "cores": ["1.0", "5.0"],
+        "input_cores": ["1.1"],
+    }
+    assert text == (
+        f"{path}: 3 neurons and 6 synapses for sanafe, {len(SIX_STEPS)} bytes\n"
+        "groups: input, layer0, layer1\n"
+        "cores (tile.core): 1.0, 5.0; of the inputs: 1.1"
+    )
+
+
+def test_neurons_are_mapped_in_the_order_of_their_compartments():
+    neurons = [Neuron(layer=layer) for layer in (0, 1, 0, 0)] + [Neuron(core=1)]
+    netlist = build(neurons, [Axon(source=0, targets=((0, 2),))], n_inputs=1, depths=[0, 1])
+    netlist = replace(netlist, neuron=read_only([5, 0, 9, 7, 8]), core_tile=read_only([31, 31]))
+    assert sanafe.members(netlist).tolist() == [0, 0, 3, 1, 2]
+    mapped = lines(netlist)[lines(netlist).index("mappings:") + 1 :]
+    assert mapped == [
+        "  - input.0..0: {core: '31.2'}",
+        "  - layer0.0..0: {core: '31.0'}",
+        "  - layer1.0..0: {core: '31.0'}",
+        "  - layer0.3..3: {core: '31.0'}",
+        "  - layer0.1..1: {core: '31.0'}",
+        "  - layer0.2..2: {core: '31.1'}",
+    ]
+
+
+def test_parameters_and_weights_are_exact():
+    neuron = Neuron(threshold=131071, decay_v=0, bias=-4095, bias_exponent=7)
+    axons = [Axon(source=0, targets=((0, -254),), exponent=-1), Axon(source=1, targets=((0, 6),), exponent=7)]
+    text = "\n".join(lines(build([neuron, Neuron(bias=1)], axons, n_inputs=2, depths=[0])))
+    assert "- 0: {threshold: 131071.0, leak_decay: 1.0, bias: -8190.0, " in text
+    assert f"bias: {1 / 64}, " in text
+    assert "weight: [-127.0, 768.0]" in text
+
+
+def test_a_neuron_names_the_unit_of_most_of_its_synapses():
+    axons = [Axon(source=i, targets=((0, 2), (1, 2)), exponent=i) for i in range(3)]
+    netlist = build([Neuron(), Neuron()], axons, n_inputs=3, depths=[0])
+    netlist = replace(netlist, format_index_bits=read_only([0, 10, 10]))
+    assert len(re.findall("loihi_sparse_synapse", "\n".join(lines(netlist)))) == 2
+    assert not sanafe.dense_synapses(netlist).any()
+    netlist = replace(netlist, format_index_bits=read_only([0, 0, 10]))
+    assert len(re.findall("loihi_dense_synapse", "\n".join(lines(netlist)))) == 2
+    assert sanafe.dense_synapses(netlist).all()
+
+
+def test_names_are_such_that_the_format_can_hold_them():
+    netlist, _, _ = six_steps()
+    layers = tuple(replace(layer, name=name) for layer, name in zip(netlist.layers, ("a.b c", "input"), strict=True))
+    assert sanafe.group_names(replace(netlist, layers=layers)) == ("a_b_c", "input_1")
+    layers = tuple(replace(layer, name="fc") for layer in netlist.layers)
+    assert sanafe.group_names(replace(netlist, layers=layers)) == ("fc_0", "fc_1")
+
+
+def test_channels_fill_cores_of_their_own():
+    netlist = replace(six_steps()[0], taxels=1030)
+    text = "\n".join(lines(netlist))
+    assert "- 1029: {soma_hw_name: 'loihi_inputs[5]'}" in text
+    assert "- input.0..1023: {core: '1.1'}\n  - input.1024..1029: {core: '1.2'}" in text
+
+
+def test_a_current_that_lasts_cannot_be_said(tmp_path):
+    netlist, _, _ = six_steps()
+    decays = np.array([4095, 4095, 2048])
+    write_netlist(replace(netlist, decay_u=read_only(decays)), tmp_path / "net.loom")
+    with pytest.raises(ModelError) as caught:
+        run(tmp_path / "net.loom", "--to", "sanafe", "-o", tmp_path / "net.yaml")
+    assert str(caught.value) == (
+        "layer1: a current that outlasts its step found (decay_u 2048), SANA-FE keeps currents as floats, "
+        "not as the chip does; export networks without currents"
+    )
+    assert [path.name for path in tmp_path.iterdir()] == ["net.loom"]
+
+
+def test_a_place_that_cannot_be_written(tmp_path):
+    write_netlist(six_steps()[0], tmp_path / "net.loom")
+    before = (tmp_path / "net.loom").read_bytes()
+    for place, why in (
+        (tmp_path / "no" / "x.yaml", "the folder does not exist; make it first"),
+        (tmp_path, "is not a regular file; give the name of a file to write"),
+        (tmp_path / "net.loom", f"is an input of this command ({tmp_path / 'net.loom'}); give another name"),
+    ):
+        with pytest.raises(OptionError) as caught:
+            run(tmp_path / "net.loom", "--to", "sanafe", "-o", place)
+        assert str(caught.value) == f"-o {place}: {why}"
+    assert (tmp_path / "net.loom").read_bytes() == before

@@ -1,0 +1,365 @@
+"""The time models against their definition, against a published run to the decimal, and by hand."""
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from random_netlists import Axon, Neuron, build, by_engine, large_netlist, netlists, recordings
+
+from compiler.errors import ModelError
+from compiler.netlist import read_only
+from compiler.targets import LATENCIES, Quantity, load_target
+from runtime import cost, energy, engine, sanafe, timing
+from runtime.timing_spec import Chip
+
+LOIHI = load_target("loihi1")
+(SANAFE,) = LOIHI.time
+PICO = 1000
+
+
+def table(link_buffer=16, **latencies):
+    """SANA-FE's table with other values."""
+    return replace(
+        SANAFE,
+        latencies={
+            event: Quantity(value=latencies.get(event, entry.value), unit="ns", source="test")
+            for event, entry in SANAFE.latencies.items()
+        },
+        link_buffer=Quantity(value=link_buffer, unit="messages", source="test"),
+    )
+
+
+def both(netlist, trace, events, *, times=SANAFE, input_tiles=()):
+    """Simple and detailed times of one recording."""
+    clock = timing.prepare(netlist, LOIHI, times, input_tiles=input_tiles)
+    batch = trace.spikes[None], trace.updated[None], events[None]
+    return timing.simple(clock, *batch), timing.detailed(clock, *batch)
+
+
+def assert_as_defined(netlist, trace, events, *, times=SANAFE, input_tiles=()):
+    """Every figure of both models is the definition's; returns what it says."""
+    simple, detailed = both(netlist, trace, events, times=times, input_tiles=input_tiles)
+    wanted = Chip(netlist, LOIHI, times, input_tiles).run(trace.spikes, trace.updated, events)
+
+    def column(name, scale=PICO):
+        return np.array([[getattr(step, name) for step in wanted]]) / scale
+
+    np.testing.assert_array_equal(simple.duration_ns, column("simple"))
+    cores = len(wanted[0].generation) if wanted else netlist.n_cores + len(input_tiles)
+    for name in ("generation", "processing"):
+        total = [sum(getattr(step, name)[core] for step in wanted) / PICO for core in range(cores)]
+        np.testing.assert_array_equal(getattr(simple, f"{name}_ns"), [total])
+    loads = [step.generation + step.processing for step in wanted]
+    critical = [load.index(max(load)) for load in loads]
+    np.testing.assert_array_equal(simple.critical_core, [[core % cores for core in critical]])
+    np.testing.assert_array_equal(simple.receiving, [[core >= cores for core in critical]])
+    for name, field in (("detailed", "duration"), ("sent", "sent"), ("processed", "processed"), ("blocked", "blocked")):
+        np.testing.assert_array_equal(getattr(detailed, f"{field}_ns"), column(name), err_msg=name)
+    np.testing.assert_array_equal(detailed.critical_core, column("critical_core", 1))
+    np.testing.assert_array_equal(detailed.receiving, column("receiving", 1))
+    np.testing.assert_array_equal(detailed.peak_load, column("peak_load", 1))
+    return wanted
+
+
+# -- a published run ---------------------------------------------------------------------------------------------------
+
+
+def six_steps():
+    """Two inputs, h0 and h1 one tile north of them, o one tile east of these; what SANA-FE 2.2.9 was run on."""
+    neurons = [Neuron(threshold=80), Neuron(threshold=80), Neuron(threshold=80, core=1, layer=1)]
+    axons = [
+        Axon(source=0, targets=((0, 60), (1, -30))),
+        Axon(source=1, targets=((0, 50), (1, 90))),
+        Axon(source=2, core=1, targets=((0, 100),)),
+        Axon(source=3, core=1, targets=((0, 70),)),
+    ]
+    netlist = build(neurons, axons, n_inputs=2, depths=[0, 1])
+    netlist = replace(netlist, core_tile=read_only([8, 9]), format_index_bits=read_only([0]))
+    # an event acts in the step after the one in which its channel fires there
+    events = np.array([[0, 1, 1, 0, 1, 0], [0, 1, 0, 0, 1, 1]], np.uint8)
+    return netlist, events, by_engine(netlist, events, gated=False)
+
+
+DETAILED = [1058.8, 1068.7, 1039.7, 1058.8, 1068.7, 1078.4]
+SIMPLE = [1047.2, 1054.5, 1039.7, 1047.2, 1054.5, 1054.5]
+
+
+def test_the_published_run_to_the_decimal():
+    netlist, events, trace = six_steps()
+    assert np.argwhere(trace.spikes).tolist() == [[1, 0], [2, 2], [4, 0], [5, 1], [5, 2]]
+    assert trace.membranes[1:5, 1].tolist() == [3840, -1153, -230, 3795]
+    simple, detailed = both(netlist, trace, events, input_tiles=(0,))
+    assert detailed.duration_ns[0].round(1).tolist() == DETAILED
+    assert simple.duration_ns[0].tolist() == SIMPLE
+    assert detailed.duration_ns.sum() == pytest.approx(6373.1, abs=0.05)
+    assert simple.duration_ns.sum() == pytest.approx(6297.6, abs=0.05)
+    assert_as_defined(netlist, trace, events, input_tiles=(0,))
+
+
+ENERGY_PJ = {
+    "synapse": [142.0, 106.5, 0, 142.0, 106.5, 35.5],
+    "soma": [153.6, 266.1, 287.7, 196.8, 266.1, 357.0],
+    "network": [230.4, 229.2, 0, 230.4, 229.2, 114.0],
+}
+
+
+def test_the_published_energies_to_the_decimal():
+    netlist, events, trace = six_steps()
+    # each step as a recording of its own; a spike of the last step is sent and processed in it, as everywhere
+    sent = np.column_stack([events[:, 1:], np.zeros(2, np.uint8)]).T
+    counts = replace(trace.counts, inputs=sent, spikes=trace.spikes.astype(np.int64))
+    updated = sanafe.updates(netlist, events[None], trace.spikes[None], trace.membranes[None])[0]
+    updates = energy.updates_by_core(netlist, updated[:, None])
+    amounts = energy.count_by_core(netlist, LOIHI, counts, updates, 1, input_tiles=(0,))
+    (fit,) = (entry for entry in LOIHI.energy if entry.name == "sanafe")
+    parts = energy.by_part(fit, amounts)
+    assert {part: (1e12 * joules.sum(axis=1)).round(1).tolist() for part, joules in parts.items()} == ENERGY_PJ
+    assert 1e12 * sum(joules.sum() for joules in parts.values()) == pytest.approx(3093.0, abs=0.05)
+
+
+def test_updates_as_the_reference_counts_them():
+    netlist, events, trace = six_steps()
+    seen = sanafe.updates(netlist, events[None], trace.spikes[None], trace.membranes[None])[0]
+    # o fired in step 2 on what arrived; its current still holds that in step 3, and nothing else happens to it
+    assert np.argwhere(trace.updated & ~seen).tolist() == [[3, 2]]
+    assert not np.any(seen & ~trace.updated)
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.data())
+def test_updates_of_the_reference_by_hand(data):
+    netlist = data.draw(netlists(weight_exponents=(0,)))
+    events = data.draw(recordings(netlist))
+    trace = by_engine(netlist, events, gated=False)
+    seen = sanafe.updates(netlist, events[None], trace.spikes[None], trace.membranes[None])[0]
+    axon = netlist.axon_of_synapse()
+    for t, c in np.ndindex(*trace.spikes.shape):
+        active = set(np.flatnonzero(events[:, t]).tolist())
+        active |= {netlist.n_inputs + int(other) for other in np.flatnonzero(trace.spikes[t - 1])} if t else set()
+        heard = set(netlist.axon_source[axon[netlist.synapse_compartment() == c]].tolist())
+        rests = t == 0 or trace.spikes[t - 1, c] or trace.membranes[t - 1, c] == 0
+        assert seen[t, c] == bool(netlist.bias_mantissa[c] or not rests or active & heard)
+        assert trace.updated[t, c] >= seen[t, c]
+
+
+def test_inputs_on_no_core_are_processed_at_once_and_from_the_start():
+    netlist, events, trace = six_steps()
+    simple, detailed = both(netlist, trace, events)
+    # step 1 (from 0): both channels act, h0 fires; its message meets nobody
+    received = 2 * (16 + 2 * 3.8)
+    swept = 2 * 6 + 2 * 3.7 + 30
+    assert simple.processing_ns[0].tolist() == pytest.approx([6 * (16 + 2 * 3.8), 3 * 19.8])
+    assert simple.duration_ns[0, 1] == pytest.approx(1000 + swept + 5.1)
+    assert (simple.critical_core[0, 1], simple.receiving[0, 1]) == (0, False)
+    # h0 is swept and updated, fires and is sent, flies east and is processed; or h1 is swept at last
+    assert detailed.duration_ns[0, 1] == pytest.approx(1000 + max(6 + 3.7 + 30 + 5.1 + 4.1 + 19.8, swept + 5.1))
+    assert detailed.processed_ns[0, 0] == 0
+    assert detailed.processed_ns[0, 1] == pytest.approx(max(received, 68.7))
+
+
+# -- the definition ----------------------------------------------------------------------------------------------------
+
+
+@st.composite
+def cases(draw):
+    """A network on any tiles, a recording, a table with large and small latencies, tiles of inputs or none."""
+    netlist = draw(netlists(weight_exponents=(0,)))
+    tile = st.sampled_from([0, 1, 8, 12, 31])
+    tiles = draw(st.lists(tile, min_size=netlist.n_cores, max_size=netlist.n_cores))
+    index_bits = draw(st.sampled_from([0, 10]))
+    netlist = replace(
+        netlist,
+        core_tile=read_only(tiles),
+        format_index_bits=read_only([index_bits] * len(netlist.format_index_bits)),
+    )
+    latency = st.sampled_from([0.0, 0.001, 1.0, 3.7, 500.0])
+    chosen = {event: draw(latency) for event in LATENCIES}
+    times = table(draw(st.sampled_from([0, 1, 16])), **chosen)
+    events = draw(recordings(netlist, max_length=5))
+    input_tiles = draw(st.sampled_from([(), (0,), (9,)]))
+    return netlist, events, times, input_tiles
+
+
+@settings(deadline=None, max_examples=150)
+@given(cases(), st.integers(0, 2**32 - 1))
+def test_kernels_and_definition_agree_exactly(case, seed):
+    netlist, events, times, input_tiles = case
+    steps = events.shape[1] + 2
+    rng = np.random.default_rng(seed)
+    # any spikes will do: the models do not ask where they come from
+    spikes = rng.random((steps, netlist.n_compartments)) < 0.5
+    trace = replace(by_engine(netlist, events[:, :0]), spikes=spikes, updated=spikes | (rng.random(spikes.shape) < 0.5))
+    assert_as_defined(netlist, trace, events, times=times, input_tiles=input_tiles)
+
+
+@pytest.mark.parametrize("link_buffer", [0, 2, 16])
+@pytest.mark.parametrize("input_tiles", [(), (1,)])
+def test_kernels_and_definition_agree_on_a_crowded_mesh(link_buffer, input_tiles):
+    netlist = replace(large_netlist(1, proved=True), core_tile=read_only([0, 0, 3, 17, 30]))
+    rng = np.random.default_rng(2)
+    spikes = rng.random((3, netlist.n_compartments)) < 0.3
+    events = (rng.random((netlist.n_inputs, 3)) < 0.5).astype(np.uint8)
+    trace = replace(by_engine(netlist, events[:, :0]), spikes=spikes, updated=spikes | (rng.random(spikes.shape) < 0.5))
+    wanted = assert_as_defined(netlist, trace, events, times=table(link_buffer), input_tiles=input_tiles)
+    assert (max(step.blocked for step in wanted) > 0) == (link_buffer < 16)
+
+
+# -- by hand -----------------------------------------------------------------------------------------------------------
+
+
+def pipe(tiles, targets=1, senders=1):
+    """Neurons of a first core that each feed `targets` of a second one."""
+    neurons = [Neuron() for _ in range(senders)] + [Neuron(core=1, layer=1) for _ in range(targets)]
+    axons = [Axon(source=1 + i, core=1, targets=tuple((j, 2) for j in range(targets))) for i in range(senders)]
+    netlist = build(neurons, axons, n_inputs=1, depths=[0, 1])
+    return replace(netlist, core_tile=read_only(tiles))
+
+
+def fire(netlist, slots):
+    """One step in which these compartments fire and nobody else has work to do."""
+    spikes = np.zeros((1, netlist.n_compartments), np.bool_)
+    spikes[0, slots] = True
+    return replace(by_engine(netlist, np.zeros((netlist.n_inputs, 0), np.uint8)), spikes=spikes, updated=spikes.copy())
+
+
+NOTHING = np.zeros((1, 1), np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("tiles", "flight", "barrier"), [((0, 0), 0, 600), ((0, 1), 4.1, 1000), ((11, 0), 3 * 4.1 + 6.5, 1000)]
+)
+def test_one_message(tiles, flight, barrier):
+    netlist = pipe(tiles, targets=3)
+    simple, detailed = both(netlist, fire(netlist, [0]), NOTHING)
+    sent, received = 6 + 3.7 + 30 + 5.1, 16 + 3 * 4.7
+    assert simple.duration_ns[0, 0] == pytest.approx(barrier + max(sent, received))
+    assert detailed.duration_ns[0, 0] == pytest.approx(barrier + sent + flight + received)
+    assert detailed.sent_ns[0, 0] == pytest.approx(sent)
+    assert (detailed.critical_core[0, 0], detailed.receiving[0, 0]) == (1, True)
+    hops = round(abs(tiles[0] % 8 - tiles[1] % 8) + abs(tiles[0] // 8 - tiles[1] // 8))
+    assert detailed.peak_load[0, 0] == 1 / (hops + 2)
+
+
+def test_the_longest_of_sweep_and_receiving_is_critical():
+    netlist = pipe((0, 1), senders=40)
+    simple, detailed = both(netlist, fire(netlist, []), NOTHING)
+    assert simple.duration_ns[0, 0] == detailed.duration_ns[0, 0] == 1000 + 40 * 6
+    assert (simple.critical_core[0, 0], simple.receiving[0, 0]) == (0, False)
+    assert (detailed.critical_core[0, 0], detailed.receiving[0, 0]) == (0, False)
+
+
+def test_a_sender_waits_while_its_links_are_full():
+    netlist = pipe((0, 1), targets=8, senders=40)
+    trace = fire(netlist, range(40))
+    slow = table(16, spike=0.0, axon_in=1000.0)
+    _, detailed = both(netlist, trace, NOTHING, times=slow)
+    assert detailed.blocked_ns[0, 0] == 0  # 40 messages put 2/3 each on two links, which hold 16 each
+    _, detailed = both(netlist, trace, NOTHING, times=table(4, spike=0.0, axon_in=1000.0))
+    # the 13th message finds 12 on two links that hold 8; every message ahead takes as long as the mean
+    assert detailed.blocked_ns[0, 0] > 1000 / 3
+    assert detailed.sent_ns[0, 0] == pytest.approx(40 * (6 + 3.7 + 5.1) + detailed.blocked_ns[0, 0])
+
+
+def test_a_recording_ends_with_its_own_steps():
+    netlist, events, trace = six_steps()
+    clock = timing.prepare(netlist, LOIHI, SANAFE)
+    batch = [np.stack([a, a]) for a in (trace.spikes, trace.updated, events)]
+    cut = [a[:4].copy() for a in (trace.spikes, trace.updated)]
+    for model in (timing.simple, timing.detailed):
+        found = model(clock, *batch, steps=np.array([6, 4]))
+        alone = model(clock, cut[0][None], cut[1][None], events[None])
+        for field in fields(found):
+            whole, part = getattr(found, field.name), getattr(alone, field.name)
+            if whole.shape[1] == 6:
+                np.testing.assert_array_equal(whole[1, :4], part[0])
+                assert np.all(whole[1, 4:] == (-1 if field.name == "critical_core" else 0))
+            else:
+                np.testing.assert_array_equal(whole[1], part[0])
+
+
+def test_input_cores_go_where_there_is_room():
+    netlist, _, _ = six_steps()
+    assert timing.input_tiles(netlist, LOIHI) == (8,)
+    full = replace(netlist, core_tile=read_only([8] * 4 + [9] * 4), core_compartments=read_only([0, 2] + [3] * 7))
+    assert timing.input_tiles(full, LOIHI) == (0,)
+    wide = replace(full, taxels=3000)
+    assert timing.input_tiles(wide, LOIHI) == (0, 0, 0)
+    everywhere = replace(netlist, core_tile=read_only(list(range(32)) * 4))
+    with pytest.raises(ModelError) as caught:
+        timing.input_tiles(everywhere, LOIHI)
+    assert str(caught.value) == "input channels: 1 cores needed, the chip has 0 left; compile for fewer cores"
+
+
+def test_input_channels_spread_over_their_cores():
+    netlist = replace(six_steps()[0], taxels=1500)
+    clock = timing.prepare(netlist, LOIHI, SANAFE, input_tiles=(3, 4))
+    size = netlist.n_compartments
+    assert clock.tables.start.tolist() == [0, 2, size, size + 1024, size + 1500]
+    assert clock.barrier == 1400 * PICO  # four tiles
+
+
+# -- energy by part and core -------------------------------------------------------------------------------------------
+
+
+def test_parts_and_cores_add_up_to_the_estimate():
+    netlist = replace(large_netlist(3, proved=True), core_tile=read_only([0, 0, 3, 17, 30]))
+    form = np.arange(len(netlist.format_index_bits)) % 2 * 10
+    netlist = replace(netlist, format_index_bits=read_only(form))
+    events = (np.random.default_rng(4).random((3, netlist.n_inputs, 12)) < 0.3).astype(np.uint8)
+    lengths = np.array([12, 5, 0])
+    trace = engine.simulate(netlist, events, lengths=lengths, spikes=True, updated=True)
+    estimate = cost.estimate(cost.prepare(netlist, LOIHI), trace.counts, lengths)
+    updates = energy.updates_by_core(netlist, trace.updated)
+    amounts = energy.count_by_core(netlist, LOIHI, trace.counts, updates, lengths + netlist.max_depth)
+    assert all(amount.shape == (3, netlist.n_cores) for amount in amounts.values())
+    for event, amount in amounts.items():
+        np.testing.assert_allclose(amount.sum(axis=1), estimate.events[event].sum(axis=1), err_msg=event)
+        assert amount.any(), event
+    for priced in LOIHI.energy:
+        for found in (amounts, estimate.events):
+            whole = sum(joules.sum(axis=1) for joules in energy.by_part(priced, found).values())
+            np.testing.assert_allclose(whole, estimate.energy[priced.name].sum(axis=1), rtol=1e-12)
+
+
+def test_amounts_of_a_core_are_its_own():
+    netlist, _, trace = six_steps()
+    counts = replace(trace.counts, inputs=trace.counts.inputs[None], spikes=trace.counts.spikes[None])
+    updates = energy.updates_by_core(netlist, trace.updated[None])
+    amounts = energy.count_by_core(netlist, LOIHI, counts, updates, 6)
+    # h0 fires twice and h1 once, all to o; o fires twice, to nobody; six events reach two neurons each
+    assert amounts["spike"].tolist() == [[3, 2]]
+    assert amounts["packet"].tolist() == amounts["hop_east_west"].tolist() == [[3, 0]]
+    assert amounts["hop_north_south"].tolist() == [[0, 0]]
+    assert amounts["synaptic_operation_dense"].tolist() == [[12, 3]]
+    assert amounts["neuron_active"].tolist() == updates.tolist()
+    assert amounts["neuron_idle"].tolist() == [[12 - updates[0, 0], 6 - updates[0, 1]]]
+    fed = energy.count_by_core(netlist, LOIHI, counts, updates, 6, input_tiles=(0,))
+    assert fed["packet"].tolist() == [[3, 0, 6]]
+    assert fed["hop_north_south"].tolist() == [[0, 0, 6]]
+    assert fed["neuron_idle"][:, 2:].tolist() == [[0]]
+    sparse = energy.count_by_core(netlist, LOIHI, counts, updates, 6, dense=np.zeros(netlist.n_synapses, np.bool_))
+    assert sparse["synaptic_operation_sparse"].tolist() == [[12, 3]]
+    assert not sparse["synaptic_operation_dense"].any()
+
+
+def test_a_table_that_lacks_a_price_says_so():
+    netlist, _, trace = six_steps()
+    counts = replace(trace.counts, inputs=trace.counts.inputs[None], spikes=trace.counts.spikes[None])
+    amounts = energy.count_by_core(netlist, LOIHI, counts, energy.updates_by_core(netlist, trace.updated[None]), 6)
+    (davies,) = (entry for entry in LOIHI.energy if entry.name == "davies2018")
+    prices = {event: price for event, price in davies.prices.items() if event != "packet"}
+    assert energy.by_part(replace(davies, prices=prices), amounts) == ("packet",)
+    assert set(energy.PARTS) == {"synapse", "soma", "network"}
+    assert sorted(event for events in energy.PARTS.values() for event in events) == sorted(cost.EVENTS)
+
+
+@pytest.mark.parametrize("dense", [True, False])
+def test_synapses_take_the_time_that_one_says(dense):
+    netlist = large_netlist(5, proved=True)
+    said = timing.prepare(netlist, LOIHI, SANAFE, dense=np.full(netlist.n_synapses, dense))
+    form = np.full(len(netlist.format_index_bits), 0 if dense else 10)
+    stored = timing.prepare(replace(netlist, format_index_bits=read_only(form)), LOIHI, SANAFE)
+    for ours, theirs in zip(said.tables, stored.tables, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
