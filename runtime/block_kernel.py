@@ -16,7 +16,8 @@ the magnitude is multiplied without a sign, and nothing saturates.
 synapses that reach it are all zero. Only those without a bias can be idle, the others are not looked at.
 
 *Vectors.* They are written in LLVM's own terms, as numba leaves no other way to hold 16-bit sums in registers and to
-turn 64 comparisons into one word. LLVM makes of them what the machine has.
+turn 64 comparisons into one word. LLVM makes of them what the machine has. All of it stands in one file because the
+machine code is cached by the stamp of the file that it was made from.
 """
 
 from __future__ import annotations
@@ -435,39 +436,34 @@ def _list(words: AnyArray, start: int, width: int, steps: int, bounds: AnyArray,
 
 
 @compiled
-def _run_stage(blocks: Blocks, s: int, steps: int, listed: AnyArray, bounds: AnyArray, scratch: Scratch) -> None:
-    """Let a stage integrate on listed sources.
-
-    All blocks of a step come before the next step: their loops over the list are equally long, which the machine
-    learns.
-    """
-    begin, end = blocks.stage[s], blocks.stage[s + 1]
-    place = steps * begin
-    for t in range(steps):
-        for block in range(begin, end):
-            kept = place * LANES if scratch.membranes.size else -1
-            if blocks.restful[block]:
-                fired = _restful_listed_step(blocks, listed, bounds[t], bounds[t + 1], block, scratch, place, kept)
-            else:
-                fired = _busy_listed_step(blocks, listed, bounds[t], bounds[t + 1], block, scratch, place, kept)
-            scratch.raster[place] = fired
-            place += 1
-
-
-@compiled
-def _run_scattered(
-    blocks: Blocks, s: int, steps: int, active: AnyArray, start: int, width: int, scratch: Scratch
+def _run_stage(
+    blocks: Blocks,
+    s: int,
+    steps: int,
+    words: AnyArray,
+    start: int,
+    width: int,
+    listed: AnyArray,
+    bounds: IntArray,
+    scratch: Scratch,
 ) -> None:
-    """Let a stage integrate on words of sources; a block's rows and membranes stay in cache for all steps."""
+    """Let a stage integrate on its sources, as words and listed; a block's rows and membranes stay in cache."""
     begin, end = blocks.stage[s], blocks.stage[s + 1]
     for block in range(begin, end):
+        rests = blocks.restful[block] != 0
         for t in range(steps):
             place = steps * begin + t * (end - begin) + block - begin
             kept = place * LANES if scratch.membranes.size else -1
-            if blocks.restful[block]:
-                fired = _restful_step(blocks, active, start + t * width, 0, block, scratch, place, kept)
+            if not blocks.dense[s]:
+                at = start + t * width
+                if rests:
+                    fired = _restful_step(blocks, words, at, 0, block, scratch, place, kept)
+                else:
+                    fired = _busy_step(blocks, words, at, 0, block, scratch, place, kept)
+            elif rests:
+                fired = _restful_listed_step(blocks, listed, bounds[t], bounds[t + 1], block, scratch, place, kept)
             else:
-                fired = _busy_step(blocks, active, start + t * width, 0, block, scratch, place, kept)
+                fired = _busy_listed_step(blocks, listed, bounds[t], bounds[t + 1], block, scratch, place, kept)
             scratch.raster[place] = fired
 
 
@@ -518,10 +514,7 @@ def _run_stages(
     for s in range(blocks.stage.size - 1):
         listed = _list(active, start, width, steps, bounds, count)
         _charge_all(listed, bounds, steps, charges, at * LANES * charges.width, delay, sums)
-        if blocks.dense[s]:
-            _run_stage(blocks, s, steps, listed, bounds, scratch)
-        else:
-            _run_scattered(blocks, s, steps, active, start, width, scratch)
+        _run_stage(blocks, s, steps, active, start, width, listed, bounds, scratch)
         begin, end = blocks.stage[s], blocks.stage[s + 1]
         active, start, width, count = scratch.raster, steps * begin, end - begin, scratch.spikes[begin * LANES :]
         at, delay = n_words + begin, s
