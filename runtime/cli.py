@@ -33,7 +33,7 @@ from compiler.text import text
 from models.evtouch import Recordings
 from models.graphs import CHOICES
 from models.grasps import SYNTHETIC
-from runtime import bits, decisions, explain, export, finetune, render, verdicts, watch
+from runtime import bits, decisions, explain, export, finetune, render, verdicts, watch, yardstick_command
 from runtime.data_commands import add_data_commands
 from runtime.inputs import (
     asked_graph,
@@ -448,6 +448,7 @@ def build_parser() -> argparse.ArgumentParser:
     export.add_arguments(command("export", export.export, export.SUMMARY))
     finetune.add_arguments(command("finetune", finetune.finetune, finetune.SUMMARY))
     watch.add_arguments(command("watch", watch.watch, watch.SUMMARY))
+    yardstick_command.add_arguments(command("yardsticks", yardstick_command.measure, yardstick_command.SUMMARY))
     add_data_commands(commands)
     command("demo", _demo, "the main job on a shipped checkpoint and synthetic grasps; needs no file and no network")
     return parser

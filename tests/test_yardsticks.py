@@ -9,14 +9,18 @@ import sys
 
 import numpy as np
 import pytest
+from made_files import recordings_folder, small_checkpoint
 from random_networks import random_checkpoint
 
 from compiler.errors import DataError
 from compiler.frontends.checkpoint import Dense
 from compiler.interpret import channels_last, run_float
 from compiler.passes.expand import expand
+from compiler.pipeline import compile_checkpoint
+from compiler.serialize import write_netlist
 from models.evtouch import load_recordings
 from models.graphs import build_graph, normalised_adjacency
+from runtime import cli
 from runtime.yardsticks import HOROWITZ, measure, yardsticks_json, yardsticks_text
 
 PAIR = np.array([[0.0, 1.0], [1.0, 0.0]])
@@ -230,3 +234,25 @@ def test_the_released_network_in_round_figures(released_checkpoint, objects_zip)
     text = yardsticks_text(found)
     assert f"{250 * dense:,}" in text
     assert "Horowitz, ISSCC 2014" in text
+
+
+def test_the_command(tmp_path, capsys):
+    small_checkpoint(tmp_path)
+    recordings_folder(tmp_path / "data")
+    words = ["yardsticks", str(tmp_path / "small.pt"), "--data", str(tmp_path / "data")]
+    assert cli.main([*words, "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["samples"] == 6
+    assert report["neurobench"]["synaptic_operations"]["Effective_MACs"] == 0
+    assert cli.main(words) == 0
+    assert "NeuroBench's metrics per recording, over 6" in capsys.readouterr().out
+
+
+def test_the_command_wants_a_checkpoint(tmp_path, capsys):
+    checkpoint, adjacency = small_checkpoint(tmp_path)
+    path = tmp_path / "net.loom"
+    write_netlist(compile_checkpoint(checkpoint, adjacency).netlist, path)
+    assert cli.main(["yardsticks", str(path), "--data", "synthetic"]) == 2
+    assert capsys.readouterr().err == (
+        f"spikeloom: {path}: is a netlist, estimate says what it costs; give the checkpoint it was made from\n"
+    )

@@ -1,0 +1,49 @@
+"""The command ``yardsticks``: what others count of the float model, beside what the chip does."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from typing import Any
+
+from compiler.errors import ModelError
+from compiler.frontends.checkpoint import read_checkpoint
+from compiler.serialize import is_netlist
+from runtime import yardsticks
+from runtime.inputs import asked_graph, propagation, recordings, shipped
+from runtime.options import add_model, add_recordings
+
+Json = dict[str, Any]
+
+SUMMARY = "NeuroBench's metrics of a checkpoint, and arithmetic energy on a processor"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Describe the options of the command."""
+    parser.add_argument("checkpoint")
+    add_model(parser)
+    add_recordings(parser)
+
+
+def measure(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
+    """Run the command: the report, how to print it, and the exit code."""
+    from models.reference import float_spikes  # torch, so only here
+
+    path = shipped(arguments.checkpoint)
+    if is_netlist(path):
+        raise ModelError(f"{path}: is a netlist, estimate says what it costs; give the checkpoint it was made from")
+    checkpoint = read_checkpoint(
+        path, run=arguments.run, weights=arguments.weights, beta=arguments.beta, theta=arguments.theta
+    )
+    graph, adjacency = propagation(checkpoint, asked_graph(arguments), arguments.checkpoint)
+    data = recordings(
+        arguments.data,
+        arguments.split,
+        limit=arguments.limit,
+        classes=checkpoint.classes,
+        taxels=checkpoint.taxels,
+        bin_s=arguments.bin,
+    )
+    spikes = float_spikes(checkpoint, adjacency, data.events)
+    found = yardsticks.measure(checkpoint, adjacency, data.events, spikes, lengths=data.lengths)
+    return yardsticks.yardsticks_json(found) | {"graph": graph}, yardsticks.yardsticks_text, 0
