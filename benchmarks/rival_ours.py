@@ -33,12 +33,12 @@ def totals(netlist: Netlist) -> Run:
 
 def counts(netlist: Netlist) -> Run:
     """Events and energy of every recording, and the time of every step by the simple model."""
-    engine, chip = prepare(netlist), load_target(netlist.target)
+    chip = load_target(netlist.target)
     clock, meter = timing.prepare(netlist, chip, chip.time[0]), cost.prepare(netlist, chip)
-    charged = charges.charges(clock)
+    engine = prepare(netlist, charges=charges.charges(clock))
 
     def run(events: Any) -> Trace:
-        trace = simulate(engine, events, threads=1, charges=charged)
+        trace = simulate(engine, events, threads=1)
         assert trace.charged is not None
         steps = np.full(len(events), events.shape[2])
         charges.simple_from(clock, trace.charged, steps + engine.drain)

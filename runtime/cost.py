@@ -110,16 +110,18 @@ class Meter:
         What runs.
     target : Target
         Its chip.
-    caused : mapping of str to (sources, layers) float64
-        Amount of an event, or of visited ``zeros``, for each layer by a spike of each source: input channels, then
-        compartments.
+    names : tuple of str
+        Events, and ``zeros`` for visited zeros.
+    caused : (sources, names * layers) float64
+        Amount of each of these for each layer by a spike of each source: input channels, then compartments.
     neurons : (layers,) float64
         Compartments of each layer.
     """
 
     netlist: Netlist
     target: Target
-    caused: Mapping[str, FloatArray]
+    names: tuple[str, ...]
+    caused: FloatArray
     neurons: FloatArray
 
 
@@ -140,16 +142,18 @@ def prepare(netlist: Netlist, target: Target) -> Meter:
         event: np.concatenate([silent, route[:, None] * of_layer])
         for event, route in zip(("packet", "hop_east_west", "hop_north_south"), _routes(netlist, target).T, strict=True)
     }
+    caused = {
+        "synaptic_operation_dense": _visits(netlist, dense.astype(np.float64)),
+        "synaptic_operation_sparse": _visits(netlist, (~dense).astype(np.float64)),
+        "spike": np.concatenate([silent, of_layer]),
+        **sent,
+        "zeros": _visits(netlist, (netlist.synapse_weight == 0).astype(np.float64)),
+    }
     return Meter(
         netlist=netlist,
         target=target,
-        caused={
-            "synaptic_operation_dense": _visits(netlist, dense.astype(np.float64)),
-            "synaptic_operation_sparse": _visits(netlist, (~dense).astype(np.float64)),
-            "spike": np.concatenate([silent, of_layer]),
-            **sent,
-            "zeros": _visits(netlist, (netlist.synapse_weight == 0).astype(np.float64)),
-        },
+        names=tuple(caused),
+        caused=np.concatenate(list(caused.values()), axis=1),
         neurons=np.bincount(netlist.layer, minlength=len(netlist.layers)).astype(np.float64),
     )
 
@@ -167,8 +171,7 @@ def count(meter: Meter, counts: Counts, steps: int | IntArray) -> tuple[dict[str
         Data steps T of all recordings, or of each.
     """
     sources = np.concatenate([counts.inputs, counts.spikes], axis=1).astype(np.float64)
-    sums = sources @ np.concatenate(list(meter.caused.values()), axis=1)
-    amounts = dict(zip(meter.caused, np.split(sums, len(meter.caused), axis=1), strict=True))
+    amounts = dict(zip(meter.names, np.split(sources @ meter.caused, len(meter.names), axis=1), strict=True))
     active = counts.updates.astype(np.float64)
     amounts["neuron_active"] = active
     amounts["neuron_idle"] = meter.neurons * (np.reshape(steps, (-1, 1)) + meter.netlist.max_depth) - active

@@ -50,6 +50,10 @@ class Engine:
         Packed magnitudes of negative weights; None where no register can overflow, whatever the input.
     drain : int
         Chip steps that a recording takes beyond its data steps.
+    charges : Charges or None
+        What events add to sums of each chip step.
+    rows : ChargeRows or None
+        The same for the kernel of layers.
     """
 
     netlist: Netlist
@@ -57,9 +61,18 @@ class Engine:
     tables: Tables | None
     negative: npt.NDArray[Any] | None
     drain: int
+    charges: Charges | None
+    rows: ChargeRows | None
 
 
-def prepare(netlist: Netlist, *, stepwise: bool = False, checked: bool = False, gated: bool = True) -> Engine:
+def prepare(
+    netlist: Netlist,
+    *,
+    stepwise: bool = False,
+    checked: bool = False,
+    gated: bool = True,
+    charges: Charges | None = None,
+) -> Engine:
     """Lay a netlist out for a kernel.
 
     Parameters
@@ -72,13 +85,19 @@ def prepare(netlist: Netlist, *, stepwise: bool = False, checked: bool = False, 
         Check registers in every step even where it is proven that they hold any input; so in steps.
     gated : bool
         Whether a layer integrates in its window only, see :func:`runtime.spec.simulate`; in steps if not.
+    charges : Charges, optional
+        What events add to the sums of each chip step that a trace shall hold.
     """
     blocks = lay_out_blocks(netlist) if gated and not checked and not stepwise else None
     drain = netlist.max_depth if gated else 0
-    if blocks is not None:
-        return Engine(netlist=netlist, blocks=blocks, tables=None, negative=None, drain=drain)
-    tables, negative = lay_out_segments(netlist, checked=checked, gated=gated)
-    return Engine(netlist=netlist, blocks=None, tables=tables, negative=negative, drain=drain)
+    tables, negative, rows = None, None, None
+    if blocks is None:
+        tables, negative = lay_out_segments(netlist, checked=checked, gated=gated)
+    else:
+        rows = charge_rows(netlist, blocks, charges)
+    return Engine(
+        netlist=netlist, blocks=blocks, tables=tables, negative=negative, drain=drain, charges=charges, rows=rows
+    )
 
 
 def tables_of(engine: Engine) -> Tables:
@@ -171,7 +190,6 @@ def simulate(
     spikes: bool = False,
     membranes: bool = False,
     updated: bool = False,
-    charges: Charges | None = None,
     threads: int | None = None,
     progress: Callable[[int], object] | None = None,
 ) -> Trace:
@@ -187,8 +205,6 @@ def simulate(
         Steps of each recording where some are shorter than T. What comes after them is not run: zeros in the trace.
     spikes, membranes, updated : bool
         Whether to keep these per chip step: one, four and one bytes for each recording, chip step and compartment.
-    charges : Charges, optional
-        What events add to the sums of each chip step that are wanted.
     threads : int, optional
         Recordings that run at the same time, by default one per processor. Results do not depend on it.
     progress : callable, optional
@@ -212,8 +228,8 @@ def simulate(
     check_channels(netlist, events.shape[1])
     recordings, _, length = events.shape
     shape = (recordings, length + engine.drain, netlist.n_compartments)
+    rows, charges = engine.rows, engine.charges
     sums = 0 if charges is None else charges.spikes.shape[1]
-    rows = None if engine.blocks is None else charge_rows(netlist, engine.blocks, charges)
     charged = np.zeros((*shape[:2], sums if rows is None else rows.width), np.int64)
     trace = Trace(
         counts=Counts(
@@ -234,7 +250,7 @@ def simulate(
             _run_layers(engine.blocks, rows, events[part], ends[part], trace, charged, part)
         else:
             for index in range(part.start, part.stop):
-                _run_steps(engine, events[index], int(ends[index]), trace, charges, index)
+                _run_steps(engine, events[index], int(ends[index]), trace, index)
 
     if engine.blocks is not None:
         events = np.ascontiguousarray(events)
@@ -268,11 +284,9 @@ def _run_layers(
     )
 
 
-def _run_steps(
-    engine: Engine, events: EventArray, length: int, trace: Trace, charges: Charges | None, index: int
-) -> None:
+def _run_steps(engine: Engine, events: EventArray, length: int, trace: Trace, index: int) -> None:
     """Run one recording step after step; `index` is its place in the trace."""
-    state, window = start(engine), length + engine.drain
+    state, window, charges = start(engine), length + engine.drain, engine.charges
     fired = None if trace.spikes is None else trace.spikes[index, :window]
     worked = None if trace.updated is None else trace.updated[index, :window]
     if charges is not None:

@@ -88,10 +88,17 @@ def estimate(
     DataError, NumericRangeError
         As the engine says.
     """
-    prepared = engine.prepare(netlist)
     clocks = {times.name: timing.prepare(netlist, target, times) for times in target.time}
+    prepared = _charged(netlist, clocks)
     steps = np.full(len(events), events.shape[2]) if lengths is None else np.asarray(lengths, np.int64)
-    counts, simple = _quick(prepared, clocks, events, steps)
+    trace = engine.simulate(prepared, events, lengths=steps)
+    counts, simple = trace.counts, {}
+    if trace.charged is not None:
+        sums = np.split(trace.charged, len(clocks), axis=2)
+        simple = {
+            name: charges.simple_from(clock, own, steps + prepared.drain)
+            for (name, clock), own in zip(clocks.items(), sums, strict=True)
+        }
     costs = cost.estimate(cost.prepare(netlist, target), counts, steps)
     parts = {prices.name: energy.by_part(prices, costs.events) for prices in target.energy}
     detailed: dict[str, DetailedTimes] = {}
@@ -113,26 +120,17 @@ def estimate(
     )
 
 
-def _quick(
-    prepared: engine.Engine, clocks: Mapping[str, timing.Clock], events: engine.EventArray, steps: IntArray
-) -> tuple[Counts, dict[str, SimpleTimes]]:
-    """Counts, and simple times from what the engine adds up on the way."""
+def _charged(netlist: Netlist, clocks: Mapping[str, timing.Clock]) -> engine.Engine:
+    """An engine that adds up the times of the simple model, one table's after the other's."""
     if not clocks:
-        return engine.simulate(prepared, events, lengths=steps).counts, {}
+        return engine.prepare(netlist)
     each = [charges.charges(clock) for clock in clocks.values()]
     wanted = Charges(
         channels=np.concatenate([found.channels for found in each], axis=1),
         spikes=np.concatenate([found.spikes for found in each], axis=1),
         updates=np.concatenate([found.updates for found in each], axis=1),
     )
-    trace = engine.simulate(prepared, events, lengths=steps, charges=wanted)
-    assert trace.charged is not None, "sums were asked for"
-    bounds = np.cumsum([found.spikes.shape[1] for found in each])[:-1]
-    simple = {
-        name: charges.simple_from(clock, charged, steps + prepared.drain)
-        for (name, clock), charged in zip(clocks.items(), np.split(trace.charged, bounds, axis=2), strict=True)
-    }
-    return trace.counts, simple
+    return engine.prepare(netlist, charges=wanted)
 
 
 def _deep(

@@ -83,7 +83,7 @@ class Trace:
         Whether a compartment had work to do in a chip step, as ``Counts.updates`` counts it; None where it was not
         asked for.
     charged : (…, chip steps, sums) int64, or None
-        What the events of each chip step add up to under the charges that were given.
+        What the events of each chip step add up to under the charges that the engine was prepared with.
     """
 
     counts: Counts

@@ -75,8 +75,8 @@ def assert_kernels_agree(netlist: Netlist, events: np.ndarray) -> None:
     wanted = expected.spikes.astype(np.int64) @ charges.spikes + expected.updated.astype(np.int64) @ charges.updates
     wanted[: events.shape[1]] += events.T.astype(np.int64) @ charges.channels
     for stepwise in (False, True):
-        prepared = engine.prepare(netlist, stepwise=stepwise)
-        found = engine.simulate(prepared, events[None], charges=charges).charged
+        prepared = engine.prepare(netlist, stepwise=stepwise, charges=charges)
+        found = engine.simulate(prepared, events[None]).charged
         np.testing.assert_array_equal(found[0], wanted, strict=True)
 
 

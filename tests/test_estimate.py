@@ -38,8 +38,8 @@ def test_sums_of_the_engine_give_the_simple_times(small, stepwise):
     netlist, recordings = small
     (times,) = LOIHI.time
     clock = timing.prepare(netlist, LOIHI, times)
-    prepared = engine.prepare(netlist, stepwise=stepwise)
-    trace = engine.simulate(prepared, recordings, lengths=LENGTHS, charges=charges(clock), spikes=True, updated=True)
+    prepared = engine.prepare(netlist, stepwise=stepwise, charges=charges(clock))
+    trace = engine.simulate(prepared, recordings, lengths=LENGTHS, spikes=True, updated=True)
     ran = LENGTHS + netlist.max_depth
     cut = recordings.copy()
     for recording, length in zip(cut, LENGTHS, strict=True):
