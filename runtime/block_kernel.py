@@ -82,6 +82,8 @@ class Blocks(NamedTuple):
         Depth and layer of each block.
     compartment : (blocks * 64,) int64
         Compartment of each position, -1 for none.
+    whole : (blocks,) int64
+        Compartment of the first position where the block holds 64 consecutive ones, else -1.
     """
 
     stage: IntArray
@@ -101,6 +103,7 @@ class Blocks(NamedTuple):
     depth: IntArray
     layer: IntArray
     compartment: IntArray
+    whole: IntArray
 
 
 class ChargeRows(NamedTuple):
@@ -392,6 +395,20 @@ def _lowest(typing: Any, word: Any) -> Any:
 
 
 @_intrinsic
+def _spread(typing: Any, word: Any, out: Any, at: Any) -> Any:
+    """Write the bits of a word as 64 bytes."""
+    bits, flags = ir.VectorType(_BIT, LANES), ir.VectorType(ir.IntType(8), LANES)
+
+    def emit(context: Any, builder: Any, _signature: Any, values: Any) -> Any:
+        array = context.make_array(out)(context, builder, values[1]).data
+        place = builder.bitcast(builder.gep(array, [values[2]]), flags.as_pointer())
+        builder.store(builder.zext(builder.bitcast(values[0], bits), flags), place, align=1)
+        return context.get_dummy_value()
+
+    return types.void(types.uint64, out, types.int64), emit
+
+
+@_intrinsic
 def _bits(typing: Any, word: Any) -> Any:
     """Bits of a word that are set."""
 
@@ -527,6 +544,7 @@ def _run_stages(
 @compiled
 def _unpack(blocks: Blocks, steps: int, words: AnyArray, out: AnyArray, inverse: Any) -> None:
     """Write bits into a (chip steps, compartments) array; inverted, those of positions that hold a compartment."""
+    flat, row = out.reshape(-1), out.shape[1]
     for s in range(blocks.stage.size - 1):
         begin, end = blocks.stage[s], blocks.stage[s + 1]
         for t in range(steps):
@@ -534,6 +552,9 @@ def _unpack(blocks: Blocks, steps: int, words: AnyArray, out: AnyArray, inverse:
                 left = words[steps * begin + t * (end - begin) + block - begin]
                 if inverse:
                     left = ~left & blocks.held[block]
+                if blocks.whole[block] >= 0:
+                    _spread(left, flat, (t + blocks.depth[block]) * row + blocks.whole[block])
+                    continue
                 while left:
                     position = block * LANES + _lowest(left)
                     out[t + blocks.depth[block], blocks.compartment[position]] = True

@@ -115,6 +115,7 @@ def lay_out_blocks(netlist: Netlist) -> Blocks | None:
         depth=seats.depth[seats.layer],
         layer=seats.layer,
         compartment=compartment,
+        whole=_whole(compartment.reshape(-1, LANES)),
     )
 
 
@@ -206,6 +207,12 @@ def _narrowed(
     shifted = weight.reshape(-1, LANES) >> shift[row_block][:, None].astype(np.int16)
     narrow = shifted.astype(np.int8)
     return shift, (narrow if np.array_equal(narrow, shifted) else shifted).reshape(-1)
+
+
+def _whole(compartment: IntArray) -> IntArray:
+    """First compartment of each block (blocks, 64) that holds consecutive ones, -1 of the others."""
+    consecutive = (compartment[:, 0] >= 0) & np.all(np.diff(compartment, axis=1) == 1, axis=1)
+    return np.where(consecutive, compartment[:, 0], -1)
 
 
 def _bit(lane: IntArray) -> npt.NDArray[np.uint64]:

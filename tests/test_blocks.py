@@ -111,6 +111,23 @@ def test_the_random_pipelines_reach_every_way_of_storage():
     assert [blocks.weight.dtype for blocks in found] == [np.int8, np.int8, np.int16]
     assert [blocks.dense.tolist() for blocks in found[:2]] == [[False, False, True], [True] * 3]
     assert any(blocks.restful.any() for blocks in found)
+    whole = lay_out_blocks(build([Neuron()] * 70, [Axon(source=0, targets=((0, 1),))], n_inputs=1, depths=[0])).whole
+    assert whole.tolist() == [0, -1]
+
+
+@pytest.mark.parametrize("rate", [0.0, 0.3])
+def test_whole_blocks_beside_others(rate):
+    """Neurons 0 to 69 of each layer on one core: 64 that follow each other, and six."""
+    rng = np.random.default_rng(1)
+    neurons = [Neuron(layer=i // 70, threshold=20, bias=int(rng.integers(-9, 9))) for i in range(140)]
+    axons = [
+        Axon(source=source, targets=tuple((c, int(rng.integers(-9, 9))) for c in range(70 * layer, 70 * layer + 70)))
+        for layer, sources in ((0, range(5)), (1, range(5, 75)))
+        for source in sources
+    ]
+    netlist = build(neurons, axons, n_inputs=5, depths=[0, 1])
+    assert lay_out_blocks(netlist).whole.tolist() == [0, -1, 70, -1]
+    assert_kernels_agree(netlist, (rng.random((5, 20)) < rate).astype(np.uint8))
 
 
 def test_recordings_of_any_length_together():
