@@ -21,9 +21,9 @@ from compiler.passes.calibrate import FEW, MANY, Calibration, calibrate, evenly_
 from compiler.passes.emit import Origin, emit
 from compiler.passes.exact import Exactness, make_exact
 from compiler.passes.expand import expand
+from compiler.passes.layout import Layout, lay_out, require_goal
 from compiler.passes.legalize import LimitUse, require_legal
-from compiler.passes.partition import partition
-from compiler.passes.place import Placement, core_traffic, place
+from compiler.passes.place import Placement
 from compiler.passes.prune import (
     Removal,
     compact,
@@ -65,10 +65,12 @@ class Compilation:
         Use of every limit by every core.
     removals : tuple of Removal
         What was left out of each layer.
-    placement : Placement
-        Tiles and what they cost.
-    core_bound : int
-        No legal partition uses fewer cores.
+    goal : str
+        What the layout was chosen for.
+    layout : Layout
+        Cores and tiles, and what a step is expected to take.
+    usual : Layout
+        The same for the layout of fewest cores; often that is the layout.
     """
 
     network: Network
@@ -79,8 +81,19 @@ class Compilation:
     proofs: tuple[RangeProof, ...]
     uses: tuple[LimitUse, ...]
     removals: tuple[Removal, ...]
-    placement: Placement
-    core_bound: int
+    goal: str
+    layout: Layout
+    usual: Layout
+
+    @property
+    def placement(self) -> Placement:
+        """Tiles and what they cost."""
+        return self.layout.placement
+
+    @property
+    def core_bound(self) -> int:
+        """No legal partition uses fewer cores."""
+        return self.layout.parts.bound
 
 
 def compile_checkpoint(
@@ -95,6 +108,8 @@ def compile_checkpoint(
     training_events: npt.NDArray[Any] | None = None,
     ranges: str = "proven",
     margin: float = 0.1,
+    cores_for: Mapping[str, int] | None = None,
+    optimize: str = "cores",
     provenance: Mapping[str, Any] | None = None,
     after: Callable[[str, Network | IntegerNetwork | Netlist], None] | None = None,
 ) -> Compilation:
@@ -123,6 +138,10 @@ def compile_checkpoint(
         How scales are kept from overflowing, see :func:`compiler.passes.quantize.quantize`.
     margin : float
         Share added to observed ranges.
+    cores_for : mapping of str to int, optional
+        Least number of cores of a layer, by name; they hold no other. Its neurons are cut as evenly as possible.
+    optimize : {"cores", "energy", "latency"}
+        What the layout is chosen for, see :mod:`compiler.passes.layout`; all but cores need training events.
     provenance : mapping, optional
         JSON values to store with the netlist.
     after : callable, optional
@@ -136,6 +155,7 @@ def compile_checkpoint(
     chip = load_target(target)
     if not 0 <= margin < math.inf:
         raise OptionError(f"--margin {margin:g}: is no share to add to a range; give a number from 0")
+    require_goal(optimize, cores_for, chip, calibrated=training_events is not None)
     publish = after or (lambda _stage, _artefact: None)
 
     network = expand(checkpoint, adjacency)
@@ -184,10 +204,11 @@ def compile_checkpoint(
     laid, identity = compact(integer, either(silent, unheard))
     if rates is not None:
         rates = tuple(rate[ids] for rate, ids in zip(rates, identity, strict=True))
-    parts = partition(laid, chip, rates)
-    placement = place(core_traffic(laid, parts, rates), chip)
+    layout, usual = lay_out(
+        laid, chip, goal=optimize, cores_for=cores_for, rates=rates, calibration=calibration, identity=identity
+    )
     origin = Origin(network=integer, identity=identity, unheard=unheard)
-    netlist = emit(laid, parts, placement.tiles, chip, provenance or {}, origin)
+    netlist = emit(laid, layout.parts, layout.placement.tiles, chip, provenance or {}, origin)
     uses = require_legal(netlist, chip)
     publish("place", netlist)
     return Compilation(
@@ -199,8 +220,9 @@ def compile_checkpoint(
         proofs=prove_ranges(integer),
         uses=uses,
         removals=removals(whole, silent, unheard, unused),
-        placement=placement,
-        core_bound=parts.bound,
+        goal=optimize,
+        layout=layout,
+        usual=usual,
     )
 
 

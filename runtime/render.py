@@ -12,9 +12,10 @@ import numpy as np
 from compiler.fixedpoint import FloatArray, IntArray
 from compiler.frontends.checkpoint import Checkpoint
 from compiler.netlist import Netlist
+from compiler.passes.layout import Layout
 from compiler.passes.legalize import LimitUse
 from compiler.pipeline import Compilation
-from runtime.tables import table
+from runtime.tables import si, table
 
 Json = dict[str, Any]
 
@@ -88,7 +89,17 @@ def compilation_json(compilation: Compilation, sha256: str) -> Json:
         "exactness": [asdict(layer) for layer in compilation.exactness],
         "core_bound": compilation.core_bound,
         "placement": asdict(compilation.placement),
+        "layout": {
+            "optimize": compilation.goal,
+            "expected": _expected(compilation.layout),
+            "usual": _expected(compilation.usual),
+        },
     }
+
+
+def _expected(layout: Layout) -> Json:
+    expected = layout.expected
+    return {"cores": len(layout.parts.cores)} | (asdict(expected) if expected else {})
 
 
 def netlist_text(report: Json) -> str:
@@ -207,7 +218,31 @@ def compilation_text(report: Json) -> str:
         f"cores: {report['cores']} used, {report['core_bound']} at least; "
         f"spike-hops a step{'' if calibrated else ' if every neuron spiked'}: {placement['spike_hops']:.1f} ({optimal})"
     )
+    lines += _layout_lines(report["layout"], report["layers"])
     return "\n".join(lines)
+
+
+def _layout_lines(layout: Json, layers: list[Json]) -> list[str]:
+    """What a step is expected to take, and what another layout would."""
+    chosen, usual = layout["expected"], layout["usual"]
+    if "step_ns" not in chosen:
+        return []
+    core = chosen["critical_core"]
+    held = ", ".join(layer["name"] for layer in layers if core in layer["cores"])
+    lines = [
+        f"expected step on the training recordings ({chosen['time_table']} table): {chosen['step_ns']:,.0f} ns, "
+        f"{si(chosen['step_j'], 'J')}; slowest most often: core {core} ({held}), "
+        f"{'receiving' if chosen['receiving'] else 'sweeping its neurons and sending'}"
+    ]
+    if chosen != usual:
+        time, energy = (chosen[key] / usual[key] for key in ("step_ns", "step_j"))
+        lines.append(
+            f"layout of fewest cores: {usual['cores']} instead of {chosen['cores']}, {usual['step_ns']:,.0f} ns, "
+            f"{si(usual['step_j'], 'J')}; this one takes {time:.2f} times the time and {energy:.2f} times the energy"
+        )
+    elif layout["optimize"] != "cores":
+        lines.append(f"--optimize {layout['optimize']}: found nothing better than the layout of fewest cores")
+    return lines
 
 
 def _removal_lines(layers: list[Json]) -> list[str]:

@@ -126,6 +126,81 @@ def test_observed_ranges_are_said_to_be_unproven(spikeloom, tmp_path):
     assert ("proof: no register overflows for any input" in out) == (not unproven)
 
 
+def test_a_layer_gets_the_cores_asked_for(as_json, spikeloom, tmp_path):
+    words = ["compile", "net.pt", "--calibrate", "data", "--cores-for", "conv1=3,fc1=2", "-o", tmp_path / "out.loom"]
+    report = as_json(*words)
+    assert [len(layer["cores"]) for layer in report["layers"]] == [3, 2, 1, 1]
+    assert report["provenance"]["cores_for"] == {"conv1": 3, "fc1": 2}
+    assert "optimize" not in report["provenance"]
+    layout = report["layout"]
+    assert (layout["optimize"], layout["expected"]["cores"], layout["usual"]["cores"]) == ("cores", 6, 1)
+    assert layout["expected"]["packets"] > layout["usual"]["packets"] > 0
+    assert read_netlist(tmp_path / "out.loom").n_cores == report["cores"] == 6
+    _, out, _ = spikeloom(*words)
+    expected, usual = layout["expected"], layout["usual"]
+    assert f"expected step on the training recordings (sanafe table): {expected['step_ns']:,.0f} ns, " in out
+    assert f"layout of fewest cores: 1 instead of 6, {usual['step_ns']:,.0f} ns, " in out
+    assert f"this one takes {expected['step_ns'] / usual['step_ns']:.2f} times the time and " in out
+
+
+def test_a_layout_for_short_steps(as_json, spikeloom, tmp_path):
+    words = ["compile", "net.pt", "--calibrate", "data", "--optimize", "latency", "-o", tmp_path / "out.loom"]
+    report = as_json(*words)
+    layout = report["layout"]
+    assert layout["expected"]["step_ns"] < layout["usual"]["step_ns"]
+    assert report["provenance"]["optimize"] == "latency"
+    content = (tmp_path / "out.loom").read_bytes()
+    assert as_json(*words)["layout"] == layout
+    assert (tmp_path / "out.loom").read_bytes() == content
+
+
+def test_a_layout_for_little_energy_says_that_it_found_none(spikeloom, tmp_path):
+    words = ["compile", "net.pt", "--calibrate", "data", "--optimize", "energy", "-o", tmp_path / "out.loom"]
+    assert "--optimize energy: found nothing better than the layout of fewest cores\n" in spikeloom(*words)[1]
+
+
+def test_no_step_is_expected_without_recordings(as_json, spikeloom, tmp_path):
+    assert as_json("compile", "net.pt", "-o", tmp_path / "out.loom")["layout"] == {
+        "optimize": "cores",
+        "expected": {"cores": 1},
+        "usual": {"cores": 1},
+    }
+    assert "expected step" not in spikeloom("compile", "net.pt", "-o", tmp_path / "out.loom")[1]
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        *(
+            (["--cores-for", text], f"--cores-for {text}: {word!r} is not LAYER=N, N from 1; write for example fc1=6")
+            for text, word in (("fc1", "fc1"), ("fc1=", "fc1="), ("fc1=2,=3", "=3"), ("fc1=0", "fc1=0"), ("", ""))
+        ),
+        *(
+            (["--cores-for", text], f"--cores-for {text}: {text!r} is not LAYER=N, N from 1; write for example fc1=6")
+            for text in ("fc1=-2", "fc1=2.5", "fc1=two", "fc1=²", "fc1:2")
+        ),
+        (["--cores-for", "fc1=2,fc1=3"], "--cores-for fc1=2,fc1=3: names fc1 twice; give it once"),
+        (["--cores-for", "fc4=2"], "--cores-for fc4=2: no such layer; layers are conv1, fc1, fc2, fc3"),
+        (["--cores-for", "fc1=10"], "--cores-for fc1=10: fc1 has 9 neurons on the chip; give 9 or fewer"),
+        (
+            ["--cores-for", "conv1=200"],
+            "--cores-for conv1=200: Intel Loihi 1 has 128 cores (loihi1.chip.cores); give 128 or fewer",
+        ),
+        (["--optimize", "speed"], "--optimize speed: no such goal; give one of cores, energy, latency"),
+        (["--optimize", "energy"], "--optimize energy: needs firing rates; give --calibrate"),
+        (["--optimize", "latency"], "--optimize latency: needs firing rates; give --calibrate"),
+        (
+            ["--optimize", "latency", "--calibrate", "data", "--cores-for", "fc1=2"],
+            "--optimize latency: chooses the cores of every layer itself; leave --cores-for away",
+        ),
+    ],
+)
+def test_layouts_that_cannot_be(spikeloom, tmp_path, words, line):
+    code, out, err = spikeloom("compile", "net.pt", *words, "-o", tmp_path / "out.loom")
+    assert (code, out, err) == (2, "", f"spikeloom: {line}\n")
+    assert not (tmp_path / "out.loom").exists()
+
+
 @pytest.mark.parametrize("bits", [2, 3, 4, 5, 6, 8])
 def test_every_storage_width(as_json, tmp_path, bits):
     report = as_json("compile", "net.pt", "--weight-bits", bits, "-o", tmp_path / "out.loom")

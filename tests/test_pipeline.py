@@ -16,6 +16,8 @@ from compiler.serialize import netlist_bytes, read_netlist, write_netlist
 from compiler.text import text
 from models.evtouch import load_recordings
 from models.graphs import build_graph, normalised_adjacency
+from runtime import engine
+from runtime.trace import aligned
 
 
 def ring(taxels):
@@ -46,6 +48,32 @@ def test_the_passes_run_in_order_and_hand_on_what_they_make():
     assert (done.core_bound, done.netlist.n_cores) == (1, 1)
     assert all(use.used <= use.allowed for use in done.uses)
     assert done.netlist.provenance == {}
+    assert (done.goal, done.layout, done.layout.expected) == ("cores", done.usual, None)
+
+
+@pytest.mark.parametrize("options", [{"cores_for": {"conv1": 3, "fc2": 2}}, {"optimize": "latency"}])
+def test_a_layout_changes_no_spike(options):
+    events = grasps(seed=9)
+    usual = compile_checkpoint(random_checkpoint(seed=4), ring(5), training_events=grasps())
+    done = compile_checkpoint(random_checkpoint(seed=4), ring(5), training_events=grasps(), **options)
+    assert done.usual.parts.cores == usual.layout.parts.cores
+    assert done.usual.expected == usual.layout.expected
+    assert done.netlist.n_cores == len(done.layout.parts.cores) > usual.netlist.n_cores
+    assert tuple(done.netlist.core_tile) == done.layout.placement.tiles
+    batch = events.reshape(len(events), -1, events.shape[-1])
+    traces = [(c.netlist, engine.simulate(c.netlist, batch, spikes=True).spikes) for c in (usual, done)]
+    for layer in range(4):
+        np.testing.assert_array_equal(*(aligned(netlist, spikes, layer) for netlist, spikes in traces))
+
+
+def test_what_is_left_out_is_not_counted_among_the_neurons_of_a_layer():
+    kept = compile_checkpoint(random_checkpoint(seed=4), ring(5), cores_for={"conv1": 2})
+    held = int(np.count_nonzero(kept.netlist.layer == 0))
+    with pytest.raises(OptionError) as caught:
+        compile_checkpoint(random_checkpoint(seed=4), ring(5), cores_for={"conv1": held + 1})
+    assert str(caught.value) == (
+        f"--cores-for conv1={held + 1}: conv1 has {held} neurons on the chip; give {held} or fewer"
+    )
 
 
 @pytest.mark.parametrize("bits", [2, 5, 8])
@@ -150,6 +178,18 @@ def test_the_released_network_fits_nine_cores(calibrated):
     assert all(use.used <= use.allowed for use in calibrated.uses)
     assert calibrated.placement.bound == calibrated.placement.spike_hops
     assert all(proof.holds for proof in calibrated.proofs)
+
+
+@pytest.mark.recordings
+def test_a_step_of_the_released_network_can_take_a_seventh(released, manual, objects_zip):
+    """112 cores; the fc2 core of the usual layout and the fc1 cores keep the others waiting."""
+    events = load_recordings(objects_zip, "train").events
+    done = compile_checkpoint(released, manual, training_events=events, optimize="latency")
+    usual, fast = done.usual.expected, done.layout.expected
+    assert 25_000 < usual.step_ns < 36_000
+    assert fast.step_ns < usual.step_ns / 6
+    assert usual.step_j < fast.step_j < 1.5 * usual.step_j
+    assert all(use.used <= use.allowed for use in done.uses)
 
 
 @pytest.mark.recordings

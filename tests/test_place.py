@@ -11,7 +11,7 @@ from compiler.passes import place as place_module
 from compiler.passes.emit import emit
 from compiler.passes.needs import Chunk
 from compiler.passes.partition import Partition, partition
-from compiler.passes.place import core_traffic, hops, place
+from compiler.passes.place import core_traffic, hops, place, place_within
 
 
 def cost(traffic, tiles, width):
@@ -163,6 +163,29 @@ def test_a_full_mesh_has_a_place_for_every_core():
 def test_two_placements_are_equal(cores):
     traffic = layered(2, cores)
     assert place(traffic, LOIHI) == place(traffic.copy(), LOIHI)
+
+
+@pytest.mark.parametrize(("tiles", "cores"), [(1, 4), (2, 5), (3, 9), (3, 12), (28, 60)])
+def test_a_placement_within_few_tiles(tiles, cores):
+    """A ring of cores that would rather spread: each talks to the next but one."""
+    traffic = np.roll(np.eye(cores), 2, axis=1) + 0.1 * np.random.default_rng(0).random((cores, cores))
+    placement = place_within(traffic, LOIHI, tiles)
+    assert len(set(placement.tiles)) <= tiles
+    assert max(placement.tiles.count(tile) for tile in placement.tiles) <= 4
+    assert placement.spike_hops == pytest.approx(cost(traffic, placement.tiles, 8))
+    assert placement == place_within(traffic, LOIHI, tiles)
+
+
+def test_a_placement_keeps_to_few_tiles_even_where_more_cost_fewer_hops():
+    """Three pairs on tiles for four cores: three tiles cost no hop, two tiles tear one pair apart."""
+    traffic = np.zeros((6, 6))
+    traffic[[0, 1, 2, 3, 4, 5], [1, 2, 0, 4, 5, 3]] = 1.0
+    target = small_target(mesh_tile_cores=3)
+    assert place_within(traffic, target, 2).spike_hops == 0
+    assert len(set(place(np.kron(np.eye(3), np.ones((2, 2))), target).tiles)) == 3
+    squeezed = place_within(np.kron(np.eye(3), np.ones((2, 2))), target, 2)
+    assert len(set(squeezed.tiles)) == 2
+    assert squeezed.spike_hops == 2
 
 
 # --- traffic

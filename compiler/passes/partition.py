@@ -8,6 +8,7 @@ how many output axons the populations before it need, so populations are cut fro
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
@@ -21,6 +22,7 @@ from compiler.targets import Target
 
 EXACT_CHUNKS = 10
 """Up to this many chunks the packing is searched exhaustively; above it, first fit."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Partition:
@@ -50,7 +52,7 @@ def _largest(low: int, high: int, fits: Callable[[int], bool]) -> int:
     return low
 
 
-def _cut(needs: Needs, population: int) -> tuple[list[Chunk], list[Violation]]:
+def fill(needs: Needs, population: int) -> tuple[list[Chunk], list[Violation]]:
     """Cut one population greedily into chunks that fit an empty core; or say why one neuron does not."""
     size = needs.network.populations[population].size
     chunks: list[Chunk] = []
@@ -147,21 +149,22 @@ def _pack(needs: Needs, chunks: list[Chunk], traffic: Callable[[Chunk, Chunk], f
     return best
 
 
-def _spread(needs: Needs, population: int, least: int) -> tuple[list[Chunk], list[Violation]]:
-    """Cut one population as evenly as possible into at least so many chunks that fit an empty core."""
-    fewest, why = _cut(needs, population)
+def spread(needs: Needs, population: int, least: int) -> tuple[list[Chunk], list[Violation]]:
+    """Cut one population as evenly as possible into at least so many chunks that fit an empty core; or say why not."""
     name, size = needs.network.populations[population].name, needs.network.populations[population].size
-    if why:
-        return [], why
-    if least < len(fewest):
-        raise OptionError(
-            f"--cores-for {name}={least}: {name} needs {len(fewest)} cores at least; give {len(fewest)} or more"
-        )
     for parts in range(least, size + 1):
         bounds = [i * size // parts for i in range(parts + 1)]
         chunks = [Chunk(population=population, first=first, last=last) for first, last in pairwise(bounds)]
         if not any(needs.excess((chunk,)) for chunk in chunks):
             return chunks, []
+        if parts == least:
+            fewest, why = fill(needs, population)
+            if why:
+                return [], why
+            if least < len(fewest):
+                raise OptionError(
+                    f"--cores-for {name}={least}: {name} needs {len(fewest)} cores at least; give {len(fewest)} or more"
+                )
     return [], _worst(needs, population)
 
 
@@ -179,14 +182,18 @@ def cut(needs: Needs, least: Mapping[int, int]) -> list[Chunk]:
     violations: list[Violation] = []
     needs.forget()
     for population in reversed(range(len(needs.network.populations))):
-        found, why = _spread(needs, population, least[population]) if population in least else _cut(needs, population)
+        found, why = spread(needs, population, least[population]) if population in least else fill(needs, population)
         violations = why + violations
         chunks += found
-        for chunk in found:
-            needs.listen(chunk)
+        needs.listen(found)
     if violations:
         raise CapacityError(tuple(violations))
     return sorted(chunks)
+
+
+def chunks_of(chunks: Iterable[Chunk]) -> dict[int, int]:
+    """Number of chunks of each population."""
+    return dict(sorted(Counter(chunk.population for chunk in chunks).items()))
 
 
 def arrange(needs: Needs, groups: Iterable[tuple[Chunk, ...]]) -> Partition:

@@ -10,7 +10,7 @@ References
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -250,3 +250,33 @@ def place(traffic: FloatArray, target: Target) -> Placement:
     spent = float(sum(between[a, b] * sum(hops(tiles[a], tiles[b], width)) for a in range(cores) for b in range(a)))
     weaker = max(tail_bound / (1 + TIE), _lower_bound(between, price, tile_cores))
     return Placement(tiles=tiles, spike_hops=spent, bound=spent if complete else min(spent, weaker))
+
+
+def place_within(traffic: FloatArray, target: Target, tiles: int) -> Placement:
+    """Choose tiles as :func:`place` does, but at most so many; of several that fit the best rectangle is taken.
+
+    Parameters
+    ----------
+    traffic : (cores, cores) float64
+        Packets per step.
+    target : Target
+        Mesh size and cores per tile.
+    tiles : int
+        Enough for the cores.
+    """
+    free = place(traffic, target)
+    if len(set(free.tiles)) <= tiles:
+        return free
+    width, height = target.limit("mesh.width"), target.limit("mesh.height")
+    found = []
+    for columns in range(1, min(width, tiles) + 1):
+        rows = min(height, tiles // columns)
+        if columns * rows * target.limit("mesh.tile_cores") >= len(traffic):
+            limits = {
+                rule: replace(target.limits[rule], value=value)
+                for rule, value in (("mesh.width", columns), ("mesh.height", rows))
+            }
+            inside = place(traffic, replace(target, limits={**target.limits, **limits}))
+            moved = tuple(tile // columns * width + tile % columns for tile in inside.tiles)
+            found.append(replace(inside, tiles=moved))
+    return min(found, key=lambda placement: placement.spike_hops, default=free)

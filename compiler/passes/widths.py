@@ -21,7 +21,8 @@ from compiler.interpret import BoolArray, cut, run_float, vote
 from compiler.ir import INPUT, IntegerNetwork, Network, Readout
 from compiler.passes.branches import Offers, Path, Widths, offer_forms, settle, usual, votes
 from compiler.passes.calibrate import calibrate, evenly_spaced
-from compiler.passes.partition import Chunk, choose_dense, lists_into, partition
+from compiler.passes.needs import Chunk, choose_dense, lists_into
+from compiler.passes.partition import partition
 from compiler.passes.prune import Mask, compact, disconnect, either, never_fires, removable
 from compiler.passes.quantize import Recipe, check_recipes
 from compiler.targets import Target
