@@ -12,7 +12,6 @@ import json
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
-from importlib import metadata
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -21,30 +20,29 @@ import numpy as np
 from compiler.atomic import write_atomically
 from compiler.errors import OptionError, SpikeloomError
 from compiler.fixedpoint import IntArray
-from compiler.frontends.checkpoint import WEIGHTS, Checkpoint, read_checkpoint
+from compiler.frontends.checkpoint import WEIGHTS
 from compiler.netlist import Netlist
-from compiler.passes.layout import require_goal
 from compiler.passes.legalize import measure
-from compiler.passes.quantize import Recipe
-from compiler.pipeline import compile_checkpoint
-from compiler.serialize import is_netlist, read_netlist, write_netlist
+from compiler.serialize import is_netlist, read_netlist
 from compiler.targets import load_target, with_tables
-from compiler.text import text
 from models.evtouch import Recordings
 from models.graphs import CHOICES
 from models.grasps import SYNTHETIC
 from runtime import bits, decisions, explain, export, finetune, render, verdicts, watch, yardstick_command
+from runtime.compile_command import compile_netlist
 from runtime.data_commands import add_data_commands
 from runtime.inputs import (
+    asked_checkpoint,
     asked_graph,
     graph_words,
+    progress,
     propagation,
     recordings,
     require_inspectable,
     require_place,
-    shipped,
+    version,
 )
-from runtime.options import MARGIN, add_compile, add_detail, add_model, add_recordings, add_training, cores_asked
+from runtime.options import add_compile, add_detail, add_model, add_recordings, add_training
 from runtime.tables import show
 
 Arguments = argparse.Namespace
@@ -62,30 +60,12 @@ DEMO = (
 MIN_AGREEMENT = 0.95
 
 
-def version() -> str:
-    """Version of the installed package."""
-    return metadata.version("spikeloom")
-
-
-def _progress(label: str) -> None:
-    if sys.stderr.isatty():
-        sys.stderr.write(f"\r\x1b[K{label} …" if label else "\r\x1b[K")
-        sys.stderr.flush()
-
-
 def _sha256(path: str) -> str:
     return hashlib.sha256(Path(path).read_bytes()).hexdigest()
 
 
-def _checkpoint(path: str, arguments: Arguments) -> Checkpoint:
-    _progress("reading the checkpoint")
-    return read_checkpoint(
-        shipped(path), run=arguments.run, weights=arguments.weights, beta=arguments.beta, theta=arguments.theta
-    )
-
-
 def _recordings(arguments: Arguments, netlist: Netlist, *, labels_for: str | None = None) -> Recordings:
-    _progress("reading the recordings")
+    progress("reading the recordings")
     return recordings(
         arguments.data,
         arguments.split,
@@ -95,110 +75,6 @@ def _recordings(arguments: Arguments, netlist: Netlist, *, labels_for: str | Non
         bin_s=arguments.bin,
         labels_for=labels_for,
     )
-
-
-def _numbers(text: str, option: str) -> list[int]:
-    try:
-        return [int(part) for part in text.split(",")]
-    except ValueError:
-        raise OptionError(f"{option} {text}: not a number; give one, or one for each layer as in 8,4,4,8") from None
-
-
-def _recipes(arguments: Arguments) -> tuple[Recipe, ...] | None:
-    """Storage that the options ask for, or None where they do not."""
-    if not (arguments.weight_bits or arguments.planes or arguments.scale_groups):
-        return None
-    asked = {
-        "--weight-bits": _numbers(arguments.weight_bits or "8", "--weight-bits"),
-        "--planes": _numbers(arguments.planes or "1", "--planes"),
-        "--scale-groups": _numbers(arguments.scale_groups or "1", "--scale-groups"),
-    }
-    layers = max(len(values) for values in asked.values())
-    for option, values in asked.items():
-        if len(values) not in (1, layers):
-            raise OptionError(f"{option}: {len(values)} numbers, another option gives {layers}; give as many, or one")
-    columns = [values if len(values) == layers else values * layers for values in asked.values()]
-    return tuple(Recipe(bits=b, planes=p, groups=g) for b, p, g in zip(*columns, strict=True))
-
-
-def _storage(recipes: tuple[Recipe, ...] | None, checkpoint: Checkpoint) -> Report:
-    """The same for the provenance of a netlist."""
-    if checkpoint.forms is not None:
-        return {"weight_bits": _one_or_list([form.bits for form in checkpoint.forms]), "fine_tuned": True}
-    known = recipes or (Recipe(),)
-    return {
-        "weight_bits": _one_or_list([recipe.bits for recipe in known]),
-        "planes": _one_or_list([recipe.planes for recipe in known]),
-        "scale_groups": _one_or_list([recipe.groups for recipe in known]),
-    }
-
-
-def _one_or_list(values: list[int]) -> int | list[int]:
-    return values[0] if len(set(values)) == 1 else values
-
-
-def _compile(arguments: Arguments) -> Outcome:
-    require_place(arguments.output, "-o", arguments)
-    if arguments.margin is not None and arguments.ranges != "observed":
-        raise OptionError(
-            f"--margin {arguments.margin:g}: only observed ranges have one; add --ranges observed or leave it away"
-        )
-    margin = MARGIN if arguments.margin is None else arguments.margin
-    chip = load_target(arguments.target)
-    recipes = _recipes(arguments)
-    cores_for = cores_asked(arguments.cores_for)
-    require_goal(arguments.optimize, cores_for, chip, calibrated=arguments.calibrate is not None)
-    checkpoint = _checkpoint(arguments.checkpoint, arguments)
-    name, adjacency = propagation(checkpoint, asked_graph(arguments), arguments.checkpoint)
-    training = None
-    if arguments.calibrate is not None:
-        _progress("reading the recordings")
-        training = recordings(
-            arguments.calibrate,
-            "train",
-            classes=checkpoint.classes,
-            taxels=checkpoint.taxels,
-            bin_s=arguments.bin,
-        ).events
-    _progress("compiling")
-
-    def dump(stage: str, artefact: Any) -> None:
-        if stage in arguments.dump_after:
-            sys.stderr.write(text(artefact))
-
-    compilation = compile_checkpoint(
-        checkpoint,
-        adjacency,
-        target=arguments.target,
-        recipes=recipes,
-        spike_exact=arguments.spike_exact,
-        keep_all=arguments.keep_all,
-        prune_unused=arguments.prune_unused,
-        training_events=training,
-        ranges=arguments.ranges,
-        margin=margin,
-        cores_for=cores_for,
-        optimize=arguments.optimize,
-        provenance={
-            "spikeloom": version(),
-            "checkpoint_sha256": checkpoint.sha256,
-            "run": arguments.run,
-            "weights": checkpoint.weights,
-            "graph": name,
-            **_storage(recipes, checkpoint),
-            "spike_exact": arguments.spike_exact,
-            "keep_all": arguments.keep_all,
-            "prune_unused": arguments.prune_unused,
-            "ranges": arguments.ranges,
-            "margin": margin,
-            "calibrated": training is not None,
-            **({"cores_for": cores_for} if cores_for else {}),
-            **({"optimize": arguments.optimize} if arguments.optimize != "cores" else {}),
-        },
-        after=dump,
-    )
-    report = render.compilation_json(compilation, write_netlist(compilation.netlist, arguments.output))
-    return report, render.compilation_text, 0
 
 
 def _inspect(arguments: Arguments) -> Outcome:
@@ -212,7 +88,7 @@ def _inspect(arguments: Arguments) -> Outcome:
         uses = measure(netlist, load_target(netlist.target))
         return render.netlist_json(netlist, uses, _sha256(arguments.path)), render.netlist_text, 0
     given = tuple(name for name in ("beta", "theta") if getattr(arguments, name) is not None)
-    return render.checkpoint_json(_checkpoint(arguments.path, arguments), given), render.checkpoint_text, 0
+    return render.checkpoint_json(asked_checkpoint(arguments.path, arguments), given), render.checkpoint_text, 0
 
 
 def _run(arguments: Arguments) -> Outcome:
@@ -224,7 +100,7 @@ def _run(arguments: Arguments) -> Outcome:
         require_place(arguments.spikes, "--spikes", arguments)
     netlist = read_netlist(arguments.netlist)
     data = _recordings(arguments, netlist)
-    _progress("running")
+    progress("running")
     events = data.events.reshape(len(data), -1, data.steps)
     found: Report | None = None
     if arguments.detail == "spikes" or arguments.spikes is not None:
@@ -256,7 +132,7 @@ def _verify(arguments: Arguments) -> Outcome:
             )
         required = parse_requirements(arguments.require)
     netlist = read_netlist(arguments.netlist)
-    checkpoint = _checkpoint(arguments.checkpoint, arguments)
+    checkpoint = asked_checkpoint(arguments.checkpoint, arguments)
     name, adjacency = propagation(checkpoint, asked_graph(arguments), arguments.checkpoint)
     data = _recordings(arguments, netlist, labels_for="verify")
     verdict = verify(
@@ -266,10 +142,10 @@ def _verify(arguments: Arguments) -> Outcome:
         data.events,
         data.labels,
         data.files,
-        original=None if arguments.original is None else _checkpoint(arguments.original, arguments),
+        original=None if arguments.original is None else asked_checkpoint(arguments.original, arguments),
         spec_samples=arguments.spec_samples,
         lengths=data.lengths,
-        progress=_progress,
+        progress=progress,
     )
     compiled_for = netlist.provenance.get("graph", name)
     if compiled_for != name:
@@ -292,7 +168,7 @@ def _costs(arguments: Arguments, netlist: Netlist, data: Recordings) -> tuple[In
     from runtime.estimate import estimate
     from runtime.estimates import estimate_json
 
-    _progress("running")
+    progress("running")
     target = load_target(netlist.target)
     target = target if arguments.table is None else with_tables(target, arguments.table)
     counts, found = estimate(
@@ -301,7 +177,7 @@ def _costs(arguments: Arguments, netlist: Netlist, data: Recordings) -> tuple[In
         data.events.reshape(len(data), -1, data.steps),
         lengths=data.lengths,
         detail=arguments.detail,
-        progress=lambda done: _progress(f"running: {done} of {len(data)}"),
+        progress=lambda done: progress(f"running: {done} of {len(data)}"),
     )
     return counts.spikes, estimate_json(netlist, target, found, bin_s=arguments.bin)
 
@@ -327,11 +203,11 @@ def _train(arguments: Arguments) -> Outcome:
     graph = asked_graph(arguments)
     if graph is None:
         raise OptionError(f"train: no graph; name it with --graph: {CHOICES}, or give --edges")
-    _progress("reading the recordings")
+    progress("reading the recordings")
     shared: dict[str, Any] = {"taxels": graph.n_taxels, "bin_s": arguments.bin, "labels_for": "training"}
     training = recordings(arguments.data, "train", classes=None, **shared)
     test = recordings(arguments.data, "test", classes=int(training.labels.max()) + 1, **shared)
-    _progress("")
+    progress("")
     data = arguments.data if arguments.data == SYNTHETIC else training.source
     command = f"spikeloom train --data {data} {graph_words(arguments)} --epochs {arguments.epochs}"
     keep = tuple(dict.fromkeys(arguments.keep or WEIGHTS))
@@ -400,7 +276,7 @@ def build_parser() -> argparse.ArgumentParser:
         sub.add_argument("--debug", action="store_true", help="show a traceback on errors")
         return sub
 
-    sub = command("compile", _compile, "lower a checkpoint to a netlist that obeys every limit of the chip")
+    sub = command("compile", compile_netlist, "lower a checkpoint to a netlist that obeys every limit of the chip")
     add_compile(sub)
 
     sub = command("inspect", _inspect, "show a netlist (layers, scales, cores, fill of every limit) or a checkpoint")
@@ -470,16 +346,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         arguments = build_parser().parse_args(words)
         report, as_text, code = arguments.action(arguments)
-        _progress("")
+        progress("")
         show(json.dumps(report) if arguments.json else as_text(report))
         return int(code)
     except (SpikeloomError, OSError, MemoryError) as error:
-        _progress("")
+        progress("")
         if "--debug" in words:
             raise
         sys.stderr.writelines(f"spikeloom: {line}\n" for line in _mistake(error).splitlines())
         return 2
     except KeyboardInterrupt as interrupt:
-        _progress("")
+        progress("")
         sys.stderr.write(f"spikeloom: interrupted; {str(interrupt) or 'nothing was written'}\n")
         return 2

@@ -5,14 +5,14 @@ from __future__ import annotations
 import argparse
 import sys
 import zipfile
-from importlib import resources
+from importlib import metadata, resources
 from pathlib import Path
 
 import numpy as np
 
 from compiler.errors import DataError, ModelError, OptionError
 from compiler.fixedpoint import FloatArray
-from compiler.frontends.checkpoint import Checkpoint
+from compiler.frontends.checkpoint import Checkpoint, read_checkpoint
 from models.events import BIN_S, load_data, need_labels, require_events
 from models.evtouch import Recordings
 from models.graphs import CHOICES, Graph, normalised_adjacency
@@ -183,3 +183,29 @@ def require_inspectable(path: str) -> None:
         return
     shown = ", ".join(sorted(name.as_posix() for name in names)[:3]) or "nothing"
     raise OptionError(f"{path}: holds {shown}, not a netlist or a checkpoint; {_RECORDINGS}")
+
+
+def version() -> str:
+    """Version of the installed package."""
+    return metadata.version("spikeloom")
+
+
+def progress(label: str) -> None:
+    """Say on a terminal what is being done; an empty label wipes the line."""
+    if sys.stderr.isatty():
+        sys.stderr.write(f"\r\x1b[K{label} …" if label else "\r\x1b[K")
+        sys.stderr.flush()
+
+
+def asked_checkpoint(path: str, arguments: argparse.Namespace) -> Checkpoint:
+    """Read a checkpoint as the options say.
+
+    Raises
+    ------
+    OptionError, ModelError
+        If it is not there, or not as they say.
+    """
+    progress("reading the checkpoint")
+    return read_checkpoint(
+        shipped(path), run=arguments.run, weights=arguments.weights, beta=arguments.beta, theta=arguments.theta
+    )

@@ -7,10 +7,9 @@ from collections.abc import Callable
 from typing import Any
 
 from compiler.errors import ModelError
-from compiler.frontends.checkpoint import read_checkpoint
 from compiler.serialize import is_netlist
 from runtime import yardsticks
-from runtime.inputs import asked_graph, propagation, recordings, shipped
+from runtime.inputs import asked_checkpoint, asked_graph, propagation, recordings, shipped
 from runtime.options import add_model, add_recordings
 
 Json = dict[str, Any]
@@ -32,9 +31,7 @@ def measure(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str],
     path = shipped(arguments.checkpoint)
     if is_netlist(path):
         raise ModelError(f"{path}: is a netlist, estimate says what it costs; give the checkpoint it was made from")
-    checkpoint = read_checkpoint(
-        path, run=arguments.run, weights=arguments.weights, beta=arguments.beta, theta=arguments.theta
-    )
+    checkpoint = asked_checkpoint(path, arguments)
     graph, adjacency = propagation(checkpoint, asked_graph(arguments), arguments.checkpoint)
     data = recordings(
         arguments.data,

@@ -22,7 +22,7 @@ from compiler.serialize import read_netlist
 from compiler.targets import load_target
 from compiler.text import text
 from models.graphs import build_graph
-from runtime import cli
+from runtime import cli, compile_command, inputs
 from runtime.inputs import recordings
 
 SIZES = {"conv1": TAXELS * FEATURES, "fc1": 9, "fc2": 8, "fc3": CLASSES}
@@ -508,8 +508,12 @@ def shipped_grasps(monkeypatch, tmp_path):
     """A made-up network in place of the shipped one, and few grasps."""
     last = made_weights(taxels=39, sizes=(6, 5, 6))
     path = str(own_file(tmp_path / "grasps.pt", last=last, graph=build_graph("manual")))
-    monkeypatch.setattr(cli, "shipped", lambda name: path if name == "pretrained:grasps" else name)
-    monkeypatch.setattr(cli, "recordings", lambda *words, **options: recordings(*words, **options | {"limit": 6}))
+    monkeypatch.setattr(inputs, "shipped", lambda name: path if name == "pretrained:grasps" else name)
+    for module in (cli, compile_command):
+        few = {"limit": 6}
+        monkeypatch.setattr(
+            module, "recordings", lambda *words, few=few, **options: recordings(*words, **options | few)
+        )
 
 
 @pytest.mark.usefixtures("shipped_grasps")

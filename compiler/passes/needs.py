@@ -69,10 +69,10 @@ def lists_into(network: IntegerNetwork, chunk: Chunk) -> tuple[Lists, ...]:
             row, column = part.coords[0][keep], part.coords[1][keep]
             pre = projection.weight.shape[1]
             nonzero = np.bincount(column, minlength=pre)
-            first = np.full(pre, chunk.size)
-            last = np.zeros(pre, np.int64)
-            np.minimum.at(first, column, row)
-            np.maximum.at(last, column, row)
+            # rows ascend, and of repeated indices the last assignment stays
+            first, last = np.zeros((2, pre), np.int64)
+            last[column] = row
+            first[column[::-1]] = row[::-1]
             source = np.flatnonzero(nonzero)
             found.append(
                 Lists(

@@ -1,0 +1,127 @@
+"""The command ``compile``: a checkpoint becomes a netlist."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from typing import Any
+
+from compiler.errors import OptionError
+from compiler.frontends.checkpoint import Checkpoint
+from compiler.passes.layout import require_goal
+from compiler.passes.quantize import Recipe
+from compiler.pipeline import compile_checkpoint
+from compiler.serialize import write_netlist
+from compiler.targets import load_target
+from compiler.text import text
+from runtime import render
+from runtime.inputs import asked_checkpoint, asked_graph, progress, propagation, recordings, require_place, version
+from runtime.options import MARGIN, cores_asked
+
+Json = dict[str, Any]
+
+
+def compile_netlist(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
+    """Run the command: the report, how to print it, and the exit code."""
+    require_place(arguments.output, "-o", arguments)
+    if arguments.margin is not None and arguments.ranges != "observed":
+        raise OptionError(
+            f"--margin {arguments.margin:g}: only observed ranges have one; add --ranges observed or leave it away"
+        )
+    margin = MARGIN if arguments.margin is None else arguments.margin
+    chip = load_target(arguments.target)
+    recipes = _recipes(arguments)
+    cores_for = cores_asked(arguments.cores_for)
+    require_goal(arguments.optimize, cores_for, chip, calibrated=arguments.calibrate is not None)
+    checkpoint = asked_checkpoint(arguments.checkpoint, arguments)
+    name, adjacency = propagation(checkpoint, asked_graph(arguments), arguments.checkpoint)
+    training = None
+    if arguments.calibrate is not None:
+        progress("reading the recordings")
+        training = recordings(
+            arguments.calibrate,
+            "train",
+            classes=checkpoint.classes,
+            taxels=checkpoint.taxels,
+            bin_s=arguments.bin,
+        ).events
+    progress("compiling")
+
+    def dump(stage: str, artefact: Any) -> None:
+        if stage in arguments.dump_after:
+            sys.stderr.write(text(artefact))
+
+    compilation = compile_checkpoint(
+        checkpoint,
+        adjacency,
+        target=arguments.target,
+        recipes=recipes,
+        spike_exact=arguments.spike_exact,
+        keep_all=arguments.keep_all,
+        prune_unused=arguments.prune_unused,
+        training_events=training,
+        ranges=arguments.ranges,
+        margin=margin,
+        cores_for=cores_for,
+        optimize=arguments.optimize,
+        provenance={
+            "spikeloom": version(),
+            "checkpoint_sha256": checkpoint.sha256,
+            "run": arguments.run,
+            "weights": checkpoint.weights,
+            "graph": name,
+            **_storage(recipes, checkpoint),
+            "spike_exact": arguments.spike_exact,
+            "keep_all": arguments.keep_all,
+            "prune_unused": arguments.prune_unused,
+            "ranges": arguments.ranges,
+            "margin": margin,
+            "calibrated": training is not None,
+            **({"cores_for": cores_for} if cores_for else {}),
+            **({"optimize": arguments.optimize} if arguments.optimize != "cores" else {}),
+        },
+        after=dump,
+    )
+    report = render.compilation_json(compilation, write_netlist(compilation.netlist, arguments.output))
+    return report, render.compilation_text, 0
+
+
+def _numbers(text: str, option: str) -> list[int]:
+    try:
+        return [int(part) for part in text.split(",")]
+    except ValueError:
+        raise OptionError(f"{option} {text}: not a number; give one, or one for each layer as in 8,4,4,8") from None
+
+
+def _recipes(arguments: argparse.Namespace) -> tuple[Recipe, ...] | None:
+    """Storage that the options ask for, or None where they do not."""
+    if not (arguments.weight_bits or arguments.planes or arguments.scale_groups):
+        return None
+    asked = {
+        "--weight-bits": _numbers(arguments.weight_bits or "8", "--weight-bits"),
+        "--planes": _numbers(arguments.planes or "1", "--planes"),
+        "--scale-groups": _numbers(arguments.scale_groups or "1", "--scale-groups"),
+    }
+    layers = max(len(values) for values in asked.values())
+    for option, values in asked.items():
+        if len(values) not in (1, layers):
+            raise OptionError(f"{option}: {len(values)} numbers, another option gives {layers}; give as many, or one")
+    columns = [values if len(values) == layers else values * layers for values in asked.values()]
+    return tuple(Recipe(bits=b, planes=p, groups=g) for b, p, g in zip(*columns, strict=True))
+
+
+def _storage(recipes: tuple[Recipe, ...] | None, checkpoint: Checkpoint) -> Json:
+    """The same for the provenance of a netlist."""
+    if checkpoint.forms is not None:
+        return {"weight_bits": _one_or_list([form.bits for form in checkpoint.forms]), "fine_tuned": True}
+    known = recipes or (Recipe(),)
+    return {
+        "weight_bits": _one_or_list([recipe.bits for recipe in known]),
+        "planes": _one_or_list([recipe.planes for recipe in known]),
+        "scale_groups": _one_or_list([recipe.groups for recipe in known]),
+    }
+
+
+def _one_or_list(values: list[int]) -> int | list[int]:
+    return values[0] if len(set(values)) == 1 else values
