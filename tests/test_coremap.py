@@ -10,7 +10,7 @@ from compiler.passes.legalize import measure
 from compiler.pipeline import compile_checkpoint
 from compiler.targets import load_target
 from models.graphs import normalised_adjacency
-from runtime.cli import shipped
+from runtime.inputs import shipped
 
 TARGET = load_target("loihi1")
 
