@@ -15,7 +15,8 @@ from collections.abc import Callable
 from typing import Any
 
 from compiler.frontends.checkpoint import read_checkpoint
-from compiler.pipeline import compile_checkpoint
+from compiler.passes.expand import expand
+from compiler.pipeline import compile_network
 from models.evtouch import load_recordings
 from models.graphs import build_graph, normalised_adjacency
 from models.reference import float_spikes
@@ -43,13 +44,13 @@ def main() -> None:
     adjacency = normalised_adjacency(graph.edges, graph.n_taxels)
     train = load_recordings(arguments.recordings, "train").events
     test = load_recordings(arguments.recordings, "test").events
-    netlist = compile_checkpoint(checkpoint, adjacency, training_events=train).netlist
+    netlist = compile_network(expand(checkpoint, adjacency), training_events=train).netlist
     flat = test.reshape(len(test), netlist.n_inputs, -1)
     prepared = engine.prepare(netlist)
 
     jobs: dict[str, Callable[[], Any]] = {
-        "compile, calibrated": lambda: compile_checkpoint(checkpoint, adjacency, training_events=train),
-        "compile, from the weights": lambda: compile_checkpoint(checkpoint, adjacency),
+        "compile, calibrated": lambda: compile_network(expand(checkpoint, adjacency), training_events=train),
+        "compile, from the weights": lambda: compile_network(expand(checkpoint, adjacency)),
         "engine, all recordings": lambda: engine.simulate(prepared, flat, threads=1),
         "engine, one recording": lambda: engine.simulate(prepared, flat[:1], threads=1),
         "float model, all recordings": lambda: float_spikes(checkpoint, adjacency, test, dtype="float32"),

@@ -19,8 +19,9 @@ import numpy as np
 from compiler.atomic import write_atomically
 from compiler.frontends.checkpoint import Checkpoint, read_checkpoint
 from compiler.interpret import vote
+from compiler.passes.expand import expand
 from compiler.passes.quantize import Recipe
-from compiler.pipeline import compile_checkpoint
+from compiler.pipeline import compile_network
 from compiler.targets import load_target
 from models.evtouch import Recordings, load_recordings
 from models.graphs import build_graph, normalised_adjacency
@@ -54,7 +55,9 @@ def measure(
     """Compile and run one network by one scheme."""
     options = dict(options)
     events = training.events if options.pop("calibrated", True) else None
-    netlist = compile_checkpoint(checkpoint, adjacency, training_events=events, **options).netlist
+    netlist = compile_network(
+        expand(checkpoint, adjacency), forms=checkpoint.forms, training_events=events, **options
+    ).netlist
     trace = engine.simulate(netlist, test.events.reshape(len(test), -1, test.steps), spikes=True)
     assert trace.spikes is not None
     costs = cost.estimate(cost.prepare(netlist, load_target(netlist.target)), trace.counts, test.steps)

@@ -1,4 +1,4 @@
-"""The ordered passes: checkpoint to netlist, verified after each, printable after each."""
+"""The ordered passes: float network to netlist, verified after each, printable after each."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ import numpy.typing as npt
 from compiler.errors import OptionError
 from compiler.fixedpoint import FloatArray
 from compiler.forms import Form
-from compiler.frontends.checkpoint import Checkpoint
 from compiler.interpret import channels_last
 from compiler.ir import IntegerNetwork, Network
 from compiler.netlist import Netlist
@@ -20,7 +19,6 @@ from compiler.passes.bounds import RangeProof, prove_ranges
 from compiler.passes.calibrate import FEW, MANY, Calibration, calibrate, evenly_spaced
 from compiler.passes.emit import Origin, emit
 from compiler.passes.exact import Exactness, make_exact
-from compiler.passes.expand import expand
 from compiler.passes.layout import Layout, lay_out, require_goal
 from compiler.passes.legalize import LimitUse, require_legal
 from compiler.passes.place import Placement
@@ -96,10 +94,10 @@ class Compilation:
         return self.layout.parts.bound
 
 
-def compile_checkpoint(
-    checkpoint: Checkpoint,
-    adjacency: FloatArray,
+def compile_network(
+    network: Network,
     *,
+    forms: Sequence[Form] | None = None,
     target: str = "loihi1",
     recipes: Sequence[Recipe] | None = None,
     spike_exact: bool = False,
@@ -113,18 +111,18 @@ def compile_checkpoint(
     provenance: Mapping[str, Any] | None = None,
     after: Callable[[str, Network | IntegerNetwork | Netlist], None] | None = None,
 ) -> Compilation:
-    """Lower a trained checkpoint to a placed netlist that obeys every limit of the chip.
+    """Lower a float network, wherever it comes from, to a placed netlist that obeys every limit of the chip.
 
     Parameters
     ----------
-    checkpoint : Checkpoint
-        Trained weights.
-    adjacency : (taxels, taxels) float64
-        Normalised propagation matrix of the graph that it was trained on.
+    network : Network
+        Float stage.
+    forms : sequence of Form, optional
+        Storage that the network was fine-tuned for, by population.
     target : str
         Chip.
     recipes : sequence of Recipe
-        Storage of each layer, or one for all; 8 bits by default. A fine-tuned checkpoint brings its own and takes none.
+        Storage of each layer, or one for all; 8 bits by default. A fine-tuned network brings its own and takes none.
     spike_exact : bool
         Add planes and scales until every spike on the training recordings, all of them, is the float64 model's, see
         :mod:`compiler.passes.exact`; takes the width from `recipes` and nothing else.
@@ -158,7 +156,6 @@ def compile_checkpoint(
     require_goal(optimize, cores_for, chip, calibrated=training_events is not None)
     publish = after or (lambda _stage, _artefact: None)
 
-    network = expand(checkpoint, adjacency)
     verify(network)
     publish("expand", network)
 
@@ -172,25 +169,25 @@ def compile_checkpoint(
         rates = tuple(spikes.mean(axis=(0, 1)) for spikes in calibration.spikes)
     unused = nobody(network)
     if prune_unused:
-        if calibration is None or keep_all or checkpoint.forms is not None:
+        if calibration is None or keep_all or forms is not None:
             raise OptionError(
                 "--prune-unused: needs --calibrate, and neither --keep-all nor a fine-tuned checkpoint; "
                 "change the options"
             )
         unused = never_fired(network, calibration)
     whole = network
-    if not keep_all and checkpoint.forms is None:
+    if not keep_all and forms is None:
         network = disconnect(network, either(never_fires(network), unused))
 
     exactness: tuple[Exactness, ...] = ()
-    if checkpoint.forms is not None:
+    if forms is not None:
         if recipes is not None or spike_exact or ranges != "proven":
             raise OptionError(
                 "compile: the checkpoint was fine-tuned for its own storage; leave --weight-bits, --planes, "
                 "--scale-groups, --spike-exact and --ranges away"
             )
-        _require_stored(network, checkpoint.forms, chip)
-        integer, choices = round_to_forms(network, checkpoint.forms, calibration)
+        _require_stored(network, forms, chip)
+        integer, choices = round_to_forms(network, forms, calibration)
     elif spike_exact:
         integer, choices, exactness = _exact(network, chip, recipes or (Recipe(),), calibration, ranges)
     else:

@@ -9,9 +9,10 @@ from typing import Any
 
 from compiler.errors import OptionError
 from compiler.frontends.checkpoint import Checkpoint
+from compiler.passes.expand import expand
 from compiler.passes.layout import require_goal
 from compiler.passes.quantize import Recipe
-from compiler.pipeline import compile_checkpoint
+from compiler.pipeline import compile_network
 from compiler.serialize import write_netlist
 from compiler.targets import load_target
 from compiler.text import text
@@ -52,9 +53,9 @@ def compile_netlist(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json
         if stage in arguments.dump_after:
             sys.stderr.write(text(artefact))
 
-    compilation = compile_checkpoint(
-        checkpoint,
-        adjacency,
+    compilation = compile_network(
+        expand(checkpoint, adjacency),
+        forms=checkpoint.forms,
         target=arguments.target,
         recipes=recipes,
         spike_exact=arguments.spike_exact,

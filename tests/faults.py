@@ -19,7 +19,7 @@ from compiler.lift import lift
 from compiler.netlist import Netlist
 from compiler.passes.expand import expand
 from compiler.passes.quantize import Recipe, round_to_forms
-from compiler.pipeline import compile_checkpoint
+from compiler.pipeline import compile_network
 from models.graphs import normalised_adjacency
 from runtime import engine
 from runtime.causes import Explanation, Observed, explain
@@ -73,14 +73,14 @@ class Base:
         """Compile something else in the same way."""
         checkpoint = self.checkpoint if checkpoint is None else checkpoint
         adjacency = normalised_adjacency(self.edges if edges is None else edges, checkpoint.taxels)
-        return compile_checkpoint(
-            checkpoint, adjacency, recipes=(self.recipe,), training_events=self.calibration
+        return compile_network(
+            expand(checkpoint, adjacency), recipes=(self.recipe,), training_events=self.calibration
         ).netlist
 
 
 def base_of(checkpoint, edges, recipe, events, calibration=None) -> Base:
     adjacency = normalised_adjacency(edges, checkpoint.taxels)
-    netlist = compile_checkpoint(checkpoint, adjacency, recipes=(recipe,), training_events=calibration).netlist
+    netlist = compile_network(expand(checkpoint, adjacency), recipes=(recipe,), training_events=calibration).netlist
     return Base(
         checkpoint=checkpoint,
         edges=edges,

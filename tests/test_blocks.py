@@ -9,8 +9,9 @@ from random_netlists import Axon, Neuron, assert_equal, build, by_engine, by_ste
 from compiler.errors import NumericRangeError
 from compiler.frontends.checkpoint import read_checkpoint
 from compiler.netlist import Netlist
+from compiler.passes.expand import expand
 from compiler.passes.quantize import Recipe
-from compiler.pipeline import compile_checkpoint
+from compiler.pipeline import compile_network
 from runtime import engine, spec
 from runtime.blocks import lay_out_blocks
 from runtime.trace import Charges
@@ -238,7 +239,7 @@ def test_the_released_network(released_checkpoint, objects_zip, recipe):
     graph = build_graph("manual")
     checkpoint = read_checkpoint(released_checkpoint)
     adjacency = normalised_adjacency(graph.edges, graph.n_taxels)
-    netlist = compile_checkpoint(checkpoint, adjacency, recipes=(recipe,)).netlist
+    netlist = compile_network(expand(checkpoint, adjacency), recipes=(recipe,)).netlist
     recordings = load_recordings(objects_zip, "test")
     events = recordings.events[::24].reshape(6, -1, recordings.steps)
     prepared = engine.prepare(netlist)

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from made_files import CLASSES, STEPS, TAXELS, events, small_checkpoint, weights
 
+from compiler.passes.expand import expand
 from compiler.passes.quantize import Recipe
-from compiler.pipeline import compile_checkpoint
+from compiler.pipeline import compile_network
 from runtime import cli, verdicts
 from runtime.breakdowns import breakdowns
 from runtime.equivalence import verify
@@ -79,7 +80,7 @@ def test_nearly_empty_recordings():
 
 def verified(folder, arrays, recordings, recipe, **options):
     checkpoint, adjacency = small_checkpoint(folder, last=arrays)
-    netlist = compile_checkpoint(checkpoint, adjacency, recipes=(recipe,), **options).netlist
+    netlist = compile_network(expand(checkpoint, adjacency), recipes=(recipe,), **options).netlist
     verdict = verify(netlist, checkpoint, adjacency, recordings, LABELS, FILES)
     report = verdicts.verify_json(verdict, levels_of(verdict), [])
     return {breakdown["kind"]: breakdown for breakdown in report["breakdowns"]}, verdicts.verify_text(report)

@@ -13,7 +13,7 @@ from compiler.interpret import channels_last, run_float, vote
 from compiler.lift import lift
 from compiler.passes.expand import expand
 from compiler.passes.quantize import Recipe
-from compiler.pipeline import compile_checkpoint
+from compiler.pipeline import compile_network
 from models.reference import float_spikes
 from runtime import engine
 from runtime.certificates import _recurrence, certificate_json, certificate_text, certify, float_certainty, wins
@@ -191,7 +191,7 @@ def by_hand(checkpoint, adjacency, recordings, chip, kept=None, lengths=None):
 @pytest.mark.parametrize("bits", [4, 8])
 def test_entries_are_counted_once_each(folder, bits):
     checkpoint, adjacency = model(folder, 3)
-    netlist = compile_checkpoint(checkpoint, adjacency, recipes=(Recipe(bits=bits),)).netlist
+    netlist = compile_network(expand(checkpoint, adjacency), recipes=(Recipe(bits=bits),)).netlist
     recordings = events(4, samples=10, steps=12)
     chip, decisions = on_chip(netlist, recordings)
     found = certify(checkpoint, adjacency, lift(netlist), recordings, chip, decisions)
@@ -209,7 +209,7 @@ def test_entries_are_counted_once_each(folder, bits):
 
 def test_parts_of_layers_and_of_recordings(folder):
     checkpoint, adjacency = model(folder, 3)
-    netlist = compile_checkpoint(checkpoint, adjacency, recipes=(Recipe(bits=4),)).netlist
+    netlist = compile_network(expand(checkpoint, adjacency), recipes=(Recipe(bits=4),)).netlist
     recordings, lengths = events(4, samples=3, steps=12), np.array([5, 12, 9])
     for recording, length in zip(recordings, lengths, strict=True):
         recording[..., length:] = 0
@@ -225,7 +225,7 @@ def test_parts_of_layers_and_of_recordings(folder):
 
 def test_a_flipped_spike_is_certified_different(folder):
     checkpoint, adjacency = model(folder, 3)
-    netlist = compile_checkpoint(checkpoint, adjacency, recipes=(Recipe(bits=8),)).netlist
+    netlist = compile_network(expand(checkpoint, adjacency), recipes=(Recipe(bits=8),)).netlist
     recordings = events(4, samples=2, steps=12)
     chip, decisions = on_chip(netlist, recordings)
     _, doubt = float_certainty(checkpoint, adjacency, recordings)[1]
@@ -249,7 +249,7 @@ def far_from_thresholds():
 
 def test_a_network_far_from_its_thresholds_is_certified_whole(tmp_path):
     checkpoint, adjacency = small_checkpoint(tmp_path, last=far_from_thresholds(), beta=0.0, theta=0.25)
-    netlist = compile_checkpoint(checkpoint, adjacency).netlist
+    netlist = compile_network(expand(checkpoint, adjacency)).netlist
     files = tuple("abcdef")
     verdict = verify(netlist, checkpoint, adjacency, events(2, steps=8), np.arange(6) % CLASSES, files)
     found = verdict.certificate
@@ -263,7 +263,7 @@ def test_a_network_far_from_its_thresholds_is_certified_whole(tmp_path):
 
 def test_the_same_network_at_its_thresholds_is_not(tmp_path):
     checkpoint, adjacency = small_checkpoint(tmp_path, last=far_from_thresholds(), beta=0.5, theta=0.5)
-    netlist = compile_checkpoint(checkpoint, adjacency).netlist
+    netlist = compile_network(expand(checkpoint, adjacency)).netlist
     verdict = verify(netlist, checkpoint, adjacency, events(2, steps=8), np.zeros(6, np.int64), tuple("abcdef"))
     # these very sums are exact, so that no spike differs; another order of sums is not known to be
     assert verdict.first_divergence is None
@@ -274,7 +274,7 @@ def test_the_same_network_at_its_thresholds_is_not(tmp_path):
 def test_registers_without_a_proof_are_named(tmp_path):
     """Almost without leak a negative input adds up almost without end: the membrane may clip, and is said to."""
     checkpoint, adjacency = small_checkpoint(tmp_path, beta=4095 / 4096)
-    netlist = compile_checkpoint(checkpoint, adjacency, keep_all=True).netlist
+    netlist = compile_network(expand(checkpoint, adjacency), keep_all=True).netlist
     recordings = events(2, steps=8)
     found = certify(checkpoint, adjacency, lift(netlist), recordings, *on_chip(netlist, recordings))
     assert found.unproven == ("conv1", "fc1", "fc2", "fc3")

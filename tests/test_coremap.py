@@ -6,8 +6,9 @@ import pytest
 
 from compiler.coremap import core_map
 from compiler.frontends.checkpoint import read_checkpoint
+from compiler.passes.expand import expand
 from compiler.passes.legalize import measure
-from compiler.pipeline import compile_checkpoint
+from compiler.pipeline import compile_network
 from compiler.targets import load_target
 from models.graphs import normalised_adjacency
 from runtime.inputs import shipped
@@ -18,7 +19,7 @@ TARGET = load_target("loihi1")
 @pytest.fixture(scope="module")
 def compilation():
     checkpoint = read_checkpoint(shipped("pretrained:grasps"))
-    return compile_checkpoint(checkpoint, normalised_adjacency(checkpoint.edges, checkpoint.taxels))
+    return compile_network(expand(checkpoint, normalised_adjacency(checkpoint.edges, checkpoint.taxels)))
 
 
 def test_axons_of_the_map_are_those_that_the_limits_count(compilation):

@@ -12,7 +12,8 @@ from made_files import own_file, recordings_folder, weights
 
 from compiler.frontends.checkpoint import read_checkpoint
 from compiler.netlist import Netlist
-from compiler.pipeline import compile_checkpoint
+from compiler.passes.expand import expand
+from compiler.pipeline import compile_network
 from compiler.serialize import netlist_bytes, read_netlist
 from models.evtouch import load_recordings
 from models.graphs import build_graph, normalised_adjacency
@@ -209,9 +210,8 @@ def test_compiled_again_the_bytes_are_the_same(compiled, released_checkpoint, ob
     path, _ = compiled
     first = read_netlist(path)
     graph = build_graph("manual")
-    again = compile_checkpoint(
-        read_checkpoint(released_checkpoint),
-        normalised_adjacency(graph.edges, graph.n_taxels),
+    again = compile_network(
+        expand(read_checkpoint(released_checkpoint), normalised_adjacency(graph.edges, graph.n_taxels)),
         training_events=load_recordings(objects_zip, "train").events,
         provenance=first.provenance,
     )

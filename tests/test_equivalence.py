@@ -16,7 +16,7 @@ from compiler.lift import lift
 from compiler.netlist import read_only
 from compiler.passes.expand import expand
 from compiler.passes.quantize import Recipe
-from compiler.pipeline import compile_checkpoint
+from compiler.pipeline import compile_network
 from models.reference import float_membranes, float_spikes
 from runtime import cli, engine, equivalence, spec
 from runtime.equivalence import LADDER, realised, verify
@@ -32,7 +32,7 @@ FILES = tuple("abcdef")
 def small(tmp_path_factory):
     """A checkpoint, its propagation matrix and a coarse netlist that often strays from it."""
     checkpoint, adjacency = small_checkpoint(tmp_path_factory.mktemp("small"))
-    netlist = compile_checkpoint(checkpoint, adjacency, recipes=(Recipe(bits=4),)).netlist
+    netlist = compile_network(expand(checkpoint, adjacency), recipes=(Recipe(bits=4),)).netlist
     return checkpoint, adjacency, netlist
 
 
@@ -106,7 +106,7 @@ def test_the_first_divergence_is_the_first(small, verdict):
 @pytest.mark.parametrize("seed", range(6))
 def test_the_first_divergence_of_other_networks(tmp_path, seed):
     checkpoint, adjacency = small_checkpoint(tmp_path, last=weights(seed))
-    netlist = compile_checkpoint(checkpoint, adjacency, recipes=(Recipe(bits=6),), keep_all=True).netlist
+    netlist = compile_network(expand(checkpoint, adjacency), recipes=(Recipe(bits=6),), keep_all=True).netlist
     recordings = events(seed, samples=3)
     found = verify(netlist, checkpoint, adjacency, recordings, LABELS[:3], FILES[:3], spec_samples=1).first_divergence
     reference = list(float_spikes(checkpoint, adjacency, recordings).values())
@@ -162,7 +162,7 @@ def test_saturation_is_a_rung_of_its_own(tmp_path):
     checkpoint, adjacency = small_checkpoint(tmp_path, last=arrays, beta=4095 / 4096)
     recordings = np.zeros((1, 6, 2, 80), np.uint8)
     recordings[:, :, :, 30:] = 1
-    netlist = compile_checkpoint(checkpoint, adjacency).netlist
+    netlist = compile_network(expand(checkpoint, adjacency)).netlist
     found = verify(netlist, checkpoint, adjacency, recordings, LABELS[:1], FILES[:1])
     ladder = dict(found.ladder)
     assert ladder["rounding"]["fc1"] < ladder["saturation"]["fc1"] == found.spikes["fc1"].different
@@ -181,7 +181,7 @@ def exact_network(folder):
 
 def test_no_divergence_at_all(tmp_path):
     checkpoint, adjacency = exact_network(tmp_path)
-    netlist = compile_checkpoint(checkpoint, adjacency).netlist
+    netlist = compile_network(expand(checkpoint, adjacency)).netlist
     found = verify(netlist, checkpoint, adjacency, events(2, steps=8), LABELS, FILES)
     assert found.first_divergence is None
     assert all(layer.float == layer.chip > 0 for layer in found.spikes.values())
@@ -195,7 +195,7 @@ def test_ill_posed_spikes_are_told_from_faults(tmp_path):
     arrays["fc1.bias"][:] = 2.0
     arrays["fc2.weight"][:, :2] = [1.0, 2.0**-25]
     checkpoint, adjacency = small_checkpoint(tmp_path, last=arrays, beta=0.0, theta=1.0)
-    netlist = compile_checkpoint(checkpoint, adjacency, keep_all=True).netlist
+    netlist = compile_network(expand(checkpoint, adjacency), keep_all=True).netlist
     found = verify(netlist, checkpoint, adjacency, events(0), LABELS, FILES)
     assert found.spikes["fc2"].float == 0
     assert found.spikes["fc2"].ill_posed == 6 * STEPS * 8

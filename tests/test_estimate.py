@@ -7,8 +7,9 @@ import pytest
 from made_files import events, small_checkpoint
 from random_networks import LOIHI
 
+from compiler.passes.expand import expand
 from compiler.passes.quantize import Recipe
-from compiler.pipeline import compile_checkpoint
+from compiler.pipeline import compile_network
 from runtime import engine, timing
 from runtime.charges import charges, simple_from
 from runtime.estimate import estimate
@@ -20,7 +21,7 @@ LENGTHS = np.array([30, 7, 1, 30])
 @pytest.fixture(scope="module")
 def small(tmp_path_factory):
     checkpoint, adjacency = small_checkpoint(tmp_path_factory.mktemp("small"))
-    netlist = compile_checkpoint(checkpoint, adjacency, recipes=(Recipe(planes=2),)).netlist
+    netlist = compile_network(expand(checkpoint, adjacency), recipes=(Recipe(planes=2),)).netlist
     recordings = events(5, samples=4, steps=30)
     return netlist, recordings.reshape(4, netlist.n_inputs, -1)
 

@@ -8,8 +8,9 @@ from compiler.errors import OptionError
 from compiler.interpret import run_integer
 from compiler.passes.calibrate import calibrate
 from compiler.passes.exact import make_exact
+from compiler.passes.expand import expand
 from compiler.passes.quantize import Recipe, quantize
-from compiler.pipeline import compile_checkpoint
+from compiler.pipeline import compile_network
 from compiler.verify import verify
 
 
@@ -87,5 +88,5 @@ def test_an_outlier_takes_another_plane():
 )
 def test_exactness_that_cannot_be_had(options, message):
     with pytest.raises(OptionError) as caught:
-        compile_checkpoint(random_checkpoint(), np.eye(5), spike_exact=True, **options)
+        compile_network(expand(random_checkpoint(), np.eye(5)), spike_exact=True, **options)
     assert str(caught.value) == message

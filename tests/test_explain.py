@@ -12,7 +12,7 @@ from compiler.interpret import channels_last, run_float
 from compiler.lift import lift
 from compiler.passes.expand import expand
 from compiler.passes.quantize import Recipe
-from compiler.pipeline import compile_checkpoint
+from compiler.pipeline import compile_network
 from compiler.serialize import read_netlist
 from models.events import load_data
 from models.graphs import build_graph, normalised_adjacency
@@ -245,7 +245,7 @@ def test_every_cause_has_a_change(cause):
 def test_a_released_recording_is_explained_within_a_second(released_checkpoint, objects_zip):
     checkpoint = read_checkpoint(released_checkpoint)
     adjacency = normalised_adjacency(build_graph("manual").edges, checkpoint.taxels)
-    netlist = compile_checkpoint(checkpoint, adjacency, recipes=(Recipe(),)).netlist
+    netlist = compile_network(expand(checkpoint, adjacency), recipes=(Recipe(),)).netlist
     recording = load_data(objects_zip, "test", limit=4)[0].events[3:4]
     network, integer, prepared = expand(checkpoint, adjacency), lift(netlist), engine.prepare(netlist)
     engine.simulate(prepared, recording.reshape(1, 78, -1))  # compiles the kernel where it is not cached

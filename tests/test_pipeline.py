@@ -10,8 +10,9 @@ from compiler.ir import IntegerNetwork, Network, fan_in
 from compiler.lift import lift
 from compiler.netlist import Netlist, one_step_bounds
 from compiler.passes.bounds import prove_ranges
+from compiler.passes.expand import expand
 from compiler.passes.quantize import Recipe
-from compiler.pipeline import STAGES, compile_checkpoint
+from compiler.pipeline import STAGES, compile_network
 from compiler.serialize import netlist_bytes, read_netlist, write_netlist
 from compiler.text import text
 from models.evtouch import load_recordings
@@ -35,8 +36,8 @@ def grasps(samples=6, *, taxels=5, steps=40, seed=0):
 
 def test_the_passes_run_in_order_and_hand_on_what_they_make():
     seen = []
-    done = compile_checkpoint(
-        random_checkpoint(), ring(5), after=lambda stage, artefact: seen.append((stage, artefact))
+    done = compile_network(
+        expand(random_checkpoint(), ring(5)), after=lambda stage, artefact: seen.append((stage, artefact))
     )
     assert tuple(stage for stage, _ in seen) == STAGES == ("expand", "quantize", "place")
     assert [type(artefact) for _, artefact in seen] == [Network, IntegerNetwork, Netlist]
@@ -54,8 +55,8 @@ def test_the_passes_run_in_order_and_hand_on_what_they_make():
 @pytest.mark.parametrize("options", [{"cores_for": {"conv1": 3, "fc2": 2}}, {"optimize": "latency"}])
 def test_a_layout_changes_no_spike(options):
     events = grasps(seed=9)
-    usual = compile_checkpoint(random_checkpoint(seed=4), ring(5), training_events=grasps())
-    done = compile_checkpoint(random_checkpoint(seed=4), ring(5), training_events=grasps(), **options)
+    usual = compile_network(expand(random_checkpoint(seed=4), ring(5)), training_events=grasps())
+    done = compile_network(expand(random_checkpoint(seed=4), ring(5)), training_events=grasps(), **options)
     assert done.usual.parts.cores == usual.layout.parts.cores
     assert done.usual.expected == usual.layout.expected
     assert done.netlist.n_cores == len(done.layout.parts.cores) > usual.netlist.n_cores
@@ -67,10 +68,10 @@ def test_a_layout_changes_no_spike(options):
 
 
 def test_what_is_left_out_is_not_counted_among_the_neurons_of_a_layer():
-    kept = compile_checkpoint(random_checkpoint(seed=4), ring(5), cores_for={"conv1": 2})
+    kept = compile_network(expand(random_checkpoint(seed=4), ring(5)), cores_for={"conv1": 2})
     held = int(np.count_nonzero(kept.netlist.layer == 0))
     with pytest.raises(OptionError) as caught:
-        compile_checkpoint(random_checkpoint(seed=4), ring(5), cores_for={"conv1": held + 1})
+        compile_network(expand(random_checkpoint(seed=4), ring(5)), cores_for={"conv1": held + 1})
     assert str(caught.value) == (
         f"--cores-for conv1={held + 1}: conv1 has {held} neurons on the chip; give {held} or fewer"
     )
@@ -81,8 +82,11 @@ def test_what_is_left_out_is_not_counted_among_the_neurons_of_a_layer():
 def test_two_compiles_give_the_same_bytes(bits, calibrated):
     def compiled():
         events = grasps() if calibrated else None
-        return compile_checkpoint(
-            random_checkpoint(), ring(5), recipes=(Recipe(bits=bits),), training_events=events, provenance={"seed": 1}
+        return compile_network(
+            expand(random_checkpoint(), ring(5)),
+            recipes=(Recipe(bits=bits),),
+            training_events=events,
+            provenance={"seed": 1},
         )
 
     one, two = compiled(), compiled()
@@ -92,7 +96,7 @@ def test_two_compiles_give_the_same_bytes(bits, calibrated):
 
 
 def test_the_file_means_the_integer_network(tmp_path):
-    done = compile_checkpoint(random_checkpoint(seed=4), ring(5), training_events=grasps())
+    done = compile_network(expand(random_checkpoint(seed=4), ring(5)), training_events=grasps())
     write_netlist(done.netlist, tmp_path / "a.loom")
     events = channels_last(grasps(seed=9))
     expected = run_integer(done.integer, events, membranes=True)
@@ -104,7 +108,7 @@ def test_the_file_means_the_integer_network(tmp_path):
 
 def test_the_proof_covers_the_netlist():
     """Bounds of the network and of the netlist are counted in two places and agree."""
-    done = compile_checkpoint(random_checkpoint(seed=2), ring(5))
+    done = compile_network(expand(random_checkpoint(seed=2), ring(5)))
     positive, negative = one_step_bounds(done.netlist)
     for layer, proof in enumerate(done.proofs):
         ids = done.netlist.compartments_of(layer)
@@ -113,32 +117,34 @@ def test_the_proof_covers_the_netlist():
 
 def test_observed_ranges_need_recordings():
     with pytest.raises(OptionError) as caught:
-        compile_checkpoint(random_checkpoint(), ring(5), ranges="observed")
+        compile_network(expand(random_checkpoint(), ring(5)), ranges="observed")
     assert str(caught.value) == ("--ranges observed: nothing was observed; give --calibrate, or use --ranges proven")
 
 
 @pytest.mark.parametrize("margin", [-0.1, np.inf, np.nan])
 def test_a_margin_that_is_no_share(margin):
     with pytest.raises(OptionError) as caught:
-        compile_checkpoint(random_checkpoint(), ring(5), training_events=grasps(), ranges="observed", margin=margin)
+        compile_network(
+            expand(random_checkpoint(), ring(5)), training_events=grasps(), ranges="observed", margin=margin
+        )
     assert str(caught.value) == f"--margin {margin:g}: is no share to add to a range; give a number from 0"
 
 
 def test_an_unknown_target():
     with pytest.raises(OptionError) as caught:
-        compile_checkpoint(random_checkpoint(), ring(5), target="loihi2")
+        compile_network(expand(random_checkpoint(), ring(5)), target="loihi2")
     assert str(caught.value) == "--target loihi2: not modelled; no public per-event energies; allowed: loihi1"
 
 
 def test_an_empty_split():
     with pytest.raises(DataError) as caught:
-        compile_checkpoint(random_checkpoint(), ring(5), training_events=grasps(0))
+        compile_network(expand(random_checkpoint(), ring(5)), training_events=grasps(0))
     assert str(caught.value) == "calibration: the split is empty; give recordings with a train split"
 
 
 def test_another_graph():
     with pytest.raises(ModelError) as caught:
-        compile_checkpoint(random_checkpoint(taxels=5), ring(4))
+        compile_network(expand(random_checkpoint(taxels=5), ring(4)))
     assert str(caught.value) == (
         "graph and weights disagree: the graph has 4 taxels, fc1 was trained on 5; "
         "give the graph that the checkpoint was trained on"
@@ -165,7 +171,7 @@ def manual():
 @pytest.fixture(scope="module")
 def calibrated(released, manual, objects_zip):
     training = load_recordings(objects_zip, "train")
-    return compile_checkpoint(released, manual, training_events=training.events)
+    return compile_network(expand(released, manual), training_events=training.events)
 
 
 @pytest.mark.recordings
@@ -184,7 +190,7 @@ def test_the_released_network_fits_nine_cores(calibrated):
 def test_a_step_of_the_released_network_can_take_a_seventh(released, manual, objects_zip):
     """112 cores; the fc2 core of the usual layout and the fc1 cores keep the others waiting."""
     events = load_recordings(objects_zip, "train").events
-    done = compile_checkpoint(released, manual, training_events=events, optimize="latency")
+    done = compile_network(expand(released, manual), training_events=events, optimize="latency")
     usual, fast = done.usual.expected, done.layout.expected
     assert 25_000 < usual.step_ns < 36_000
     assert fast.step_ns < usual.step_ns / 6
@@ -194,7 +200,7 @@ def test_a_step_of_the_released_network_can_take_a_seventh(released, manual, obj
 
 @pytest.mark.recordings
 def test_the_released_network_without_calibration(released, manual):
-    one, two = (compile_checkpoint(released, manual) for _ in range(2))
+    one, two = (compile_network(expand(released, manual)) for _ in range(2))
     assert netlist_bytes(one.netlist) == netlist_bytes(two.netlist)
     assert one.netlist.n_cores <= 9
     assert all(choice.clipped == 0 for choice in one.choices)

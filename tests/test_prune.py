@@ -10,8 +10,9 @@ from random_networks import chain, float_networks, integer_networks, random_chec
 from compiler.errors import OptionError
 from compiler.interpret import channels_last, run_float, run_integer
 from compiler.lift import lift
+from compiler.passes.expand import expand
 from compiler.passes.prune import compact, disconnect, either, never_fires, nobody, removable
-from compiler.pipeline import compile_checkpoint
+from compiler.pipeline import compile_network
 from compiler.serialize import read_netlist, write_netlist
 from runtime import engine, spec
 from runtime.equivalence import verify
@@ -67,7 +68,7 @@ def test_silence_spreads_to_listeners():
 def test_a_pruned_netlist_decides_as_the_whole_one(tmp_path, seed):
     checkpoint, recordings = random_checkpoint(seed=seed), events(seed, taxels=5)
     flat = recordings.reshape(len(recordings), -1, recordings.shape[3])
-    pruned, whole = (compile_checkpoint(checkpoint, np.eye(5), keep_all=keep) for keep in (False, True))
+    pruned, whole = (compile_network(expand(checkpoint, np.eye(5)), keep_all=keep) for keep in (False, True))
     assert sum(r.silent + r.unheard for r in whole.removals) == 0
     left = sum(layer.neurons for layer in pruned.netlist.layers) - pruned.netlist.n_compartments
     assert left == sum(r.silent + r.unheard + r.unused for r in pruned.removals)
@@ -93,7 +94,7 @@ def test_neurons_that_nobody_hears_are_not_compared(tmp_path):
     from dataclasses import replace
 
     changed = replace(checkpoint, dense=(replace(checkpoint.dense[0], weight=weak), *checkpoint.dense[1:]))
-    compilation = compile_checkpoint(changed, adjacency)
+    compilation = compile_network(expand(changed, adjacency))
     netlist, labels = compilation.netlist, np.zeros(6, np.int64)
     assert netlist.layers[0].unheard == (0, 1, 2)
     assert isinstance(heard(netlist, 0), np.ndarray)
@@ -106,14 +107,14 @@ def test_neurons_that_nobody_hears_are_not_compared(tmp_path):
 def test_pruning_by_evidence_is_asked_for(tmp_path):
     checkpoint, adjacency = small_checkpoint(tmp_path)
     quiet = events(1, rate=0.002)
-    plain = compile_checkpoint(checkpoint, adjacency, training_events=quiet)
-    fewer = compile_checkpoint(checkpoint, adjacency, training_events=quiet, prune_unused=True)
+    plain = compile_network(expand(checkpoint, adjacency), training_events=quiet)
+    fewer = compile_network(expand(checkpoint, adjacency), training_events=quiet, prune_unused=True)
     assert sum(r.unused for r in plain.removals) == 0
     assert sum(r.unused for r in fewer.removals) > 0
     assert fewer.netlist.n_compartments < plain.netlist.n_compartments
     for options in ({}, {"training_events": quiet, "keep_all": True}):
         with pytest.raises(OptionError) as caught:
-            compile_checkpoint(checkpoint, adjacency, prune_unused=True, **options)
+            compile_network(expand(checkpoint, adjacency), prune_unused=True, **options)
         assert str(caught.value) == (
             "--prune-unused: needs --calibrate, and neither --keep-all nor a fine-tuned checkpoint; change the options"
         )

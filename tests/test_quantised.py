@@ -16,7 +16,7 @@ from compiler.lift import lift
 from compiler.passes.calibrate import calibrate
 from compiler.passes.expand import expand
 from compiler.passes.quantize import Recipe, round_to_forms
-from compiler.pipeline import compile_checkpoint
+from compiler.pipeline import compile_network
 from compiler.targets import load_target
 from models.checkpoint import save_checkpoint
 from models.evtouch import Recordings, load_recordings
@@ -132,7 +132,7 @@ def test_a_fine_tuned_checkpoint_compiles_to_what_was_trained(tmp_path, bits):
     for ours, theirs in zip(again.forms, tuned.forms, strict=True):
         assert (ours.bits, ours.exponents) == (theirs.bits, theirs.exponents) == (bits, theirs.exponents)
         np.testing.assert_array_equal(ours.threshold, theirs.threshold)
-    netlist = compile_checkpoint(again, adjacency).netlist
+    netlist = compile_network(expand(again, adjacency), forms=again.forms).netlist
     trace = engine.simulate(netlist, test.events.reshape(len(test), -1, test.steps), spikes=True)
     model = quantised_spikes(again, adjacency, test.events)
     for index, layer in enumerate(netlist.layers):
@@ -151,7 +151,12 @@ def test_a_fine_tuned_checkpoint_brings_its_own_storage(tmp_path):
     save_checkpoint(path, {"last": tuned.weights}, graph, beta=0.2, theta=0.5, training={}, forms=tuned.forms)
     for options in ({"recipes": (Recipe(),)}, {"spike_exact": True}, {"ranges": "observed"}):
         with pytest.raises(OptionError) as caught:
-            compile_checkpoint(read_checkpoint(path), adjacency, training_events=train.events, **options)
+            compile_network(
+                expand(read_checkpoint(path), adjacency),
+                forms=read_checkpoint(path).forms,
+                training_events=train.events,
+                **options,
+            )
         assert str(caught.value) == (
             "compile: the checkpoint was fine-tuned for its own storage; leave --weight-bits, --planes, "
             "--scale-groups, --spike-exact and --ranges away"
@@ -306,7 +311,7 @@ def test_the_model_is_the_chip_on_every_recording(tmp_path, objects_zip, contain
         words = ["finetune", f"pretrained:{name}", "--data", str(place), "--weight-bits", "4", "--epochs", "2"]
         assert main([*words, "-o", str(output)]) == 0
         checkpoint = read_checkpoint(output)
-        netlist = compile_checkpoint(checkpoint, adjacency).netlist
+        netlist = compile_network(expand(checkpoint, adjacency), forms=checkpoint.forms).netlist
         for split in ("train", "test"):
             data = load_recordings(place, split)
             model = quantised_spikes(checkpoint, adjacency, data.events)

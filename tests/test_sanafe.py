@@ -18,7 +18,8 @@ from test_timing import DETAILED, ENERGY_PJ, LOIHI, SANAFE, SIMPLE, six_steps
 
 from compiler.frontends.checkpoint import read_checkpoint
 from compiler.netlist import Netlist, read_only
-from compiler.pipeline import compile_checkpoint
+from compiler.passes.expand import expand
+from compiler.pipeline import compile_network
 from models.evtouch import load_recordings
 from models.graphs import build_graph, normalised_adjacency
 from runtime import energy, engine, sanafe, timing
@@ -176,9 +177,8 @@ def without_second_lists(netlist: Netlist, kept: np.ndarray) -> Netlist:
 @pytest.mark.recordings
 def test_the_real_checkpoint(interpreter, released_checkpoint, objects_zip, tmp_path):
     graph = build_graph("manual")
-    netlist = compile_checkpoint(
-        read_checkpoint(released_checkpoint),
-        normalised_adjacency(graph.edges, graph.n_taxels),
+    netlist = compile_network(
+        expand(read_checkpoint(released_checkpoint), normalised_adjacency(graph.edges, graph.n_taxels)),
         training_events=load_recordings(objects_zip, "train").events,
     ).netlist
     recordings = load_recordings(objects_zip, "test").events[[0, 29, 58, 87, 116]]

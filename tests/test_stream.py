@@ -15,7 +15,8 @@ from random_netlists import Axon, Neuron, build, large_netlist, netlists, record
 from compiler.errors import DataError, FormatError, NumericRangeError
 from compiler.frontends.checkpoint import read_checkpoint
 from compiler.netlist import Netlist, read_only
-from compiler.pipeline import compile_checkpoint
+from compiler.passes.expand import expand
+from compiler.pipeline import compile_network
 from compiler.serialize import write_netlist
 from models.evtouch import load_recordings
 from models.graphs import build_graph, normalised_adjacency
@@ -99,7 +100,7 @@ def test_large_networks(proved):
 def released_netlist(released_checkpoint: Path) -> Netlist:
     graph = build_graph("manual")
     adjacency = normalised_adjacency(graph.edges, graph.n_taxels)
-    return compile_checkpoint(read_checkpoint(str(released_checkpoint)), adjacency).netlist
+    return compile_network(expand(read_checkpoint(str(released_checkpoint)), adjacency)).netlist
 
 
 @pytest.mark.recordings

@@ -19,7 +19,8 @@ from random_netlists import Axon, Neuron, build, large_netlist
 from compiler.errors import DataError, ModelError, OptionError
 from compiler.frontends.checkpoint import read_checkpoint
 from compiler.netlist import Netlist, read_only
-from compiler.pipeline import compile_checkpoint
+from compiler.passes.expand import expand
+from compiler.pipeline import compile_network
 from compiler.serialize import write_netlist
 from models.events import load_data
 from models.evtouch import load_recordings
@@ -174,7 +175,7 @@ def test_several_grasps_are_runs_of_their_own(lively, lively_file, lines, object
 def test_the_released_network_on_its_recordings(released_checkpoint, objects_zip, tmp_path, lines, objects):
     graph = build_graph("manual")
     adjacency = normalised_adjacency(graph.edges, graph.n_taxels)
-    netlist = compile_checkpoint(read_checkpoint(str(released_checkpoint)), adjacency).netlist
+    netlist = compile_network(expand(read_checkpoint(str(released_checkpoint)), adjacency)).netlist
     write_netlist(netlist, tmp_path / "net.loom")
     data = load_recordings(objects_zip, "test", limit=3).events
     path = lines("\n".join(as_lines(recording, inside=19_999) for recording in data))

@@ -15,7 +15,7 @@ from compiler.passes.legalize import measure
 from compiler.passes.prune import disconnect, never_fires
 from compiler.passes.quantize import Recipe, assemble, shortlist
 from compiler.passes.widths import Found, Point, check_widths, front, search
-from compiler.pipeline import compile_checkpoint
+from compiler.pipeline import compile_network
 
 WIDTHS = (2, 4, 8)
 
@@ -39,8 +39,8 @@ def channels(events):
 def compiled(checkpoint, events, bits, groups=1):
     taxels = events.shape[1]
     recipes = [Recipe(bits=b, groups=groups) for b in bits]
-    return compile_checkpoint(
-        checkpoint, np.full((taxels, taxels), 1 / taxels), recipes=recipes, training_events=events
+    return compile_network(
+        expand(checkpoint, np.full((taxels, taxels), 1 / taxels)), recipes=recipes, training_events=events
     )
 
 

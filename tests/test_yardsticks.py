@@ -16,7 +16,7 @@ from compiler.errors import DataError
 from compiler.frontends.checkpoint import Dense
 from compiler.interpret import channels_last, run_float
 from compiler.passes.expand import expand
-from compiler.pipeline import compile_checkpoint
+from compiler.pipeline import compile_network
 from compiler.serialize import write_netlist
 from models.evtouch import load_recordings
 from models.graphs import build_graph, normalised_adjacency
@@ -251,7 +251,7 @@ def test_the_command(tmp_path, capsys):
 def test_the_command_wants_a_checkpoint(tmp_path, capsys):
     checkpoint, adjacency = small_checkpoint(tmp_path)
     path = tmp_path / "net.loom"
-    write_netlist(compile_checkpoint(checkpoint, adjacency).netlist, path)
+    write_netlist(compile_network(expand(checkpoint, adjacency)).netlist, path)
     assert cli.main(["yardsticks", str(path), "--data", "synthetic"]) == 2
     assert capsys.readouterr().err == (
         f"spikeloom: {path}: is a netlist, estimate says what it costs; give the checkpoint it was made from\n"
