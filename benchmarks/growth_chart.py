@@ -62,5 +62,36 @@ def draw(result: dict[str, Any], stem: str) -> None:
     _finish(figure, panel, f"{stem}-threads")
 
 
+def draw_skins(result: dict[str, Any], stem: str) -> None:
+    """Write STEM.svg and STEM.png: time, and memory per synapse, of the file that skins.py writes."""
+    rows = result["skins"]
+    synapses = np.array([row["synapses"] for row in rows], np.float64)
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 4), layout="constrained")
+    for key, label, colour, mark in (
+        ("compile_s", "compile", OURS, "o"),
+        ("prepare_s", "prepare the engine", "#3b6fb5", "s"),
+        ("run_s", "run a recording", "#c2571a", "^"),
+    ):
+        cost = np.array([row["run_ms"] / 1e3 if key == "run_s" else row[key] for row in rows])
+        left.loglog(synapses, cost, f"{mark}-", color=colour, label=label)
+        left.loglog(synapses, cost[-1] * synapses / synapses[-1], "--", color=GUIDE, lw=1)
+    left.set_ylabel("seconds (dashed: proportional)", fontsize=9)
+    for key, label, colour, mark in (
+        ("compile_bytes", "compiling", OURS, "o"),
+        ("run_bytes", "and running", "#c2571a", "^"),
+    ):
+        right.semilogx(synapses, [row[key] / row["synapses"] for row in rows], f"{mark}-", color=colour, label=label)
+    right.axhline(64, ls="--", color=GUIDE, lw=1)
+    right.set_ylim(0)
+    right.set_ylabel("bytes per synapse, at most (dashed: 64)", fontsize=9)
+    for panel in (left, right):
+        panel.set_xlabel("synapses", fontsize=9)
+        panel.legend(frameon=False, fontsize=9)
+        panel.grid(which="major", color="#ddd", lw=0.6)
+        panel.set_axisbelow(True)
+        panel.spines[["top", "right"]].set_visible(False)
+    _finish(figure, right, stem)
+
+
 if __name__ == "__main__":
     draw(json.loads(Path(sys.argv[1]).read_text(encoding="utf-8")), sys.argv[2])

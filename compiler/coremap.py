@@ -6,6 +6,7 @@ import networkx as nx
 import numpy as np
 
 from compiler.netlist import Netlist
+from compiler.passes.chips import chip_of_core
 from compiler.passes.place import hops
 from compiler.targets import Target
 
@@ -25,13 +26,14 @@ def core_map(netlist: Netlist, target: Target) -> nx.DiGraph:
     networkx.DiGraph
         Node attributes ``tile`` (None for the input), ``compartments`` and ``layers`` (names). Edge attributes
         ``axons`` (input axons of the second core that listen to the first) and ``hops`` (0 on one tile; None from
-        the input, which has no place on the mesh).
+        the input, which has no place on the mesh, and between chips).
 
     Notes
     -----
     A core that no path from ``input`` reaches can only spike from its biases.
     """
     graph = nx.DiGraph()
+    chip = chip_of_core(netlist.core_tile, target)
     graph.add_node("input", tile=None, compartments=0, layers=())
     for core, tile in enumerate(netlist.core_tile.tolist()):
         held = slice(*netlist.core_compartments[core : core + 2].tolist())
@@ -43,8 +45,8 @@ def core_map(netlist: Netlist, target: Target) -> nx.DiGraph:
     pairs, axons = np.unique(np.stack([sender, netlist.core_of_axon()]), axis=1, return_counts=True)
     width = target.limit("mesh.width")
     for (pre, post), count in zip(pairs.T.tolist(), axons.tolist(), strict=True):
-        if pre < 0:
-            graph.add_edge("input", post, axons=count, hops=None)
+        if pre < 0 or chip[pre] != chip[post]:
+            graph.add_edge(pre if pre >= 0 else "input", post, axons=count, hops=None)
         else:
             distance = sum(hops(int(netlist.core_tile[pre]), int(netlist.core_tile[post]), width))
             graph.add_edge(pre, post, axons=count, hops=distance)

@@ -17,7 +17,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from compiler.fixedpoint import MEMBRANE_SHIFT, FloatArray, IntArray, encode_bias, round_half_even, weight_step
-from compiler.ir import IntegerPopulation, IntegerProjection, Population, Projection, Sparse
+from compiler.ir import (
+    MANTISSA,
+    IntegerPopulation,
+    IntegerProjection,
+    Population,
+    Projection,
+    one_sided,
+    row_parts,
+    with_data,
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -135,8 +144,9 @@ def store_steps(projection: Projection, steps: IntArray, form: Form) -> tuple[In
     """
     stored = []
     for plane, mantissa in enumerate(split_planes(steps, form.bits, form.exponents)):
-        weight = _with(projection.weight, mantissa)
+        weight = with_data(projection.weight, mantissa.astype(MANTISSA))
         if plane:
+            weight = weight.copy()
             weight.eliminate_zeros()
         if not plane or weight.nnz:
             stored.append(
@@ -151,17 +161,15 @@ def store_steps(projection: Projection, steps: IntArray, form: Form) -> tuple[In
     return tuple(stored)
 
 
-def _with(weight: Sparse, data: IntArray) -> Sparse:
-    """A csr_array of the same structure with other numbers."""
-    changed = weight.astype(np.int64)
-    changed.data = data.copy()
-    return changed
-
-
 def nearest_steps(population: Population, projection: Projection, form: Form) -> IntArray:
     """Weights of a projection in whole steps of the finest plane, each rounded to the nearest; shape (synapses,)."""
-    scale = np.repeat(scales(population, form), np.diff(projection.weight.indptr))
-    return round_steps(projection.weight.data, scale, form.bits, form.exponents)
+    weight, scale = projection.weight, scales(population, form)
+    steps = np.empty(weight.nnz, np.int32)
+    for rows in row_parts(weight):
+        held = slice(weight.indptr[rows.start], weight.indptr[rows.stop])
+        each = np.repeat(scale[rows], np.diff(weight.indptr[rows.start : rows.stop + 1]))
+        steps[held] = round_steps(weight.data[held], each, form.bits, form.exponents)
+    return steps
 
 
 def store(
@@ -218,7 +226,7 @@ def one_sided_sums(projections: tuple[IntegerProjection, ...], neurons: int) -> 
     """
     up, down = np.zeros(neurons, np.int64), np.zeros(neurons, np.int64)
     for projection in projections:
-        weight = projection.effective()
-        up += np.asarray(weight.maximum(0).sum(axis=1), np.int64)
-        down -= np.asarray(weight.minimum(0).sum(axis=1), np.int64)
+        positive, negative = one_sided(projection)
+        up += positive
+        down += negative
     return np.maximum(up, down)

@@ -7,11 +7,14 @@ of weight zero. What one object can know is checked on construction, everything 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import Any
 
 import networkx as nx
 import numpy as np
+import numpy.typing as npt
+from scipy import sparse
 
 from compiler.fixedpoint import DECAY_BITS, FloatArray, IntArray
 
@@ -20,6 +23,12 @@ INPUT = -1
 
 Sparse = Any
 """A ``scipy.sparse.csr_array``; scipy ships no types."""
+
+MANTISSA = np.int16
+"""Type that mantissas are stored in."""
+
+PART = 1 << 19
+"""Synapses that are worked on at a time where that saves memory."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -164,8 +173,8 @@ class IntegerProjection:
     ----------
     pre, post : int
         Population indices; `pre` may be ``INPUT``.
-    weight : csr_array (neurons of post, neurons of pre) int64
-        Signed mantissas.
+    weight : csr_array (neurons of post, neurons of pre) of an integer type
+        Signed mantissas, usually ``MANTISSA``.
     exponent : int
         A synapse adds ``mantissa * 2**exponent`` weight units.
     bits : int
@@ -179,10 +188,9 @@ class IntegerProjection:
     bits: int
 
     def effective(self) -> Sparse:
-        """Weights in weight units, csr_array of int64; exact, since mantissas are even."""
-        scaled = self.weight.copy()
-        scaled.data = scaled.data >> 1 if self.exponent < 0 else scaled.data << self.exponent
-        return scaled
+        """Weights in weight units, csr_array of int32; exact, since mantissas are even."""
+        units = self.weight.data.astype(np.int32)
+        return with_data(self.weight, units >> 1 if self.exponent < 0 else units << self.exponent)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -224,14 +232,55 @@ def to_networkx(network: Network | IntegerNetwork) -> nx.MultiDiGraph:
 
 def fan_in(network: Network | IntegerNetwork, post: int) -> IntArray:
     """Structural synapses into each neuron of a population, planes of one synapse counted once; shape (neurons,)."""
-    pattern: dict[int, Sparse] = {}
+    planes: dict[int, list[Sparse]] = {}
     projections: tuple[Projection | IntegerProjection, ...] = network.projections
     for projection in projections:
         if projection.post == post:
-            ones = projection.weight.astype(np.int64)
-            ones.data = np.ones_like(ones.data)
-            pattern[projection.pre] = pattern[projection.pre] + ones if projection.pre in pattern else ones
+            planes.setdefault(projection.pre, []).append(projection.weight)
     total = np.zeros(network.populations[post].size, np.int64)
-    for weight in pattern.values():
-        total += np.diff(weight.indptr)
+    for first, *others in planes.values():
+        pattern = first
+        for weight in others:
+            pattern = _ones(pattern) + _ones(weight)
+        total += np.diff(pattern.indptr)
     return total
+
+
+def _ones(weight: Sparse) -> Sparse:
+    return with_data(weight, np.ones(weight.nnz, np.int32))
+
+
+def with_data(weight: Sparse, data: npt.NDArray[Any]) -> Sparse:
+    """A csr_array of other numbers that shares its structure with `weight`: change neither in place."""
+    return sparse.csr_array((data, weight.indices, weight.indptr), shape=weight.shape)
+
+
+def one_sided(projection: IntegerProjection) -> tuple[IntArray, IntArray]:
+    """Sums of the positive weights of each neuron and of the magnitudes of its negative ones, weight units.
+
+    Returns
+    -------
+    positive, negative : (neurons of post,) int64
+    """
+    positive, negative = np.zeros((2, projection.weight.shape[0]), np.int64)
+    for rows in row_parts(projection.weight):
+        part = replace(projection, weight=projection.weight[rows]).effective()
+        positive[rows] = part.maximum(0).sum(axis=1)
+        negative[rows] = -part.minimum(0).sum(axis=1)
+    return positive, negative
+
+
+def row_parts(weight: Sparse) -> Iterator[slice]:
+    """Rows of a matrix in turn, so many that they hold about ``PART`` synapses.
+
+    Examples
+    --------
+    >>> list(row_parts(sparse.csr_array((2, 5))))
+    [slice(0, 2, None)]
+    """
+    first, rows = 0, weight.shape[0]
+    while first < rows:
+        last = int(np.searchsorted(weight.indptr, weight.indptr[first] + PART, side="right")) - 1
+        last = min(max(last, first + 1), rows)
+        yield slice(first, last)
+        first = last

@@ -75,7 +75,8 @@ def lift(netlist: Netlist) -> IntegerNetwork:
     for kind in kinds[:, np.unique(code, return_index=True)[1]].T:
         held = np.all(kinds == kind[:, None], axis=0) & (netlist.synapse_weight != 0)
         weight = sparse.csr_array(
-            (netlist.synapse_weight[held], (row[held], column[held])), shape=(sizes[int(kind[0])], sizes[int(kind[1])])
+            (netlist.synapse_weight[held].astype(np.int64), (row[held], column[held])),
+            shape=(sizes[int(kind[0])], sizes[int(kind[1])]),
         )
         weight.sum_duplicates()
         projections.append(

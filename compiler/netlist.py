@@ -102,8 +102,8 @@ class Netlist:
         Source id and synapse format of each axon.
     axon_synapses : (axons + 1,) int64
         Range bounds into the synapses.
-    synapse_target, synapse_weight : (synapses,) int64
-        Compartment within the core, and mantissa.
+    synapse_target, synapse_weight : (synapses,) of an integer type
+        Compartment within the core, and mantissa; in as few bytes as hold them.
     format_weight_bits, format_exponent, format_index_bits : (formats,) int64
         Synapse formats of the whole netlist; a core uses some of them.
     provenance : mapping
@@ -180,6 +180,21 @@ class Netlist:
         """Core of each axon; shape (axons,)."""
         return np.repeat(np.arange(self.n_cores), np.diff(self.core_axons))
 
+    def synapses_of(self, core: int) -> tuple[IntArray, IntArray, IntArray]:
+        """Synapses of one core: source, compartment and effective weight of each; all (synapses of the core,) int64.
+
+        Core by core, what holds for all synapses is found without arrays of them all.
+        """
+        axons = slice(*self.core_axons[core : core + 2].tolist())
+        ends = self.axon_synapses[axons.start : axons.stop + 1]
+        held, length = slice(*ends[[0, -1]].tolist()), np.diff(ends)
+        exponent = np.repeat(self.format_exponent[self.axon_format[axons]], length)
+        return (
+            np.repeat(self.axon_source[axons], length),
+            self.synapse_target[held] + self.core_compartments[core],
+            in_units(self.synapse_weight[held], exponent),
+        )
+
     def axon_of_synapse(self) -> IntArray:
         """Axon of each synapse; shape (synapses,)."""
         return np.repeat(np.arange(self.n_axons), np.diff(self.axon_synapses))
@@ -187,7 +202,7 @@ class Netlist:
     def effective_weight(self) -> IntArray:
         """``mantissa * 2**exponent`` of each synapse; shape (synapses,). Exact: at exponent -1 mantissas are even."""
         exponent = self.format_exponent[self.axon_format[self.axon_of_synapse()]]
-        return np.where(exponent < 0, self.synapse_weight >> 1, self.synapse_weight << np.maximum(exponent, 0))
+        return in_units(self.synapse_weight, exponent)
 
     def synapse_compartment(self) -> IntArray:
         """Compartment id that each synapse targets; shape (synapses,)."""
@@ -206,13 +221,26 @@ def one_step_bounds(netlist: Netlist) -> tuple[IntArray, IntArray]:
     positive, negative : (compartments,) int64
         Non-negative magnitudes in weight units.
     """
-    weight = netlist.effective_weight()
-    compartment = netlist.synapse_compartment()
-    size = netlist.n_compartments
-    # float64 sums of integers below 2**53 are exact
-    positive = np.bincount(compartment, np.maximum(weight, 0), size)
-    negative = np.bincount(compartment, np.maximum(-weight, 0), size)
-    return positive.astype(np.int64), negative.astype(np.int64)
+    positive, negative = np.zeros((2, netlist.n_compartments), np.int64)
+    for core in range(netlist.n_cores):
+        _, compartment, weight = netlist.synapses_of(core)
+        first, last = netlist.core_compartments[core : core + 2]
+        for sums, share in ((positive, weight), (negative, -weight)):
+            # float64 sums of integers below 2**53 are exact
+            sums[first:last] = np.bincount(compartment - first, np.maximum(share, 0), last - first)
+    return positive, negative
+
+
+def in_units(mantissa: IntArray, exponent: IntArray) -> IntArray:
+    """``mantissa * 2**exponent``, int64; at exponent -1 mantissas are even."""
+    wide = mantissa.astype(np.int64)
+    return np.where(exponent < 0, wide >> 1, wide << np.maximum(exponent, 0))
+
+
+def frozen(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """The same array, read-only from now on."""
+    array.flags.writeable = False
+    return array
 
 
 def read_only(array: npt.ArrayLike) -> IntArray:

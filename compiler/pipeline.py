@@ -107,6 +107,7 @@ def compile_network(
     ranges: str = "proven",
     margin: float = 0.1,
     cores_for: Mapping[str, int] | None = None,
+    chips: int = 1,
     optimize: str = "cores",
     provenance: Mapping[str, Any] | None = None,
     after: Callable[[str, Network | IntegerNetwork | Netlist], None] | None = None,
@@ -138,6 +139,8 @@ def compile_network(
         Share added to observed ranges.
     cores_for : mapping of str to int, optional
         Least number of cores of a layer, by name; they hold no other. Its neurons are cut as evenly as possible.
+    chips : int
+        Number of chips at most; as few are used as hold the cores.
     optimize : {"cores", "energy", "latency"}
         What the layout is chosen for, see :mod:`compiler.passes.layout`; all but cores need training events.
     provenance : mapping, optional
@@ -153,7 +156,7 @@ def compile_network(
     chip = load_target(target)
     if not 0 <= margin < math.inf:
         raise OptionError(f"--margin {margin:g}: is no share to add to a range; give a number from 0")
-    require_goal(optimize, cores_for, chip, calibrated=training_events is not None)
+    require_goal(optimize, cores_for, chip, calibrated=training_events is not None, chips=chips)
     publish = after or (lambda _stage, _artefact: None)
 
     verify(network)
@@ -202,7 +205,14 @@ def compile_network(
     if rates is not None:
         rates = tuple(rate[ids] for rate, ids in zip(rates, identity, strict=True))
     layout, usual = lay_out(
-        laid, chip, goal=optimize, cores_for=cores_for, rates=rates, calibration=calibration, identity=identity
+        laid,
+        chip,
+        goal=optimize,
+        cores_for=cores_for,
+        chips=chips,
+        rates=rates,
+        calibration=calibration,
+        identity=identity,
     )
     origin = Origin(network=integer, identity=identity, unheard=unheard)
     netlist = emit(laid, layout.parts, layout.placement.tiles, chip, provenance or {}, origin)

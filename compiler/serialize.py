@@ -30,11 +30,15 @@ import numpy as np
 
 from compiler.atomic import write_atomically
 from compiler.errors import FormatError
-from compiler.netlist import Layer, Netlist, read_only, read_only_float
+from compiler.netlist import Layer, Netlist, frozen, read_only, read_only_float
 from compiler.targets import known_targets
 
 FORMAT = "spikeloom-netlist"
 VERSION = 2
+
+LARGE = frozenset({"synapse_target", "synapse_weight"})
+"""Arrays that stay in the type that they are stored in."""
+
 SIZE_LIMIT = 2**32
 """Bytes that a netlist file may have, 4 GiB: some hundred times the synapses of a whole chip."""
 
@@ -176,7 +180,7 @@ def read_netlist(path: str | os.PathLike[str]) -> Netlist:
         layers=tuple(Layer(**(layer | {"unheard": tuple(layer["unheard"])})) for layer in manifest["layers"]),
         provenance=manifest["provenance"],
         scale=read_only_float(members["scale"]),
-        **{name: read_only(members[name]) for name in ARRAYS if name not in FLOATS},
+        **{name: (frozen if name in LARGE else read_only)(members[name]) for name in ARRAYS if name not in FLOATS},
     )
     faults = inconsistencies(netlist)
     if faults:

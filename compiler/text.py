@@ -34,7 +34,8 @@ def _span(values: IntArray | FloatArray) -> str:
 def _digest(*arrays: IntArray | FloatArray) -> str:
     digest = hashlib.sha256()
     for array in arrays:
-        digest.update(np.ascontiguousarray(array).tobytes())
+        whole = array if array.dtype.kind == "f" else array.astype(np.int64)  # integers come in several widths
+        digest.update(np.ascontiguousarray(whole).tobytes())
     return digest.hexdigest()[:12]
 
 

@@ -119,7 +119,7 @@ def _registers_hold(network: IntegerNetwork) -> Faults:
 def _mantissas_hold(network: IntegerNetwork) -> Faults:
     for i, projection in enumerate(network.projections):
         step, data = weight_step(projection.bits), projection.weight.data
-        if data.dtype != np.int64 or np.any(data % step) or np.any(data < -256) or np.any(data > 256 - step):
+        if data.dtype.kind != "i" or np.any(data % step) or np.any(data < -256) or np.any(data > 256 - step):
             yield f"projection {i} has mantissas that {projection.bits} bits cannot hold"
         if projection.exponent < -1:
             yield f"projection {i} has exponent {projection.exponent}: below -1 its weights are no whole units"

@@ -48,11 +48,15 @@ def _in_range(netlist: Netlist) -> bool:
     return bool(np.all(highest <= MEMBRANE_MAX) and np.all(stored <= MEMBRANE_MAX) and np.all(stored * keep < 2**32))
 
 
-def _is_pipeline(netlist: Netlist, source: IntArray, target: IntArray) -> bool:
+def _is_pipeline(netlist: Netlist) -> bool:
     """Whether every layer hears the layers of the depth before it only, so that none has to wait for another."""
     depth = np.array([layer.depth for layer in netlist.layers])[netlist.layer]
-    heard = np.append(np.full(netlist.n_inputs, -1), depth)[source]
-    return bool(np.all(heard == depth[target] - 1))
+    sent = np.append(np.full(netlist.n_inputs, -1), depth)
+    for core in range(netlist.n_cores):
+        source, compartment, _ = netlist.synapses_of(core)
+        if np.any(sent[source] != depth[compartment] - 1):
+            return False
+    return True
 
 
 def lay_out_blocks(netlist: Netlist) -> Blocks | None:
@@ -64,26 +68,34 @@ def lay_out_blocks(netlist: Netlist) -> Blocks | None:
         None where currents have a memory, a register could overflow or saturate, a layer hears others than the one
         before it, or synapses are so scattered that rows of 64 would waste memory.
     """
-    axon = netlist.axon_of_synapse()
-    source, target = netlist.axon_source[axon], netlist.synapse_compartment()
-    if np.any(netlist.decay_u != NO_MEMORY) or not _is_pipeline(netlist, source, target) or not _in_range(netlist):
+    if np.any(netlist.decay_u != NO_MEMORY) or not _is_pipeline(netlist) or not _in_range(netlist):
         return None
     seats = _seats(netlist)
 
     # rows: one for each block and each source that reaches it
     first_source = np.append(0, netlist.n_inputs + seats.stage[:-1] * LANES)  # by depth
     number = np.append(np.arange(netlist.n_inputs), netlist.n_inputs + seats.position)
-    local = number[source] - first_source[seats.depth[netlist.layer[target]]]
-    block, lane = np.divmod(seats.position[target], LANES)
     width = LANES * max(-(-netlist.n_inputs // LANES), len(seats.layer))
-    rows, dense = _rows(netlist, seats, block * width + local, width)
+
+    def places(core: int) -> tuple[IntArray, IntArray, IntArray]:
+        """Row, by its pair, lane and weight of each synapse of a core."""
+        source, compartment, weight = netlist.synapses_of(core)
+        block, lane = np.divmod(seats.position[compartment], LANES)
+        local = number[source] - first_source[seats.depth[netlist.layer[compartment]]]
+        return block * width + local, lane, weight
+
+    rows, dense = _rows(netlist, seats, [np.unique(places(core)[0]) for core in range(netlist.n_cores)], width)
     if len(rows) * LANES * 2 > SPARE + BYTES_A_SYNAPSE * netlist.n_synapses:
         return None
-    row = np.searchsorted(rows, block * width + local)
     row_block, row_source = np.divmod(rows, width)
-    shift, weight = _narrowed(_net_weights(netlist, row * LANES + lane, len(rows)), row_block, len(seats.layer))
-    reached = np.zeros(len(rows), np.uint64)
-    np.bitwise_or.at(reached, row, _bit(lane))
+    net, reached = np.zeros(len(rows) * LANES, np.int16), np.zeros(len(rows), np.uint64)
+    for core in range(netlist.n_cores):
+        pair, lane, units = places(core)
+        row = np.searchsorted(rows, pair)
+        # of several synapses of one entry, what leaves 16 bits on the way comes back into them
+        np.add.at(net, row * LANES + lane, units.astype(np.int16))
+        np.bitwise_or.at(reached, row, _bit(lane))
+    shift, weight = _narrowed(net, row_block, len(seats.layer))
 
     # links: the rows of a block by words of sources
     words = width // LANES
@@ -175,9 +187,9 @@ def _seats(netlist: Netlist) -> _Seats:
     return _Seats(position=position, layer=layer, keep=keep_of_block, stage=stage, depth=depth)
 
 
-def _rows(netlist: Netlist, seats: _Seats, pairs: IntArray, width: int) -> tuple[IntArray, BoolArray]:
+def _rows(netlist: Netlist, seats: _Seats, pairs: list[IntArray], width: int) -> tuple[IntArray, BoolArray]:
     """Pairs of block and source that get a row, sorted, and whether those of a stage are all that there can be."""
-    rows = np.unique(pairs)
+    rows = np.unique(np.concatenate(pairs))
     blocks = np.diff(seats.stage)
     heard = np.append(netlist.n_inputs, np.bincount(seats.depth[netlist.layer], minlength=len(blocks))[:-1])
     places = np.append(netlist.n_inputs, blocks[:-1] * LANES)
@@ -187,13 +199,6 @@ def _rows(netlist: Netlist, seats: _Seats, pairs: IntArray, width: int) -> tuple
         for s in np.flatnonzero(dense)
     ]
     return np.unique(np.concatenate([rows, *filled])), dense
-
-
-def _net_weights(netlist: Netlist, entry: IntArray, rows: int) -> npt.NDArray[np.int16]:
-    """Sum of the synapses of each entry; what leaves 16 bits on the way comes back into them."""
-    weight = np.zeros(rows * LANES, np.int16)
-    np.add.at(weight, entry, netlist.effective_weight().astype(np.int16))
-    return weight
 
 
 def _narrowed(

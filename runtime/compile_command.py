@@ -34,7 +34,7 @@ def compile_netlist(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json
     chip = load_target(arguments.target)
     recipes = _recipes(arguments)
     cores_for = cores_asked(arguments.cores_for)
-    require_goal(arguments.optimize, cores_for, chip, calibrated=arguments.calibrate is not None)
+    require_goal(arguments.optimize, cores_for, chip, calibrated=arguments.calibrate is not None, chips=arguments.chips)
     checkpoint = asked_checkpoint(arguments.checkpoint, arguments)
     name, adjacency = propagation(checkpoint, asked_graph(arguments), arguments.checkpoint)
     training = None
@@ -65,6 +65,7 @@ def compile_netlist(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json
         ranges=arguments.ranges,
         margin=margin,
         cores_for=cores_for,
+        chips=arguments.chips,
         optimize=arguments.optimize,
         provenance={
             "spikeloom": version(),
@@ -80,6 +81,7 @@ def compile_netlist(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json
             "margin": margin,
             "calibrated": training is not None,
             **({"cores_for": cores_for} if cores_for else {}),
+            **({"chips": arguments.chips} if arguments.chips != 1 else {}),
             **({"optimize": arguments.optimize} if arguments.optimize != "cores" else {}),
         },
         after=dump,

@@ -20,6 +20,7 @@ import numpy as np
 
 from compiler.fixedpoint import FloatArray, IntArray
 from compiler.netlist import Netlist
+from compiler.passes.chips import chip_of_core
 from compiler.passes.place import hops
 from compiler.targets import EnergyTable, Target
 from runtime.trace import Counts
@@ -45,6 +46,9 @@ NOT_PRICED = (
 )
 """What no table covers; always listed, never counted as zero."""
 
+BETWEEN_CHIPS = "packet_between_chips"
+"""Packets that leave their chip: priced as packets, but neither their way over the link nor hops on the way to it."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Costs:
@@ -57,6 +61,8 @@ class Costs:
         hops to the layer that sends them.
     zeros : (samples, layers) float64
         Synaptic operations on stored zeros.
+    between_chips : (samples, layers) float64
+        Packets that leave their chip.
     steps : int
         Chip steps of the longest recording.
     energy : mapping of str to (samples, layers) float64
@@ -67,6 +73,7 @@ class Costs:
 
     events: Mapping[str, FloatArray]
     zeros: FloatArray
+    between_chips: FloatArray
     steps: int
     energy: Mapping[str, FloatArray]
     unpriced: Mapping[str, tuple[str, ...]]
@@ -77,27 +84,41 @@ class Costs:
         return self.events["synaptic_operation_dense"] + self.events["synaptic_operation_sparse"]
 
 
-def _visits(netlist: Netlist, kept: FloatArray) -> FloatArray:
-    """Entries that one spike of each source visits in each layer, over the synapses that `kept` marks with 1."""
-    axon = netlist.axon_of_synapse()
-    source = netlist.axon_source[axon]
-    layers = len(netlist.layers)
-    flat = source * layers + netlist.layer[netlist.synapse_compartment()]
-    size = netlist.n_inputs + netlist.n_compartments
-    return np.bincount(flat, kept, size * layers).astype(np.float64).reshape(size, layers)
+def _visits(netlist: Netlist) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Entries that one spike of each source visits in each layer; each (sources, layers).
+
+    Those of dense lists, those of sparse lists, and zeros among both.
+    """
+    size, layers = netlist.n_inputs + netlist.n_compartments, len(netlist.layers)
+    dense, sparse, zeros = (np.zeros(size * layers) for _ in range(3))
+    in_dense = netlist.format_index_bits[netlist.axon_format] == 0
+    length = np.diff(netlist.axon_synapses)
+    for core in range(netlist.n_cores):
+        source, compartment, weight = netlist.synapses_of(core)
+        axons = slice(*netlist.core_axons[core : core + 2])
+        listed = np.repeat(in_dense[axons], length[axons])
+        entry = source * layers + netlist.layer[compartment]
+        for total, kept in ((dense, listed), (sparse, ~listed), (zeros, weight == 0)):
+            place, amount = np.unique(entry[kept], return_counts=True)
+            total[place] += amount
+    shape = size, layers
+    return dense.reshape(shape), sparse.reshape(shape), zeros.reshape(shape)
 
 
 def _routes(netlist: Netlist, target: Target) -> FloatArray:
-    """Packets, east-west hops and north-south hops of one spike of each compartment; shape (compartments, 3)."""
+    """What one spike of each compartment sends; shape (compartments, 4).
+
+    Packets, east-west and north-south hops of those that stay on their chip, and packets that do not.
+    """
     width = target.limit("mesh.width")
     inner = netlist.axon_source >= netlist.n_inputs
     source = netlist.axon_source[inner] - netlist.n_inputs
-    start = netlist.core_tile[netlist.core_of_compartment()[source]]
-    end = netlist.core_tile[netlist.core_of_axon()[inner]]
-    moves = [hops(int(a), int(b), width) for a, b in zip(start, end, strict=True)]
-    routes = np.zeros((netlist.n_compartments, 3))
-    np.add.at(routes, source, np.column_stack([np.ones(len(moves)), np.array(moves).reshape(-1, 2)]))
-    return routes
+    start, end = netlist.core_of_compartment()[source], netlist.core_of_axon()[inner]
+    chip = chip_of_core(netlist.core_tile, target)
+    leaves = chip[start] != chip[end]
+    moves = np.where(leaves, 0, hops(netlist.core_tile[start], netlist.core_tile[end], width))
+    each = [np.ones(len(source)), *moves, leaves]
+    return np.stack([np.bincount(source, amount, netlist.n_compartments) for amount in each], axis=1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -111,7 +132,7 @@ class Meter:
     target : Target
         Its chip.
     names : tuple of str
-        Events, and ``zeros`` for visited zeros.
+        Events, ``BETWEEN_CHIPS``, and ``zeros`` for visited zeros.
     caused : (sources, names * layers) float64
         Amount of each of these for each layer by a spike of each source: input channels, then compartments.
     neurons : (layers,) float64
@@ -135,19 +156,21 @@ def prepare(netlist: Netlist, target: Target) -> Meter:
     target : Target
         Its chip, with energy tables.
     """
-    dense = (netlist.format_index_bits[netlist.axon_format] == 0)[netlist.axon_of_synapse()]
+    dense, sparse, zeros = _visits(netlist)
     of_layer = np.eye(len(netlist.layers))[netlist.layer]
     silent = np.zeros((netlist.n_inputs, len(netlist.layers)))
     sent = {
         event: np.concatenate([silent, route[:, None] * of_layer])
-        for event, route in zip(("packet", "hop_east_west", "hop_north_south"), _routes(netlist, target).T, strict=True)
+        for event, route in zip(
+            ("packet", "hop_east_west", "hop_north_south", BETWEEN_CHIPS), _routes(netlist, target).T, strict=True
+        )
     }
     caused = {
-        "synaptic_operation_dense": _visits(netlist, dense.astype(np.float64)),
-        "synaptic_operation_sparse": _visits(netlist, (~dense).astype(np.float64)),
+        "synaptic_operation_dense": dense,
+        "synaptic_operation_sparse": sparse,
         "spike": np.concatenate([silent, of_layer]),
         **sent,
-        "zeros": _visits(netlist, (netlist.synapse_weight == 0).astype(np.float64)),
+        "zeros": zeros,
     }
     return Meter(
         netlist=netlist,
@@ -158,8 +181,8 @@ def prepare(netlist: Netlist, target: Target) -> Meter:
     )
 
 
-def count(meter: Meter, counts: Counts, steps: int | IntArray) -> tuple[dict[str, FloatArray], FloatArray]:
-    """Amount of every event per recording and layer, and the visited zeros.
+def count(meter: Meter, counts: Counts, steps: int | IntArray) -> dict[str, FloatArray]:
+    """Amount per recording and layer of everything that a meter knows and of neuron updates.
 
     Parameters
     ----------
@@ -175,7 +198,7 @@ def count(meter: Meter, counts: Counts, steps: int | IntArray) -> tuple[dict[str
     active = counts.updates.astype(np.float64)
     amounts["neuron_active"] = active
     amounts["neuron_idle"] = meter.neurons * (np.reshape(steps, (-1, 1)) + meter.netlist.max_depth) - active
-    return {event: amounts[event] for event in EVENTS}, amounts["zeros"]
+    return amounts
 
 
 def price(table: EnergyTable, events: Mapping[str, FloatArray]) -> FloatArray | tuple[str, ...]:
@@ -210,11 +233,13 @@ def estimate(meter: Meter, counts: Counts, steps: int | IntArray) -> Costs:
     steps : int or (samples,) int64
         Data steps T of all recordings, or of each.
     """
-    events, zeros = count(meter, counts, steps)
+    amounts = count(meter, counts, steps)
+    events = {event: amounts[event] for event in EVENTS}
     priced = {table.name: price(table, events) for table in meter.target.energy}
     return Costs(
         events=events,
-        zeros=zeros,
+        zeros=amounts["zeros"],
+        between_chips=amounts[BETWEEN_CHIPS],
         steps=int(np.max(steps)) + meter.netlist.max_depth,
         energy={name: result for name, result in priced.items() if not isinstance(result, tuple)},
         unpriced={name: result for name, result in priced.items() if isinstance(result, tuple)},

@@ -18,6 +18,7 @@ import numpy as np
 
 from compiler.fixedpoint import FloatArray, IntArray
 from compiler.netlist import Netlist
+from compiler.passes.chips import chip_count, require_one_chip
 from compiler.targets import Target
 from runtime import charges, cost, energy, engine, timing
 from runtime.cost import Costs
@@ -87,8 +88,17 @@ def estimate(
     ------
     DataError, NumericRangeError
         As the engine says.
+    OptionError
+        If several chips shall be simulated by the cycle.
+
+    Notes
+    -----
+    Of several chips events are counted and priced but not timed: links between chips have no public latency.
     """
-    clocks = {times.name: timing.prepare(netlist, target, times) for times in target.time}
+    if detail == "cycle":
+        require_one_chip(netlist.core_tile, target, "--detail cycle")
+    timed = target.time if chip_count(netlist.core_tile, target) == 1 else ()
+    clocks = {times.name: timing.prepare(netlist, target, times) for times in timed}
     prepared = _charged(netlist, clocks)
     steps = np.full(len(events), events.shape[2]) if lengths is None else np.asarray(lengths, np.int64)
     trace = engine.simulate(prepared, events, lengths=steps)

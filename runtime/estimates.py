@@ -8,8 +8,9 @@ import numpy as np
 
 from compiler.fixedpoint import FloatArray
 from compiler.netlist import Netlist
+from compiler.passes.chips import chip_count
 from compiler.targets import Target
-from runtime.cost import NOT_PRICED
+from runtime.cost import NOT_PRICED, Costs
 from runtime.estimate import Estimate
 from runtime.tables import si, table
 from runtime.timing import DetailedTimes, SimpleTimes
@@ -31,7 +32,7 @@ def estimate_json(netlist: Netlist, target: Target, found: Estimate, *, bin_s: f
     bin_s : float
         Seconds of a data step at the pace of the sensor.
     """
-    costs = found.costs
+    costs, chips = found.costs, chip_count(netlist.core_tile, target)
     per_sample: dict[str, FloatArray] = {
         "synaptic_operations": costs.synaptic_operations,
         "synaptic_operations_on_zeros": costs.zeros,
@@ -41,6 +42,8 @@ def estimate_json(netlist: Netlist, target: Target, found: Estimate, *, bin_s: f
         "packets": costs.events["packet"],
         "hops": costs.events["hop_east_west"] + costs.events["hop_north_south"],
     }
+    if chips > 1:
+        per_sample["packets_between_chips"] = costs.between_chips
 
     def summary(reduce: Any) -> Json:
         values: Json = {key: float(reduce(amount.sum(axis=1))) for key, amount in per_sample.items()}
@@ -70,7 +73,8 @@ def estimate_json(netlist: Netlist, target: Target, found: Estimate, *, bin_s: f
             {
                 "source": name,
                 "chip_w": power.value * 1e-3,
-                "real_time_j": float((power.value * 1e-3 * found.steps * bin_s).mean()),
+                "chips": chips,
+                "real_time_j": float((chips * power.value * 1e-3 * found.steps * bin_s).mean()),
                 "full_speed_j": [
                     {
                         "time_table": of,
@@ -82,9 +86,23 @@ def estimate_json(netlist: Netlist, target: Target, found: Estimate, *, bin_s: f
             }
             for name, power in target.static.items()
         ],
-        "not_modelled": [f"{name}: no price for {', '.join(events)}" for name, events in costs.unpriced.items()],
+        "not_modelled": [
+            *(f"{name}: no price for {', '.join(events)}" for name, events in costs.unpriced.items()),
+            *_between_chips(chips, costs),
+        ],
         "not_priced": list(NOT_PRICED),
     }
+
+
+def _between_chips(chips: int, costs: Costs) -> list[str]:
+    """What is not known of a netlist on several chips."""
+    if chips == 1:
+        return []
+    left, sent = (float(amount.sum(axis=1).mean()) for amount in (costs.between_chips, costs.events["packet"]))
+    return [
+        f"links between the {chips} chips: {left:,.0f} of {sent:,.0f} packets of an inference leave their chip; their "
+        "hops and latency are left out, and so are all times (no public figures)"
+    ]
 
 
 def _models(found: Estimate) -> dict[tuple[str, str], SimpleTimes | DetailedTimes]:
@@ -200,7 +218,8 @@ def estimate_text(report: Json) -> str:
     ]
     if parts:
         lines += [table(["energy by part", *next(iter(report["energy_by_part_j"].values()))], parts), ""]
-    lines += [_cores_text(report), "", *_pace_lines(report)]
+    lines += [_cores_text(report), ""] if report["time"] else []
+    lines += _pace_lines(report)
     lines += [f"not modelled: {line}" for line in report["not_modelled"]]
     lines += [f"not priced: {line}" for line in report["not_priced"]]
     return "\n".join(lines)
@@ -247,7 +266,8 @@ def _pace_lines(report: Json) -> list[str]:
     for static in report["static"]:
         full = ", ".join(f"{si(e['energy_j'], 'J')} ({e['time_table']}, {e['model']})" for e in static["full_speed_j"])
         lines.append(
-            f"static, not in the above: {si(static['chip_w'], 'W')} a chip ({static['source']}), so an inference takes "
+            f"static, not in the above: {si(static['chip_w'], 'W')} a chip ({static['source']}), so an inference "
+            f"{'' if static['chips'] == 1 else 'on {} chips '.format(static['chips'])}takes "
             f"{si(static['real_time_j'], 'J')} at the sensor's pace" + (f", at full speed {full}" if full else "")
         )
     return lines

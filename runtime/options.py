@@ -137,6 +137,7 @@ def add_compile(sub: argparse.ArgumentParser) -> None:
         metavar="LAYER=N[,…]",
         help="at least N cores for a layer, which it shares with none, as in conv1=4,fc1=6",
     )
+    sub.add_argument("--chips", type=int, default=1, metavar="N", help="use up to N chips (default: 1)")
     sub.add_argument(
         "--optimize",
         default="cores",

@@ -12,9 +12,11 @@ import numpy as np
 from compiler.fixedpoint import FloatArray, IntArray
 from compiler.frontends.checkpoint import Checkpoint
 from compiler.netlist import Netlist
+from compiler.passes.chips import chip_count
 from compiler.passes.layout import Layout
 from compiler.passes.legalize import LimitUse
 from compiler.pipeline import Compilation
+from compiler.targets import load_target
 from runtime.tables import si, table
 
 Json = dict[str, Any]
@@ -64,6 +66,7 @@ def netlist_json(netlist: Netlist, uses: Sequence[LimitUse], sha256: str) -> Jso
         "synapses_stored": netlist.n_synapses,
         "synapses_nonzero": int(np.count_nonzero(netlist.synapse_weight)),
         "cores": netlist.n_cores,
+        "chips": chip_count(netlist.core_tile, load_target(netlist.target)),
         "tiles": netlist.core_tile.tolist(),
         "layers": layers,
         "limits": [asdict(use) for use in uses],
@@ -149,12 +152,13 @@ def netlist_text(report: Json) -> str:
         ]
         for use in fullest.values()
     ]
+    where = f"{report['chips']} chips" if report["chips"] > 1 else f"tiles {', '.join(map(str, report['tiles']))}"
     left = "" if report["compartments"] == report["neurons"] else f" ({report['compartments']:,} on the chip)"
     return "\n".join(
         [
             f"{report['target']}: {report['neurons']:,} neurons{left}, {report['synapses']:,} synapses "
             f"({report['synapses_stored']:,} stored, {report['synapses_nonzero']:,} non-zero), {report['cores']} cores "
-            f"on tiles {', '.join(map(str, report['tiles']))}",
+            f"on {where}",
             table(head, layers),
             "",
             table(["limit", "used", "allowed", "fill", "fullest core"], limits),
@@ -218,6 +222,11 @@ def compilation_text(report: Json) -> str:
         f"cores: {report['cores']} used, {report['core_bound']} at least; "
         f"spike-hops a step{'' if calibrated else ' if every neuron spiked'}: {placement['spike_hops']:.1f} ({optimal})"
     )
+    if placement["between_chips"]:
+        lines.append(
+            f"packets a step that leave their chip{'' if calibrated else ' if every neuron spiked'}: "
+            f"{placement['between_chips']:.1f}; links between chips are not modelled"
+        )
     lines += _layout_lines(report["layout"], report["layers"])
     return "\n".join(lines)
 

@@ -32,6 +32,7 @@ from scipy.sparse import csr_array
 from compiler.errors import ModelError
 from compiler.fixedpoint import DECAY_BITS, MEMBRANE_SHIFT, IntArray
 from compiler.netlist import Netlist
+from compiler.passes.chips import require_one_chip
 from compiler.targets import Target
 from runtime.engine import EventArray
 from runtime.timing import input_tiles
@@ -112,7 +113,13 @@ def cores(netlist: Netlist, target: Target) -> tuple[str, ...]:
     """``tile.core`` of the netlist's cores, then of those that hold the input channels.
 
     SANA-FE counts tiles column by column.
+
+    Raises
+    ------
+    OptionError
+        If the netlist takes several chips.
     """
+    require_one_chip(netlist.core_tile, target, "--to sanafe")
     width, height = target.limit("mesh.width"), target.limit("mesh.height")
     tiles = [*netlist.core_tile.tolist(), *input_tiles(netlist, target)]
     return tuple(
@@ -127,6 +134,8 @@ def export(netlist: Netlist, target: Target) -> Iterator[str]:
     ------
     ModelError
         If SANA-FE cannot say what the netlist does.
+    OptionError
+        If the netlist takes several chips.
     """
     remembering = np.flatnonzero(netlist.decay_u != 2**DECAY_BITS - 1)
     if len(remembering):

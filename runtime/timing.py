@@ -31,6 +31,7 @@ import numpy.typing as npt
 from compiler.errors import ModelError
 from compiler.fixedpoint import FloatArray, IntArray
 from compiler.netlist import Netlist
+from compiler.passes.chips import require_one_chip
 from compiler.targets import PICOSECONDS, Target, TimeTable
 from runtime.engine import EventArray
 from runtime.timing_kernel import Steps, Tables, loads, schedule
@@ -179,7 +180,13 @@ def prepare(
         Tiles of cores that hold the input channels, as many on each as it has room for; empty if no core holds them.
     dense : (synapses,) bool, optional
         Which synapses take the time of a dense list; by default those that are stored in one.
+
+    Raises
+    ------
+    OptionError
+        If the netlist takes several chips.
     """
+    require_one_chip(netlist.core_tile, target, "time")
     size, n_inputs = netlist.n_compartments, netlist.n_inputs
     core_tile = np.append(netlist.core_tile, np.array(input_tiles, np.int64))
     extra = [min(i * target.limit("core.compartments"), n_inputs) for i in range(1, len(input_tiles) + 1)]

@@ -248,7 +248,7 @@ def dense_weights(network: IntegerNetwork, post: int) -> dict[int, np.ndarray]:
     found = {}
     for p in network.projections:
         if p.post == post:
-            effective = p.weight.toarray() * 2 ** (p.exponent + 1)
+            effective = p.weight.toarray().astype(np.int64) * 2 ** (p.exponent + 1)
             assert not np.any(effective % 2)
             found[p.pre] = found.get(p.pre, 0) + effective // 2
     return found

@@ -285,7 +285,7 @@ def test_too_many_cores_together():
     with pytest.raises(CapacityError) as caught:
         lay_out(network, LOIHI, cores_for={"fc1": 100, "fc2": 29})
     assert str(caught.value) == (
-        "chip: 129 used, 128 allowed (loihi1.chip.cores); fewer neurons, fewer weight bits or a sparser graph"
+        "chip: 129 used, 128 allowed (loihi1.chip.cores); fewer neurons or weight bits, a sparser graph or more --chips"
     )
 
 

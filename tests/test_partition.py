@@ -356,7 +356,7 @@ def test_a_core_that_holds_nothing(rule, remedy):
 def test_a_network_that_needs_too_many_cores():
     network = integer_chain(np.full((129 * 1024, 1), 2))
     assert refused(network) == (
-        "chip: 129 used, 128 allowed (loihi1.chip.cores); fewer neurons, fewer weight bits or a sparser graph"
+        "chip: 129 used, 128 allowed (loihi1.chip.cores); fewer neurons or weight bits, a sparser graph or more --chips"
     )
     assert len(partition(integer_chain(np.full((128 * 1024, 1), 2)), LOIHI).cores) == 128
 
@@ -388,7 +388,7 @@ def test_an_illegal_netlist_is_refused_with_every_violation():
         "core 0 (fc1, fc2): 1 used, 0 allowed (loihi1.core.synapse_formats); fewer different weight formats on the "
         "core",
         "core 0 (fc1, fc2): 1 used, 0 allowed (loihi1.core.compartment_configs); fewer different decays on the core",
-        "chip: 1 used, 0 allowed (loihi1.chip.cores); fewer neurons, fewer weight bits or a sparser graph",
+        "chip: 1 used, 0 allowed (loihi1.chip.cores); fewer neurons or weight bits, a sparser graph or more --chips",
     ]
     assert [violation.rule for violation in caught.value.violations][:2] == [
         "loihi1.core.compartments",

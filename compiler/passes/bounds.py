@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, MEMBRANE_MAX, MEMBRANE_SHIFT, FloatArray
-from compiler.ir import IntegerNetwork
+from compiler.ir import IntegerNetwork, one_sided
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,9 +59,9 @@ def prove_ranges(network: IntegerNetwork) -> tuple[RangeProof, ...]:
         negative = np.zeros(population.size)
         for projection in network.projections:
             if projection.post == post:
-                weight = projection.effective()
-                positive += np.asarray(weight.maximum(0).sum(axis=1), np.float64)
-                negative -= np.asarray(weight.minimum(0).sum(axis=1), np.float64)
+                gained, lost = one_sided(projection)
+                positive += gained
+                negative += lost
         unit = 1 << MEMBRANE_SHIFT
         kept_u = (4096 - (population.decay_u + 1)) / 4096
         up, down = _settled(positive * unit, kept_u), _settled(negative * unit, kept_u)

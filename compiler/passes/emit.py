@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from compiler.fixedpoint import IntArray
-from compiler.ir import INPUT, IntegerNetwork, depths, fan_in
-from compiler.netlist import Layer, Netlist, read_only, read_only_float
+from compiler.ir import INPUT, MANTISSA, IntegerNetwork, depths, fan_in
+from compiler.netlist import Layer, Netlist, frozen, read_only, read_only_float
 from compiler.passes.needs import Chunk, Lists, choose_dense, index_bits, lean_fits, lists_into
 from compiler.passes.partition import Partition
 from compiler.targets import Target
@@ -23,24 +23,23 @@ from compiler.targets import Target
 
 def _entries(
     network: IntegerNetwork, chunk: Chunk, lists: Lists, dense: IntArray, base: int
-) -> tuple[IntArray, IntArray, IntArray]:
-    """Synapses of a chunk's lists: entries per list, targets on the core, mantissas."""
-    columns = network.projections[lists.projection].weight[chunk.first : chunk.last].tocsc()
+) -> tuple[IntArray, npt.NDArray[np.int32], npt.NDArray[np.int16]]:
+    """Synapses of a chunk's lists: entries per list, targets on the core, mantissas (``MANTISSA``)."""
+    part = network.projections[lists.projection].weight[chunk.first : chunk.last].tocoo()
+    keep = part.data != 0
+    (row, column), data = (coordinate[keep] for coordinate in part.coords), part.data[keep]
+    order = np.argsort(column, kind="stable")  # rows ascend already
+    row, data = row[order], data[order]
     length = np.where(dense, lists.last - lists.first + 1, lists.nonzero)
-    start = np.concatenate([[0], np.cumsum(length)])
-    target = np.zeros(start[-1], np.int64)
-    weight = np.zeros(start[-1], np.int64)
-    for i, source in enumerate(lists.source):
-        held = slice(columns.indptr[source], columns.indptr[source + 1])
-        row, data = columns.indices[held], columns.data[held]
-        row, data = row[data != 0], data[data != 0]
-        place = slice(start[i], start[i + 1])
-        if dense[i]:
-            target[place] = base + np.arange(lists.first[i], lists.last[i] + 1)
-            weight[start[i] + row - lists.first[i]] = data
-        else:
-            target[place] = base + row
-            weight[place] = data
+    start = np.cumsum(length) - length
+    each = np.repeat(np.arange(len(length)), lists.nonzero)  # list of each synapse that is not zero
+    rank = np.arange(len(row)) - np.repeat(np.cumsum(lists.nonzero) - lists.nonzero, lists.nonzero)
+    place = start[each] + np.where(dense[each], row - lists.first[each], rank)
+    within = np.arange(length.sum()) - np.repeat(start, length)
+    target = (np.repeat(lists.first, length) + within + base).astype(np.int32)  # right for dense lists
+    target[place] = base + row
+    weight = np.zeros(len(target), MANTISSA)
+    weight[place] = data
     return length, target, weight
 
 
@@ -130,7 +129,7 @@ def emit(
 
     formats: dict[tuple[int, int, int], int] = {}
     axons_per_core = np.zeros(len(partition.cores), np.int64)
-    parts: dict[str, list[IntArray]] = {key: [] for key in ("source", "format", "length", "target", "weight")}
+    parts: dict[str, list[npt.NDArray[Any]]] = {key: [] for key in ("source", "format", "length", "target", "weight")}
     lean = [lean_fits(network, target, chunks) for chunks in partition.cores]
     for chunk, core, base in placed:
         for lists in lists_into(network, chunk):
@@ -181,8 +180,8 @@ def emit(
         axon_source=read_only(np.concatenate(parts["source"])),
         axon_format=read_only(np.concatenate(parts["format"])),
         axon_synapses=read_only(np.concatenate([[0], np.cumsum(np.concatenate(parts["length"]))])),
-        synapse_target=read_only(np.concatenate(parts["target"])),
-        synapse_weight=read_only(np.concatenate(parts["weight"])),
+        synapse_target=frozen(np.concatenate(parts.pop("target"))),
+        synapse_weight=frozen(np.concatenate(parts.pop("weight"))),
         format_weight_bits=read_only([key[0] for key in columns]),
         format_exponent=read_only([key[1] for key in columns]),
         format_index_bits=read_only([key[2] for key in columns]),

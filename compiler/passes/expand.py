@@ -41,13 +41,14 @@ def effective_weight(powers: FloatArray, hops: FloatArray) -> FloatArray:
     return weight
 
 
-def expand_graph_convolution(adjacency: FloatArray, hops: FloatArray) -> Sparse:
+def expand_graph_convolution(adjacency: FloatArray | Sparse, hops: FloatArray) -> Sparse:
     """Effective weights ``W[(i, f), (j, c)] = sum_k (A^k)[i, j] * g[k, f, c]``.
 
     Parameters
     ----------
-    adjacency : (taxels, taxels) float64
-        Normalised propagation matrix; row i gathers into taxel i.
+    adjacency : (taxels, taxels) float64, dense or sparse
+        Normalised propagation matrix; row i gathers into taxel i. From a sparse one nothing dense is made; sums are
+        then taken in another order, so that weights may differ in their last bits.
     hops : (K + 1, features, channels) float64
         Filter of each hop.
 
@@ -57,6 +58,8 @@ def expand_graph_convolution(adjacency: FloatArray, hops: FloatArray) -> Sparse:
         Rows are taxel-major (``taxel * features + feature``), columns likewise. The stored entries are all pairs of
         taxels that some hop connects, whatever their weight.
     """
+    if sparse.issparse(adjacency):
+        return _expand_sparse(adjacency, hops)
     taxels = len(adjacency)
     n_hops, features, channels = hops.shape
     reach = np.zeros((taxels, taxels), np.bool_)
@@ -68,6 +71,25 @@ def expand_graph_convolution(adjacency: FloatArray, hops: FloatArray) -> Sparse:
     structure = np.broadcast_to(reach[:, None, :, None], weight.shape)
     shape = (taxels * features, taxels * channels)
     return _stored(weight.reshape(shape), structure.reshape(shape))
+
+
+def _expand_sparse(adjacency: Sparse, hops: FloatArray) -> Sparse:
+    """The same of a sparse matrix: the pairs of taxels that some hop connects, then a block of weights for each."""
+    taxels = adjacency.shape[0]
+    n_hops, features, channels = hops.shape
+    power, powers = sparse.eye_array(taxels, format="csr"), []
+    for _ in range(n_hops):
+        powers.append(sparse.coo_array(power))
+        power = sparse.csr_array(adjacency @ power)
+    pair = np.concatenate([p.coords[0].astype(np.int64) * taxels + p.coords[1] for p in powers])
+    pairs, index = np.unique(pair, return_inverse=True)
+    weight = np.zeros((len(pairs), features, channels))
+    for p, own, hop in zip(powers, np.split(index, np.cumsum([p.nnz for p in powers])[:-1]), hops, strict=True):
+        weight[own] += p.data[:, None, None] * hop
+    row, column = np.divmod(pairs, taxels)
+    first = np.searchsorted(row, np.arange(taxels + 1)).astype(np.int32)
+    blocks = sparse.bsr_array((weight, column.astype(np.int32), first), shape=(taxels * features, taxels * channels))
+    return sparse.csr_array(blocks)
 
 
 def _stored(weight: FloatArray, structure: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> Sparse:

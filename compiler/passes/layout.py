@@ -18,11 +18,12 @@ from compiler.errors import CapacityError, OptionError
 from compiler.fixedpoint import FloatArray, IntArray
 from compiler.ir import IntegerNetwork
 from compiler.passes.calibrate import Calibration
+from compiler.passes.chips import place_on_chips
 from compiler.passes.fastest import estimate, fastest, tiles_for
 from compiler.passes.forecast import Expectation, Forecast, sample, tables
 from compiler.passes.needs import Chunk, Needs
 from compiler.passes.partition import Partition, arrange, chunks_of, cut, partition
-from compiler.passes.place import Placement, core_traffic, place, place_within
+from compiler.passes.place import Placement, core_traffic, place_within
 from compiler.targets import PICOSECONDS, Target
 
 GOALS = ("cores", "energy", "latency")
@@ -51,7 +52,9 @@ class Layout:
     expected: Expectation | None
 
 
-def asked_cores(network: IntegerNetwork, cores_for: Mapping[str, int], target: Target) -> dict[int, int]:
+def asked_cores(
+    network: IntegerNetwork, cores_for: Mapping[str, int], target: Target, chips: int = 1
+) -> dict[int, int]:
     """Least number of cores by population, from names.
 
     Raises
@@ -64,11 +67,11 @@ def asked_cores(network: IntegerNetwork, cores_for: Mapping[str, int], target: T
     for name, least in cores_for.items():
         if name not in names:
             raise OptionError(f"--cores-for {name}={least}: no such layer; layers are {', '.join(names)}")
-        population, allowed = names.index(name), target.limit("chip.cores")
+        population, allowed = names.index(name), chips * target.limit("chip.cores")
         size = network.populations[population].size
         if least > allowed:
             raise OptionError(
-                f"--cores-for {name}={least}: {target.title} has {allowed} cores ({target.name}.chip.cores); "
+                f"--cores-for {name}={least}: {_named(target, chips)} {allowed} cores ({target.name}.chip.cores); "
                 f"give {allowed} or fewer"
             )
         if least > size:
@@ -79,8 +82,14 @@ def asked_cores(network: IntegerNetwork, cores_for: Mapping[str, int], target: T
     return found
 
 
-def require_goal(goal: str, cores_for: Mapping[str, int] | None, target: Target, *, calibrated: bool) -> None:
-    """Refuse a goal that is unknown or cannot be judged.
+def _named(target: Target, chips: int) -> str:
+    return f"{target.title} has" if chips == 1 else f"{chips} chips {target.title} have"
+
+
+def require_goal(
+    goal: str, cores_for: Mapping[str, int] | None, target: Target, *, calibrated: bool, chips: int = 1
+) -> None:
+    """Refuse a goal that is unknown or cannot be judged, and a number of chips that is none.
 
     Raises
     ------
@@ -89,8 +98,12 @@ def require_goal(goal: str, cores_for: Mapping[str, int] | None, target: Target,
     """
     if goal not in GOALS:
         raise OptionError(f"--optimize {goal}: no such goal; give one of {', '.join(GOALS)}")
+    if chips < 1:
+        raise OptionError(f"--chips {chips}: not a number of chips; give 1 or more")
     if goal == "cores":
         return
+    if chips > 1:
+        raise OptionError(f"--optimize {goal}: links between chips are not modelled; leave --chips away")
     if cores_for:
         raise OptionError(f"--optimize {goal}: chooses the cores of every layer itself; leave --cores-for away")
     if not calibrated:
@@ -105,6 +118,7 @@ def lay_out(
     *,
     goal: str = "cores",
     cores_for: Mapping[str, int] | None = None,
+    chips: int = 1,
     rates: tuple[FloatArray, ...] | None = None,
     calibration: Calibration | None = None,
     identity: tuple[IntArray, ...] | None = None,
@@ -121,6 +135,8 @@ def lay_out(
         One of ``GOALS``: fewest cores, least expected energy of a step, shortest expected step.
     cores_for : mapping of str to int, optional
         Least number of cores of a layer, by name. These hold no other layer.
+    chips : int
+        Number of chips at most; as few are used as hold the cores.
     rates : tuple of (neurons,) float64, optional
         Spikes per step, from calibration.
     calibration : Calibration, optional
@@ -140,8 +156,8 @@ def lay_out(
     OptionError
         If the goal is unknown or cannot be judged, or the cores asked for do not exist.
     """
-    require_goal(goal, cores_for, target, calibrated=calibration is not None)
-    least = asked_cores(network, cores_for or {}, target)
+    require_goal(goal, cores_for, target, calibrated=calibration is not None, chips=chips)
+    least = asked_cores(network, cores_for or {}, target, chips)
     priced = tables(target)
     forecast = None
     if calibration is not None and priced is not None:
@@ -151,17 +167,17 @@ def lay_out(
 
     def placed(parts: Partition, tiles: int | None = None) -> Layout:
         traffic = core_traffic(network, parts, rates)
-        placement = place(traffic, target) if tiles is None else place_within(traffic, target, tiles)
+        placement = place_on_chips(traffic, target) if tiles is None else place_within(traffic, target, tiles)
         return Layout(parts=parts, placement=placement, expected=expect(parts, placement))
 
     def expect(parts: Partition, placement: Placement) -> Expectation | None:
-        if forecast is None:
+        if forecast is None or len(parts.cores) > target.limit("chip.cores"):
             return None
         return forecast.expect(parts, placement.tiles, core_traffic(network, parts, forecast.rates))
 
-    usual = placed(partition(network, target, rates))
+    usual = placed(partition(network, target, rates, chips=chips))
     if least:
-        return placed(partition(network, target, rates, cores_for=least)), usual
+        return placed(partition(network, target, rates, cores_for=least, chips=chips)), usual
     if forecast is None or goal == "cores":
         return usual, usual
     if goal == "energy":

@@ -23,7 +23,7 @@ REMEDIES = {
     "core.synapse_formats": "fewer different weight formats on the core",
     "core.compartment_configs": "fewer different decays on the core",
     "core.dense_base": "place the dense layer first on its core",
-    "chip.cores": "fewer neurons, fewer weight bits or a sparser graph",
+    "chip.cores": "fewer neurons or weight bits, a sparser graph or more --chips",
 }
 
 
@@ -72,7 +72,7 @@ def measure(netlist: Netlist, target: Target) -> tuple[LimitUse, ...]:
     Returns
     -------
     tuple of LimitUse
-        One entry per per-core limit and core, and one for the chip's cores.
+        One entry per per-core limit and core, and one for the cores of the fullest chip.
     """
     cores = netlist.n_cores
     core_of_axon = netlist.core_of_axon()
@@ -100,7 +100,8 @@ def measure(netlist: Netlist, target: Target) -> tuple[LimitUse, ...]:
         for rule, amounts in used.items()
         for core, amount in enumerate(amounts)
     ]
-    return (*uses, LimitUse(name="chip.cores", used=cores, allowed=target.limit("chip.cores"), core=None))
+    chips = np.bincount(netlist.core_tile // (target.limit("mesh.width") * target.limit("mesh.height")))
+    return (*uses, LimitUse(name="chip.cores", used=int(chips.max()), allowed=target.limit("chip.cores"), core=None))
 
 
 def violation(use: LimitUse, owner: str, target: Target) -> Violation:

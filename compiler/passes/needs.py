@@ -135,6 +135,10 @@ class Needs:
             self._lists[chunk] = lists_into(self.network, chunk)
         return self._lists[chunk]
 
+    def drop(self, chunk: Chunk) -> None:
+        """Forget the lists of a chunk that was only tried."""
+        self._lists.pop(chunk, None)
+
     def stored(self, chunk: Chunk, base: int, *, lean: bool = False) -> tuple[int, frozenset[SynapseFormat]]:
         """Words and synapse formats of a chunk's lists if it starts at compartment `base` of its core."""
         key = (chunk, base, lean)

@@ -63,7 +63,10 @@ def fill(needs: Needs, population: int) -> tuple[list[Chunk], list[Violation]]:
             return [], _worst(needs, population)
 
         def fits(last: int, first: int = first) -> bool:
-            return not needs.excess((Chunk(population=population, first=first, last=last),))
+            tried = Chunk(population=population, first=first, last=last)
+            fit = not needs.excess((tried,))
+            needs.drop(tried)
+            return fit
 
         most = min(size, first + needs.target.limit("core.compartments"))
         chunks.append(Chunk(population=population, first=first, last=_largest(first + 1, most, fits)))
@@ -196,18 +199,19 @@ def chunks_of(chunks: Iterable[Chunk]) -> dict[int, int]:
     return dict(sorted(Counter(chunk.population for chunk in chunks).items()))
 
 
-def arrange(needs: Needs, groups: Iterable[tuple[Chunk, ...]]) -> Partition:
+def arrange(needs: Needs, groups: Iterable[tuple[Chunk, ...]], chips: int = 1) -> Partition:
     """Put groups of chunks on cores, in order.
 
     Raises
     ------
     CapacityError
-        If the chip has too few cores.
+        If the chips have too few cores.
     """
     cores = sorted((order_on_core(needs, group) for group in groups), key=min)
-    used = LimitUse(name="chip.cores", used=len(cores), allowed=needs.target.limit("chip.cores"), core=None)
+    used = LimitUse(name="chip.cores", used=len(cores), allowed=chips * needs.target.limit("chip.cores"), core=None)
     if used.used > used.allowed:
-        raise CapacityError((violation(used, "chip", needs.target),))
+        owner = "chip" if chips == 1 else f"{chips} chips"
+        raise CapacityError((violation(used, owner, needs.target),))
     return Partition(cores=tuple(cores), bound=_core_bound(needs, [chunk for core in cores for chunk in core]))
 
 
@@ -218,6 +222,7 @@ def partition(
     *,
     cores_for: Mapping[int, int] | None = None,
     shared: bool = False,
+    chips: int = 1,
 ) -> Partition:
     """Assign every neuron to a core.
 
@@ -233,6 +238,8 @@ def partition(
         At least so many cores for a population, which is cut as evenly as possible.
     shared : bool
         Whether these cores may hold other populations, too.
+    chips : int
+        Number of chips at most.
 
     Returns
     -------
@@ -243,7 +250,7 @@ def partition(
     Raises
     ------
     CapacityError
-        If a single neuron exceeds a limit or the chip has too few cores; lists every violation.
+        If a single neuron exceeds a limit or the chips have too few cores; lists every violation.
     OptionError
         If a population needs more cores than `cores_for` says.
     """
@@ -261,4 +268,4 @@ def partition(
 
     alone = [chunk for chunk in chunks if chunk.population in least and not shared]
     groups = _pack(needs, [chunk for chunk in chunks if chunk not in alone], traffic)
-    return arrange(needs, [*groups, *((chunk,) for chunk in alone)])
+    return arrange(needs, [*groups, *((chunk,) for chunk in alone)], chips)

@@ -11,6 +11,7 @@ References
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -32,6 +33,8 @@ TIE = 1e-9
 
 Layout = tuple[IntArray, IntArray]
 
+Tiles = TypeVar("Tiles", int, IntArray)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Placement:
@@ -45,11 +48,14 @@ class Placement:
         Spikes per step times hops that this placement costs.
     bound : float
         No placement costs less (by more than a billionth); equal to `spike_hops` if that is proven optimal.
+    between_chips : float
+        Packets per step that leave their chip.
     """
 
     tiles: tuple[int, ...]
     spike_hops: float
     bound: float
+    between_chips: float = 0.0
 
 
 def core_traffic(network: IntegerNetwork, partition: Partition, rates: tuple[FloatArray, ...] | None) -> FloatArray:
@@ -73,8 +79,8 @@ def core_traffic(network: IntegerNetwork, partition: Partition, rates: tuple[Flo
     return traffic
 
 
-def hops(tile: int, other: int, width: int) -> tuple[int, int]:
-    """East-west and north-south hops between two tiles under XY routing.
+def hops(tile: Tiles, other: Tiles, width: int) -> tuple[Tiles, Tiles]:
+    """East-west and north-south hops between two tiles of a chip under XY routing.
 
     Examples
     --------

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from compiler.fixedpoint import MEMBRANE_SHIFT, IntArray
-from compiler.ir import INPUT, IntegerNetwork, IntegerPopulation, Network, Sparse
+from compiler.ir import INPUT, IntegerNetwork, IntegerPopulation, Network, Sparse, row_parts, with_data
 from compiler.passes.calibrate import Calibration
 
 Mask = npt.NDArray[np.bool_]
@@ -61,8 +61,10 @@ def never_fires(network: Network) -> tuple[Mask, ...]:
         for p in network.projections:
             if p.post == post:
                 heard = (~silent[p.pre]).astype(np.float64)
-                up += p.weight.maximum(0) @ heard
-                total = total + abs(p.weight) @ heard
+                for rows in row_parts(p.weight):
+                    weight = p.weight[rows]
+                    up[rows] += weight.maximum(0) @ heard
+                    total[rows] += abs(weight) @ heard
                 inputs += p.weight.shape[1]
         slack = (inputs + 8) * FLOAT32_ROUNDING * total
         most = np.maximum(up + population.bias + slack, 0)
@@ -91,6 +93,8 @@ def either(first: tuple[Mask, ...], second: tuple[Mask, ...]) -> tuple[Mask, ...
 
 def disconnect(network: Network, gone: tuple[Mask, ...]) -> Network:
     """Set the weights from and to some neurons, and their biases, to zero; the structure stays."""
+    if not any(mask.any() for mask in gone):
+        return network
     return replace(
         network,
         populations=tuple(
@@ -119,7 +123,9 @@ def removable(network: IntegerNetwork) -> tuple[tuple[Mask, ...], tuple[Mask, ..
         up = np.zeros(population.size)
         for p in network.projections:
             if p.post == post:
-                up += p.effective().maximum(0) @ (~silent[p.pre]).astype(np.float64)
+                fires = (~silent[p.pre]).astype(np.float64)
+                for rows in row_parts(p.weight):
+                    up[rows] += replace(p, weight=p.weight[rows]).effective().maximum(0) @ fires
         silent[post] = _cannot_reach(population, up * (1 << MEMBRANE_SHIFT))
     unheard: dict[int, Mask] = {}
     for pre in reversed(range(len(network.populations))):
@@ -131,7 +137,10 @@ def removable(network: IntegerNetwork) -> tuple[tuple[Mask, ...], tuple[Mask, ..
         for p in network.projections:
             if p.pre == pre:
                 listens = ~(silent[p.post] | unheard[p.post])
-                heard |= np.asarray((p.weight[np.flatnonzero(listens)] != 0).sum(axis=0)).ravel() > 0
+                for rows in row_parts(p.weight):
+                    weight = p.weight[rows]
+                    counts = np.repeat(listens[rows], np.diff(weight.indptr)) & (weight.data != 0)
+                    heard[weight.indices[counts]] = True
         unheard[pre] = ~heard & ~silent[pre]
         if np.all(silent[pre] | unheard[pre]):
             silent[pre][0] = unheard[pre][0] = False
@@ -161,6 +170,8 @@ def compact(network: IntegerNetwork, gone: tuple[Mask, ...]) -> tuple[IntegerNet
         Which neuron of the original each one is.
     """
     kept = tuple(np.flatnonzero(~mask) for mask in gone)
+    if not any(mask.any() for mask in gone):
+        return network, kept
     projections = []
     for p in network.projections:
         weight = p.weight[kept[p.post]]
@@ -199,9 +210,12 @@ def removals(
         synapses = 0
         for p in network.projections:
             if p.post == post:
-                row, column = p.weight.tocoo().coords
-                lost = gone[post][row] | _of(gone, p.pre, p.weight.shape[1])[column]
-                synapses += int((lost & (p.weight.data != 0)).sum())
+                deaf = _of(gone, p.pre, p.weight.shape[1])
+                for rows in row_parts(p.weight):
+                    held = slice(p.weight.indptr[rows.start], p.weight.indptr[rows.stop])
+                    own = np.repeat(gone[post][rows], np.diff(p.weight.indptr[rows.start : rows.stop + 1]))
+                    lost = own | deaf[p.weight.indices[held]]
+                    synapses += int((lost & (p.weight.data[held] != 0)).sum())
         found.append(
             Removal(
                 layer=population.name,
@@ -224,7 +238,5 @@ def _of(masks: tuple[Mask, ...], pre: int, size: int) -> Mask:
 
 
 def _zeroed(weight: Sparse, rows: Mask, columns: Mask) -> Sparse:
-    changed = weight.copy()
-    row = np.repeat(np.arange(len(rows)), np.diff(weight.indptr))
-    changed.data = np.where(rows[row] | columns[weight.indices], 0, weight.data)
-    return changed
+    away = np.repeat(rows, np.diff(weight.indptr)) | columns[weight.indices]
+    return with_data(weight, np.where(away, 0, weight.data))

@@ -17,7 +17,7 @@ from compiler.errors import ModelError, OptionError
 from compiler.fixedpoint import ONE_STEP_SUM_MAX, FloatArray
 from compiler.forms import Form, reach, step_units
 from compiler.interpret import run_integer
-from compiler.ir import IntegerNetwork, Network, Projection
+from compiler.ir import IntegerNetwork, Network, Projection, row_parts
 from compiler.passes.calibrate import MANY, Calibration, fewer
 from compiler.passes.compensate import compensated
 from compiler.passes.scales import Rounded, candidate, flips, grouped, observed_sums, rounded
@@ -209,13 +209,16 @@ def explain_choice(network: Network, post: int, chosen: Candidate, calibration: 
     form, scale = chosen.layer.form, chosen.layer.population.scale
     clipped = zeroed = weights = 0
     for p in incoming(network, post):
-        planes = (abs(plane.effective()) for plane in chosen.layer.projections if plane.pre == p.pre)
-        kept = sum(planes, start=0 * p.weight)
-        weights += int(p.weight.count_nonzero())
-        zeroed += int(p.weight.count_nonzero() - kept.multiply(p.weight != 0).count_nonzero())
-        units = np.abs(p.weight.data) * np.repeat(scale, np.diff(p.weight.indptr))
         held = reach(form.bits, form.exponents) * step_units(form.bits, form.exponents)
-        clipped += int(np.count_nonzero(units > held * (1 + 1e-12)))
+        planes = [plane for plane in chosen.layer.projections if plane.pre == p.pre]
+        for rows in row_parts(p.weight):
+            weight = p.weight[rows]
+            stored = (abs(replace(plane, weight=plane.weight[rows]).effective()) for plane in planes)
+            kept = sum(stored, start=0 * weight)
+            weights += int(weight.count_nonzero())
+            zeroed += int(weight.count_nonzero() - kept.multiply(weight != 0).count_nonzero())
+            units = np.abs(weight.data) * np.repeat(scale[rows], np.diff(weight.indptr))
+            clipped += int(np.count_nonzero(units > held * (1 + 1e-12)))
     return Choice(
         layer=network.populations[post].name,
         bits=form.bits,

@@ -1,0 +1,154 @@
+"""Large skins on several chips: time and memory of compiling and running against the number of synapses.
+
+Command: ``python benchmarks/skins.py -o skins.json --chart skins``
+
+A skin is a square lattice of taxels whose numbers run patch by patch, 16 x 16 taxels each; neighbours are joined. A
+graph convolution of 16 features (K = 3) covers it. Each patch, 4,096 convolution neurons and so as many as one core
+can hear, has its own 64 neurons of fc1 and its own vote of 10 classes; votes add up. Weights are random, events too
+(2 % of the channels in a step). Each size runs in a process of its own; memory is the most that the process ever held
+beyond what it held after a tiny skin had been through, so the float network is part of it. The engine's spikes are those of the kernel
+of steps, which shares no code with it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import platform
+import resource
+import time
+from typing import Any
+
+import numpy as np
+from growth_chart import draw_skins
+from scipy import sparse
+
+from compiler.atomic import write_atomically
+from compiler.ir import INPUT, Input, Network, Population, Projection, Readout
+from compiler.passes.chips import chip_count
+from compiler.passes.expand import expand_graph_convolution
+from compiler.pipeline import compile_network
+from compiler.targets import load_target
+from runtime import engine
+
+TAXELS = (1000, 2000, 5000, 10000, 20000)
+SIDE, FEATURES, HIDDEN, CLASSES, HOPS = 16, 16, 64, 10, 4
+BETA, THETA = 0.2, 0.5
+DENSITY, STEPS, RECORDINGS = 0.02, 50, 4
+
+
+def lattice(taxels: int) -> sparse.csr_array:
+    """Normalised propagation matrix of the skin."""
+    patch, inner = np.divmod(np.arange(taxels), SIDE * SIDE)
+    across = int(np.ceil(np.sqrt(patch[-1] + 1)))
+    x = patch % across * SIDE + inner % SIDE
+    y = patch // across * SIDE + inner // SIDE
+    width = across * SIDE + 1
+    place = {int(p): i for i, p in enumerate(y * width + x)}
+    pairs = [(i, place[p + step]) for p, i in place.items() for step in (1, width) if p + step in place]
+    a, b = np.array(pairs).T
+    joined = sparse.csr_array((np.ones(2 * len(a)), (np.append(a, b), np.append(b, a))), (taxels, taxels))
+    scale = sparse.diags_array(np.asarray(joined.sum(axis=1)).ravel() ** -0.5)
+    return sparse.csr_array(scale @ joined @ scale)
+
+
+def skin(taxels: int, seed: int = 0) -> Network:
+    """The network of a skin, in float64."""
+    rng = np.random.default_rng(seed)
+    conv = expand_graph_convolution(lattice(taxels), rng.normal(0, 0.7, (HOPS, FEATURES, 2)))
+    sizes = [min(SIDE * SIDE, taxels - first) * FEATURES for first in range(0, taxels, SIDE * SIDE)]
+    hidden = sparse.block_diag([rng.normal(0, 3 / size**0.5, (HIDDEN, size)) for size in sizes], format="csr")
+    votes = sparse.block_diag([rng.normal(0, 0.3, (CLASSES, HIDDEN)) for _ in sizes], format="csr")
+    weights = [conv, sparse.csr_array(hidden), sparse.csr_array(votes)]
+    return Network(
+        input=Input(taxels=taxels, polarities=2),
+        populations=tuple(
+            Population(name=name, beta=BETA, theta=THETA, bias=rng.normal(0, 0.05, weight.shape[0]))
+            for name, weight in zip(("conv1", "fc1", "fc2"), weights, strict=True)
+        ),
+        projections=tuple(
+            Projection(pre=post - 1 if post else INPUT, post=post, weight=weight) for post, weight in enumerate(weights)
+        ),
+        readout=Readout(population=2, label=np.tile(np.arange(CLASSES), len(sizes))),
+        classes=CLASSES,
+    )
+
+
+def held() -> int:
+    """Most bytes that this process ever held."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
+def measure(taxels: int) -> dict[str, Any]:
+    """One size: compile, prepare, run and compare."""
+    small = compile_network(skin(SIDE)).netlist  # imports and compiles what the work needs
+    for stepwise in (False, True):
+        engine.simulate(engine.prepare(small, stepwise=stepwise), np.zeros((1, small.n_inputs, 4), np.uint8))
+    idle, start = held(), time.perf_counter()
+    network = skin(taxels)
+    made = time.perf_counter()
+    built = held()
+    compilation = compile_network(network, chips=1 + taxels // 1000)
+    netlist, placement = compilation.netlist, compilation.placement
+    del network, compilation
+    compiled, compile_bytes = time.perf_counter(), held()
+    prepared = engine.prepare(netlist)
+    ready, prepare_bytes = time.perf_counter(), held()
+    events = (np.random.default_rng(1).random((RECORDINGS, netlist.n_inputs, STEPS)) < DENSITY).astype(np.uint8)
+    engine.simulate(prepared, events[:1], threads=1)
+    warm = time.perf_counter()
+    trace = engine.simulate(prepared, events, threads=1)
+    ran = time.perf_counter()
+    run_bytes = held()
+    stepwise = engine.simulate(engine.prepare(netlist, stepwise=True), events[:1], threads=1)
+    assert prepared.blocks is not None
+    assert np.array_equal(stepwise.counts.spikes, trace.counts.spikes[:1])
+    return {
+        "taxels": taxels,
+        "neurons": netlist.n_compartments,
+        "synapses": netlist.n_synapses,
+        "cores": netlist.n_cores,
+        "chips": chip_count(netlist.core_tile, load_target("loihi1")),
+        "packets_between_chips": placement.between_chips,
+        "network_s": made - start,
+        "compile_s": compiled - made,
+        "prepare_s": ready - compiled,
+        "run_ms": 1e3 * (ran - warm) / RECORDINGS,
+        "synaptic_operations": float((trace.counts.inputs.sum() + trace.counts.spikes.sum()) / RECORDINGS),
+        "spikes_per_neuron_step": float(trace.counts.spikes.mean() / STEPS),
+        "network_bytes": built - idle,
+        "compile_bytes": compile_bytes - idle,
+        "run_bytes": max(run_bytes, prepare_bytes) - idle,
+        "peak_bytes": run_bytes,
+    }
+
+
+def main() -> None:
+    """Measure every size and write what was found."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser.add_argument("-o", "--output", required=True)
+    parser.add_argument("--chart", metavar="STEM")
+    parser.add_argument("--taxels", type=int, nargs="+", default=TAXELS)
+    arguments = parser.parse_args()
+    rows = []
+    for taxels in arguments.taxels:
+        with multiprocessing.get_context("spawn").Pool(1) as pool:
+            row = pool.apply(measure, (taxels,))
+        rows.append(row)
+        each = {key: row[f"{key}_bytes"] / row["synapses"] for key in ("compile", "run")}
+        print(
+            f"{taxels} taxels, {row['synapses']:,} synapses, {row['cores']} cores, {row['chips']} chip(s): compiled in "
+            f"{row['compile_s']:.1f} s ({each['compile']:.0f} bytes a synapse), prepared in {row['prepare_s']:.1f} s, "
+            f"run in {row['run_ms']:.0f} ms a recording ({each['run']:.0f}); peak {row['peak_bytes'] / 2**30:.2f} GiB",
+            flush=True,
+        )
+    result = {"machine": platform.processor() or platform.machine(), "steps": STEPS, "density": DENSITY, "skins": rows}
+    with write_atomically(arguments.output) as file:
+        file.write(json.dumps(result, indent=1).encode() + b"\n")
+    if arguments.chart:
+        draw_skins(result, arguments.chart)
+
+
+if __name__ == "__main__":
+    main()

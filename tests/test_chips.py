@@ -1,0 +1,228 @@
+"""Networks on several chips: shared out, placed, run, priced, and what is refused of them."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from random_networks import LOIHI, integer_chain, small_target
+
+from compiler.coremap import core_map
+from compiler.errors import CapacityError, OptionError
+from compiler.passes.chips import chip_count, chip_of_core, place_on_chips, share
+from compiler.passes.emit import emit
+from compiler.passes.expand import expand_graph_convolution
+from compiler.passes.layout import asked_cores, lay_out, require_goal
+from compiler.passes.legalize import LimitUse, measure, require_legal
+from compiler.passes.place import place
+from compiler.serialize import read_netlist, write_netlist
+from runtime import cost, engine, sanafe, spec, timing
+from runtime.estimate import estimate
+from runtime.estimates import estimate_json, estimate_text
+
+SMALL = small_target(core_compartments=4, chip_cores=2, mesh_width=2, mesh_height=1, mesh_tile_cores=1)
+"""Two cores of four neurons a chip, one on each tile."""
+
+
+def net():
+    """Three layers of 8, 8 and 4 neurons that need five cores of ``SMALL``."""
+    rng = np.random.default_rng(3)
+    weights = [2 * rng.integers(-20, 60, shape) for shape in ((8, 6), (8, 8), (4, 8))]
+    return integer_chain(*weights, thresholds=[60, 200, 200])
+
+
+@pytest.fixture(scope="module")
+def netlist():
+    layout, _ = lay_out(net(), SMALL, chips=3)
+    made = emit(net(), layout.parts, layout.placement.tiles, SMALL, {})
+    require_legal(made, SMALL)
+    return made
+
+
+@pytest.fixture(scope="module")
+def recordings():
+    return (np.random.default_rng(5).random((3, 6, 40)) < 0.5).astype(np.uint8)
+
+
+def test_a_network_takes_as_few_chips_as_hold_it(netlist):
+    assert netlist.n_cores == 5
+    chip = chip_of_core(netlist.core_tile, SMALL)
+    assert np.bincount(chip).tolist() == [2, 2, 1]
+    assert chip_count(netlist.core_tile, SMALL) == 3
+    assert len(set(netlist.core_tile.tolist())) == 5
+    one, _ = lay_out(net(), LOIHI, chips=9)
+    assert chip_count(np.array(one.placement.tiles), LOIHI) == 1
+
+
+@pytest.mark.parametrize("chips", [1, 2])
+def test_too_few_chips(chips):
+    with pytest.raises(CapacityError) as caught:
+        lay_out(net(), SMALL, chips=chips)
+    assert str(caught.value) == (
+        f"{'chip' if chips == 1 else '2 chips'}: 5 used, {2 * chips} allowed (loihi1.chip.cores); "
+        "fewer neurons or weight bits, a sparser graph or more --chips"
+    )
+
+
+def test_the_fullest_chip_is_measured(netlist):
+    full = LimitUse(name="chip.cores", used=2, allowed=2, core=None)
+    assert measure(netlist, SMALL)[-1] == full
+    crowded = dataclasses.replace(netlist, core_tile=np.array([0, 1, 0, 2, 3]))
+    with pytest.raises(CapacityError) as caught:
+        require_legal(crowded, SMALL)
+    assert str(caught.value) == (
+        "chip: 3 used, 2 allowed (loihi1.chip.cores); fewer neurons or weight bits, a sparser graph or more --chips"
+    )
+
+
+def test_cores_that_talk_share_a_chip():
+    traffic = np.zeros((6, 6))
+    traffic[0, 4] = traffic[1, 3] = traffic[2, 5] = 1.0
+    assert share(traffic, 2).tolist() == [0, 1, 2, 1, 0, 2]
+
+
+@given(st.integers(1, 9), st.integers(1, 4), st.integers(0, 2**32 - 1))
+def test_every_core_gets_a_chip_that_has_room(cores, room, seed):
+    chip = share(np.random.default_rng(seed).random((cores, cores)), room)
+    assert np.all(np.bincount(chip)[:-1] == room)
+    assert chip.max() + 1 == -(-cores // room)
+
+
+@given(st.integers(3, 8), st.integers(0, 2**32 - 1))
+def test_a_placement_counts_what_stays_and_what_leaves(cores, seed):
+    traffic = np.random.default_rng(seed).random((cores, cores))
+    placement = place_on_chips(traffic, SMALL)
+    chip = np.array(placement.tiles) // 2
+    stays = hops = 0.0
+    for a in range(cores):
+        for b in range(cores):
+            if chip[a] == chip[b]:
+                stays += traffic[a, b]
+                hops += traffic[a, b] * abs(placement.tiles[a] - placement.tiles[b])
+    assert placement.between_chips == pytest.approx(traffic.sum() - stays)
+    assert placement.spike_hops == pytest.approx(hops)
+    assert placement.bound <= placement.spike_hops
+
+
+def test_what_one_chip_holds_is_placed_as_ever():
+    traffic = np.random.default_rng(0).random((5, 5))
+    assert place_on_chips(traffic, LOIHI) == place(traffic, LOIHI)
+    assert place(traffic, LOIHI).between_chips == 0
+
+
+@pytest.mark.parametrize("stepwise", [False, True])
+def test_chips_do_not_change_a_spike(netlist, recordings, stepwise):
+    trace = engine.simulate(engine.prepare(netlist, stepwise=stepwise), recordings, spikes=True)
+    one, _ = lay_out(net(), LOIHI)
+    alone = emit(net(), one.parts, one.placement.tiles, LOIHI, {})
+    other = engine.simulate(alone, recordings, spikes=True)
+    for index in range(3):
+        np.testing.assert_array_equal(
+            trace.spikes[:, :, netlist.compartments_of(index)], other.spikes[:, :, alone.compartments_of(index)]
+        )
+    slow = spec.simulate(netlist, recordings[0])
+    np.testing.assert_array_equal(slow.spikes, trace.spikes[0])
+    assert trace.counts.spikes.sum() > 20
+
+
+def test_packets_that_leave_are_counted_and_their_way_is_not(netlist, recordings):
+    counts, found = estimate(netlist, SMALL, recordings)
+    chip = chip_of_core(netlist.core_tile, SMALL)
+    core = netlist.core_of_compartment()
+    left = hops = packets = 0
+    for axon, source in enumerate(netlist.axon_source):
+        if source >= netlist.n_inputs:
+            start, end = core[source - netlist.n_inputs], netlist.core_of_axon()[axon]
+            spikes = counts.spikes[:, source - netlist.n_inputs].sum()
+            packets += spikes
+            if chip[start] != chip[end]:
+                left += spikes
+            else:
+                hops += spikes * abs(netlist.core_tile[start] - netlist.core_tile[end])
+    assert found.costs.between_chips.sum() == left > 0
+    assert found.costs.events["packet"].sum() == packets > left
+    assert found.costs.events["hop_east_west"].sum() == hops > 0
+    assert found.simple == found.detailed == {}
+    assert cost.prepare(netlist, SMALL).names[-2:] == ("packet_between_chips", "zeros")
+
+
+def test_the_report_says_what_is_not_modelled(netlist, recordings):
+    _, found = estimate(netlist, SMALL, recordings)
+    report = estimate_json(netlist, SMALL, found, bin_s=0.02)
+    left = report["per_inference"]["packets_between_chips"]
+    line = (
+        f"links between the 3 chips: {left:,.0f} of {report['per_inference']['packets']:,.0f} packets of an inference "
+        "leave their chip; their hops and latency are left out, and so are all times (no public figures)"
+    )
+    assert report["not_modelled"] == [line]
+    assert report["time"] == []
+    (static,) = report["static"]
+    assert (static["chips"], static["full_speed_j"]) == (3, [])
+    assert static["real_time_j"] == pytest.approx(3 * 104.4e-3 * 40 * 0.02)
+    shown = estimate_text(report)
+    assert f"not modelled: {line}" in shown
+    assert "an inference on 3 chips takes 251 mJ at the sensor's pace" in shown
+    assert "slowest" not in shown
+
+
+def test_what_is_refused_of_several_chips(netlist, recordings):
+    end = (
+        "the netlist takes 3 chips, and links between chips are not modelled; use estimate --detail counts, or a "
+        "network that one chip holds"
+    )
+    with pytest.raises(OptionError) as caught:
+        estimate(netlist, SMALL, recordings, detail="cycle")
+    assert str(caught.value) == f"--detail cycle: {end}"
+    with pytest.raises(OptionError) as caught:
+        timing.prepare(netlist, SMALL, SMALL.time[0])
+    assert str(caught.value) == f"time: {end}"
+    for use in (lambda: sanafe.cores(netlist, SMALL), lambda: list(sanafe.export(netlist, SMALL))):
+        with pytest.raises(OptionError) as caught:
+            use()
+        assert str(caught.value) == f"--to sanafe: {end}"
+
+
+def test_options_that_make_no_sense():
+    for chips, goal, line in (
+        (0, "cores", "--chips 0: not a number of chips; give 1 or more"),
+        (2, "latency", "--optimize latency: links between chips are not modelled; leave --chips away"),
+        (2, "energy", "--optimize energy: links between chips are not modelled; leave --chips away"),
+    ):
+        with pytest.raises(OptionError) as caught:
+            require_goal(goal, None, LOIHI, calibrated=True, chips=chips)
+        assert str(caught.value) == line
+    with pytest.raises(OptionError) as caught:
+        asked_cores(net(), {"fc1": 7}, SMALL, 3)
+    assert str(caught.value) == (
+        "--cores-for fc1=7: 3 chips Intel Loihi 1 have 6 cores (loihi1.chip.cores); give 6 or fewer"
+    )
+    assert asked_cores(net(), {"fc1": 6}, SMALL, 3) == {0: 6}
+
+
+def test_hops_between_chips_are_unknown_to_the_map(netlist):
+    graph = core_map(netlist, SMALL)
+    chip = chip_of_core(netlist.core_tile, SMALL)
+    kinds = {chip[a] == chip[b]: edge["hops"] for a, b, edge in graph.edges(data=True) if a != "input"}
+    assert kinds[False] is None
+    assert kinds[True] == 1
+
+
+def test_a_netlist_on_several_chips_comes_back_whole(netlist, tmp_path):
+    write_netlist(netlist, tmp_path / "net.loom")
+    assert read_netlist(tmp_path / "net.loom").core_tile.tolist() == netlist.core_tile.tolist()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_sparse_graph_expands_as_a_dense_one_does(seed):
+    from scipy import sparse
+
+    rng = np.random.default_rng(seed)
+    adjacency = np.where(rng.random((9, 9)) < 0.2, rng.normal(size=(9, 9)), 0.0)
+    hops = rng.normal(size=(4, 3, 2))
+    dense = expand_graph_convolution(adjacency, hops)
+    thin = expand_graph_convolution(sparse.csr_array(adjacency), hops)
+    assert thin.has_canonical_format
+    np.testing.assert_array_equal(thin.indptr, dense.indptr)
+    np.testing.assert_array_equal(thin.indices, dense.indices)
+    np.testing.assert_allclose(thin.data, dense.data, rtol=1e-12, atol=1e-14)
