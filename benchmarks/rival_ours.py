@@ -13,16 +13,16 @@ from compiler.serialize import read_netlist
 from compiler.targets import load_target
 from runtime import charges, cost, timing
 from runtime.engine import prepare, simulate
-from runtime.trace import Trace
+from runtime.trace import BoolArray, Trace, unpack
 
 Run = Callable[[Any], Trace]
 """Runs events (recordings, channels, steps); what it computes beyond the trace is computed and thrown away."""
 
 
 def spikes(netlist: Netlist) -> Run:
-    """Every spike of every layer."""
+    """Every spike of every layer, kept at a bit each."""
     engine = prepare(netlist)
-    return lambda events: simulate(engine, events, threads=1, spikes=True)
+    return lambda events: simulate(engine, events, threads=1, packed=True)
 
 
 def totals(netlist: Netlist) -> Run:
@@ -69,6 +69,11 @@ MODES: dict[str, Callable[[Netlist], Run]] = {"spikes": spikes, "totals": totals
 """What can be measured, under the names that rivals.py asks for."""
 
 
+def _kept(netlist: Netlist, trace: Trace) -> BoolArray | None:
+    """Spikes of a run that kept them."""
+    return trace.spikes if trace.packed is None else unpack(trace.packed, netlist.n_compartments)
+
+
 def prepare_job(task: Task, options: list[str]) -> Job:
     mode, share = options
     if mode not in MODES:
@@ -84,9 +89,10 @@ def prepare_job(task: Task, options: list[str]) -> Job:
         found = []
         for layer, entry in enumerate(netlist.layers):
             expected, ids = task.expected("aligned", layer), netlist.compartments_of(layer)
-            if results[0].spikes is not None:
+            kept = [_kept(netlist, result) for result in results]
+            if kept[0] is not None:
                 window = slice(entry.depth, entry.depth + events.shape[2])
-                spiked = np.concatenate([result.spikes for result in results])[which][:, window, ids]
+                spiked = np.concatenate(kept)[which][:, window, ids]
                 found.append(int(np.count_nonzero(spiked != expected)))
             else:
                 summed = np.concatenate([result.counts.spikes for result in results])[which][:, ids]

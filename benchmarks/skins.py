@@ -6,8 +6,8 @@ A skin is a square lattice of taxels whose numbers run patch by patch, 16 x 16 t
 graph convolution of 16 features (K = 3) covers it. Each patch, 4,096 convolution neurons and so as many as one core
 can hear, has its own 64 neurons of fc1 and its own vote of 10 classes; votes add up. Weights are random, events too
 (2 % of the channels in a step). Each size runs in a process of its own; memory is the most that the process ever held
-beyond what it held after a tiny skin had been through, so the float network is part of it. The engine's spikes are those of the kernel
-of steps, which shares no code with it.
+beyond what it held after a tiny skin had been through, so the float network is part of it. The engine's spikes are
+those of the kernel of steps, which shares no code with it.
 """
 
 from __future__ import annotations

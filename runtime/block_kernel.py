@@ -43,6 +43,9 @@ LANES = 64
 CHARGES = 16
 """Charges of a source are padded to a multiple of this."""
 
+LISTED = 4
+"""Bits of a word that are listed at a time."""
+
 UNROLLED = 4
 """Rows that are added up without a look at how many are left."""
 
@@ -113,15 +116,28 @@ class ChargeRows(NamedTuple):
     ----------
     width : int
         Sums, padded to a multiple of `CHARGES`; 0 if there are none.
+    narrow : bool
+        Whether all events that a stage can hear in a step add up to less than 2**31 in each sum.
     source : ((words of the inputs + blocks) * 64 * width,) int32
         What an event of each channel, then a spike of each position adds.
-    update : (blocks * 64 * width,) int32
-        What an update of each position adds.
+    everyone : (stages * width,) int64
+        What an update of all compartments of each stage adds.
+    update : (kinds * width,) int64
+        What an update adds; few compartments differ in that.
+    first : (blocks + 1,) int64
+        Bounds of each block in the groups.
+    group, member : (groups,) int64, uint64
+        Kind of each group, and which positions of the block are of it.
     """
 
     width: int
+    narrow: bool
     source: AnyArray
-    update: AnyArray
+    everyone: IntArray
+    update: IntArray
+    first: IntArray
+    group: IntArray
+    member: AnyArray
 
 
 class Scratch(NamedTuple):
@@ -358,38 +374,48 @@ _busy_step, _restful_step = (_block_step(listed=False, rests=rests) for rests in
 _busy_listed_step, _restful_listed_step = (_block_step(listed=True, rests=rests) for rests in (False, True))
 
 
-@_intrinsic
-def _charge(
-    typing: Any, listed: Any, begin: Any, end: Any, charges: Any, at: Any, width: Any, out: Any, to: Any
-) -> Any:
-    """Add up some charges of all sources that are listed from `begin` to `end`; `at` is that of source 0."""
-    signature = types.void(listed, types.int64, types.int64, charges, *[types.int64] * 2, out, types.int64)
-    narrow, wide = ir.VectorType(_STATE, CHARGES), ir.VectorType(_WORD, CHARGES)
+def _charging(*, narrow: bool) -> Function:
+    """Make the sum of charges; `narrow` where it fits the 32 bits of a charge."""
+    each, wide = ir.VectorType(_STATE, CHARGES), ir.VectorType(_WORD, CHARGES)
+    held = each if narrow else wide
 
-    def emit(context: Any, builder: Any, _signature: Any, values: Any) -> Any:
-        sources, rows, sums = (
-            context.make_array(kind)(context, builder, value).data
-            for kind, value in ((listed, values[0]), (charges, values[3]), (out, values[6]))
-        )
+    @_intrinsic
+    def charge(
+        typing: Any, listed: Any, begin: Any, end: Any, charges: Any, at: Any, width: Any, out: Any, to: Any
+    ) -> Any:
+        """Add up some charges of all sources that are listed from `begin` to `end`; `at` is that of source 0."""
+        signature = types.void(listed, types.int64, types.int64, charges, *[types.int64] * 2, out, types.int64)
 
-        def add(source: Any, totals: Any) -> Any:
-            row = builder.add(values[4], builder.mul(source, values[5]))
-            return (builder.add(totals[0], builder.sext(_vector(builder, rows, row, narrow)[0], wide)),)
+        def emit(context: Any, builder: Any, _signature: Any, values: Any) -> Any:
+            sources, rows, sums = (
+                context.make_array(kind)(context, builder, value).data
+                for kind, value in ((listed, values[0]), (charges, values[3]), (out, values[6]))
+            )
 
-        before, place = _vector(builder, sums, values[7], wide)
-        (total,) = _each_listed(builder, sources, values[1:3], (before,), add)
-        _store(builder, total, place)
-        return context.get_dummy_value()
+            def add(source: Any, totals: Any) -> Any:
+                row = builder.add(values[4], builder.mul(source, values[5]))
+                charged = _vector(builder, rows, row, each)[0]
+                return (builder.add(totals[0], charged if narrow else builder.sext(charged, wide)),)
 
-    return signature, emit
+            (total,) = _each_listed(builder, sources, values[1:3], (ir.Constant(held, [0] * CHARGES),), add)
+            before, place = _vector(builder, sums, values[7], wide)
+            _store(builder, builder.add(before, builder.sext(total, wide) if narrow else total), place)
+            return context.get_dummy_value()
+
+        return signature, emit
+
+    return charge
+
+
+_charge, _charge_narrow = (_charging(narrow=narrow) for narrow in (False, True))
 
 
 @_intrinsic
 def _lowest(typing: Any, word: Any) -> Any:
-    """Index of the lowest bit of a word that is not zero."""
+    """Index of the lowest bit of a word, 64 of zero."""
 
     def emit(_context: Any, builder: Any, _signature: Any, values: Any) -> Any:
-        return builder.cttz(values[0], ir.Constant(_BIT, 1))
+        return builder.cttz(values[0], ir.Constant(_BIT, 0))
 
     return types.int64(types.uint64), emit
 
@@ -409,6 +435,19 @@ def _spread(typing: Any, word: Any, out: Any, at: Any) -> Any:
 
 
 @_intrinsic
+def _gathered(typing: Any, flags: Any, at: Any) -> Any:
+    """One word of 64 bytes: which are not zero."""
+    kind = ir.VectorType(ir.IntType(8), LANES)
+
+    def emit(context: Any, builder: Any, _signature: Any, values: Any) -> Any:
+        array = context.make_array(flags)(context, builder, values[0]).data
+        found = builder.icmp_unsigned("!=", _vector(builder, array, values[1], kind)[0], _all(kind, 0))
+        return builder.bitcast(found, _WORD)
+
+    return types.uint64(flags, types.int64), emit
+
+
+@_intrinsic
 def _bits(typing: Any, word: Any) -> Any:
     """Bits of a word that are set."""
 
@@ -425,9 +464,16 @@ def _bits(typing: Any, word: Any) -> Any:
 def _pack(events: AnyArray, steps: int, words: AnyArray) -> None:
     """Turn the events of a recording into words, channel after channel."""
     n_words = (events.shape[0] + LANES - 1) // LANES
+    flat, columns = events.reshape(-1), events.shape[1]
     for channel in range(events.shape[0]):
-        place, bit = channel // LANES, np.uint64(channel % LANES)
-        for t in range(steps):
+        place, bit = channel >> 6, np.uint64(channel & 63)
+        whole = steps - steps % LANES
+        for begin in range(0, whole, LANES):
+            left = _gathered(flat, channel * columns + begin)
+            while left:
+                words[(begin + _lowest(left)) * n_words + place] |= np.uint64(1) << bit
+                left &= left - np.uint64(1)
+        for t in range(whole, steps):
             words[t * n_words + place] |= np.uint64(events[channel, t] != 0) << bit
 
 
@@ -437,18 +483,23 @@ def _list(words: AnyArray, start: int, width: int, steps: int, bounds: AnyArray,
     total = 0
     for w in range(start, start + steps * width):
         total += _bits(words[w])
-    listed = np.empty(total, np.int32)
+    listed = np.empty(total + LISTED, np.int32)
     n = 0
     for t in range(steps):
         bounds[t] = n
         for w in range(width):
             left = words[start + t * width + w]
-            while left:
-                listed[n] = w * LANES + _lowest(left)
-                count[listed[n]] += 1
-                n += 1
-                left &= left - np.uint64(1)
+            end = n + _bits(left)
+            # some at a time, as if they were there: guessing how many bits a word has left costs more
+            while n < end:
+                for i in range(LISTED):
+                    listed[n + i] = w * LANES + _lowest(left)
+                    left &= left - np.uint64(1)
+                n += LISTED
+            n = end
     bounds[steps] = n
+    for i in range(n):
+        count[listed[i]] += 1
     return listed
 
 
@@ -492,32 +543,33 @@ def _charge_all(
     for t in range(steps):
         for part in range(0, charges.width, CHARGES):
             to = (t + delay) * charges.width + part
-            _charge(listed, bounds[t], bounds[t + 1], charges.source, at + part, charges.width, sums, to)
+            if charges.narrow:
+                _charge_narrow(listed, bounds[t], bounds[t + 1], charges.source, at + part, charges.width, sums, to)
+            else:
+                _charge(listed, bounds[t], bounds[t + 1], charges.source, at + part, charges.width, sums, to)
 
 
 @compiled
 def _charge_updates(blocks: Blocks, steps: int, idle: AnyArray, charges: ChargeRows, sums: IntArray) -> None:
     """Add what updates bring: those of all compartments, less those that are idle."""
     width = charges.width
-    everyone = np.zeros(width, np.int64)
+    resting = np.empty(charges.update.size // width, np.int64)
     for s in range(blocks.stage.size - 1):
         begin, end = blocks.stage[s], blocks.stage[s + 1]
-        everyone[:] = 0
-        for position in range(begin * LANES, end * LANES):
-            for i in range(width):
-                everyone[i] += charges.update[position * width + i]
         for t in range(steps):
             at = (t + s) * width
             for i in range(width):
-                sums[at + i] += everyone[i]
+                sums[at + i] += charges.everyone[s * width + i]
+            resting[:] = 0
             for block in range(begin, end):
                 if blocks.restful[block]:
-                    left = idle[steps * begin + t * (end - begin) + block - begin]
-                    while left:
-                        position = block * LANES + _lowest(left)
-                        for i in range(width):
-                            sums[at + i] -= charges.update[position * width + i]
-                        left &= left - np.uint64(1)
+                    word = idle[steps * begin + t * (end - begin) + block - begin]
+                    for g in range(charges.first[block], charges.first[block + 1]):
+                        resting[charges.group[g]] += _bits(word & charges.member[g])
+            for kind in range(resting.size):
+                if resting[kind]:
+                    for i in range(width):
+                        sums[at + i] -= resting[kind] * charges.update[kind * width + i]
 
 
 @compiled
@@ -562,6 +614,29 @@ def _unpack(blocks: Blocks, steps: int, words: AnyArray, out: AnyArray, inverse:
 
 
 @compiled
+def _pack_spikes(blocks: Blocks, steps: int, words: AnyArray, out: AnyArray) -> None:
+    """Write bits into a (chip steps, words) array, compartment c at bit c % 64 of word c // 64."""
+    n_words = out.shape[1]
+    flat = out.reshape(-1)
+    for s in range(blocks.stage.size - 1):
+        begin, end = blocks.stage[s], blocks.stage[s + 1]
+        for t in range(steps):
+            for block in range(begin, end):
+                left = words[steps * begin + t * (end - begin) + block - begin]
+                row = (t + blocks.depth[block]) * n_words
+                if blocks.whole[block] >= 0:
+                    to, by = row + (blocks.whole[block] >> 6), np.uint64(blocks.whole[block] & 63)
+                    flat[to] |= left << by
+                    if by:
+                        flat[to + 1] |= left >> (np.uint64(LANES) - by)
+                    continue
+                while left:
+                    compartment = blocks.compartment[block * LANES + _lowest(left)]
+                    flat[row + (compartment >> 6)] |= np.uint64(1) << np.uint64(compartment & 63)
+                    left &= left - np.uint64(1)
+
+
+@compiled
 def _count_idle(blocks: Blocks, block: int, s: int, steps: int, idle: AnyArray) -> int:
     """Idle compartment-steps of a block of a stage."""
     begin, width = blocks.stage[s], blocks.stage[s + 1] - blocks.stage[s]
@@ -597,6 +672,7 @@ def run_recordings(
     updated: AnyArray,
     charges: ChargeRows,
     charged: IntArray,
+    packed: AnyArray,
 ) -> None:
     """Run some recordings.
 
@@ -616,6 +692,8 @@ def run_recordings(
         What events add to the sums of each chip step.
     charged : (recordings, chip steps * sums) int64
         Zeros; filled with these sums.
+    packed : (recordings, chip steps, words) uint64
+        Zeros; filled, see :class:`runtime.trace.Trace`. No recordings where it is not wanted.
     """
     n_words, n_blocks = (events.shape[1] + LANES - 1) // LANES, blocks.keep.size
     for r in range(events.shape[0]):
@@ -643,6 +721,8 @@ def run_recordings(
                 if blocks.restful[block]:
                     worked -= _count_idle(blocks, block, s, steps, scratch.idle)
                 updates[r, blocks.layer[block]] += worked
+        if packed.shape[0]:
+            _pack_spikes(blocks, steps, scratch.raster, packed[r])
         if fired.shape[0]:
             _unpack(blocks, steps, scratch.raster, fired[r], False)
         if updated.shape[0]:

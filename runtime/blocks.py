@@ -134,18 +134,34 @@ def lay_out_blocks(netlist: Netlist) -> Blocks | None:
 def charge_rows(netlist: Netlist, blocks: Blocks, charges: Charges | None) -> ChargeRows:
     """Lay charges out for the kernel: padded, by channel and position."""
     if charges is None:
-        nothing = np.zeros(0, np.int32)
-        return ChargeRows(width=0, source=nothing, update=nothing)
+        none = np.zeros(0, np.int64)
+        return ChargeRows(0, False, none.astype(np.int32), none, none, none, none, none.astype(np.uint64))
     sums = charges.spikes.shape[1]
     width = -(-sums // CHARGES) * CHARGES
     channels = -(-netlist.n_inputs // LANES) * LANES
     seated = np.flatnonzero(blocks.compartment >= 0)
     source = np.zeros((channels + len(blocks.compartment), width), np.int32)
-    update = np.zeros((len(blocks.compartment), width), np.int32)
+    update = np.zeros((len(blocks.compartment), width), np.int64)
     source[: netlist.n_inputs, :sums] = charges.channels
     source[channels + seated, :sums] = charges.spikes[blocks.compartment[seated]]
     update[seated, :sums] = charges.updates[blocks.compartment[seated]]
-    return ChargeRows(width=width, source=source.reshape(-1), update=update.reshape(-1))
+    begins = np.append(0, channels + blocks.stage * LANES)  # of the channels, then of the positions of each stage
+    most = np.add.reduceat(np.abs(source.astype(np.int64)), begins[:-1], axis=0).max(initial=0)
+    kinds, kind = np.unique(update, axis=0, return_inverse=True)
+    groups, member = np.unique(np.arange(len(update)) // LANES * len(kinds) + kind.reshape(-1), return_inverse=True)
+    words = np.zeros(len(groups), np.uint64)
+    np.bitwise_or.at(words, member.reshape(-1), _bit(np.arange(len(update)) % LANES))
+    block, group = np.divmod(groups, len(kinds))
+    return ChargeRows(
+        width=width,
+        narrow=bool(most < 2**31),
+        source=source.reshape(-1),
+        everyone=np.add.reduceat(update, blocks.stage[:-1] * LANES, axis=0).reshape(-1),
+        update=kinds.reshape(-1),
+        first=np.searchsorted(block, np.arange(len(blocks.layer) + 1)),
+        group=group,
+        member=words,
+    )
 
 
 class _Seats(NamedTuple):

@@ -52,8 +52,4 @@ def simple_from(clock: Clock, charged: IntArray, steps: IntArray) -> SimpleTimes
     steps : (samples,) int64
         Chip steps of each recording.
     """
-    cores = clock.netlist.n_cores
-    sweep = np.diff(clock.tables.start) * clock.tables.access
-    runs = np.arange(charged.shape[1]) < steps[:, None]
-    generation = charged[..., :cores] + np.where(runs[..., None], sweep, 0)
-    return simple_times(clock, generation, charged[..., cores:], steps)
+    return simple_times(clock, charged, np.diff(clock.tables.start) * clock.tables.access, steps)

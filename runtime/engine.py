@@ -26,7 +26,17 @@ from runtime.block_kernel import Blocks, ChargeRows, run_recordings
 from runtime.blocks import charge_rows, lay_out_blocks
 from runtime.kernel import State, Tables, chip_steps
 from runtime.segments import lay_out_segments, padded
-from runtime.trace import REGISTER_LIMITS, BoolArray, Charges, Counts, MembraneArray, Trace, check_channels, range_error
+from runtime.trace import (
+    REGISTER_LIMITS,
+    BoolArray,
+    Charges,
+    Counts,
+    MembraneArray,
+    Trace,
+    check_channels,
+    pack,
+    range_error,
+)
 
 EventArray = npt.NDArray[np.uint8 | np.bool_]
 
@@ -190,6 +200,7 @@ def simulate(
     spikes: bool = False,
     membranes: bool = False,
     updated: bool = False,
+    packed: bool = False,
     threads: int | None = None,
     progress: Callable[[int], object] | None = None,
 ) -> Trace:
@@ -205,6 +216,8 @@ def simulate(
         Steps of each recording where some are shorter than T. What comes after them is not run: zeros in the trace.
     spikes, membranes, updated : bool
         Whether to keep these per chip step: one, four and one bytes for each recording, chip step and compartment.
+    packed : bool
+        Whether to keep spikes at a bit each.
     threads : int, optional
         Recordings that run at the same time, by default one per processor. Results do not depend on it.
     progress : callable, optional
@@ -242,6 +255,7 @@ def simulate(
         membranes=np.zeros(shape, np.int32) if membranes else None,
         updated=np.zeros(shape, np.bool_) if updated else None,
         charged=None if charges is None else charged[..., :sums],
+        packed=np.zeros((*shape[:2], -(-shape[2] // 64)), np.uint64) if packed else None,
     )
     ends = np.full(recordings, length) if lengths is None else np.asarray(lengths, np.int64)
 
@@ -281,6 +295,7 @@ def _run_layers(
         np.zeros(nothing, np.bool_) if trace.updated is None else trace.updated[part],
         rows,
         charged[part].reshape(len(events), -1),
+        np.zeros(nothing, np.uint64) if trace.packed is None else trace.packed[part],
     )
 
 
@@ -289,10 +304,11 @@ def _run_steps(engine: Engine, events: EventArray, length: int, trace: Trace, in
     state, window, charges = start(engine), length + engine.drain, engine.charges
     fired = None if trace.spikes is None else trace.spikes[index, :window]
     worked = None if trace.updated is None else trace.updated[index, :window]
-    if charges is not None:
-        size = (window, engine.netlist.n_compartments)
-        fired = np.zeros(size, np.bool_) if fired is None else fired
-        worked = np.zeros(size, np.bool_) if worked is None else worked
+    size = (window, engine.netlist.n_compartments)
+    if fired is None and (charges is not None or trace.packed is not None):
+        fired = np.zeros(size, np.bool_)
+    if worked is None and charges is not None:
+        worked = np.zeros(size, np.bool_)
     try:
         advance(
             engine,
@@ -311,6 +327,8 @@ def _run_steps(engine: Engine, events: EventArray, length: int, trace: Trace, in
     trace.counts.spikes[index] = state.spikes
     trace.counts.updates[index] = state.updates
     trace.counts.saturations[index] = state.saturations
+    if trace.packed is not None and fired is not None:
+        trace.packed[index, :window] = pack(fired)
     if charges is not None and trace.charged is not None and fired is not None and worked is not None:
         # float64 products of integers below 2**53 are exact
         found = fired.astype(np.float64) @ charges.spikes + worked.astype(np.float64) @ charges.updates

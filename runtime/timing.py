@@ -34,7 +34,7 @@ from compiler.netlist import Netlist
 from compiler.passes.chips import require_one_chip
 from compiler.targets import PICOSECONDS, Target, TimeTable
 from runtime.engine import EventArray
-from runtime.timing_kernel import Steps, Tables, loads, schedule
+from runtime.timing_kernel import Steps, Tables, conclude, loads, schedule
 from runtime.trace import BoolArray
 
 EAST, WEST, NORTH, SOUTH, PORTS = range(5)
@@ -285,32 +285,34 @@ def simple(
     own = np.full(samples, length) if steps is None else steps
     for i in range(samples):
         loads(clock.tables, fired[i], worked[i], events[i], int(own[i]), generation[i], processing[i])
-    return simple_times(clock, generation, processing, own)
+    return simple_times(clock, np.concatenate([generation, processing], axis=2), np.zeros(cores, np.int64), own)
 
 
-def simple_times(clock: Clock, generation: IntArray, processing: IntArray, steps: IntArray) -> SimpleTimes:
+def simple_times(clock: Clock, sums: IntArray, sweep: IntArray, steps: IntArray) -> SimpleTimes:
     """Times of the simple model from what each core does in each step.
 
     Parameters
     ----------
     clock : Clock
         The prepared netlist.
-    generation, processing : (samples, chip steps, cores) int64
-        Picoseconds of sweep and sending, and of receiving.
+    sums : (samples, chip steps, 2 * cores) int64
+        Picoseconds of each core's sweep and sending, then of its receiving.
+    sweep : (cores,) int64
+        Picoseconds that each sweep takes beyond that.
     steps : (samples,) int64
         Chip steps of each recording.
     """
-    cores = len(clock.core_tile)
-    both = np.concatenate([generation, processing], axis=2)
-    longest = np.argmax(both, axis=2)
-    runs = np.arange(both.shape[1]) < steps[:, None]
-    duration = np.where(runs, both.max(axis=2) + clock.barrier, 0)
+    samples, length = sums.shape[:2]
+    cores = len(sweep)
+    duration, critical = np.zeros((samples, length)), np.full((samples, length), -1)
+    each, receiving = np.zeros((samples, 2 * cores), np.int64), np.zeros((samples, length), np.bool_)
+    conclude(sums, sweep, steps, clock.barrier, duration, each, critical, receiving)
     return SimpleTimes(
         duration_ns=duration / PICOSECONDS,
-        generation_ns=generation.sum(axis=1) / PICOSECONDS,
-        processing_ns=processing.sum(axis=1) / PICOSECONDS,
-        critical_core=np.where(runs, longest % cores, -1),
-        receiving=runs & (longest >= cores),
+        generation_ns=each[:, :cores] / PICOSECONDS,
+        processing_ns=each[:, cores:] / PICOSECONDS,
+        critical_core=critical,
+        receiving=receiving,
     )
 
 

@@ -161,6 +161,48 @@ def loads(
             generation[t, core] += _works(updated[t, begin:end]) * tables.update[core]
 
 
+@compiled_and_cached
+def conclude(
+    sums: AnyArray,
+    sweep: IntArray,
+    steps: IntArray,
+    barrier: int,
+    duration: FloatArray,
+    each: IntArray,
+    critical: IntArray,
+    receiving: AnyArray,
+) -> None:
+    """Find the slowest core of each step, the sum of all steps, and how long each step takes.
+
+    Parameters
+    ----------
+    sums : (samples, chip steps, 2 * cores) int64
+        Picoseconds that events cost each core's sweep and sending, then its receiving.
+    sweep : (cores,) int64
+        Picoseconds that a sweep takes in any case.
+    steps : (samples,) int64
+        Chip steps of each recording; nothing happens after them.
+    barrier : int
+        Picoseconds that end a step.
+    duration, critical, receiving : (samples, chip steps) float64, int64, bool
+        Filled for the steps of each recording; picoseconds.
+    each : (samples, 2 * cores) int64
+        Zeros; filled with the sum of all steps.
+    """
+    cores = sweep.size
+    for r in range(sums.shape[0]):
+        for t in range(steps[r]):
+            longest, which = np.int64(-1), 0
+            for i in range(2 * cores):
+                spent = sums[r, t, i] + (sweep[i] if i < cores else 0)
+                each[r, i] += spent
+                if spent > longest:
+                    longest, which = spent, i
+            duration[r, t] = longest + barrier
+            critical[r, t] = which % cores
+            receiving[r, t] = which >= cores
+
+
 @compiled
 def _replay(tree: IntArray, key: FloatArray, leaf: int) -> None:
     """Mend a winner tree after the key of one leaf changed; the left of two equal keys wins."""

@@ -84,6 +84,9 @@ class Trace:
         asked for.
     charged : (…, chip steps, sums) int64, or None
         What the events of each chip step add up to under the charges that the engine was prepared with.
+    packed : (…, chip steps, ceil(compartments / 64)) uint64, or None
+        The spikes at a bit each: that of compartment c is bit ``c % 64`` of word ``c // 64``; see :func:`unpack`. None
+        where it was not asked for.
     """
 
     counts: Counts
@@ -91,6 +94,26 @@ class Trace:
     membranes: MembraneArray | None
     updated: BoolArray | None = None
     charged: IntArray | None = None
+    packed: npt.NDArray[np.uint64] | None = None
+
+
+def pack(spikes: BoolArray) -> npt.NDArray[np.uint64]:
+    """Spikes (…, compartments) at a bit each; the layout of ``Trace.packed``."""
+    bits = np.zeros((*spikes.shape[:-1], -(-spikes.shape[-1] // 64) * 8), np.uint8)
+    bits[..., : -(-spikes.shape[-1] // 8)] = np.packbits(spikes, axis=-1, bitorder="little")
+    return bits.view("<u8").astype(np.uint64)
+
+
+def unpack(packed: npt.NDArray[np.uint64], compartments: int) -> BoolArray:
+    """Spikes (…, compartments) of ``Trace.packed``.
+
+    Examples
+    --------
+    >>> unpack(np.array([[5]], np.uint64), 4).tolist()
+    [[True, False, True, False]]
+    """
+    flags = packed.astype("<u8").view(np.uint8)
+    return np.unpackbits(flags, axis=-1, count=compartments, bitorder="little").view(np.bool_)
 
 
 def aligned(netlist: Netlist, array: npt.NDArray[Any], layer: int) -> npt.NDArray[Any]:
