@@ -12,6 +12,7 @@ import numpy as np
 
 mpl.use("Agg")
 from matplotlib import pyplot as plt
+from matplotlib.ticker import NullFormatter
 
 OURS, GUIDE = "#1b7f5c", "#9aa5b1"
 
@@ -78,13 +79,15 @@ def draw_skins(result: dict[str, Any], stem: str) -> None:
     left.set_ylabel("seconds (dashed: proportional)", fontsize=9)
     for key, label, colour, mark in (
         ("compile_bytes", "compiling", OURS, "o"),
-        ("run_bytes", "and running", "#c2571a", "^"),
+        ("run_bytes", "running", "#c2571a", "^"),
     ):
         right.semilogx(synapses, [row[key] / row["synapses"] for row in rows], f"{mark}-", color=colour, label=label)
     right.axhline(64, ls="--", color=GUIDE, lw=1)
     right.set_ylim(0)
     right.set_ylabel("bytes per synapse, at most (dashed: 64)", fontsize=9)
     for panel in (left, right):
+        panel.xaxis.set_major_formatter(lambda value, _: f"{value / 1e6:g} M")
+        panel.xaxis.set_minor_formatter(NullFormatter())
         panel.set_xlabel("synapses", fontsize=9)
         panel.legend(frameon=False, fontsize=9)
         panel.grid(which="major", color="#ddd", lw=0.6)

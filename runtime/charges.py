@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from compiler.errors import DataError
 from compiler.fixedpoint import IntArray
 from runtime.timing import Clock, SimpleTimes, simple_times
 from runtime.trace import Charges
@@ -51,5 +52,15 @@ def simple_from(clock: Clock, charged: IntArray, steps: IntArray) -> SimpleTimes
         What they added up to, see :class:`runtime.trace.Trace`.
     steps : (samples,) int64
         Chip steps of each recording.
+
+    Raises
+    ------
+    DataError
+        If the sums are of another netlist.
     """
+    if charged.ndim != 3 or charged.shape[::2] != (len(steps), 2 * clock.netlist.n_cores):
+        raise DataError(
+            f"trace: sums {charged.shape} of {len(steps)} recordings found, the netlist has {clock.netlist.n_cores} "
+            "cores; give (recordings, chip steps, twice the cores), charged for this netlist"
+        )
     return simple_times(clock, charged, np.diff(clock.tables.start) * clock.tables.access, steps)

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from compiler.errors import DataError
 from compiler.fixedpoint import FloatArray, IntArray
 from compiler.netlist import Netlist
 from compiler.passes.chips import chip_of_core
@@ -192,7 +193,20 @@ def count(meter: Meter, counts: Counts, steps: int | IntArray) -> dict[str, Floa
         Of a batch: arrays have one leading axis of recordings.
     steps : int or (samples,) int64
         Data steps T of all recordings, or of each.
+
+    Raises
+    ------
+    DataError
+        If the counts are of another netlist.
     """
+    netlist = meter.netlist
+    wanted = netlist.n_inputs, netlist.n_compartments, len(netlist.layers)
+    found = tuple(part.shape[-1] for part in (counts.inputs, counts.spikes, counts.updates))
+    if found != wanted:
+        raise DataError(
+            "trace: counts of {} channels, {} compartments and {} layers found, ".format(*found)
+            + "the netlist has {}, {} and {}; give counts of a run of this netlist".format(*wanted)
+        )
     sources = np.concatenate([counts.inputs, counts.spikes], axis=1).astype(np.float64)
     amounts = dict(zip(meter.names, np.split(sources @ meter.caused, len(meter.names), axis=1), strict=True))
     active = counts.updates.astype(np.float64)

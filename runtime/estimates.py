@@ -65,6 +65,7 @@ def estimate_json(netlist: Netlist, target: Target, found: Estimate, *, bin_s: f
             name: {part: float(each.sum(axis=1).mean()) for part, each in parts.items()}
             for name, parts in found.parts.items()
         },
+        "energy_range_j": _range_json(costs),
         "layers": layers,
         "cores": _cores_json(netlist, found),
         "time": _times_json(found),
@@ -92,6 +93,15 @@ def estimate_json(netlist: Netlist, target: Target, found: Estimate, *, bin_s: f
         ],
         "not_priced": list(NOT_PRICED),
     }
+
+
+def _range_json(costs: Costs) -> Json | None:
+    """Lowest and highest mean energy of an inference where tables disagree, and whose they are."""
+    means = {name: float(each.sum(axis=1).mean()) for name, each in costs.energy.items()}
+    if len(means) < 2:
+        return None
+    ends = {"low": min(means, key=lambda name: means[name]), "high": max(means, key=lambda name: means[name])}
+    return {end: {"table": name, "energy_j": means[name]} for end, name in ends.items()}
 
 
 def _between_chips(chips: int, costs: Costs) -> list[str]:
@@ -249,9 +259,13 @@ def _cores_text(report: Json) -> str:
 
 
 def _pace_lines(report: Json) -> list[str]:
-    pace = report["pace"]
+    pace, ends = report["pace"], report["energy_range_j"]
     realtime = ", ".join(f"{si(value, 'W')} ({name})" for name, value in pace["real_time_w"].items())
-    lines = [f"dynamic power at the sensor's pace, {1000 * pace['bin_s']:g} ms a step: {realtime}"]
+    lines = []
+    if ends is not None:
+        low, high = (f"{si(ends[end]['energy_j'], 'J')} ({ends[end]['table']})" for end in ("low", "high"))
+        lines.append(f"sources differ: a mean inference takes {low} to {high}")
+    lines += [f"dynamic power at the sensor's pace, {1000 * pace['bin_s']:g} ms a step: {realtime}"]
     lines += [
         f"at full speed ({entry['time_table']}, {entry['model']} model): {si(entry['power_w'], 'W')}, energy-delay "
         f"product {si(entry['energy_delay_js'], 'J s')} ({entry['energy_table']})"

@@ -28,7 +28,7 @@ from math import lcm
 import numpy as np
 import numpy.typing as npt
 
-from compiler.errors import ModelError
+from compiler.errors import DataError, ModelError
 from compiler.fixedpoint import FloatArray, IntArray
 from compiler.netlist import Netlist
 from compiler.passes.chips import require_one_chip
@@ -252,7 +252,19 @@ def prepare(
 def _slots(
     clock: Clock, spikes: BoolArray, updated: BoolArray, events: EventArray
 ) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8], npt.NDArray[np.uint8]]:
-    """Firing slots, working slots and events that nobody sends, as the kernels want them."""
+    """Firing slots, working slots and events that nobody sends, as the kernels want them; refuses another's trace."""
+    netlist = clock.netlist
+    if (
+        spikes.ndim != 3
+        or spikes.shape[2] != netlist.n_compartments
+        or updated.shape != spikes.shape
+        or events.shape[:2] != (len(spikes), netlist.n_inputs)
+    ):
+        raise DataError(
+            f"trace: spikes {spikes.shape}, updates {updated.shape} and events {events.shape} found, the netlist has "
+            f"{netlist.n_compartments} compartments and {netlist.n_inputs} input channels; give (recordings, chip "
+            "steps, compartments) twice and (recordings, channels, steps) of one run of this netlist"
+        )
     fired, worked, seen = (np.ascontiguousarray(bits).view(np.uint8) for bits in (spikes, updated, events != 0))
     if len(clock.core_tile) == clock.netlist.n_cores:
         return fired, worked, seen
@@ -277,6 +289,11 @@ def simple(
         What it was given.
     steps : (samples,) int64, optional
         Chip steps of each recording, by default all.
+
+    Raises
+    ------
+    DataError
+        If the trace is of another netlist.
     """
     fired, worked, events = _slots(clock, spikes, updated, events)
     samples, length = spikes.shape[:2]
@@ -319,7 +336,7 @@ def simple_times(clock: Clock, sums: IntArray, sweep: IntArray, steps: IntArray)
 def detailed(
     clock: Clock, spikes: BoolArray, updated: BoolArray, events: EventArray, *, steps: IntArray | None = None
 ) -> DetailedTimes:
-    """Time a batch of recordings by the detailed model; parameters as :func:`simple`."""
+    """Time a batch of recordings by the detailed model; parameters and errors as those of :func:`simple`."""
     fired, worked, events = _slots(clock, spikes, updated, events)
     samples, length = spikes.shape[:2]
     own = np.full(samples, length) if steps is None else steps

@@ -19,7 +19,7 @@ from compiler.interpret import channels_last, run_integer
 from compiler.lift import lift
 from compiler.pipeline import STAGES
 from compiler.serialize import read_netlist
-from compiler.targets import load_target
+from compiler.targets import EVENTS, load_target
 from compiler.text import text
 from models.graphs import build_graph
 from runtime import cli, compile_command, inputs
@@ -478,6 +478,64 @@ def test_estimate_prints_the_promised_keys(as_json):
     assert all(low[key] <= mean[key] <= high[key] for low, mean, high in [flat] for key in low)
     for key in keys - {"energy_j"}:
         assert sum(layer[key] for layer in report["layers"]) == pytest.approx(report["per_inference"][key], rel=1e-12)
+
+
+@pytest.mark.parametrize("detail", ["counts", "cycle"])
+def test_details_agree_and_add(as_json, detail):
+    plain = as_json("run", "net.loom", "--data", "data")
+    deep = as_json("run", "net.loom", "--data", "data", "--detail", detail)
+    assert "costs" not in plain
+    costs = deep.pop("costs")
+    assert deep == plain
+    assert costs == as_json("estimate", "net.loom", "--data", "data", "--detail", detail)
+    assert {entry["model"] for entry in costs["time"]} == {"simple", *(["detailed"] if detail == "cycle" else [])}
+
+
+def test_estimate_has_no_mode_that_estimates_nothing(spikeloom):
+    code, out, err = spikeloom("estimate", "net.loom", "--data", "data", "--detail", "spikes")
+    assert (code, out) == (2, "")
+    assert err.replace("'", "") == (  # later versions of Python quote no choices
+        "spikeloom: argument --detail: invalid choice: spikes (choose from counts, cycle); "
+        "see spikeloom estimate --help\n"
+    )
+
+
+def test_a_table_of_ones_own_prices_alone(as_json, tmp_path):
+    prices = [f'{event} = {{ value = 1000.0, unit = "pJ", source = "mine" }}' for event in EVENTS]
+    (tmp_path / "mine.toml").write_text("\n".join(['[energy.mine]\ntitle = "Mine"', *prices]))
+    report = as_json("estimate", "net.loom", "--data", "data", "--table", tmp_path / "mine.toml")
+    known = as_json("estimate", "net.loom", "--data", "data", "--table", "davies2018")
+    assert (list(report["per_inference"]["energy_j"]), report["energy_range_j"]) == (["mine"], None)
+    assert list(known["per_inference"]["energy_j"]) == ["davies2018"]
+    assert report["per_inference"]["energy_j"]["mine"] > known["per_inference"]["energy_j"]["davies2018"]
+
+
+def test_faults_of_a_table_are_told_at_once(spikeloom, tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text(
+        '[energy.mine]\ntitle = "Mine"\nspike = { value = -1.0, source = "mine" }\n'
+        'jump = { value = 1.0, unit = "pJ", source = "mine" }\n'
+    )
+    code, out, err = spikeloom("run", "net.loom", "--data", "data", "--detail", "counts", "--table", path)
+    assert (code, out) == (2, "")
+    lines = err.splitlines()
+    assert len(lines) == 3
+    assert all(line.startswith(f"spikeloom: {path}: energy.mine.") for line in lines)
+    assert spikeloom("estimate", "net.loom", "--data", "data", "--table", "mine") == (
+        2,
+        "",
+        "spikeloom: --table mine: unknown; allowed: davies2018, sanafe, or a file that ends in .toml\n",
+    )
+
+
+def test_chips_are_counted(as_json, spikeloom, tmp_path):
+    report = as_json("compile", "net.pt", "--chips", "3", "-o", tmp_path / "out.loom")
+    assert (report["chips"], report["provenance"]["chips"]) == (1, 3)
+    assert spikeloom("compile", "net.pt", "--chips", "0", "-o", tmp_path / "none.loom") == (
+        2,
+        "",
+        "spikeloom: --chips 0: not a number of chips; give 1 or more\n",
+    )
 
 
 def test_estimate_agrees_with_run(as_json, tmp_path):

@@ -7,9 +7,11 @@ import pytest
 from made_files import events, small_checkpoint
 from random_networks import LOIHI
 
+from compiler.errors import DataError
 from compiler.passes.expand import expand
 from compiler.passes.quantize import Recipe
 from compiler.pipeline import compile_network
+from runtime import cost as cost_of
 from runtime import engine, timing
 from runtime.charges import charges, simple_from
 from runtime.estimate import estimate
@@ -104,6 +106,57 @@ def test_the_report_says_power_and_pace(small, found):
     text = estimate_text(report)
     for words in ("time, sanafe, simple model", "time, sanafe, detailed model", "energy by part", "20 ms a step"):
         assert words in text
+
+
+def test_the_range_names_both_ends(small, found):
+    netlist, _ = small
+    _, cost = found["counts"]
+    report = estimate_json(netlist, LOIHI, cost, bin_s=0.02)
+    means = {name: energy.sum(axis=1).mean() for name, energy in cost.costs.energy.items()}
+    ends = report["energy_range_j"]
+    for end, choose in (("low", min), ("high", max)):
+        assert ends[end]["energy_j"] == pytest.approx(choose(means.values()))
+        assert means[ends[end]["table"]] == pytest.approx(choose(means.values()))
+    assert "sources differ: a mean inference takes" in estimate_text(report)
+    single = dataclasses.replace(cost, costs=dataclasses.replace(cost.costs, energy={"one": cost.costs.zeros}))
+    alone = estimate_json(netlist, LOIHI, single, bin_s=0.02)
+    assert alone["energy_range_j"] is None
+
+
+def test_a_trace_that_does_not_belong_to_the_netlist(small):
+    netlist, recordings = small
+    clock = timing.prepare(netlist, LOIHI, LOIHI.time[0])
+    trace = engine.simulate(engine.prepare(netlist, charges=charges(clock)), recordings, spikes=True, updated=True)
+    n, steps, inputs, cores = netlist.n_compartments, 30 + netlist.max_depth, netlist.n_inputs, netlist.n_cores
+    less = trace.spikes[..., :-1]
+    for model in (timing.simple, timing.detailed):
+        for spikes, updated, given in (
+            (less, less, recordings),
+            (trace.spikes, less, recordings),
+            (trace.spikes, trace.updated, recordings[:, :-1]),
+            (trace.spikes, trace.updated, recordings[:2]),
+        ):
+            with pytest.raises(DataError) as caught:
+                model(clock, spikes, updated, given)
+            assert str(caught.value) == (
+                f"trace: spikes {spikes.shape}, updates {updated.shape} and events {given.shape} found, the netlist "
+                f"has {n} compartments and {inputs} input channels; give (recordings, chip steps, compartments) twice "
+                "and (recordings, channels, steps) of one run of this netlist"
+            )
+    with pytest.raises(DataError) as caught:
+        simple_from(clock, trace.charged[..., :-1], LENGTHS)
+    assert str(caught.value) == (
+        f"trace: sums (4, {steps}, {2 * cores - 1}) of 4 recordings found, the netlist has {cores} cores; give "
+        "(recordings, chip steps, twice the cores), charged for this netlist"
+    )
+    counts = dataclasses.replace(trace.counts, spikes=trace.counts.spikes[:, 1:])
+    layers = len(netlist.layers)
+    with pytest.raises(DataError) as caught:
+        cost_of.estimate(cost_of.prepare(netlist, LOIHI), counts, 30)
+    assert str(caught.value) == (
+        f"trace: counts of {inputs} channels, {n - 1} compartments and {layers} layers found, the netlist has "
+        f"{inputs}, {n} and {layers}; give counts of a run of this netlist"
+    )
 
 
 def test_a_chip_without_tables(small):
