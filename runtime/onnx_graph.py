@@ -174,9 +174,11 @@ def _layerwise(graph: Nodes, layers: tuple[Layer, ...]) -> None:
     for layer in layers:
         name, body = layer.name, graph.inner()
         heard[layer.index] = f"{name}.spikes"
-        found = products(graph, layer, [heard[source] for source, _ in layer.sources], f"{name}/product")
+        found = products(graph, layer, [heard[source.pre] for source in layer.sources], f"{name}/product")
         size = ("batch", layer.size)
-        if layer.size >= WIDE:
+        # a current that lasts must not take the bias along
+        early = layer.size < WIDE and not layer.remembers
+        if not early:
             given = [(product, Port(name=f"{product}/now", kind=np.int32, shape=size)) for product, _ in found]
             inflow = gathered(body, layer, tuple((f"{product}/now", unit) for product, unit in found), name)
         else:
@@ -186,7 +188,7 @@ def _layerwise(graph: Nodes, layers: tuple[Layer, ...]) -> None:
             given = [(sums, Port(name=inflow, kind=layer.kind, shape=size))]
         registers = [f"{name}.membrane", *([f"{name}.current"] if layer.remembers else [])]
         state = registers[0], registers[1] if layer.remembers else None
-        fired = integrate(body, layer, inflow, state, biased=layer.size < WIDE)
+        fired = integrate(body, layer, inflow, state, biased=early)
         left = [fired.membrane, *([fired.current] if fired.current is not None else [])]
         graph.scan(
             body,
@@ -218,7 +220,7 @@ def _stepwise(graph: Nodes, netlist: Netlist, layers: tuple[Layer, ...]) -> None
     tail = _zeros(graph, "tail", np.uint8, sizes)
     filled = graph.add("Concat", ["events", tail], "filled", {"axis": 0})
     kept = [
-        (Port(name=f"{after.name}.spikes_next", kind=np.uint8, shape=("batch", after.size)), f"{layer.name}/steps")
+        (Port(name=f"{after.name}/fired", kind=np.bool_, shape=("batch", after.size)), f"{layer.name}/steps")
         for layer, after in zip(layers, chip, strict=True)
     ]
     if any(layer.checked for layer in layers):
@@ -234,7 +236,8 @@ def _stepwise(graph: Nodes, netlist: Netlist, layers: tuple[Layer, ...]) -> None
             graph.constant(f"{layer.name}/{side}", [at], np.int64)
             for side, at in (("begin", layer.depth), ("end", end))
         ]
-        graph.add("Slice", [f"{layer.name}/steps", *window], f"{layer.name}.spikes")
+        graph.add("Slice", [f"{layer.name}/steps", *window], f"{layer.name}/fired")
+        graph.cast(f"{layer.name}/fired", f"{layer.name}.spikes", np.uint8)
     if any(layer.checked for layer in layers):
         numbers = graph.cast("overflow/steps", "overflow/numbers", np.int32)
         most = graph.add("ReduceMax", [numbers], "overflow/most", {"axes": [0], "keepdims": 0})

@@ -44,10 +44,10 @@ def products(graph: Nodes, layer: Layer, spikes: Sequence[str], name: str, sign:
         All weights, or magnitudes of the positive or the negative ones.
     """
     found: list[tuple[str, str]] = []
-    for source, (_, weight) in zip(spikes, layer.sources, strict=True):
-        for digit, factor in digits(weight if sign == 0 else np.maximum(sign * weight, 0)):
+    for heard, source in zip(spikes, layer.sources, strict=True):
+        for digit, factor in digits(source.weight(sign)):
             own = f"{name}/{len(found)}"
-            product = graph.add("MatMulInteger", [source, graph.constant(f"{own}/weight", digit, np.int8)], own)
+            product = graph.add("MatMulInteger", [heard, graph.constant(f"{own}/weight", digit, np.int8)], own)
             found.append((product, graph.column(f"{own}/unit", factor << MEMBRANE_SHIFT, layer.kind)))
     return tuple(found)
 

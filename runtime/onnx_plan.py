@@ -28,6 +28,27 @@ Digit = tuple[npt.NDArray[np.int8], IntArray]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Source:
+    """What a layer hears from another one, or from the input.
+
+    Parameters
+    ----------
+    pre : int
+        Index into ``netlist.layers``, or ``INPUT``.
+    positive, negative : (neurons of the source, neurons) int64
+        Sums of its positive and of its negative effective weights, as magnitudes.
+    """
+
+    pre: int
+    positive: IntArray
+    negative: IntArray
+
+    def weight(self, sign: int = 0) -> IntArray:
+        """All weights (0), or magnitudes of the positive (1) or the negative ones (-1)."""
+        return {0: self.positive - self.negative, 1: self.positive, -1: self.negative}[sign]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Layer:
     """One population as the graph computes it; arrays have an entry per compartment, ordered by neuron.
 
@@ -41,8 +62,8 @@ class Layer:
         Compartments.
     depth : int
         Steps that it lags behind the data.
-    sources : tuple of (source, weight)
-        Layers that it hears (``INPUT`` for the input) and the effective weights, (their compartments, n) int64.
+    sources : tuple of Source
+        What it hears.
     decay_u, decay_v, threshold, bias : (n,) int64
         Registers; thresholds and biases in membrane units.
     label : (n,) int64
@@ -61,7 +82,7 @@ class Layer:
     name: str
     ids: IntArray
     depth: int
-    sources: tuple[tuple[int, IntArray], ...]
+    sources: tuple[Source, ...]
     decay_u: IntArray
     decay_v: IntArray
     threshold: IntArray
@@ -118,8 +139,11 @@ def plan(netlist: Netlist) -> tuple[Layer, ...]:
     names = group_names(netlist)
     inner = netlist.axon_source >= netlist.n_inputs
     pre_of_axon = np.where(inner, netlist.layer[np.where(inner, netlist.axon_source - netlist.n_inputs, 0)], INPUT)
-    axon = netlist.axon_of_synapse()
-    pre, post = pre_of_axon[axon], netlist.layer[netlist.synapse_compartment()]
+    # zeros of dense lists are no synapses
+    weight = netlist.effective_weight()
+    real = weight != 0
+    weight, axon, target = weight[real], netlist.axon_of_synapse()[real], netlist.synapse_compartment()[real]
+    pre, post = pre_of_axon[axon], netlist.layer[target]
     pairs = np.unique(np.stack([post, pre], axis=1), axis=0)
     place = np.zeros(netlist.n_compartments, np.int64)
     counts = {INPUT: netlist.n_inputs}
@@ -128,17 +152,19 @@ def plan(netlist: Netlist) -> tuple[Layer, ...]:
         place[ids] = np.arange(len(ids))
         counts[index] = len(ids)
     require_room(sum(counts[a] * counts[b] for b, a in pairs.tolist()))
-    column = np.append(np.arange(netlist.n_inputs), place)[netlist.axon_source[axon]]
-    row, weight = place[netlist.synapse_compartment()], netlist.effective_weight()
+    row = np.append(np.arange(netlist.n_inputs), place)[netlist.axon_source[axon]]
 
-    def matrix(a: int, b: int) -> IntArray:
-        found, dense = (pre == a) & (post == b), np.zeros((counts[a], counts[b]), np.int64)
-        np.add.at(dense, (column[found], row[found]), weight[found])
-        return dense
+    def source(a: int, b: int) -> Source:
+        sides = []
+        for side in (weight > 0, weight < 0):
+            found, dense = (pre == a) & (post == b) & side, np.zeros((counts[a], counts[b]), np.int64)
+            np.add.at(dense, (row[found], place[target[found]]), np.abs(weight[found]))
+            sides.append(dense)
+        return Source(pre=a, positive=sides[0], negative=sides[1])
 
     bounds = one_step_bounds(netlist)
     layers = [
-        _layer(netlist, index, name, tuple((a, matrix(a, index)) for b, a in pairs.tolist() if b == index), bounds)
+        _layer(netlist, index, name, tuple(source(a, b) for b, a in pairs.tolist() if b == index), bounds)
         for index, name in enumerate(names)
         if counts[index]
     ]
@@ -149,7 +175,7 @@ def _layer(
     netlist: Netlist,
     index: int,
     name: str,
-    sources: tuple[tuple[int, IntArray], ...],
+    sources: tuple[Source, ...],
     bounds: tuple[IntArray, IntArray],
 ) -> Layer:
     ids = netlist.compartments_of(index)
@@ -190,23 +216,23 @@ def _layer(
     )
 
 
-def _gathered(sources: tuple[tuple[int, IntArray], ...]) -> int:
+def _gathered(sources: tuple[Source, ...]) -> int:
     """Bound of any partial result while products with digits are added up, membrane units."""
     total = 0
-    for _, weight in sources:
-        for part in (weight, np.maximum(weight, 0), np.maximum(-weight, 0)):
-            for digit, factor in digits(part):
+    for source in sources:
+        for sign in (0, 1, -1):
+            for digit, factor in digits(source.weight(sign)):
                 total += int((np.abs(digit.astype(np.int64)).sum(axis=0) * factor).max(initial=0)) << MEMBRANE_SHIFT
     return total
 
 
 def is_pipeline(netlist: Netlist, layers: tuple[Layer, ...]) -> bool:
-    """Whether every layer hears layers of the depth before it only, the first ones the input.
+    """Whether every layer hears layers of the depth before it, the first ones the input, and nobody else.
 
     Then none has to wait for another: each runs over the whole recording, aligned with the data.
     """
-    return all(
-        (-1 if source == INPUT else netlist.layers[source].depth) == layer.depth - 1
+    heard = [
+        {-1 if source.pre == INPUT else netlist.layers[source.pre].depth for source in layer.sources}
         for layer in layers
-        for source, _ in layer.sources
-    )
+    ]
+    return all(depths == {layer.depth - 1} for layer, depths in zip(layers, heard, strict=True))

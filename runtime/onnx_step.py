@@ -46,7 +46,7 @@ def chip_step(graph: Nodes, layers: tuple[Layer, ...], classes: int, prefix: str
     for layer in layers:
         name, is_open = layer.name, windows[layer.depth]
         window = graph.cast(is_open, f"{name}/window", layer.kind)
-        inflow, signed = _arrived(graph, layer, [heard[source] for source, _ in layer.sources])
+        inflow, signed = _arrived(graph, layer, [heard[source.pre] for source in layer.sources])
         state = f"{name}.membrane", f"{name}.current" if layer.remembers else None
         fired = integrate(graph, layer, inflow, state, window=window)
         if fired.current is not None:
