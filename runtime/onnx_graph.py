@@ -39,7 +39,6 @@ import hashlib
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
 from compiler.ir import INPUT
 from compiler.netlist import Netlist
@@ -49,6 +48,7 @@ from runtime.onnx_neuron import bias, gathered, integrate, products
 from runtime.onnx_nodes import Nodes, Port, model_bytes
 from runtime.onnx_plan import Layer, is_pipeline, plan
 from runtime.onnx_step import chip_step, poll, states, voters
+from runtime.onnx_time import counted, decided, read_sizes, rest, zeros
 
 FORMS = ("step", "scan")
 
@@ -132,25 +132,12 @@ def _stop(layers: tuple[Layer, ...]) -> list[Port]:
 
 def _scan_model(netlist: Netlist, layers: tuple[Layer, ...]) -> Model:
     graph = Nodes()
-    graph.add("Shape", ["events"], "duration", {"start": 0, "end": 1})
-    graph.add("Shape", ["events"], "shape", {"start": 1, "end": 2})
+    read_sizes(graph)
     if is_pipeline(netlist, layers) and not any(layer.checked for layer in layers):
         _layerwise(graph, layers)
     else:
         _stepwise(graph, netlist, layers)
-    outputs = []
-    single = graph.constant("single", [1], np.int64)
-    row = graph.add("Concat", [single, "duration"], "row", {"axis": 0})
-    graph.add("Expand", [graph.constant("one", 1, np.uint8), row], "ones")
-    for layer in layers:
-        trains = Port(name=f"{layer.name}.spikes", kind=np.uint8, shape=("time", "batch", layer.size))
-        counts = Port(name=f"{layer.name}.counts", kind=np.int32, shape=("batch", layer.size))
-        # a product with ones adds up bytes ten times faster than ReduceSum, which wants them as int32
-        flat = graph.add("Reshape", [trains.name, graph.constant("flat", [0, -1], np.int64)], f"{layer.name}/flat")
-        total = graph.add("MatMulInteger", ["ones", flat], f"{layer.name}/total")
-        form = graph.constant(f"{layer.name}/form", [-1, layer.size], np.int64)
-        graph.add("Reshape", [total, form], counts.name)
-        outputs += [trains, counts]
+    outputs = [port for layer in layers for port in counted(graph, layer.name, layer.size)]
     votes, voting = "", voters(layers)
     for layer in voting:
         label = poll(graph, layer, netlist.classes, np.int32)
@@ -158,9 +145,7 @@ def _scan_model(netlist: Netlist, layers: tuple[Layer, ...]) -> Model:
         more = graph.add("MatMul", [f"{layer.name}.counts", label], f"{layer.name}/votes" if votes else last)
         votes = graph.add("Add", [votes, more], last) if votes else more
     if voting:
-        graph.add("ArgMax", ["votes"], "class", {"axis": 1, "keepdims": 0})
-        outputs.append(Port(name="votes", kind=np.int32, shape=("batch", netlist.classes)))
-        outputs.append(Port(name="class", kind=np.int64, shape=("batch",)))
+        outputs += decided(graph, netlist.classes)
     return (
         graph,
         [Port(name="events", kind=np.uint8, shape=("time", "batch", netlist.n_inputs))],
@@ -193,7 +178,7 @@ def _layerwise(graph: Nodes, layers: tuple[Layer, ...]) -> None:
         graph.scan(
             body,
             [
-                (_rest(graph, port), port, after, f"{port.name}/last")
+                (rest(graph, port), port, after, f"{port.name}/last")
                 for port, after in zip(
                     [Port(name=register, kind=layer.kind, shape=size) for register in registers], left, strict=True
                 )
@@ -214,10 +199,10 @@ def _stepwise(graph: Nodes, netlist: Netlist, layers: tuple[Layer, ...]) -> None
     events = Port(name=f"{CHIP}events", kind=np.uint8, shape=("batch", netlist.n_inputs))
     sizes = [
         graph.constant("drain", [drain], np.int64),
-        "shape",
+        "batch",
         graph.constant("inputs", [netlist.n_inputs], np.int64),
     ]
-    tail = _zeros(graph, "tail", np.uint8, sizes)
+    tail = zeros(graph, "tail", np.uint8, sizes)
     filled = graph.add("Concat", ["events", tail], "filled", {"axis": 0})
     kept = [
         (Port(name=f"{after.name}/fired", kind=np.bool_, shape=("batch", after.size)), f"{layer.name}/steps")
@@ -226,7 +211,7 @@ def _stepwise(graph: Nodes, netlist: Netlist, layers: tuple[Layer, ...]) -> None
     if any(layer.checked for layer in layers):
         kept.append((Port(name=f"{CHIP}overflow", kind=np.bool_, shape=("batch",)), "overflow/steps"))
     begun = [
-        (_rest(graph, port), port, f"{port.name}_next", f"{port.name}/last")
+        (rest(graph, port), port, f"{port.name}_next", f"{port.name}/last")
         for port in states(chip, netlist.classes, CHIP)
     ]
     graph.scan(body, begun, [(filled, events)], kept, "chip")
@@ -242,16 +227,3 @@ def _stepwise(graph: Nodes, netlist: Netlist, layers: tuple[Layer, ...]) -> None
         numbers = graph.cast("overflow/steps", "overflow/numbers", np.int32)
         most = graph.add("ReduceMax", [numbers], "overflow/most", {"axes": [0], "keepdims": 0})
         graph.cast(most, "overflow", np.bool_)
-
-
-def _rest(graph: Nodes, port: Port) -> str:
-    """Zeros for a state at the start of recordings."""
-    sizes = [graph.constant(f"{port.name}/size", port.shape[1:], np.int64)] if port.shape else []
-    return _zeros(graph, f"{port.name}/rest", port.kind, ["shape", *sizes] if port.shape else [])
-
-
-def _zeros(graph: Nodes, name: str, kind: npt.DTypeLike, sizes: list[str]) -> str:
-    zero = graph.constant(f"{name}/zero", 0, kind)
-    if not sizes:
-        return zero
-    return graph.add("Expand", [zero, graph.add("Concat", sizes, f"{name}/shape", {"axis": 0})], name)

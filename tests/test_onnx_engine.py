@@ -8,11 +8,9 @@ from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from random_netlists import Axon, Neuron, build, large_netlist, netlists, recordings
 
-from compiler.errors import DataError, ModelError, NumericRangeError, OptionError
+from compiler.errors import NumericRangeError
 from compiler.netlist import read_only
-from compiler.pipeline import compile_network
-from compiler.serialize import write_netlist
-from runtime import engine, onnx_engine, onnx_graph, onnx_nodes, onnx_plan, spec
+from runtime import engine, onnx_engine, onnx_graph, onnx_plan, spec
 
 FORMS = onnx_graph.FORMS
 SETTINGS = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
