@@ -185,3 +185,19 @@ def model_bytes(
     package.checker.check_model(model, full_check=True)
     content: bytes = model.SerializeToString(deterministic=True)
     return content
+
+
+def port_words(content: bytes) -> tuple[list[str], list[str]]:
+    """Inputs and outputs of a model for people, such as ``events uint8 (time, batch, 78)``."""
+    package = onnx_package()
+    graph = package.load_from_string(content).graph
+
+    def words(ports: Any) -> list[str]:
+        found = []
+        for port in ports:
+            kind = package.helper.tensor_dtype_to_np_dtype(port.type.tensor_type.elem_type)
+            sizes = [str(size.dim_param or size.dim_value) for size in port.type.tensor_type.shape.dim]
+            found.append(f"{port.name} {kind.name} ({', '.join(sizes)})")
+        return found
+
+    return words(graph.input), words(graph.output)

@@ -1,16 +1,19 @@
 """onnxruntime on the integer graph: every spike and membrane of the specification."""
 
+import json
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
+from made_files import own_file, recordings_folder
 from random_netlists import Axon, Neuron, build, large_netlist, netlists, recordings
 
-from compiler.errors import NumericRangeError
+from compiler.errors import DataError, ModelError, NumericRangeError, OptionError
 from compiler.netlist import read_only
-from runtime import engine, onnx_engine, onnx_graph, onnx_plan, spec
+from runtime import cli, engine, onnx_engine, onnx_graph, onnx_nodes, onnx_plan, spec
 
 FORMS = onnx_graph.FORMS
 SETTINGS = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -119,3 +122,144 @@ def test_a_large_network_is_the_engine(proved):
         found = by_onnx(netlist, events, form, lengths=lengths, batch=2, progress=done.append)
         np.testing.assert_array_equal(found.spikes, expected.spikes)
         assert done == [2, 4]
+
+
+def three_neurons(**changes):
+    """A netlist by hand: two inputs, two neurons that hear them, one that hears these and votes for class 1."""
+    neurons = [Neuron(threshold=80), Neuron(threshold=80, bias=-7), Neuron(layer=1, core=1, threshold=80)]
+    axons = [
+        Axon(source=0, targets=((0, 60), (1, -30))),
+        Axon(source=1, targets=((0, 50), (1, 90))),
+        Axon(source=2, core=1, targets=((0, 100),)),
+        Axon(source=3, core=1, targets=((0, 70),)),
+    ]
+    netlist = build(neurons, axons, n_inputs=2, depths=[0, 1])
+    return replace(netlist, classes=2, readout_class=read_only([-1, -1, 1]), **changes)
+
+
+def test_a_run_by_hand():
+    # neuron 0: 60 + 50 = 110 > 80 spikes, then 60, 60 * 819/4096 + 50 = 61; neuron 1: 60, then -30 ..., 90 spikes
+    events = np.array([[[1, 1, 0], [1, 0, 1]]], np.uint8)
+    for form in FORMS:
+        found = by_onnx(three_neurons(), events, form, membranes=form == "step")
+        assert found.spikes[0].astype(int).tolist() == [[1, 0, 0], [0, 0, 1], [0, 1, 0], [0, 0, 0]]
+        assert found.votes.tolist() == [[0, 1]]
+        if found.membranes is not None:
+            assert found.membranes[0, :2, :2].tolist() == [[0, 3833], [3840, -1161]]
+            assert found.membranes[0, 3].tolist() == [0, 0, 4480]
+
+
+def test_votes_of_several_layers_add_up():
+    netlist = three_neurons()
+    netlist = replace(netlist, readout_class=read_only([1, 0, 1]))
+    events = np.ones((1, 2, 4), np.uint8)
+    expected = engine.simulate(netlist, events).counts.spikes[0]
+    assert expected.min() > 0
+    for form in FORMS:
+        assert by_onnx(netlist, events, form).votes.tolist() == [[expected[1], expected[0] + expected[2]]]
+
+
+def test_recordings_of_another_sensor():
+    prepared = onnx_engine.prepare(three_neurons())
+    with pytest.raises(DataError) as caught:
+        onnx_engine.simulate(prepared, np.zeros((1, 3, 4), np.uint8))
+    assert str(caught.value).startswith("recordings: 3 input channels found, the netlist has 2; ")
+
+
+@pytest.mark.parametrize(("form", "where"), [("step", "recording 1, chip step 2"), ("scan", "recording 1")])
+def test_a_register_that_overflows(form, where):
+    axons = [Axon(source=0, targets=((0, 254),), exponent=7), Axon(source=1, targets=((0, 254),), exponent=7)]
+    netlist = build([Neuron()], axons, n_inputs=2, depths=[0])
+    events = np.zeros((2, 2, 4), np.uint8)
+    events[:, 0, 1] = 1
+    assert by_onnx(netlist, events, form).spikes[:, :, 0].tolist() == [[False, True, False, False]] * 2
+    events[1, :, 2] = 1
+    with pytest.raises(NumericRangeError) as caught:
+        by_onnx(netlist, events, form)
+    assert str(caught.value) == (
+        f"onnx: {where}: a register overflows, where the chip is not defined; compile with --ranges proven"
+    )
+
+
+def test_a_program_that_is_not_installed(monkeypatch):
+    for name in ("onnx", "onnxruntime"):
+        with monkeypatch.context() as patch:
+            patch.setitem(sys.modules, name, None)
+            with pytest.raises(OptionError) as caught:
+                onnx_engine.prepare(three_neurons())
+            assert str(caught.value) == f"{name}: the package is not installed; install it with pip install {name}"
+
+
+def test_a_network_that_the_format_cannot_hold(monkeypatch):
+    monkeypatch.setattr(onnx_nodes, "SIZE_LIMIT", 5)
+    with pytest.raises(ModelError) as caught:
+        onnx_engine.prepare(three_neurons())
+    assert str(caught.value) == (
+        "onnx: the weights need 6 bytes as dense matrices, a file holds 5; export a smaller network"
+    )
+
+
+# -- verify ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def verified(tmp_path, monkeypatch):
+    """Words of a verify command on a small network."""
+    own_file(tmp_path / "net.pt")
+    recordings_folder(tmp_path / "data")
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["compile", "net.pt", "-o", "net.loom"]) == 0
+    return ["verify", "net.loom", "--checkpoint", "net.pt", "--data", "data", "--min-agreement", "0"]
+
+
+def test_verify_tells_which_engine(verified, capsys):
+    found = {}
+    for name in ("spikeloom", "onnx"):
+        capsys.readouterr()
+        assert cli.main([*verified, "--engine", name, "--json"]) == 0
+        found[name] = json.loads(capsys.readouterr().out)
+    assert [(report["engine"], report["engine_different"]) for report in found.values()] == [
+        ("spikeloom", None),
+        ("onnx", 0),
+    ]
+    assert found["onnx"]["spec_equals_engine"]
+    text = "specification = engine in every spike, membrane and count of 3 recordings"
+    texts = [report["levels"][0]["text"] for report in found.values()]
+    samples = found["onnx"]["samples"]
+    assert texts == [text, f"{text}; onnx beside it, 0 differing spikes on {samples} recordings"]
+    ours = {key: entry for key, entry in found["onnx"].items() if key not in ("engine", "engine_different", "levels")}
+    assert ours == {key: found["spikeloom"][key] for key in ours}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_verify_finds_an_engine_that_strays(verified, form, monkeypatch, capsys):
+    plain = onnx_engine.simulate
+
+    def stray(prepared, *words, **options):
+        trace = plain(prepared, *words, **options)
+        if prepared.form == form:
+            trace.spikes[0, 5, 0] ^= True
+        return trace
+
+    monkeypatch.setattr(onnx_engine, "simulate", stray)
+    capsys.readouterr()
+    assert cli.main([*verified, "--engine", "onnx", "--json"]) == 1
+    report = json.loads(capsys.readouterr().out)
+    assert not report["spec_equals_engine"]
+    assert report["engine_different"] == (form == "scan")
+
+
+def test_verify_without_the_program(verified, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    capsys.readouterr()
+    assert cli.main([*verified, "--engine", "onnx"]) == 2
+    out, err = capsys.readouterr()
+    why = "onnxruntime: the package is not installed; install it with pip install onnxruntime"
+    assert (out, err) == ("", f"spikeloom: {why}\n")
+
+
+def test_verify_where_the_format_is_too_small(verified, monkeypatch, capsys):
+    monkeypatch.setattr(onnx_nodes, "SIZE_LIMIT", 100)
+    capsys.readouterr()
+    assert cli.main([*verified, "--engine", "onnx"]) == 2
+    assert capsys.readouterr().err.startswith("spikeloom: onnx: the weights need ")
