@@ -163,6 +163,7 @@ def _same_run(slow: Trace, prepared: engine.Engine, events: npt.NDArray[np.uint8
 
 
 def _held_to_specification(
+    netlist: Netlist,
     prepared: engine.Engine,
     further: onnx_check.Check | None,
     checked: int,
@@ -173,7 +174,7 @@ def _held_to_specification(
     """Whether specification and engines agree; spikes of a further engine that differ from ours, if there is one."""
     ends = np.full(len(events), events.shape[2]) if lengths is None else lengths
     samples = [events[i, :, : ends[i]] for i in range(checked)]
-    specified = [spec.simulate(prepared.netlist, sample) for sample in samples]
+    specified = [spec.simulate(netlist, sample) for sample in samples]
     equal = all(_same_run(slow, prepared, sample) for slow, sample in zip(specified, samples, strict=True))
     if further is None:
         return equal, None
@@ -320,7 +321,7 @@ def verify(
 
     tell("specification")
     checked = min(spec_samples, len(flat))
-    equal, different = _held_to_specification(prepared, further, checked, flat, lengths, trace.spikes)
+    equal, different = _held_to_specification(netlist, prepared, further, checked, flat, lengths, trace.spikes)
 
     def differences(stage: list[BoolArray] | tuple[BoolArray, ...]) -> dict[str, int]:
         return {name: int(np.count_nonzero(a != b)) for name, a, b in zip(names, reference, stage, strict=True)}

@@ -152,7 +152,7 @@ def test_a_run_by_hand():
 def test_votes_of_several_layers_add_up():
     netlist = three_neurons()
     netlist = replace(netlist, readout_class=read_only([1, 0, 1]))
-    events = np.ones((1, 2, 4), np.uint8)
+    events = np.array([[[1, 0, 1, 0], [1, 1, 1, 1]]], np.uint8)
     expected = engine.simulate(netlist, events).counts.spikes[0]
     assert expected.min() > 0
     for form in FORMS:
