@@ -5,7 +5,7 @@ It takes recordings as :func:`runtime.engine.simulate` does and gives the same s
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,21 +20,39 @@ from runtime.engine import EventArray
 from runtime.onnx_plan import Layer, plan
 from runtime.trace import BoolArray, MembraneArray, check_channels
 
-BATCH = {"step": 64, "scan": 16}
+BATCH = {"step": 144, "scan": 16}
 """Recordings that run together: few enough for the caches."""
 
 KINDS = {f"tensor({kind})": np.dtype(kind) for kind in ("bool", "uint8", "int32", "int64")}
 """Types of onnxruntime that the graphs use."""
 
+Runs = list[tuple[slice, slice]]
+"""Where runs of neighbours lie in a large array, and in a small one that holds them alone."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class OnnxEngine:
-    """A netlist in onnxruntime, made by :func:`prepare`; `session` is an ``onnxruntime.InferenceSession``."""
+    """A netlist in onnxruntime, made by :func:`prepare`.
+
+    Parameters
+    ----------
+    netlist : Netlist
+        What it was made from.
+    layers : tuple of Layer
+        Its layers, as the graph has them.
+    form : {"step", "scan"}
+        Of the graph.
+    session : onnxruntime.InferenceSession
+        The graph, loaded.
+    runs : mapping of str to Runs
+        Compartments of each layer, by its name.
+    """
 
     netlist: Netlist
     layers: tuple[Layer, ...]
     form: str
     session: Any
+    runs: Mapping[str, Runs]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -104,7 +122,9 @@ def prepare(netlist: Netlist, *, form: str = "scan", threads: int = 1) -> OnnxEn
     """
     onnxruntime_package()
     session = open_session(onnx_graph.export(netlist, form), threads=threads)
-    return OnnxEngine(netlist=netlist, layers=plan(netlist), form=form, session=session)
+    layers = plan(netlist)
+    runs = {layer.name: _runs(layer.ids) for layer in layers}
+    return OnnxEngine(netlist=netlist, layers=layers, form=form, session=session, runs=runs)
 
 
 def simulate(
@@ -176,9 +196,9 @@ def _run_scan(engine: OnnxEngine, events: EventArray, which: IntArray, trace: On
     if "overflow" in found:
         _stop(which[found["overflow"]], None)
     for layer in engine.layers:
-        spikes, ids = found[f"{layer.name}.spikes"].view(np.bool_), _span(layer.ids)
-        for place, index in enumerate(which):
-            trace.spikes[index, layer.depth : layer.depth + len(events)][:, ids] = spikes[:, place]
+        spikes = found[f"{layer.name}.spikes"].view(np.bool_).transpose(1, 0, 2)
+        window = slice(layer.depth, layer.depth + len(events))
+        _keep(trace.spikes[:, window], _runs(which), engine.runs[layer.name], spikes)
     if "votes" in found:
         trace.votes[which] = found["votes"]
 
@@ -194,19 +214,17 @@ def _run_steps(engine: OnnxEngine, events: EventArray, which: IntArray, trace: O
     swapped = given | {name: left[f"{name}_next"] for name in states}
     results = left, left | {f"{name}_next": given[name] for name in states}
     bindings = [_bound(session, *sides) for sides in zip((given, swapped), results, strict=True)]
-    spans = [(layer.name, _span(layer.ids)) for layer in engine.layers]
+    rows = _runs(which)
     for step in range(steps + engine.netlist.max_depth):
         given["events"][...] = events[step] if step < steps else 0
         session.run_with_iobinding(bindings[step % 2])
         found = results[step % 2]
         if "overflow" in found:
             _stop(which[found["overflow"]], step)
-        for name, ids in spans:
-            spikes = found[f"{name}.spikes_next"].view(np.bool_)
-            for place, index in enumerate(which):
-                trace.spikes[index, step][ids] = spikes[place]
-                if trace.membranes is not None:
-                    trace.membranes[index, step][ids] = found[f"{name}.membrane_next"][place]
+        for name, ids in engine.runs.items():
+            _keep(trace.spikes[:, step], rows, ids, found[f"{name}.spikes_next"].view(np.bool_))
+            if trace.membranes is not None:
+                _keep(trace.membranes[:, step], rows, ids, found[f"{name}.membrane_next"])
     if "votes_next" in left:
         trace.votes[which] = found["votes_next"]
 
@@ -227,10 +245,18 @@ def _bound(session: Any, given: dict[str, npt.NDArray[Any]], left: dict[str, npt
     return binding
 
 
-def _span(ids: IntArray) -> slice | IntArray:
-    """Compartments as a slice where they follow each other, which numpy copies faster."""
-    first, last = int(ids[0]), int(ids[-1])
-    return slice(first, last + 1) if np.all(np.diff(ids) == 1) else ids
+def _runs(ids: IntArray) -> Runs:
+    """Cut indices into runs of neighbours, which numpy copies many times faster than single ones."""
+    ends = np.append(np.flatnonzero(np.diff(ids) != 1) + 1, len(ids)).tolist()
+    begins = [0, *ends[:-1]]
+    return [(slice(int(ids[a]), int(ids[a]) + b - a), slice(a, b)) for a, b in zip(begins, ends, strict=True)]
+
+
+def _keep(kept: npt.NDArray[Any], rows: Runs, ids: Runs, values: npt.NDArray[Any]) -> None:
+    """Write into some recordings and some compartments, the first and the last axis."""
+    for row, own_row in rows:
+        for place, own in ids:
+            kept[row, ..., place] = values[own_row, ..., own]
 
 
 def _stop(overflown: IntArray, step: int | None) -> None:

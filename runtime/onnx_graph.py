@@ -30,7 +30,8 @@ layer did with data step ``t``, in chip step ``t + depth``.
 ====================== ======================= ========================================================================
 
 A network in which each layer hears the one before it only, with proven ranges, is run layer after layer: one product
-over all steps, then a ``Scan`` of the recurrence. Any other is a ``Scan`` over the form ``step``.
+over all steps (in wide layers one a step), then a ``Scan`` of the recurrence. Any other is a ``Scan`` over the form
+``step``.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ END = 2**63 - 1
 """A slice with this end reaches to the end of its axis."""
 
 WIDE = 512
-"""Neurons from which on a layer's sums are put together step by step, in the cache, and not for all steps before."""
+"""Neurons from which on a layer's products are taken step by step too: sums of all steps would not fit the cache."""
 
 CHIP = "chip/"
 """Names inside the loop over chip steps start with this."""
@@ -159,18 +160,24 @@ def _layerwise(graph: Nodes, layers: tuple[Layer, ...]) -> None:
     for layer in layers:
         name, body = layer.name, graph.inner()
         heard[layer.index] = f"{name}.spikes"
-        found = products(graph, layer, [heard[source.pre] for source in layer.sources], f"{name}/product")
+        spikes = [heard[source.pre] for source in layer.sources]
         size = ("batch", layer.size)
         # a current that lasts must not take the bias along
         early = layer.size < WIDE and not layer.remembers
-        if not early:
-            given = [(product, Port(name=f"{product}/now", kind=np.int32, shape=size)) for product, _ in found]
-            inflow = gathered(body, layer, tuple((f"{product}/now", unit) for product, unit in found), name)
-        else:
-            sums = bias(graph, layer, gathered(graph, layer, found, name), f"{name}/inflow")
+        if early:
+            sums = gathered(graph, layer, products(graph, layer, spikes, f"{name}/product"), name)
+            sums = bias(graph, layer, sums, f"{name}/inflow")
             assert sums is not None, "a layer of a pipeline hears the one before"
-            inflow = f"{name}/now"
-            given = [(sums, Port(name=inflow, kind=layer.kind, shape=size))]
+            inflow: str | None = f"{name}/now"
+            given = [(sums, Port(name=f"{name}/now", kind=layer.kind, shape=size))]
+        else:
+            now = [
+                Port(name=f"{name}/now{i}", kind=np.uint8, shape=("batch", len(source.positive)))
+                for i, source in enumerate(layer.sources)
+            ]
+            given = list(zip(spikes, now, strict=True))
+            found = products(body, layer, [port.name for port in now], f"{name}/product")
+            inflow = gathered(body, layer, found, name)
         registers = [f"{name}.membrane", *([f"{name}.current"] if layer.remembers else [])]
         state = registers[0], registers[1] if layer.remembers else None
         fired = integrate(body, layer, inflow, state, biased=early)
