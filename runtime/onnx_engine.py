@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from compiler.errors import NumericRangeError, OptionError
+from compiler.errors import NumericRangeError
 from compiler.fixedpoint import IntArray
 from compiler.netlist import Netlist
 from runtime import onnx_graph
 from runtime.engine import EventArray
+from runtime.onnx_nodes import package
 from runtime.onnx_plan import Layer, plan
 from runtime.trace import BoolArray, MembraneArray, check_channels
 
@@ -74,31 +75,20 @@ class OnnxTrace:
     membranes: MembraneArray | None
 
 
-def onnxruntime_package() -> Any:
-    """The package ``onnxruntime``, imported when it is first needed.
+def open_session(model: bytes, *, threads: int = 1) -> Any:
+    """Load a model into onnxruntime's CPU provider.
 
     Raises
     ------
     OptionError
-        If it is not installed.
+        If ``onnxruntime`` is not installed.
     """
-    try:
-        import onnxruntime
-    except ImportError as error:
-        raise OptionError(
-            "onnxruntime: the package is not installed; install it with pip install onnxruntime"
-        ) from error
-    return onnxruntime
-
-
-def open_session(model: bytes, *, threads: int = 1) -> Any:
-    """Load a model into onnxruntime's CPU provider."""
-    package = onnxruntime_package()
-    settings = package.SessionOptions()
+    onnxruntime = package("onnxruntime")
+    settings = onnxruntime.SessionOptions()
     settings.intra_op_num_threads = threads
     settings.inter_op_num_threads = 1
     settings.log_severity_level = 3
-    return package.InferenceSession(model, settings, providers=["CPUExecutionProvider"])
+    return onnxruntime.InferenceSession(model, settings, providers=["CPUExecutionProvider"])
 
 
 def prepare(netlist: Netlist, *, form: str = "scan", threads: int = 1) -> OnnxEngine:
@@ -120,7 +110,7 @@ def prepare(netlist: Netlist, *, form: str = "scan", threads: int = 1) -> OnnxEn
     ModelError
         If the format cannot hold the network.
     """
-    onnxruntime_package()
+    package("onnxruntime")  # before any work
     session = open_session(onnx_graph.export(netlist, form), threads=threads)
     layers = plan(netlist)
     runs = {layer.name: _runs(layer.ids) for layer in layers}
@@ -236,7 +226,7 @@ def _zeros(port: Any, batch: int) -> npt.NDArray[Any]:
 
 def _bound(session: Any, given: dict[str, npt.NDArray[Any]], left: dict[str, npt.NDArray[Any]]) -> Any:
     """Bind arrays to inputs and outputs, in place."""
-    wrap = onnxruntime_package().OrtValue.ortvalue_from_numpy
+    wrap = package("onnxruntime").OrtValue.ortvalue_from_numpy
     binding = session.io_binding()
     for name, array in given.items():
         binding.bind_ortvalue_input(name, wrap(array))

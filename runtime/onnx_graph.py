@@ -191,10 +191,10 @@ def _layerwise(graph: Nodes, layers: tuple[Layer, ...]) -> None:
                 )
             ],
             given,
-            [(Port(name=fired.silent, kind=np.bool_, shape=size), f"{name}/quiet")],
+            [(Port(name=fired.spiked, kind=np.bool_, shape=size), f"{name}/trains")],
             f"{name}/scan",
         )
-        graph.cast(graph.add("Not", [f"{name}/quiet"], f"{name}/fired"), f"{name}.spikes", np.uint8)
+        graph.cast(f"{name}/trains", f"{name}.spikes", np.uint8)
 
 
 def _stepwise(graph: Nodes, netlist: Netlist, layers: tuple[Layer, ...]) -> None:
@@ -228,8 +228,8 @@ def _stepwise(graph: Nodes, netlist: Netlist, layers: tuple[Layer, ...]) -> None
             graph.constant(f"{layer.name}/{side}", [at], np.int64)
             for side, at in (("begin", layer.depth), ("end", end))
         ]
-        graph.add("Slice", [f"{layer.name}/steps", *window], f"{layer.name}/fired")
-        graph.cast(f"{layer.name}/fired", f"{layer.name}.spikes", np.uint8)
+        graph.add("Slice", [f"{layer.name}/steps", *window], f"{layer.name}/trains")
+        graph.cast(f"{layer.name}/trains", f"{layer.name}.spikes", np.uint8)
     if any(layer.checked for layer in layers):
         numbers = graph.cast("overflow/steps", "overflow/numbers", np.int32)
         most = graph.add("ReduceMax", [numbers], "overflow/most", {"axes": [0], "keepdims": 0})

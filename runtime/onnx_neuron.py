@@ -17,12 +17,12 @@ Products = tuple[tuple[str, str], ...]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fired:
-    """Names of what a step of a layer leaves: whether neurons are silent (bool), membranes after the reset, currents.
+    """Names of what a step of a layer leaves: whether neurons spiked (bool), membranes after the reset, currents.
 
     `current` is the register before a window closes it; None where no current outlasts its step.
     """
 
-    silent: str
+    spiked: str
     membrane: str
     current: str | None
 
@@ -115,10 +115,10 @@ def integrate(
     if window is not None:
         value = graph.add("Mul", [value, window], f"{name}/gated")
     threshold = graph.column(f"{name}/threshold", layer.threshold, layer.kind)
-    silent = graph.add("LessOrEqual", [value, threshold], f"{name}/silent")
-    # a product with 0 or 1 takes less time than Where
-    keeps = graph.cast(silent, f"{name}/keeps", layer.kind)
-    return Fired(silent=silent, membrane=graph.add("Mul", [value, keeps], f"{name}.membrane_next"), current=current)
+    fired = graph.add("Greater", [value, threshold], f"{name}/fired")
+    zero = graph.constant(f"zero/{np.dtype(layer.kind).name}", 0, layer.kind)
+    left = graph.add("Where", [fired, zero, value], f"{name}.membrane_next")
+    return Fired(spiked=fired, membrane=left, current=current)
 
 
 def _decayed(graph: Nodes, layer: Layer, register: str, lost: IntArray, name: str) -> str:

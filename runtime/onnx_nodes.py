@@ -5,6 +5,7 @@ Operator set 17 with IR version 8, which onnxruntime reads since 1.13. Equal gra
 
 from __future__ import annotations
 
+import importlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -91,24 +92,24 @@ class Nodes:
         name : str
             Of the node and its body.
         """
-        package = onnx_package()
+        onnx = onnx_package()
         inputs = [value(port) for _, port, _, _ in states] + [value(port) for _, port in given]
         outputs = [value(Port(name=after, kind=port.kind, shape=port.shape)) for _, port, after, _ in states]
         outputs += [value(port) for port, _ in kept]
         self.nodes.append(
-            package.helper.make_node(
+            onnx.helper.make_node(
                 "Scan",
                 [start for start, _, _, _ in states] + [array for array, _ in given],
                 [last for _, _, _, last in states] + [array for _, array in kept],
                 name=name,
                 num_scan_inputs=len(given),
-                body=package.helper.make_graph(body.nodes, f"{name}.body", inputs, outputs),
+                body=onnx.helper.make_graph(body.nodes, f"{name}.body", inputs, outputs),
             )
         )
 
 
-def onnx_package() -> Any:
-    """The package ``onnx``, imported when it is first needed.
+def package(name: str) -> Any:
+    """Import ``onnx`` or ``onnxruntime``, which load slowly, when it is first needed.
 
     Raises
     ------
@@ -116,10 +117,14 @@ def onnx_package() -> Any:
         If it is not installed.
     """
     try:
-        import onnx
+        return importlib.import_module(name)
     except ImportError as error:
-        raise OptionError("onnx: the package is not installed; install it with pip install onnx") from error
-    return onnx
+        raise OptionError(f"{name}: the package is not installed; install it with pip install {name}") from error
+
+
+def onnx_package() -> Any:
+    """The package ``onnx``."""
+    return package("onnx")
 
 
 def proto_type(kind: npt.DTypeLike) -> int:
@@ -163,16 +168,16 @@ def model_bytes(
     facts : mapping
         JSON values for the metadata; ``version`` becomes the producer's version too.
     """
-    package = onnx_package()
-    model = package.helper.make_model(
-        package.helper.make_graph(
+    onnx = onnx_package()
+    model = onnx.helper.make_model(
+        onnx.helper.make_graph(
             graph.nodes,
             name,
             [value(port) for port in inputs],
             [value(port) for port in outputs],
-            [package.numpy_helper.from_array(array, key) for key, array in graph.constants.items()],
+            [onnx.numpy_helper.from_array(array, key) for key, array in graph.constants.items()],
         ),
-        opset_imports=[package.helper.make_opsetid("", OPSET)],
+        opset_imports=[onnx.helper.make_opsetid("", OPSET)],
         ir_version=IR_VERSION,
         producer_name="spikeloom",
         producer_version=str(facts["version"]),
@@ -182,20 +187,20 @@ def model_bytes(
         entry = model.metadata_props.add()
         entry.key = key
         entry.value = facts[key] if isinstance(facts[key], str) else json.dumps(facts[key], sort_keys=True)
-    package.checker.check_model(model, full_check=True)
+    onnx.checker.check_model(model, full_check=True)
     content: bytes = model.SerializeToString(deterministic=True)
     return content
 
 
 def port_words(content: bytes) -> tuple[list[str], list[str]]:
     """Inputs and outputs of a model for people, such as ``events uint8 (time, batch, 78)``."""
-    package = onnx_package()
-    graph = package.load_from_string(content).graph
+    onnx = onnx_package()
+    graph = onnx.load_from_string(content).graph
 
     def words(ports: Any) -> list[str]:
         found = []
         for port in ports:
-            kind = package.helper.tensor_dtype_to_np_dtype(port.type.tensor_type.elem_type)
+            kind = onnx.helper.tensor_dtype_to_np_dtype(port.type.tensor_type.elem_type)
             sizes = [str(size.dim_param or size.dim_value) for size in port.type.tensor_type.shape.dim]
             found.append(f"{port.name} {kind.name} ({', '.join(sizes)})")
         return found

@@ -53,7 +53,7 @@ def chip_step(graph: Nodes, layers: tuple[Layer, ...], classes: int, prefix: str
             graph.add("Mul", [fired.current, window], f"{name}.current_next")
         if layer.checked:
             flags.append(overflow(graph, layer, signed, fired.current, is_open))
-        graph.cast(graph.add("Not", [fired.silent], f"{name}/fired"), f"{name}.spikes_next", np.uint8)
+        graph.cast(fired.spiked, f"{name}.spikes_next", np.uint8)
     if flags:
         most = graph.add("Max", flags, f"{prefix}overflow/most")
         graph.add("Greater", [most, graph.constant("nothing", 0, np.int32)], f"{prefix}overflow")

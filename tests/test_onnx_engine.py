@@ -10,6 +10,7 @@ from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from made_files import own_file, recordings_folder
 from random_netlists import Axon, Neuron, build, large_netlist, netlists, recordings
+from test_timing import six_steps
 
 from compiler.errors import DataError, ModelError, NumericRangeError, OptionError
 from compiler.netlist import read_only
@@ -124,17 +125,10 @@ def test_a_large_network_is_the_engine(proved):
         assert done == [2, 4]
 
 
-def three_neurons(**changes):
-    """A netlist by hand: two inputs, two neurons that hear them, one that hears these and votes for class 1."""
-    neurons = [Neuron(threshold=80), Neuron(threshold=80, bias=-7), Neuron(layer=1, core=1, threshold=80)]
-    axons = [
-        Axon(source=0, targets=((0, 60), (1, -30))),
-        Axon(source=1, targets=((0, 50), (1, 90))),
-        Axon(source=2, core=1, targets=((0, 100),)),
-        Axon(source=3, core=1, targets=((0, 70),)),
-    ]
-    netlist = build(neurons, axons, n_inputs=2, depths=[0, 1])
-    return replace(netlist, classes=2, readout_class=read_only([-1, -1, 1]), **changes)
+def three_neurons():
+    """A netlist by hand: two neurons that hear both inputs, one that hears these and votes for class 1."""
+    netlist, _, _ = six_steps()
+    return replace(netlist, bias_mantissa=read_only([0, -7, 0]), classes=2, readout_class=read_only([-1, -1, 1]))
 
 
 def test_a_run_by_hand():
