@@ -1,8 +1,10 @@
 """onnxruntime on the integer graph: every spike and membrane of the specification."""
 
+import importlib
 import json
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -257,3 +259,16 @@ def test_verify_where_the_format_is_too_small(verified, monkeypatch, capsys):
     capsys.readouterr()
     assert cli.main([*verified, "--engine", "onnx"]) == 2
     assert capsys.readouterr().err.startswith("spikeloom: onnx: the weights need ")
+
+
+def test_the_benchmark_compares_what_it_times(monkeypatch):
+    monkeypatch.syspath_prepend(str(Path(__file__).parent.parent / "benchmarks"))
+    benchmark = importlib.import_module("onnx_engine")
+    monkeypatch.setattr(benchmark, "FEW", 2)
+    events = np.random.default_rng(1).integers(0, 2, (3, 2, 20), np.uint8)
+    runs, ready = benchmark.contenders(three_neurons())
+    assert list(runs) == list(ready) == ["ours", "scan", "step"]
+    runs["scan"] = lambda given: ~benchmark.contenders(three_neurons())[0]["ours"](given)
+    found = benchmark.measure(runs, [events[:1], events[1:]], rounds=2)
+    assert [figures["differing_spikes"] for figures in found.values()] == [0, 2 * 3 * 21 * 3, 0]
+    assert found["ours"]["times_ours"] == 1

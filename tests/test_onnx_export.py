@@ -106,10 +106,26 @@ def test_what_is_a_pipeline():
 # -- files -------------------------------------------------------------------------------------------------------------
 
 
+def lines_of(graph, indent=""):
+    """A graph as text; constants as they are, loops with their bodies."""
+    for side in ("input", "output"):
+        yield f"{indent}{side} " + ", ".join(port.name for port in getattr(graph, side))
+    for constant in graph.initializer:
+        array = onnx.numpy_helper.to_array(constant)
+        yield f"{indent}{constant.name} = {array.dtype} {json.dumps(array.tolist())}"
+    for node in graph.node:
+        plain = [a for a in node.attribute if a.name != "body"]
+        options = [f"{a.name}={onnx.helper.get_attribute_value(a)}" for a in sorted(plain, key=lambda a: a.name)]
+        yield f"{indent}{', '.join(node.output)} = {node.op_type}({', '.join([*node.input, *options])})"
+        for attribute in node.attribute:
+            if attribute.name == "body":
+                yield from lines_of(attribute.g, f"{indent}    ")
+
+
 @pytest.mark.parametrize("form", FORMS)
 def test_the_text_of_a_small_graph(form, golden):
     model = model_of(onnx_graph.export(three_neurons(), form))
-    golden(f"onnx_{form}.txt", onnx.printer.to_text(model.graph) + "\n")
+    golden(f"onnx_{form}.txt", "\n".join(lines_of(model.graph)) + "\n")
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -156,6 +172,7 @@ def test_every_name_is_documented(proved):
 
 
 def test_the_reference_of_the_format_computes_the_same():
+    pytest.importorskip("onnx", "1.18", "before, the evaluator did not see constants from inside a loop")
     netlist = three_neurons()
     given = np.random.default_rng(2).integers(0, 2, (2, 2, 12), np.uint8)
     expected = engine.simulate(netlist, given, spikes=True).spikes
