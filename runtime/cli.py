@@ -44,6 +44,7 @@ from runtime.inputs import (
 )
 from runtime.options import add_compile, add_detail, add_model, add_recordings, add_training
 from runtime.tables import show
+from runtime.trace import ENGINES
 
 Arguments = argparse.Namespace
 Report = dict[str, Any]
@@ -144,6 +145,7 @@ def _verify(arguments: Arguments) -> Outcome:
         data.files,
         original=None if arguments.original is None else asked_checkpoint(arguments.original, arguments),
         spec_samples=arguments.spec_samples,
+        engine_name=arguments.engine,
         lengths=data.lengths,
         progress=progress,
     )
@@ -299,6 +301,12 @@ def build_parser() -> argparse.ArgumentParser:
     )
     sub.add_argument(
         "--spec-samples", type=int, default=3, metavar="N", help="recordings for spec = engine (default: 3)"
+    )
+    sub.add_argument(
+        "--engine",
+        choices=ENGINES,
+        default=ENGINES[0],
+        help=f"onnx: onnxruntime runs the integer graph beside our engine (default: {ENGINES[0]})",
     )
     sub.add_argument(
         "--min-agreement",
