@@ -59,7 +59,8 @@ def class_of_each(counts: Sparse) -> IntArray | None:
     one_each = np.all(np.diff(columns.indptr) == 1)
     if not one_each or not columns.nnz or columns.data[0] <= 0 or np.ptp(columns.data) > 1e-12 * columns.data[0]:
         return None
-    return columns.indices.astype(np.int64)
+    label: IntArray = columns.indices.astype(np.int64)
+    return label
 
 
 def unique_names(names: Sequence[str]) -> tuple[str, ...]:
@@ -70,7 +71,9 @@ def unique_names(names: Sequence[str]) -> tuple[str, ...]:
     >>> unique_names(["conv", "", "fc", "fc"])
     ('conv', 'layer2', 'layer3', 'layer4')
     """
-    usable = [name if name and names.count(name) == 1 and len(name) < 40 and name.isprintable() else "" for name in names]
+    usable = [
+        name if name and names.count(name) == 1 and len(name) < 40 and name.isprintable() else "" for name in names
+    ]
     return tuple(name or f"layer{place}" for place, name in enumerate(usable, 1))
 
 
@@ -120,7 +123,8 @@ def assemble(layers: Sequence[Layer], sensor: Input, voters: int, label: IntArra
     """
     order = in_order(layers)
     place = {INPUT: INPUT} | {old: new for new, old in enumerate(order)}
-    populations, projections = [], []
+    populations: list[Population] = []
+    projections = []
     for layer in (layers[index] for index in order):
         _require_neuron(layer)
         post = len(populations)

@@ -17,8 +17,9 @@ import numpy as np
 from compiler.errors import ModelError
 from compiler.fixedpoint import IntArray
 from compiler.frontends.assemble import Layer, assemble, unique_names
-from compiler.frontends.onnx_affine import as_affine, check
+from compiler.frontends.onnx_affine import check
 from compiler.frontends.onnx_file import BOOL, DOUBLE, Declared, Graph, Model, read_model
+from compiler.frontends.onnx_gates import as_affine
 from compiler.frontends.onnx_lif import Neurons, is_output, neurons_of
 from compiler.frontends.onnx_order import inner
 from compiler.frontends.onnx_run import run
@@ -103,7 +104,10 @@ def _network(model: Model, polarities: int | None, polarities_first: bool | None
     voters, label, counted = readout(table, found, outputs)
     sensor, positions, words = sensor_layout(found.shape, polarities=polarities, polarities_first=polarities_first)
     names = _names(model.graph, table, found)
-    double = next(declared.kind for declared in model.graph.inputs if declared.name == table.atoms[found.data].label) == DOUBLE
+    double = (
+        next(declared.kind for declared in model.graph.inputs if declared.name == table.atoms[found.data].label)
+        == DOUBLE
+    )
     layers = [
         Layer(
             name=names[index],
@@ -178,8 +182,8 @@ def _names(graph: Graph, table: Table, found: Unrolled) -> tuple[str, ...]:
                 continue
             seen.add(name)
             pending += makers[name].inputs
-        common = os.path.commonprefix(owners) if owners else []
-        names.append(common[-1] if common and not common[-1].isdecimal() else "")
+        shared = [words[0] for words in zip(*owners, strict=False) if len(set(words)) == 1]
+        names.append(shared[-1] if shared and not shared[-1].isdecimal() else "")
     return unique_names(names)
 
 
@@ -205,5 +209,7 @@ def _facts(
         if not n.strict:
             told += "; >= is read as > the next number below"
         facts.append(told)
-    ignored = [printable(atom.label) for index, atom in enumerate(table.atoms) if atom.kind == INPUT_ATOM and index not in used]
+    ignored = [
+        printable(atom.label) for index, atom in enumerate(table.atoms) if atom.kind == INPUT_ATOM and index not in used
+    ]
     return facts + ([f"inputs without effect on a spike: {', '.join(ignored)}"] if ignored else [])

@@ -16,21 +16,26 @@ from compiler.errors import ModelError
 from compiler.fixedpoint import FloatArray
 from compiler.frontends.onnx_elementwise import COMPARISONS, FLOATING, NUMBERS, POINTWISE
 from compiler.frontends.onnx_file import Array, Node
+from compiler.frontends.onnx_gates import (
+    NOT_AFFINE,
+    as_affine,
+    chosen,
+    compared,
+    is_binary,
+    multiplied,
+    scaled_by,
+    spread,
+)
 from compiler.frontends.onnx_linear import LINEAR, scatter_matrix
 from compiler.frontends.onnx_moves import MOVES, Operands
 from compiler.frontends.onnx_values import (
-    INPUT_ATOM,
-    MEMBRANE,
     SAMPLES,
-    SPIKE,
     Affine,
     Decision,
-    Point,
     Table,
     Value,
     added,
     diagonal,
-    one_each,
     picked,
     rows_of,
     scaled,
@@ -38,15 +43,36 @@ from compiler.frontends.onnx_values import (
 )
 from compiler.ir import Sparse
 
-NOT_AFFINE = "is not affine in its input; only affine operators between two spiking layers can become synapses"
 NO_LIF = "keeps a state that is no leaky integrate-and-fire neuron; only such neurons can be lowered"
 UNKNOWN = "is an operator that is not known here; write the layer with other operators"
 
 STATEFUL = ("GRU", "LSTM", "RNN")
-_SMOOTH = (
-    "ArgMax Celu Cos Elu Erf Gelu HardSigmoid HardSwish InstanceNormalization LayerNormalization LeakyRelu LogSoftmax "
-    "MaxPool Mish PRelu Selu Sin Softmax Softplus Softsign Tan TopK"
-).split()
+_SMOOTH = frozenset(
+    [
+        "ArgMax",
+        "Celu",
+        "Cos",
+        "Elu",
+        "Erf",
+        "Gelu",
+        "HardSigmoid",
+        "HardSwish",
+        "InstanceNormalization",
+        "LayerNormalization",
+        "LeakyRelu",
+        "LogSoftmax",
+        "MaxPool",
+        "Mish",
+        "PRelu",
+        "Selu",
+        "Sin",
+        "Softmax",
+        "Softplus",
+        "Softsign",
+        "Tan",
+        "TopK",
+    ]
+)
 """Operators that are not affine, known by name only, for a clear refusal."""
 
 CONSTANT = "is computed from constants by an operator that is not known here; fold constants before the export"
@@ -86,47 +112,22 @@ def apply(node: Node, table: Table, operands: Sequence[Value | None]) -> list[Va
             return [decided]
     values = [as_affine(table, operand) if isinstance(operand, Decision) else operand for operand in operands]
     varying = [place for place, operand in enumerate(values) if isinstance(operand, Affine)]
-    if node.op in COMPARISONS or node.op == "Sign":
-        return [_compared(node, table, values)]
-    if node.op == "Where" and 0 in varying:
-        return [_chosen(table, values)]
-    if node.op in ("ScatterElements", "ScatterND") and node.attributes.get("reduction", "none") == "add":
-        return [_scattered(node, table, values)]
-    if node.op in MOVES:
+    if node.op in MOVES and not (node.op == "Where" and 0 in varying) and node.attributes.get("reduction") != "add":
         return _moved(node, table, values)
+    return [_single(node, table, values, varying)]
+
+
+def _single(node: Node, table: Table, values: Sequence[Value | None], varying: list[int]) -> Value:
+    """The result of an operator that does not only move numbers."""
+    if node.op in COMPARISONS or node.op == "Sign":
+        return compared(node, table, values)
+    if node.op == "Where":
+        return chosen(table, values)
+    if node.op in ("ScatterElements", "ScatterND"):
+        return _scattered(node, table, values)
     if node.op in LINEAR:
-        return [_linear(node, table, values, varying)]
-    return [_elementwise(node, table, values, varying)]
-
-
-def as_affine(table: Table, value: Value) -> Affine:
-    """A value that varies as an affine one: a choice by a threshold becomes a multiple of the spikes.
-
-    Raises
-    ------
-    ModelError
-        If it has a third value at the threshold itself.
-    """
-    if isinstance(value, Affine):
-        return value
-    if isinstance(value, Decision):
-        low, equal, high = (array.ravel().astype(np.float64) for array in value.values)
-        strict = np.array_equal(equal, low)
-        if not strict and not np.array_equal(equal, high):
-            raise ModelError(
-                "takes a third value where the membrane equals the threshold; write the spike as u > theta or u >= theta"
-            )
-        spike = table.spike(value.point, strict=strict)
-        atom = table.atoms[spike]
-        return scaled_by(table.value(spike, value.shape), high - low, low, low + (high - low) * atom.sample)
-    array = np.asarray(value, np.float64)
-    return Affine(shape=array.shape, terms={}, bias=array.ravel(), sample=np.tile(array.ravel(), (SAMPLES, 1)))
-
-
-def scaled_by(value: Affine, factor: FloatArray, shift: FloatArray, sample: FloatArray) -> Affine:
-    """Each element times one constant plus another."""
-    times = value if np.all(factor == 1) else scaled(value, factor, sample)
-    return Affine(shape=value.shape, terms=times.terms, bias=times.bias + shift, sample=sample)
+        return _linear(node, table, values, varying)
+    return _elementwise(node, table, values, varying)
 
 
 def sampled(node: Node, table: Table, operands: Sequence[Value | None]) -> list[FloatArray]:
@@ -149,62 +150,6 @@ def _decided(node: Node, table: Table, operands: Sequence[Value | None]) -> Valu
     if results[0].shape != decision.shape:
         return None
     return Decision(point=decision.point, values=(results[0], results[1], results[2]))
-
-
-def _compared(node: Node, table: Table, values: Sequence[Value | None]) -> Value:
-    """A comparison of a membrane with a threshold, or its sign."""
-    first = values[0]
-    second = np.zeros(()) if node.op == "Sign" else values[1]
-    if isinstance(first, Affine) and isinstance(second, Affine):
-        raise ModelError("compares two values that both vary; only a fixed threshold can be lowered")
-    mirrored = not isinstance(first, Affine)
-    membrane, limit = (second, first) if mirrored else (first, second)
-    assert isinstance(membrane, Affine) and isinstance(limit, np.ndarray)
-    single = next(iter(membrane.terms), -1)
-    factor = diagonal(membrane.terms[single]) if len(membrane.terms) == 1 else None
-    if not factor or table.atoms[single].kind not in (MEMBRANE, INPUT_ATOM):
-        raise ModelError("compares what is not the membrane of a layer; only a membrane can be held against a threshold")
-    theta = (np.broadcast_to(limit, membrane.shape).ravel().astype(np.float64) - membrane.bias) / factor
-    key = ("point", single, theta.tobytes())
-    if key not in table.known:
-        table.points.append(Point(node=str(node), membrane=single, theta=theta))
-        table.known[key] = len(table.points) - 1
-    sides = [np.sign(factor) * side for side in (-1, 0, 1)]
-    if node.op == "Sign":
-        outcomes = [np.full(membrane.shape, side) for side in sides]
-    else:
-        compare = COMPARISONS[node.op]
-        outcomes = [np.full(membrane.shape, compare(0, s) if mirrored else compare(s, 0)) for s in sides]
-    return Decision(point=table.known[key], values=(outcomes[0], outcomes[1], outcomes[2]))
-
-
-def _chosen(table: Table, values: Sequence[Value | None]) -> Value:
-    """``Where(s, a, b) = b + s * (a - b)`` for a spike s."""
-    condition, one, other = values
-    assert isinstance(condition, Affine)
-    if not _is_binary(table, condition):
-        raise ModelError("chooses by what is neither a spike nor a constant; only spikes can choose")
-    shape = table.room(np.broadcast_shapes(*(np.shape(v) if isinstance(v, np.ndarray) else v.shape for v in values)))  # type: ignore[union-attr]
-    s, a, b = (_spread(as_affine(table, value), shape) for value in values)  # type: ignore[arg-type]
-    difference = added([(1.0, a), (-1.0, b)], shape, a.sample - b.sample)
-    product = _multiplied(table, s, difference, s.sample * difference.sample)
-    return added([(1.0, b), (1.0, product)], shape, b.sample + product.sample)
-
-
-def _is_binary(table: Table, value: Affine) -> bool:
-    if len(value.terms) != 1 or np.any(value.bias):
-        return False
-    ((atom, terms),) = value.terms.items()
-    single = one_each(terms)
-    return table.atoms[atom].binary and single is not None and bool(np.all(single[0] == 1))
-
-
-def _spread(value: Affine, shape: tuple[int, ...]) -> Affine:
-    """A value broadcast to a shape."""
-    if value.shape == shape:
-        return value
-    rows = np.broadcast_to(np.arange(size_of(value.shape)).reshape(value.shape), shape).ravel()
-    return picked(value, rows, shape, value.sample[:, rows])
 
 
 def _scattered(node: Node, table: Table, values: Sequence[Value | None]) -> Value:
@@ -267,10 +212,12 @@ def _rows_of_all(parts: list[Affine], rows: Array, total: int, sample: FloatArra
 def _linear(node: Node, table: Table, values: Sequence[Value | None], varying: list[int]) -> Value:
     matrix_of = LINEAR[node.op][1]
     if node.op == "Gemm" and 2 in varying:
-        bare = Node(name=node.name, op=node.op, inputs=node.inputs[:2], outputs=node.outputs, attributes=node.attributes)
+        bare = Node(
+            name=node.name, op=node.op, inputs=node.inputs[:2], outputs=node.outputs, attributes=node.attributes
+        )
         product = as_affine(table, apply(bare, table, values[:2])[0])
         sample = sampled(node, table, values)[0]
-        extra = _spread(as_affine(table, values[2]), product.shape)  # type: ignore[arg-type]
+        extra = spread(as_affine(table, values[2]), product.shape)  # type: ignore[arg-type]
         return added([(1.0, product), (node.attributes.get("beta", 1.0), extra)], product.shape, sample)
     if matrix_of is None or len(varying) != 1 or varying[0] not in LINEAR[node.op][2]:
         raise ModelError(NOT_AFFINE)
@@ -291,43 +238,48 @@ def _linear(node: Node, table: Table, values: Sequence[Value | None], varying: l
 def _elementwise(node: Node, table: Table, values: Sequence[Value | None], varying: list[int]) -> Value:
     op = node.op
     if op == "Cast" and varying == [0]:
-        value = values[0]
-        assert isinstance(value, Affine)
-        if int(node.attributes["to"]) in FLOATING or _is_binary(table, value):
-            return value
-        raise ModelError(f"rounds its input to whole numbers, which {NOT_AFFINE}")
+        return _cast(node, table, values[0])
     if op == "BatchNormalization" and varying == [0]:
         return _affine_map(node, table, values)
-    if op in ("Add", "Sub", "Sum", "Mean", "Neg", "Not", "Mul", "Div") and all(v is not None for v in values):
+    if op in ("Add", "Div", "Mean", "Mul", "Neg", "Not", "Sub", "Sum") and all(value is not None for value in values):
         shape = table.room(np.broadcast_shapes(*(v.shape for v in values)))  # type: ignore[union-attr]
-        parts = [_spread(as_affine(table, value), shape) for value in values]  # type: ignore[arg-type]
-        match op:
-            case "Mul" if len(varying) == 2:
-                return _multiplied(table, parts[0], parts[1], parts[0].sample * parts[1].sample)
-            case "Mul":
-                factor = parts[1 - varying[0]]
-                return scaled(parts[varying[0]], factor.bias, parts[0].sample * parts[1].sample)
-            case "Div" if varying == [0]:
-                # Division, not a product with the reciprocal: 1 / 3 is not a number.
-                value = parts[0]
-                divided = scaled(value, np.ones(len(value.bias)), value.sample / parts[1].sample)
-                for own in divided.terms.values():
-                    own.data = own.data / np.repeat(parts[1].bias, np.diff(own.indptr))
-                return Affine(
-                    shape=shape, terms=divided.terms, bias=value.bias / parts[1].bias, sample=divided.sample
-                )
-            case "Div":
-                raise ModelError(NOT_AFFINE)
-            case "Not":
-                if not _is_binary(table, parts[0]):
-                    raise ModelError(NOT_AFFINE)
-                return scaled_by(parts[0], np.array(-1.0) + parts[0].bias, np.array(1.0), 1 - parts[0].sample)
-        weights = {"Sub": [1.0, -1.0], "Neg": [-1.0], "Mean": [1 / len(parts)] * len(parts)}.get(op, [1.0] * len(parts))
-        total = sum(weight * part.sample for weight, part in zip(weights, parts, strict=True))
-        return added(list(zip(weights, parts, strict=True)), shape, np.asarray(total))
+        parts = [spread(as_affine(table, value), shape) for value in values]  # type: ignore[arg-type]
+        return _added(op, parts) if op in ("Add", "Mean", "Neg", "Sub", "Sum") else _scaled(op, table, parts, varying)
     if op in STATEFUL:
         raise ModelError(NO_LIF)
     raise ModelError(NOT_AFFINE if op in NUMBERS or op in _SMOOTH else UNKNOWN)
+
+
+def _cast(node: Node, table: Table, value: Value | None) -> Value:
+    assert isinstance(value, Affine)
+    if int(node.attributes["to"]) in FLOATING or is_binary(table, value):
+        return value
+    raise ModelError(f"rounds its input to whole numbers, so it {NOT_AFFINE}")
+
+
+def _added(op: str, parts: list[Affine]) -> Value:
+    weights = {"Sub": [1.0, -1.0], "Neg": [-1.0], "Mean": [1 / len(parts)] * len(parts)}.get(op, [1.0] * len(parts))
+    pairs = list(zip(weights, parts, strict=True))
+    return added(pairs, parts[0].shape, np.asarray(sum(weight * part.sample for weight, part in pairs)))
+
+
+def _scaled(op: str, table: Table, parts: list[Affine], varying: list[int]) -> Value:
+    value, other = parts[0], parts[-1]
+    match op:
+        case "Mul" if len(varying) == 2:
+            return multiplied(table, value, other, value.sample * other.sample)
+        case "Mul":
+            return scaled(parts[varying[0]], parts[1 - varying[0]].bias, value.sample * other.sample)
+        case "Div" if varying == [0]:
+            # Division, not a product with the reciprocal: 1 / 3 is not a number.
+            terms = {atom: own.copy() for atom, own in value.terms.items()}
+            for own in terms.values():
+                own.data = own.data / np.repeat(other.bias, np.diff(own.indptr))
+            quotient = value.sample / other.sample
+            return Affine(shape=value.shape, terms=terms, bias=value.bias / other.bias, sample=quotient)
+        case "Not" if is_binary(table, value):
+            return scaled_by(value, np.full(len(value.bias), -1.0), np.array(1.0), 1 - value.sample)
+    raise ModelError(NOT_AFFINE)
 
 
 def _affine_map(node: Node, table: Table, values: Sequence[Value | None]) -> Value:
@@ -338,49 +290,6 @@ def _affine_map(node: Node, table: Table, values: Sequence[Value | None]) -> Val
     shift = function(node, table, [np.zeros(value.shape), *values[1:]])[0].ravel()
     gain = (function(node, table, [np.full(value.shape, 2.0**20), *values[1:]])[0].ravel() - shift) / 2.0**20
     return scaled_by(value, gain, shift, sampled(node, table, values)[0])
-
-
-def _multiplied(table: Table, a: Affine, b: Affine, sample: FloatArray) -> Affine:
-    """A product of two values that vary: of a membrane with its spikes, or of two inputs that may be these."""
-    size = len(a.bias)
-    parts = []
-    for value, factor in ((a, b.bias), (b, a.bias)):
-        if np.any(factor):
-            linear = scaled(value, factor, sample)
-            parts.append(Affine(shape=a.shape, terms=linear.terms, bias=np.zeros(size), sample=sample))
-    for first, own in a.terms.items():
-        for second, other in b.terms.items():
-            one, two = one_each(own), one_each(other)
-            if one is None or two is None:
-                raise ModelError(NOT_AFFINE)
-            coefficient = one[0] * two[0]
-            if not np.any(coefficient):
-                continue
-            used = coefficient != 0
-            if np.any(one[1][used] != two[1][used]):
-                raise ModelError(NOT_AFFINE)
-            atom = _pair(table, first, second)
-            rows = np.flatnonzero(used)
-            terms = sparse.csr_array(
-                (coefficient[rows], (rows, one[1][rows])), shape=(size, table.atoms[atom].size)
-            )
-            parts.append(Affine(shape=a.shape, terms={atom: terms}, bias=np.zeros(size), sample=sample))
-    constant = Affine(shape=a.shape, terms={}, bias=a.bias * b.bias, sample=sample)
-    return added([(1.0, part) for part in [constant, *parts]], a.shape, sample)
-
-
-def _pair(table: Table, first: int, second: int) -> int:
-    """Atom of a product of two atoms, where it may be a reset."""
-    kinds = {table.atoms[first].kind, table.atoms[second].kind}
-    if first == second and table.atoms[first].binary:
-        return first
-    if kinds == {INPUT_ATOM} and first != second:
-        return table.product(first, second)
-    spike = first if table.atoms[first].kind == SPIKE else second
-    other = second if spike == first else first
-    if table.atoms[spike].kind == SPIKE and table.points[table.atoms[spike].of[0]].membrane == other:
-        return table.product(first, second)
-    raise ModelError(f"multiplies {table.atoms[first].label} by {table.atoms[second].label}, so it {NOT_AFFINE}")
 
 
 def check(table: Table, value: Affine) -> None:
@@ -406,4 +315,3 @@ def check(table: Table, value: Affine) -> None:
 
 TOLERANCE = 1e-9
 """Largest deviation from affinity, relative to the largest response, that rounding in float64 explains."""
-

@@ -1,4 +1,4 @@
-"""Operators on numbers element by element, for what a file computes from constants and for the three values of a spike."""
+"""Operators on numbers, element by element: on what a file computes from constants, and on the values of a spike."""
 
 from __future__ import annotations
 

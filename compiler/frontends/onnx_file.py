@@ -166,7 +166,7 @@ def read_model(path: Path) -> Model:
     ModelError
         If it is no ONNX file, or names, sizes, types or places in it cannot be right; the message lacks the path.
     """
-    from google.protobuf.message import DecodeError
+    from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
     from onnx import ModelProto
 
     if not path.is_file():
@@ -188,9 +188,7 @@ def read_model(path: Path) -> Model:
         )
     counted = [NODE_LIMIT]
     graph = _graph(proto.graph, content, counted, NESTING)
-    return Model(
-        graph=graph, opset=opset, producer=printable(proto.producer_name), sha256=content.digest.hexdigest()
-    )
+    return Model(graph=graph, opset=opset, producer=printable(proto.producer_name), sha256=content.digest.hexdigest())
 
 
 def _graph(proto: Any, content: _Content, left: list[int], nesting: int) -> Graph:
@@ -220,7 +218,9 @@ def _declared(proto: Any) -> Declared:
         which = dimension.WhichOneof("value")
         shape.append(None if which is None else getattr(dimension, which))
     if len(shape) > DIMENSIONS or any(isinstance(size, int) and size < 0 for size in shape):
-        raise ModelError(f"input {printable(proto.name)}: has an impossible shape {tuple(shape[:DIMENSIONS])}; {DAMAGED}")
+        raise ModelError(
+            f"input {printable(proto.name)}: has an impossible shape {tuple(shape[:DIMENSIONS])}; {DAMAGED}"
+        )
     return Declared(name=proto.name, kind=kind.elem_type, shape=tuple(shape))
 
 

@@ -92,9 +92,7 @@ def neurons_of(table: Table, outputs: Mapping[str, Affine]) -> list[Neurons]:
 
 def _read(table: Table, membrane: int, definition: Affine, outputs: Mapping[str, Affine]) -> Neurons | None:
     points = [index for index, point in enumerate(table.points) if point.membrane == membrane]
-    spikes = [
-        index for index, atom in enumerate(table.atoms) if atom.kind == SPIKE and atom.of[0] in points
-    ]
+    spikes = [index for index, atom in enumerate(table.atoms) if atom.kind == SPIKE and atom.of[0] in points]
     if not spikes:
         return None
     if len(points) > 1 or len(spikes) > 1:
@@ -106,8 +104,8 @@ def _read(table: Table, membrane: int, definition: Affine, outputs: Mapping[str,
         )
     terms = dict(definition.terms)
     previous, gate, beta = _carried(table, membrane, spikes[0], terms, outputs)
-    for atom in terms:
-        _require_current(table, atom, terms[atom], previous, membrane)
+    for atom, weight in terms.items():
+        _require_current(table, atom, weight, previous, membrane)
     return Neurons(
         membrane=membrane,
         node=table.nodes[membrane],
@@ -140,15 +138,17 @@ def _carried(
     gate = pair[0] if pair[1] == previous else pair[1]
     beta, removed = _decay(terms.pop(previous)), _decay(terms.pop(products[0]))
     if beta is None or removed is None:
-        raise ModelError(f"mixes or weighs the neurons of {printable(table.atoms[previous].label)} differently; {RESET}")
+        raise ModelError(
+            f"mixes or weighs the neurons of {printable(table.atoms[previous].label)} differently; {RESET}"
+        )
     if abs(beta + removed) > EQUAL * max(abs(beta), abs(removed)):
         raise ModelError(f"keeps {beta:g} of a membrane and {beta + removed:g} of it after a spike; {RESET}")
     if table.atoms[gate].kind == SPIKE:
         _require_same_threshold(table, previous, gate, spike)
     if table.atoms[previous].kind == INPUT_ATOM:
-        _require_output(table, outputs, {membrane: 1.0}, f"membrane of {printable(table.atoms[previous].label)}")
+        _require_output(outputs, {membrane: 1.0}, f"membrane of {printable(table.atoms[previous].label)}")
         if table.atoms[gate].kind == INPUT_ATOM:
-            _require_output(table, outputs, {spike: 1.0}, f"spikes of {printable(table.atoms[gate].label)}")
+            _require_output(outputs, {spike: 1.0}, f"spikes of {printable(table.atoms[gate].label)}")
     return previous, gate if table.atoms[gate].kind == INPUT_ATOM else None, beta
 
 
@@ -168,11 +168,7 @@ def _already_reset(
 ) -> tuple[int | None, None, float | None]:
     """A state input that holds the membrane after its reset, so that nothing is reset at its use."""
     pair = table.known.get((PRODUCT, min(membrane, spike), max(membrane, spike)))
-    states = [
-        atom
-        for atom in terms
-        if table.atoms[atom].kind == INPUT_ATOM and _decay(terms[atom]) is not None
-    ]
+    states = [atom for atom in terms if table.atoms[atom].kind == INPUT_ATOM and _decay(terms[atom]) is not None]
     factors = [] if pair is None else [
         factor
         for output in outputs.values()
@@ -202,7 +198,7 @@ def is_output(outputs: Mapping[str, Affine], wanted: Mapping[int, float]) -> str
     return next((name for name, value in outputs.items() if _multiple(value, wanted) == 1), None)
 
 
-def _require_output(table: Table, outputs: Mapping[str, Affine], wanted: Mapping[int, float], what: str) -> None:
+def _require_output(outputs: Mapping[str, Affine], wanted: Mapping[int, float], what: str) -> None:
     if is_output(outputs, wanted) is None:
         raise ModelError(f"takes the {what} as a state, and no output gives it back; add it to the outputs")
 

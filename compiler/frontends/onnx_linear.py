@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import string
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from scipy import sparse
@@ -32,7 +33,7 @@ def _matrix(out: Array, place: Array, weight: Array, shape: tuple[int, int]) -> 
 
 def _contract(table: Table, spelled: str, place: Array, weight: Array, columns: int) -> Sparse:
     """Matrix of ``einsum("place,weight->out")``; `place` holds positions of the operand, -1 for none."""
-    (left, right), out = spelled.split("->")[0].split(","), spelled.split("->")[1]
+    (left, right), out = spelled.split("->", maxsplit=1)[0].split(","), spelled.split("->")[1]
     if any(len(set(labels)) != len(labels) for labels in (left, right, out)) or not set(out) <= set(left + right):
         raise ValueError("a sum that is not known")
     every = out + "".join(sorted(set(left + right) - set(out)))
@@ -47,8 +48,7 @@ def _contract(table: Table, spelled: str, place: Array, weight: Array, columns: 
         order = sorted(range(len(labels)), key=lambda axis: every.index(labels[axis]))
         return array.transpose(order).reshape([sizes[label] if label in labels else 1 for label in every])
 
-    shape = [sizes[label] for label in out]
-    target = np.arange(size_of(shape)).reshape(shape)
+    target = np.arange(size_of([sizes[label] for label in out])).reshape([sizes[label] for label in out])
     return _matrix(spread(target, out), spread(place, left), spread(weight, right), (target.size, columns))
 
 
@@ -127,7 +127,13 @@ def _reduce_axes(node: Node, operands: Operands) -> tuple[int, ...]:
 
 
 def _reduce(node: Node, _table: Table, operands: Operands) -> list[Array]:
-    reduce = {"ReduceSum": np.sum, "ReduceMean": np.mean, "ReduceMax": np.max, "ReduceMin": np.min, "ReduceProd": np.prod}
+    reduce: dict[str, Callable[..., Any]] = {
+        "ReduceSum": np.sum,
+        "ReduceMean": np.mean,
+        "ReduceMax": np.max,
+        "ReduceMin": np.min,
+        "ReduceProd": np.prod,
+    }
     kept = bool(node.attributes.get("keepdims", 1))
     return [np.asarray(reduce[node.op](operands[0], axis=_reduce_axes(node, operands), keepdims=kept))]
 
@@ -155,7 +161,12 @@ def _windows(node: Node, table: Table, data: Array, kernel: Sequence[int], filli
     padded = np.pad(data, sides, constant_values=filling)
     reach = [(k - 1) * d + 1 for k, d in zip(kernel, dilations, strict=True)]
     view = np.lib.stride_tricks.sliding_window_view(padded, reach, axis=tuple(range(2, data.ndim)))
-    step = [slice(None), slice(None), *(slice(None, None, s) for s in strides), *(slice(None, None, d) for d in dilations)]
+    step = [
+        slice(None),
+        slice(None),
+        *(slice(None, None, s) for s in strides),
+        *(slice(None, None, d) for d in dilations),
+    ]
     view = view[tuple(step)]
     table.room(view.shape)
     return view

@@ -77,7 +77,7 @@ def _element_index(indices: Array, shape: tuple[int, ...], axis: int) -> tuple[A
     """Where each element of `indices` points to, as an index of a tensor of that shape."""
     if indices.ndim != len(shape) or np.any(indices < -shape[axis]) or np.any(indices >= shape[axis]):
         raise IndexError("indices outside the tensor")
-    grid = list(np.indices(indices.shape, sparse=True))
+    grid: list[Array] = list(np.indices(indices.shape, sparse=True))
     grid[axis] = np.where(indices < 0, indices + shape[axis], indices)
     return tuple(np.broadcast_arrays(*grid))
 
@@ -102,12 +102,12 @@ def _slice(node: Node, _table: Table, operands: Operands) -> list[Array]:
     axes = range(len(starts)) if axes is None else axes
     steps = [1] * len(starts) if steps is None else steps
     cut = [slice(None)] * data.ndim
-    for start, end, axis, step in zip(starts, ends, axes, steps, strict=True):
-        start, end, step = int(start), int(end), int(step)
+    for bounds in zip(starts, ends, axes, steps, strict=True):
+        start, end, axis, step = (int(bound) for bound in bounds)
         # Counting down to before the first element is written as a far negative end.
-        below = step < 0 and end < -data.shape[int(axis)]
-        cut[int(axis)] = slice(start, None if below else end, step)
-    return [data[tuple(cut)]]
+        below = step < 0 and end < -data.shape[axis]
+        cut[axis] = slice(start, None if below else end, step)
+    return [np.asarray(data[tuple(cut)])]
 
 
 def _split(node: Node, _table: Table, operands: Operands) -> list[Array]:
@@ -159,7 +159,7 @@ def _pad(node: Node, table: Table, operands: Operands) -> list[Array]:
 
 def _where(_node: Node, table: Table, operands: Operands) -> list[Array]:
     table.room(np.broadcast_shapes(*(operand.shape for operand in operands)))
-    return [np.where(*operands)]
+    return [np.asarray(np.where(*operands))]
 
 
 def scatter_place(node: Node, operands: Operands) -> tuple[Array, ...]:

@@ -30,6 +30,16 @@ def reads(node: Node) -> tuple[str, ...]:
     return tuple(found)
 
 
+def _makers(graph: Graph) -> dict[str, Node]:
+    makers: dict[str, Node] = {}
+    for node in graph.nodes:
+        for name in node.outputs:
+            if name and name in makers:
+                raise ModelError(f"{node}: makes {printable(name)} again, each value is made once; export it again")
+            makers[name] = node
+    return makers
+
+
 def ordered(graph: Graph, known: Container[str]) -> list[Node]:
     """Operators that the outputs need, each after those that it needs itself; `known` are values from outside.
 
@@ -38,12 +48,7 @@ def ordered(graph: Graph, known: Container[str]) -> list[Node]:
     ModelError
         If a value is made twice, not at all, or from itself.
     """
-    makers: dict[str, Node] = {}
-    for node in graph.nodes:
-        for name in node.outputs:
-            if name and name in makers:
-                raise ModelError(f"{node}: makes {printable(name)} again, each value is made once; export it again")
-            makers[name] = node
+    makers = _makers(graph)
     order: list[Node] = []
     state: dict[int, bool] = {}  # by operator: False while those that it needs are being placed, True once it is
     for output in graph.outputs:

@@ -39,7 +39,9 @@ def run(graph: Graph, outer: Mapping[str, Value], given: Mapping[str, Value], ta
     """
     values: dict[str, Value] = {**outer, **graph.constants, **given}
     order = ordered(graph, values)
-    held = membranes(order, graph.outputs, {name for name, value in values.items() if not isinstance(value, np.ndarray)})
+    held = membranes(
+        order, graph.outputs, {name for name, value in values.items() if not isinstance(value, np.ndarray)}
+    )
     last = {name: index for index, node in enumerate(order) for name in reads(node)}
     for index, node in enumerate(order):
         try:
@@ -77,22 +79,28 @@ def _evaluate(node: Node, values: Mapping[str, Value], table: Table) -> list[Val
     operands = [values[name] if name else None for name in node.inputs]
     match node.op:
         case "Constant":
-            return [_constant(node)]
-        case "Shape":
-            shape = np.array(np.shape(operands[0]) if isinstance(operands[0], np.ndarray) else operands[0].shape, np.int64)  # type: ignore[union-attr]
-            return [shape[node.attributes.get("start", 0) : node.attributes.get("end", len(shape))]]
-        case "Size":
-            return [np.array(size_of(operands[0].shape))]  # type: ignore[union-attr]
+            results: list[Value] = [_constant(node)]
+        case "Shape" | "Size":
+            shape = np.array(_present(operands[0]).shape, np.int64)
+            cut = shape[node.attributes.get("start", 0) : node.attributes.get("end", len(shape))]
+            results = [cut if node.op == "Shape" else np.array(size_of(_present(operands[0]).shape))]
         case "If":
-            branch = node.attributes["then_branch" if _truth(operands[0]) else "else_branch"]
-            return run(branch, values, {}, table)
+            results = run(node.attributes["then_branch" if _truth(operands[0]) else "else_branch"], values, {}, table)
         case "Loop":
-            return _loop(node, values, operands, table)
+            results = _loop(node, values, operands, table)
         case "Scan":
-            return _scan(node, values, operands, table)
-    if inner(node):
-        raise ModelError("holds a graph; only If, Loop and Scan may")
-    return apply(node, table, operands)
+            results = _scan(node, values, operands, table)
+        case _ if inner(node):
+            raise ModelError("holds a graph; only If, Loop and Scan may")
+        case _:
+            results = apply(node, table, operands)
+    return results
+
+
+def _present(value: Value | None) -> Value:
+    if value is None:
+        raise ModelError("lacks an operand; export it again")
+    return value
 
 
 def _constant(node: Node) -> Array:

@@ -1,4 +1,4 @@
-"""Group the neurons of a graph into layers: those of one step as they are, those of several steps by what carries on."""
+"""Group the neurons of a graph into layers: of one step as they are, of several steps by what carries on."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def group(table: Table, neurons: Sequence[Neurons], shapes: Mapping[int, tuple[i
     shape, positions = _time(table, layers, data, shapes[data])
     sources: list[dict[int, Sparse]] = []
     bias = []
-    for index, layer in enumerate(layers):
+    for layer in layers:
         every = [
             _sources(table, n, step, step_of, data, positions[step] if positions is not None else None)
             for step, n in enumerate(layer)
@@ -76,9 +76,9 @@ def group(table: Table, neurons: Sequence[Neurons], shapes: Mapping[int, tuple[i
             _require_like(layer, step, every)
         sources.append(every[0])
         bias.append(layer[0].bias)
-        if not layer[-1].beta and layer[-1].beta is None:
+        if layer[-1].beta is None:
             raise ModelError(
-                f"{layers[index][0].node}: keeps no membrane from step to step, so its decay is unknown; export one "
+                f"{layer[0].node}: keeps no membrane from step to step, so its decay is unknown; export one "
                 "step with its state as inputs and outputs, or at least two steps"
             )
     return Unrolled(
@@ -185,7 +185,9 @@ def _sources(
         if atom == data:
             found[INPUT] = weight if positions is None else weight[:, positions]
         elif atom not in step_of:
-            raise ModelError(f"{n.node}: takes {printable(table.atoms[atom].label)}, which is no spike of a layer; {RESET}")
+            raise ModelError(
+                f"{n.node}: takes {printable(table.atoms[atom].label)}, which is no spike of a layer; {RESET}"
+            )
         else:
             layer, when = step_of[atom]
             if when != step:
@@ -215,7 +217,7 @@ def _require_like(layer: list[Neurons], step: int, every: list[dict[int, Sparse]
     )
     if not same:
         raise ModelError(
-            f"{this.node}: step {step} differs from step 0 in weights, bias, decay or threshold; every step must be the "
+            f"{this.node}: step {step} differs from step 0 in weights, bias, decay or threshold; all steps must be the "
             "same, from a state of zero"
         )
 

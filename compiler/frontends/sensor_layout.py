@@ -70,7 +70,9 @@ def sensor_layout(
         return _table(sizes, shown, polarities, polarities_first)
     if len(sizes) == 1:
         return _flat(sizes[0], shown, polarities, polarities_first)
-    raise ModelError(f"the input {shown} is none of [taxels, polarities], flat, [polarities, height, width]; reshape it")
+    raise ModelError(
+        f"the input {shown} is none of [taxels, polarities], flat, [polarities, height, width]; reshape it"
+    )
 
 
 def _image(sizes: list[int], shown: str, polarities: int | None, first: bool | None) -> tuple[Input, IntArray, str]:
@@ -80,7 +82,7 @@ def _image(sizes: list[int], shown: str, polarities: int | None, first: bool | N
         fits = [axis for axis in fits if (axis == 0) == first]
     if not fits:
         raise ModelError(
-            f"the input {shown} has no axis of {count} polarities where it is asked for; tell how many with --polarities"
+            f"the input {shown} has no axis of {count} polarities where they should be; tell how many with --polarities"
         )
     axis = fits[0]
     grid = np.moveaxis(np.arange(np.prod(sizes)).reshape(sizes), axis, -1)
@@ -94,9 +96,9 @@ def _table(sizes: list[int], shown: str, polarities: int | None, first: bool | N
     if first is not None:
         fits = [0 if first else 1] if polarities is None else [axis for axis in fits if (axis == 0) == first]
     if len(fits) != 1:
-        found = "both axes could be" if fits else "no axis is"
+        which = "both axes could be" if fits else "no axis is"
         raise ModelError(
-            f"the input {shown}: {found} the polarities; tell with --polarities N and --polarities-first or -last"
+            f"the input {shown}: {which} the polarities; tell with --polarities N and --polarities-first or -last"
         )
     grid = np.arange(sizes[0] * sizes[1]).reshape(sizes)
     return _told(grid.T if fits[0] == 0 else grid, "[polarities, taxels]" if fits[0] == 0 else "[taxels, polarities]")
@@ -106,7 +108,7 @@ def _flat(size: int, shown: str, polarities: int | None, first: bool | None) -> 
     count = polarities or POLARITIES
     if size % count:
         raise ModelError(
-            f"the input {shown} is not a whole number of taxels with {count} polarities; tell how many with --polarities"
+            f"the input {shown} is no whole number of taxels with {count} polarities; tell how many with --polarities"
         )
     grid = np.arange(size).reshape((count, -1) if first else (-1, count))
     assumed = "" if polarities else f"; {count} polarities are assumed"
