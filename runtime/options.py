@@ -122,7 +122,7 @@ def cores_asked(words: str | None) -> dict[str, int] | None:
 
 def add_compile(sub: argparse.ArgumentParser) -> None:
     """Add the options of a compilation."""
-    sub.add_argument("checkpoint", metavar="CKPT|NET.onnx")
+    sub.add_argument("checkpoint", help="checkpoint, or a network as an ONNX file")
     add_network(sub)
     sub.add_argument("--against", metavar="NET.loom", help="list the weights that differ from another netlist's")
     sub.add_argument("--target", default="loihi1", help="chip (default: loihi1)")

@@ -34,7 +34,7 @@ def _makers(graph: Graph) -> dict[str, Node]:
     makers: dict[str, Node] = {}
     for node in graph.nodes:
         for name in node.outputs:
-            if name and name in makers:
+            if name and (name in makers or name in graph.constants):
                 raise ModelError(f"{node}: makes {printable(name)} again, each value is made once; export it again")
             makers[name] = node
     return makers

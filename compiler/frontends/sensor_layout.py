@@ -58,8 +58,8 @@ def sensor_layout(
     sizes = list(shape)
     while len(sizes) > 3 and sizes[0] == 1:
         sizes.pop(0)
-    # What is left of [1, 39, 2] is a batch's axis, of [1, 8, 8] one polarity of an image.
-    while len(sizes) > 1 and sizes[0] == 1 and (len(sizes) < 3 or (len(shape) == 3 and sizes[2] == (polarities or 2))):
+    # The 1 of [1, 39, 2] is a batch's axis, of [1, 8, 8] one polarity of an image.
+    while len(sizes) > 1 and sizes[0] == 1 and (len(sizes) < 3 or (len(shape) == 3 and (polarities or 2) in sizes[1:])):
         sizes.pop(0)
     shown = f"[{', '.join(map(str, shape))}]"
     if not sizes or min(sizes) < 1:
