@@ -77,8 +77,10 @@ def read_onnx(
         If there are no such polarities.
     """
     try:
-        model = read_model(Path(path))
-        return _network(model, polarities, polarities_first)
+        # A constant may divide by zero on its way, as degrees of lonely taxels do; what counts is checked at the end.
+        with np.errstate(all="ignore"):
+            model = read_model(Path(path))
+            return _network(model, polarities, polarities_first)
     except ModelError as error:
         raise ModelError(f"{path}: {error}") from error
 

@@ -303,10 +303,8 @@ def check(table: Table, value: Affine) -> None:
     affine = np.tile(value.bias, (SAMPLES, 1))
     for atom, own in value.terms.items():
         affine += (own @ table.atoms[atom].sample.T).T
-    with np.errstate(all="ignore"):
-        worst = np.abs(value.sample - affine).max(axis=1, initial=0) / np.maximum(
-            np.abs(affine).max(axis=1, initial=0), 1e-300
-        )
+    largest = np.maximum(np.abs(affine).max(axis=1, initial=0), 1e-300)
+    worst = np.abs(value.sample - affine).max(axis=1, initial=0) / largest
     if not np.all(np.isfinite(affine)):
         raise ModelError("has coefficients that are not finite; train it again")
     if not np.all(worst <= TOLERANCE):

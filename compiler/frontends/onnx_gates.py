@@ -70,8 +70,8 @@ def compared(node: Node, table: Table, values: Sequence[Value | None]) -> Value:
         raise ModelError("compares two values that both vary; only a fixed threshold can be lowered")
     mirrored = not isinstance(first, Affine)
     membrane, limit = (second, first) if mirrored else (first, second)
-    assert isinstance(membrane, Affine)
-    assert isinstance(limit, np.ndarray)
+    if not isinstance(membrane, Affine) or not isinstance(limit, np.ndarray):
+        raise ModelError("lacks an operand; export it again")
     single = next(iter(membrane.terms), -1)
     factor = diagonal(membrane.terms[single]) if len(membrane.terms) == 1 else None
     if not factor or table.atoms[single].kind not in (MEMBRANE, INPUT_ATOM):

@@ -18,6 +18,7 @@ from scipy import sparse
 from compiler.errors import ModelError
 from compiler.fixedpoint import FloatArray, IntArray
 from compiler.frontends.onnx_file import Array
+from compiler.frontends.tensors import printable
 from compiler.ir import Sparse
 
 SAMPLES = 4
@@ -26,7 +27,10 @@ SAMPLES = 4
 VALUE_LIMIT = 2**24
 """Elements of a value, and coefficients of an operator: more than the synapses of a chip."""
 
-WORK_LIMIT = 2**31
+ATOM_LIMIT = 2**20
+"""Elements of an input, over all steps, or of a layer."""
+
+WORK_LIMIT = 2**30
 """Elements and coefficients of all values together; bounds the time that a file can take."""
 
 NODE_WORK = 2**14
@@ -175,7 +179,11 @@ class Table:
         strict: bool = True,
         sample: FloatArray | None = None,
     ) -> int:
-        """Add an atom; its random numbers are drawn unless they are given."""
+        """Add an atom, if there may be one of that size; its random numbers are drawn unless they are given."""
+        if size > ATOM_LIMIT:
+            raise ModelError(
+                f"{printable(label)} has {size} elements, allowed are {ATOM_LIMIT}; no chip holds such a layer"
+            )
         if sample is None:
             rng = np.random.default_rng((self.seed, len(self.atoms)))
             sample = rng.normal(size=(SAMPLES, size)) * 10.0 ** np.arange(-1, SAMPLES - 1)[:, None]
