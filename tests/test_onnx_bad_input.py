@@ -323,8 +323,8 @@ def test_data_beside_the_file_that_is_right(tmp_path):
 
 
 def test_a_file_above_the_limit(refusal, monkeypatch):
-    monkeypatch.setattr(onnx_file, "SIZE_LIMIT", 1000)
-    assert refusal(two_layers()) == "more than 1000 bytes, the limit of a network; export a smaller one"
+    monkeypatch.setattr(onnx_file, "SIZE_LIMIT", 100)
+    assert refusal(two_layers()) == "more than 100 bytes, the limit of a network; export a smaller one"
 
 
 def test_no_file(refusal):
