@@ -104,7 +104,7 @@ def test_loops_are_unrolled(read, content):
 
 def test_what_is_told_of_a_step(read):
     assert read(two_layers()).facts == (
-        "hand, operators of version 20: one step, state in and out",
+        "hand, operators of version 20: one step, state in and out from zero",
         "input x: 2 taxels, 2 polarities, as flat, channel = taxel * polarities + polarity; 2 polarities are assumed",
         "layer layer1: 3 neurons, decay 0.2, fires at u > 0.5, membrane u0 -> u0_new",
         "layer layer2: 2 neurons, decay 0.2, fires at u > 0.5, membrane u1 -> u1_new",

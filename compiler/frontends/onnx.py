@@ -27,7 +27,7 @@ from compiler.frontends.onnx_steps import Unrolled, group, readout
 from compiler.frontends.onnx_values import INPUT_ATOM, Affine, Table
 from compiler.frontends.sensor_layout import sensor_layout
 from compiler.frontends.tensors import printable
-from compiler.ir import INPUT, Network
+from compiler.ir import INPUT, Network, Sparse
 
 SUFFIX = ".onnx"
 
@@ -106,10 +106,7 @@ def _network(model: Model, polarities: int | None, polarities_first: bool | None
     voters, label, counted = readout(table, found, outputs)
     sensor, positions, words = sensor_layout(found.shape, polarities=polarities, polarities_first=polarities_first)
     names = _names(model.graph, table, found)
-    double = (
-        next(declared.kind for declared in model.graph.inputs if declared.name == table.atoms[found.data].label)
-        == DOUBLE
-    )
+    double = any(declared.kind == DOUBLE for declared in model.graph.inputs)
     layers = [
         Layer(
             name=names[index],
@@ -148,10 +145,10 @@ def _fixed(declared: Declared, graph: Graph, facts: list[str], *, loops: bool) -
     return tuple(shape)
 
 
-def _columns(weight: Affine, positions: IntArray) -> Affine:
-    taken = weight[:, positions]  # type: ignore[index]
+def _columns(weight: Sparse, positions: IntArray) -> Sparse:
+    taken = weight[:, positions]
     taken.sort_indices()
-    return taken  # type: ignore[no-any-return]
+    return taken
 
 
 def _threshold(neurons: Neurons, *, double: bool) -> float:
@@ -194,7 +191,7 @@ def _facts(
 ) -> list[str]:
     """What a reader of the file would want to check."""
     steps = len(found.layers[0])
-    form = "one step, state in and out" if steps == 1 else f"{steps} steps unrolled"
+    form = "one step, state in and out from zero" if steps == 1 else f"{steps} steps unrolled"
     facts = [
         f"{model.producer or 'unknown producer'}, operators of version {model.opset}: {form}",
         f"input {printable(table.atoms[found.data].label)}: {words}",

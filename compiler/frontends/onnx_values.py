@@ -24,7 +24,7 @@ from compiler.ir import Sparse
 SAMPLES = 4
 """Random numbers in place of each atom's elements."""
 
-VALUE_LIMIT = 2**24
+VALUE_LIMIT, COEFFICIENT_LIMIT = 2**22, 2**24
 """Elements of a value, and coefficients of an operator: more than the synapses of a chip."""
 
 ATOM_LIMIT = 2**20
@@ -152,13 +152,11 @@ class Table:
     matrices: dict[tuple[object, ...], tuple[Sparse, FloatArray, list[Value]]] = field(default_factory=dict)
     done: int = 0
 
-    def room(self, shape: Sequence[int]) -> tuple[int, ...]:
-        """The shape itself, if a value of it may be made."""
+    def room(self, shape: Sequence[int], limit: int = VALUE_LIMIT) -> tuple[int, ...]:
+        """The shape itself, if a value of it, or an operator of so many coefficients, may be made."""
         size = math.prod(int(length) for length in shape)
-        if size > VALUE_LIMIT or any(length < 0 for length in shape):
-            raise ModelError(
-                f"makes {size} values or coefficients, allowed are {VALUE_LIMIT}; no chip holds such a network"
-            )
+        if size > limit or any(length < 0 for length in shape):
+            raise ModelError(f"makes {size} values or coefficients, allowed are {limit}; no chip holds such a network")
         self.spend(size)
         return tuple(int(length) for length in shape)
 
