@@ -14,11 +14,13 @@ from made_modules import NETS, at_a_tie, example_of, exported, one_step
 from made_onnx import (
     BIAS,
     FIRES,
+    RESTS,
     SECOND,
     STAGE,
     STATE_IN,
     STATE_OUT,
     WEIGHTS,
+    body,
     fire,
     looped,
     model,
@@ -245,6 +247,27 @@ def test_open_size_in_front_is_one_recording(read):
     found = read(one_step(net, example, input_names=["input"], dynamic_axes=axes))
     assert "the open size 'batch' is the batch's, read as 1" in found.facts
     assert compare(compile_module(net, example).integer, compile_network(found.network).integer).equal
+
+
+def test_open_time_of_a_loop_is_run_for_three_steps(read):
+    constants = RESTS | {"axis": np.array([1])}
+    scan = node(
+        "Scan",
+        "r0 r0 r1 r1 sequence",
+        "end0 end1 end2 end3 spikes",
+        body=body(),
+        num_scan_inputs=1,
+        scan_input_axes=[0],
+    )
+    count = [node("Cast", "spikes", "whole", to=6), node("ReduceSum", "whole axes", "votes", keepdims=0)]
+    nodes = [node("Unsqueeze", "events axis", "sequence"), scan, *count, node("ArgMax", "votes", "class", axis=1)]
+    found = read(model(nodes, [("events", ["time", 4])], ["class"], constants))
+    require_the_two_layers(found.network)
+    assert found.steps == 3
+    assert found.facts[:2] == (
+        "output class: the class of the largest of votes",
+        "the open size 'time' is time, read as 3 steps",
+    )
 
 
 @pytest.mark.parametrize(

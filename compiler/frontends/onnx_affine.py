@@ -15,13 +15,14 @@ from scipy import sparse
 from compiler.errors import ModelError
 from compiler.fixedpoint import FloatArray
 from compiler.frontends.onnx_elementwise import COMPARISONS, FLOATING, NUMBERS, POINTWISE
-from compiler.frontends.onnx_file import Array, Node
+from compiler.frontends.onnx_file import BOOL, Array, Node
 from compiler.frontends.onnx_gates import (
     NOT_AFFINE,
     as_affine,
     chosen,
     compared,
     is_binary,
+    is_whole,
     multiplied,
     scaled_by,
     spread,
@@ -252,7 +253,8 @@ def _elementwise(node: Node, table: Table, values: Sequence[Value | None], varyi
 
 def _cast(node: Node, table: Table, value: Value | None) -> Value:
     assert isinstance(value, Affine)
-    if int(node.attributes["to"]) in FLOATING or is_binary(table, value):
+    to = int(node.attributes["to"])
+    if to in FLOATING or (is_binary(table, value) if to == BOOL else is_whole(table, value)):
         return value
     raise ModelError(f"rounds its input to whole numbers, so it {NOT_AFFINE}")
 

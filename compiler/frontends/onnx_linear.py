@@ -240,6 +240,7 @@ LINEAR: Mapping[str, tuple[Numbers, Matrix | None, tuple[int, ...]]] = {
     "Gemm": (_gemm, _gemm_matrix, (0, 1)),
     "GlobalAveragePool": (_pool, _pool_matrix, (0,)),
     "MatMul": (_matmul, _matmul_matrix, (0, 1)),
+    "MatMulInteger": (_matmul, _matmul_matrix, (0, 1)),
     "ReduceMax": (_reduce, None, ()),
     "ReduceMean": (_reduce, _reduce_matrix, (0,)),
     "ReduceMin": (_reduce, None, ()),

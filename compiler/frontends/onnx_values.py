@@ -231,7 +231,7 @@ def picked(value: Affine, rows: IntArray, shape: tuple[int, ...], sample: FloatA
     """Elements of a value in another order, some of them perhaps not or several times."""
     return Affine(
         shape=shape,
-        terms={atom: rows_of(terms, rows) for atom, terms in value.terms.items()},
+        terms={atom: own for atom, terms in value.terms.items() if (own := rows_of(terms, rows)).nnz},
         bias=value.bias[rows],
         sample=sample,
     )
