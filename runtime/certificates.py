@@ -27,10 +27,11 @@ import numpy.typing as npt
 from compiler.fixedpoint import FloatArray, IntArray
 from compiler.frontends.checkpoint import Checkpoint
 from compiler.interpret import BATCH, DENORMAL, BoolArray, channels_last, cut
-from compiler.ir import IntegerNetwork
+from compiler.ir import INPUT, IntegerNetwork, Network
 from compiler.passes.bounds import prove_ranges
 from compiler.passes.expand import effective_weight, expand, hop_powers
 from runtime.tables import table
+from runtime.votes import readout_counts
 
 UNIT = 2.0**-24
 """Unit roundoff of float32."""
@@ -107,6 +108,10 @@ class _Layer:
         Roundings in a current, beside one for each input spike where `per_spike`.
     per_spike : bool
         Whether the current is one plain sum over input spikes; a product with a zero is exact and adds exactly.
+    beta, theta : float
+        Decay and threshold.
+    sources : tuple of int
+        Populations whose neurons lie side by side in the rows, ``INPUT`` among them.
     """
 
     weight: FloatArray
@@ -114,10 +119,16 @@ class _Layer:
     bias: FloatArray
     roundings: int
     per_spike: bool
+    beta: float
+    theta: float
+    sources: tuple[int, ...]
 
 
-def _layers(checkpoint: Checkpoint, adjacency: FloatArray) -> list[_Layer]:
-    network = expand(checkpoint, adjacency)
+def _layers(model: Checkpoint | Network, adjacency: FloatArray | None) -> list[_Layer]:
+    if isinstance(model, Network):
+        return [_plain(model, post) for post in range(len(model.populations))]
+    assert adjacency is not None, "a checkpoint has a graph"
+    checkpoint, network = model, expand(model, adjacency)
     hops = checkpoint.hops.astype(np.float64)
     # Hop after hop on its own, as the released operator does: its terms may cancel only after they were rounded.
     spelled = effective_weight(hop_powers(np.abs(adjacency), len(hops)), np.abs(hops))
@@ -134,9 +145,41 @@ def _layers(checkpoint: Checkpoint, adjacency: FloatArray) -> list[_Layer]:
                 bias=population.bias,
                 roundings=SPARE if post else SPARE + chain,
                 per_spike=post > 0,
+                beta=population.beta,
+                theta=population.theta,
+                sources=(projection.pre,),
             )
         )
     return layers
+
+
+def _plain(network: Network, post: int) -> _Layer:
+    """A layer whose current is the plain sum over its synapses, as the float stage of the compiler has it."""
+    into = [projection for projection in network.projections if projection.post == post]
+    weight = np.concatenate([projection.weight.toarray().T for projection in into])
+    population = network.populations[post]
+    return _Layer(
+        weight=weight,
+        magnitude=np.abs(weight).astype(np.float32),
+        bias=population.bias,
+        roundings=SPARE + len(into),
+        per_spike=True,
+        beta=population.beta,
+        theta=population.theta,
+        sources=tuple(projection.pre for projection in into),
+    )
+
+
+def _side_by_side(
+    sources: tuple[int, ...], part: BoolArray, done: list[tuple[BoolArray, BoolArray]]
+) -> tuple[BoolArray, BoolArray | None]:
+    """Certain and uncertain spikes of several populations as if they were one; the input is certain."""
+    if sources == (INPUT,):
+        return part, None
+    pairs = [(part, np.zeros_like(part)) if source == INPUT else done[source] for source in sources]
+    if len(pairs) == 1:
+        return pairs[0]
+    return np.concatenate([sure for sure, _ in pairs], axis=-1), np.concatenate([doubt for _, doubt in pairs], axis=-1)
 
 
 def _currents(layer: _Layer, certain: BoolArray, open_: BoolArray | None) -> tuple[FloatArray, npt.NDArray[np.float32]]:
@@ -201,16 +244,16 @@ def _recurrence(
 
 
 def float_certainty(
-    checkpoint: Checkpoint, adjacency: FloatArray, events: npt.NDArray[np.uint8]
+    model: Checkpoint | Network, adjacency: FloatArray | None, events: npt.NDArray[np.uint8]
 ) -> list[tuple[BoolArray, BoolArray]]:
     """Spikes of the float model that no order of summation can change, in float32 or finer.
 
     Parameters
     ----------
-    checkpoint : Checkpoint
-        Float model.
-    adjacency : (taxels, taxels) float64
-        Normalised propagation matrix.
+    model : Checkpoint or Network
+        Float model; a network sums over its synapses.
+    adjacency : (taxels, taxels) float64, or None
+        Normalised propagation matrix of a checkpoint.
     events : (samples, taxels, polarities, steps) uint8
         Recordings.
 
@@ -220,14 +263,14 @@ def float_certainty(
         One pair per layer, each (samples, steps, neurons) bool: entries that surely spike, and entries that may or
         may not. All others surely do not.
     """
-    layers = _layers(checkpoint, adjacency)
+    layers = _layers(model, adjacency)
     inputs = channels_last(events)
 
     def batch(part: BoolArray) -> list[tuple[BoolArray, BoolArray]]:
         done: list[tuple[BoolArray, BoolArray]] = []
         for layer in layers:
-            certain, doubt = done[-1] if done else (part, None)
-            done.append(_recurrence(checkpoint.beta, checkpoint.theta, *_currents(layer, certain, doubt)))
+            certain, doubt = _side_by_side(layer.sources, part, done)
+            done.append(_recurrence(layer.beta, layer.theta, *_currents(layer, certain, doubt)))
         return done
 
     parts = [inputs[start : start + BATCH] for start in range(0, len(inputs), BATCH)]
@@ -265,8 +308,8 @@ def wins(decisions: IntArray, least: IntArray, most: IntArray) -> BoolArray:
 
 
 def certify(
-    checkpoint: Checkpoint,
-    adjacency: FloatArray,
+    model: Checkpoint | Network,
+    adjacency: FloatArray | None,
     integer: IntegerNetwork,
     events: npt.NDArray[np.uint8],
     chip: Sequence[BoolArray],
@@ -279,10 +322,10 @@ def certify(
 
     Parameters
     ----------
-    checkpoint : Checkpoint
-        Float model.
-    adjacency : (taxels, taxels) float64
-        Normalised propagation matrix.
+    model : Checkpoint or Network
+        Float model; a network sums over its synapses.
+    adjacency : (taxels, taxels) float64, or None
+        Normalised propagation matrix of a checkpoint.
     integer : IntegerNetwork
         The chip's network.
     events : (samples, taxels, polarities, steps) uint8
@@ -299,7 +342,7 @@ def certify(
     neurons = [slice(None)] * len(chip) if kept is None else kept
     float_model = [
         (cut(certain[..., part], lengths), cut(doubt[..., part], lengths))
-        for part, (certain, doubt) in zip(neurons, float_certainty(checkpoint, adjacency, events), strict=True)
+        for part, (certain, doubt) in zip(neurons, float_certainty(model, adjacency, events), strict=True)
     ]
     steps = events.shape[3] * len(events) if lengths is None else int(lengths.sum())
     layers = {}
@@ -309,9 +352,8 @@ def certify(
         layers[population.name] = LayerCertificate(
             entries=entries, equal=entries - unknown - different, different=different
         )
-    certain, doubt = float_model[-1]
-    least = certain.sum(axis=1, dtype=np.int64)
-    most = least + doubt.sum(axis=1, dtype=np.int64)
+    votes = [readout_counts(integer.readout, integer.classes, each) for each in float_model[integer.readout.population]]
+    least, most = votes[0], votes[0] + votes[1]
     return Certificate(
         layers=layers,
         samples=len(events),

@@ -29,6 +29,7 @@ from models.evtouch import Recordings
 from models.graphs import CHOICES
 from models.grasps import SYNTHETIC
 from runtime import bits, decisions, explain, export, finetune, render, verdicts, watch, yardstick_command
+from runtime.asked import asked_network
 from runtime.compile_command import compile_netlist
 from runtime.data_commands import add_data_commands
 from runtime.inputs import (
@@ -36,13 +37,12 @@ from runtime.inputs import (
     asked_graph,
     graph_words,
     progress,
-    propagation,
     recordings,
     require_inspectable,
     require_place,
     version,
 )
-from runtime.options import add_compile, add_detail, add_model, add_recordings, add_training
+from runtime.options import add_compile, add_detail, add_model, add_network, add_recordings, add_training
 from runtime.tables import show
 
 Arguments = argparse.Namespace
@@ -132,24 +132,27 @@ def _verify(arguments: Arguments) -> Outcome:
             )
         required = parse_requirements(arguments.require)
     netlist = read_netlist(arguments.netlist)
-    checkpoint = asked_checkpoint(arguments.checkpoint, arguments)
-    name, adjacency = propagation(checkpoint, asked_graph(arguments), arguments.checkpoint)
+    asked = asked_network(arguments.checkpoint, arguments)
+    original = None if arguments.original is None else asked_network(arguments.original, arguments)
     data = _recordings(arguments, netlist, labels_for="verify")
     verdict = verify(
         netlist,
-        checkpoint,
-        adjacency,
+        asked.model,
+        asked.adjacency,
         data.events,
         data.labels,
         data.files,
-        original=None if arguments.original is None else asked_checkpoint(arguments.original, arguments),
+        original=None if original is None else original.model,
+        sha256=asked.sha256,
         spec_samples=arguments.spec_samples,
         lengths=data.lengths,
         progress=progress,
     )
-    compiled_for = netlist.provenance.get("graph", name)
-    if compiled_for != name:
-        sys.stderr.write(f"spikeloom: warning: the netlist was compiled for graph {compiled_for}, this is {name}\n")
+    compiled_for = netlist.provenance.get("graph", asked.graph)
+    if asked.graph not in (None, compiled_for):
+        sys.stderr.write(
+            f"spikeloom: warning: the netlist was compiled for graph {compiled_for}, this is {asked.graph}\n"
+        )
     levels = levels_of(verdict)
     missed = unmet(levels, required)
     return verdicts.verify_json(verdict, levels, missed), verdicts.verify_text, 1 if missed else 0
@@ -291,8 +294,8 @@ def build_parser() -> argparse.ArgumentParser:
 
     sub = command("verify", _verify, "compare chip and float model, spike for spike")
     sub.add_argument("netlist")
-    sub.add_argument("--checkpoint", required=True)
-    add_model(sub)
+    sub.add_argument("--checkpoint", required=True, metavar="CKPT|NET.onnx")
+    add_network(sub)
     add_recordings(sub)
     sub.add_argument(
         "--original", metavar="CKPT", help="float model for E2 and E3 (default: the weights of --checkpoint)"

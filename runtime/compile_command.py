@@ -1,26 +1,32 @@
-"""The command ``compile``: a checkpoint becomes a netlist."""
+"""The command ``compile``: a checkpoint or an ONNX file becomes a netlist."""
 
 from __future__ import annotations
 
 import argparse
 import sys
 from collections.abc import Callable
+from dataclasses import asdict
 from typing import Any
 
+from compiler.compare import WeightDifference, compare
 from compiler.errors import OptionError
 from compiler.frontends.checkpoint import Checkpoint
-from compiler.passes.expand import expand
+from compiler.lift import lift
 from compiler.passes.layout import require_goal
 from compiler.passes.quantize import Recipe
 from compiler.pipeline import compile_network
-from compiler.serialize import write_netlist
+from compiler.serialize import read_netlist, write_netlist
 from compiler.targets import load_target
 from compiler.text import text
 from runtime import render
-from runtime.inputs import asked_checkpoint, asked_graph, progress, propagation, recordings, require_place, version
+from runtime.asked import asked_network
+from runtime.inputs import progress, recordings, require_place, version
 from runtime.options import MARGIN, cores_asked
 
 Json = dict[str, Any]
+
+LISTED = 20
+"""Weights that differ from another netlist's which the text names; JSON has them all."""
 
 
 def compile_netlist(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
@@ -35,16 +41,17 @@ def compile_netlist(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json
     recipes = _recipes(arguments)
     cores_for = cores_asked(arguments.cores_for)
     require_goal(arguments.optimize, cores_for, chip, calibrated=arguments.calibrate is not None, chips=arguments.chips)
-    checkpoint = asked_checkpoint(arguments.checkpoint, arguments)
-    name, adjacency = propagation(checkpoint, asked_graph(arguments), arguments.checkpoint)
+    other = None if arguments.against is None else lift(read_netlist(arguments.against))
+    asked = asked_network(arguments.checkpoint, arguments)
+    checkpoint = asked.checkpoint
     training = None
     if arguments.calibrate is not None:
         progress("reading the recordings")
         training = recordings(
             arguments.calibrate,
             "train",
-            classes=checkpoint.classes,
-            taxels=checkpoint.taxels,
+            classes=asked.network.classes,
+            taxels=asked.network.input.taxels,
             bin_s=arguments.bin,
         ).events
     progress("compiling")
@@ -54,8 +61,8 @@ def compile_netlist(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json
             sys.stderr.write(text(artefact))
 
     compilation = compile_network(
-        expand(checkpoint, adjacency),
-        forms=checkpoint.forms,
+        asked.network,
+        forms=None if checkpoint is None else checkpoint.forms,
         target=arguments.target,
         recipes=recipes,
         spike_exact=arguments.spike_exact,
@@ -69,10 +76,12 @@ def compile_netlist(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json
         optimize=arguments.optimize,
         provenance={
             "spikeloom": version(),
-            "checkpoint_sha256": checkpoint.sha256,
-            "run": arguments.run,
-            "weights": checkpoint.weights,
-            "graph": name,
+            "checkpoint_sha256": asked.sha256,
+            **(
+                {"format": "onnx"}
+                if checkpoint is None
+                else {"run": arguments.run, "weights": checkpoint.weights, "graph": asked.graph}
+            ),
             **_storage(recipes, checkpoint),
             "spike_exact": arguments.spike_exact,
             "keep_all": arguments.keep_all,
@@ -87,7 +96,27 @@ def compile_netlist(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json
         after=dump,
     )
     report = render.compilation_json(compilation, write_netlist(compilation.netlist, arguments.output))
-    return report, render.compilation_text, 0
+    report |= {"facts": list(asked.facts)} if asked.facts else {}
+    if other is not None:
+        found = compare(lift(compilation.netlist), other)
+        report["against"] = {
+            "synapses": found.synapses,
+            "weights": [asdict(weight) for weight in found.weights],
+            "registers": list(found.registers),
+        }
+    return report, _text, 0
+
+
+def _text(report: Json) -> str:
+    """A compilation for people, with what was read from an ONNX file and what differs from another netlist."""
+    lines = [*report.get("facts", ()), *([""] if "facts" in report else []), render.compilation_text(report)]
+    if "against" in report:
+        weights, registers = report["against"]["weights"], report["against"]["registers"]
+        lines.append(f"against the other netlist: {len(weights)} of {report['against']['synapses']:,} weights differ")
+        lines += [f"  {WeightDifference(**weight)}" for weight in weights[:LISTED]]
+        lines += [f"  … and {len(weights) - LISTED} more, see --json"] if len(weights) > LISTED else []
+        lines += [f"  other registers in {layer}" for layer in registers]
+    return "\n".join(lines)
 
 
 def _numbers(text: str, option: str) -> list[int]:
@@ -114,9 +143,9 @@ def _recipes(arguments: argparse.Namespace) -> tuple[Recipe, ...] | None:
     return tuple(Recipe(bits=b, planes=p, groups=g) for b, p, g in zip(*columns, strict=True))
 
 
-def _storage(recipes: tuple[Recipe, ...] | None, checkpoint: Checkpoint) -> Json:
+def _storage(recipes: tuple[Recipe, ...] | None, checkpoint: Checkpoint | None) -> Json:
     """The same for the provenance of a netlist."""
-    if checkpoint.forms is not None:
+    if checkpoint is not None and checkpoint.forms is not None:
         return {"weight_bits": _one_or_list([form.bits for form in checkpoint.forms]), "fine_tuned": True}
     known = recipes or (Recipe(),)
     return {

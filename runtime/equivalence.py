@@ -25,7 +25,7 @@ from runtime.breakdowns import Breakdown, breakdowns
 from runtime.certificates import Certificate, certify
 from runtime.divergence import Divergence, first_divergence
 from runtime.trace import aligned, check_channels, heard
-from runtime.votes import class_counts
+from runtime.votes import class_counts, readout_counts
 
 LADDER = ("float64", "beta", "weights", "bias_threshold", "rounding", "saturation")
 """Deviations in the order in which they are added; the last one is the chip."""
@@ -119,8 +119,8 @@ class Verdict:
         return float(np.mean(self.float_predictions == self.chip_predictions))
 
 
-def require_match(netlist: Netlist, checkpoint: Checkpoint) -> None:
-    """Refuse a netlist and a checkpoint of different architecture.
+def require_match(netlist: Netlist, model: Checkpoint | Network) -> None:
+    """Refuse a netlist and a checkpoint or float network of different architecture.
 
     Raises
     ------
@@ -129,14 +129,19 @@ def require_match(netlist: Netlist, checkpoint: Checkpoint) -> None:
     """
     ours = {"taxels": netlist.taxels, "channels": netlist.polarities}
     ours |= {layer.name: layer.neurons for layer in netlist.layers}
-    theirs = {"taxels": checkpoint.taxels, "channels": checkpoint.hops.shape[2]}
-    theirs |= {"conv1": checkpoint.taxels * checkpoint.hops.shape[1]}
-    theirs |= {dense.name: len(dense.bias) for dense in checkpoint.dense}
+    what = "network" if isinstance(model, Network) else "checkpoint"
+    if isinstance(model, Network):
+        theirs = {"taxels": model.input.taxels, "channels": model.input.polarities}
+        theirs |= {population.name: population.size for population in model.populations}
+    else:
+        theirs = {"taxels": model.taxels, "channels": model.hops.shape[2]}
+        theirs |= {"conv1": model.taxels * model.hops.shape[1]}
+        theirs |= {dense.name: len(dense.bias) for dense in model.dense}
     if ours != theirs:
         sizes = [", ".join(f"{name} {neurons}" for name, neurons in side.items()) for side in (ours, theirs)]
         raise ModelError(
-            f"netlist and checkpoint disagree: the netlist has {sizes[0]}, the checkpoint {sizes[1]}; "
-            "give the checkpoint that the netlist was compiled from"
+            f"netlist and {what} disagree: the netlist has {sizes[0]}, the {what} {sizes[1]}; "
+            f"give the {what} that the netlist was compiled from"
         )
 
 
@@ -205,16 +210,69 @@ def _rows_scaled(weight: Sparse, factor: FloatArray) -> Sparse:
     return scaled
 
 
+def _spikes(
+    model: Checkpoint | Network, adjacency: FloatArray | None, events: npt.NDArray[np.uint8], dtype: str
+) -> list[BoolArray]:
+    """Float spikes of each layer: of a checkpoint in its own operator order, of a network as sums over synapses."""
+    from models.reference import float_spikes  # torch, so only here
+
+    if isinstance(model, Network):
+        return list(run_float(model, channels_last(events), dtype=np.dtype(dtype)).spikes)
+    assert adjacency is not None, "a checkpoint has a graph"
+    return list(float_spikes(model, adjacency, events, dtype=dtype).values())
+
+
+def _membranes(
+    model: Checkpoint | Network, adjacency: FloatArray | None, events: npt.NDArray[np.uint8]
+) -> list[npt.NDArray[np.floating]]:
+    """Membranes of each layer in float32, likewise."""
+    from models.reference import float_membranes  # torch, so only here
+
+    if isinstance(model, Network):
+        kept = run_float(model, channels_last(events), dtype=np.float32, membranes=True).membranes
+        assert kept is not None, "membranes were asked for"
+        return list(kept)
+    assert adjacency is not None, "a checkpoint has a graph"
+    return list(float_membranes(model, adjacency, events).values())
+
+
+def _tuned_spikes(
+    checkpoint: Checkpoint, adjacency: FloatArray | None, events: npt.NDArray[np.uint8]
+) -> list[BoolArray]:
+    """Spikes of each layer of a fine-tuned checkpoint's torch model, on chip integers."""
+    from models.quantised import quantised_spikes
+
+    assert adjacency is not None, "a checkpoint has a graph"
+    return list(quantised_spikes(checkpoint, adjacency, events).values())
+
+
+def _network(model: Checkpoint | Network, adjacency: FloatArray | None) -> Network:
+    """The float stage of a model."""
+    if isinstance(model, Network):
+        return model
+    assert adjacency is not None, "a checkpoint has a graph"
+    return expand(model, adjacency)
+
+
+def _from_this(netlist: Netlist, checkpoint: Checkpoint | Network, sha256: str | None) -> bool:
+    """Whether a netlist says that it was compiled from this file, and this epoch."""
+    made = netlist.provenance
+    if isinstance(checkpoint, Network):
+        return made.get("checkpoint_sha256") == sha256
+    return made.get("checkpoint_sha256") == checkpoint.sha256 and made.get("weights") == checkpoint.weights
+
+
 def verify(
     netlist: Netlist,
-    checkpoint: Checkpoint,
-    adjacency: FloatArray,
+    checkpoint: Checkpoint | Network,
+    adjacency: FloatArray | None,
     events: npt.NDArray[np.uint8],
     labels: IntArray,
     files: tuple[str, ...],
     *,
     lengths: IntArray | None = None,
-    original: Checkpoint | None = None,
+    original: Checkpoint | Network | None = None,
+    sha256: str | None = None,
     spec_samples: int = 3,
     progress: Callable[[str], None] | None = None,
 ) -> Verdict:
@@ -224,10 +282,10 @@ def verify(
     ----------
     netlist : Netlist
         Compiled network.
-    checkpoint : Checkpoint
-        What it was compiled from, or another checkpoint of the same architecture.
-    adjacency : (taxels, taxels) float64
-        Normalised propagation matrix of its graph.
+    checkpoint : Checkpoint or Network
+        What it was compiled from, or another of the same architecture.
+    adjacency : (taxels, taxels) float64, or None
+        Normalised propagation matrix of a checkpoint's graph.
     events : (samples, taxels, polarities, steps) uint8
         Recordings.
     labels : (samples,) int64
@@ -236,8 +294,10 @@ def verify(
         Their names.
     lengths : (samples,) int64, optional
         Steps of each recording where some are shorter than the array.
-    original : Checkpoint, optional
+    original : Checkpoint or Network, optional
         Float model to compare with; by default the weights of `checkpoint` itself.
+    sha256 : str, optional
+        Of the file that a network was read from; a checkpoint knows its own.
     spec_samples : int
         Recordings on which the specification runs beside the engine.
     progress : callable, optional
@@ -248,26 +308,24 @@ def verify(
     ModelError, DataError, NumericRangeError
         If the parts do not belong together, or a register of the chip overflows.
     """
-    from models.reference import float_membranes, float_spikes  # torch, so only here
-
     if not 1 <= spec_samples:
         raise DataError(f"--spec-samples {spec_samples}: at least 1 recording is needed; give a positive number")
     tell = progress or (lambda _part: None)
     model = checkpoint if original is None else original
     require_match(netlist, checkpoint)
     require_match(netlist, model)
-    network, integer = expand(model, adjacency), lift(netlist)
+    network, integer = _network(model, adjacency), lift(netlist)
     names = [layer.name for layer in netlist.layers]
     flat = events.reshape(len(events), -1, events.shape[3])
     check_channels(netlist, flat.shape[1])
 
     tell("float32 reference")
-    narrow = float_spikes(model, adjacency, events, dtype="float32")
+    narrow = _spikes(model, adjacency, events, "float32")
     kept = [heard(netlist, layer) for layer in range(len(names))]
-    reference = [cut(narrow[name], lengths)[..., keep] for name, keep in zip(names, kept, strict=True)]
+    reference = [cut(spikes, lengths)[..., keep] for spikes, keep in zip(narrow, kept, strict=True)]
     tell("float64 beside it")
-    double = float_spikes(model, adjacency, events, dtype="float64")
-    wide = [cut(double[name], lengths)[..., keep] for name, keep in zip(names, kept, strict=True)]
+    double = _spikes(model, adjacency, events, "float64")
+    wide = [cut(spikes, lengths)[..., keep] for spikes, keep in zip(double, kept, strict=True)]
 
     tell("chip")
     prepared = engine.prepare(netlist)
@@ -276,14 +334,12 @@ def verify(
     chip = [aligned(netlist, trace.spikes, layer)[..., keep] for layer, keep in enumerate(kept)]
 
     quantised_different = None
-    if checkpoint.forms is not None:
-        from models.quantised import quantised_spikes
-
+    if isinstance(checkpoint, Checkpoint) and checkpoint.forms is not None:
         tell("fine-tuned model")
-        tuned = quantised_spikes(checkpoint, adjacency, events)
+        tuned = _tuned_spikes(checkpoint, adjacency, events)
         quantised_different = sum(
-            int(np.count_nonzero(cut(tuned[name], lengths)[..., keep] != ours))
-            for name, keep, ours in zip(names, kept, chip, strict=True)
+            int(np.count_nonzero(cut(spikes, lengths)[..., keep] != ours))
+            for spikes, keep, ours in zip(tuned, kept, chip, strict=True)
         )
 
     tell("specification")
@@ -315,9 +371,11 @@ def verify(
         wide,
         flat,
         files,
-        lambda sample, layer: float_membranes(model, adjacency, events[sample : sample + 1])[names[layer]][0],
+        lambda sample, layer: _membranes(model, adjacency, events[sample : sample + 1])[layer][0],
     )
-    float_counts = reference[-1].sum(axis=1, dtype=np.int64)
+    if divergence is not None and isinstance(model, Network):
+        divergence = replace(divergence, taxel=None, feature=None)  # its neurons may lie in any order
+    float_counts = readout_counts(network.readout, network.classes, reference[network.readout.population])
     chip_counts = class_counts(netlist, trace.counts.spikes)
     compared_neurons = [np.arange(layer.neurons)[keep] for layer, keep in zip(netlist.layers, kept, strict=True)]
     tell("certificate")
@@ -342,10 +400,7 @@ def verify(
         spec_equals_engine=equal,
         first_divergence=divergence,
         ladder=tuple(ladder),
-        same_checkpoint=(
-            netlist.provenance.get("checkpoint_sha256") == checkpoint.sha256
-            and netlist.provenance.get("weights") == checkpoint.weights
-        ),
+        same_checkpoint=_from_this(netlist, checkpoint, sha256),
         quantised_different=quantised_different,
         breakdowns=breakdowns(
             names, reference, chip, compared_neurons, (float_counts, chip_counts), flat, files, lengths

@@ -17,18 +17,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from compiler.errors import DataError, OptionError
-from compiler.frontends.checkpoint import Checkpoint, read_checkpoint
+from compiler.frontends.checkpoint import Checkpoint
 from compiler.interpret import BoolArray, channels_last
 from compiler.ir import IntegerNetwork
 from compiler.lift import lift
 from compiler.netlist import Netlist
-from compiler.passes.expand import expand
 from compiler.serialize import read_netlist
 from models.evtouch import Recordings
 from runtime import causes
+from runtime.asked import Asked, asked_network
 from runtime.causes import Explanation, Observed, RootCause
-from runtime.inputs import asked_graph, propagation, recordings, shipped
-from runtime.options import add_model, add_recordings
+from runtime.inputs import recordings
+from runtime.options import add_network, add_recordings
 from runtime.suspects import BETA, BIAS, LEFT_OUT, SATURATION, THRESHOLD, TIE, TRUNCATION, WEIGHTS
 from runtime.tables import table
 from runtime.trace import aligned, check_channels
@@ -55,8 +55,8 @@ WIDTH = 116
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Describe the options of the command."""
     parser.add_argument("netlist", metavar="NET.loom")
-    parser.add_argument("--checkpoint", required=True)
-    add_model(parser)
+    parser.add_argument("--checkpoint", required=True, metavar="CKPT|NET.onnx")
+    add_network(parser)
     add_recordings(parser)
     parser.add_argument("--sample", metavar="FILE", help="recording to explain (default: the first that differs)")
     parser.add_argument("--top", type=int, default=10, metavar="N", help="roots to show (default: 10)")
@@ -77,16 +77,10 @@ def explain(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str],
     if arguments.top < 1:
         raise OptionError(f"--top {arguments.top}: at least 1 root can be shown; give a positive number")
     netlist = read_netlist(arguments.netlist)
-    checkpoint = read_checkpoint(
-        shipped(arguments.checkpoint),
-        run=arguments.run,
-        weights=arguments.weights,
-        beta=arguments.beta,
-        theta=arguments.theta,
-    )
-    require_match(netlist, checkpoint)
-    graph, adjacency = propagation(checkpoint, asked_graph(arguments), arguments.checkpoint)
-    _warn(netlist, checkpoint, graph)
+    asked = asked_network(arguments.checkpoint, arguments)
+    checkpoint, graph = asked.checkpoint, asked.graph
+    require_match(netlist, asked.model)
+    _warn(netlist, asked)
     limit = LIMIT if arguments.limit is None and arguments.sample is None else arguments.limit
     data = recordings(
         arguments.data,
@@ -99,7 +93,7 @@ def explain(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str],
     check_channels(netlist, data.events.shape[1] * data.events.shape[2])
     chosen = range(len(data)) if arguments.sample is None else [_index(data, arguments.sample)]
 
-    network, integer, prepared = expand(checkpoint, adjacency), lift(netlist), engine.prepare(netlist)
+    network, integer, prepared = asked.network, lift(netlist), engine.prepare(netlist)
     absent, unheard = left_out(netlist)
     found: Explanation | None = None
     index = 0
@@ -110,7 +104,9 @@ def explain(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str],
             integer,
             channels_last(events)[0],
             _observe(netlist, prepared, events),
-            convolution=(adjacency, checkpoint.hops.astype(np.float64)),
+            convolution=None
+            if checkpoint is None or asked.adjacency is None
+            else (asked.adjacency, checkpoint.hops.astype(np.float64)),
             may_compensate=bool(netlist.provenance.get("calibrated", True)),
             absent=absent,
             unheard=unheard,
@@ -131,14 +127,14 @@ def explain(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str],
     return report | explanation_json(found, integer, checkpoint, arguments.top), explanation_text, 0
 
 
-def _warn(netlist: Netlist, checkpoint: Checkpoint, graph: str) -> None:
+def _warn(netlist: Netlist, asked: Asked) -> None:
     """Say on stderr what the netlist remembers of its origin, where that is something else."""
-    made = netlist.provenance
+    made, checkpoint, graph = netlist.provenance, asked.checkpoint, asked.graph
     if made.get("graph", graph) != graph:
         sys.stderr.write(f"spikeloom: warning: the netlist was compiled for graph {made['graph']}, this is {graph}\n")
-    if made.get("checkpoint_sha256", checkpoint.sha256) != checkpoint.sha256:
+    if made.get("checkpoint_sha256", asked.sha256) != asked.sha256:
         sys.stderr.write("spikeloom: warning: the netlist was compiled from another checkpoint file\n")
-    elif made.get("weights", checkpoint.weights) != checkpoint.weights:
+    elif checkpoint is not None and made.get("weights", checkpoint.weights) != checkpoint.weights:
         sys.stderr.write(
             f"spikeloom: warning: the netlist was compiled from the weights {made['weights']!r}, these are "
             f"{checkpoint.weights!r}; name them with --weights\n"
@@ -222,7 +218,7 @@ def remedy(found: RootCause, layer: str, *, bits: int, planes: int) -> str:
 # -- the result --------------------------------------------------------------------------------------------------------
 
 
-def explanation_json(found: Explanation, integer: IntegerNetwork, checkpoint: Checkpoint, top: int) -> Json:
+def explanation_json(found: Explanation, integer: IntegerNetwork, checkpoint: Checkpoint | None, top: int) -> Json:
     """An explanation as JSON values, with its first roots in full."""
     names = [population.name for population in integer.populations]
     per_layer = Counter(root.root.layer for root in found.roots)
@@ -269,10 +265,10 @@ def explanation_json(found: Explanation, integer: IntegerNetwork, checkpoint: Ch
     }
 
 
-def _root_json(found: RootCause, integer: IntegerNetwork, checkpoint: Checkpoint) -> Json:
+def _root_json(found: RootCause, integer: IntegerNetwork, checkpoint: Checkpoint | None) -> Json:
     root, population = found.root, integer.populations[found.root.layer]
     stored = [p for p in integer.projections if p.post == root.layer]
-    features = checkpoint.hops.shape[1] if root.layer == 0 else None
+    features = checkpoint.hops.shape[1] if checkpoint is not None and root.layer == 0 else None
     return {
         "layer": population.name,
         "neuron": root.neuron,

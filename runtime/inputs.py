@@ -130,7 +130,7 @@ def propagation(checkpoint: Checkpoint, asked: Graph | None, where: str) -> tupl
     return asked.name, adjacency
 
 
-INPUTS = ("checkpoint", "original", "netlist", "data", "calibrate", "source", "taxels", "edges")
+INPUTS = ("checkpoint", "original", "against", "netlist", "data", "calibrate", "source", "taxels", "edges")
 """Arguments that may name a file to read."""
 
 

@@ -79,6 +79,21 @@ def add_model(parser: argparse.ArgumentParser, *, graph: bool = True) -> None:
     parser.add_argument("--theta", type=float, help="threshold, where the file does not say (default: 0.5)")
 
 
+def add_network(parser: argparse.ArgumentParser) -> None:
+    """Add the options that say how to read a float network: a checkpoint on its graph, or an ONNX file."""
+    add_model(parser)
+    parser.add_argument("--polarities", type=int, metavar="N", help="of an ONNX input, where its shape is flat")
+    order = parser.add_mutually_exclusive_group()
+    for name, first in (("first", True), ("last", False)):
+        order.add_argument(
+            f"--polarities-{name}",
+            dest="polarities_first",
+            action="store_const",
+            const=first,
+            help=f"they are the {name} axis, where the shape of an ONNX input does not say",
+        )
+
+
 def cores_asked(words: str | None) -> dict[str, int] | None:
     """Least number of cores by layer, from the words of ``--cores-for``.
 
@@ -107,8 +122,9 @@ def cores_asked(words: str | None) -> dict[str, int] | None:
 
 def add_compile(sub: argparse.ArgumentParser) -> None:
     """Add the options of a compilation."""
-    sub.add_argument("checkpoint")
-    add_model(sub)
+    sub.add_argument("checkpoint", help="checkpoint, or a network as an ONNX file")
+    add_network(sub)
+    sub.add_argument("--against", metavar="NET.loom", help="list the weights that differ from another netlist's")
     sub.add_argument("--target", default="loihi1", help="chip (default: loihi1)")
     sub.add_argument(
         "--weight-bits",

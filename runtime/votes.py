@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from compiler.fixedpoint import IntArray
-from compiler.interpret import vote
+from compiler.interpret import BoolArray, vote
+from compiler.ir import Readout
 from compiler.netlist import Netlist
 
 
@@ -14,6 +15,13 @@ def class_counts(netlist: Netlist, spikes: IntArray) -> IntArray:
     voters = np.flatnonzero(netlist.readout_class >= 0)
     counts = np.zeros((len(spikes), netlist.classes), np.int64)
     np.add.at(counts.T, netlist.readout_class[voters], spikes[:, voters].T)
+    return counts
+
+
+def readout_counts(readout: Readout, classes: int, spikes: BoolArray) -> IntArray:
+    """Votes per class from the spikes of the population that votes (samples, steps, neurons); (samples, classes)."""
+    counts = np.zeros((len(spikes), classes), np.int64)
+    np.add.at(counts.T, readout.label, spikes.sum(axis=1, dtype=np.int64).T)
     return counts
 
 

@@ -1,0 +1,215 @@
+"""Read a spiking network from an ONNX file: one step with its state as inputs and outputs, or all steps unrolled.
+
+The graph is run on values that vary, in float64: what is affine between two spiking layers becomes weights, what is
+held against a threshold becomes a layer, and everything else is refused by name.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from compiler.errors import ModelError
+from compiler.fixedpoint import IntArray
+from compiler.frontends.assemble import Layer, assemble, unique_names
+from compiler.frontends.onnx_affine import check
+from compiler.frontends.onnx_file import BOOL, DOUBLE, Declared, Graph, Model, read_model
+from compiler.frontends.onnx_gates import as_affine
+from compiler.frontends.onnx_lif import Neurons, is_output, neurons_of
+from compiler.frontends.onnx_order import inner
+from compiler.frontends.onnx_run import run
+from compiler.frontends.onnx_steps import Unrolled, group, readout
+from compiler.frontends.onnx_values import INPUT_ATOM, Affine, Table
+from compiler.frontends.sensor_layout import sensor_layout
+from compiler.frontends.tensors import printable
+from compiler.ir import INPUT, Network
+
+SUFFIX = ".onnx"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class OnnxNetwork:
+    """A network, and what was found about the file that it is from.
+
+    Parameters
+    ----------
+    network : Network
+        Float stage, in float64.
+    steps : int
+        Steps that the file holds; 1 where state goes in and out.
+    facts : tuple of str
+        What was read and what was assumed, for people.
+    sha256 : str
+        Of the file and of its external data.
+    """
+
+    network: Network
+    steps: int
+    facts: tuple[str, ...]
+    sha256: str
+
+
+def read_onnx(
+    path: str | os.PathLike[str], *, polarities: int | None = None, polarities_first: bool | None = None
+) -> OnnxNetwork:
+    """Read a network.
+
+    Parameters
+    ----------
+    path : path
+        File; data that it keeps beside itself must lie in its folder.
+    polarities : int, optional
+        Polarities of the input, where its shape does not tell.
+    polarities_first : bool, optional
+        Whether the input counts polarity by polarity, where its shape does not tell.
+
+    Raises
+    ------
+    ModelError
+        If the file cannot be read, or holds something else than a feed-forward network of leaky integrate-and-fire
+        neurons with affine stages; the message names the operator.
+    OptionError
+        If there are no such polarities.
+    """
+    try:
+        model = read_model(Path(path))
+        return _network(model, polarities, polarities_first)
+    except ModelError as error:
+        raise ModelError(f"{path}: {error}") from error
+
+
+def _network(model: Model, polarities: int | None, polarities_first: bool | None) -> OnnxNetwork:
+    table = Table()
+    facts: list[str] = []
+    loops = any(node.op in ("Loop", "Scan") for node in model.graph.nodes)
+    shapes: dict[int, tuple[int, ...]] = {}
+    given = {}
+    for declared in model.graph.inputs:
+        shape = _fixed(declared, model.graph, facts, loops=loops)
+        atom = table.atom(INPUT_ATOM, declared.name, math.prod(table.room(shape)), binary=declared.kind == BOOL)
+        shapes[atom], given[declared.name] = shape, table.value(atom, shape)
+    results = zip(model.graph.outputs, run(model.graph, {}, given, table), strict=True)
+    outputs = {name: as_affine(table, value) for name, value in results}
+    for name, value in outputs.items():
+        try:
+            check(table, value)
+        except ModelError as error:
+            raise ModelError(f"output {printable(name)}: {error}") from error
+    found = group(table, neurons_of(table, outputs), shapes)
+    voters, label, counted = readout(table, found, outputs)
+    sensor, positions, words = sensor_layout(found.shape, polarities=polarities, polarities_first=polarities_first)
+    names = _names(model.graph, table, found)
+    double = (
+        next(declared.kind for declared in model.graph.inputs if declared.name == table.atoms[found.data].label)
+        == DOUBLE
+    )
+    layers = [
+        Layer(
+            name=names[index],
+            beta=found.beta[index],
+            theta=_threshold(found.layers[index][0], double=double),
+            bias=found.bias[index],
+            sources={
+                source: _columns(weight, positions) if source == INPUT else weight
+                for source, weight in found.sources[index].items()
+            },
+        )
+        for index in range(len(found.layers))
+    ]
+    network = assemble(layers, sensor, voters, label)
+    facts += _facts(model, table, found, outputs, names, words)
+    facts.append(f"classes: the spikes of {names[voters]} in output {printable(counted)}")
+    return OnnxNetwork(network=network, steps=len(found.layers[0]), facts=tuple(facts), sha256=model.sha256)
+
+
+def _fixed(declared: Declared, graph: Graph, facts: list[str], *, loops: bool) -> tuple[int, ...]:
+    """Shape of an input; an open size in front of every input that has one is the batch's, and read as 1."""
+    shape: list[int] = []
+    for axis, size in enumerate(declared.shape):
+        if isinstance(size, int):
+            shape.append(size)
+            continue
+        same = all(size not in other.shape[1:] for other in graph.inputs) if size else True
+        if axis > 0 or loops or not same:
+            raise ModelError(
+                f"input {printable(declared.name)}: has an open size {size or '?'!r}, allowed are fixed ones; export "
+                "without dynamic axes"
+            )
+        fact = f"the open size {size or '?'!r} is the batch's, read as 1"
+        facts += [] if fact in facts else [fact]
+        shape.append(1)
+    return tuple(shape)
+
+
+def _columns(weight: Affine, positions: IntArray) -> Affine:
+    taken = weight[:, positions]  # type: ignore[index]
+    taken.sort_indices()
+    return taken  # type: ignore[no-any-return]
+
+
+def _threshold(neurons: Neurons, *, double: bool) -> float:
+    """Threshold of a strict comparison: of ``u >= theta`` the next number below, in the arithmetic of the file."""
+    if neurons.strict:
+        return neurons.theta
+    if double:
+        return float(np.nextafter(neurons.theta, -np.inf))
+    return float(np.nextafter(np.float32(neurons.theta), np.float32(-np.inf)))
+
+
+def _names(graph: Graph, table: Table, found: Unrolled) -> tuple[str, ...]:
+    """Names of the modules that the layers' weights belong to, as far as the file keeps them."""
+    graphs, makers = [graph], {}
+    for each in graphs:
+        makers.update({name: node for node in each.nodes for name in node.outputs})
+        graphs += [part for node in each.nodes for part in inner(node)]
+    parameters = {name for each in graphs for name in each.constants if "." in name}
+    ends = {table.atoms[n.membrane].label for layer in found.layers for n in layer}
+    names = []
+    for layer in found.layers:
+        seen: set[str] = set()
+        pending = [table.atoms[layer[0].membrane].label]
+        owners: list[list[str]] = []
+        while pending:
+            name = pending.pop()
+            if name in parameters:
+                owners.append(name.split(".")[:-1])
+            if name in seen or name not in makers or (name in ends and seen):
+                continue
+            seen.add(name)
+            pending += makers[name].inputs
+        shared = [words[0] for words in zip(*owners, strict=False) if len(set(words)) == 1]
+        names.append(shared[-1] if shared and not shared[-1].isdecimal() else "")
+    return unique_names(names)
+
+
+def _facts(
+    model: Model, table: Table, found: Unrolled, outputs: Mapping[str, Affine], names: tuple[str, ...], words: str
+) -> list[str]:
+    """What a reader of the file would want to check."""
+    steps = len(found.layers[0])
+    form = "one step, state in and out" if steps == 1 else f"{steps} steps unrolled"
+    facts = [
+        f"{model.producer or 'unknown producer'}, operators of version {model.opset}: {form}",
+        f"input {printable(table.atoms[found.data].label)}: {words}",
+    ]
+    used = {found.data}
+    for name, layer, beta in zip(names, found.layers, found.beta, strict=True):
+        n = layer[0]
+        sign = ">" if n.strict else ">="
+        told = f"layer {name}: {len(n.bias)} neurons, decay {beta:g}, fires at u {sign} {n.theta:g}"
+        if n.previous is not None:
+            held = is_output(outputs, {n.membrane: 1.0}) or "after the reset"
+            told += f", membrane {printable(table.atoms[n.previous].label)} -> {printable(held)}"
+            used |= {n.previous} | ({n.gate} if n.gate is not None else set())
+        if not n.strict:
+            told += "; >= is read as > the next number below"
+        facts.append(told)
+    ignored = [
+        printable(atom.label) for index, atom in enumerate(table.atoms) if atom.kind == INPUT_ATOM and index not in used
+    ]
+    return facts + ([f"inputs without effect on a spike: {', '.join(ignored)}"] if ignored else [])

@@ -1,0 +1,80 @@
+"""The float network that a command is given: a checkpoint on its graph, or an ONNX file that holds everything."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass
+
+from compiler.errors import OptionError
+from compiler.fixedpoint import FloatArray
+from compiler.frontends.checkpoint import Checkpoint
+from compiler.frontends.onnx import SUFFIX, read_onnx
+from compiler.ir import Network
+from compiler.passes.expand import expand
+from runtime.inputs import asked_checkpoint, asked_graph, progress, propagation
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Asked:
+    """A float network and where it is from.
+
+    Parameters
+    ----------
+    network : Network
+        Float stage.
+    checkpoint : Checkpoint or None
+        Where it is from one.
+    adjacency : (taxels, taxels) float64, or None
+        Propagation matrix, likewise.
+    graph : str or None
+        Its name, likewise.
+    facts : tuple of str
+        What was read from an ONNX file and what was assumed.
+    sha256 : str
+        Of the file.
+    """
+
+    network: Network
+    checkpoint: Checkpoint | None
+    adjacency: FloatArray | None
+    graph: str | None
+    facts: tuple[str, ...]
+    sha256: str
+
+    @property
+    def model(self) -> Checkpoint | Network:
+        """What float spikes are computed from: the checkpoint in its own operator order where there is one."""
+        return self.network if self.checkpoint is None else self.checkpoint
+
+
+def asked_network(path: str, arguments: argparse.Namespace) -> Asked:
+    """Read what a command is given.
+
+    Raises
+    ------
+    OptionError, ModelError
+        If it is not there, not as the options say, or an option is for the other kind of file.
+    """
+    onnx_only = {"--polarities": arguments.polarities, "--polarities-first or -last": arguments.polarities_first}
+    if not path.endswith(SUFFIX):
+        for option, value in onnx_only.items():
+            if value is not None:
+                raise OptionError(f"{option}: is for ONNX files, {path} is none; leave it away")
+        checkpoint = asked_checkpoint(path, arguments)
+        graph, adjacency = propagation(checkpoint, asked_graph(arguments), path)
+        return Asked(
+            network=expand(checkpoint, adjacency),
+            checkpoint=checkpoint,
+            adjacency=adjacency,
+            graph=graph,
+            facts=(),
+            sha256=checkpoint.sha256,
+        )
+    for name in ("graph", "taxels", "edges", "directed", "weights", "beta", "theta", "run"):
+        if getattr(arguments, name) not in (None, False, 0):
+            raise OptionError(f"--{name}: is for checkpoints, the ONNX file {path} holds all it needs; leave it away")
+    progress("reading the network")
+    found = read_onnx(path, polarities=arguments.polarities, polarities_first=arguments.polarities_first)
+    return Asked(
+        network=found.network, checkpoint=None, adjacency=None, graph=None, facts=found.facts, sha256=found.sha256
+    )

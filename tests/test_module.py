@@ -1,0 +1,216 @@
+"""Torch modules compiled from Python: layer types that the compiler has never heard of, and what it refuses."""
+
+import numpy as np
+import pytest
+import torch
+from made_modules import CLASSES, NETS, TAXELS, example_of, graph_net, mlp, seeded
+from torch import nn
+
+from compiler.errors import ModelError
+from compiler.interpret import channels_last, run_float
+from models.lif import LIF, AllSteps, OneStep, reset
+from models.module import compile_module, module_network
+from runtime.equivalence import verify
+
+STEPS = 12
+
+
+def events_of(network, samples=3):
+    shape = (samples, network.input.taxels, network.input.polarities, STEPS)
+    return (np.random.default_rng(5).random(shape) < 0.4).astype(np.uint8)
+
+
+def as_input(name, events, step):
+    """One step of a recording (taxels, polarities, steps) in the shape that a net of this name takes."""
+    frame = torch.tensor(events[:, :, step], dtype=torch.float64)
+    return frame.T.reshape(example_of(name).shape) if name == "grid" else frame.reshape(example_of(name).shape)
+
+
+def by_torch(name, events):
+    """Spikes of each LIF layer by the module itself in float64, one list of (samples, steps, neurons) a layer."""
+    net = NETS[name]().double()
+    layers = [module for module in net.modules() if isinstance(module, LIF)]
+    spikes = []
+    for recording in events:
+        reset(net)
+        steps = []
+        for step in range(STEPS):
+            net(as_input(name, recording, step))
+            steps.append([layer.spikes.detach().numpy().ravel().astype(bool) for layer in layers])
+        spikes.append(steps)
+    return [np.array([[step[i] for step in steps] for steps in spikes]) for i in range(len(layers))]
+
+
+@pytest.mark.parametrize("name", NETS)
+def test_spikes_are_the_modules_own(name):
+    network = module_network(NETS[name](), example_of(name))
+    events = events_of(network)
+    expected = by_torch(name, events)
+    found = run_float(network, channels_last(events)).spikes
+    assert len(found) == len(expected)
+    for population, ours, theirs in zip(network.populations, found, expected, strict=True):
+        assert np.array_equal(ours, theirs), population.name
+    assert any(spikes.any() for spikes in expected)
+    assert network.classes == CLASSES
+
+
+@pytest.mark.parametrize("name", ["chebyshev", "averaged", "grid"])
+def test_a_layer_type_of_ones_own_is_compiled_and_verified(name):
+    net, example = NETS[name](), example_of(name)
+    compilation = compile_module(net, example)
+    network = module_network(net, example)
+    events = events_of(network)
+    files = tuple("abc")
+    verdict = verify(compilation.netlist, network, None, events, np.arange(3), files, sha256="x")
+    assert verdict.spec_equals_engine
+    assert not verdict.same_checkpoint
+    chip = {name: layer.chip for name, layer in verdict.spikes.items()}
+    reference = [int(spikes.sum()) for spikes in run_float(network, channels_last(events), dtype=np.float32).spikes]
+    assert [layer.float for layer in verdict.spikes.values()] == reference
+    assert sum(chip.values()) > 0
+    assert verdict.certificate.samples == 3
+
+
+def test_constants_and_names():
+    network = module_network(mlp(), torch.zeros(1, 12))
+    told = [(p.name, p.size, p.beta, p.theta) for p in network.populations]
+    assert told == [("1", 16, 0.9, 1.0), ("3", 3, 0.3, 0.25)]
+    assert (network.input.taxels, network.input.polarities) == (6, 2)
+
+
+def test_weights_are_the_layers_own_to_the_last_bit():
+    net = mlp()
+    network = module_network(net, torch.zeros(1, 12))
+    for linear, population, projection in zip([net[0], net[2]], network.populations, network.projections, strict=True):
+        assert np.array_equal(projection.weight.toarray(), linear.weight.detach().double().numpy())
+        assert np.array_equal(population.bias, linear.bias.detach().double().numpy())
+
+
+def test_convolution_stores_no_synapse_that_is_not_there():
+    network = module_network(NETS["grid"](), example_of("grid"))
+    # 16 places, 9 in the window of an inner one, 6 at an edge, 4 in a corner; 2 polarities to 4 features
+    assert network.projections[0].weight.nnz == (4 * 9 + 8 * 6 + 4 * 4) * 2 * 4
+
+
+class TwoWays(nn.Module):
+    """Two layers beside each other, heard by a third."""
+
+    def __init__(self, *, skip=False):
+        super().__init__()
+        self.a, self.b, self.c = nn.Linear(4, 3), nn.Linear(4, 5), nn.Linear(12 if skip else 8, 2)
+        self.lif_a, self.lif_b, self.lif_c = LIF(), LIF(0.7), LIF()
+        self.skip = skip
+
+    def forward(self, x):
+        parts = [self.lif_a(self.a(x)), self.lif_b(self.b(x)), *([x] if self.skip else [])]
+        return self.lif_c(self.c(torch.cat(parts, -1)))
+
+
+def test_layers_beside_each_other():
+    net = seeded(TwoWays)
+    network = module_network(net, torch.zeros(1, 4))
+    assert [(p.pre, p.post) for p in network.projections] == [(-1, 0), (-1, 1), (0, 2), (1, 2)]
+    events = events_of(network)
+    found = verify(compile_module(net, torch.zeros(1, 4)).netlist, network, None, events, np.arange(3) % 2, tuple("abc"))
+    assert found.spec_equals_engine
+
+
+def test_without_a_batch_axis_inputs_are_probed_one_by_one():
+    class Flat(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.one, self.two = nn.Linear(2, 3), nn.Linear(3 * TAXELS, CLASSES)
+            self.lif_one, self.lif_two = LIF(), LIF()
+
+        def forward(self, x):
+            return self.lif_two(self.two(self.lif_one(self.one(x)).view(-1)))
+
+    net = seeded(Flat)
+    network = module_network(net, torch.zeros(TAXELS, 2))
+    assert np.array_equal(network.projections[1].weight.toarray(), net.two.weight.detach().double().numpy())
+    block = network.projections[0].weight.toarray()[:3, :2]
+    assert np.array_equal(block, net.one.weight.detach().double().numpy())
+
+
+def test_groups_of_neurons_vote_for_a_class():
+    class Grouped(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.linear, self.lif = nn.Linear(4, 6), LIF()
+
+        def forward(self, x):
+            return self.lif(self.linear(x)).view(-1, 3, 2).sum(-1)
+
+    network = module_network(seeded(Grouped), torch.zeros(1, 4))
+    assert network.readout.label.tolist() == [0, 0, 1, 1, 2, 2]
+    assert network.classes == 3
+
+
+def test_training_has_a_gradient_and_evaluation_leaves_no_state():
+    net = mlp()
+    net(torch.ones(1, 12)).sum().backward()
+    assert net[0].weight.grad is not None
+    reset(net)
+    step = OneStep(net, torch.zeros(1, 12))
+    output, *state = step(torch.ones(1, 12), *step.rest)
+    assert torch.equal(output, state[3])
+    with torch.no_grad():
+        mean = AllSteps(net)(torch.ones(1, 12, 4))
+        assert mean.shape == (1, CLASSES)
+    assert all(module.membrane is None for module in net.modules() if isinstance(module, LIF))
+
+
+def twice():
+    neurons = LIF()
+    return nn.Sequential(nn.Linear(4, 4), neurons, nn.Linear(4, 4), neurons)
+
+
+class Pair(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.net = nn.Sequential(nn.Linear(4, 2), LIF())
+
+    def forward(self, x):
+        return self.net(x), x
+
+
+REFUSED = {
+    "module: the stage before 3 is not affine (a random combination of inputs is off by 1 of the response, 1e-09 allowed); "
+    "only affine stages between LIF layers can become synapses": lambda: nn.Sequential(
+        nn.Linear(4, 3), LIF(), nn.Sequential(nn.Linear(3, 2), nn.ReLU()), LIF()
+    ),
+    "module: has no LIF layer, so nothing spikes; put models.lif.LIF between its stages": lambda: nn.Linear(4, 2),
+    "module 1: is called 2 times in a step, each LIF layer holds the neurons of one place; use one for each": twice,
+    "module: returns a tuple, wanted one tensor, the spikes of its classes": Pair,
+    "module: its output is no count of the spikes of its last LIF layer; return these spikes, or their sum over a group of "
+    "neurons for each class": lambda: nn.Sequential(nn.Linear(4, 3), LIF(), nn.Linear(3, 2)),
+    "layer lif_c: listens to the input and lif_a and lif_b, which lie differently deep; a spike takes one step on the chip "
+    "and would arrive too early, so put a spiking layer into the shorter way": lambda: TwoWays(skip=True),
+    "layer 1: keeps 1.5 of its membrane in a step, allowed are 0 to 1; train it again": lambda: nn.Sequential(
+        nn.Linear(4, 2), LIF(beta=1.5)
+    ),
+    "layer 1: has the threshold 0, allowed are numbers above 0; train it again": lambda: nn.Sequential(
+        nn.Linear(4, 2), LIF(theta=0)
+    ),
+}
+
+
+@pytest.mark.parametrize("line", REFUSED)
+def test_refused(line):
+    with pytest.raises(ModelError) as caught:
+        module_network(seeded(REFUSED[line]), torch.zeros(1, 4))
+    found = str(caught.value)
+    if "random combination" in line:
+        start, end = line.split("off by 1")[0], line.split("off by 1")[1]
+        assert found.startswith(start)
+        assert found.endswith(end)
+    else:
+        assert found == line
+
+
+def test_max_pooling_is_refused():
+    net = graph_net(nn.Sequential(nn.Linear(2, 8), nn.MaxPool1d(1)))
+    module_network(net, torch.zeros(1, TAXELS, 2))  # over windows of one it is the identity
+    net = seeded(lambda: nn.Sequential(nn.Linear(4, 4), nn.MaxPool1d(2), LIF()))
+    with pytest.raises(ModelError, match="the stage before 2 is not affine"):
+        module_network(net, torch.zeros(1, 1, 4))

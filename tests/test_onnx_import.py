@@ -1,0 +1,359 @@
+"""Networks read from ONNX files: every spelling of a neuron, round trips of torch modules, the released network."""
+
+import importlib.util
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from made_files import recordings_folder
+from made_modules import NETS, example_of, exported, one_step, wide
+from made_onnx import (
+    BIAS,
+    FIRES,
+    SECOND,
+    STAGE,
+    STATE_IN,
+    STATE_OUT,
+    WEIGHTS,
+    fire,
+    looped,
+    model,
+    neuron,
+    node,
+    scanned,
+    two_layers,
+)
+
+from compiler.compare import compare
+from compiler.errors import ModelError, OptionError
+from compiler.frontends.onnx import read_onnx
+from compiler.frontends.sensor_layout import sensor_layout
+from compiler.interpret import channels_last, run_float
+from compiler.lift import lift
+from compiler.passes.quantize import Recipe
+from compiler.pipeline import compile_network
+from compiler.serialize import read_netlist
+from models.lif import LIF, AllSteps
+from models.module import compile_module, module_network
+from runtime import cli
+
+needs_dynamo = pytest.mark.skipif(
+    importlib.util.find_spec("onnxscript") is None, reason="torch's newer exporter needs onnxscript"
+)
+
+
+@pytest.fixture
+def read(tmp_path):
+    def from_bytes(content, **options):
+        path = tmp_path / "net.onnx"
+        path.write_bytes(content)
+        return read_onnx(path, **options)
+
+    return from_bytes
+
+
+def require_the_two_layers(network, theta=0.5):
+    """The network that all hand-written graphs spell."""
+    assert [(p.size, p.beta, p.theta) for p in network.populations] == [(3, 0.2, theta), (2, 0.2, theta)]
+    first, second = network.projections
+    assert np.array_equal(first.weight.toarray(), WEIGHTS.astype(float))
+    assert np.array_equal(second.weight.toarray(), SECOND.astype(float))
+    assert np.array_equal(network.populations[0].bias, BIAS.astype(float))
+    assert not network.populations[1].bias.any()
+    assert (network.classes, network.readout.population, network.readout.label.tolist()) == (2, 1, [0, 1])
+
+
+@pytest.mark.parametrize("spelling", ["product", "difference", "where", "less", "truth", "after"])
+def test_every_spelling_of_the_reset(read, spelling):
+    found = read(two_layers(spelling))
+    require_the_two_layers(found.network)
+    assert found.steps == 1
+
+
+@pytest.mark.parametrize("kind", FIRES)
+def test_every_spelling_of_the_spike(read, kind):
+    nodes = [*STAGE, *neuron(0, "current")[:-2], *fire(kind, "u0_new", "s0_new")]
+    network = read(model(nodes, [("x", [1, 4]), *STATE_IN[:2]], ["s0_new", "u0_new"])).network
+    assert [(p.size, p.beta, p.theta) for p in network.populations] == [(3, 0.2, 0.5)]
+    assert np.array_equal(network.projections[0].weight.toarray(), WEIGHTS.astype(float))
+
+
+def test_at_the_threshold_is_the_next_number_below(read):
+    nodes = [*STAGE, *neuron(0, "current")[:-2]]
+    nodes += [node("GreaterOrEqual", "u0_new theta", "hot"), node("Cast", "hot", "s0_new", to=1)]
+    found = read(model(nodes, [("x", [1, 4]), *STATE_IN[:2]], ["s0_new", "u0_new"]))
+    (population,) = found.network.populations
+    below = float(np.nextafter(np.float32(0.5), np.float32(0)))
+    assert population.theta == below
+    assert any("fires at u >= 0.5" in fact and "the next number below" in fact for fact in found.facts)
+    # in float32, the arithmetic of the file, every membrane is decided as the file decides it
+    for membrane in (0.5, below, np.nextafter(np.float32(0.5), np.float32(1))):
+        assert (np.float32(membrane) >= np.float32(0.5)) == (np.float32(membrane) > np.float32(population.theta))
+
+
+@pytest.mark.parametrize("content", [scanned(), looped(), scanned(1 + 2), looped(7)])
+def test_loops_are_unrolled(read, content):
+    found = read(content)
+    require_the_two_layers(found.network)
+    assert found.steps > 1
+
+
+def test_what_is_told_of_a_step(read):
+    assert read(two_layers()).facts == (
+        "hand, operators of version 20: one step, state in and out",
+        "input x: 2 taxels, 2 polarities, as flat, channel = taxel * polarities + polarity; 2 polarities are assumed",
+        "layer layer1: 3 neurons, decay 0.2, fires at u > 0.5, membrane u0 -> u0_new",
+        "layer layer2: 2 neurons, decay 0.2, fires at u > 0.5, membrane u1 -> u1_new",
+        "classes: the spikes of layer2 in output s1_new",
+    )
+
+
+def test_numbers_of_the_program_are_read_as_decimals_and_weights_as_they_are(read):
+    weights = (WEIGHTS * np.float32(0.1)).T
+    nodes = [*STAGE, *neuron(0, "current")]
+    network = read(model(nodes, [("x", [1, 4]), *STATE_IN[:2]], ["s0_new", "u0_new"], {"w": weights})).network
+    assert network.populations[0].beta == 0.2
+    assert np.array_equal(network.projections[0].weight.toarray(), weights.T.astype(float))
+
+
+def test_a_running_count_is_the_read_out(read):
+    nodes = [*STAGE, *neuron(0, "current"), node("Add", "count s0_new", "count_new")]
+    outputs = ["count_new", "u0_new", "s0_new"]
+    network = read(model(nodes, [("x", [1, 4]), *STATE_IN[:2], ("count", [1, 3])], outputs)).network
+    assert network.readout.label.tolist() == [0, 1, 2]
+
+
+def test_groups_of_neurons_vote(read):
+    votes = np.array([[1, 0], [0, 1], [1, 0]], np.float32)
+    nodes = [*STAGE, *neuron(0, "current"), node("MatMul", "s0_new votes", "classes")]
+    outputs = ["classes", "u0_new", "s0_new"]
+    network = read(model(nodes, [("x", [1, 4]), *STATE_IN[:2]], outputs, {"votes": votes})).network
+    assert network.readout.label.tolist() == [0, 1, 0]
+    assert network.classes == 2
+
+
+@pytest.mark.parametrize("opset", [11, 13, 17, 20])
+@pytest.mark.parametrize("name", ["tag", "grid", "mlp", "gcn"])
+def test_modules_come_back_with_the_same_integers(read, name, opset):
+    if name == "gcn" and opset < 16:
+        pytest.skip("scattering sums came with version 16")
+    net, example = NETS[name](), example_of(name)
+    found = read(one_step(net, example, opset_version=opset)).network
+    ours = module_network(net, example)
+    for recipe in (Recipe(), Recipe(bits=4)):
+        first, second = (compile_network(network, recipes=(recipe,)).integer for network in (ours, found))
+        assert compare(first, second).equal
+    # torch's exporter folds a batch norm into the convolution before it, in float32
+    error = 1e-7 if name == "grid" else 1e-14
+    for a, b in zip(ours.populations, found.populations, strict=True):
+        assert (a.beta, a.theta) == (b.beta, b.theta)
+        assert np.abs(a.bias - b.bias).max() < error
+    for a, b in zip(ours.projections, found.projections, strict=True):
+        assert abs(a.weight - b.weight).max() < error
+
+
+@pytest.mark.parametrize("name", [*NETS])
+def test_all_steps_are_the_one_step(read, name):
+    net, example = NETS[name](), example_of(name)
+    found = read(exported(AllSteps(net), (torch.zeros(*example.shape, 5),)))
+    assert found.steps == 5
+    assert compare(compile_module(net, example).integer, compile_network(found.network).integer).equal
+
+
+@needs_dynamo
+@pytest.mark.parametrize("name", [*NETS])
+def test_the_newer_exporter(read, name):
+    net, example = NETS[name](), example_of(name)
+    ours = compile_module(net, example).integer
+    one = read(one_step(net, example, dynamo=True))
+    several = read(exported(AllSteps(net), (torch.zeros(*example.shape, 3),), dynamo=True))
+    assert (one.steps, several.steps) == (1, 3)
+    for found in (one, several):
+        assert compare(ours, compile_network(found.network).integer).equal
+
+
+def test_layers_are_called_as_the_modules_are(read):
+    class Named(torch.nn.Module):
+        def __init__(self, inner):
+            super().__init__()
+            self.conv1, self.lif1, _, self.fc1, self.lif2, self.fc2, self.lif3 = inner
+
+        def forward(self, x):
+            x = self.lif1(self.conv1(x)).flatten(1)
+            return self.lif3(self.fc2(self.lif2(self.fc1(x))))
+
+    found = read(one_step(Named(NETS["tag"]()), example_of("tag"))).network
+    assert [population.name for population in found.populations] == ["conv1", "fc1", "fc2"]
+
+
+def test_coefficients_that_a_file_carries_in_float32_are_listed(read):
+    """Degrees normalised in the file are recomputed in float64; numbers that were rounded before are taken as they are."""
+    example = example_of("gcn")
+    exact = read(one_step(wide(), example)).network
+    rounded = read(one_step(wide(cached=True), example)).network
+    error = abs(exact.projections[0].weight - rounded.projections[0].weight).max()
+    assert 1e-9 < error < 1e-6
+    integers = [compile_network(network, recipes=(Recipe(planes=3),)).integer for network in (exact, rounded)]
+    found = compare(*integers)
+    assert found.weights, "24 bits see what float32 lost"
+    first = found.weights[0]
+    assert str(first) == f"{first.layer} {first.post} from input {first.pre}: {first.first} and {first.second}"
+    assert {w.layer for w in found.weights} == {exact.populations[0].name}
+    assert abs(first.first - first.second) <= 2
+
+
+def test_against_another_netlist(read, tmp_path, capsys):
+    for name, net in (("exact", wide()), ("rounded", wide(cached=True))):
+        (tmp_path / f"{name}.onnx").write_bytes(one_step(net, example_of("gcn")))
+        words = ["compile", f"{tmp_path}/{name}.onnx", "--planes", "3", "-o", f"{tmp_path}/{name}.loom"]
+        words += ["--against", f"{tmp_path}/exact.loom"] if name == "rounded" else []
+        assert cli.main(words) == 0
+    told = capsys.readouterr().out
+    assert "weights differ\n  " in told
+    assert "against the other netlist: " in told
+
+
+def test_the_command_line_from_file_to_verdict(tmp_path, capsys, monkeypatch):
+    """compile, run, verify, explain and estimate know the network by its file alone."""
+    monkeypatch.chdir(tmp_path)
+    recordings_folder(tmp_path / "data")
+    example = torch.zeros(1, 6, 2)
+    torch.manual_seed(3)
+    net = torch.nn.Sequential(torch.nn.Linear(2, 5), LIF(), torch.nn.Flatten(1), torch.nn.Linear(30, 4), LIF())
+    (tmp_path / "net.onnx").write_bytes(one_step(net, example))
+    assert cli.main("compile net.onnx --calibrate data -o net.loom".split()) == 0
+    assert ": 6 taxels, 2 polarities, as [taxels, polarities]\n" in capsys.readouterr().out
+    for words in (
+        "run net.loom --data data",
+        "verify net.loom --checkpoint net.onnx --data data --require E0",
+        "explain net.loom --checkpoint net.onnx --data data",
+        "estimate net.loom --data data",
+    ):
+        assert cli.main(words.split()) == 0, words
+        told = capsys.readouterr()
+        assert told.out
+        assert not told.err
+
+
+def test_open_size_in_front_is_one_recording(read):
+    net, example = NETS["mlp"](), example_of("mlp")
+    axes = {"input": {0: "batch"}}
+    found = read(one_step(net, example, input_names=["input"], dynamic_axes=axes))
+    assert "the open size 'batch' is the batch's, read as 1" in found.facts
+    assert compare(compile_module(net, example).integer, compile_network(found.network).integer).equal
+
+
+@pytest.mark.parametrize(
+    ("shape", "options", "expected"),
+    [
+        ([39, 2], {}, (39, 2, "[taxels, polarities]")),
+        ([1, 39, 2], {}, (39, 2, "[taxels, polarities]")),
+        ([2, 39], {}, (39, 2, "[polarities, taxels]")),
+        ([39, 1], {}, (39, 1, "[taxels, polarities]")),
+        ([39, 3], {"polarities": 3}, (39, 3, "[taxels, polarities]")),
+        ([2, 2], {"polarities_first": True}, (2, 2, "[polarities, taxels]")),
+        ([78], {}, (39, 2, "flat, channel = taxel * polarities + polarity; 2 polarities are assumed")),
+        ([1, 39], {"polarities": 1}, (39, 1, "flat, channel = taxel * polarities + polarity")),
+        ([78], {"polarities": 2, "polarities_first": True}, (39, 2, "flat, polarity by polarity")),
+        ([2, 4, 5], {}, (20, 2, "[polarities, height, width], taxels row by row")),
+        ([1, 2, 4, 5], {}, (20, 2, "[polarities, height, width], taxels row by row")),
+        ([1, 1, 4, 5], {}, (20, 1, "[polarities, height, width], taxels row by row")),
+        ([4, 5, 2], {}, (20, 2, "[height, width, polarities], taxels row by row")),
+    ],
+)
+def test_shapes_of_inputs(shape, options, expected):
+    sensor, positions, words = sensor_layout(shape, **options)
+    taxels, polarities, spelled = expected
+    assert (sensor.taxels, sensor.polarities) == (taxels, polarities)
+    assert words == f"{taxels} taxels, {polarities} polarities, as {spelled}"
+    assert sorted(positions) == list(range(taxels * polarities))
+
+
+@pytest.mark.parametrize(
+    ("shape", "options", "error", "line"),
+    [
+        (
+            [39, 5],
+            {},
+            ModelError,
+            "the input [39, 5]: no axis is the polarities; tell with --polarities N and --polarities-first or -last",
+        ),
+        (
+            [2, 2],
+            {},
+            ModelError,
+            "the input [2, 2]: both axes could be the polarities; tell with --polarities N and --polarities-first or -last",
+        ),
+        (
+            [77],
+            {},
+            ModelError,
+            "the input [77] is no whole number of taxels with 2 polarities; tell how many with --polarities",
+        ),
+        (
+            [3, 4, 5],
+            {},
+            ModelError,
+            "the input [3, 4, 5] has no axis of 2 polarities where they should be; tell how many with --polarities",
+        ),
+        (
+            [2, 3, 4, 5],
+            {},
+            ModelError,
+            "the input [2, 3, 4, 5] is none of [taxels, polarities], flat, [polarities, height, width]; reshape it",
+        ),
+        ([39, 0], {}, ModelError, "the input [39, 0] has no elements; give it the shape of one step"),
+        ([39, 2], {"polarities": 0}, OptionError, "--polarities 0: allowed are numbers from 1"),
+    ],
+)
+def test_shapes_that_do_not_tell(shape, options, error, line):
+    with pytest.raises(error) as caught:
+        sensor_layout(shape, **options)
+    assert str(caught.value) == line
+
+
+def test_layers_after_a_turned_input_hear_the_right_channels(read):
+    """A network that wants [polarities, taxels] gives the same spikes on recordings as one that wants the other order."""
+    torch.manual_seed(1)
+    linear = torch.nn.Linear(12, 5)
+
+    class Turned(torch.nn.Module):
+        def __init__(self, turn):
+            super().__init__()
+            self.linear, self.lif, self.turn = linear, LIF(), turn
+
+        def forward(self, x):
+            x = x.transpose(1, 2) if self.turn else x
+            return self.lif(self.linear(x.reshape(1, -1)))
+
+    plain = read(one_step(Turned(False), torch.zeros(1, 6, 2))).network
+    turned = read(one_step(Turned(True), torch.zeros(1, 2, 6))).network
+    events = (np.random.default_rng(0).random((2, 6, 2, 20)) < 0.5).astype(np.uint8)
+    spikes = [run_float(network, channels_last(events)).spikes[0] for network in (plain, turned)]
+    assert np.array_equal(*spikes)
+    assert spikes[0].any()
+
+
+@pytest.mark.recordings
+def test_the_released_network_by_torch_geometric(released_checkpoint, tmp_path):
+    """Its ONNX files, written by the released code, compile to the integers of its checkpoint, weight by weight."""
+    code = os.environ.get("SPIKELOOM_RELEASED_CODE")
+    if code is None or importlib.util.find_spec("torch_geometric") is None:
+        pytest.skip("needs torch_geometric, and SPIKELOOM_RELEASED_CODE as the folder of the released code")
+    script = Path(__file__).parents[1] / "benchmarks" / "released_onnx.py"
+    subprocess.run([sys.executable, str(script), code, str(released_checkpoint), str(tmp_path)], check=True)
+    words = ["compile", str(released_checkpoint), "--graph", "manual", "-o", str(tmp_path / "t7.loom"), "--json"]
+    assert cli.main(words) == 0
+    for path in sorted(tmp_path.glob("*.onnx")):
+        found = compile_network(read_onnx(path).network).netlist
+        assert compare(lift(read_netlist(tmp_path / "t7.loom")), lift(found)).equal, path.name
+
+
+def test_states_must_come_back(read):
+    with pytest.raises(ModelError, match="no output gives it back"):
+        read(model([*STAGE, *neuron(0, "current")], [("x", [1, 4]), *STATE_IN[:2]], ["s0_new"]))
+    assert STATE_OUT[0] == "u0_new"
