@@ -61,9 +61,8 @@ class _HopSum(torch.autograd.Function):
     def forward(ctx: Any, rows: Tensor, hops: Tensor, bias: Tensor) -> Tensor:
         ctx.save_for_backward(rows)
         out = rows[0] @ hops[0].t()
-        term = torch.empty_like(out)
         for k in range(1, len(hops)):
-            out += torch.mm(rows[k], hops[k].t(), out=term)
+            out.addmm_(rows[k], hops[k].t())
         out += bias
         return out
 
