@@ -177,8 +177,9 @@ def train(
         with bar as progress:
             for index in range(len(history), epochs):
                 rate = float(optimizer.param_groups[0]["lr"])
-                training_loss = _train_epoch(network, optimizer, training, order.permutation(len(training)))
-                _require_finite(training_loss, index + 1)
+                training_loss = _train_epoch(
+                    network, optimizer, training, order.permutation(len(training)), epoch=index + 1
+                )
                 if index % DECAY_EPOCHS == 0 and index > 1:
                     for group in optimizer.param_groups:
                         group["lr"] *= 0.1
@@ -225,11 +226,11 @@ def _check_options(epochs: int, seed: int, device: str) -> None:
         raise OptionError("--device cuda: this machine has no usable GPU; leave --device away")
 
 
-def _require_finite(loss: float, epoch: int) -> None:
+def _require_finite(loss: float, epoch: int, step: int) -> None:
     if not math.isfinite(loss):
         raise DataError(
-            f"epoch {epoch}: the loss is {loss}, a finite number is needed; the state of the epoch before is kept, "
-            "try a lower learning rate"
+            f"epoch {epoch}, step {step}: the loss is {loss}, a finite number is needed; the state of the epoch before "
+            "is kept, try a lower learning rate"
         )
 
 
@@ -298,17 +299,24 @@ def _batches(recordings: Recordings) -> Iterator[tuple[slice, NDArray[np.uint8]]
 
 
 def _train_epoch(
-    network: SpikingNet, optimizer: torch.optim.Optimizer, recordings: Recordings, order: NDArray[np.int64]
+    network: SpikingNet,
+    optimizer: torch.optim.Optimizer,
+    recordings: Recordings,
+    order: NDArray[np.int64],
+    *,
+    epoch: int,
 ) -> float:
     total = 0.0
-    for index in order:
+    for step, index in enumerate(order, 1):
         chosen = slice(index, index + 1)
         optimizer.zero_grad()
         events = recordings.events[chosen, ..., : recordings.steps_of(int(index))]
         loss = rate_loss(_rates(network, events), recordings.labels[chosen])
+        found = float(loss.detach())
+        _require_finite(found, epoch, step)
         loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
-        total += float(loss.detach())
+        total += found
     return total / len(order)
 
 

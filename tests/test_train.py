@@ -213,11 +213,12 @@ def test_a_loss_that_is_no_number_stops_and_keeps_the_state(tmp_path, monkeypatc
     state = tmp_path / "x.state"
     train(grasps(0), grasps(1), ADJACENCY, SMALL, epochs=1, state=state)
     kept = state.read_bytes()
-    monkeypatch.setattr(models.train, "_train_epoch", lambda *_: float("nan"))
+    steps = iter((1.0, float("nan")))
+    monkeypatch.setattr(models.train, "rate_loss", lambda rates, _: rates.sum() * next(steps))
     with pytest.raises(DataError) as stopped:
         train(grasps(0), grasps(1), ADJACENCY, SMALL, epochs=1, seed=1, state=state)
     assert str(stopped.value) == (
-        "epoch 1: the loss is nan, a finite number is needed; the state of the epoch before is kept, "
+        "epoch 1, step 2: the loss is nan, a finite number is needed; the state of the epoch before is kept, "
         "try a lower learning rate"
     )
     assert state.read_bytes() == kept
