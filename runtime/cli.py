@@ -40,6 +40,7 @@ from runtime.inputs import (
 )
 from runtime.options import add_compile, add_detail, add_model, add_network, add_recordings, add_training
 from runtime.tables import show
+from runtime.trace import ENGINES
 from runtime.train_command import train
 
 Arguments = argparse.Namespace
@@ -142,6 +143,7 @@ def _verify(arguments: Arguments) -> Outcome:
         original=None if original is None else original.model,
         sha256=asked.sha256,
         spec_samples=arguments.spec_samples,
+        engine_name=arguments.engine,
         lengths=data.lengths,
         progress=progress,
     )
@@ -244,6 +246,12 @@ def build_parser() -> argparse.ArgumentParser:
     )
     sub.add_argument(
         "--spec-samples", type=int, default=3, metavar="N", help="recordings for spec = engine (default: 3)"
+    )
+    sub.add_argument(
+        "--engine",
+        choices=ENGINES,
+        default=ENGINES[0],
+        help=f"onnx: onnxruntime runs the integer graph beside our engine (default: {ENGINES[0]})",
     )
     sub.add_argument(
         "--min-agreement",

@@ -21,11 +21,11 @@ from compiler.ir import IntegerNetwork, Network, Projection, Sparse
 from compiler.lift import lift
 from compiler.netlist import Netlist
 from compiler.passes.expand import expand
-from runtime import engine, spec
+from runtime import engine, onnx_check, spec
 from runtime.breakdowns import Breakdown, breakdowns
 from runtime.certificates import Certificate, certify
 from runtime.divergence import Divergence, first_divergence
-from runtime.trace import aligned, check_channels, heard
+from runtime.trace import ENGINES, Trace, aligned, check_channels, heard
 from runtime.votes import class_counts, readout_counts
 
 LADDER = ("float64", "beta", "weights", "bias_threshold", "rounding", "saturation")
@@ -69,7 +69,8 @@ class Verdict:
     spec_samples : int
         Recordings on which the specification was run beside the engine.
     spec_equals_engine : bool
-        Whether every spike, membrane and count was equal there.
+        Whether every spike, membrane and count was equal there; with onnxruntime beside, whether its spikes, its
+        membranes after the reset and its votes were so too, and its spikes those of our engine on all recordings.
     first_divergence : Divergence or None
         None if no spike differs.
     ladder : tuple of (stage, mapping of layer to different entries)
@@ -85,6 +86,10 @@ class Verdict:
         Neurons of each layer that the chip leaves out because nobody hears them, where there are any.
     certificate : Certificate
         What of all this holds in whatever order the float model adds, and of registers for any input.
+    engine : str
+        One of ``ENGINES``.
+    engine_different : int or None
+        Spikes in which the further engine differs from ours, on all recordings; None where there is no further one.
     """
 
     files: tuple[str, ...]
@@ -103,6 +108,8 @@ class Verdict:
     breakdowns: tuple[Breakdown, ...]
     not_compared: Mapping[str, int]
     certificate: Certificate
+    engine: str
+    engine_different: int | None
 
     @property
     def float_accuracy(self) -> float:
@@ -146,9 +153,8 @@ def require_match(netlist: Netlist, model: Checkpoint | Network) -> None:
         )
 
 
-def _same_run(netlist: Netlist, prepared: engine.Engine, events: npt.NDArray[np.uint8]) -> bool:
+def _same_run(slow: Trace, prepared: engine.Engine, events: npt.NDArray[np.uint8]) -> bool:
     """Whether specification and engine agree on one recording: every spike, membrane and count."""
-    slow = spec.simulate(netlist, events)
     fast = engine.simulate(prepared, events[None], spikes=True, membranes=True, updated=True)
     pairs = [
         (slow.spikes, fast.spikes),
@@ -160,6 +166,26 @@ def _same_run(netlist: Netlist, prepared: engine.Engine, events: npt.NDArray[np.
         (slow.counts.saturations, fast.counts.saturations),
     ]
     return all(a is not None and b is not None and np.array_equal(a, b[0]) for a, b in pairs)
+
+
+def _held_to_specification(
+    netlist: Netlist,
+    prepared: engine.Engine,
+    further: onnx_check.Check | None,
+    checked: int,
+    events: npt.NDArray[np.uint8],
+    lengths: IntArray | None,
+    spikes: BoolArray,
+) -> tuple[bool, int | None]:
+    """Whether specification and engines agree; spikes of a further engine that differ from ours, if there is one."""
+    ends = np.full(len(events), events.shape[2]) if lengths is None else lengths
+    samples = [events[i, :, : ends[i]] for i in range(checked)]
+    specified = [spec.simulate(netlist, sample) for sample in samples]
+    equal = all(_same_run(slow, prepared, sample) for slow, sample in zip(specified, samples, strict=True))
+    if further is None:
+        return equal, None
+    different = onnx_check.differing(further, events, lengths, spikes)
+    return equal and different == 0 and onnx_check.as_specified(further, samples, specified), different
 
 
 def realised(network: Network, integer: IntegerNetwork) -> tuple[Network, Network, Network]:
@@ -275,6 +301,7 @@ def verify(
     original: Checkpoint | Network | None = None,
     sha256: str | None = None,
     spec_samples: int = 3,
+    engine_name: str = ENGINES[0],
     progress: Callable[[str], None] | None = None,
 ) -> Verdict:
     """Compare float model, chip and specification.
@@ -301,13 +328,18 @@ def verify(
         Of the file that a network was read from; a checkpoint knows its own.
     spec_samples : int
         Recordings on which the specification runs beside the engine.
+    engine_name : str
+        One of ``ENGINES``; any but the first runs beside ours.
     progress : callable, optional
         Told the name of each part as it starts.
 
     Raises
     ------
     ModelError, DataError, NumericRangeError
-        If the parts do not belong together, or a register of the chip overflows.
+        If the parts do not belong together, or a register of the chip overflows; ModelError also if the format of
+        the further engine cannot hold the netlist.
+    OptionError
+        If the further engine is not installed.
     """
     if not 1 <= spec_samples:
         raise DataError(f"--spec-samples {spec_samples}: at least 1 recording is needed; give a positive number")
@@ -319,6 +351,7 @@ def verify(
     names = [layer.name for layer in netlist.layers]
     flat = events.reshape(len(events), -1, events.shape[3])
     check_channels(netlist, flat.shape[1])
+    further = onnx_check.prepare(netlist) if engine_name == "onnx" else None
 
     tell("float32 reference")
     narrow = _spikes(model, adjacency, events, "float32")
@@ -345,8 +378,7 @@ def verify(
 
     tell("specification")
     checked = min(spec_samples, len(flat))
-    ends = np.full(len(flat), flat.shape[2]) if lengths is None else lengths
-    equal = all(_same_run(netlist, prepared, flat[i, :, : ends[i]]) for i in range(checked))
+    equal, different = _held_to_specification(netlist, prepared, further, checked, flat, lengths, trace.spikes)
 
     def differences(stage: list[BoolArray] | tuple[BoolArray, ...]) -> dict[str, int]:
         return {name: int(np.count_nonzero(a != b)) for name, a, b in zip(names, reference, stage, strict=True)}
@@ -408,4 +440,6 @@ def verify(
         ),
         not_compared={layer.name: len(layer.unheard) for layer in netlist.layers if layer.unheard},
         certificate=certificate,
+        engine=engine_name,
+        engine_different=different,
     )

@@ -1,40 +1,66 @@
-"""The command ``export``: a netlist in the format of another program."""
+"""The command ``export``: a netlist, or a checkpoint's float network, in the format of another program."""
 
 from __future__ import annotations
 
 import argparse
 import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from compiler.atomic import write_atomically
-from compiler.netlist import Netlist
+from compiler.errors import OptionError
 from compiler.serialize import read_netlist
-from compiler.targets import Target, load_target
-from runtime import sanafe
-from runtime.inputs import require_place
+from compiler.targets import load_target
+from runtime import onnx_float, onnx_graph, sanafe
+from runtime.inputs import asked_checkpoint, asked_graph, propagation, require_place
+from runtime.onnx_nodes import port_words
+from runtime.options import add_model
 
 Json = dict[str, Any]
 
-SUMMARY = "write a netlist in the format of another program"
+SUMMARY = "write a network in the format of another program"
 
-FORMATS = {"sanafe": f"network and mapping for SANA-FE {sanafe.VERSION}, YAML"}
+FORMATS = {
+    "sanafe": f"network and mapping of a netlist for SANA-FE {sanafe.VERSION}, YAML",
+    "onnx": "a netlist as an integer ONNX graph, bit for bit the chip",
+    "onnx-float": "the float network of a checkpoint as a static ONNX graph",
+}
 """Values of ``--to``."""
+
+MODEL = {
+    "graph": None,
+    "taxels": None,
+    "edges": None,
+    "directed": False,
+    "run": 0,
+    "weights": None,
+    "beta": None,
+    "theta": None,
+}
+"""Options of checkpoints, and what they are where they are not given."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Describe the options of the command."""
-    parser.add_argument("netlist", metavar="NET.loom")
+    parser.add_argument("source", metavar="NET.loom|CKPT", help="a netlist; for onnx-float a checkpoint")
     parser.add_argument(
         "--to", required=True, choices=tuple(FORMATS), help="; ".join(f"{key}: {what}" for key, what in FORMATS.items())
     )
+    parser.add_argument(
+        "--form", choices=onnx_graph.FORMS, help="onnx: one step with its state, or whole recordings (default: scan)"
+    )
+    add_model(parser)
     parser.add_argument("-o", "--output", required=True, metavar="FILE")
 
 
-def _sanafe(netlist: Netlist, target: Target) -> tuple[Iterator[bytes], Json]:
+def _sanafe(arguments: argparse.Namespace) -> tuple[Iterable[bytes], Json]:
+    netlist = read_netlist(arguments.source)
+    target = load_target(netlist.target)
     places = sanafe.cores(netlist, target)
     lines = (f"{line}\n".encode() for line in sanafe.export(netlist, target))
     facts = {
+        "neurons": netlist.n_compartments,
+        "synapses": netlist.n_synapses,
         "groups": [sanafe.INPUT, *sanafe.group_names(netlist)],
         "cores": list(places[: netlist.n_cores]),
         "input_cores": list(places[netlist.n_cores :]),
@@ -42,15 +68,52 @@ def _sanafe(netlist: Netlist, target: Target) -> tuple[Iterator[bytes], Json]:
     return lines, facts
 
 
-WRITERS: dict[str, Callable[[Netlist, Target], tuple[Iterator[bytes], Json]]] = {"sanafe": _sanafe}
+def _onnx(arguments: argparse.Namespace) -> tuple[Iterable[bytes], Json]:
+    netlist = read_netlist(arguments.source)
+    content = onnx_graph.export(netlist, arguments.form or "scan")
+    facts = {"neurons": netlist.n_compartments, "synapses": netlist.n_synapses}
+    return [content], facts | _ports(arguments, content)
+
+
+def _onnx_float(arguments: argparse.Namespace) -> tuple[Iterable[bytes], Json]:
+    checkpoint = asked_checkpoint(arguments.source, arguments)
+    name, adjacency = propagation(checkpoint, asked_graph(arguments), arguments.source)
+    content = onnx_float.export_float(checkpoint, adjacency, arguments.form or "scan", graph_name=name)
+    neurons = len(adjacency) * len(checkpoint.conv_bias) + sum(len(dense.bias) for dense in checkpoint.dense)
+    return [content], {"neurons": neurons, "graph": name} | _ports(arguments, content)
+
+
+def _ports(arguments: argparse.Namespace, content: bytes) -> Json:
+    inputs, outputs = port_words(content)
+    return {"form": arguments.form or "scan", "inputs": inputs, "outputs": outputs}
+
+
+WRITERS: dict[str, Callable[[argparse.Namespace], tuple[Iterable[bytes], Json]]] = {
+    "sanafe": _sanafe,
+    "onnx": _onnx,
+    "onnx-float": _onnx_float,
+}
 """For each format what yields the file and what tells about it."""
+
+
+def _require_fit(arguments: argparse.Namespace) -> None:
+    """Refuse options that the format would ignore."""
+    if arguments.form is not None and arguments.to == "sanafe":
+        raise OptionError(f"--form {arguments.form}: is for onnx and onnx-float; leave it away")
+    if arguments.to == "onnx-float":
+        return
+    for name, absent in MODEL.items():
+        given = getattr(arguments, name)
+        if given != absent:
+            shown = f"--{name}" if given is True else f"--{name} {given}"
+            raise OptionError(f"{shown}: is for checkpoints, --to {arguments.to} takes a netlist; leave it away")
 
 
 def export(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
     """Run the command: the report, how to print it, and the exit code."""
+    _require_fit(arguments)
     require_place(arguments.output, "-o", arguments)
-    netlist = read_netlist(arguments.netlist)
-    chunks, facts = WRITERS[arguments.to](netlist, load_target(netlist.target))
+    chunks, facts = WRITERS[arguments.to](arguments)
     digest, size = hashlib.sha256(), 0
     with write_atomically(arguments.output) as file:
         for chunk in chunks:
@@ -62,17 +125,20 @@ def export(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], 
         "format": arguments.to,
         "bytes": size,
         "sha256": digest.hexdigest(),
-        "neurons": netlist.n_compartments,
-        "synapses": netlist.n_synapses,
         **facts,
     }
     return report, _text, 0
 
 
 def _text(report: Json) -> str:
-    return (
-        f"{report['path']}: {report['neurons']} neurons and {report['synapses']} synapses for {report['format']}, "
-        f"{report['bytes']} bytes\n"
-        f"groups: {', '.join(report['groups'])}\n"
-        f"cores (tile.core): {', '.join(report['cores'])}; of the inputs: {', '.join(report['input_cores'])}"
-    )
+    held = f"{report['neurons']} neurons"
+    if "synapses" in report:
+        held += f" and {report['synapses']} synapses"
+    first = f"{report['path']}: {held} for {report['format']}, {report['bytes']} bytes"
+    if "groups" in report:
+        return (
+            f"{first}\ngroups: {', '.join(report['groups'])}\n"
+            f"cores (tile.core): {', '.join(report['cores'])}; of the inputs: {', '.join(report['input_cores'])}"
+        )
+    sides = [f"{side}:\n" + "\n".join(f"  {port}" for port in report[side]) for side in ("inputs", "outputs")]
+    return "\n".join([f"{first}, form {report['form']}", *sides])

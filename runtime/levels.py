@@ -93,7 +93,7 @@ def levels_of(verdict: Verdict) -> tuple[Level, ...]:
             name="E0",
             share=float(verdict.spec_equals_engine),
             text=f"specification = engine {'in' if verdict.spec_equals_engine else 'NOT in'} every spike, membrane and "
-            f"count of {verdict.spec_samples} recordings",
+            f"count of {verdict.spec_samples} recordings{_further(verdict)}",
         ),
         _quantised_level(verdict),
         Level(
@@ -109,6 +109,13 @@ def levels_of(verdict: Verdict) -> tuple[Level, ...]:
             f"{only_chip} (exact McNemar p = {p:.3g}); class votes moved: {moved:,} of {verdict.float_counts.sum():,}",
         ),
     )
+
+
+def _further(verdict: Verdict) -> str:
+    if verdict.engine_different is None:
+        return ""
+    where = f"{verdict.engine_different:,} differing spikes on {len(verdict.files)} recordings"
+    return f"; {verdict.engine} beside it, {where}"
 
 
 def _quantised_level(verdict: Verdict) -> Level:

@@ -22,6 +22,9 @@ MembraneArray = npt.NDArray[np.int32]
 REGISTER_LIMITS = {"synaptic sum": ACCUMULATOR_MAX, "current": CURRENT_MAX}
 """Registers that may not overflow, in the order in which a step fills them, and their largest magnitude."""
 
+ENGINES = ("spikeloom", "onnx")
+"""What can be held against the specification: our engine, or onnxruntime beside it."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Counts:

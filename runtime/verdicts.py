@@ -23,6 +23,8 @@ def verify_json(verdict: Verdict, levels: Sequence[Level], missed: Sequence[str]
         "spikes": {name: asdict(layer) for name, layer in verdict.spikes.items()},
         "spec_equals_engine": verdict.spec_equals_engine,
         "spec_samples": verdict.spec_samples,
+        "engine": verdict.engine,
+        "engine_different": verdict.engine_different,
         "first_divergence": None if verdict.first_divergence is None else asdict(verdict.first_divergence),
         "ladder": [{"stage": stage, "different": dict(different)} for stage, different in verdict.ladder],
         "same_checkpoint": verdict.same_checkpoint,

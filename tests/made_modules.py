@@ -1,4 +1,4 @@
-"""Torch networks of LIF layers and of layer types that the compiler has never heard of, small and with fixed weights."""
+"""Torch networks of LIF layers and of layer types that the compiler has never heard of; small, with fixed weights."""
 
 import io
 import warnings
@@ -7,7 +7,9 @@ import numpy as np
 import torch
 from torch import nn
 
+from compiler.passes.quantize import Recipe
 from models.lif import LIF, OneStep
+from models.module import compile_module
 
 TAXELS, CLASSES = 6, 3
 RING = np.array([[i, (i + 1) % TAXELS] for i in range(TAXELS)] + [[(i + 1) % TAXELS, i] for i in range(TAXELS)])
@@ -95,7 +97,7 @@ def seeded(make):
     with torch.no_grad():
         for name, parameter in net.named_parameters():
             if name.endswith("weight"):
-                parameter *= 2
+                parameter.mul_(2)
         for module in net.modules():
             if isinstance(module, nn.BatchNorm2d):
                 module.running_mean.normal_(0, 0.3)
@@ -111,7 +113,9 @@ def graph_net(layer):
 
 
 def mlp():
-    return seeded(lambda: nn.Sequential(nn.Linear(2 * TAXELS, 16), LIF(0.9, 1.0), nn.Linear(16, CLASSES), LIF(0.3, 0.25)))
+    return seeded(
+        lambda: nn.Sequential(nn.Linear(2 * TAXELS, 16), LIF(0.9, 1.0), nn.Linear(16, CLASSES), LIF(0.3, 0.25))
+    )
 
 
 def tag():
@@ -122,13 +126,20 @@ def gcn():
     return seeded(lambda: graph_net(Messages(2, 8)))
 
 
-def wide(*, cached=False):
-    """Many neurons behind message passing, so that some weight lies near the middle between two integers."""
-    return seeded(
-        lambda: nn.Sequential(
-            Messages(2, 256, cached=cached), LIF(), nn.Flatten(1), nn.Linear(TAXELS * 256, CLASSES), LIF()
-        )
-    )
+def at_a_tie(*, cached):
+    """Message passing with a weight between two integers, nearer to the other one for float32 coefficients."""
+    net = seeded(lambda: graph_net(Messages(2, 8, cached=cached)))
+    two = (Recipe(planes=2),)
+    scale = 2 * compile_module(gcn(), example_of("gcn"), recipes=two).integer.populations[0].threshold[0]
+    exact, rounded = 1 / 3, float((np.float32(3) ** np.float32(-0.5)) ** 2)
+    for middle in range(20, 4000):
+        weight = np.float32((middle + 0.5) / scale / exact)
+        sides = [round(float(weight) * coefficient * scale) for coefficient in (exact, rounded)]
+        if sides[0] != sides[1]:
+            break
+    with torch.no_grad():
+        net[0].linear.weight[0, 0] = float(weight)
+    return net
 
 
 def chebyshev():

@@ -27,7 +27,7 @@ def node(op, inputs, outputs, **attributes):
     return helper.make_node(op, ["" if i == "-" else i for i in inputs], outputs, name=outputs[0], **attributes)
 
 
-def model(nodes, inputs, outputs, constants=None, *, opset=20, domains=(), outer=None):
+def model(nodes, inputs, outputs, constants=None, *, opset=20, domains=()):
     """Serialised model; inputs and outputs as (name, shape) or (name, shape, kind)."""
     tensors = [numpy_helper.from_array(np.asarray(a), n) for n, a in (CONSTANTS | (constants or {})).items()]
     ends = [[value(*end) if isinstance(end, tuple) else value(end, None) for end in side] for side in (inputs, outputs)]
@@ -75,7 +75,11 @@ def neuron(k, source, spelling="product"):
             ]
             fire = [node("Greater", f"{new} theta", fired)]
         case "subtract":
-            reset = [node("Mul", f"{u} beta", f"d{k}"), node("Mul", f"{s} theta", f"q{k}"), node("Sub", f"d{k} q{k}", f"k{k}")]
+            reset = [
+                node("Mul", f"{u} beta", f"d{k}"),
+                node("Mul", f"{s} theta", f"q{k}"),
+                node("Sub", f"d{k} q{k}", f"k{k}"),
+            ]
         case _:
             reset = [node("Mul", f"{u} beta", f"k{k}")]
     add = [node("Add", f"k{k} {source}", new)]
@@ -147,12 +151,16 @@ RESTS = {"r0": np.zeros((1, 3), np.float32), "r1": np.zeros((1, 2), np.float32),
 
 def scanned(steps=4, *, reverse=False):
     """All steps by a Scan over the last axis of (4, steps), then the mean."""
-    more = {"scan_input_directions": [1]} if reverse else {}
+    more = {"body": body(), "num_scan_inputs": 1, "scan_input_axes": [0]}
+    more |= {"scan_input_directions": [1]} if reverse else {}
     nodes = [
         node("Transpose", "events", "turned", perm=[1, 0]),
         node("Unsqueeze", "turned axis", "sequence"),
         node(
-            "Scan", "r0 r0 r1 r1 sequence", "end0 end1 end2 end3 spikes", body=body(), num_scan_inputs=1, scan_input_axes=[0], **more
+            "Scan",
+            "r0 r0 r1 r1 sequence",
+            "end0 end1 end2 end3 spikes",
+            **more,
         ),
         node("ReduceMean", "spikes axes", "rate", keepdims=0),
     ]

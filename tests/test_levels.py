@@ -31,6 +31,8 @@ def verdict(**changes):
         "spec_equals_engine": True,
         "decision_agreement": 0.5,
         "quantised_different": None,
+        "engine": "spikeloom",
+        "engine_different": None,
     }
     return SimpleNamespace(**(base | changes))
 
@@ -39,6 +41,8 @@ def test_levels_of_a_verdict():
     levels = {level.name: level for level in levels_of(verdict())}
     assert {name: level.share for name, level in levels.items()} == {"E0": 1.0, "E1": None, "E2": 0.8, "E3": 0.5}
     assert levels["E0"].text == "specification = engine in every spike, membrane and count of 3 recordings"
+    further = levels_of(verdict(engine="onnx", engine_different=1234))[0].text
+    assert further == f"{levels['E0'].text}; onnx beside it, 1,234 differing spikes on 4 recordings"
     assert levels["E2"].text == "spikes in common with the float model: conv1 80.00 %, fc1 95.00 %"
     assert levels["E3"].text == (
         "2 of 4 decisions equal; right on float only 1, on chip only 1 (exact McNemar p = 1); "

@@ -111,7 +111,9 @@ def test_layers_beside_each_other():
     network = module_network(net, torch.zeros(1, 4))
     assert [(p.pre, p.post) for p in network.projections] == [(-1, 0), (-1, 1), (0, 2), (1, 2)]
     events = events_of(network)
-    found = verify(compile_module(net, torch.zeros(1, 4)).netlist, network, None, events, np.arange(3) % 2, tuple("abc"))
+    found = verify(
+        compile_module(net, torch.zeros(1, 4)).netlist, network, None, events, np.arange(3) % 2, tuple("abc")
+    )
     assert found.spec_equals_engine
 
 
@@ -175,17 +177,17 @@ class Pair(nn.Module):
 
 
 REFUSED = {
-    "module: the stage before 3 is not affine (a random combination of inputs is off by 1 of the response, 1e-09 allowed); "
-    "only affine stages between LIF layers can become synapses": lambda: nn.Sequential(
+    "module: the stage before 3 is not affine (a random combination of inputs is off by 1 of the response, 1e-09 "
+    "allowed); only affine stages between LIF layers can become synapses": lambda: nn.Sequential(
         nn.Linear(4, 3), LIF(), nn.Sequential(nn.Linear(3, 2), nn.ReLU()), LIF()
     ),
     "module: has no LIF layer, so nothing spikes; put models.lif.LIF between its stages": lambda: nn.Linear(4, 2),
     "module 1: is called 2 times in a step, each LIF layer holds the neurons of one place; use one for each": twice,
     "module: returns a tuple, wanted one tensor, the spikes of its classes": Pair,
-    "module: its output is no count of the spikes of its last LIF layer; return these spikes, or their sum over a group of "
-    "neurons for each class": lambda: nn.Sequential(nn.Linear(4, 3), LIF(), nn.Linear(3, 2)),
-    "layer lif_c: listens to the input and lif_a and lif_b, which lie differently deep; a spike takes one step on the chip "
-    "and would arrive too early, so put a spiking layer into the shorter way": lambda: TwoWays(skip=True),
+    "module: its output is no count of the spikes of its last LIF layer; return these spikes, or their sum over a "
+    "group of neurons for each class": lambda: nn.Sequential(nn.Linear(4, 3), LIF(), nn.Linear(3, 2)),
+    "layer lif_c: listens to the input and lif_a and lif_b, which lie differently deep; a spike takes one step on the "
+    "chip and would arrive too early, so put a spiking layer into the shorter way": lambda: TwoWays(skip=True),
     "layer 1: keeps 1.5 of its membrane in a step, allowed are 0 to 1; train it again": lambda: nn.Sequential(
         nn.Linear(4, 2), LIF(beta=1.5)
     ),

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -27,9 +28,12 @@ from compiler.frontends.onnx_steps import Unrolled, group, readout
 from compiler.frontends.onnx_values import INPUT_ATOM, Affine, Table
 from compiler.frontends.sensor_layout import sensor_layout
 from compiler.frontends.tensors import printable
-from compiler.ir import INPUT, Network
+from compiler.ir import INPUT, Network, Sparse
 
 SUFFIX = ".onnx"
+
+OPEN_STEPS = 3
+"""Steps that are run where a file leaves their number open: two show what carries on, a third that it goes on so."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -77,8 +81,10 @@ def read_onnx(
         If there are no such polarities.
     """
     try:
-        model = read_model(Path(path))
-        return _network(model, polarities, polarities_first)
+        # A constant may divide by zero on its way, as degrees of lonely taxels do; what counts is checked at the end.
+        with np.errstate(all="ignore"):
+            model = read_model(Path(path))
+            return _network(model, polarities, polarities_first)
     except ModelError as error:
         raise ModelError(f"{path}: {error}") from error
 
@@ -86,14 +92,15 @@ def read_onnx(
 def _network(model: Model, polarities: int | None, polarities_first: bool | None) -> OnnxNetwork:
     table = Table()
     facts: list[str] = []
-    loops = any(node.op in ("Loop", "Scan") for node in model.graph.nodes)
+    graph = _undecided(model.graph, facts)
+    loops = any(node.op in ("Loop", "Scan") for node in graph.nodes)
     shapes: dict[int, tuple[int, ...]] = {}
     given = {}
-    for declared in model.graph.inputs:
-        shape = _fixed(declared, model.graph, facts, loops=loops)
+    for declared in graph.inputs:
+        shape = _fixed(declared, graph, facts, loops=loops)
         atom = table.atom(INPUT_ATOM, declared.name, math.prod(table.room(shape)), binary=declared.kind == BOOL)
         shapes[atom], given[declared.name] = shape, table.value(atom, shape)
-    results = zip(model.graph.outputs, run(model.graph, {}, given, table), strict=True)
+    results = zip(graph.outputs, run(graph, {}, given, table), strict=True)
     outputs = {name: as_affine(table, value) for name, value in results}
     for name, value in outputs.items():
         try:
@@ -103,11 +110,8 @@ def _network(model: Model, polarities: int | None, polarities_first: bool | None
     found = group(table, neurons_of(table, outputs), shapes)
     voters, label, counted = readout(table, found, outputs)
     sensor, positions, words = sensor_layout(found.shape, polarities=polarities, polarities_first=polarities_first)
-    names = _names(model.graph, table, found)
-    double = (
-        next(declared.kind for declared in model.graph.inputs if declared.name == table.atoms[found.data].label)
-        == DOUBLE
-    )
+    names = _names(graph, table, found)
+    double = any(declared.kind == DOUBLE for declared in graph.inputs)
     layers = [
         Layer(
             name=names[index],
@@ -128,28 +132,42 @@ def _network(model: Model, polarities: int | None, polarities_first: bool | None
 
 
 def _fixed(declared: Declared, graph: Graph, facts: list[str], *, loops: bool) -> tuple[int, ...]:
-    """Shape of an input; an open size in front of every input that has one is the batch's, and read as 1."""
+    """Shape of an input; an open size in front is the batch's, or time and batch of a graph that loops over steps."""
+    meanings = (f"time, read as {OPEN_STEPS} steps", "the batch's, read as 1") if loops else ("the batch's, read as 1",)
     shape: list[int] = []
     for axis, size in enumerate(declared.shape):
         if isinstance(size, int):
             shape.append(size)
             continue
-        same = all(size not in other.shape[1:] for other in graph.inputs) if size else True
-        if axis > 0 or loops or not same:
+        alone = all(size not in (*other.shape[:axis], *other.shape[axis + 1 :]) for other in graph.inputs)
+        if axis >= len(meanings) or (size and not alone):
             raise ModelError(
                 f"input {printable(declared.name)}: has an open size {size or '?'!r}, allowed are fixed ones; export "
                 "without dynamic axes"
             )
-        fact = f"the open size {size or '?'!r} is the batch's, read as 1"
+        fact = f"the open size {size or '?'!r} is {meanings[axis]}"
         facts += [] if fact in facts else [fact]
-        shape.append(1)
+        shape.append(OPEN_STEPS if loops and axis == 0 else 1)
     return tuple(shape)
 
 
-def _columns(weight: Affine, positions: IntArray) -> Affine:
-    taken = weight[:, positions]  # type: ignore[index]
+def _undecided(graph: Graph, facts: list[str]) -> Graph:
+    """The graph with what a decision is taken from in place of the decision: of most spikes, the lowest on a tie."""
+    makers = {name: node for node in graph.nodes for name in node.outputs}
+    outputs = []
+    for output in graph.outputs:
+        name, node = output, makers.get(output)
+        if node is not None and node.op == "ArgMax" and node.inputs and not node.attributes.get("select_last_index", 0):
+            facts.append(f"output {printable(name)}: the class of the largest of {printable(node.inputs[0])}")
+            name = node.inputs[0]
+        outputs += [] if name in outputs else [name]
+    return replace(graph, outputs=tuple(outputs))
+
+
+def _columns(weight: Sparse, positions: IntArray) -> Sparse:
+    taken = weight[:, positions]
     taken.sort_indices()
-    return taken  # type: ignore[no-any-return]
+    return taken
 
 
 def _threshold(neurons: Neurons, *, double: bool) -> float:
@@ -167,7 +185,7 @@ def _names(graph: Graph, table: Table, found: Unrolled) -> tuple[str, ...]:
     for each in graphs:
         makers.update({name: node for node in each.nodes for name in node.outputs})
         graphs += [part for node in each.nodes for part in inner(node)]
-    parameters = {name for each in graphs for name in each.constants if "." in name}
+    parameters = {name for each in graphs for name in each.constants if re.search(r"[./]", name)}
     ends = {table.atoms[n.membrane].label for layer in found.layers for n in layer}
     names = []
     for layer in found.layers:
@@ -177,7 +195,7 @@ def _names(graph: Graph, table: Table, found: Unrolled) -> tuple[str, ...]:
         while pending:
             name = pending.pop()
             if name in parameters:
-                owners.append(name.split(".")[:-1])
+                owners.append(re.split(r"[./]", name)[:-1])
             if name in seen or name not in makers or (name in ends and seen):
                 continue
             seen.add(name)
@@ -192,7 +210,7 @@ def _facts(
 ) -> list[str]:
     """What a reader of the file would want to check."""
     steps = len(found.layers[0])
-    form = "one step, state in and out" if steps == 1 else f"{steps} steps unrolled"
+    form = "one step, state in and out from zero" if steps == 1 else f"{steps} steps unrolled"
     facts = [
         f"{model.producer or 'unknown producer'}, operators of version {model.opset}: {form}",
         f"input {printable(table.atoms[found.data].label)}: {words}",

@@ -15,13 +15,14 @@ from scipy import sparse
 from compiler.errors import ModelError
 from compiler.fixedpoint import FloatArray
 from compiler.frontends.onnx_elementwise import COMPARISONS, FLOATING, NUMBERS, POINTWISE
-from compiler.frontends.onnx_file import Array, Node
+from compiler.frontends.onnx_file import BOOL, Array, Node
 from compiler.frontends.onnx_gates import (
     NOT_AFFINE,
     as_affine,
     chosen,
     compared,
     is_binary,
+    is_whole,
     multiplied,
     scaled_by,
     spread,
@@ -252,7 +253,8 @@ def _elementwise(node: Node, table: Table, values: Sequence[Value | None], varyi
 
 def _cast(node: Node, table: Table, value: Value | None) -> Value:
     assert isinstance(value, Affine)
-    if int(node.attributes["to"]) in FLOATING or is_binary(table, value):
+    to = int(node.attributes["to"])
+    if to in FLOATING or (is_binary(table, value) if to == BOOL else is_whole(table, value)):
         return value
     raise ModelError(f"rounds its input to whole numbers, so it {NOT_AFFINE}")
 
@@ -303,10 +305,8 @@ def check(table: Table, value: Affine) -> None:
     affine = np.tile(value.bias, (SAMPLES, 1))
     for atom, own in value.terms.items():
         affine += (own @ table.atoms[atom].sample.T).T
-    with np.errstate(all="ignore"):
-        worst = np.abs(value.sample - affine).max(axis=1, initial=0) / np.maximum(
-            np.abs(affine).max(axis=1, initial=0), 1e-300
-        )
+    largest = np.maximum(np.abs(affine).max(axis=1, initial=0), 1e-300)
+    worst = np.abs(value.sample - affine).max(axis=1, initial=0) / largest
     if not np.all(np.isfinite(affine)):
         raise ModelError("has coefficients that are not finite; train it again")
     if not np.all(worst <= TOLERANCE):

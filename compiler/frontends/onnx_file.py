@@ -110,6 +110,15 @@ def decimal(value: Any) -> float:
     return float(str(np.float32(value)))
 
 
+def _text(value: str | bytes) -> str:
+    """A name; protobuf gives bytes where it is no text."""
+    return value.decode("utf-8", "backslashreplace") if isinstance(value, bytes) else value
+
+
+def _texts(values: Iterable[str | bytes]) -> tuple[str, ...]:
+    return tuple(_text(value) for value in values)
+
+
 class _Content:
     """Bytes of a file and of the files beside it that it names, counted together."""
 
@@ -122,7 +131,7 @@ class _Content:
 
     def external(self, name: str, entries: Iterable[Any]) -> bytes:
         """The part of a file beside this one that holds a tensor."""
-        stated = {str(entry.key): str(entry.value) for entry in entries}
+        stated = {_text(entry.key): _text(entry.value) for entry in entries}
         location = stated.get("location", "")
         what = f"tensor {printable(name)}: its data lies in {printable(location)!r}"
         place = Path(location)
@@ -179,7 +188,7 @@ def read_model(path: Path) -> Model:
         raise ModelError(f"is not an ONNX file, or {DAMAGED}") from error
     if not proto.HasField("graph"):
         raise ModelError("holds no graph, so it is not an ONNX file; give a file of torch.onnx.export")
-    versions = [entry.version for entry in proto.opset_import if entry.domain in ("", "ai.onnx")]
+    versions = [entry.version for entry in proto.opset_import if _text(entry.domain) in ("", "ai.onnx")]
     opset = versions[0] if versions else 1
     if opset not in OPSETS:
         raise ModelError(
@@ -188,7 +197,9 @@ def read_model(path: Path) -> Model:
         )
     counted = [NODE_LIMIT]
     graph = _graph(proto.graph, content, counted, NESTING)
-    return Model(graph=graph, opset=opset, producer=printable(proto.producer_name), sha256=content.digest.hexdigest())
+    return Model(
+        graph=graph, opset=opset, producer=printable(_text(proto.producer_name)), sha256=content.digest.hexdigest()
+    )
 
 
 def _graph(proto: Any, content: _Content, left: list[int], nesting: int) -> Graph:
@@ -200,13 +211,13 @@ def _graph(proto: Any, content: _Content, left: list[int], nesting: int) -> Grap
         raise ModelError("has sparse or quantised constants; export the float network")
     constants: dict[str, Array] = {}
     for tensor in proto.initializer:
-        if tensor.name in constants:
-            raise ModelError(f"tensor {printable(tensor.name)} is there twice; {DAMAGED}")
-        constants[tensor.name] = _array(tensor, content)
+        if _text(tensor.name) in constants:
+            raise ModelError(f"tensor {printable(_text(tensor.name))} is there twice; {DAMAGED}")
+        constants[_text(tensor.name)] = _array(tensor, content)
     return Graph(
         nodes=tuple(_node(node, content, left, nesting) for node in proto.node),
-        inputs=tuple(_declared(value) for value in proto.input if value.name not in constants),
-        outputs=tuple(value.name for value in proto.output),
+        inputs=tuple(_declared(value) for value in proto.input if _text(value.name) not in constants),
+        outputs=tuple(_text(value.name) for value in proto.output),
         constants=constants,
     )
 
@@ -216,20 +227,23 @@ def _declared(proto: Any) -> Declared:
     shape: list[int | str | None] = []
     for dimension in kind.shape.dim:
         which = dimension.WhichOneof("value")
-        shape.append(None if which is None else getattr(dimension, which))
+        size = None if which is None else getattr(dimension, which)
+        shape.append(_text(size) if isinstance(size, bytes) else size)
     if len(shape) > DIMENSIONS or any(isinstance(size, int) and size < 0 for size in shape):
         raise ModelError(
-            f"input {printable(proto.name)}: has an impossible shape {tuple(shape[:DIMENSIONS])}; {DAMAGED}"
+            f"input {printable(_text(proto.name))}: has an impossible shape {tuple(shape[:DIMENSIONS])}; {DAMAGED}"
         )
-    return Declared(name=proto.name, kind=kind.elem_type, shape=tuple(shape))
+    return Declared(name=_text(proto.name), kind=kind.elem_type, shape=tuple(shape))
 
 
 def _node(proto: Any, content: _Content, left: list[int], nesting: int) -> Node:
-    named = proto.name or (proto.output[0] if proto.output else "?")
-    node = Node(name=named, op=proto.op_type, inputs=tuple(proto.input), outputs=tuple(proto.output), attributes={})
-    if proto.domain not in ("", "ai.onnx"):
+    named = _text(proto.name or (proto.output[0] if proto.output else "?"))
+    node = Node(
+        name=named, op=_text(proto.op_type), inputs=_texts(proto.input), outputs=_texts(proto.output), attributes={}
+    )
+    if _text(proto.domain) not in ("", "ai.onnx"):
         raise ModelError(
-            f"{node}: is of the domain {printable(proto.domain)}, allowed are the operators of ONNX itself; "
+            f"{node}: is of the domain {printable(_text(proto.domain))}, allowed are the operators of ONNX itself; "
             "export without custom operators"
         )
     attributes = {}
@@ -250,14 +264,16 @@ def _node(proto: Any, content: _Content, left: list[int], nesting: int) -> Node:
             case entry.INTS:
                 value = [int(number) for number in entry.ints]
             case _:
-                raise ModelError(f"{node}: attribute {printable(entry.name)} is of a kind that is not known; {DAMAGED}")
-        attributes[entry.name] = value
+                raise ModelError(
+                    f"{node}: attribute {printable(_text(entry.name))} is of a kind that is not known; {DAMAGED}"
+                )
+        attributes[_text(entry.name)] = value
     return Node(name=node.name, op=node.op, inputs=node.inputs, outputs=node.outputs, attributes=attributes)
 
 
 def _array(proto: Any, content: _Content) -> Array:
     """A tensor, widened to float64, int64 or bool."""
-    what = f"tensor {printable(proto.name) or '(no name)'}"
+    what = f"tensor {printable(_text(proto.name)) or '(no name)'}"
     if proto.data_type not in _STORED:
         raise ModelError(f"{what}: has element type {proto.data_type}, allowed are numbers and truth values; {DAMAGED}")
     stored, field = _STORED[proto.data_type]
@@ -266,7 +282,7 @@ def _array(proto: Any, content: _Content) -> Array:
     if len(shape) > DIMENSIONS or any(size < 0 for size in shape):
         raise ModelError(f"{what}: has an impossible shape {shape[:DIMENSIONS]}; {DAMAGED}")
     if proto.data_location == _EXTERNAL:
-        data = content.external(proto.name, proto.external_data)
+        data = content.external(_text(proto.name), proto.external_data)
     elif proto.raw_data:
         data = proto.raw_data
     else:

@@ -70,8 +70,8 @@ def compared(node: Node, table: Table, values: Sequence[Value | None]) -> Value:
         raise ModelError("compares two values that both vary; only a fixed threshold can be lowered")
     mirrored = not isinstance(first, Affine)
     membrane, limit = (second, first) if mirrored else (first, second)
-    assert isinstance(membrane, Affine)
-    assert isinstance(limit, np.ndarray)
+    if not isinstance(membrane, Affine) or not isinstance(limit, np.ndarray):
+        raise ModelError("lacks an operand; export it again")
     single = next(iter(membrane.terms), -1)
     factor = diagonal(membrane.terms[single]) if len(membrane.terms) == 1 else None
     if not factor or table.atoms[single].kind not in (MEMBRANE, INPUT_ATOM):
@@ -106,12 +106,21 @@ def chosen(table: Table, values: Sequence[Value | None]) -> Value:
 
 
 def is_binary(table: Table, value: Affine) -> bool:
-    """Whether a value is zeros and ones: spikes, or an input of truth values."""
-    if len(value.terms) != 1 or np.any(value.bias):
-        return False
-    ((atom, terms),) = value.terms.items()
-    single = one_each(terms)
-    return table.atoms[atom].binary and single is not None and bool(np.all(single[0] == 1))
+    """Whether a value is zeros and ones: spikes, or an input of truth values, one for each element."""
+    counts = np.zeros(len(value.bias), np.int64)
+    for terms in value.terms.values():
+        counts += np.diff(terms.indptr)
+    return is_whole(table, value) and not np.any(value.bias) and bool(np.all(counts <= 1)) and _all_ones(value)
+
+
+def _all_ones(value: Affine) -> bool:
+    return all(np.all(terms.data == 1) for terms in value.terms.values())
+
+
+def is_whole(table: Table, value: Affine) -> bool:
+    """Whether a value is a whole number: a count of spikes."""
+    parts = [value.bias, *(terms.data for terms in value.terms.values())]
+    return all(table.atoms[atom].binary for atom in value.terms) and all(np.all(part % 1 == 0) for part in parts)
 
 
 def spread(value: Affine, shape: tuple[int, ...]) -> Affine:

@@ -130,7 +130,8 @@ def _carried(
     if not products:
         return _already_reset(table, membrane, spike, terms, outputs)
     pair = table.atoms[products[0]].of
-    kept = [atom for atom in pair if atom in terms and table.atoms[atom].kind in (INPUT_ATOM, MEMBRANE)]
+    linear = [atom for atom in pair if atom in terms and table.atoms[atom].kind in (INPUT_ATOM, MEMBRANE)]
+    kept = [atom for atom in linear if _decay(terms[atom]) is not None] or linear
     shown = table.atoms[products[0]].label
     if len(kept) != 1:
         raise ModelError(f"holds {printable(shown)} in a way that is no reset; {RESET}")

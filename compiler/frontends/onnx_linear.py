@@ -14,7 +14,7 @@ from scipy import sparse
 
 from compiler.frontends.onnx_file import Array, Node
 from compiler.frontends.onnx_moves import Operands, axes_of, scatter_place
-from compiler.frontends.onnx_values import Table, size_of
+from compiler.frontends.onnx_values import COEFFICIENT_LIMIT, Table, size_of
 from compiler.ir import Sparse
 
 Matrix = Callable[[Node, Table, Operands, int], Sparse]
@@ -42,7 +42,7 @@ def _contract(table: Table, spelled: str, place: Array, weight: Array, columns: 
         for label, size in zip(labels, shape, strict=True):
             if sizes.setdefault(label, size) != size:
                 raise ValueError("sizes that do not fit each other")
-    table.room([sizes[label] for label in every])
+    table.room([sizes[label] for label in every], COEFFICIENT_LIMIT)
 
     def spread(array: Array, labels: str) -> Array:
         order = sorted(range(len(labels)), key=lambda axis: every.index(labels[axis]))
@@ -98,7 +98,7 @@ def _einsum(node: Node, table: Table, operands: Operands) -> list[Array]:
     spelled = _equation(node, operands)
     sizes = {label: n for part, o in zip(spelled.split("->")[0].split(","), operands, strict=True)
              for label, n in zip(part, o.shape, strict=True)}  # fmt: skip
-    table.room(list(sizes.values()))
+    table.room(list(sizes.values()), COEFFICIENT_LIMIT)
     return [np.einsum(spelled, *operands)]
 
 
@@ -168,7 +168,7 @@ def _windows(node: Node, table: Table, data: Array, kernel: Sequence[int], filli
         *(slice(None, None, d) for d in dilations),
     ]
     view = view[tuple(step)]
-    table.room(view.shape)
+    table.room(view.shape, COEFFICIENT_LIMIT)
     return view
 
 
@@ -240,6 +240,7 @@ LINEAR: Mapping[str, tuple[Numbers, Matrix | None, tuple[int, ...]]] = {
     "Gemm": (_gemm, _gemm_matrix, (0, 1)),
     "GlobalAveragePool": (_pool, _pool_matrix, (0,)),
     "MatMul": (_matmul, _matmul_matrix, (0, 1)),
+    "MatMulInteger": (_matmul, _matmul_matrix, (0, 1)),
     "ReduceMax": (_reduce, None, ()),
     "ReduceMean": (_reduce, _reduce_matrix, (0,)),
     "ReduceMin": (_reduce, None, ()),

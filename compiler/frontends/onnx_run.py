@@ -11,6 +11,7 @@ from compiler.frontends.onnx_affine import apply, check
 from compiler.frontends.onnx_file import Array, Graph, Node
 from compiler.frontends.onnx_order import inner, membranes, ordered, reads
 from compiler.frontends.onnx_values import INPUT_ATOM, MEMBRANE, NODE_WORK, Affine, Table, Value, diagonal, size_of
+from compiler.frontends.tensors import printable
 
 STEP_LIMIT = 4096
 """Steps of a Scan or a Loop that are unrolled."""
@@ -45,11 +46,10 @@ def run(graph: Graph, outer: Mapping[str, Value], given: Mapping[str, Value], ta
     last = {name: index for index, node in enumerate(order) for name in reads(node)}
     for index, node in enumerate(order):
         try:
-            with np.errstate(all="ignore"):
-                table.spend(NODE_WORK)
-                results = _evaluate(node, values, table)
-                for name, result in zip(node.outputs, results, strict=False):
-                    values[name] = _set_apart(node, name, result, table) if name in held else result
+            table.spend(NODE_WORK)
+            results = _evaluate(node, values, table)
+            for name, result in zip(node.outputs, results, strict=False):
+                values[name] = _set_apart(node, name, result, table) if name in held else result
         except ModelError as error:
             raise ModelError(f"{node}: {error}") from error
         except _MISFIT as error:
@@ -58,6 +58,9 @@ def run(graph: Graph, outer: Mapping[str, Value], given: Mapping[str, Value], ta
         for name in reads(node):
             if last[name] == index and name not in outer and name not in graph.outputs:
                 values.pop(name, None)
+    for name in graph.outputs:
+        if name not in values:
+            raise ModelError(f"output {printable(name)}: its operator does not give so many results; export it again")
     return [values[name] for name in graph.outputs]
 
 

@@ -18,15 +18,19 @@ from scipy import sparse
 from compiler.errors import ModelError
 from compiler.fixedpoint import FloatArray, IntArray
 from compiler.frontends.onnx_file import Array
+from compiler.frontends.tensors import printable
 from compiler.ir import Sparse
 
 SAMPLES = 4
 """Random numbers in place of each atom's elements."""
 
-VALUE_LIMIT = 2**24
+VALUE_LIMIT, COEFFICIENT_LIMIT = 2**22, 2**24
 """Elements of a value, and coefficients of an operator: more than the synapses of a chip."""
 
-WORK_LIMIT = 2**31
+ATOM_LIMIT = 2**20
+"""Elements of an input, over all steps, or of a layer."""
+
+WORK_LIMIT = 2**30
 """Elements and coefficients of all values together; bounds the time that a file can take."""
 
 NODE_WORK = 2**14
@@ -148,13 +152,11 @@ class Table:
     matrices: dict[tuple[object, ...], tuple[Sparse, FloatArray, list[Value]]] = field(default_factory=dict)
     done: int = 0
 
-    def room(self, shape: Sequence[int]) -> tuple[int, ...]:
-        """The shape itself, if a value of it may be made."""
+    def room(self, shape: Sequence[int], limit: int = VALUE_LIMIT) -> tuple[int, ...]:
+        """The shape itself, if a value of it, or an operator of so many coefficients, may be made."""
         size = math.prod(int(length) for length in shape)
-        if size > VALUE_LIMIT or any(length < 0 for length in shape):
-            raise ModelError(
-                f"makes {size} values or coefficients, allowed are {VALUE_LIMIT}; no chip holds such a network"
-            )
+        if size > limit or any(length < 0 for length in shape):
+            raise ModelError(f"makes {size} values or coefficients, allowed are {limit}; no chip holds such a network")
         self.spend(size)
         return tuple(int(length) for length in shape)
 
@@ -175,7 +177,11 @@ class Table:
         strict: bool = True,
         sample: FloatArray | None = None,
     ) -> int:
-        """Add an atom; its random numbers are drawn unless they are given."""
+        """Add an atom, if there may be one of that size; its random numbers are drawn unless they are given."""
+        if size > ATOM_LIMIT:
+            raise ModelError(
+                f"{printable(label)} has {size} elements, allowed are {ATOM_LIMIT}; no chip holds such a layer"
+            )
         if sample is None:
             rng = np.random.default_rng((self.seed, len(self.atoms)))
             sample = rng.normal(size=(SAMPLES, size)) * 10.0 ** np.arange(-1, SAMPLES - 1)[:, None]
@@ -225,7 +231,7 @@ def picked(value: Affine, rows: IntArray, shape: tuple[int, ...], sample: FloatA
     """Elements of a value in another order, some of them perhaps not or several times."""
     return Affine(
         shape=shape,
-        terms={atom: rows_of(terms, rows) for atom, terms in value.terms.items()},
+        terms={atom: own for atom, terms in value.terms.items() if (own := rows_of(terms, rows)).nnz},
         bias=value.bias[rows],
         sample=sample,
     )

@@ -145,8 +145,9 @@ def emit(
             if projection.pre != INPUT:
                 source = network.input.size + compartment_id[projection.pre][source]
             axons_per_core[core] += len(source)
-            for key, value in zip(parts, (source, np.array(form), length, targets, weights), strict=True):
-                parts[key].append(value)
+            found: list[npt.NDArray[Any]] = [source, np.array(form), length, targets, weights]
+            for part, values in zip(parts.values(), found, strict=True):
+                part.append(values)
 
     order = [chunk for chunk, _, _ in placed]
     populations = [network.populations[chunk.population] for chunk in order]

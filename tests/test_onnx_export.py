@@ -1,0 +1,324 @@
+"""The ONNX files: what is in them, that they are the same every time, and the command that writes them."""
+
+import hashlib
+import json
+from dataclasses import replace
+
+import numpy as np
+import onnx
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+from made_files import TAXELS, events, own_file, recordings_folder, ring, small_checkpoint
+from onnx.reference import ReferenceEvaluator
+from random_netlists import Axon, Neuron, build, large_netlist
+from test_export import run
+from test_onnx_engine import three_neurons
+
+from compiler.errors import FormatError, ModelError, OptionError
+from compiler.netlist import read_only
+from compiler.passes.expand import expand
+from compiler.passes.quantize import Recipe
+from compiler.pipeline import compile_network
+from compiler.serialize import netlist_bytes, write_netlist
+from models.reference import float_spikes
+from runtime import cli, engine, onnx_engine, onnx_float, onnx_graph
+from runtime.inputs import version
+from runtime.onnx_nodes import port_words
+from runtime.onnx_plan import digits, is_pipeline, plan
+
+FORMS = onnx_graph.FORMS
+
+
+def model_of(content):
+    model = onnx.load_from_string(content)
+    onnx.checker.check_model(model, full_check=True)
+    return model
+
+
+# -- digits and widths -------------------------------------------------------------------------------------------------
+
+
+@given(
+    arrays.arrays(np.int64, st.tuples(st.integers(1, 4), st.integers(1, 4)), elements=st.integers(-(2**22), 2**22)),
+    st.integers(0, 6),
+)
+def test_digits_add_up_to_the_weights(weight, shift):
+    found = digits(weight << shift)
+    assert all(digit.dtype == np.int8 for digit, _ in found)
+    np.testing.assert_array_equal(sum(digit.astype(np.int64) * factor for digit, factor in found), weight << shift)
+
+
+@pytest.mark.parametrize(
+    ("weights", "count"),
+    [
+        ([0], 1),
+        ([254, -254], 1),
+        ([254 * 128, -2 * 128], 1),
+        ([127, -128], 1),
+        ([128, 1], 2),
+        ([32639, 1], 2),
+        ([32640, 1], 3),
+    ],
+)
+def test_weights_of_one_exponent_are_one_digit(weights, count):
+    assert len(digits(np.array([weights]).T)) == count
+
+
+def one_layer(**neuron):
+    return plan(build([Neuron(**neuron)], [Axon(source=0, targets=((0, -254),))], n_inputs=1, depths=[0]))[0]
+
+
+def test_registers_are_int32_where_no_product_can_be_wider():
+    assert one_layer().kind is np.int32
+    # 64 * 32767 * 1024 is below 2**31, 64 * 32769 * 1024 is above
+    assert one_layer(threshold=32767, decay_v=3072).kind is np.int32
+    assert one_layer(threshold=32769, decay_v=3072).kind is np.int64
+    # -254 * 64 adds up to -254 * 64 * 4096 / 100, times 3996 that is 2.7e9; 160 in place of 100: 1.7e9
+    assert one_layer(decay_v=100).kind is np.int64
+    assert one_layer(decay_v=160).kind is np.int32
+    assert one_layer(decay_v=0).kind is np.int64
+
+
+def test_ranges_that_are_proven_are_not_checked():
+    assert not one_layer().checked
+    assert not one_layer().saturates
+    assert one_layer(decay_v=0).saturates
+    assert not one_layer(decay_u=100).checked
+    assert one_layer(decay_u=1).checked
+    axons = [Axon(source=0, targets=((0, 254),), exponent=7), Axon(source=0, targets=((0, 256 - 2),), exponent=7)]
+    assert plan(build([Neuron()], axons, n_inputs=1, depths=[0]))[0].checked
+    assert not plan(build([Neuron()], axons[:1], n_inputs=1, depths=[0]))[0].checked
+
+
+def test_what_is_a_pipeline():
+    netlist = three_neurons()
+    assert is_pipeline(netlist, plan(netlist))
+    for source, target in ((0, 0), (4, 0), (2, 1)):  # input to the second layer, itself, the first layer itself
+        more = Axon(source=source, core=int(target == 0), targets=((0, 2),))
+        axons = [Axon(source=0, targets=((0, 60),)), Axon(source=2, core=1, targets=((0, 100),)), more]
+        neurons = [Neuron(), Neuron(), Neuron(layer=1, core=1)]
+        other = build(neurons, axons, n_inputs=2, depths=[0, 1])
+        assert not is_pipeline(other, plan(other))
+
+
+# -- files -------------------------------------------------------------------------------------------------------------
+
+
+def lines_of(graph, indent=""):
+    """A graph as text; constants as they are, loops with their bodies."""
+    for side in ("input", "output"):
+        yield f"{indent}{side} " + ", ".join(port.name for port in getattr(graph, side))
+    for constant in graph.initializer:
+        array = onnx.numpy_helper.to_array(constant)
+        yield f"{indent}{constant.name} = {array.dtype} {json.dumps(array.tolist())}"
+    for node in graph.node:
+        plain = [a for a in node.attribute if a.name != "body"]
+        options = [f"{a.name}={onnx.helper.get_attribute_value(a)}" for a in sorted(plain, key=lambda a: a.name)]
+        yield f"{indent}{', '.join(node.output)} = {node.op_type}({', '.join([*node.input, *options])})"
+        for attribute in node.attribute:
+            if attribute.name == "body":
+                yield from lines_of(attribute.g, f"{indent}    ")
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_the_text_of_a_small_graph(form, golden):
+    model = model_of(onnx_graph.export(three_neurons(), form))
+    golden(f"onnx_{form}.txt", "\n".join(lines_of(model.graph)) + "\n")
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_equal_netlists_give_equal_bytes(form):
+    netlist = large_netlist(1, proved=True)
+    assert onnx_graph.export(netlist, form) == onnx_graph.export(replace(netlist), form)
+
+
+def test_metadata_tell_where_a_file_comes_from():
+    # the chip lacks neuron 1 of the first layer
+    netlist = replace(three_neurons(), neuron=read_only([0, 2, 0]))
+    netlist = replace(netlist, layers=(replace(netlist.layers[0], neurons=3), netlist.layers[1]))
+    model = model_of(onnx_graph.export(netlist, "step"))
+    facts = {entry.key: entry.value for entry in model.metadata_props}
+    assert json.loads(facts.pop("layers")) == [
+        {"name": "layer0", "depth": 0, "neurons": 3, "held": [0, 2], "kind": "int32"},
+        {"name": "layer1", "depth": 1, "neurons": 1, "held": [0], "kind": "int32"},
+    ]
+    assert facts == {
+        "form": "step",
+        "input": "2 taxels x 1 polarities; channel = taxel * 1 + polarity; 0 or 1",
+        "max_depth": "1",
+        "netlist_sha256": hashlib.sha256(netlist_bytes(netlist)).hexdigest(),
+        "version": version(),
+    }
+    assert (model.producer_name, model.producer_version) == ("spikeloom", version())
+    assert "LAYER.membrane" in model.doc_string
+
+
+@pytest.mark.parametrize("proved", [True, False])
+def test_every_name_is_documented(proved):
+    netlist = replace(large_netlist(3, proved=proved), readout_class=read_only(np.arange(300) % 2), classes=2)
+    for form in FORMS:
+        inputs, outputs = port_words(onnx_graph.export(netlist, form))
+        for words in inputs + outputs:
+            name = words.split(" ")[0].removesuffix("_next")
+            shown = name if "." not in name else f"LAYER.{name.split('.')[1]}"
+            assert f"``{shown}``" in onnx_graph.__doc__
+        assert any(words.startswith("overflow bool") for words in outputs) != proved
+        kept = {words.split(" ")[0] for words in inputs}
+        assert {name for name in kept if name.endswith(".current")} == (
+            {"layer1.current", "layer3.current"} if form == "step" else set()
+        )
+
+
+def test_the_reference_of_the_format_computes_the_same():
+    pytest.importorskip("onnx", "1.18", "before, the evaluator did not see constants from inside a loop")
+    netlist = three_neurons()
+    given = np.random.default_rng(2).integers(0, 2, (2, 2, 12), np.uint8)
+    expected = engine.simulate(netlist, given, spikes=True).spikes
+    model = ReferenceEvaluator(model_of(onnx_graph.export(netlist, "scan")))
+    found = dict(zip(model.output_names, model.run(None, {"events": given.transpose(2, 0, 1)}), strict=True))
+    np.testing.assert_array_equal(found["layer0.spikes"].transpose(1, 0, 2), expected[:, :12, :2])
+    np.testing.assert_array_equal(found["layer1.spikes"].transpose(1, 0, 2), expected[:, 1:13, 2:])
+    assert found["votes"].tolist() == [[0, int(sample[:, 2].sum())] for sample in expected]
+    assert found["class"].tolist() == [int(sample[:, 2].any()) for sample in expected]
+
+
+@pytest.mark.parametrize("recipe", [Recipe(bits=8, planes=2), Recipe(bits=4, groups=4), Recipe(bits=2)])
+def test_planes_groups_and_few_bits(tmp_path, recipe):
+    checkpoint, adjacency = small_checkpoint(tmp_path)
+    netlist = compile_network(expand(checkpoint, adjacency), recipes=(recipe,)).netlist
+    given = events(3).reshape(-1, netlist.n_inputs, events(3).shape[3])
+    expected = engine.simulate(netlist, given, spikes=True).spikes
+    assert expected.any()
+    for form in FORMS:
+        found = onnx_engine.simulate(onnx_engine.prepare(netlist, form=form), given)
+        np.testing.assert_array_equal(found.spikes, expected)
+
+
+# -- the float network -------------------------------------------------------------------------------------------------
+
+
+def test_the_float_graph_is_the_float_model(tmp_path):
+    checkpoint, adjacency = small_checkpoint(tmp_path)
+    recorded = events(4)
+    expected = float_spikes(checkpoint, adjacency, recorded)
+    given = np.ascontiguousarray(recorded.reshape(len(recorded), -1, recorded.shape[3]).transpose(2, 0, 1))
+
+    scan = onnx_engine.open_session(onnx_float.export_float(checkpoint, adjacency, "scan", graph_name="ring"))
+    names = [port.name for port in scan.get_outputs()]
+    found = dict(zip(names, scan.run(names, {"events": given}), strict=True))
+    step = onnx_engine.open_session(onnx_float.export_float(checkpoint, adjacency, "step", graph_name="ring"))
+    kinds = {"tensor(uint8)": np.uint8, "tensor(int32)": np.int32, "tensor(float)": np.float32}
+    feed = {port.name: np.zeros((len(recorded), port.shape[1]), kinds[port.type]) for port in step.get_inputs()}
+    for t, now in enumerate(given):
+        left = dict(
+            zip([port.name for port in step.get_outputs()], step.run(None, feed | {"events": now}), strict=True)
+        )
+        feed |= {name.removesuffix("_next"): array for name, array in left.items() if name.endswith("_next")}
+        for name, spikes in expected.items():
+            np.testing.assert_array_equal(left[f"{name}.spikes"], spikes[:, t])
+    for name, spikes in expected.items():
+        assert spikes.any()
+        np.testing.assert_array_equal(found[f"{name}.spikes"].transpose(1, 0, 2), spikes)
+        np.testing.assert_array_equal(found[f"{name}.counts"], spikes.sum(axis=1))
+    np.testing.assert_array_equal(found["votes"], expected["fc3"].sum(axis=1))
+    np.testing.assert_array_equal(feed["votes"], found["votes"])
+    np.testing.assert_array_equal(found["class"], found["votes"].argmax(axis=1))
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_the_float_graph_knows_no_lists_of_edges(tmp_path, form):
+    checkpoint, adjacency = small_checkpoint(tmp_path)
+    content = onnx_float.export_float(checkpoint, adjacency, form, graph_name="ring")
+    assert content == onnx_float.export_float(checkpoint, adjacency, form, graph_name="ring")
+    model = model_of(content)
+    assert not {node.op_type for node in model.graph.node} & {"Gather", "GatherND", "ScatterND", "ScatterElements"}
+    facts = {entry.key: entry.value for entry in model.metadata_props}
+    assert (facts["graph"], facts["checkpoint_sha256"], facts["beta"]) == ("ring", checkpoint.sha256, "0.2")
+    ports = port_words(content)
+    assert all(
+        f"``{words.split(' ')[0].removesuffix('_next')}``" in onnx_float.__doc__.replace("LAYER", "fc1")
+        for words in ports[0] + ports[1]
+        if "." not in words or words.startswith("fc1")
+    )
+
+
+# -- the command -------------------------------------------------------------------------------------------------------
+
+
+def test_the_command_writes_both_forms(tmp_path):
+    write_netlist(three_neurons(), tmp_path / "net.loom")
+    for form, words in (("scan", ()), ("step", ("--form", "step"))):
+        path = tmp_path / f"{form}.onnx"
+        report, text = run(tmp_path / "net.loom", "--to", "onnx", *words, "-o", path)
+        content = onnx_graph.export(three_neurons(), form)
+        assert path.read_bytes() == content
+        inputs, outputs = port_words(content)
+        assert report == {
+            "path": str(path),
+            "format": "onnx",
+            "bytes": len(content),
+            "sha256": hashlib.sha256(content).hexdigest(),
+            "neurons": 3,
+            "synapses": 6,
+            "form": form,
+            "inputs": inputs,
+            "outputs": outputs,
+        }
+    assert inputs[:2] == ["events uint8 (batch, 2)", "length int64 ()"]
+    assert text.splitlines()[:3] == [
+        f"{path}: 3 neurons and 6 synapses for onnx, {len(content)} bytes, form step",
+        "inputs:",
+        "  events uint8 (batch, 2)",
+    ]
+
+
+def test_the_command_writes_a_float_network(tmp_path):
+    own_file(tmp_path / "net.pt")
+    report, text = run(tmp_path / "net.pt", "--to", "onnx-float", "-o", tmp_path / "f.onnx")
+    assert report["neurons"] == TAXELS * 5 + 9 + 8 + 4
+    assert report["graph"] == ring().name
+    assert report["inputs"] == ["events uint8 (time, batch, 12)"]
+    assert text.startswith(f"{tmp_path / 'f.onnx'}: 51 neurons for onnx-float, {report['bytes']} bytes, form scan\n")
+    model_of((tmp_path / "f.onnx").read_bytes())
+
+
+def test_options_that_would_be_ignored_are_refused(tmp_path):
+    write_netlist(three_neurons(), tmp_path / "net.loom")
+    checkpoints = "is for checkpoints, --to onnx takes a netlist; leave it away"
+    for words, why in (
+        (("--to", "sanafe", "--form", "scan"), "--form scan: is for onnx and onnx-float; leave it away"),
+        (("--to", "onnx", "--graph", "manual"), f"--graph manual: {checkpoints}"),
+        (("--to", "onnx", "--directed"), f"--directed: {checkpoints}"),
+        (("--to", "onnx", "--beta", "0.5"), f"--beta 0.5: {checkpoints}"),
+    ):
+        with pytest.raises(OptionError) as caught:
+            run(tmp_path / "net.loom", *words, "-o", tmp_path / "x.onnx")
+        assert str(caught.value) == why
+    assert [path.name for path in tmp_path.iterdir()] == ["net.loom"]
+
+
+def test_the_wrong_kind_of_file(tmp_path):
+    own_file(tmp_path / "net.pt")
+    write_netlist(three_neurons(), tmp_path / "net.loom")
+    with pytest.raises(FormatError, match="not a netlist"):
+        run(tmp_path / "net.pt", "--to", "onnx", "-o", tmp_path / "x.onnx")
+    with pytest.raises(ModelError, match=r"net\.loom: "):
+        run(tmp_path / "net.loom", "--to", "onnx-float", "-o", tmp_path / "x.onnx")
+    with pytest.raises(OptionError, match="is an input of this command"):
+        run(tmp_path / "net.loom", "--to", "onnx", "-o", tmp_path / "net.loom")
+
+
+def test_on_the_command_line(tmp_path, monkeypatch, capsys):
+    own_file(tmp_path / "net.pt")
+    recordings_folder(tmp_path / "data")
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["compile", "net.pt", "-o", "net.loom"]) == 0
+    assert cli.main(["export", "net.loom", "--to", "onnx", "--form", "step", "-o", "net.onnx"]) == 0
+    assert cli.main(["export", "net.pt", "--to", "onnx-float", "-o", "f.onnx"]) == 0
+    capsys.readouterr()
+    assert cli.main(["export", "net.loom", "--to", "onnx", "--form", "loop", "-o", "x.onnx"]) == 2
+    assert capsys.readouterr().err.startswith("spikeloom: argument --form: invalid choice: 'loop'")
+    for name in ("net.onnx", "f.onnx"):
+        model_of((tmp_path / name).read_bytes())
