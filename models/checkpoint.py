@@ -16,6 +16,7 @@ import torch
 from compiler.atomic import write_atomically
 from compiler.forms import Form
 from compiler.frontends.checkpoint import FORMAT, VERSIONS, content_digest
+from compiler.frontends.systems import TACTILESGNET, Grid
 from models.evtouch import Recordings
 from models.graphs import Graph
 from models.protocols import Reported, data_digest
@@ -69,13 +70,15 @@ def checkpoint_bytes(
     theta: float,
     training: Mapping[str, Any],
     forms: Sequence[Form] | None = None,
+    system: str = TACTILESGNET,
+    grid: Grid | None = None,
 ) -> bytes:
     """File content of a checkpoint; equal input gives equal bytes.
 
     Parameters
     ----------
     weights : mapping of ``last``, ``best`` or ``clean`` (at least one) to tensors
-        ``conv1.hops`` (K + 1, features, channels), ``conv1.bias``, ``fc1.weight``, ``fc1.bias`` … float32.
+        ``conv1.hops`` (filters, features, channels), ``conv1.bias``, ``fc1.weight``, ``fc1.bias`` … float32.
     graph : Graph
         What it was trained on.
     beta, theta : float
@@ -84,6 +87,10 @@ def checkpoint_bytes(
         JSON values: how it was made and what it reached.
     forms : sequence of Form, optional
         How the chip stores each layer, conv1 first, where the network was fine-tuned for it.
+    system : str
+        One of :data:`compiler.frontends.systems.SYSTEMS`.
+    grid : Grid, optional
+        Of a grid-based CNN.
     """
     tensors_of_one = next(iter(weights.values()))
     stages = sum(name.startswith("fc") and name.endswith(".weight") for name in tensors_of_one)
@@ -94,8 +101,8 @@ def checkpoint_bytes(
     }
     manifest: dict[str, Any] = {
         "format": FORMAT,
-        "version": VERSIONS[0] if forms is None else VERSIONS[1],
-        "architecture": "tactilesgnet",
+        "version": VERSIONS[2] if system != TACTILESGNET else VERSIONS[0] if forms is None else VERSIONS[1],
+        "architecture": system,
         "taxels": graph.n_taxels,
         "classes": len(tensors_of_one[f"fc{stages}.bias"]),
         "beta": beta,
@@ -104,6 +111,8 @@ def checkpoint_bytes(
         "weights": list(weights),
         "training": dict(training),
     }
+    if grid is not None:
+        manifest["grid"] = grid.to_json()
     if forms is not None:
         layers = ["conv1", *(f"fc{stage}" for stage in range(1, stages + 1))]
         manifest["forms"] = [
@@ -137,6 +146,8 @@ def save_checkpoint(
     theta: float,
     training: Mapping[str, Any],
     forms: Sequence[Form] | None = None,
+    system: str = TACTILESGNET,
+    grid: Grid | None = None,
 ) -> None:
     """Write a checkpoint, whole or not at all; parameters as :func:`checkpoint_bytes`.
 
@@ -145,6 +156,8 @@ def save_checkpoint(
     OSError
         If the file cannot be written; an older file is left as it was.
     """
-    content = checkpoint_bytes(weights, graph, beta=beta, theta=theta, training=training, forms=forms)
+    content = checkpoint_bytes(
+        weights, graph, beta=beta, theta=theta, training=training, forms=forms, system=system, grid=grid
+    )
     with write_atomically(path) as file:
         file.write(content)

@@ -164,6 +164,9 @@ def _nearest_steps(weight: NDArray[np.float64], rate: NDArray[np.float64], codes
         error = (rate * (weight - rounded) ** 2).sum(axis=1)
         better = error < best
         best[better], chosen[better] = error[better], step[better]
+    unheard = ~weight.any(axis=1)  # where a window sees no taxel any step will do
+    if not unheard.all():
+        chosen[unheard] = np.exp(np.log(chosen[~unheard]).mean())
     return chosen
 
 

@@ -61,9 +61,8 @@ class _HopSum(torch.autograd.Function):
     def forward(ctx: Any, rows: Tensor, hops: Tensor, bias: Tensor) -> Tensor:
         ctx.save_for_backward(rows)
         out = rows[0] @ hops[0].t()
-        term = torch.empty_like(out)
         for k in range(1, len(hops)):
-            out += torch.mm(rows[k], hops[k].t(), out=term)
+            out.addmm_(rows[k], hops[k].t())
         out += bias
         return out
 
@@ -74,6 +73,32 @@ class _HopSum(torch.autograd.Function):
         beside = rows.transpose(0, 1).reshape(n_rows, n_hops * channels)
         hops = (beside.t() @ gradients[0]).view(n_hops, channels, -1).transpose(1, 2)
         return None, hops, gradients[0].sum(0)
+
+
+def filter_places(x: Tensor, propagation: Tensor, filters: Tensor, bias: Tensor) -> Tensor:
+    """``y = sum_k M_k x g_k^T + b``, in one product: of what every place sees, with all filters side by side.
+
+    Parameters
+    ----------
+    x : (steps, samples, taxels, channels)
+        Input; no gradient flows into it.
+    propagation : (filters, places, taxels)
+        Stack of the M_k.
+    filters : (filters, features, channels)
+    bias : (features,)
+
+    Returns
+    -------
+    (steps, samples, places * features)
+        Place-major: entry ``place * features + feature``.
+    """
+    steps, samples, taxels, channels = x.shape
+    n_filters, places, _ = propagation.shape
+    # Rows are places here, so that one product with a wide matrix gathers for all steps and samples.
+    seen = propagation.transpose(0, 1).reshape(-1, taxels) @ x.permute(2, 0, 1, 3).reshape(taxels, -1)
+    rows = seen.view(places, n_filters, -1, channels).permute(2, 0, 1, 3).reshape(-1, n_filters * channels)
+    weight = filters.permute(0, 2, 1).reshape(n_filters * channels, -1)
+    return torch.addmm(bias, rows, weight).view(steps, samples, -1)
 
 
 def lif(current: Tensor, beta: float, theta: float) -> tuple[Tensor, Tensor]:

@@ -1,4 +1,4 @@
-"""Spiking graph networks for touch, computed layer by layer over all time steps.
+"""Spiking networks for touch, computed layer by layer over all time steps; they differ in their first layer.
 
 References
 ----------
@@ -17,16 +17,18 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from models.layers import lif, spike_linear, tag_convolution
+from compiler.frontends.systems import GCN, GRID_CNN, MLP, TACTILESGNET, feature_major, in_order
+from models.layers import filter_places, lif, spike_linear, tag_convolution
+from models.systems import HOPS, filters_of
 
 Weights = dict[str, NDArray[np.float32]]
-"""Arrays by name: ``conv1.hops`` (K + 1, features, channels), ``conv1.bias``, then ``fc1.weight`` (outputs, inputs),
-``fc1.bias`` and so on."""
+"""Arrays by name: ``conv1.hops`` (filters, features, channels), ``conv1.bias``, then ``fc1.weight`` (outputs, inputs),
+``fc1.bias`` and so on; see :mod:`compiler.frontends.systems`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Architecture:
-    """Sizes and neuron constants of a `TactileSGNet`; the defaults are those of [1]_.
+    """Sizes and neuron constants of a `SpikingNet`; the defaults are those of [1]_.
 
     Parameters
     ----------
@@ -35,23 +37,26 @@ class Architecture:
     channels : int
         Inputs per taxel (polarities).
     hops : int
-        K of the graph convolution, which has K + 1 filters.
+        K of the graph convolution of a TactileSGNet, which has K + 1 filters.
     features : int
-        Outputs of the graph convolution per taxel.
+        Outputs of the first layer per place.
     hidden : tuple of int
         Neurons of each dense layer before the last.
     beta, theta : float
         Membrane decay per step and firing threshold of every neuron.
+    system : str
+        One of :data:`compiler.frontends.systems.SYSTEMS`.
     """
 
     taxels: int
     classes: int
     channels: int = 2
-    hops: int = 3
+    hops: int = HOPS
     features: int = 64
     hidden: tuple[int, ...] = (128, 256)
     beta: float = 0.2
     theta: float = 0.5
+    system: str = TACTILESGNET
 
 
 class TagConvolution(nn.Module):
@@ -66,6 +71,43 @@ class TagConvolution(nn.Module):
     def forward(self, x: Tensor, adjacency: Tensor) -> Tensor:
         """See :func:`models.layers.tag_convolution`."""
         return tag_convolution(x, adjacency, self.hops, self.bias)
+
+
+class PlaceFilters(nn.Module):
+    """Filters (filters, features, channels) over what each place sees: the first layer of a GCN or a grid-based CNN.
+
+    Starts as the layers of those names start in torch_geometric and torch: Glorot's uniform weights and no bias, or
+    weights and bias within 1/sqrt(fan-in).
+    """
+
+    def __init__(self, filters: int, channels: int, features: int, system: str, generator: torch.Generator) -> None:
+        super().__init__()
+        self.hops = nn.Parameter(torch.empty(filters, features, channels))
+        self.bias = nn.Parameter(torch.zeros(features))
+        if system == GCN:
+            _uniform(self.hops, (channels + features) / 6, generator)
+        else:
+            _uniform(self.hops, filters * channels, generator)
+            _uniform(self.bias, filters * channels, generator)
+
+    def forward(self, x: Tensor, propagation: Tensor) -> Tensor:
+        """See :func:`models.layers.filter_places`."""
+        return filter_places(x, propagation, self.hops, self.bias)
+
+
+class TaxelWeights(nn.Module):
+    """The first layer of an MLP: a weight (taxels * channels, features) for each input, which are few and spikes."""
+
+    def __init__(self, inputs: int, features: int, generator: torch.Generator) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.empty(inputs, features))
+        self.bias = nn.Parameter(torch.empty(features))
+        _uniform(self.weight, inputs, generator)
+        _uniform(self.bias, inputs, generator)
+
+    def forward(self, x: Tensor, _propagation: Tensor) -> Tensor:
+        """See :func:`models.layers.spike_linear`."""
+        return spike_linear(x.flatten(2), self.weight, self.bias)
 
 
 class SpikeLinear(nn.Module):
@@ -83,36 +125,41 @@ class SpikeLinear(nn.Module):
         return spike_linear(spikes, self.weight, self.bias)
 
 
-class TactileSGNet(nn.Module):
-    """Graph convolution, dense layers and a spike-count vote; every layer is one of LIF neurons [1]_.
+class SpikingNet(nn.Module):
+    """A first layer, dense layers and a spike-count vote; every layer is one of LIF neurons [1]_.
 
     Parameters
     ----------
     architecture : Architecture
         Sizes.
-    adjacency : (taxels, taxels) float64
-        Normalised propagation matrix of the taxel graph.
+    propagation : (taxels, taxels) or (filters, places, taxels) float64
+        What the first layer sees, see :func:`models.systems.propagation_of`.
     seed : int
         Of the initial weights: uniform within 1/sqrt(fan-in), as torch and torch_geometric draw them; the bias of
-        the convolution starts at zero. The global random state is neither used nor moved.
+        a graph convolution starts at zero. The global random state is neither used nor moved.
+
+    Notes
+    -----
+    Neurons of the first layer lie place by place here; exported weights are in the order of the system.
     """
 
-    def __init__(self, architecture: Architecture, adjacency: NDArray[np.float64], *, seed: int = 0) -> None:
+    def __init__(self, architecture: Architecture, propagation: NDArray[np.float64], *, seed: int = 0) -> None:
         super().__init__()
         self.architecture = architecture
+        self.places = propagation.shape[-2]
         generator = torch.Generator().manual_seed(seed)
-        self.conv1 = TagConvolution(architecture.channels, architecture.features, architecture.hops, generator)
-        sizes = (architecture.taxels * architecture.features, *architecture.hidden, architecture.classes)
+        self.conv1 = _first_layer(architecture, generator)
+        sizes = (self.places * architecture.features, *architecture.hidden, architecture.classes)
         self.dense = tuple(f"fc{i}" for i in range(1, len(sizes)))
         for name, inputs, outputs in zip(self.dense, sizes[:-1], sizes[1:], strict=True):
             self.add_module(name, SpikeLinear(inputs, outputs, generator))
         self.adjacency: Tensor
-        self.register_buffer("adjacency", torch.tensor(adjacency, dtype=torch.float32), persistent=False)
+        self.register_buffer("adjacency", torch.tensor(propagation, dtype=torch.float32), persistent=False)
 
     def layers(self, events: Tensor) -> dict[str, tuple[Tensor, Tensor]]:
         """Spikes and membranes of every layer, each (steps, samples, neurons), for (steps, samples, taxels, channels).
 
-        Neurons of ``conv1`` are taxel-major: ``taxel * features + feature``.
+        Neurons of ``conv1`` lie place by place: ``place * features + feature``.
         """
         beta, theta = self.architecture.beta, self.architecture.theta
         found = {"conv1": lif(self.conv1(events, self.adjacency), beta, theta)}
@@ -129,11 +176,44 @@ class TactileSGNet(nn.Module):
     def export_weights(self) -> Weights:
         """Copy of the weights."""
         state = {name: parameter.detach().cpu().numpy() for name, parameter in self.named_parameters()}
-        return {name: (array.T if _turned(name) else array).copy(order="C") for name, array in state.items()}
+        found = {name: (array.T if _turned(name) else array) for name, array in state.items()}
+        if self.architecture.system == MLP:
+            weight = found.pop("conv1.weight")
+            found = {"conv1.hops": weight.reshape(len(weight), self.architecture.taxels, -1).swapaxes(0, 1)} | found
+        if feature_major(self.architecture.system):
+            found["fc1.weight"] = found["fc1.weight"][:, self._order()]
+        return {name: array.copy(order="C") for name, array in found.items()}
 
     def load_weights(self, weights: Mapping[str, NDArray[np.float32]]) -> None:
         """Take over what `export_weights` returned."""
-        self.load_state_dict({n: torch.tensor(array.T if _turned(n) else array) for n, array in weights.items()})
+        given = dict(weights)
+        if self.architecture.system == MLP:
+            hops = given.pop("conv1.hops")
+            given["conv1.weight"] = hops.swapaxes(0, 1).reshape(hops.shape[1], -1)
+        if feature_major(self.architecture.system):
+            given["fc1.weight"] = given["fc1.weight"][:, np.argsort(self._order())]
+        self.load_state_dict({n: torch.tensor(array.T if _turned(n) else array) for n, array in given.items()})
+
+    def _order(self) -> NDArray[np.int64]:
+        """Neuron of ours that is the first, second … one in the order of the system."""
+        features = self.architecture.features
+        order: NDArray[np.int64] = in_order(
+            self.architecture.system, np.arange(self.places * features).reshape(self.places, features)
+        )
+        return order
+
+
+def _first_layer(architecture: Architecture, generator: torch.Generator) -> nn.Module:
+    channels, features, system = architecture.channels, architecture.features, architecture.system
+    match system:
+        case "tactilesgnet":
+            return TagConvolution(channels, features, architecture.hops, generator)
+        case "mlp":
+            return TaxelWeights(architecture.taxels * channels, features, generator)
+    assert system in (GCN, GRID_CNN), "systems are checked where they are named"
+    return PlaceFilters(
+        filters_of(system, architecture.taxels, architecture.hops), channels, features, system, generator
+    )
 
 
 def _turned(name: str) -> bool:
@@ -141,7 +221,7 @@ def _turned(name: str) -> bool:
     return name.endswith(".weight")
 
 
-def _uniform(weight: Tensor, fan_in: int, generator: torch.Generator) -> None:
+def _uniform(weight: Tensor, fan_in: float, generator: torch.Generator) -> None:
     bound = 1 / math.sqrt(fan_in)
     with torch.no_grad():
         weight.uniform_(-bound, bound, generator=generator)

@@ -92,7 +92,7 @@ def data_digest(training: Recordings, test: Recordings) -> str:
 def train_both(
     training: Recordings,
     test: Recordings,
-    adjacency: NDArray[np.float64],
+    propagation: NDArray[np.float64],
     architecture: Architecture,
     *,
     epochs: int,
@@ -111,7 +111,7 @@ def train_both(
     validation = train(
         fitted,
         held,
-        adjacency,
+        propagation,
         architecture,
         epochs=epochs,
         seed=seed,
@@ -125,7 +125,7 @@ def train_both(
     trained = train(
         training,
         test,
-        adjacency,
+        propagation,
         architecture,
         epochs=epochs,
         seed=seed,

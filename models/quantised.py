@@ -28,7 +28,8 @@ from compiler.fixedpoint import (
 )
 from compiler.forms import Form, decay_registers, reach, round_steps, step_units
 from compiler.frontends.checkpoint import Checkpoint
-from compiler.passes.expand import effective_weight, hop_powers
+from compiler.frontends.systems import in_order
+from compiler.passes.expand import effective_weight, stack_of
 from models.layers import SURROGATE_HALF_WIDTH, differentiate, events_of, gather, scatter
 
 SHRINK = 0.98
@@ -64,14 +65,14 @@ class Integers:
 
 
 class QuantisedNet(nn.Module):
-    """A TactileSGNet on chip integers.
+    """A network on chip integers.
 
     Parameters
     ----------
     checkpoint : Checkpoint
         Weights, decay and threshold.
-    adjacency : (taxels, taxels) float64
-        Normalised propagation matrix.
+    adjacency : (taxels, taxels) or (filters, places, taxels) float64
+        What the first layer sees, see :func:`compiler.passes.expand.stack_of`.
     forms : sequence of Form
         How the chip stores each layer, conv1 first.
     """
@@ -82,7 +83,8 @@ class QuantisedNet(nn.Module):
         self.names = ("conv1", *(dense.name for dense in checkpoint.dense))
         self.theta = checkpoint.theta
         self.keep = (1 << DECAY_BITS) - decay_registers(checkpoint.beta)[1]
-        self.powers = hop_powers(adjacency, len(checkpoint.hops))
+        self.system = checkpoint.system
+        self.stack = stack_of(checkpoint, adjacency)
         self.hops = nn.Parameter(torch.tensor(checkpoint.hops))
         self.conv_bias = nn.Parameter(torch.tensor(checkpoint.conv_bias))
         self.weights = nn.ParameterList(nn.Parameter(torch.tensor(dense.weight)) for dense in checkpoint.dense)
@@ -93,14 +95,9 @@ class QuantisedNet(nn.Module):
     def real_weights(self) -> list[tuple[Array, Array]]:
         """Weights (neurons, inputs) and biases (neurons,) of each layer, float64, the convolution expanded."""
         hops = self.hops.detach().numpy().astype(np.float64)
-        conv = effective_weight(self.powers, hops)
-        taxels, features, _, channels = conv.shape
-        layers = [
-            (
-                conv.reshape(taxels * features, taxels * channels),
-                np.tile(self.conv_bias.detach().numpy().astype(np.float64), taxels),
-            )
-        ]
+        conv = in_order(self.system, effective_weight(self.stack, hops))
+        bias = np.tile(self.conv_bias.detach().numpy().astype(np.float64), (self.stack.shape[1], 1))
+        layers = [(conv.reshape(len(conv), -1), in_order(self.system, bias))]
         for weight, bias in zip(self.weights, self.biases, strict=True):
             layers.append((weight.detach().numpy().astype(np.float64), bias.detach().numpy().astype(np.float64)))
         return layers
@@ -161,17 +158,19 @@ class QuantisedNet(nn.Module):
                     if layer:
                         self.weights[layer - 1][torch.tensor(wrong)] *= SHRINK
                     else:
-                        features = np.unique(np.flatnonzero(wrong) % self.hops.shape[1])
-                        self.hops[:, torch.tensor(features)] *= SHRINK
+                        places, features = self.stack.shape[1], self.hops.shape[1]
+                        feature = in_order(self.system, np.tile(np.arange(features), (places, 1)))
+                        self.hops[:, torch.tensor(np.unique(feature[wrong]))] *= SHRINK
 
     def spikes_of(self, events: Tensor) -> list[Tensor]:
         """Spikes of every layer, (steps, samples, neurons), for events (steps, samples, channels) of zeros and ones."""
-        powers = torch.tensor(self.powers, dtype=torch.float32)
-        taxels, features = powers.shape[1], self.hops.shape[1]
+        stack = torch.tensor(self.stack, dtype=torch.float32)
+        places, features = stack.shape[1], self.hops.shape[1]
         # for the gradient only; the integers come from float64
-        conv = torch.einsum("kij,kfc->ifjc", powers, self.hops).reshape(taxels * features, -1)
+        conv = in_order(self.system, torch.einsum("kij,kfc->ifjc", stack, self.hops))
+        bias = in_order(self.system, self.conv_bias.repeat(places).view(places, features))
         found, spikes = [], events
-        pairs = [(conv, self.conv_bias.repeat(taxels)), *zip(self.weights, self.biases, strict=True)]
+        pairs = [(conv.reshape(len(conv), -1), bias), *zip(self.weights, self.biases, strict=True)]
         for (weight, bias), integers in zip(pairs, self.integers, strict=True):
             spikes = _ChipLayer.apply(spikes, weight, bias, integers, self.theta)  # type: ignore[no-untyped-call]
             found.append(spikes)

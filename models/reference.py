@@ -1,19 +1,22 @@
 """The float model of a checkpoint, in the released operator order, as ``verify`` compares the chip with it.
 
 Released order: hop 0 first, then one propagation and one linear map per hop, added up, bias last; then the
-recurrence. In float32 this gives every spike of the released code on the released test recordings.
+recurrence. In float32 this gives every spike of the released code on the released test recordings. A GCN is mapped
+first and then propagated, as torch_geometric does it; the sums of the others are one product.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
 from compiler.frontends.checkpoint import Checkpoint
-from models.layers import lif, tag_convolution
+from compiler.frontends.systems import GCN, TACTILESGNET, feature_major
+from models.layers import filter_places, lif, tag_convolution
 
 BATCH = 8
 """Recordings that run together: few enough for the caches."""
@@ -31,14 +34,25 @@ def _layers(
         return torch.tensor(np.ascontiguousarray(array), dtype=kind)
 
     x = tensor(events.transpose(3, 0, 1, 2))
-    hops = tensor(checkpoint.hops)
-    current = tag_convolution(x, tensor(adjacency), hops, tensor(checkpoint.conv_bias))
+    current = _first(checkpoint.system, x, tensor(adjacency), tensor(checkpoint.hops), tensor(checkpoint.conv_bias))
     spikes, membranes = lif(current, checkpoint.beta, checkpoint.theta)
     yield "conv1", spikes, membranes
     for dense in checkpoint.dense:
         current = torch.nn.functional.linear(spikes, tensor(dense.weight), tensor(dense.bias))
         spikes, membranes = lif(current, checkpoint.beta, checkpoint.theta)
         yield dense.name, spikes, membranes
+
+
+def _first(system: str, x: torch.Tensor, propagation: torch.Tensor, hops: torch.Tensor, bias: torch.Tensor) -> Any:
+    """Currents of the first layer, (steps, samples, neurons), in the order of the system's neurons."""
+    if system == TACTILESGNET:
+        return tag_convolution(x, propagation, hops, bias)
+    if system == GCN:
+        return (propagation[0] @ (x @ hops[0].t()) + bias).flatten(2)
+    current = filter_places(x, propagation, hops, bias)
+    if feature_major(system):
+        return current.view(*current.shape[:2], -1, len(bias)).transpose(2, 3).flatten(2)
+    return current
 
 
 def float_spikes(
@@ -54,8 +68,8 @@ def float_spikes(
     ----------
     checkpoint : Checkpoint
         Trained weights.
-    adjacency : (taxels, taxels) float64
-        Normalised propagation matrix; rounded to `dtype`.
+    adjacency : (taxels, taxels) or (filters, places, taxels) float64
+        What the first layer sees, see :func:`compiler.passes.expand.stack_of`; rounded to `dtype`.
     events : (samples, taxels, channels, steps) uint8
         Recordings.
     dtype : {"float32", "float64"}

@@ -30,7 +30,7 @@ from tqdm import tqdm
 from compiler.errors import DataError, OptionError
 from compiler.frontends.checkpoint import arrays_digest
 from models.evtouch import Recordings
-from models.networks import Architecture, TactileSGNet, Weights
+from models.networks import Architecture, SpikingNet, Weights
 from models.resume import TrainingState, pack, read_state, unpack, write_state
 
 DECAY_EPOCHS = 40
@@ -100,7 +100,7 @@ class Trained:
 def train(
     training: Recordings,
     test: Recordings,
-    adjacency: NDArray[np.float64],
+    propagation: NDArray[np.float64],
     architecture: Architecture,
     *,
     epochs: int = 100,
@@ -114,14 +114,14 @@ def train(
     position: int = 0,
     after_epoch: Callable[[Epoch], None] | None = None,
 ) -> Trained:
-    """Train a `TactileSGNet` from scratch, or go on with an interrupted training.
+    """Train a `SpikingNet` from scratch, or go on with an interrupted training.
 
     Parameters
     ----------
     training, test : Recordings
         Both splits; `test` is only looked at.
-    adjacency : (taxels, taxels) float64
-        Normalised propagation matrix of the taxel graph.
+    propagation : (taxels, taxels) or (filters, places, taxels) float64
+        What the first layer sees, see :func:`models.systems.propagation_of`.
     architecture : Architecture
         Sizes.
     epochs : int
@@ -155,7 +155,7 @@ def train(
         _check(recordings, architecture)
     options = {
         "architecture": repr(architecture),
-        "graph": arrays_digest({"adjacency": adjacency}),
+        "graph": arrays_digest({"adjacency": propagation}),
         "training data": arrays_digest(training.identity()),
         "test data": arrays_digest(test.identity()),
         "epochs": epochs,
@@ -168,7 +168,7 @@ def train(
     history: list[Epoch] = []
     weights: dict[str, Weights] = {}
     with one_thread():
-        network = TactileSGNet(architecture, adjacency, seed=seed).to(device)
+        network = SpikingNet(architecture, propagation, seed=seed).to(device)
         optimizer = torch.optim.Adam(network.parameters(), lr=learning_rate, amsgrad=True, fused=device == "cpu")
         if resume and state is not None and state.exists():
             found = read_state(state, options)
@@ -177,8 +177,9 @@ def train(
         with bar as progress:
             for index in range(len(history), epochs):
                 rate = float(optimizer.param_groups[0]["lr"])
-                training_loss = _train_epoch(network, optimizer, training, order.permutation(len(training)))
-                _require_finite(training_loss, index + 1)
+                training_loss = _train_epoch(
+                    network, optimizer, training, order.permutation(len(training)), epoch=index + 1
+                )
                 if index % DECAY_EPOCHS == 0 and index > 1:
                     for group in optimizer.param_groups:
                         group["lr"] *= 0.1
@@ -225,16 +226,16 @@ def _check_options(epochs: int, seed: int, device: str) -> None:
         raise OptionError("--device cuda: this machine has no usable GPU; leave --device away")
 
 
-def _require_finite(loss: float, epoch: int) -> None:
+def _require_finite(loss: float, epoch: int, step: int) -> None:
     if not math.isfinite(loss):
         raise DataError(
-            f"epoch {epoch}: the loss is {loss}, a finite number is needed; the state of the epoch before is kept, "
-            "try a lower learning rate"
+            f"epoch {epoch}, step {step}: the loss is {loss}, a finite number is needed; the state of the epoch before "
+            "is kept, try a lower learning rate"
         )
 
 
 def _restore(
-    found: TrainingState, network: TactileSGNet, optimizer: torch.optim.Optimizer, order: np.random.Generator
+    found: TrainingState, network: SpikingNet, optimizer: torch.optim.Optimizer, order: np.random.Generator
 ) -> tuple[list[Epoch], dict[str, Weights]]:
     """Put a state back; return its history and the weights that it kept."""
     unpack(found.arrays, network, optimizer, found.progress["rate"])
@@ -249,7 +250,7 @@ def _restore(
 
 def _state(
     options: Mapping[str, Any],
-    network: TactileSGNet,
+    network: SpikingNet,
     optimizer: torch.optim.Optimizer,
     order: np.random.Generator,
     history: list[Epoch],
@@ -265,7 +266,7 @@ def _state(
     return TrainingState(options=options, progress=progress, arrays=arrays)
 
 
-def evaluate(network: TactileSGNet, recordings: Recordings) -> tuple[float, int]:
+def evaluate(network: SpikingNet, recordings: Recordings) -> tuple[float, int]:
     """Mean loss, and how many recordings are classified correctly; equal top rates count for the lowest class."""
     loss, correct = 0.0, 0
     with torch.no_grad():
@@ -277,7 +278,7 @@ def evaluate(network: TactileSGNet, recordings: Recordings) -> tuple[float, int]
     return loss / len(recordings), correct
 
 
-def predict(network: TactileSGNet, recordings: Recordings) -> NDArray[np.int64]:
+def predict(network: SpikingNet, recordings: Recordings) -> NDArray[np.int64]:
     """Class of each recording; equal top rates count for the lowest one."""
     found = []
     with torch.no_grad(), one_thread():
@@ -298,17 +299,24 @@ def _batches(recordings: Recordings) -> Iterator[tuple[slice, NDArray[np.uint8]]
 
 
 def _train_epoch(
-    network: TactileSGNet, optimizer: torch.optim.Optimizer, recordings: Recordings, order: NDArray[np.int64]
+    network: SpikingNet,
+    optimizer: torch.optim.Optimizer,
+    recordings: Recordings,
+    order: NDArray[np.int64],
+    *,
+    epoch: int,
 ) -> float:
     total = 0.0
-    for index in order:
+    for step, index in enumerate(order, 1):
         chosen = slice(index, index + 1)
         optimizer.zero_grad()
         events = recordings.events[chosen, ..., : recordings.steps_of(int(index))]
         loss = rate_loss(_rates(network, events), recordings.labels[chosen])
+        found = float(loss.detach())
+        _require_finite(found, epoch, step)
         loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
-        total += float(loss.detach())
+        total += found
     return total / len(order)
 
 
@@ -319,7 +327,7 @@ def rate_loss(rates: Tensor, labels: NDArray[np.int64]) -> Tensor:
     return torch.nn.functional.mse_loss(rates, target)
 
 
-def _rates(network: TactileSGNet, events: NDArray[np.uint8]) -> Tensor:
+def _rates(network: SpikingNet, events: NDArray[np.uint8]) -> Tensor:
     """Spike rates on the CPU, computed where the network is."""
     rates: Tensor = network(_time_first(events).to(network.adjacency.device)).cpu()
     return rates

@@ -24,8 +24,8 @@ class Asked:
         Float stage.
     checkpoint : Checkpoint or None
         Where it is from one.
-    adjacency : (taxels, taxels) float64, or None
-        Propagation matrix, likewise.
+    adjacency : (taxels, taxels) or (filters, places, taxels) float64, or None
+        What its first layer sees, likewise; see :func:`compiler.passes.expand.stack_of`.
     graph : str or None
         Its name, likewise.
     facts : tuple of str
@@ -61,7 +61,7 @@ def asked_network(path: str, arguments: argparse.Namespace) -> Asked:
             if value is not None:
                 raise OptionError(f"{option}: is for ONNX files, {path} is none; leave it away")
         checkpoint = asked_checkpoint(path, arguments)
-        graph, adjacency = propagation(checkpoint, asked_graph(arguments), path)
+        graph, adjacency = propagation(checkpoint, asked_graph(arguments, checkpoint.system), path)
         return Asked(
             network=expand(checkpoint, adjacency),
             checkpoint=checkpoint,
@@ -70,7 +70,7 @@ def asked_network(path: str, arguments: argparse.Namespace) -> Asked:
             facts=(),
             sha256=checkpoint.sha256,
         )
-    for name in ("graph", "taxels", "edges", "directed", "weights", "beta", "theta", "run"):
+    for name in ("system", "graph", "taxels", "edges", "directed", "weights", "beta", "theta", "run"):
         if getattr(arguments, name) not in (None, False, 0):
             raise OptionError(f"--{name}: is for checkpoints, the ONNX file {path} holds all it needs; leave it away")
     progress("reading the network")

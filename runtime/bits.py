@@ -21,7 +21,7 @@ from typing import Any
 from compiler.atomic import write_atomically
 from compiler.errors import ModelError, OptionError
 from compiler.fixedpoint import FloatArray
-from compiler.frontends.checkpoint import Checkpoint, arrays_digest, read_checkpoint
+from compiler.frontends.checkpoint import Checkpoint, arrays_digest
 from compiler.interpret import channels_last
 from compiler.passes.expand import expand
 from compiler.passes.widths import Found, Point, check_widths, front, search
@@ -31,7 +31,7 @@ from models.events import BIN_S
 from models.evtouch import Recordings
 from models.fetch import data_folder
 from runtime.data_commands import add_bin_option
-from runtime.inputs import asked_graph, propagation, recordings, require_place, shipped
+from runtime.inputs import asked_checkpoint, asked_graph, propagation, recordings, require_place, shipped
 from runtime.options import add_model
 from runtime.tables import percent, table
 
@@ -97,14 +97,12 @@ def bits(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], in
     path = shipped(arguments.checkpoint)
     if Path(path).is_file() and is_netlist(path):
         raise ModelError(f"{path}: is a netlist, its widths are decided; give the checkpoint that it was made from")
-    checkpoint = read_checkpoint(
-        path, run=arguments.run, weights=arguments.weights, beta=arguments.beta, theta=arguments.theta
-    )
+    checkpoint = asked_checkpoint(path, arguments)
     if checkpoint.forms is not None:
         raise ModelError(f"{path}: was fine-tuned for its own widths; give the network that it was made from")
     layers = ("conv1", *(dense.name for dense in checkpoint.dense))
     widths = check_widths(asked, arguments.scale_groups, len(layers), target)
-    _, adjacency = propagation(checkpoint, asked_graph(arguments), arguments.checkpoint)
+    _, adjacency = propagation(checkpoint, asked_graph(arguments, checkpoint.system), arguments.checkpoint)
     _tell("reading the recordings")
     training = recordings(
         arguments.calibrate,

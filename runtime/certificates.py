@@ -26,10 +26,11 @@ import numpy.typing as npt
 
 from compiler.fixedpoint import FloatArray, IntArray
 from compiler.frontends.checkpoint import Checkpoint
+from compiler.frontends.systems import TACTILESGNET, in_order
 from compiler.interpret import BATCH, DENORMAL, BoolArray, channels_last, cut
 from compiler.ir import INPUT, IntegerNetwork, Network
 from compiler.passes.bounds import prove_ranges
-from compiler.passes.expand import effective_weight, expand, hop_powers
+from compiler.passes.expand import effective_weight, expand, stack_of
 from runtime.tables import table
 from runtime.votes import readout_counts
 
@@ -131,9 +132,12 @@ def _layers(model: Checkpoint | Network, adjacency: FloatArray | None) -> list[_
     checkpoint, network = model, expand(model, adjacency)
     hops = checkpoint.hops.astype(np.float64)
     # Hop after hop on its own, as the released operator does: its terms may cancel only after they were rounded.
-    spelled = effective_weight(hop_powers(np.abs(adjacency), len(hops)), np.abs(hops))
-    gathered = int(np.count_nonzero(adjacency, axis=1).max(initial=0)) + 1
-    chain = (len(hops) - 1) * gathered + hops.shape[2] + 1 + len(hops)
+    spelled = in_order(checkpoint.system, effective_weight(stack_of(checkpoint, np.abs(adjacency)), np.abs(hops)))
+    # Of a graph the longest sum into a taxel, hop after hop; of a stack that into a place, filter after filter.
+    gathered = int(np.count_nonzero(adjacency, axis=-1).max(initial=0)) + 1
+    chain = len(hops) * gathered + hops.shape[2] * len(hops) + 1 + len(hops)
+    if checkpoint.system == TACTILESGNET:
+        chain = (len(hops) - 1) * gathered + hops.shape[2] + 1 + len(hops)
     layers = []
     for post, (population, projection) in enumerate(zip(network.populations, network.projections, strict=True)):
         weight = projection.weight.toarray()

@@ -20,13 +20,11 @@ import numpy as np
 from compiler.atomic import write_atomically
 from compiler.errors import OptionError, SpikeloomError
 from compiler.fixedpoint import IntArray
-from compiler.frontends.checkpoint import WEIGHTS
 from compiler.netlist import Netlist
 from compiler.passes.legalize import measure
 from compiler.serialize import is_netlist, read_netlist
 from compiler.targets import load_target, with_tables
 from models.evtouch import Recordings
-from models.graphs import CHOICES
 from models.grasps import SYNTHETIC
 from runtime import bits, decisions, explain, export, finetune, render, verdicts, watch, yardstick_command
 from runtime.asked import asked_network
@@ -34,8 +32,6 @@ from runtime.compile_command import compile_netlist
 from runtime.data_commands import add_data_commands
 from runtime.inputs import (
     asked_checkpoint,
-    asked_graph,
-    graph_words,
     progress,
     recordings,
     require_inspectable,
@@ -45,6 +41,7 @@ from runtime.inputs import (
 from runtime.options import add_compile, add_detail, add_model, add_network, add_recordings, add_training
 from runtime.tables import show
 from runtime.trace import ENGINES
+from runtime.train_command import train
 
 Arguments = argparse.Namespace
 Report = dict[str, Any]
@@ -81,7 +78,7 @@ def _recordings(arguments: Arguments, netlist: Netlist, *, labels_for: str | Non
 def _inspect(arguments: Arguments) -> Outcome:
     require_inspectable(arguments.path)
     if is_netlist(arguments.path):
-        for name in ("beta", "theta", "weights", "run"):
+        for name in ("beta", "theta", "weights", "run", "system"):
             value = getattr(arguments, name)
             if value is not None and (name, value) != ("run", 0):
                 raise OptionError(f"--{name} {value}: is for checkpoints, {arguments.path} is a netlist; leave it away")
@@ -187,61 +184,6 @@ def _costs(arguments: Arguments, netlist: Netlist, data: Recordings) -> tuple[In
     return counts.spikes, estimate_json(netlist, target, found, bin_s=arguments.bin)
 
 
-def _train(arguments: Arguments) -> Outcome:
-    from runtime.seeds import train_seeds
-    from runtime.training import (
-        PICTURES,
-        Job,
-        check_seeds,
-        draw_training,
-        output_of,
-        summary,
-        training_text,
-    )
-
-    check_seeds(arguments.seeds)
-    require_place(arguments.output, "-o", arguments)
-    if arguments.picture is not None:
-        require_place(arguments.picture, "--picture", arguments)
-        if Path(arguments.picture).suffix not in PICTURES:
-            raise OptionError(f"--picture {arguments.picture}: allowed are {', '.join(PICTURES)}; name one of these")
-    graph = asked_graph(arguments)
-    if graph is None:
-        raise OptionError(f"train: no graph; name it with --graph: {CHOICES}, or give --edges")
-    progress("reading the recordings")
-    shared: dict[str, Any] = {"taxels": graph.n_taxels, "bin_s": arguments.bin, "labels_for": "training"}
-    training = recordings(arguments.data, "train", classes=None, **shared)
-    test = recordings(arguments.data, "test", classes=int(training.labels.max()) + 1, **shared)
-    progress("")
-    data = arguments.data if arguments.data == SYNTHETIC else training.source
-    command = f"spikeloom train --data {data} {graph_words(arguments)} --epochs {arguments.epochs}"
-    keep = tuple(dict.fromkeys(arguments.keep or WEIGHTS))
-    jobs = [
-        Job(
-            training=training,
-            test=test,
-            graph=graph,
-            epochs=arguments.epochs,
-            seed=seed,
-            device=arguments.device,
-            resume=arguments.resume,
-            output=output_of(arguments.output, seed, arguments.seeds),
-            keep=keep,
-            command=f"{command} --seed {seed}",
-            facts={"spikeloom": version(), "device": arguments.device},
-            draws=arguments.picture is not None,
-            position=position,
-        )
-        for position, seed in enumerate(range(arguments.seed, arguments.seed + arguments.seeds))
-    ]
-    results = train_seeds(jobs, resume=arguments.resume)
-    records = [record for record, _ in results]
-    if arguments.picture is not None:
-        decided = [predicted for _, predicted in results if predicted is not None]
-        draw_training(arguments.picture, records, test.labels, decided)
-    return {"runs": records, "protocols": summary(records)}, training_text, 0
-
-
 def _demo(_arguments: Arguments) -> Outcome:
     parser = build_parser()
     reports: Report = {}
@@ -328,7 +270,7 @@ def build_parser() -> argparse.ArgumentParser:
     add_recordings(sub)
     add_detail(sub, ("counts", "cycle"), "counts")
 
-    sub = command("train", _train, "train a network by the released protocol, reported by the paper's and a clean one")
+    sub = command("train", train, "train a network by the released protocol, reported by the paper's and a clean one")
     add_training(sub)
     bits.add_arguments(command("bits", bits.bits, bits.SUMMARY))
     explain.add_arguments(command("explain", explain.explain, explain.SUMMARY))

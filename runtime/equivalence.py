@@ -15,6 +15,7 @@ import numpy.typing as npt
 from compiler.errors import DataError, ModelError
 from compiler.fixedpoint import MEMBRANE_SHIFT, FloatArray, IntArray
 from compiler.frontends.checkpoint import Checkpoint
+from compiler.frontends.systems import GRAPH_SYSTEMS
 from compiler.interpret import BoolArray, channels_last, cut, run_float, run_integer, vote
 from compiler.ir import IntegerNetwork, Network, Projection, Sparse
 from compiler.lift import lift
@@ -142,7 +143,7 @@ def require_match(netlist: Netlist, model: Checkpoint | Network) -> None:
         theirs |= {population.name: population.size for population in model.populations}
     else:
         theirs = {"taxels": model.taxels, "channels": model.hops.shape[2]}
-        theirs |= {"conv1": model.taxels * model.hops.shape[1]}
+        theirs |= {"conv1": model.places * model.hops.shape[1]}
         theirs |= {dense.name: len(dense.bias) for dense in model.dense}
     if ours != theirs:
         sizes = [", ".join(f"{name} {neurons}" for name, neurons in side.items()) for side in (ours, theirs)]
@@ -405,8 +406,8 @@ def verify(
         files,
         lambda sample, layer: _membranes(model, adjacency, events[sample : sample + 1])[layer][0],
     )
-    if divergence is not None and isinstance(model, Network):
-        divergence = replace(divergence, taxel=None, feature=None)  # its neurons may lie in any order
+    if divergence is not None and (isinstance(model, Network) or model.system not in GRAPH_SYSTEMS):
+        divergence = replace(divergence, taxel=None, feature=None)  # its neurons lie otherwise
     float_counts = readout_counts(network.readout, network.classes, reference[network.readout.population])
     chip_counts = class_counts(netlist, trace.counts.spikes)
     compared_neurons = [np.arange(layer.neurons)[keep] for layer, keep in zip(netlist.layers, kept, strict=True)]

@@ -18,6 +18,7 @@ import numpy as np
 
 from compiler.errors import DataError, OptionError
 from compiler.frontends.checkpoint import Checkpoint
+from compiler.frontends.systems import GRAPH_SYSTEMS, TACTILESGNET
 from compiler.interpret import BoolArray, channels_last
 from compiler.ir import IntegerNetwork
 from compiler.lift import lift
@@ -105,7 +106,7 @@ def explain(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str],
             channels_last(events)[0],
             _observe(netlist, prepared, events),
             convolution=None
-            if checkpoint is None or asked.adjacency is None
+            if checkpoint is None or checkpoint.system != TACTILESGNET or asked.adjacency is None
             else (asked.adjacency, checkpoint.hops.astype(np.float64)),
             may_compensate=bool(netlist.provenance.get("calibrated", True)),
             absent=absent,
@@ -268,7 +269,8 @@ def explanation_json(found: Explanation, integer: IntegerNetwork, checkpoint: Ch
 def _root_json(found: RootCause, integer: IntegerNetwork, checkpoint: Checkpoint | None) -> Json:
     root, population = found.root, integer.populations[found.root.layer]
     stored = [p for p in integer.projections if p.post == root.layer]
-    features = checkpoint.hops.shape[1] if checkpoint is not None and root.layer == 0 else None
+    by_taxel = checkpoint is not None and checkpoint.system in GRAPH_SYSTEMS and root.layer == 0
+    features = checkpoint.hops.shape[1] if checkpoint is not None and by_taxel else None
     return {
         "layer": population.name,
         "neuron": root.neuron,

@@ -8,16 +8,19 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from compiler.atomic import remove_leftovers
 from compiler.errors import ModelError, OptionError
 from compiler.frontends.checkpoint import Checkpoint, read_checkpoint
+from compiler.frontends.systems import GRAPH_SYSTEMS
 from compiler.passes.expand import expand
 from compiler.passes.quantize import round_to_forms
 from compiler.serialize import is_netlist
 from compiler.targets import load_target
 from models.graphs import Graph
 from runtime.data_commands import add_bin_option
-from runtime.inputs import asked_graph, graph_words, propagation, recordings, require_place, shipped
+from runtime.inputs import asked_checkpoint, asked_graph, graph_words, propagation, recordings, require_place, shipped
 from runtime.options import DATA_HELP, add_model
 from runtime.tables import percent, table
 
@@ -54,11 +57,12 @@ def _widths(words: str) -> list[int]:
 
 def _graph(checkpoint: Checkpoint, asked: Graph | None, name: str) -> Graph:
     """Graph to store: the one in the checkpoint, or the one that was asked for; `propagation` has compared them."""
-    if checkpoint.edges is None:
+    if checkpoint.edges is None and checkpoint.system in GRAPH_SYSTEMS:
         assert asked is not None, "propagation needs a graph"
         return asked
+    edges = np.zeros((0, 2), np.int64) if checkpoint.edges is None else checkpoint.edges
     coordinates = [[float(taxel), 0.0] for taxel in range(checkpoint.taxels)]  # only edges are stored
-    return Graph(name=name, coordinates=coordinates, edges=checkpoint.edges)  # type: ignore[arg-type]
+    return Graph(name=name, coordinates=coordinates, edges=edges)  # type: ignore[arg-type]
 
 
 def _state(output: Path, *, resume: bool) -> Path:
@@ -93,12 +97,10 @@ def finetune(arguments: argparse.Namespace) -> tuple[Report, Callable[[Report], 
     path = shipped(arguments.checkpoint)
     if Path(path).is_file() and is_netlist(path):
         raise ModelError(f"{path}: is a netlist, its weights are rounded already; give the checkpoint it was made from")
-    checkpoint = read_checkpoint(
-        path, run=arguments.run, weights=arguments.weights, beta=arguments.beta, theta=arguments.theta
-    )
+    checkpoint = asked_checkpoint(path, arguments)
     if checkpoint.forms is not None:
         raise ModelError(f"{path}: was fine-tuned already; give the network that it was made from")
-    asked = asked_graph(arguments)
+    asked = asked_graph(arguments, checkpoint.system)
     name, adjacency = propagation(checkpoint, asked, arguments.checkpoint)
     training, test = (
         recordings(
@@ -156,6 +158,8 @@ def finetune(arguments: argparse.Namespace) -> tuple[Report, Callable[[Report], 
         theta=checkpoint.theta,
         training=record,
         forms=tuned.forms,
+        system=checkpoint.system,
+        grid=checkpoint.grid,
     )
     round_to_forms(expand(read_checkpoint(output), adjacency), tuned.forms)  # it compiles, or says why not
     state.unlink(missing_ok=True)

@@ -11,13 +11,15 @@ from pathlib import Path
 import numpy as np
 
 from compiler.errors import DataError, ModelError, OptionError
-from compiler.fixedpoint import FloatArray
+from compiler.fixedpoint import FloatArray, IntArray
 from compiler.frontends.checkpoint import Checkpoint, read_checkpoint
+from compiler.frontends.systems import GRAPH_SYSTEMS, TACTILESGNET, TITLES
 from models.events import BIN_S, load_data, need_labels, require_events
 from models.evtouch import Recordings
-from models.graphs import CHOICES, Graph, normalised_adjacency
+from models.graphs import CHOICES, NEUTOUCH, Graph
 from models.grasps import SYNTHETIC, synthetic_split
-from models.sensors import sensor_graph
+from models.sensors import read_layout, sensor_graph
+from models.systems import NO_GRAPH, grid_cells, propagation_of
 from runtime.found import show_counts
 
 _RECORDINGS = "recordings are shown by spikeloom data describe"
@@ -82,14 +84,19 @@ def recordings(
     return grasps
 
 
-def asked_graph(arguments: argparse.Namespace) -> Graph | None:
+def asked_graph(arguments: argparse.Namespace, system: str = TACTILESGNET) -> Graph | None:
     """Graph that the options name, or None if they name none; warnings go to stderr.
 
     Raises
     ------
     OptionError, ModelError
-        If there is no such graph, or its files are wrong.
+        If there is no such graph, its files are wrong, or the system has no graph at all.
     """
+    if system not in GRAPH_SYSTEMS:
+        for option in ("graph", "edges", "directed"):
+            if getattr(arguments, option):
+                raise OptionError(f"--{option}: is for taxel graphs, {TITLES[system]} has none; leave it away")
+        return None
     if not (arguments.graph or arguments.taxels or arguments.edges or arguments.directed):
         return None
     graph, warnings = sensor_graph(
@@ -97,6 +104,20 @@ def asked_graph(arguments: argparse.Namespace) -> Graph | None:
     )
     sys.stderr.writelines(f"spikeloom: warning: {warning}\n" for warning in warnings)
     return graph
+
+
+def asked_places(taxels: str | None) -> FloatArray:
+    """Positions of the taxels in millimetres: of ``--taxels``, where a number lines them up, or of the built-in sensor.
+
+    Raises
+    ------
+    OptionError, DataError
+        If there is no such sensor.
+    """
+    if taxels is None:
+        return NEUTOUCH
+    count, places = read_layout(taxels)
+    return np.arange(float(count))[:, None] if places is None else places
 
 
 def graph_words(arguments: argparse.Namespace) -> str:
@@ -108,26 +129,30 @@ def graph_words(arguments: argparse.Namespace) -> str:
 
 
 def propagation(checkpoint: Checkpoint, asked: Graph | None, where: str) -> tuple[str, FloatArray]:
-    """Name and propagation matrix of the graph that was asked for, or of the one in the checkpoint.
+    """Name of the graph that was asked for, or of the one in the checkpoint, and what the first layer sees.
 
     Raises
     ------
     ModelError
         If no graph is known, or another one than the checkpoint was trained on is asked for.
     """
+
+    def seen(edges: IntArray, taxels: int) -> FloatArray:
+        return propagation_of(checkpoint.system, edges, taxels, checkpoint.grid, len(checkpoint.hops))
+
+    if checkpoint.system not in GRAPH_SYSTEMS:
+        return NO_GRAPH, seen(np.zeros((0, 2), np.int64), checkpoint.taxels)
     if asked is None:
         if checkpoint.edges is None:
             raise ModelError(f"{where}: the graph is not in this file; name it with --graph: {CHOICES}")
-        return str(checkpoint.graph), normalised_adjacency(checkpoint.edges, checkpoint.taxels)
-    adjacency = normalised_adjacency(asked.edges, asked.n_taxels)
-    if checkpoint.edges is not None:
-        trained = normalised_adjacency(checkpoint.edges, checkpoint.taxels)
-        if not np.array_equal(trained, adjacency):
-            raise ModelError(
-                f"{where}: graph and weights disagree: it was trained on {checkpoint.graph}, --graph says "
-                f"{asked.name}; leave --graph away"
-            )
-    return asked.name, adjacency
+        return str(checkpoint.graph), seen(checkpoint.edges, checkpoint.taxels)
+    found = seen(asked.edges, asked.n_taxels)
+    if checkpoint.edges is not None and not np.array_equal(seen(checkpoint.edges, checkpoint.taxels), found):
+        raise ModelError(
+            f"{where}: graph and weights disagree: it was trained on {checkpoint.graph}, --graph says "
+            f"{asked.name}; leave --graph away"
+        )
+    return asked.name, found
 
 
 INPUTS = ("checkpoint", "original", "against", "netlist", "data", "calibrate", "source", "taxels", "edges")
@@ -206,6 +231,13 @@ def asked_checkpoint(path: str, arguments: argparse.Namespace) -> Checkpoint:
         If it is not there, or not as they say.
     """
     progress("reading the checkpoint")
+    places = asked_places(getattr(arguments, "taxels", None))
     return read_checkpoint(
-        shipped(path), run=arguments.run, weights=arguments.weights, beta=arguments.beta, theta=arguments.theta
+        shipped(path),
+        run=arguments.run,
+        weights=arguments.weights,
+        beta=arguments.beta,
+        theta=arguments.theta,
+        system=arguments.system,
+        cells=grid_cells(places) if places.shape[1] == 2 else None,
     )

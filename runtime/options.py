@@ -6,10 +6,12 @@ import argparse
 
 from compiler.errors import OptionError
 from compiler.frontends.checkpoint import WEIGHTS
+from compiler.frontends.systems import GRAPH_SYSTEMS, SYSTEMS, TACTILESGNET
 from compiler.passes.layout import GOALS
 from compiler.passes.quantize import RANGES
 from compiler.pipeline import STAGES
 from models.graphs import CHOICES
+from models.systems import PADDINGS
 from runtime.data_commands import add_bin_option
 
 MARGIN = 0.1
@@ -23,6 +25,11 @@ def add_graph_options(parser: argparse.ArgumentParser, purpose: str) -> None:
     parser.add_argument("--taxels", metavar="N|COORDS.csv", help="your own sensor: positions x,y[,z] in mm")
     parser.add_argument("--edges", metavar="EDGES.csv", help="your own graph: source,target")
     parser.add_argument("--directed", action="store_true", help="take --edges as they are, one way")
+
+
+def add_system(parser: argparse.ArgumentParser, default: str) -> None:
+    """Add the option that names a system."""
+    parser.add_argument("--system", choices=SYSTEMS, help=f"{', '.join(SYSTEMS)} ({default})")
 
 
 def add_recordings(parser: argparse.ArgumentParser) -> None:
@@ -49,6 +56,12 @@ def add_training(parser: argparse.ArgumentParser) -> None:
     """Add the options of a training."""
     parser.add_argument("--data", required=True, metavar="PATH", help=DATA_HELP)
     add_bin_option(parser)
+    add_system(parser, f"default: {TACTILESGNET}; {' and '.join(GRAPH_SYSTEMS)} need a graph")
+    parser.add_argument(
+        "--padding",
+        choices=PADDINGS,
+        help="of a grid-cnn's window: none, moving by 2 (default), or same, which no Loihi core holds",
+    )
     add_graph_options(parser, "to train on")
     parser.add_argument("--epochs", type=int, default=100, metavar="N", help="default: 100, as released")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of weights and order (default: 0)")
@@ -69,6 +82,7 @@ def add_model(parser: argparse.ArgumentParser, *, graph: bool = True) -> None:
     """Add the options that say how to read a checkpoint."""
     if graph:
         add_graph_options(parser, "that it was trained on")
+    add_system(parser, "default: what the checkpoint is")
     parser.add_argument("--run", type=int, default=0, metavar="N", help="which run of a released file (default: 0)")
     parser.add_argument(
         "--weights",

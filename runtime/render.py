@@ -11,6 +11,7 @@ import numpy as np
 
 from compiler.fixedpoint import FloatArray, IntArray
 from compiler.frontends.checkpoint import Checkpoint
+from compiler.frontends.systems import GRAPH_SYSTEMS, TACTILESGNET
 from compiler.netlist import Netlist
 from compiler.passes.chips import chip_count
 from compiler.passes.layout import Layout
@@ -293,11 +294,12 @@ def checkpoint_json(checkpoint: Checkpoint, given: tuple[str, ...]) -> Json:
     """What a checkpoint holds, and what of it the user gave or was assumed."""
     return {
         "layout": checkpoint.layout,
+        "system": checkpoint.system,
         "taxels": checkpoint.taxels,
         "classes": checkpoint.classes,
-        "hops": int(checkpoint.hops.shape[0] - 1),
+        **({"hops": int(checkpoint.hops.shape[0] - 1)} if checkpoint.system == TACTILESGNET else {}),
         "layers": [
-            {"name": "conv1", "neurons": checkpoint.taxels * int(checkpoint.hops.shape[1])},
+            {"name": "conv1", "neurons": checkpoint.places * int(checkpoint.hops.shape[1])},
             *({"name": dense.name, "neurons": len(dense.bias)} for dense in checkpoint.dense),
         ],
         "beta": checkpoint.beta,
@@ -313,10 +315,12 @@ def checkpoint_json(checkpoint: Checkpoint, given: tuple[str, ...]) -> Json:
 def checkpoint_text(report: Json) -> str:
     """A checkpoint for people."""
     layers = ", ".join(f"{layer['name']} {layer['neurons']:,}" for layer in report["layers"])
+    system = f"K = {report['hops']}" if "hops" in report else report["system"]
+    graph = report["graph"] or "not in the file; name it with --graph"
     lines = [
-        f"checkpoint, {report['layout']} layout: {report['taxels']} taxels, K = {report['hops']}, {layers}, "
+        f"checkpoint, {report['layout']} layout: {report['taxels']} taxels, {system}, {layers}, "
         f"{report['classes']} classes",
-        f"  graph: {report['graph'] or 'not in the file; name it with --graph'}",
+        f"  graph: {graph if report['system'] in GRAPH_SYSTEMS else 'none, as the system has none'}",
     ]
     for name in ("beta", "theta"):
         source = "given" if name in report["given"] else "read from the file"

@@ -13,10 +13,12 @@ from typing import Any
 import numpy as np
 
 from compiler.errors import OptionError
-from compiler.fixedpoint import IntArray
+from compiler.fixedpoint import FloatArray, IntArray
 from compiler.frontends.checkpoint import WEIGHTS, read_checkpoint
+from compiler.frontends.systems import TACTILESGNET, Grid
 from models.evtouch import Recordings
-from models.graphs import Graph, normalised_adjacency
+from models.graphs import Graph
+from models.systems import HOPS, filters_of, propagation_of
 from runtime.intervals import wilson
 from runtime.tables import table
 
@@ -49,6 +51,10 @@ class Job:
         Whether predictions are needed, for a picture.
     position : int
         Row of the progress bar.
+    system : str
+        One of :data:`compiler.frontends.systems.SYSTEMS`.
+    grid : Grid, optional
+        Of a grid-based CNN.
     """
 
     training: Recordings
@@ -64,6 +70,13 @@ class Job:
     facts: Mapping[str, Any]
     draws: bool
     position: int
+    system: str = TACTILESGNET
+    grid: Grid | None = None
+
+    def propagation(self) -> FloatArray:
+        """What the first layer sees."""
+        taxels = self.graph.n_taxels
+        return propagation_of(self.system, self.graph.edges, taxels, self.grid, filters_of(self.system, taxels, HOPS))
 
 
 def output_of(output: str, seed: int, seeds: int) -> Path:
@@ -103,11 +116,13 @@ def run_job(job: Job) -> tuple[dict[str, Any], IntArray | None]:
     from models.networks import Architecture
     from models.protocols import train_both
 
-    architecture = Architecture(taxels=job.graph.n_taxels, classes=int(job.training.labels.max()) + 1)
+    architecture = Architecture(
+        taxels=job.graph.n_taxels, classes=int(job.training.labels.max()) + 1, system=job.system
+    )
     reported = train_both(
         job.training,
         job.test,
-        normalised_adjacency(job.graph.edges, job.graph.n_taxels),
+        job.propagation(),
         architecture,
         epochs=job.epochs,
         seed=job.seed,
@@ -127,6 +142,8 @@ def run_job(job: Job) -> tuple[dict[str, Any], IntArray | None]:
         beta=architecture.beta,
         theta=architecture.theta,
         training=record,
+        system=job.system,
+        grid=job.grid,
     )
     for file in state_of(job):
         file.unlink(missing_ok=True)
@@ -156,6 +173,9 @@ def recall(job: Job) -> tuple[dict[str, Any], IntArray | None]:
     differing = [name.removesuffix("_sha256") for name, value in wanted.items() if record.get(name) != value]
     if found.graph != job.graph.name:
         differing.append("graph")
+    ours, theirs = (None if grid is None else grid.to_json() for grid in (job.grid, found.grid))
+    if found.system != job.system or ours != theirs:
+        differing.append("system")
     if differing:
         raise OptionError(
             f"{job.output}: holds another training (other {', '.join(differing)}); give its options, or another -o"
@@ -178,11 +198,13 @@ def _with_file(job: Job, record: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _predictions(job: Job, weights: Mapping[str, Any]) -> IntArray:
-    from models.networks import Architecture, TactileSGNet
+    from models.networks import Architecture, SpikingNet
     from models.train import predict
 
-    architecture = Architecture(taxels=job.graph.n_taxels, classes=int(job.training.labels.max()) + 1)
-    network = TactileSGNet(architecture, normalised_adjacency(job.graph.edges, job.graph.n_taxels))
+    architecture = Architecture(
+        taxels=job.graph.n_taxels, classes=int(job.training.labels.max()) + 1, system=job.system
+    )
+    network = SpikingNet(architecture, job.propagation())
     network.load_weights(weights)
     return predict(network, job.test)
 

@@ -32,7 +32,7 @@ def measure(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str],
     if is_netlist(path):
         raise ModelError(f"{path}: is a netlist, estimate says what it costs; give the checkpoint it was made from")
     checkpoint = asked_checkpoint(path, arguments)
-    graph, adjacency = propagation(checkpoint, asked_graph(arguments), arguments.checkpoint)
+    graph, adjacency = propagation(checkpoint, asked_graph(arguments, checkpoint.system), arguments.checkpoint)
     data = recordings(
         arguments.data,
         arguments.split,

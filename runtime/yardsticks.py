@@ -26,6 +26,7 @@ import numpy.typing as npt
 from compiler.errors import DataError
 from compiler.fixedpoint import FloatArray
 from compiler.frontends.checkpoint import Checkpoint
+from compiler.frontends.systems import GCN, TACTILESGNET
 from compiler.ir import INPUT, Network
 from compiler.passes.expand import expand
 from compiler.targets import Quantity
@@ -227,10 +228,11 @@ def _neurobench(
 
 
 def _factored(checkpoint: Checkpoint, adjacency: FloatArray) -> int:
-    """Multiply-accumulates of the graph convolution in one step, hop by hop over the edges."""
+    """Multiply-accumulates of the first layer in one step: its maps, and of a graph its hops over the edges."""
     hops, _, channels = checkpoint.hops.shape
-    maps = checkpoint.taxels * int(checkpoint.hops.size)
-    return maps + (int(hops) - 1) * int(np.count_nonzero(adjacency)) * int(channels)
+    maps = checkpoint.places * int(checkpoint.hops.size)
+    times = {TACTILESGNET: int(hops) - 1, GCN: 1}.get(checkpoint.system, 0)
+    return maps + times * int(np.count_nonzero(adjacency)) * int(channels)
 
 
 def yardsticks_json(found: Yardsticks) -> Json:

@@ -243,8 +243,8 @@ def test_altered_checkpoint(refusal, tmp_path):
 def test_newer_checkpoint(refusal, tmp_path):
     path = tmp_path / "net.pt"
     with zipfile.ZipFile(path, "w") as made:
-        made.writestr("manifest.json", json.dumps({"format": "spikeloom-checkpoint", "version": 3}))
-    assert refusal("inspect", path) == f"{path}: has format version 3, this program reads up to 2; update spikeloom"
+        made.writestr("manifest.json", json.dumps({"format": "spikeloom-checkpoint", "version": 4}))
+    assert refusal("inspect", path) == f"{path}: has format version 4, this program reads up to 3; update spikeloom"
 
 
 def test_checkpoint_zip_bomb(refusal, tmp_path):

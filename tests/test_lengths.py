@@ -10,7 +10,7 @@ from compiler.interpret import run_integer
 from compiler.lift import lift
 from compiler.serialize import read_netlist
 from models.events import load_data
-from models.networks import Architecture, TactileSGNet
+from models.networks import Architecture, SpikingNet
 from models.protocols import validation_split
 from models.train import evaluate, predict, train
 from runtime.cli import main
@@ -116,7 +116,7 @@ def test_estimate_prices_each_recording_at_its_own_length(folder, capsys):
 
 def test_training_sees_each_recording_at_its_own_length(folder):
     adjacency = np.eye(TAXELS)
-    network = TactileSGNet(Architecture(taxels=TAXELS, classes=CLASSES), adjacency, seed=2)
+    network = SpikingNet(Architecture(taxels=TAXELS, classes=CLASSES), adjacency, seed=2)
     together, _ = load_data(folder, "test")
     alone = [load_data(file, taxels=TAXELS)[0] for file in files(folder)]
     assert predict(network, together).tolist() == [int(predict(network, one)[0]) for one in alone]

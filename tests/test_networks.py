@@ -15,7 +15,7 @@ from compiler.passes.expand import expand_graph_convolution
 from models.evtouch import load_recordings
 from models.graphs import build_graph, normalised_adjacency
 from models.layers import SURROGATE_HALF_WIDTH, LifSteps, lif, spike_linear, tag_convolution
-from models.networks import Architecture, TactileSGNet
+from models.networks import Architecture, SpikingNet
 from models.reference import float_membranes, float_spikes
 
 BETA, THETA = 0.2, 0.5
@@ -201,7 +201,7 @@ SMALL = Architecture(taxels=39, classes=4, hops=2, features=3, hidden=(8, 6, 5),
 
 def lively(seed):
     """A network of which every layer spikes: initial weights times four."""
-    network = TactileSGNet(SMALL, adjacency_of(), seed=seed)
+    network = SpikingNet(SMALL, adjacency_of(), seed=seed)
     with torch.no_grad():
         for parameter in network.parameters():
             parameter.mul_(4)
@@ -209,7 +209,7 @@ def lively(seed):
 
 
 def test_sizes_come_from_the_architecture():
-    network = TactileSGNet(SMALL, adjacency_of(), seed=1)
+    network = SpikingNet(SMALL, adjacency_of(), seed=1)
     shapes = {name: array.shape for name, array in network.export_weights().items()}
     assert shapes == {
         "conv1.hops": (3, 3, 2),
@@ -228,7 +228,7 @@ def test_sizes_come_from_the_architecture():
 
 def test_initial_weights_follow_the_seed_and_leave_the_global_random_state_alone():
     before = torch.get_rng_state()
-    first, again, other = (TactileSGNet(SMALL, adjacency_of(), seed=seed).export_weights() for seed in (1, 1, 2))
+    first, again, other = (SpikingNet(SMALL, adjacency_of(), seed=seed).export_weights() for seed in (1, 1, 2))
     assert torch.equal(torch.get_rng_state(), before)
     for name, array in first.items():
         assert_array_equal(array, again[name])
@@ -243,7 +243,7 @@ def test_initial_weights_follow_the_seed_and_leave_the_global_random_state_alone
 
 def test_weights_can_be_taken_over():
     events = random_events(2, 20, 2, 39)
-    first, second = (TactileSGNet(SMALL, adjacency_of(), seed=seed) for seed in (1, 2))
+    first, second = (SpikingNet(SMALL, adjacency_of(), seed=seed) for seed in (1, 2))
     exported = first.export_weights()
     second.load_weights(exported)
     for name, (spikes, _) in first.layers(events).items():
@@ -290,7 +290,7 @@ def test_all_layers_equal_the_step_by_step_network_in_spikes_and_gradient():
 # --- the reference -------------------------------------------------------------------------------------------------
 
 
-def checkpoint_of(network: TactileSGNet) -> Checkpoint:
+def checkpoint_of(network: SpikingNet) -> Checkpoint:
     weights = network.export_weights()
     return Checkpoint(
         hops=weights["conv1.hops"],

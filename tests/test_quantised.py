@@ -72,7 +72,7 @@ def test_batches_do_not_mix(tmp_path):
 
 def test_gradients_are_those_of_the_rounded_float_model(tmp_path):
     """At 8 bits and with scales this fine the straight-through gradient is the float model's, to a few parts in 100."""
-    from models.networks import Architecture, TactileSGNet
+    from models.networks import Architecture, SpikingNet
 
     checkpoint, adjacency = small_checkpoint(tmp_path)
     data = recordings(checkpoint, 1, samples=3)
@@ -87,7 +87,7 @@ def test_gradients_are_those_of_the_rounded_float_model(tmp_path):
         hidden=tuple(sizes[:-1]),
         beta=819 / 4096,
     )
-    plain = TactileSGNet(architecture, adjacency)
+    plain = SpikingNet(architecture, adjacency)
     exact = {"conv1.hops": model.hops, "conv1.bias": model.conv_bias}
     for dense, weight, bias in zip(plain.dense, model.weights, model.biases, strict=True):
         exact |= {f"{dense}.weight": weight, f"{dense}.bias": bias}

@@ -13,7 +13,7 @@ from models.checkpoint import checkpoint_bytes, training_record
 from models.evtouch import Recordings
 from models.graphs import build_graph, normalised_adjacency
 from models.grasps import synthetic_grasps
-from models.networks import Architecture, TactileSGNet
+from models.networks import Architecture, SpikingNet
 from models.protocols import state_files, train_both, validation_split
 from models.train import Epoch, evaluate, train
 
@@ -62,7 +62,7 @@ def test_one_epoch_twice_gives_the_same_bytes_whatever_the_threads_and_the_globa
 def test_steps_equal_adam_on_the_released_loss():
     training, seed = grasps(0), 5
     trained = train(training, grasps(1), ADJACENCY, SMALL, epochs=2, seed=seed)
-    network = TactileSGNet(SMALL, ADJACENCY, seed=seed)
+    network = SpikingNet(SMALL, ADJACENCY, seed=seed)
     optimizer = torch.optim.Adam(network.parameters(), lr=1e-3, amsgrad=True, foreach=False)
     order = np.random.default_rng(seed)
     for epoch in range(2):
@@ -96,7 +96,7 @@ def test_best_weights_are_those_of_the_first_epoch_with_the_most_right(monkeypat
     right = iter([2, 5, 5, 3])
     kept = []
 
-    def fake(network: TactileSGNet, recordings: Recordings) -> tuple[float, int]:
+    def fake(network: SpikingNet, recordings: Recordings) -> tuple[float, int]:
         kept.append(network.export_weights())
         return 0.5, next(right)
 
@@ -118,7 +118,7 @@ def test_it_learns_the_synthetic_grasps():
 
 
 def test_evaluation_counts_the_lowest_of_equal_classes_and_averages_over_recordings():
-    silent = TactileSGNet(SMALL, ADJACENCY)
+    silent = SpikingNet(SMALL, ADJACENCY)
     with torch.no_grad():
         for parameter in silent.parameters():
             parameter.zero_()
@@ -213,11 +213,12 @@ def test_a_loss_that_is_no_number_stops_and_keeps_the_state(tmp_path, monkeypatc
     state = tmp_path / "x.state"
     train(grasps(0), grasps(1), ADJACENCY, SMALL, epochs=1, state=state)
     kept = state.read_bytes()
-    monkeypatch.setattr(models.train, "_train_epoch", lambda *_: float("nan"))
+    steps = iter((1.0, float("nan")))
+    monkeypatch.setattr(models.train, "rate_loss", lambda rates, _: rates.sum() * next(steps))
     with pytest.raises(DataError) as stopped:
         train(grasps(0), grasps(1), ADJACENCY, SMALL, epochs=1, seed=1, state=state)
     assert str(stopped.value) == (
-        "epoch 1: the loss is nan, a finite number is needed; the state of the epoch before is kept, "
+        "epoch 1, step 2: the loss is nan, a finite number is needed; the state of the epoch before is kept, "
         "try a lower learning rate"
     )
     assert state.read_bytes() == kept

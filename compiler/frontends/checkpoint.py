@@ -1,4 +1,4 @@
-"""Read trained TactileSGNet checkpoints: our own files, the released layout and bare state dicts.
+"""Read trained checkpoints of all systems: our own files, the released layout and bare state dicts.
 
 Our own format is a plain zip (members stored, not compressed) that needs neither pickle nor torch:
 
@@ -12,6 +12,10 @@ Our own format is a plain zip (members stored, not compressed) that needs neithe
 
 Version 2 adds ``forms`` to the manifest: how the chip stores each layer that the network was fine-tuned for, an
 object per layer with ``layer``, ``bits``, ``exponents`` and ``threshold`` (one integer a neuron).
+
+Version 3 is for the other systems: ``architecture`` is "mlp", "gcn" or "grid-cnn", and ``conv1.hops`` holds a filter
+for each taxel, one filter, or one for each cell of the window, row by row; ``grid`` says of the last where the taxels
+lie (``rows``, ``columns``, ``stride``, ``padding``, ``cells``). ``forms`` may be there or not.
 
 Files of ``torch.save`` are read by :mod:`compiler.frontends.released`.
 """
@@ -38,11 +42,24 @@ from compiler.errors import ModelError, OptionError
 from compiler.fixedpoint import THRESHOLD_MANTISSA_MAX, IntArray
 from compiler.forms import Form, plane_distance
 from compiler.frontends.released import DAMAGED, GIVE, NOT_A_CHECKPOINT, read_released
+from compiler.frontends.systems import (
+    GRAPH_SYSTEMS,
+    GRID_CNN,
+    MLP,
+    SYSTEMS,
+    TACTILESGNET,
+    TITLES,
+    Grid,
+    grid_from_json,
+    kernel_of,
+    shape_faults,
+    window_forms,
+)
 from compiler.frontends.tensors import Arrays, faults_of, size, taxel_faults, wanted_dense
 
 FORMAT = "spikeloom-checkpoint"
-VERSIONS = (1, 2)
-"""Of a plain file, and of one that holds the forms of a fine-tuning."""
+VERSIONS = (1, 2, 3)
+"""Of a plain file of a TactileSGNet, of one that holds the forms of a fine-tuning, and of another system's."""
 
 BETA, THETA = 0.2, 0.5
 """Decay and threshold of the released code; files in its layout do not hold them."""
@@ -84,8 +101,10 @@ class Checkpoint:
 
     Parameters
     ----------
-    hops : (K + 1, features, channels) float32
-        Filters of the graph convolution.
+    system : str
+        One of ``SYSTEMS``.
+    hops : (filters, features, channels) float32
+        Filters of the first layer: of a TactileSGNet K + 1, one for each hop.
     conv_bias : (features,) float32
     dense : tuple of Dense
         Fully connected stages in order.
@@ -109,6 +128,8 @@ class Checkpoint:
         How the chip stores each layer, where the network was fine-tuned for it.
     sha256 : str
         Of the file.
+    grid : Grid or None
+        Of a grid-based CNN.
     """
 
     hops: Float32Array
@@ -125,11 +146,20 @@ class Checkpoint:
     training: Mapping[str, Any] | None
     forms: tuple[Form, ...] | None
     sha256: str
+    system: str = TACTILESGNET
+    grid: Grid | None = None
+
+    @property
+    def places(self) -> int:
+        """Number of places that the first fully connected stage was trained on."""
+        return int(self.dense[0].weight.shape[1] // self.hops.shape[1])
 
     @property
     def taxels(self) -> int:
-        """Number of taxels that the first fully connected stage was trained on."""
-        return int(self.dense[0].weight.shape[1] // self.hops.shape[1])
+        """Number of taxels of the sensor."""
+        if self.grid is not None:
+            return len(self.grid.cells)
+        return len(self.hops) if self.system == MLP else self.places
 
     @property
     def classes(self) -> int:
@@ -159,6 +189,8 @@ def read_checkpoint(
     weights: str | None = None,
     beta: float | None = None,
     theta: float | None = None,
+    system: str | None = None,
+    cells: IntArray | None = None,
 ) -> Checkpoint:
     """Read a checkpoint of any known layout.
 
@@ -173,24 +205,32 @@ def read_checkpoint(
         on the test split, the clean one on a part of the training split.
     beta, theta : float, optional
         Decay and threshold; taken from the file, or from the released code where the file does not say.
+    system : str, optional
+        Which system it is; the file tells by itself.
+    cells : (taxels, 2) int64, optional
+        Row and column of each taxel on the grid of a grid-based CNN, where the file does not say.
 
     Raises
     ------
     ModelError
         If the file is no checkpoint, holds code, is damaged or altered, does not hold what is asked for, or its
-        tensors do not make a TactileSGNet; every fault of the tensors is listed.
+        tensors do not make the system; every fault of the tensors is listed.
     OptionError
-        If `weights`, `beta` or `theta` has a value that does not exist, or a fine-tuned network had another one.
+        If `system` is another than the file's, or `weights`, `beta` or `theta` has a value that does not exist, or a
+        fine-tuned network had another one.
     """
     if weights is not None and weights not in WEIGHTS:
         raise OptionError(f"--weights {weights}: unknown; choose from {', '.join(WEIGHTS)}")
+    if system is not None and system not in SYSTEMS:
+        raise OptionError(f"--system {system}: unknown; choose from {', '.join(SYSTEMS)}")
     _require_constants("", OptionError, beta, theta)
     where, path = str(path), Path(path)
     content = _content(where, path)
     members = _own_members(where, content)
     given = {"beta": beta, "theta": theta}
     if members is None:
-        arrays, layout, runs, training = read_released(where, content, run)
+        arrays, layout, runs, training, found = read_released(where, content, run, system)
+        grid = _released_grid(where, arrays, cells) if found == GRID_CNN else None
         if weights not in (None, "last"):
             raise ModelError(f"{where}: --weights {weights}: the file holds the last epoch only; leave --weights away")
         graph, edges, chosen, held = None, None, "last", {"beta": BETA, "theta": THETA}
@@ -199,7 +239,9 @@ def read_checkpoint(
     else:
         if run != 0:
             raise ModelError(f"{where}: --run {run}: the file holds only run 0; leave --run away")
-        arrays, chosen, (graph, edges, held, training), forms = _own_arrays(where, members, weights)
+        arrays, chosen, (graph, edges, held, training), (found, grid), forms = _own_arrays(where, members, weights)
+        if system not in (None, found):
+            raise OptionError(f"--system {system}: {where} holds a {found}; leave --system away")
         layout, runs, assumed = "spikeloom", 1, ()
         for name, value in given.items():
             if forms is not None and value not in (None, held[name]):
@@ -225,6 +267,26 @@ def read_checkpoint(
         training=training,
         forms=forms,
         sha256=hashlib.sha256(content).hexdigest(),
+        system=found,
+        grid=grid,
+    )
+
+
+def _released_grid(where: str, arrays: Arrays, cells: IntArray | None) -> Grid:
+    """Grid of a file that does not say what it is: which of the two forms, the number of places tells."""
+    if cells is None:
+        raise ModelError(f"{where}: where the taxels lie on the grid is not in this file; name the sensor")
+    filters, features, _ = arrays["conv1.hops"].shape
+    places = arrays["fc1.weight"].shape[1] // features
+    forms = window_forms(cells, kernel_of(filters))
+    counts = {form: math.prod(grid.places(kernel_of(filters))) for form, grid in forms.items()}
+    for form, count in counts.items():
+        if count == places:
+            return forms[form]
+    sizes = " or ".join(f"{count} (padding {form})" for form, count in counts.items())
+    raise ModelError(
+        f"{where}: fc1 was trained on {places} places, a window of {kernel_of(filters)} * {kernel_of(filters)} on this "
+        f"sensor has {sizes}; give the sensor that it was trained on"
     )
 
 
@@ -296,8 +358,14 @@ def _manifest(where: str, content: bytes) -> dict[str, Any]:
 
 def _own_arrays(
     where: str, members: dict[str, bytes], weights: str | None
-) -> tuple[Arrays, str, tuple[str, IntArray, dict[str, float], dict[str, Any]], tuple[Form, ...] | None]:
-    """Arrays of one set, its name, then graph name, edges, neuron constants and training record, and the forms."""
+) -> tuple[
+    Arrays,
+    str,
+    tuple[str, IntArray, dict[str, float], dict[str, Any]],
+    tuple[str, Grid | None],
+    tuple[Form, ...] | None,
+]:
+    """Arrays of one set, its name; graph name, edges, neuron constants and training record; system and grid; forms."""
     manifest = _manifest(where, members.pop("manifest.json"))
     try:
         arrays: Arrays = {name.removesuffix(".npy"): _read_npy(content) for name, content in members.items()}
@@ -313,6 +381,10 @@ def _own_arrays(
         held = {name: float(manifest[name]) for name in ("beta", "theta")}
         taxels, classes = int(manifest["taxels"]), int(manifest["classes"])
         facts = str(graph["name"]), edges, held, dict(manifest["training"])
+        system = str(manifest["architecture"]) if manifest["version"] == VERSIONS[2] else TACTILESGNET
+        if system not in SYSTEMS:
+            raise ValueError(f"architecture {system}")
+        grid = grid_from_json(manifest["grid"]) if system == GRID_CNN else None
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise ModelError(f"{where}: has an incomplete manifest ({error!r}); {_AGAIN}") from error
     _require_constants(f"{where}: ", ModelError, held["beta"], held["theta"])
@@ -321,19 +393,19 @@ def _own_arrays(
     if weights not in sets:
         raise ModelError(f"{where}: --weights {weights}: the file holds {', '.join(sets)}; choose one that it holds")
     chosen = {name.removeprefix(f"{weights}/"): a for name, a in arrays.items() if name.startswith(f"{weights}/")}
-    faults = _own_faults(chosen, taxels, classes)
+    faults = _own_faults(chosen, taxels, classes, system, grid)
     if edges.size and (edges.min() < 0 or edges.max() >= taxels):
         faults.append(f"the graph joins taxels outside 0..{taxels - 1}")
     if faults:
         raise ModelError(f"{where}: {'; '.join(faults)}; {_AGAIN}")
-    return chosen, weights, facts, _forms(where, manifest, chosen, taxels)
+    return chosen, weights, facts, (system, grid), _forms(where, manifest, chosen)
 
 
-def _forms(where: str, manifest: dict[str, Any], arrays: Arrays, taxels: int) -> tuple[Form, ...] | None:
+def _forms(where: str, manifest: dict[str, Any], arrays: Arrays) -> tuple[Form, ...] | None:
     """Storage of every layer of a fine-tuned network; None for a plain file."""
-    if manifest["version"] == VERSIONS[0]:
+    if manifest["version"] == VERSIONS[0] or (manifest["version"] == VERSIONS[2] and "forms" not in manifest):
         return None
-    sizes = {"conv1": taxels * len(arrays["conv1.bias"])}
+    sizes = {"conv1": arrays["fc1.weight"].shape[1]}
     stages = sum(key.endswith(".weight") for key in arrays)
     sizes |= {f"fc{stage}": len(arrays[f"fc{stage}.bias"]) for stage in range(1, stages + 1)}
     found = []
@@ -360,15 +432,17 @@ def _forms(where: str, manifest: dict[str, Any], arrays: Arrays, taxels: int) ->
     return tuple(found)
 
 
-def _own_faults(arrays: Arrays, taxels: int, classes: int) -> list[str]:
+def _own_faults(arrays: Arrays, taxels: int, classes: int, system: str, grid: Grid | None) -> list[str]:
     stages = max((int(m[1]) for key in arrays if (m := re.fullmatch(r"fc([1-9]\d?)\.weight", key))), default=1)
     features = size(arrays, "conv1.hops", 3, 1, "features")
     wanted = {"conv1.hops": ("K + 1", features, "channels"), "conv1.bias": (features,)} | wanted_dense(arrays, stages)
-    faults = faults_of(arrays, wanted)
+    faults = faults_of(arrays, wanted, TITLES[system])
     if not faults:
         assert isinstance(features, int)
         faults = taxel_faults(arrays, features)
-        made_for = arrays["fc1.weight"].shape[1] // features, len(arrays[f"fc{stages}.bias"])
+        places, made_classes = arrays["fc1.weight"].shape[1] // features, len(arrays[f"fc{stages}.bias"])
+        faults = faults or shape_faults(system, len(arrays["conv1.hops"]), places, taxels, grid)
+        made_for = places if system in GRAPH_SYSTEMS else taxels, made_classes
         if not faults and made_for != (taxels, classes):
             faults = [
                 f"made for {made_for[0]} taxels and {made_for[1]} classes, "

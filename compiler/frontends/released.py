@@ -1,9 +1,13 @@
-"""Read the released layout: files of ``torch.save`` with TAGConv and dense weights, one state dict per run.
+"""Read the released layout: files of ``torch.save`` with a first layer and dense weights, one state dict per run.
 
 A ``.t7`` file is a dict whose ``net_list`` holds the state dicts, with the weights of the *last* epoch, while
 ``best_acc`` belongs to the best one. It holds no graph, no decay and no threshold. Bare state dicts are read too, both
 kinds in torch's zip and in its older format, with the keys of current torch_geometric (``conv1.lins.0.weight`` …) or
 of old releases (``conv1.lin.weight``, the filters of all hops side by side).
+
+The other systems are told by their keys: ``fc0.weight`` of an MLP (inputs ``taxel * 2 + polarity``), a
+``conv1.lin.weight`` with ``conv1.bias`` of a GCN (with self loops), ``conv1.weight`` of a grid-based CNN, whose picture
+is flattened channel by channel.
 
 torch is imported here only, late, and always told ``weights_only=True``: files that hold code are refused.
 """
@@ -17,12 +21,13 @@ import re
 import struct
 import warnings
 import zipfile
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Collection, Mapping
+from typing import Any, NoReturn
 
 import numpy as np
 
 from compiler.errors import ModelError
+from compiler.frontends.systems import GCN, GRID_CNN, MLP, TACTILESGNET, TITLES
 from compiler.frontends.tensors import Arrays, Shape, faults_of, printable, size, taxel_faults, wanted_dense
 
 CHANNELS = 2
@@ -50,7 +55,9 @@ _ERRORS = (
 )  # what torch's reader was seen to raise on damaged files
 
 
-def read_released(where: str, content: bytes, run: int) -> tuple[Arrays, str, int, dict[str, Any] | None]:
+def read_released(
+    where: str, content: bytes, run: int, system: str | None = None
+) -> tuple[Arrays, str, int, dict[str, Any] | None, str]:
     """Read the content of a torch file.
 
     Parameters
@@ -61,6 +68,8 @@ def read_released(where: str, content: bytes, run: int) -> tuple[Arrays, str, in
         The whole file.
     run : int
         Which state dict of ``net_list``.
+    system : str, optional
+        What the tensors must be; by default their names tell.
 
     Returns
     -------
@@ -71,6 +80,8 @@ def read_released(where: str, content: bytes, run: int) -> tuple[Arrays, str, in
         How many the file holds.
     training : dict or None
         What the file tells of its training.
+    system : str
+        Which one it is.
 
     Raises
     ------
@@ -83,11 +94,25 @@ def read_released(where: str, content: bytes, run: int) -> tuple[Arrays, str, in
         if not isinstance(states, list | tuple) or not states:
             raise ModelError(f"{where}: net_list holds no run; give the file of a finished training")
         _require_run(where, run, len(states))
-        arrays = _arrays(where, states[run], len(content))
-        return _unified(where, arrays), "released", len(states), _training(loaded, run, len(states))
-    arrays = _arrays(where, loaded, len(content))
+        arrays = _arrays(where, states[run], len(content), system)
+        known = system or _told(arrays)
+        unified = _unified(where, arrays, known)
+        return unified, "released", len(states), _training(loaded, run, len(states)), known
+    arrays = _arrays(where, loaded, len(content), system)
     _require_run(where, run, 1)
-    return _unified(where, arrays), "state_dict", 1, None
+    known = system or _told(arrays)
+    return _unified(where, arrays, known), "state_dict", 1, None, known
+
+
+def _told(names: Collection[str]) -> str:
+    """System that the names of the tensors belong to."""
+    if "fc0.weight" in names:
+        return MLP
+    if "conv1.weight" in names:
+        return GRID_CNN
+    if "conv1.lin.weight" in names and "conv1.bias" in names:
+        return GCN
+    return TACTILESGNET
 
 
 def _require_run(where: str, run: int, runs: int) -> None:
@@ -126,7 +151,7 @@ def _load(where: str, content: bytes) -> Any:
         raise ModelError(f"{where}: {DAMAGED if known else NOT_A_CHECKPOINT}") from error
 
 
-def _arrays(where: str, state: Any, file_size: int) -> Arrays:
+def _arrays(where: str, state: Any, file_size: int, system: str | None) -> Arrays:
     """Convert the tensors of a state dict to float32 arrays."""
     import torch
 
@@ -142,7 +167,7 @@ def _arrays(where: str, state: Any, file_size: int) -> Arrays:
         if (fault := _tensor_fault(value, file_size)) is not None
     ]
     if faults:
-        _refuse(where, faults)
+        _refuse(where, faults, system or _told(set(map(str, state))))
     return {str(name): value.detach().to(torch.float32).numpy() for name, value in state.items()}
 
 
@@ -159,8 +184,41 @@ def _tensor_fault(value: Any, file_size: int) -> str | None:
     return None
 
 
-def _unified(where: str, arrays: Arrays) -> Arrays:
-    """Check everything and bring both key styles to the names of our own format."""
+def _unified(where: str, arrays: Arrays, system: str) -> Arrays:
+    """Check everything and bring all key styles to the names of our own format."""
+    if system == TACTILESGNET:
+        return _unified_hops(where, arrays)
+    first = {MLP: "fc0.weight", GCN: "conv1.lin.weight", GRID_CNN: "conv1.weight"}[system]
+    bias = "fc0.bias" if system == MLP else "conv1.bias"
+    features = size(arrays, first, 4 if system == GRID_CNN else 2, 0, "features")
+    shapes: dict[str, tuple[int | str, ...]] = {
+        MLP: (features, "taxels * polarities"),
+        GCN: (features, CHANNELS),
+        GRID_CNN: (features, CHANNELS, size(arrays, first, 4, 2, "kernel"), size(arrays, first, 4, 3, "kernel")),
+    }
+    inputs: int | str = features if system == MLP else "places * features"
+    wanted = {first: shapes[system], bias: (features,)} | wanted_dense(arrays, DENSE_STAGES, inputs)
+    faults = faults_of(arrays, wanted, TITLES[system])
+    if not faults:
+        assert isinstance(features, int)
+        faults = taxel_faults(arrays, features)
+        shape = arrays[first].shape
+        if system == MLP and shape[1] % CHANNELS:
+            faults.append(f"fc0.weight has {shape[1]} inputs, not a whole number of taxels with {CHANNELS} polarities")
+        if system == GRID_CNN and shape[2] != shape[3]:
+            faults.append(f"conv1.weight has a window of {shape[2]} * {shape[3]}, wanted a square one")
+    if faults:
+        _refuse(where, faults, system)
+    weight = arrays.pop(first)
+    if system == GRID_CNN:
+        filters = weight.transpose(2, 3, 0, 1).reshape(-1, len(weight), CHANNELS)
+    else:
+        filters = weight.reshape(len(weight), -1, CHANNELS).transpose(1, 0, 2)
+    return {"conv1.hops": filters, "conv1.bias": arrays.pop(bias), **arrays}
+
+
+def _unified_hops(where: str, arrays: Arrays) -> Arrays:
+    """The same of a TactileSGNet, which has two key styles."""
     hops = [int(match[1]) for key in arrays if (match := re.fullmatch(r"conv1\.lins\.(0|[1-9]\d?)\.weight", key))]
     features: int | str
     wanted: dict[str, Shape]
@@ -182,7 +240,7 @@ def _unified(where: str, arrays: Arrays) -> Arrays:
         columns = arrays["conv1.lin.weight"].shape[1]
         faults = [f"conv1.lin.weight has {columns} columns, not a whole number of hops with {CHANNELS} channels each"]
     if faults:
-        _refuse(where, faults)
+        _refuse(where, faults, TACTILESGNET)
     if hops:
         filters = np.stack([arrays.pop(f"conv1.lins.{k}.weight") for k in range(len(hops))])
     else:
@@ -191,8 +249,8 @@ def _unified(where: str, arrays: Arrays) -> Arrays:
     return {"conv1.hops": filters, "conv1.bias": arrays.pop(bias), **arrays}
 
 
-def _refuse(where: str, faults: list[str]) -> None:
-    raise ModelError(f"{where}: {'; '.join(faults)}; give the weights of a TactileSGNet")
+def _refuse(where: str, faults: list[str], system: str) -> NoReturn:
+    raise ModelError(f"{where}: {'; '.join(faults)}; give the weights of {TITLES[system]}")
 
 
 def _training(loaded: Mapping[str, Any], run: int, runs: int) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What the tensors of a TactileSGNet must be: names, shapes, finite values. Every fault is found, not the first."""
+"""What the tensors of a checkpoint must be: names, shapes, finite values. Every fault is found, not the first."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ Shape = tuple[int | str, ...]
 """A wanted shape; a word stands for any size from 1."""
 
 
-def faults_of(arrays: Mapping[str, npt.NDArray[Any]], wanted: Mapping[str, Shape]) -> list[str]:
+def faults_of(
+    arrays: Mapping[str, npt.NDArray[Any]], wanted: Mapping[str, Shape], title: str = "a TactileSGNet"
+) -> list[str]:
     """Missing, mis-shaped and unknown tensors, and values that are not finite, in that order per tensor.
 
     Examples
@@ -33,13 +35,14 @@ def faults_of(arrays: Mapping[str, npt.NDArray[Any]], wanted: Mapping[str, Shape
             faults.append(f"{name} is {array.shape}, wanted {_shown(shape)}")
         elif bad := int(np.count_nonzero(~np.isfinite(array))):
             faults.append(f"{name} has {bad} of {array.size} values NaN or infinite")
-    return faults + [f"{printable(name)} is not part of a TactileSGNet" for name in arrays if name not in wanted]
+    return faults + [f"{printable(name)} is not part of {title}" for name in arrays if name not in wanted]
 
 
-def wanted_dense(arrays: Mapping[str, npt.NDArray[Any]], stages: int) -> dict[str, Shape]:
+def wanted_dense(
+    arrays: Mapping[str, npt.NDArray[Any]], stages: int, inputs: int | str = "taxels * features"
+) -> dict[str, Shape]:
     """Shapes of ``fc1`` … as their weights announce them: each takes what the one before gives."""
     wanted: dict[str, Shape] = {}
-    inputs: int | str = "taxels * features"
     for stage in range(1, stages + 1):
         outputs = size(arrays, f"fc{stage}.weight", 2, 0, "outputs")
         wanted[f"fc{stage}.weight"] = (outputs, inputs)

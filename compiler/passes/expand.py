@@ -1,4 +1,4 @@
-"""Expand a graph convolution to the synapses that it means: fan-in weights per pair of taxels.
+"""Expand the first layer of a system to the synapses that it means: fan-in weights per place and taxel.
 
 Outputs equal those of the factored form up to floating-point rounding (float64 throughout).
 
@@ -18,6 +18,7 @@ from scipy import sparse
 from compiler.errors import ModelError
 from compiler.fixedpoint import FloatArray
 from compiler.frontends.checkpoint import Checkpoint
+from compiler.frontends.systems import TACTILESGNET, TITLES, in_order
 from compiler.ir import INPUT, Input, Network, Population, Projection, Readout, Sparse
 
 AFFINE_TOLERANCE = 1e-9
@@ -32,13 +33,49 @@ def hop_powers(adjacency: FloatArray, hops: int) -> FloatArray:
     return np.stack(powers)
 
 
-def effective_weight(powers: FloatArray, hops: FloatArray) -> FloatArray:
-    """``W[i, f, j, c] = sum_k powers[k, i, j] * hops[k, f, c]``; shape (taxels, features, taxels, channels)."""
-    _, features, channels = hops.shape
-    weight = np.zeros((powers.shape[1], features, powers.shape[1], channels))
-    for power, hop in zip(powers, hops, strict=True):
-        weight += np.einsum("ij,fc->ifjc", power, hop)
+def effective_weight(stack: FloatArray, filters: FloatArray) -> FloatArray:
+    """``W[p, f, j, c] = sum_k stack[k, p, j] * filters[k, f, c]``; shape (places, features, taxels, channels)."""
+    _, features, channels = filters.shape
+    weight = np.zeros((stack.shape[1], features, stack.shape[2], channels))
+    for matrix, values in zip(stack, filters, strict=True):
+        weight += np.einsum("ij,fc->ifjc", matrix, values)
     return weight
+
+
+def stack_of(checkpoint: Checkpoint, propagation: FloatArray) -> FloatArray:
+    """Stack (filters, places, taxels) of a checkpoint's first layer, see :mod:`compiler.frontends.systems`.
+
+    Parameters
+    ----------
+    checkpoint : Checkpoint
+        Which system it is, and how many filters it has.
+    propagation : (taxels, taxels) or (filters, places, taxels) float64
+        Of a TactileSGNet the normalised adjacency, whose powers make the stack; of the others the stack itself.
+    """
+    if checkpoint.system == TACTILESGNET:
+        return hop_powers(propagation, len(checkpoint.hops))
+    return propagation
+
+
+def expand_first_layer(checkpoint: Checkpoint, propagation: FloatArray) -> tuple[Sparse, FloatArray]:
+    """Weights and biases of a checkpoint's first layer.
+
+    Returns
+    -------
+    weight : csr_array (neurons, taxels * channels) float64
+        Rows in the order of the system's neurons. The stored entries are all pairs of a place and a taxel that some
+        filter connects, whatever their weight.
+    bias : (neurons,) float64
+    """
+    filters = checkpoint.hops.astype(np.float64)
+    bias = np.tile(checkpoint.conv_bias.astype(np.float64), (checkpoint.places, 1))
+    if checkpoint.system == TACTILESGNET:
+        return expand_graph_convolution(propagation, filters), bias.reshape(-1)
+    weight = effective_weight(propagation, filters)
+    structure = np.broadcast_to((propagation != 0).any(axis=0)[:, None, :, None], weight.shape)
+    flat = [in_order(checkpoint.system, array) for array in (weight, structure)]
+    columns = weight.shape[2] * weight.shape[3]
+    return _stored(*(array.reshape(-1, columns) for array in flat)), in_order(checkpoint.system, bias)
 
 
 def expand_graph_convolution(adjacency: FloatArray | Sparse, hops: FloatArray) -> Sparse:
@@ -144,8 +181,8 @@ def probe_affine(
     return weight, bias
 
 
-def expand(checkpoint: Checkpoint, adjacency: FloatArray) -> Network:
-    """Lower a checkpoint on its taxel graph to a network of populations and synapses, in float64.
+def expand(checkpoint: Checkpoint, propagation: FloatArray) -> Network:
+    """Lower a checkpoint to a network of populations and synapses, in float64.
 
     Spikes equal those of the float64 model up to the rounding of a differently ordered sum.
 
@@ -153,27 +190,32 @@ def expand(checkpoint: Checkpoint, adjacency: FloatArray) -> Network:
     ----------
     checkpoint : Checkpoint
         Trained weights.
-    adjacency : (taxels, taxels) float64
-        Normalised propagation matrix of the graph that it was trained on.
+    propagation : (taxels, taxels) or (filters, places, taxels) float64
+        What its first layer sees, see :func:`stack_of`.
 
     Raises
     ------
     ModelError
-        If graph and weights disagree about the number of taxels.
+        If propagation and weights disagree about the number of taxels, places or filters.
     """
-    if adjacency.shape != (checkpoint.taxels, checkpoint.taxels):
+    if checkpoint.system == TACTILESGNET:
+        if propagation.shape != (checkpoint.taxels, checkpoint.taxels):
+            raise ModelError(
+                f"graph and weights disagree: the graph has {len(propagation)} taxels, fc1 was trained on "
+                f"{checkpoint.taxels}; give the graph that the checkpoint was trained on"
+            )
+    elif propagation.shape != (len(checkpoint.hops), checkpoint.places, checkpoint.taxels):
         raise ModelError(
-            f"graph and weights disagree: the graph has {len(adjacency)} taxels, fc1 was trained on "
-            f"{checkpoint.taxels}; give the graph that the checkpoint was trained on"
+            f"sensor and weights disagree: (filters, places, taxels) is {propagation.shape}, the weights are of "
+            f"{TITLES[checkpoint.system]} with {(len(checkpoint.hops), checkpoint.places, checkpoint.taxels)}; "
+            "give the sensor that it was trained on"
         )
-    hops = checkpoint.hops.astype(np.float64)
-    conv = expand_graph_convolution(adjacency, hops)
-    stages = [("conv1", conv, np.tile(checkpoint.conv_bias.astype(np.float64), checkpoint.taxels))]
+    stages = [("conv1", *expand_first_layer(checkpoint, propagation))]
     for dense in checkpoint.dense:
         weight = dense.weight.astype(np.float64)
         stages.append((dense.name, _stored(weight, np.ones(weight.shape, np.bool_)), dense.bias.astype(np.float64)))
     return Network(
-        input=Input(taxels=checkpoint.taxels, polarities=hops.shape[2]),
+        input=Input(taxels=checkpoint.taxels, polarities=checkpoint.hops.shape[2]),
         populations=tuple(
             Population(name=name, beta=checkpoint.beta, theta=checkpoint.theta, bias=bias) for name, _, bias in stages
         ),

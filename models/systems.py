@@ -1,0 +1,121 @@
+"""What the first layer of each system sees of a sensor: its taxel graph, its taxels one by one, or a grid over them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compiler.errors import DataError, OptionError
+from compiler.frontends.systems import GCN, GRID_CNN, MLP, TACTILESGNET, Grid, taxel_propagation, window_forms
+from models.graphs import NEUTOUCH, Graph, normalised_adjacency
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+KERNEL = 3
+"""Side of the window of a grid-based CNN."""
+
+HOPS = 3
+"""K of the graph convolution of a TactileSGNet."""
+
+PADDINGS = ("none", "same")
+"""Forms of its first layer: a window that moves by 2 without padding, or by 1 with the size kept."""
+
+NO_GRAPH = "none"
+"""Name of the graph of a system that has none."""
+
+MAX_CELLS = 256
+"""Cells along a side of the grid."""
+
+
+def grid_cells(coordinates: FloatArray = NEUTOUCH) -> IntArray:
+    """Row and column of each taxel on a grid of 1 mm cells, counted from the outermost taxels; (taxels, 2).
+
+    Halves round to the even number, as the released code's ``rint`` does.
+
+    Raises
+    ------
+    DataError
+        If the sensor has three dimensions or is too large.
+
+    Examples
+    --------
+    >>> grid_cells().max(axis=0).tolist(), grid_cells()[1].tolist()
+    ([12, 18], [1, 6])
+    """
+    if coordinates.shape[1] != 2:
+        raise DataError(
+            f"grid-cnn: positions have {coordinates.shape[1]} numbers each, a grid needs x and y; give a flat sensor"
+        )
+    cells: IntArray = np.rint(coordinates).astype(np.int64)
+    cells -= cells.min(axis=0)
+    if cells.max() >= MAX_CELLS:
+        raise DataError(
+            f"grid-cnn: the sensor spans {int(cells.max()) + 1} mm, a grid of 1 mm cells has up to {MAX_CELLS} a side; "
+            "give smaller positions"
+        )
+    cells.flags.writeable = False
+    return cells
+
+
+def sensor_grid(coordinates: FloatArray, padding: str) -> Grid:
+    """Grid over a sensor.
+
+    Raises
+    ------
+    OptionError, DataError
+        If there is no such padding, or no grid fits over the sensor or no window into it.
+    """
+    if padding not in PADDINGS:
+        raise OptionError(f"--padding {padding}: unknown; choose from {', '.join(PADDINGS)}")
+    grid = window_forms(grid_cells(coordinates), KERNEL)[padding]
+    if 0 in grid.places(KERNEL):
+        raise DataError(
+            f"grid-cnn: the grid has {grid.rows} * {grid.columns} cells, a window of {KERNEL} * {KERNEL} does not fit "
+            "into it; give --padding same"
+        )
+    return grid
+
+
+def taxels_alone(coordinates: FloatArray) -> Graph:
+    """A sensor without a graph, for systems that have none."""
+    return Graph(name=NO_GRAPH, coordinates=coordinates, edges=np.zeros((0, 2), np.int64))
+
+
+def with_self_loops(edges: IntArray, n: int) -> FloatArray:
+    """Propagation of a GCN: the adjacency with a self loop for every taxel, normalised; (taxels, taxels)."""
+    loops = np.repeat(np.arange(n)[:, None], 2, axis=1)
+    return normalised_adjacency(np.concatenate([edges, loops]), n)
+
+
+def propagation_of(system: str, edges: IntArray, taxels: int, grid: Grid | None, filters: int) -> FloatArray:
+    """What the first layer sees, in the form that :func:`compiler.passes.expand.stack_of` takes.
+
+    Parameters
+    ----------
+    system : str
+        One of ``SYSTEMS``.
+    edges : (edges, 2) int64
+        Of the taxel graph; unused by systems that have none.
+    taxels : int
+        Of the sensor.
+    grid : Grid, optional
+        Of a grid-based CNN.
+    filters : int
+        Of the first layer, which say how large the window of a grid-based CNN is.
+    """
+    match system:
+        case "tactilesgnet":
+            return normalised_adjacency(edges, taxels)
+        case "gcn":
+            return with_self_loops(edges, taxels)[None]
+        case "mlp":
+            return taxel_propagation(taxels)
+    assert system == GRID_CNN, "systems are checked where they are named"
+    assert grid is not None, "a grid-based CNN has a grid"
+    return grid.propagation(round(filters**0.5))
+
+
+def filters_of(system: str, taxels: int, hops: int) -> int:
+    """Number of filters of the first layer."""
+    return {TACTILESGNET: hops + 1, GCN: 1, MLP: taxels, GRID_CNN: KERNEL * KERNEL}[system]

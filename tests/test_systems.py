@@ -1,0 +1,548 @@
+"""The systems beside TactileSGNet: their first layer in training, in files, on the chip and on the command line."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from made_files import released
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy import sparse
+
+from compiler.errors import CapacityError, DataError, ModelError, OptionError
+from compiler.frontends.checkpoint import read_checkpoint
+from compiler.frontends.systems import GCN, GRAPH_SYSTEMS, GRID_CNN, MLP, SYSTEMS, Grid, in_order
+from compiler.interpret import channels_last, run_float
+from compiler.passes.expand import expand, probe_affine
+from compiler.pipeline import compile_network
+from compiler.targets import load_target
+from models.checkpoint import checkpoint_bytes, save_checkpoint
+from models.evtouch import load_recordings
+from models.finetune import finetune
+from models.graphs import NEUTOUCH, build_graph
+from models.grasps import synthetic_grasps
+from models.layers import SURROGATE_HALF_WIDTH, filter_places
+from models.networks import Architecture, SpikingNet
+from models.quantised import time_first
+from models.reference import float_spikes
+from models.release import write_released
+from models.systems import (
+    filters_of,
+    grid_cells,
+    propagation_of,
+    sensor_grid,
+    taxels_alone,
+    with_self_loops,
+)
+from models.train import evaluate, train
+from runtime.cli import main
+from runtime.equivalence import verify
+
+NEW = (MLP, GCN, GRID_CNN)
+FORMED = ((MLP, "none"), (GCN, "none"), (GRID_CNN, "none"), (GRID_CNN, "same"))
+MANUAL = build_graph("manual")
+FORMS = {"none": sensor_grid(NEUTOUCH, "none"), "same": sensor_grid(NEUTOUCH, "same")}
+
+
+def seen_by(system, padding="none"):
+    return propagation_of(system, MANUAL.edges, 39, FORMS[padding], filters_of(system, 39, 3))
+
+
+def network_of(system, *, seed=1, gain=3.0, padding="none", features=4, hidden=(8, 6), classes=4) -> SpikingNet:
+    """A small network of random weights, lively enough to spike in every layer."""
+    sizes = Architecture(taxels=39, classes=classes, features=features, hidden=hidden, system=system)
+    network = SpikingNet(sizes, seen_by(system, padding), seed=seed)
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.mul_(gain)
+    return network
+
+
+def events_of(seed, samples=3, steps=25, rate=0.15):
+    return (np.random.default_rng(seed).random((samples, 39, 2, steps)) < rate).astype(np.uint8)
+
+
+def saved(tmp_path, network, *, padding="none", name="x.pt"):
+    system = network.architecture.system
+    save_checkpoint(
+        tmp_path / name,
+        {"last": network.export_weights()},
+        MANUAL if system in GRAPH_SYSTEMS else taxels_alone(NEUTOUCH),
+        beta=0.2,
+        theta=0.5,
+        training={},
+        system=system,
+        grid=FORMS[padding] if system == GRID_CNN else None,
+    )
+    return read_checkpoint(tmp_path / name)
+
+
+# --- plain code, as a script with torch's own layers would have it ---------------------------------------------------
+
+
+def plain_first(system, state, *, padding="none"):
+    """Current of the first layer of one step, a function of (taxels, channels), from a released-style state dict."""
+    if system == MLP:
+        return lambda x: torch.nn.functional.linear(x.reshape(-1), state["fc0.weight"], state["fc0.bias"])
+    if system == GCN:
+        source, target = torch.tensor(np.concatenate([MANUAL.edges, np.arange(39)[:, None].repeat(2, 1)])).T
+        degree = torch.zeros(39, dtype=torch.float64).index_add_(
+            0, target, torch.ones(len(target), dtype=torch.float64)
+        )
+        norm = (degree[source] * degree[target]) ** -0.5
+
+        def gcn(x):
+            mapped = x @ state["conv1.lin.weight"].t()
+            return (torch.zeros_like(mapped).index_add_(0, target, norm[:, None].to(x) * mapped[source])
+                    + state["conv1.bias"]).reshape(-1)  # fmt: skip
+
+        return gcn
+
+    def convolution(x):
+        picture = torch.zeros(2, 13, 19, dtype=x.dtype)
+        for taxel, (a, b) in enumerate(NEUTOUCH):
+            picture[:, round(a) + 6, round(b) + 9] = x[taxel]
+        stride, pad = (2, 0) if padding == "none" else (1, 1)
+        weight, bias = state["conv1.weight"], state["conv1.bias"]
+        return torch.nn.functional.conv2d(picture, weight, bias, stride=stride, padding=pad).reshape(-1)
+
+    return convolution
+
+
+def state_of(network) -> dict[str, torch.Tensor]:
+    """Weights of a network under the keys of a released-style file."""
+    weights = {name: torch.tensor(array) for name, array in network.export_weights().items()}
+    hops, bias = weights.pop("conv1.hops"), weights.pop("conv1.bias")
+    match network.architecture.system:
+        case "mlp":
+            first = {"fc0.weight": hops.permute(1, 0, 2).reshape(len(bias), -1), "fc0.bias": bias}
+        case "gcn":
+            first = {"conv1.lin.weight": hops[0], "conv1.bias": bias}
+        case _:
+            first = {"conv1.weight": hops.permute(1, 2, 0).reshape(len(bias), 2, 3, 3), "conv1.bias": bias}
+    return first | weights
+
+
+class Spike(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, membrane):
+        ctx.save_for_backward(membrane)
+        return (membrane > 0.5).to(membrane.dtype)
+
+    @staticmethod
+    def backward(ctx, gradient):
+        (membrane,) = ctx.saved_tensors
+        return gradient * ((membrane - 0.5).abs() < SURROGATE_HALF_WIDTH).to(gradient.dtype)
+
+
+def plain_spikes(system, state, events, *, padding="none"):
+    """Spikes of every layer, step by step, of one recording (taxels, channels, steps)."""
+    stages = [plain_first(system, state, padding=padding)]
+    stages += [
+        lambda x, k=k: torch.nn.functional.linear(x, state[f"fc{k}.weight"], state[f"fc{k}.bias"]) for k in (1, 2, 3)
+    ]
+    kind = state["fc1.weight"].dtype
+    membranes, spikes, trace = [0.0] * 4, [torch.zeros(())] * 4, []
+    for t in range(events.shape[-1]):
+        x = torch.tensor(events[..., t], dtype=kind)
+        for layer, stage in enumerate(stages):
+            membranes[layer] = membranes[layer] * 0.2 * (1 - spikes[layer]) + stage(x)
+            spikes[layer] = x = Spike.apply(membranes[layer])
+        trace.append(list(spikes))
+    return [torch.stack([step[layer] for step in trace]) for layer in range(4)]
+
+
+# --- the first layer -------------------------------------------------------------------------------------------------
+
+
+@given(
+    kernel=st.integers(1, 4),
+    stride=st.integers(1, 3),
+    padding=st.integers(0, 2),
+    rows=st.integers(4, 7),
+    columns=st.integers(4, 6),
+    seed=st.integers(0, 99),
+)
+@settings(max_examples=40, deadline=None)
+def test_a_window_over_a_grid_equals_torchs_convolution(kernel, stride, padding, rows, columns, seed):
+    rng = np.random.default_rng(seed)
+    cells = rng.integers((rows, columns), size=(6, 2))
+    grid = Grid(rows=rows, columns=columns, stride=stride, padding=padding, cells=cells)
+    x, filters, bias = rng.normal(size=(5, 6, 2)), rng.normal(size=(kernel**2, 3, 2)), rng.normal(size=3)
+    picture = np.zeros((5, 2, rows, columns))
+    for taxel, (row, column) in enumerate(cells):
+        picture[:, :, row, column] += x[:, taxel]
+    weight = torch.tensor(filters).permute(1, 2, 0).reshape(3, 2, kernel, kernel)
+    expected = torch.nn.functional.conv2d(torch.tensor(picture), weight, torch.tensor(bias), stride, padding)
+    assert grid.places(kernel) == tuple(expected.shape[2:])
+    found = filter_places(
+        torch.tensor(x)[:, None], torch.tensor(grid.propagation(kernel)), torch.tensor(filters), torch.tensor(bias)
+    )
+    assert_allclose(in_order(GRID_CNN, found.view(5, -1, 3).permute(1, 2, 0)).T, expected.flatten(1), atol=1e-12)
+
+
+def test_the_grid_over_the_built_in_sensor():
+    cells = grid_cells()
+    assert_array_equal(cells, np.rint(NEUTOUCH) + np.array([6, 9]))
+    assert len({tuple(cell) for cell in cells.tolist()}) == 39, "no two taxels share a cell"
+    assert [(g.rows, g.columns, *g.places(3)) for g in FORMS.values()] == [(13, 19, 6, 9), (13, 19, 13, 19)]
+    assert [64 * g.places(3)[0] * g.places(3)[1] for g in FORMS.values()] == [3456, 15808]
+
+
+def test_a_gcn_hears_itself():
+    adjacency = with_self_loops(np.array([[0, 1], [1, 0]]), 3)
+    assert_allclose(adjacency, [[0.5, 0.5, 0], [0.5, 0.5, 0], [0, 0, 1]])
+
+
+@pytest.mark.parametrize(("system", "padding"), FORMED)
+def test_spikes_and_gradients_equal_plain_code(system, padding):
+    events = events_of(4, samples=1)
+    for seed in range(20):
+        network = network_of(system, seed=seed, padding=padding).double()
+        network.adjacency = torch.tensor(seen_by(system, padding))
+        state = {name: tensor.double().requires_grad_() for name, tensor in state_of(network).items()}
+        expected = plain_spikes(system, state, events[0], padding=padding)
+        if all(layer.any() and not layer.all() for layer in expected):
+            break
+    rates = network(torch.tensor(events.transpose(3, 0, 1, 2), dtype=torch.float64))
+    assert_array_equal(rates[0].detach(), expected[-1].mean(0).detach())
+    assert all(layer.any() and not layer.all() for layer in expected), "some layer never or always spikes"
+    target = torch.tensor([0.0, 1.0, 0.0, 0.0], dtype=torch.float64)
+    ((rates[0] - target) ** 2).mean().backward()
+    ((expected[-1].mean(0) - target) ** 2).mean().backward()
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.copy_(parameter.grad)
+    for name, found in state_of(network).items():  # gradients have the order of the weights
+        assert_allclose(found, state[name].grad, rtol=1e-5, atol=1e-9, err_msg=name)
+        assert found.any()
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+def test_weights_can_be_taken_over(system):
+    first, second = network_of(system, seed=1), network_of(system, seed=2)
+    events = time_first(events_of(0)).view(25, 3, 39, 2)
+    assert (first(events) != second(events)).any()
+    second.load_weights(first.export_weights())
+    assert_array_equal(first(events).detach(), second(events).detach())
+
+
+@pytest.mark.parametrize(("system", "bound"), [(MLP, 78**-0.5), (GCN, (6 / 66) ** 0.5), (GRID_CNN, 18**-0.5)])
+def test_initial_weights_are_those_of_the_usual_layers(system, bound):
+    weights = network_of(system, gain=1.0, features=64).export_weights()
+    assert 0.9 * bound < np.abs(weights["conv1.hops"]).max() <= bound
+    assert weights["conv1.bias"].any() == (system != GCN)
+    again = network_of(system, gain=1.0, features=64).export_weights()
+    assert all(np.array_equal(weights[name], again[name]) for name in weights)
+
+
+# --- files -----------------------------------------------------------------------------------------------------------
+
+
+def torch_file(path, content):
+    torch.save(content, path)
+    return path
+
+
+@pytest.mark.parametrize(("system", "padding"), FORMED)
+def test_released_style_files_are_told_by_their_keys(tmp_path, system, padding):
+    network = network_of(system, padding=padding)
+    state = state_of(network)
+    path = torch_file(tmp_path / "x.t7", released(state))
+    found = read_checkpoint(path, cells=grid_cells())
+    assert (found.system, found.layout, found.taxels, found.classes) == (system, "released", 39, 4)
+    assert (found.grid is None) == (system != GRID_CNN)
+    for name, array in network.export_weights().items():
+        dense = {f"{d.name}.{part}": getattr(d, part) for d in found.dense for part in ("weight", "bias")}
+        ours = {"conv1.hops": found.hops, "conv1.bias": found.conv_bias} | dense
+        assert_array_equal(ours[name], array)
+    assert read_checkpoint(path, cells=grid_cells(), system=system).system == system
+    events = events_of(7)
+    spikes = float_spikes(found, seen_by(system, padding), events, dtype="float64")
+    for recording in range(len(events)):
+        doubled = {name: tensor.double() for name, tensor in state.items()}
+        plain = plain_spikes(system, doubled, events[recording], padding=padding)
+        for layer, expected in zip(spikes.values(), plain, strict=True):
+            assert_array_equal(layer[recording], expected.bool())
+
+
+@pytest.mark.parametrize("system", NEW)
+def test_own_files(tmp_path, system):
+    network = network_of(system)
+    found = saved(tmp_path, network)
+    assert (found.system, found.taxels, found.classes, found.layout) == (system, 39, 4, "spikeloom")
+    assert_array_equal(found.hops, network.export_weights()["conv1.hops"])
+    if system == GRID_CNN:
+        assert found.grid.to_json() == FORMS["none"].to_json()
+    content = (tmp_path / "x.pt").read_bytes()
+    saved(tmp_path, network, name="y.pt")
+    assert (tmp_path / "y.pt").read_bytes() == content
+    with pytest.raises(OptionError) as refused:
+        read_checkpoint(tmp_path / "x.pt", system="tactilesgnet")
+    assert str(refused.value) == (f"--system tactilesgnet: {tmp_path / 'x.pt'} holds a {system}; leave --system away")
+
+
+def test_a_tactilesgnet_is_stored_as_before():
+    made = checkpoint_bytes(
+        {"last": network_of("tactilesgnet").export_weights()}, MANUAL, beta=0.2, theta=0.5, training={}
+    )
+    assert b'"version": 1' in made
+    assert b'"grid"' not in made
+
+
+def without(state, *names):
+    return {name: tensor for name, tensor in state.items() if name not in names}
+
+
+@pytest.mark.parametrize(
+    ("system", "change", "line"),
+    [
+        (MLP, lambda s: without(s, "fc0.bias"), "fc0.bias is missing; give the weights of an MLP"),
+        (
+            MLP,
+            lambda s: s | {"fc0.weight": torch.ones(4, 77)},
+            "fc0.weight has 77 inputs, not a whole number of taxels with 2 polarities; give the weights of an MLP",
+        ),
+        (
+            GCN,
+            lambda s: s | {"conv1.lin.weight": torch.ones(4, 8)},
+            "conv1.lin.weight is (4, 8), wanted (4, 2); give the weights of a GCN",
+        ),
+        (
+            GRID_CNN,
+            lambda s: s | {"conv1.weight": torch.ones(4, 2, 3, 2)},
+            "conv1.weight has a window of 3 * 2, wanted a square one; give the weights of a grid-based CNN",
+        ),
+        (
+            GRID_CNN,
+            lambda s: s | {"fc9.bias": torch.ones(4)},
+            "fc9.bias is not part of a grid-based CNN; give the weights of a grid-based CNN",
+        ),
+        (
+            GRID_CNN,
+            lambda s: s | {"fc1.weight": torch.ones(8, 400)},
+            "fc1 was trained on 100 places, a window of 3 * 3 on this sensor has 54 (padding none) or 247 (padding "
+            "same); give the sensor that it was trained on",
+        ),
+    ],
+)
+def test_faults_of_released_style_files(tmp_path, system, change, line):
+    path = torch_file(tmp_path / "x.t7", change(state_of(network_of(system))))
+    with pytest.raises(ModelError) as refused:
+        read_checkpoint(path, cells=grid_cells())
+    assert str(refused.value) == f"{path}: {line}"
+
+
+def test_a_file_that_is_another_system(tmp_path):
+    path = torch_file(tmp_path / "x.t7", state_of(network_of(MLP)))
+    with pytest.raises(ModelError) as refused:
+        read_checkpoint(path, system=GCN)
+    assert str(refused.value) == (
+        f"{path}: conv1.lin.weight is missing; conv1.bias is missing; fc0.weight is not part of a GCN; fc0.bias is not "
+        "part of a GCN; give the weights of a GCN"
+    )
+    with pytest.raises(OptionError) as refused:
+        read_checkpoint(path, system="rnn")
+    assert str(refused.value) == "--system rnn: unknown; choose from tactilesgnet, grid-cnn, mlp, gcn"
+
+
+# --- to the chip -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("system", NEW)
+def test_expansion_equals_probing_the_layer(tmp_path, system):
+    """The general way: any affine stage, here plain torch code, by its responses to unit vectors."""
+    network = network_of(system)
+    checkpoint = saved(tmp_path, network)
+    first = plain_first(system, {name: tensor.double() for name, tensor in state_of(network).items()})
+    weight, bias = probe_affine(
+        lambda batch: np.stack([first(torch.tensor(row).view(39, 2)).numpy() for row in batch]), 78, name="conv1"
+    )
+    expanded = expand(checkpoint, seen_by(system))
+    assert expanded.populations[0].name == "conv1"
+    assert_allclose(expanded.projections[0].weight.toarray(), weight, atol=1e-12)
+    assert_allclose(expanded.populations[0].bias, bias, atol=1e-12)
+    assert isinstance(expanded.projections[0].weight, sparse.csr_array)
+    assert expanded.projections[0].weight.nnz == np.count_nonzero(weight)
+    spikes = run_float(expanded, channels_last(events_of(5))).spikes
+    reference = float_spikes(checkpoint, seen_by(system), events_of(5), dtype="float64")
+    for ours, theirs in zip(spikes, reference.values(), strict=True):
+        assert_array_equal(ours, theirs)
+
+
+@pytest.mark.parametrize("system", NEW)
+def test_the_chip_follows_the_float_model(tmp_path, system):
+    checkpoint = saved(tmp_path, network_of(system))
+    seen = seen_by(system)
+    compiled = compile_network(expand(checkpoint, seen))
+    assert [layer.name for layer in compiled.netlist.layers] == ["conv1", "fc1", "fc2", "fc3"]
+    events = events_of(8, samples=6, steps=40)
+    verdict = verify(compiled.netlist, checkpoint, seen, events, np.arange(6) % 4, tuple("abcdef"))
+    assert verdict.spec_equals_engine
+    assert np.count_nonzero(verdict.float_predictions != verdict.chip_predictions) <= 1
+    assert all(layer.different < 0.1 * layer.float + 5 for layer in verdict.spikes.values())
+    assert verdict.certificate.decisions >= 4
+    if verdict.first_divergence is not None and system == MLP:
+        assert verdict.first_divergence.taxel is None
+
+
+@pytest.mark.parametrize("system", NEW)
+def test_fine_tuned_on_the_chips_integers_they_are_the_chip(tmp_path, system):
+    checkpoint, seen = saved(tmp_path, network_of(system)), seen_by(system)
+    training, test = (
+        replace(synthetic_grasps(per_class=2, steps=12, seed=seed), split=split)
+        for split, seed in (("train", 1), ("test", 2))
+    )
+    chosen = training.labels < 4
+    files = tuple(np.array(training.files)[chosen])
+    training = replace(training, events=training.events[chosen], labels=training.labels[chosen], files=files)
+    held = replace(training, split="test")
+    tuned = finetune(checkpoint, seen, training, held, load_target("loihi1"), bits=[4], epochs=1)
+    save_checkpoint(
+        tmp_path / "tuned.pt",
+        {"last": tuned.weights},
+        MANUAL,
+        beta=0.2,
+        theta=0.5,
+        training={},
+        forms=tuned.forms,
+        system=system,
+        grid=checkpoint.grid,
+    )
+    again = read_checkpoint(tmp_path / "tuned.pt")
+    netlist = compile_network(expand(again, seen), forms=again.forms).netlist
+    verdict = verify(netlist, again, seen, test.events[:4], test.labels[:4], test.files[:4])
+    assert verdict.quantised_different == 0
+    assert verdict.spikes["fc1"].chip > 0
+
+
+def test_a_window_that_keeps_the_size_does_not_fit_a_core(tmp_path):
+    network = network_of(GRID_CNN, padding="same", features=64, gain=1.0)
+    with torch.no_grad():
+        network.conv1.bias.fill_(1.0)  # so that every place may fire
+    checkpoint = saved(tmp_path, network, padding="same")
+    assert float_spikes(checkpoint, seen_by(GRID_CNN, "same"), events_of(1))["conv1"].shape == (3, 25, 15808)
+    with pytest.raises(CapacityError) as refused:
+        compile_network(expand(checkpoint, seen_by(GRID_CNN, "same")))
+    assert " 4096 allowed (loihi1.core.axons_in); fewer inputs to the layer" in str(refused.value)
+
+
+# --- the command line ------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def data(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    splits = [
+        replace(synthetic_grasps(per_class=3, steps=12, seed=seed), split=split)
+        for split, seed in (("train", 1), ("test", 2))
+    ]
+    write_released(tmp_path / "data", splits)
+    return tmp_path
+
+
+def told(capsys, *words, code=0):
+    assert main([str(word) for word in words]) == code
+    captured = capsys.readouterr()
+    return captured.err if code == 2 else captured.out
+
+
+@pytest.mark.parametrize("system", NEW)
+def test_train_compile_verify_explain(data, capsys, system):
+    graph = ("--graph", "manual") if system == GCN else ()
+    out = told(capsys, "train", "--data", "data", "--system", system, *graph, "--epochs", 2, "-o", "x.pt")
+    assert out.startswith(" ".join(["spikeloom train --data data --system", system, *graph, "--epochs 2 --seed 0"]))
+    first = (data / "x.pt").read_bytes()
+    told(capsys, "train", "--data", "data", "--system", system, *graph, "--epochs", 2, "-o", "y.pt")
+    assert (data / "y.pt").read_bytes() == first
+    told(capsys, "compile", "x.pt", "--system", system, "--calibrate", "data", "-o", "x.loom")
+    code = main(["verify", "x.loom", "--checkpoint", "x.pt", "--data", "data", "--require", "E0", "--json"])
+    report = json.loads(capsys.readouterr().out)
+    assert code == 0
+    assert next(iter(report["spikes"])) == "conv1"
+    told(capsys, "explain", "x.loom", "--checkpoint", "x.pt", "--system", system, "--data", "data")
+    shown = told(capsys, "inspect", "x.pt", "--system", system)
+    assert f"39 taxels, {system}, conv1 " in shown
+    told(capsys, "yardsticks", "x.pt", "--data", "data")
+
+
+@pytest.mark.parametrize("system", NEW)
+def test_released_style_files_on_the_command_line(data, capsys, system):
+    torch_file(data / "x.t7", state_of(network_of(system, classes=20)))
+    graph = ("--graph", "manual") if system == GCN else ()
+    told(capsys, "compile", "x.t7", "--system", system, *graph, "-o", "x.loom")
+    told(capsys, "verify", "x.loom", "--checkpoint", "x.t7", *graph, "--data", "data", "--require", "E0")
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (
+            "--system mlp --graph manual",
+            "--graph: is for taxel graphs, an MLP has none; leave it away",
+        ),
+        ("--system gcn", "train: no graph; name it with --graph: "),
+        ("--system mlp --padding same", "--padding: is for grid-cnn, an MLP has no window; leave it away"),
+        ("--system rnn", "argument --system: invalid choice: 'rnn' (choose from "),
+        ("--system grid-cnn --taxels 39", "grid-cnn: positions have 1 numbers each, a grid needs x and y; "),
+        ("--graph knn:9", "graph 'knn:9': K is '9', allowed are whole numbers 1..8; choose another K"),
+    ],
+)
+def test_wrong_options(data, capsys, words, line):
+    told_line = told(capsys, "train", "--data", "data", *words.split(), "--epochs", 1, "-o", "x.pt", code=2)
+    assert told_line.startswith(f"spikeloom: {line}")
+    assert told_line.count("\n") == 1
+
+
+def test_a_sensor_that_no_window_fits():
+    with pytest.raises(DataError) as refused:
+        sensor_grid(np.array([[0.0, 0.0], [1.0, 5.0]]), "none")
+    assert str(refused.value) == (
+        "grid-cnn: the grid has 2 * 6 cells, a window of 3 * 3 does not fit into it; give --padding same"
+    )
+
+
+@pytest.mark.parametrize("system", NEW)
+def test_an_interrupted_training_of_each_system_resumes_to_the_same_weights(tmp_path, system):
+    training, test = (
+        replace(synthetic_grasps(per_class=2, steps=10, seed=seed), split=split)
+        for seed, split in ((1, "train"), (2, "test"))
+    )
+    sizes = Architecture(taxels=39, classes=20, features=4, hidden=(8, 6), system=system)
+    whole = train(training, test, seen_by(system), sizes, epochs=3)
+
+    class StopError(Exception):
+        pass
+
+    def stop(epoch):
+        if epoch.epoch == 2:
+            raise StopError
+
+    with pytest.raises(StopError):
+        train(training, test, seen_by(system), sizes, epochs=3, state=tmp_path / "s", after_epoch=stop)
+    again = train(training, test, seen_by(system), sizes, epochs=3, state=tmp_path / "s", resume=True)
+    assert all(np.array_equal(whole.last[name], again.last[name]) for name in whole.last)
+
+
+@pytest.mark.recordings
+@pytest.mark.parametrize("system", NEW)
+def test_on_recordings_after_a_short_training(containers_zip, tmp_path, system):
+    """Two epochs on 60 of the 240 training recordings, without the part that chooses an epoch."""
+    training = load_recordings(containers_zip, "train", limit=60)
+    test = load_recordings(containers_zip, "test", limit=20)
+    sizes = Architecture(taxels=39, classes=20, system=system)
+    seen = seen_by(system)
+    trained = train(training, test, seen, sizes, epochs=2)
+    network = SpikingNet(sizes, seen)
+    network.load_weights(trained.last)
+    checkpoint = saved(tmp_path, network)
+    compiled = compile_network(expand(checkpoint, seen), training_events=training.events)
+    verdict = verify(compiled.netlist, checkpoint, seen, test.events, test.labels, test.files, spec_samples=1)
+    assert verdict.spec_equals_engine
+    right = [int(np.sum(p == test.labels)) for p in (verdict.float_predictions, verdict.chip_predictions)]
+    assert right[0] == evaluate(network, test)[1]
+    assert abs(right[0] - right[1]) <= 1
+    assert verdict.certificate.unproven == ()
