@@ -20,7 +20,7 @@ from models.evtouch import load_recordings
 from models.grasps import synthetic_grasps
 from models.release import write_released
 from runtime.cli import main
-from runtime.seeds import _side_by_side
+from runtime.seeds import side_by_side
 from runtime.training import draw_training, summary
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -342,7 +342,7 @@ def fails(_job):
 def test_a_worker_that_fails_ends_all(run, error, line):
     job = SimpleNamespace(output=Path("x.pt"))
     with pytest.raises(error) as raised:
-        _side_by_side([job, job], [0, 1], {}, run)
+        side_by_side([job, job], [0, 1], {}, run)
     assert str(raised.value) == line
 
 
