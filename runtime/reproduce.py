@@ -1,0 +1,394 @@
+"""The command ``reproduce``: both tables of the paper, cell by cell, from whatever is there already."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from compiler.atomic import write_atomically
+from compiler.errors import DataError, OptionError
+from compiler.frontends.systems import GCN, GRID_CNN, MLP, TACTILESGNET
+from models.events import BIN_S
+from models.evtouch import Recordings
+from models.graphs import NEUTOUCH, build_graph
+from models.schedule import EPOCHS
+from runtime import paper_picture, paper_table, paper_text
+from runtime.cells import (
+    FORMAT,
+    FULL_SEEDS,
+    GRAPHS,
+    SAME_PADDING,
+    SHORT_EPOCHS,
+    TABLES,
+    Part,
+    Row,
+    cell_file,
+    data_name,
+    in_turn,
+    network_file,
+    plan,
+    read_cells,
+    write_cell,
+)
+from runtime.inputs import progress
+from runtime.options import DATA_HELP
+from runtime.training import Job
+
+Json = dict[str, Any]
+
+SUMMARY = "rebuild the tables of the TactileSGNet paper: train, compile and measure, in parts, from what is there"
+
+PACE = {TACTILESGNET: 1.0, GRID_CNN: 1.4, MLP: 0.25, GCN: 0.7, SAME_PADDING: 5.0}
+"""How long an epoch of a system takes beside one of TactileSGNet; only the time that is left is told from it."""
+
+BOTH = 1.8
+"""Trainings of a cell: one on all of the training split, one on four fifths."""
+
+MEASURING = 8.0
+"""Epochs that measuring a network takes as long as."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DataSet:
+    """Recordings that were asked for.
+
+    Parameters
+    ----------
+    path : str
+        As typed.
+    training, test : Recordings
+        Both splits.
+    sha256 : str
+        Over both.
+    """
+
+    path: str
+    training: Recordings
+    test: Recordings
+    sha256: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Work:
+    """A cell to make; crosses process borders.
+
+    Parameters
+    ----------
+    row, seed : Row, int
+        Which.
+    job : Job
+        Its training.
+    place : Path
+        Where its figures go.
+    sha256 : str
+        Of its recordings.
+    """
+
+    row: Row
+    seed: int
+    job: Job
+    place: Path
+    sha256: str
+
+    @property
+    def output(self) -> Path:
+        """Checkpoint that it writes."""
+        return self.job.output
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Describe the options of the command."""
+    parser.add_argument("--data", action="append", default=[], metavar="PATH", help=f"may be repeated: {DATA_HELP}")
+    parser.add_argument("--table", choices=TABLES, help="one table (default: both)")
+    parser.add_argument(
+        "--graph",
+        action="append",
+        metavar="NAME",
+        help=f"row of the graphs' table; may be repeated (default: {len(GRAPHS)})",
+    )
+    parser.add_argument(
+        "--same-padding", action="store_true", help="a grid-cnn of same padding too, which no chip holds"
+    )
+    parser.add_argument(
+        "--seeds", type=int, metavar="N", help="trainings a row (default: methods 5, grid-cnn 3, graphs 3)"
+    )
+    parser.add_argument(
+        "--epochs",
+        type=int,
+        metavar="N",
+        help="of each training, the learning rate falls in proportion (default: {methods} and {graphs})".format(
+            **SHORT_EPOCHS
+        ),
+    )
+    parser.add_argument("--full", action="store_true", help=f"{FULL_SEEDS} seeds of {EPOCHS} epochs, as in the paper")
+    parser.add_argument("--resume", action="store_true", help="go on with what the folder holds of this")
+    parser.add_argument(
+        "--no-train", action="store_true", help="measure networks that are finished and rebuild the tables, no more"
+    )
+    parser.add_argument("--jobs", type=int, metavar="N", help="processes at a time (default: one a core)")
+    parser.add_argument("--device", default="cpu", help="to train on: cpu or cuda (default: cpu)")
+    parser.add_argument("-o", "--output", required=True, metavar="FOLDER")
+
+
+def reproduce(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
+    """Run the command; exit code 1 where trainings are missing in the end.
+
+    Raises
+    ------
+    SpikeloomError
+        If an option, the recordings or what the folder holds cannot be used.
+    KeyboardInterrupt
+        On an interrupt or a request to end; its text says what is kept.
+    """
+    graphs = _check(arguments)
+    folder = Path(arguments.output)
+    known = read_cells(folder)
+    sets = _data_sets(arguments.data)
+    _require_same_data(folder, known, sets)
+    names = sets or dict.fromkeys(cell["data"] for cell in known.values())
+    parts = plan(
+        names,
+        [arguments.table] if arguments.table else TABLES,
+        seeds=arguments.seeds,
+        epochs=arguments.epochs,
+        full=arguments.full,
+        same_padding=arguments.same_padding,
+        graphs=graphs,
+    )
+    cells = in_turn(parts)
+    wanted = [(row, seed) for row, seed in cells if row.cell(seed) not in known and row.data in sets]
+    work = _work(arguments, folder, sets, wanted)
+    _require_resume(arguments, folder, [row.cell(seed) for row, seed in cells], work)
+    if arguments.no_train:
+        from runtime.seeds import finished
+
+        work = [each for each in work if finished(each.job)]
+    for name in ("cells", "networks"):
+        (folder / name).mkdir(parents=True, exist_ok=True)
+    _make(arguments, folder, parts, work, there=len(cells) - len(wanted), planned=len(cells))
+    report = write_tables(folder, parts, pictures=True)
+    return report, paper_text.terminal, 1 if report["missing"] else 0
+
+
+def _check(arguments: argparse.Namespace) -> tuple[str, ...]:
+    """Refuse options that cannot be meant; return the graphs by their canonical names."""
+    for option in ("seeds", "epochs", "jobs"):
+        value = getattr(arguments, option)
+        if value is not None and value < 1:
+            raise OptionError(f"--{option} {value}: allowed are 1 or more; choose another")
+        if value is not None and arguments.full and option != "jobs":
+            raise OptionError(f"--{option} {value}: --full says how many; leave one of them away")
+    if arguments.graph and arguments.table == "methods":
+        raise OptionError("--graph: chooses rows of the table of graphs; leave it or --table methods away")
+    if arguments.same_padding and arguments.table == "graphs":
+        raise OptionError("--same-padding: adds a row to the table of methods; leave it or --table graphs away")
+    if not arguments.data and not arguments.no_train:
+        raise OptionError("reproduce: no data set; name one or more with --data")
+    place = Path(arguments.output)
+    if place.exists() and not place.is_dir():
+        raise OptionError(f"-o {arguments.output}: is not a folder; give the name of one")
+    if not place.absolute().parent.is_dir():
+        raise OptionError(f"-o {arguments.output}: the folder that it shall be in does not exist; make it first")
+    return tuple(dict.fromkeys(build_graph(name).name for name in arguments.graph or GRAPHS))
+
+
+def _data_sets(paths: Sequence[str]) -> dict[str, DataSet]:
+    """Read the recordings; by the names that their cells bear."""
+    from models.protocols import data_digest
+    from runtime.train_command import both_splits
+
+    found: dict[str, DataSet] = {}
+    for path in paths:
+        name = data_name(path)
+        if name in found:
+            raise OptionError(f"--data {path}: is called {name} as {found[name].path} is; give each data set once")
+        training, test = both_splits(path, len(NEUTOUCH), BIN_S)
+        found[name] = DataSet(path=path, training=training, test=test, sha256=data_digest(training, test))
+    return found
+
+
+def _require_same_data(folder: Path, known: Mapping[str, Json], sets: Mapping[str, DataSet]) -> None:
+    """Refuse to mix cells of different recordings under one name."""
+    for name, cell in known.items():
+        data = cell["data"]
+        if data in sets and cell["data_sha256"] != sets[data].sha256:
+            raise DataError(
+                f"{cell_file(folder, name)}: is of other recordings named {data}; give those, or another -o"
+            )
+
+
+def _work(
+    arguments: argparse.Namespace, folder: Path, sets: Mapping[str, DataSet], wanted: Iterable[tuple[Row, int]]
+) -> list[Work]:
+    """Every cell that is not there, its training as ``spikeloom train`` would do it."""
+    from runtime.cli import build_parser
+    from runtime.train_command import planned
+
+    parser, found = build_parser(), list[Work]()
+    for row, seed in wanted:
+        data = sets[row.data]
+        name = row.cell(seed)
+        words = ["train", "--data", data.path, *row.words(), "--seed", str(seed), "--device", arguments.device]
+        words += ["-o", str(network_file(folder, name)), "--resume"]
+        (job,) = planned(parser.parse_args(words), data.training, data.test)
+        job = replace(job, position=len(found) % (arguments.jobs or os.cpu_count() or 1))  # of its progress bar
+        place = cell_file(folder, name)
+        found.append(Work(row=row, seed=seed, job=job, place=place, sha256=data.sha256))
+    return found
+
+
+def _require_resume(arguments: argparse.Namespace, folder: Path, cells: Sequence[str], work: Sequence[Work]) -> None:
+    """Go on only where that was asked for."""
+    from runtime.seeds import states
+
+    if arguments.resume or arguments.no_train:
+        return
+    there = sum(cell_file(folder, name).exists() for name in cells)
+    begun = sum(bool(states(each.job)) or each.output.exists() for each in work)
+    if there or begun:
+        raise OptionError(
+            f"-o {arguments.output}: holds {there} of these cells and {begun} more that are begun; go on with "
+            "--resume, or give another folder"
+        )
+
+
+# -- making cells ------------------------------------------------------------------------------------------------------
+
+
+def run_cell(work: Work) -> Json:
+    """Train a cell, or take over its network; measure it and keep the figures."""
+    from runtime.measured import measure
+    from runtime.seeds import clear, finished
+    from runtime.training import recall, run_job
+
+    job = work.job
+    clear(job)
+    record, _ = recall(job) if finished(job) else run_job(job)
+    found = {
+        "format": FORMAT,
+        "data": work.row.data,
+        "system": work.row.system,
+        "form": work.row.form,
+        "epochs": work.row.epochs,
+        "decay_epochs": job.decay_epochs,
+        "seed": work.seed,
+        "data_sha256": work.sha256,
+        "checkpoint_sha256": record["sha256"],
+        **{key: record[key] for key in ("command", "test_samples", "best", "last", "clean", "validation")},
+        **{key: record[key] for key in ("spikeloom", "torch", "numpy", "device")},
+        "chip": measure(job.output, job.training, job.test),
+    }
+    write_cell(work.place, found)
+    return found
+
+
+def _make(
+    arguments: argparse.Namespace,
+    folder: Path,
+    parts: Sequence[Part],
+    work: Sequence[Work],
+    *,
+    there: int,
+    planned: int,
+) -> None:
+    """Run what is to be run, the tables rebuilt after each cell."""
+    from runtime.seeds import ended_by_signal, finished, side_by_side
+
+    costs = [_cost(each, trained=finished(each.job)) for each in work]
+    began, results = time.monotonic(), dict[int, Json]()
+    taken = sum(finished(each.job) for each in work)
+    _tell(f"{there} of {planned} cells are there; {taken} more networks to measure, {len(work) - taken} to train")
+
+    def done(index: int) -> None:
+        write_tables(folder, parts, pictures=False)
+        spent, whole = sum(costs[i] for i in results), sum(costs)
+        left = (time.monotonic() - began) * (whole - spent) / spent
+        line = f"{there + len(results)} of {planned} cells, {duration(left)} left: {work[index].place.stem}"
+        _tell(f"{line} {_figures(results[index])}")
+
+    try:
+        with ended_by_signal():
+            if arguments.jobs == 1 or len(work) == 1:
+                for index, each in enumerate(work):
+                    results[index] = run_cell(each)
+                    done(index)
+            else:
+                side_by_side(work, range(len(work)), results, run_cell, most=arguments.jobs, fewer="--jobs", done=done)
+    except KeyboardInterrupt as interrupt:
+        kept = f"{there + len(results)} of {planned} cells and the epochs so far are kept in {folder}"
+        raise KeyboardInterrupt(f"{kept}; go on with the same command and --resume") from interrupt
+
+
+def _tell(line: str) -> None:
+    progress("")
+    sys.stderr.write(f"spikeloom: {line}\n")
+    sys.stderr.flush()
+
+
+def _figures(cell: Json) -> str:
+    """Accuracies of a cell, for the line that says that it is done."""
+    words = [f"{which} {100 * cell[which]['accuracy']:.2f}" for which in paper_table.PROTOCOLS]
+    chip = cell["chip"]
+    words += [
+        "chip refuses" if "refused" in chip else f"chip {100 * chip['last']['correct'] / cell['test_samples']:.2f}"
+    ]
+    return ", ".join(words)
+
+
+def _cost(work: Work, *, trained: bool) -> float:
+    """How long a cell takes, in epochs of TactileSGNet on Objects."""
+    pace = PACE[SAME_PADDING if work.row.form == SAME_PADDING else work.row.system]
+    epochs = MEASURING + (0.0 if trained else BOTH * pace * work.row.epochs)
+    return epochs * work.job.training.events.size
+
+
+def duration(seconds: float) -> str:
+    """Time for people.
+
+    Examples
+    --------
+    >>> duration(3900.0), duration(59.6), duration(0.0)
+    ('1 h 05 min', '1 min', '0 min')
+    """
+    hours, minutes = divmod(round(seconds / 60), 60)
+    return f"{hours} h {minutes:02d} min" if hours else f"{minutes} min"
+
+
+# -- tables ------------------------------------------------------------------------------------------------------------
+
+
+def write_tables(folder: Path, parts: Sequence[Part], *, pictures: bool) -> Json:
+    """Rebuild the tables from the cells that are there, and say what they hold.
+
+    Returns
+    -------
+    dict
+        ``methods`` and ``graphs``: rows; ``schedule``; cells ``planned``, ``finished``, ``missing``; ``files``.
+    """
+    cells = read_cells(folder)
+    names = [name for part in parts for name in part.cells()]
+    missing = [name for name in dict.fromkeys(names) if name not in cells]
+    report: Json = {"planned": len(set(names)), "finished": len(set(names)) - len(missing), "missing": missing}
+    files: dict[str, bytes] = {}
+    shown: set[str] = set()
+    for part in parts:
+        rows = paper_table.rows(part, cells)
+        shown |= {name for row in rows for name in row["cells"]}
+        shorter = paper_table.schedules(cells, part.epochs) if part.table == "graphs" else []
+        report |= {part.table: rows} | ({"schedule": shorter} if part.table == "graphs" else {})
+        files[f"{part.table}.csv"] = paper_text.csv_text(rows).encode()
+        files[f"{part.table}.md"] = paper_text.markdown(part.table, part.epochs, rows, shorter).encode()
+        if pictures:
+            files |= paper_picture.pictures(part.table, rows)
+    report["elsewhere"] = len(cells.keys() - shown)
+    report["files"] = [str(folder / name) for name in files]
+    for name, content in files.items():
+        with write_atomically(folder / name) as file:
+            file.write(content)
+    return report
