@@ -224,6 +224,17 @@ def _check_options(epochs: int, decay_epochs: int, seed: int, device: str) -> No
     for name, value, least in (("epochs", epochs, 1), ("decay-epochs", decay_epochs, 1), ("seed", seed, 0)):
         if value < least:
             raise OptionError(f"--{name} {value}: allowed are {least} or more; choose another")
+    require_device(device)
+
+
+def require_device(device: str) -> None:
+    """Refuse a device that is unknown or not there.
+
+    Raises
+    ------
+    OptionError
+        Saying which are allowed.
+    """
     if device not in DEVICES:
         raise OptionError(f"--device {device}: unknown; allowed: {', '.join(DEVICES)}")
     if device == "cuda" and not torch.cuda.is_available():

@@ -6,7 +6,7 @@ import io
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from runtime.paper_text import name_of
+from runtime.paper_text import counted, name_of
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -126,8 +126,7 @@ def _keep_readable(axes: Axes, rows: Sequence[Json]) -> None:
 
 
 def _counted(row: Json) -> str:
-    there, planned = len(row["seeds"]), row["planned"]
-    return f"{name_of(row)}\n({there} of {planned} seeds)" if row["missing"] else name_of(row)
+    return f"{name_of(row)}\n({counted(row)} seeds)" if row["missing"] else name_of(row)
 
 
 def _titled(data: str, rows: Sequence[Json]) -> str:
@@ -198,7 +197,7 @@ def _quiet(by_data: dict[str, list[Json]]) -> Figure:
         _savings(panels[1, column], rows)
         panels[1, column].set(xlabel="saved without neurons that fired in no training recording (%)")
     _legend(figure, [*panels[0]])
-    panels[1, 0].legend(loc="lower right", fontsize=8)
+    panels[1, 0].legend(loc="center right", fontsize=8)
     return figure
 
 
@@ -235,6 +234,7 @@ def _savings(axes: Axes, rows: Sequence[Json]) -> None:
         if not row["chip"]:
             axes.text(0.02, place, "missing", transform=axes.get_yaxis_transform(), va="center", color="0.5")
     axes.set_yticks(range(len(rows)), [name_of(row) for row in rows])
+    axes.set_xlim(0, 1.5 * max(1.0, *(width for widths in shares.values() for width in widths)))  # room for a legend
     axes.invert_yaxis()
     axes.grid(axis="x", alpha=0.3)
 

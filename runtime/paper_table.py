@@ -75,7 +75,11 @@ def rows(part: Part, cells: Cells) -> list[Json]:
         row = row_of(cell)
         if row in members or _belongs(part, row):
             members.setdefault(row, []).append(cell)
-    return [_row(part, row, sorted(found, key=lambda cell: cell["seed"])) for row, found in members.items()]
+    hashes = {cell["data"]: cell["data_sha256"] for cell in cells.values()}
+    return [
+        _row(part, row, sorted(found, key=lambda cell: cell["seed"]), hashes.get(row.data, ""))
+        for row, found in members.items()
+    ]
 
 
 def _belongs(part: Part, row: Row) -> bool:
@@ -85,7 +89,7 @@ def _belongs(part: Part, row: Row) -> bool:
     return row.system == TACTILESGNET if part.table == "graphs" else row.system != TACTILESGNET or row.form == "manual"
 
 
-def _row(part: Part, row: Row, cells: list[Json]) -> Json:
+def _row(part: Part, row: Row, cells: list[Json], sha256: str) -> Json:
     there = [cell["seed"] for cell in cells]
     planned = part.seeds.get(row, 0)
     found: Json = {
@@ -103,7 +107,7 @@ def _row(part: Part, row: Row, cells: list[Json]) -> Json:
     }
     for protocol in PROTOCOLS:
         found[protocol] = spread([100 * cell[protocol]["accuracy"] for cell in cells])
-    theirs = published(row.data, cells[0]["data_sha256"], row.system, row.form) if cells else None
+    theirs = published(row.data, sha256, row.system, row.form)
     found["paper"] = None if theirs is None else {"mean": theirs.mean, "std": theirs.std, "runs": RUNS}
     found["comparison"] = compare(found["best"], theirs)
     return found | _on_chip(cells)

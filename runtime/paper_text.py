@@ -68,7 +68,8 @@ def _flat(row: Json) -> dict[str, Any]:
     flat |= {"paper_mean": _of(row["paper"], "mean"), "paper_std": _of(row["paper"], "std")}
     for protocol in PROTOCOLS:
         flat |= _spread_columns(protocol, row[protocol])
-    flat |= {key: _of(row["comparison"], key) for key in ("difference", "combined_se", "within")}
+    flat |= {key: _rounded(_of(row["comparison"], key)) for key in ("difference", "combined_se")}
+    flat["within"] = _of(row["comparison"], "within")
     chip = row["chip"]
     flat["chip_refused"] = "; ".join(row["refused"] or ())
     for which in ("last", "clean"):
@@ -140,6 +141,11 @@ def markdown(kind: str, epochs: int, rows: Sequence[Json], shorter: Sequence[Jso
     for data in dict.fromkeys(row["data"] for row in rows):
         lines += ["", *_section(data, [row for row in rows if row["data"] == data])]
     if kind == "graphs":
+        lines += [
+            "",
+            "`knn:K` and `mst:SIGMA` are without the repeated edges of the released code, with which the paper's ",
+        ]
+        lines[-1] += "figures were made; `released:NAME` has them."
         lines += ["", *_schedule_lines(epochs, shorter)]
     return "\n".join(lines) + "\n"
 
@@ -149,33 +155,43 @@ def _section(data: str, rows: Sequence[Json]) -> list[str]:
     one = f" ({samples} test recordings, one is {100 / samples:.2f})" if samples else ""
     heads = ["", "seeds", "paper", *HEADS.values(), "reproduced"]
     lines = [f"## {data}{one}", "", *pipes(heads, [_accuracies(row) for row in rows])]
-    chip = [row for row in rows if row["chip"]]
-    energies = list(dict.fromkeys(name for row in chip for name in row["chip"]["energy_j"]))
-    heads = ["on the chip", "last epoch", "clean epoch", "decisions equal", "operations", "of the first layer"]
+    missing = sum(len(row["missing"]) for row in rows)
+    if missing:
+        lines += ["", f"Missing: {missing} trainings; `spikeloom reproduce --no-train --json` names them."]
+    if any(row["seeds"] for row in rows):
+        lines += _chip_section([row for row in rows if row["seeds"]])
+    return lines
+
+
+def _chip_section(rows: Sequence[Json]) -> list[str]:
+    """What is known of the chip, of rows that are there."""
+    held = [row for row in rows if row["chip"]]
+    energies = list(dict.fromkeys(name for row in held for name in row["chip"]["energy_j"]))
+    heads = ["on the chip", "last epoch", "clean epoch", "decided as float", "operations", "of the first layer"]
     heads += [*(f"energy, {name}" for name in energies), "cores"]
-    lines += ["", *pipes(heads, [_chip_cells(row, energies) for row in rows])]
+    lines = ["", *pipes(heads, [_chip_cells(row, energies) for row in rows])]
     heads = ["first layer", "neurons", "cannot fire", "never fired in training", "nor in test"]
     heads += ["operations saved", "of the first layer", *(f"energy saved, {name}" for name in energies), "cores"]
-    lines += ["", *pipes([*heads, "decisions changed"], [_quiet_cells(row, energies) for row in rows])]
+    if held:
+        lines += ["", *pipes([*heads, "decisions changed"], [_quiet_cells(row, energies) for row in held])]
     refused = [f"- {name_of(row)}: Loihi 1 refuses it: {'; '.join(row['refused'])}" for row in rows if row["refused"]]
-    missing = [name for row in rows for name in row["missing"]]
-    return [*lines, *([""] if refused else []), *refused, *_missing_lines(missing)]
-
-
-def _missing_lines(missing: Sequence[str]) -> list[str]:
-    return ["", f"Missing, {len(missing)} trainings: {', '.join(missing)}."] if missing else []
+    return [*lines, *([""] if refused else []), *refused]
 
 
 def _accuracies(row: Json) -> list[str]:
-    count = f"{len(row['seeds'])} of {row['planned']}" if row["missing"] else str(len(row["seeds"]))
-    return [name_of(row), count, paper_words(row), *(spread_words(row[p]) for p in PROTOCOLS), verdict(row)]
+    return [name_of(row), counted(row), paper_words(row), *(spread_words(row[p]) for p in PROTOCOLS), verdict(row)]
+
+
+def counted(row: Json) -> str:
+    """How many seeds there are, of how many where some are missing."""
+    return f"{len(row['seeds'])} of {row['planned']}" if row["missing"] else str(len(row["seeds"]))
 
 
 def paper_words(row: Json) -> str:
     """The paper's figure, or that it is not known."""
     paper = row["paper"]
     if paper is None:
-        return UNKNOWN if row["seeds"] else NONE
+        return UNKNOWN
     return f"{paper['mean']:.2f}" + ("" if paper["std"] is None else f" ({paper['std']:.2f})")
 
 
@@ -208,8 +224,7 @@ def verdict(row: Json) -> str:
 def _chip_cells(row: Json, energies: Sequence[str]) -> list[str]:
     chip = row["chip"]
     if chip is None:
-        why = "refused" if row["refused"] else "missing"
-        return [name_of(row), why, *[NONE] * (len(energies) + 5)]
+        return [name_of(row), "refused", *[NONE] * (len(energies) + 5)]
     return [
         name_of(row),
         *(spread_words(chip[which]) for which in ("last", "clean")),
@@ -223,8 +238,6 @@ def _chip_cells(row: Json, energies: Sequence[str]) -> list[str]:
 
 def _quiet_cells(row: Json, energies: Sequence[str]) -> list[str]:
     chip = row["chip"]
-    if chip is None:
-        return [name_of(row), *[NONE] * (len(energies) + 8)]
     layer, lean = chip["first_layer"], chip["without_quiet"]
     return [
         name_of(row),
@@ -312,7 +325,7 @@ def _terminal_cells(row: Json) -> list[str]:
     found = row["comparison"]
     return [
         name_of(row),
-        f"{len(row['seeds'])} of {row['planned']}",
+        counted(row),
         NONE if row["paper"] is None else paper_words(row),
         *(_short(row[protocol]) for protocol in PROTOCOLS),
         _short(row["chip"]["last"]) if row["chip"] else "refused" if row["refused"] else "missing",

@@ -38,6 +38,7 @@ from runtime.cells import (
 )
 from runtime.inputs import progress
 from runtime.options import DATA_HELP
+from runtime.published import RECORDINGS
 from runtime.training import Job
 
 Json = dict[str, Any]
@@ -151,7 +152,7 @@ def reproduce(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str
     known = read_cells(folder)
     sets = _data_sets(arguments.data)
     _require_same_data(folder, known, sets)
-    names = sets or dict.fromkeys(cell["data"] for cell in known.values())
+    names = list(sets) or sorted({cell["data"] for cell in known.values()}, key=_in_the_papers_order)
     parts = plan(
         names,
         [arguments.table] if arguments.table else TABLES,
@@ -171,13 +172,16 @@ def reproduce(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str
         work = [each for each in work if finished(each.job)]
     for name in ("cells", "networks"):
         (folder / name).mkdir(parents=True, exist_ok=True)
-    _make(arguments, folder, parts, work, there=len(cells) - len(wanted), planned=len(cells))
+    _make(arguments, folder, parts, work, there=sum(row.cell(seed) in known for row, seed in cells), planned=len(cells))
     report = write_tables(folder, parts, pictures=True)
     return report, paper_text.terminal, 1 if report["missing"] else 0
 
 
 def _check(arguments: argparse.Namespace) -> tuple[str, ...]:
     """Refuse options that cannot be meant; return the graphs by their canonical names."""
+    from models.train import require_device
+
+    require_device(arguments.device)
     for option in ("seeds", "epochs", "jobs"):
         value = getattr(arguments, option)
         if value is not None and value < 1:
@@ -196,6 +200,11 @@ def _check(arguments: argparse.Namespace) -> tuple[str, ...]:
     if not place.absolute().parent.is_dir():
         raise OptionError(f"-o {arguments.output}: the folder that it shall be in does not exist; make it first")
     return tuple(dict.fromkeys(build_graph(name).name for name in arguments.graph or GRAPHS))
+
+
+def _in_the_papers_order(data: str) -> tuple[bool, int, str]:
+    order = list(RECORDINGS)
+    return data not in order, order.index(data) if data in order else 0, data
 
 
 def _data_sets(paths: Sequence[str]) -> dict[str, DataSet]:
