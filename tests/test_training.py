@@ -279,6 +279,22 @@ def test_resume_leaves_finished_seeds_alone_and_trains_the_rest(data, capsys):
     assert Path("a.png").read_bytes() == Path("b.png").read_bytes()
 
 
+def test_another_decay_is_stored_and_told_apart(data, capsys):
+    words = (*WORDS, "--epochs", "3", "-o", "x.pt")
+    report = as_json(capsys, *words, "--decay-epochs", "1")
+    (run,) = report["runs"]
+    assert run["decay_epochs"] == 1
+    assert run["command"] == "spikeloom train --data data --graph manual --epochs 3 --decay-epochs 1 --seed 0"
+    assert refused(capsys, "--epochs", "3", "-o", "x.pt", "--resume") == (
+        "x.pt: holds another training (other decay epochs); give its options, or another -o"
+    )
+    assert as_json(capsys, *words, "--decay-epochs", "1", "--resume") == report
+    Path("x.pt").unlink()
+    (usual,) = as_json(capsys, *words, "--decay-epochs", "40")["runs"]
+    assert "decay_epochs" not in usual
+    assert usual["command"] == "spikeloom train --data data --graph manual --epochs 3 --seed 0"
+
+
 def test_resume_does_not_take_another_training_for_this_one(data, capsys):
     as_json(capsys, *WORDS, "--epochs", "1", "--keep", "best", "-o", "x.pt")
     assert refused(capsys, "--epochs", "2", "--seed", "3", "-o", "x.pt", "--resume") == (
