@@ -16,7 +16,7 @@ from typing import Any
 
 from compiler.atomic import write_atomically
 from compiler.errors import DataError
-from compiler.frontends.systems import GCN, GRAPH_SYSTEMS, GRID_CNN, MLP, TACTILESGNET
+from compiler.frontends.systems import GCN, GRAPH_SYSTEMS, GRID_CNN, MLP, SYSTEMS, TACTILESGNET
 from models.graphs import MAX_NEIGHBOURS
 from models.schedule import EPOCHS, scaled_decay
 from models.systems import NO_GRAPH, PADDINGS
@@ -110,11 +110,14 @@ class Part:
         Of every training.
     seeds : mapping of Row to int
         Planned seeds, counted from 0.
+    usual : mapping of str to int
+        Seeds that a row of each system has, for rows that are there without being planned.
     """
 
     table: str
     epochs: int
     seeds: Mapping[Row, int]
+    usual: Mapping[str, int]
 
     def cells(self) -> list[str]:
         """Names of all planned cells."""
@@ -166,14 +169,16 @@ def plan(
         forms = [(TACTILESGNET, graph) for graph in graphs]
         if table == "methods":
             forms = [*METHODS[:2], *([(GRID_CNN, SAME_PADDING)] if same_padding else []), *METHODS[2:]]
+        usual = {
+            system: FULL_SEEDS if full else seeds or (GRID_SEEDS if system == GRID_CNN else SEEDS[table])
+            for system in SYSTEMS
+        }
         planned = {
-            Row(data=name, system=system, form=form, epochs=length): (
-                FULL_SEEDS if full else seeds or (GRID_SEEDS if system == GRID_CNN else SEEDS[table])
-            )
+            Row(data=name, system=system, form=form, epochs=length): usual[system]
             for name in names
             for system, form in forms
         }
-        parts.append(Part(table=table, epochs=length, seeds=planned))
+        parts.append(Part(table=table, epochs=length, seeds=planned, usual=usual))
     return tuple(parts)
 
 

@@ -30,6 +30,9 @@ ENERGY = "davies2018"
 
 DPI = 110
 
+WIDTH = 6.4
+"""Of a panel, in inches."""
+
 
 def pictures(kind: str, rows: Sequence[Json]) -> dict[str, bytes]:
     """PNG files of a table by name.
@@ -64,17 +67,17 @@ def _png(figure: Figure) -> bytes:
     return content.getvalue()
 
 
-def _panels(by_data: dict[str, list[Json]], down: int, width: float, height: float) -> tuple[Figure, Any]:
+def _panels(by_data: dict[str, list[Json]], down: int, height: float) -> tuple[Figure, Any]:
     from matplotlib import pyplot as plt
 
-    size = (width * len(by_data), height * down)
+    size = (WIDTH * len(by_data), height * down)
     return plt.subplots(down, len(by_data), figsize=size, layout="constrained", squeeze=False)
 
 
 def _accuracies(by_data: dict[str, list[Json]]) -> Figure:
     """One line for each row: every seed, means with intervals, and the paper's figure."""
     longest = max(len(rows) for rows in by_data.values())
-    figure, (panels,) = _panels(by_data, 1, 6.4, 1.5 + 0.62 * longest)
+    figure, (panels,) = _panels(by_data, 1, 1.5 + 0.62 * longest)
     for axes, (data, rows) in zip(panels, by_data.items(), strict=True):
         for place, row in enumerate(rows):
             _accuracy_row(axes, place, row)
@@ -100,7 +103,7 @@ def _accuracy_row(axes: Axes, place: int, row: Json) -> None:
         axes.plot([paper["mean"]] * 2, [place - 0.44, place + 0.44], color=colour, linewidth=1.6, label=label)
     spreads = _spreads(row)
     if not spreads:
-        axes.text(0.5, place, "missing", transform=axes.get_yaxis_transform(), ha="center", va="center", color="0.5")
+        axes.text(0.02, place, "missing", transform=axes.get_yaxis_transform(), va="center", color="0.5")
     for offset, (key, spread) in zip((-0.3, -0.1, 0.1, 0.3), spreads.items(), strict=False):
         label, colour, marker = SERIES[key]
         at = place + offset
@@ -140,12 +143,13 @@ def _legend(figure: Figure, panels: Sequence[Axes]) -> None:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             entries.setdefault(label, handle)
     if entries:
-        figure.legend(list(entries.values()), list(entries), loc="outside lower center", ncols=3, fontsize=9)
+        columns = 3 if figure.get_figwidth() > WIDTH else 2
+        figure.legend(list(entries.values()), list(entries), loc="outside lower center", ncols=columns, fontsize=8)
 
 
 def _costs(by_data: dict[str, list[Json]]) -> Figure:
     """Accuracy on the chip against first-layer operations, and against the energy of an inference."""
-    figure, panels = _panels(by_data, 2, 6.4, 4.6)
+    figure, panels = _panels(by_data, 2, 4.6)
     for column, (data, rows) in enumerate(by_data.items()):
         there = [row for row in rows if row["chip"]]
         operations = [row["chip"]["first_layer_operations"] / 1e6 for row in there]
@@ -190,7 +194,7 @@ def _against(axes: Axes, rows: Sequence[Json], costs: Sequence[float]) -> None:
 def _quiet(by_data: dict[str, list[Json]]) -> Figure:
     """First-layer neurons by whether they fire, and what leaving out those that do not saves."""
     longest = max(len(rows) for rows in by_data.values())
-    figure, panels = _panels(by_data, 2, 6.4, 1.2 + 0.3 * longest)
+    figure, panels = _panels(by_data, 2, 1.2 + 0.3 * longest)
     for column, (data, rows) in enumerate(by_data.items()):
         _neurons(panels[0, column], rows)
         panels[0, column].set(xlabel="neurons of the first layer, mean over seeds", title=_titled(data, rows))

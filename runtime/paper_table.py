@@ -10,11 +10,11 @@ import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from compiler.frontends.systems import TACTILESGNET
+from compiler.frontends.systems import SYSTEMS, TACTILESGNET
 from models.schedule import EPOCHS
-from runtime.cells import Part, Row, row_of
+from runtime.cells import GRAPHS, Part, Row, row_of
 from runtime.intervals import of_mean
-from runtime.published import RUNS, Published, published
+from runtime.published import RECORDINGS, RUNS, Published, published
 
 Json = dict[str, Any]
 Cells = Mapping[str, Json]
@@ -78,8 +78,17 @@ def rows(part: Part, cells: Cells) -> list[Json]:
     hashes = {cell["data"]: cell["data_sha256"] for cell in cells.values()}
     return [
         _row(part, row, sorted(found, key=lambda cell: cell["seed"]), hashes.get(row.data, ""))
-        for row, found in members.items()
+        for row, found in sorted(members.items(), key=lambda member: _place(member[0]))
     ]
+
+
+def _place(row: Row) -> tuple[Any, ...]:
+    """Order of rows: data sets, systems and graphs as the paper has them, then all others by name."""
+    of_data, of_system, of_graph = (
+        (list(names).index(name) if name in names else len(names), name)
+        for names, name in ((RECORDINGS, row.data), (SYSTEMS, row.system), (GRAPHS, row.form))
+    )
+    return of_data, of_system, of_graph
 
 
 def _belongs(part: Part, row: Row) -> bool:
@@ -91,7 +100,7 @@ def _belongs(part: Part, row: Row) -> bool:
 
 def _row(part: Part, row: Row, cells: list[Json], sha256: str) -> Json:
     there = [cell["seed"] for cell in cells]
-    planned = part.seeds.get(row, 0)
+    planned = part.seeds.get(row, part.usual[row.system])
     found: Json = {
         "table": part.table,
         "data": row.data,

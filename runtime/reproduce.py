@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
-import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,17 +11,15 @@ from typing import Any
 
 from compiler.atomic import write_atomically
 from compiler.errors import DataError, OptionError
-from compiler.frontends.systems import GCN, GRID_CNN, MLP, TACTILESGNET
 from models.events import BIN_S
 from models.evtouch import Recordings
 from models.graphs import NEUTOUCH, build_graph
 from models.schedule import EPOCHS
 from runtime import paper_picture, paper_table, paper_text
+from runtime.cell_work import Work, make
 from runtime.cells import (
-    FORMAT,
     FULL_SEEDS,
     GRAPHS,
-    SAME_PADDING,
     SHORT_EPOCHS,
     TABLES,
     Part,
@@ -34,25 +30,12 @@ from runtime.cells import (
     network_file,
     plan,
     read_cells,
-    write_cell,
 )
-from runtime.inputs import progress
 from runtime.options import DATA_HELP
-from runtime.published import RECORDINGS
-from runtime.training import Job
 
 Json = dict[str, Any]
 
 SUMMARY = "rebuild the tables of the TactileSGNet paper: train, compile and measure, in parts, from what is there"
-
-PACE = {TACTILESGNET: 1.0, GRID_CNN: 1.4, MLP: 0.25, GCN: 0.7, SAME_PADDING: 5.0}
-"""How long an epoch of a system takes beside one of TactileSGNet; only the time that is left is told from it."""
-
-BOTH = 1.8
-"""Trainings of a cell: one on all of the training split, one on four fifths."""
-
-MEASURING = 8.0
-"""Epochs that measuring a network takes as long as."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -73,34 +56,6 @@ class DataSet:
     training: Recordings
     test: Recordings
     sha256: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Work:
-    """A cell to make; crosses process borders.
-
-    Parameters
-    ----------
-    row, seed : Row, int
-        Which.
-    job : Job
-        Its training.
-    place : Path
-        Where its figures go.
-    sha256 : str
-        Of its recordings.
-    """
-
-    row: Row
-    seed: int
-    job: Job
-    place: Path
-    sha256: str
-
-    @property
-    def output(self) -> Path:
-        """Checkpoint that it writes."""
-        return self.job.output
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -152,16 +107,9 @@ def reproduce(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str
     known = read_cells(folder)
     sets = _data_sets(arguments.data)
     _require_same_data(folder, known, sets)
-    names = list(sets) or sorted({cell["data"] for cell in known.values()}, key=_in_the_papers_order)
-    parts = plan(
-        names,
-        [arguments.table] if arguments.table else TABLES,
-        seeds=arguments.seeds,
-        epochs=arguments.epochs,
-        full=arguments.full,
-        same_padding=arguments.same_padding,
-        graphs=graphs,
-    )
+    there = sorted({cell["data"] for cell in known.values()})
+    parts = _plan(arguments, sets or there, graphs)
+    shown = _plan(arguments, dict.fromkeys([*sets, *there]), graphs)
     cells = in_turn(parts)
     wanted = [(row, seed) for row, seed in cells if row.cell(seed) not in known and row.data in sets]
     work = _work(arguments, folder, sets, wanted)
@@ -172,9 +120,30 @@ def reproduce(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str
         work = [each for each in work if finished(each.job)]
     for name in ("cells", "networks"):
         (folder / name).mkdir(parents=True, exist_ok=True)
-    _make(arguments, folder, parts, work, there=sum(row.cell(seed) in known for row, seed in cells), planned=len(cells))
-    report = write_tables(folder, parts, pictures=True)
+    known_already = sum(row.cell(seed) in known for row, seed in cells)
+    make(
+        work,
+        folder,
+        there=known_already,
+        planned=len(cells),
+        most=arguments.jobs,
+        after=lambda: write_tables(folder, shown, pictures=False),
+    )
+    report = write_tables(folder, shown, pictures=True) | _completeness(folder, parts)
     return report, paper_text.terminal, 1 if report["missing"] else 0
+
+
+def _plan(arguments: argparse.Namespace, names: Iterable[str], graphs: Sequence[str]) -> tuple[Part, ...]:
+    """What the options ask for on some data sets."""
+    return plan(
+        names,
+        [arguments.table] if arguments.table else TABLES,
+        seeds=arguments.seeds,
+        epochs=arguments.epochs,
+        full=arguments.full,
+        same_padding=arguments.same_padding,
+        graphs=graphs,
+    )
 
 
 def _check(arguments: argparse.Namespace) -> tuple[str, ...]:
@@ -200,11 +169,6 @@ def _check(arguments: argparse.Namespace) -> tuple[str, ...]:
     if not place.absolute().parent.is_dir():
         raise OptionError(f"-o {arguments.output}: the folder that it shall be in does not exist; make it first")
     return tuple(dict.fromkeys(build_graph(name).name for name in arguments.graph or GRAPHS))
-
-
-def _in_the_papers_order(data: str) -> tuple[bool, int, str]:
-    order = list(RECORDINGS)
-    return data not in order, order.index(data) if data in order else 0, data
 
 
 def _data_sets(paths: Sequence[str]) -> dict[str, DataSet]:
@@ -267,108 +231,6 @@ def _require_resume(arguments: argparse.Namespace, folder: Path, cells: Sequence
         )
 
 
-# -- making cells ------------------------------------------------------------------------------------------------------
-
-
-def run_cell(work: Work) -> Json:
-    """Train a cell, or take over its network; measure it and keep the figures."""
-    from runtime.measured import measure
-    from runtime.seeds import clear, finished
-    from runtime.training import recall, run_job
-
-    job = work.job
-    clear(job)
-    record, _ = recall(job) if finished(job) else run_job(job)
-    found = {
-        "format": FORMAT,
-        "data": work.row.data,
-        "system": work.row.system,
-        "form": work.row.form,
-        "epochs": work.row.epochs,
-        "decay_epochs": job.decay_epochs,
-        "seed": work.seed,
-        "data_sha256": work.sha256,
-        "checkpoint_sha256": record["sha256"],
-        **{key: record[key] for key in ("command", "test_samples", "best", "last", "clean", "validation")},
-        **{key: record[key] for key in ("spikeloom", "torch", "numpy", "device")},
-        "chip": measure(job.output, job.training, job.test),
-    }
-    write_cell(work.place, found)
-    return found
-
-
-def _make(
-    arguments: argparse.Namespace,
-    folder: Path,
-    parts: Sequence[Part],
-    work: Sequence[Work],
-    *,
-    there: int,
-    planned: int,
-) -> None:
-    """Run what is to be run, the tables rebuilt after each cell."""
-    from runtime.seeds import ended_by_signal, finished, side_by_side
-
-    costs = [_cost(each, trained=finished(each.job)) for each in work]
-    began, results = time.monotonic(), dict[int, Json]()
-    taken = sum(finished(each.job) for each in work)
-    _tell(f"{there} of {planned} cells are there; {taken} more networks to measure, {len(work) - taken} to train")
-
-    def done(index: int) -> None:
-        write_tables(folder, parts, pictures=False)
-        spent, whole = sum(costs[i] for i in results), sum(costs)
-        left = (time.monotonic() - began) * (whole - spent) / spent
-        line = f"{there + len(results)} of {planned} cells, {duration(left)} left: {work[index].place.stem}"
-        _tell(f"{line} {_figures(results[index])}")
-
-    try:
-        with ended_by_signal():
-            if arguments.jobs == 1 or len(work) == 1:
-                for index, each in enumerate(work):
-                    results[index] = run_cell(each)
-                    done(index)
-            else:
-                side_by_side(work, range(len(work)), results, run_cell, most=arguments.jobs, fewer="--jobs", done=done)
-    except KeyboardInterrupt as interrupt:
-        kept = f"{there + len(results)} of {planned} cells and the epochs so far are kept in {folder}"
-        raise KeyboardInterrupt(f"{kept}; go on with the same command and --resume") from interrupt
-
-
-def _tell(line: str) -> None:
-    progress("")
-    sys.stderr.write(f"spikeloom: {line}\n")
-    sys.stderr.flush()
-
-
-def _figures(cell: Json) -> str:
-    """Accuracies of a cell, for the line that says that it is done."""
-    words = [f"{which} {100 * cell[which]['accuracy']:.2f}" for which in paper_table.PROTOCOLS]
-    chip = cell["chip"]
-    words += [
-        "chip refuses" if "refused" in chip else f"chip {100 * chip['last']['correct'] / cell['test_samples']:.2f}"
-    ]
-    return ", ".join(words)
-
-
-def _cost(work: Work, *, trained: bool) -> float:
-    """How long a cell takes, in epochs of TactileSGNet on Objects."""
-    pace = PACE[SAME_PADDING if work.row.form == SAME_PADDING else work.row.system]
-    epochs = MEASURING + (0.0 if trained else BOTH * pace * work.row.epochs)
-    return epochs * work.job.training.events.size
-
-
-def duration(seconds: float) -> str:
-    """Time for people.
-
-    Examples
-    --------
-    >>> duration(3900.0), duration(59.6), duration(0.0)
-    ('1 h 05 min', '1 min', '0 min')
-    """
-    hours, minutes = divmod(round(seconds / 60), 60)
-    return f"{hours} h {minutes:02d} min" if hours else f"{minutes} min"
-
-
 # -- tables ------------------------------------------------------------------------------------------------------------
 
 
@@ -378,12 +240,10 @@ def write_tables(folder: Path, parts: Sequence[Part], *, pictures: bool) -> Json
     Returns
     -------
     dict
-        ``methods`` and ``graphs``: rows; ``schedule``; cells ``planned``, ``finished``, ``missing``; ``files``.
+        ``methods`` and ``graphs``: rows; ``schedule``; ``elsewhere``: cells of no row; ``files``.
     """
     cells = read_cells(folder)
-    names = [name for part in parts for name in part.cells()]
-    missing = [name for name in dict.fromkeys(names) if name not in cells]
-    report: Json = {"planned": len(set(names)), "finished": len(set(names)) - len(missing), "missing": missing}
+    report: Json = {}
     files: dict[str, bytes] = {}
     shown: set[str] = set()
     for part in parts:
@@ -401,3 +261,10 @@ def write_tables(folder: Path, parts: Sequence[Part], *, pictures: bool) -> Json
         with write_atomically(folder / name) as file:
             file.write(content)
     return report
+
+
+def _completeness(folder: Path, parts: Sequence[Part]) -> Json:
+    """How many cells were asked for, how many are there, and the names of the others."""
+    names = list(dict.fromkeys(name for part in parts for name in part.cells()))
+    missing = [name for name in names if not cell_file(folder, name).exists()]
+    return {"planned": len(names), "finished": len(names) - len(missing), "missing": missing}

@@ -311,6 +311,17 @@ def test_without_training_it_measures_what_is_finished_and_says_what_is_missing(
     )
 
 
+def test_tables_show_data_sets_that_were_made_before(data, capsys):
+    kept(Path("out"), made_cell("objects", "mlp", "none", 3, 0, (1, 1, 1), chip=(1, 1)))
+    report = as_json(capsys, *METHODS, "--seeds", "2", "--no-train", code=1)
+    assert [(row["data"], row["system"], len(row["seeds"]), row["planned"]) for row in report["methods"]] == [
+        (name, system, int(name == "objects" and system == "mlp"), 2)
+        for name in ("objects", "grasps")
+        for system in ("tactilesgnet", "grid-cnn", "mlp", "gcn")
+    ]
+    assert report["planned"] == 8  # of the data set that was asked for
+
+
 def test_cells_of_another_length_are_not_shown_but_told_of(tmp_path, capsys):
     kept(tmp_path, made_cell("objects", "mlp", "none", 2, 0, (1, 1, 1), chip=(1, 1)))
     assert main(["reproduce", "--no-train", "--table", "methods", "-o", str(tmp_path)]) == 1
@@ -458,10 +469,8 @@ def test_pictures_show_what_is_there_and_are_equal_for_equal_cells(tmp_path, mon
         found = paper_picture.pictures(part.table, rows)
         assert found == paper_picture.pictures(part.table, rows)
         assert all(content[:4] == b"\x89PNG" for content in found.values())
-        assert all(
-            content != paper_picture.pictures(part.table, paper_table.rows(part, {}))[name]
-            for name, content in found.items()
-        )
+        nothing = paper_picture.pictures(part.table, paper_table.rows(part, {}))
+        assert all(content != nothing[name] for name, content in found.items())
     assert paper_picture.pictures("graphs", []) == {}
 
 
