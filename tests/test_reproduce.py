@@ -53,8 +53,7 @@ def data(tmp_path, monkeypatch) -> Path:
     return tmp_path
 
 
-def uncalibrated(network, training_events):
-    assert training_events is not None
+def uncalibrated(network, training_events=None):
     return compile_network(network)
 
 
@@ -166,14 +165,18 @@ def test_leaving_out_what_never_fired_moves_no_other_spike(data, capsys):
     np.testing.assert_array_equal(class_counts(lean, rest), class_counts(netlist, whole))
 
 
-def test_a_network_that_the_chip_refuses_is_trained_and_says_why(data, capsys, monkeypatch):
-    line = "core 0 (fc1): 15808 used, 4096 allowed (loihi1.core.axons_in); fewer inputs to the layer"
+@pytest.mark.parametrize(("axons", "calibrated"), [(15808, False), (4100, True)])
+def test_a_network_that_the_chip_refuses_is_trained_and_says_why(data, capsys, monkeypatch, axons, calibrated):
+    line = f"core 0 (fc1): {axons} used, 4096 allowed (loihi1.core.axons_in); fewer inputs to the layer"
 
-    def refusing(network, training_events):
+    tried = []
+
+    def refusing(network, training_events=None):
         if network.populations[0].size == 13 * 19 * 4:  # which a trained one of full size does by itself
+            tried.append(training_events is not None)
             owner, remedy = "core 0 (fc1)", "fewer inputs to the layer"
             rule = "loihi1.core.axons_in"
-            raise CapacityError((Violation(owner=owner, rule=rule, used=15808, allowed=4096, remedy=remedy),))
+            raise CapacityError((Violation(owner=owner, rule=rule, used=axons, allowed=4096, remedy=remedy),))
         return compile_network(network)
 
     monkeypatch.setattr("runtime.measured.compile_network", refusing)
@@ -182,6 +185,7 @@ def test_a_network_that_the_chip_refuses_is_trained_and_says_why(data, capsys, m
     rows = {row["form"]: row for row in report["methods"]}
     assert rows["none"]["refused"] is None
     assert rows["same"]["refused"] == [line]
+    assert tried == [False, True][: 1 + calibrated]
     assert rows["same"]["chip"] is None
     assert rows["same"]["last"]["n"] == 1
     text = Path("out/methods.md").read_text()
