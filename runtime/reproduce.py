@@ -69,7 +69,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"row of the graphs' table; may be repeated (default: {len(GRAPHS)})",
     )
     parser.add_argument(
-        "--same-padding", action="store_true", help="a grid-cnn of same padding too, which no chip holds"
+        "--same-padding", action="store_true", help="a grid-cnn of same padding too, 15,808 neurons"
     )
     parser.add_argument(
         "--seeds", type=int, metavar="N", help="trainings a row (default: methods 5, grid-cnn 3, graphs 3)"
