@@ -61,16 +61,14 @@ class DataSet:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Describe the options of the command."""
     parser.add_argument("--data", action="append", default=[], metavar="PATH", help=f"may be repeated: {DATA_HELP}")
-    parser.add_argument("--table", choices=TABLES, help="one table (default: both)")
+    parser.add_argument("--table", metavar="|".join(TABLES), help="one table (default: both)")
     parser.add_argument(
         "--graph",
         action="append",
         metavar="NAME",
         help=f"row of the graphs' table; may be repeated (default: {len(GRAPHS)})",
     )
-    parser.add_argument(
-        "--same-padding", action="store_true", help="a grid-cnn of same padding too, 15,808 neurons"
-    )
+    parser.add_argument("--same-padding", action="store_true", help="a grid-cnn of same padding too, 15,808 neurons")
     parser.add_argument(
         "--seeds", type=int, metavar="N", help="trainings a row (default: methods 5, grid-cnn 3, graphs 3)"
     )
@@ -108,6 +106,8 @@ def reproduce(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str
     sets = _data_sets(arguments.data)
     _require_same_data(folder, known, sets)
     there = sorted({cell["data"] for cell in known.values()})
+    if not sets and not there:
+        raise OptionError(f"-o {arguments.output}: holds no cells to make tables of; name a data set with --data")
     parts = _plan(arguments, sets or there, graphs)
     shown = _plan(arguments, dict.fromkeys([*sets, *there]), graphs)
     cells = in_turn(parts)
@@ -157,6 +157,8 @@ def _check(arguments: argparse.Namespace) -> tuple[str, ...]:
             raise OptionError(f"--{option} {value}: allowed are 1 or more; choose another")
         if value is not None and arguments.full and option != "jobs":
             raise OptionError(f"--{option} {value}: --full says how many; leave one of them away")
+    if arguments.table is not None and arguments.table not in TABLES:
+        raise OptionError(f"--table {arguments.table}: unknown; choose from {', '.join(TABLES)}")
     if arguments.graph and arguments.table == "methods":
         raise OptionError("--graph: chooses rows of the table of graphs; leave it or --table methods away")
     if arguments.same_padding and arguments.table == "graphs":

@@ -501,10 +501,7 @@ def test_the_paper_is_compared_on_its_recordings_only(tmp_path, capsys):
         (["--jobs", "-1"], "--jobs -1: allowed are 1 or more; choose another"),
         (["--full", "--seeds", "3"], "--seeds 3: --full says how many; leave one of them away"),
         (["--full", "--epochs", "3"], "--epochs 3: --full says how many; leave one of them away"),
-        (
-            ["--table", "x"],
-            "argument --table: invalid choice: 'x' (choose from 'methods', 'graphs'); see spikeloom reproduce --help",
-        ),
+        (["--table", "x"], "--table x: unknown; choose from methods, graphs"),
         (
             ["--table", "methods", "--graph", "knn:1"],
             "--graph: chooses rows of the table of graphs; leave it or --table methods away",
@@ -535,6 +532,9 @@ def test_wrong_options(data, capsys, words, line):
 
 def test_wrong_places_and_no_data(data, capsys):
     assert refused(capsys, "reproduce", "-o", "out") == "reproduce: no data set; name one or more with --data"
+    assert refused(capsys, "reproduce", "--no-train", "-o", "out") == (
+        "-o out: holds no cells to make tables of; name a data set with --data"
+    )
     Path("file").write_text("")
     assert refused(capsys, "reproduce", "--data", "Ev-Grasps", "-o", "file") == (
         "-o file: is not a folder; give the name of one"
