@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import numpy.typing as npt
 
 from compiler.errors import OptionError
@@ -231,6 +232,45 @@ def compile_network(
         layout=layout,
         usual=usual,
     )
+
+
+def without(
+    compilation: Compilation,
+    unused: tuple[npt.NDArray[np.bool_], ...],
+    *,
+    target: str = "loihi1",
+    rates: tuple[FloatArray, ...] | None = None,
+) -> Netlist:
+    """Leave more neurons out of what was compiled, and lay out the rest on the fewest cores.
+
+    Weights and thresholds are the same integers: on any recording on which none of these neurons fires, every other
+    spike is as before.
+
+    Parameters
+    ----------
+    compilation : Compilation
+        Of a network on one chip.
+    unused : tuple of (neurons,) bool
+        Neurons to leave out, by population; each keeps one.
+    target : str
+        Chip that it was compiled for.
+    rates : tuple of (neurons,) float64, optional
+        Spikes per step, for the placement.
+
+    Raises
+    ------
+    CapacityError
+        If a limit cannot be kept.
+    """
+    chip, integer = load_target(target), compilation.integer
+    silent, unheard = removable(integer)
+    laid, identity = compact(integer, either(either(silent, unheard), unused))
+    left = None if rates is None else tuple(rate[ids] for rate, ids in zip(rates, identity, strict=True))
+    layout, _ = lay_out(laid, chip, rates=left)
+    origin = Origin(network=integer, identity=identity, unheard=unheard)
+    netlist = emit(laid, layout.parts, layout.placement.tiles, chip, compilation.netlist.provenance, origin)
+    require_legal(netlist, chip)
+    return netlist
 
 
 def _require_stored(network: Network, forms: Sequence[Form], chip: Target) -> None:

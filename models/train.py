@@ -32,9 +32,7 @@ from compiler.frontends.checkpoint import arrays_digest
 from models.evtouch import Recordings
 from models.networks import Architecture, SpikingNet, Weights
 from models.resume import TrainingState, pack, read_state, unpack, write_state
-
-DECAY_EPOCHS = 40
-"""The learning rate falls to a tenth after so many epochs; the first of each such block still has the old rate."""
+from models.schedule import DECAY_EPOCHS, EPOCHS
 
 DEVICES = ("cpu", "cuda")
 
@@ -103,9 +101,10 @@ def train(
     propagation: NDArray[np.float64],
     architecture: Architecture,
     *,
-    epochs: int = 100,
+    epochs: int = EPOCHS,
     seed: int = 0,
     learning_rate: float = 1e-3,
+    decay_epochs: int = DECAY_EPOCHS,
     device: str = "cpu",
     keep_epoch: int | None = None,
     state: Path | None = None,
@@ -130,6 +129,8 @@ def train(
         Of the initial weights and of the order of recordings.
     learning_rate : float
         At the start.
+    decay_epochs : int
+        It falls to a tenth after so many epochs, again and again; see :mod:`models.schedule`.
     device : {"cpu", "cuda"}
         Where the network runs.
     keep_epoch : int, optional
@@ -146,11 +147,12 @@ def train(
     Raises
     ------
     OptionError
-        If `epochs` or `seed` is too small, there is no such device, or `state` belongs to another training.
+        If `epochs`, `decay_epochs` or `seed` is too small, there is no such device, or `state` belongs to another
+        training.
     DataError
         If recordings and architecture disagree, or the loss is no longer a number.
     """
-    _check_options(epochs, seed, device)
+    _check_options(epochs, decay_epochs, seed, device)
     for recordings in (training, test):
         _check(recordings, architecture)
     options = {
@@ -163,6 +165,8 @@ def train(
         "learning rate": learning_rate,
         "device": device,
         "kept epoch": keep_epoch,
+        # the released one goes without saying, as in every state that was written before there was a choice
+        **({} if decay_epochs == DECAY_EPOCHS else {"decay epochs": decay_epochs}),
     }
     order = np.random.default_rng(seed)
     history: list[Epoch] = []
@@ -180,7 +184,7 @@ def train(
                 training_loss = _train_epoch(
                     network, optimizer, training, order.permutation(len(training)), epoch=index + 1
                 )
-                if index % DECAY_EPOCHS == 0 and index > 1:
+                if index % decay_epochs == 0 and index > 1:
                     for group in optimizer.param_groups:
                         group["lr"] *= 0.1
                 test_loss, correct = evaluate(network, test)
@@ -216,10 +220,21 @@ def train(
     )
 
 
-def _check_options(epochs: int, seed: int, device: str) -> None:
-    for name, value, least in (("epochs", epochs, 1), ("seed", seed, 0)):
+def _check_options(epochs: int, decay_epochs: int, seed: int, device: str) -> None:
+    for name, value, least in (("epochs", epochs, 1), ("decay-epochs", decay_epochs, 1), ("seed", seed, 0)):
         if value < least:
             raise OptionError(f"--{name} {value}: allowed are {least} or more; choose another")
+    require_device(device)
+
+
+def require_device(device: str) -> None:
+    """Refuse a device that is unknown or not there.
+
+    Raises
+    ------
+    OptionError
+        Saying which are allowed.
+    """
     if device not in DEVICES:
         raise OptionError(f"--device {device}: unknown; allowed: {', '.join(DEVICES)}")
     if device == "cuda" and not torch.cuda.is_available():

@@ -11,6 +11,7 @@ from compiler.passes.layout import GOALS
 from compiler.passes.quantize import RANGES
 from compiler.pipeline import STAGES
 from models.graphs import CHOICES
+from models.schedule import DECAY_EPOCHS, EPOCHS
 from models.systems import PADDINGS
 from runtime.data_commands import add_bin_option
 
@@ -63,7 +64,14 @@ def add_training(parser: argparse.ArgumentParser) -> None:
         help="of a grid-cnn's window: none, moving by 2 (default), or same, which no Loihi core holds",
     )
     add_graph_options(parser, "to train on")
-    parser.add_argument("--epochs", type=int, default=100, metavar="N", help="default: 100, as released")
+    parser.add_argument("--epochs", type=int, default=EPOCHS, metavar="N", help=f"default: {EPOCHS}, as released")
+    parser.add_argument(
+        "--decay-epochs",
+        type=int,
+        default=DECAY_EPOCHS,
+        metavar="N",
+        help=f"the learning rate falls to a tenth after N epochs (default: {DECAY_EPOCHS}, as released)",
+    )
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of weights and order (default: 0)")
     parser.add_argument("--seeds", type=int, default=1, metavar="N", help="train N seeds side by side (default: 1)")
     parser.add_argument("--resume", action="store_true", help="go on with an interrupted training of the same options")

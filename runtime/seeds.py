@@ -13,7 +13,7 @@ from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 from compiler.atomic import remove_leftovers
 from compiler.errors import OptionError, SpikeloomError
@@ -21,6 +21,18 @@ from compiler.fixedpoint import IntArray
 from runtime.training import Job, recall, run_job, state_of
 
 Result = tuple[dict[str, Any], IntArray | None]
+
+
+class Writes(Protocol):
+    """A job that crosses process borders."""
+
+    @property
+    def output(self) -> Path:
+        """File that it writes."""
+
+
+AJob = TypeVar("AJob", bound=Writes)
+AResult = TypeVar("AResult")
 
 PATIENCE_S = 5.0
 """How long a process that was told to end may take for it."""
@@ -54,42 +66,53 @@ def train_seeds(jobs: Sequence[Job], *, resume: bool) -> list[Result]:
     """
     results: dict[int, Result] = {}
     for index, job in enumerate(jobs):
-        if resume and not _states(job) and job.output.exists():
+        if resume and finished(job):
             results[index] = recall(job)
-    _require_right_start(jobs, resume=resume, finished=bool(results))
+    _require_right_start(jobs, resume=resume, some_finished=bool(results))
     for index, job in enumerate(jobs):
-        for file in (job.output, *state_of(job)):
-            remove_leftovers(file)
+        clear(job)
         if index in results:
             sys.stderr.write(f"spikeloom: {job.output}: is finished, not trained again\n")
-        elif resume and not _states(job):
+        elif resume and not states(job):
             sys.stderr.write(f"spikeloom: {job.output}: was not begun, trained from the start\n")
     waiting = [index for index in range(len(jobs)) if index not in results]
     try:
-        with _ended_by_signal():
+        with ended_by_signal():
             if len(waiting) == 1:
                 results[waiting[0]] = run_job(jobs[waiting[0]])
             else:
-                _side_by_side(jobs, waiting, results)
+                side_by_side(jobs, waiting, results, run_job)
     except KeyboardInterrupt as interrupt:
         done = [jobs[index] for index in waiting if index in results]
         raise KeyboardInterrupt(_kept(done, jobs)) from interrupt
     return [results[index] for index in range(len(jobs))]
 
 
-def _states(job: Job) -> list[Path]:
+def finished(job: Job) -> bool:
+    """Whether its checkpoint is there and nothing is left to go on with."""
+    return not states(job) and job.output.exists()
+
+
+def clear(job: Job) -> None:
+    """Remove what a killed process left half-written."""
+    for file in (job.output, *state_of(job)):
+        remove_leftovers(file)
+
+
+def states(job: Job) -> list[Path]:
+    """Files of an interrupted training, as far as they are there."""
     return [file for file in state_of(job) if file.exists()]
 
 
-def _require_right_start(jobs: Sequence[Job], *, resume: bool, finished: bool) -> None:
+def _require_right_start(jobs: Sequence[Job], *, resume: bool, some_finished: bool) -> None:
     """Neither lose an interrupted training nor begin anew in silence."""
-    states = [file for job in jobs for file in _states(job)]
-    if states and not resume:
+    kept = [file for job in jobs for file in states(job)]
+    if kept and not resume:
         raise OptionError(
-            f"{', '.join(map(str, states))}: an interrupted training is kept here; go on with --resume, or delete "
-            f"{'it' if len(states) == 1 else 'them'} to train anew"
+            f"{', '.join(map(str, kept))}: an interrupted training is kept here; go on with --resume, or delete "
+            f"{'it' if len(kept) == 1 else 'them'} to train anew"
         )
-    if resume and not states and not finished:
+    if resume and not kept and not some_finished:
         raise OptionError(
             f"--resume: nothing was interrupted, neither {jobs[0].output} nor {state_of(jobs[0])[0]} exists; "
             "leave --resume away"
@@ -99,15 +122,15 @@ def _require_right_start(jobs: Sequence[Job], *, resume: bool, finished: bool) -
 def _kept(done: Sequence[Job], jobs: Sequence[Job]) -> str:
     """What an interrupt left, and how to go on; empty if nothing."""
     written = [str(job.output) for job in done]
-    states = [str(file) for job in jobs for file in _states(job)]
+    kept = [str(file) for job in jobs for file in states(job)]
     parts = [f"{', '.join(written)} {'is' if len(written) == 1 else 'are'} finished"] if written else []
-    if states:
-        parts.append(f"the epochs so far are kept in {', '.join(states)}")
+    if kept:
+        parts.append(f"the epochs so far are kept in {', '.join(kept)}")
     return f"{' and '.join(parts)}; go on with the same command and --resume" if parts else ""
 
 
 @contextmanager
-def _ended_by_signal() -> Iterator[None]:
+def ended_by_signal() -> Iterator[None]:
     """A request to end (SIGTERM) interrupts as Ctrl-C does, so that everything is left tidy."""
     if threading.current_thread() is not threading.main_thread():
         yield  # only the main thread may say what a signal does
@@ -119,20 +142,47 @@ def _ended_by_signal() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-def _side_by_side(
-    jobs: Sequence[Job],
+def side_by_side(
+    jobs: Sequence[AJob],
     waiting: Sequence[int],
-    results: dict[int, Result],
-    run: Callable[[Job], Result] = run_job,
+    results: dict[int, AResult],
+    run: Callable[[AJob], AResult],
+    *,
+    most: int | None = None,
+    fewer: str = "--seeds",
+    done: Callable[[int], object] | None = None,
 ) -> None:
-    """Run jobs in processes of their own; whatever ends this ends them all."""
+    """Run jobs in processes of their own; whatever ends this ends them all.
+
+    Parameters
+    ----------
+    jobs : sequence
+        All of them.
+    waiting : sequence of int
+        Which to run, in this order.
+    results : dict
+        Takes the result of each job by its place among `jobs`.
+    run : callable
+        Does the work; a function of a module, since it crosses process borders.
+    most : int, optional
+        Processes at a time; as many as there are cores by default.
+    fewer : str
+        Option that makes them fewer, for the message of a lack of memory.
+    done : callable, optional
+        Told the place of each job whose result has come.
+
+    Raises
+    ------
+    SpikeloomError, OSError, MemoryError
+        What ended a job.
+    """
     # spawned, not forked: torch and its thread pools do not survive a fork
     context = get_context("spawn")
     queue = list(waiting)
     running: dict[Connection, tuple[int, SpawnProcess]] = {}
     try:
         while queue or running:
-            while queue and len(running) < (os.cpu_count() or 1):
+            while queue and len(running) < (most or os.cpu_count() or 1):
                 index = queue.pop(0)
                 receiver, sender = context.Pipe(duplex=False)
                 process = context.Process(target=_work, args=(run, jobs[index], sender))
@@ -148,13 +198,15 @@ def _side_by_side(
                     process.join()
                     raise OptionError(
                         f"{jobs[index].output}: its process ended early (exit code {process.exitcode}), perhaps for "
-                        "lack of memory; go on with --resume, and with fewer --seeds"
+                        f"lack of memory; go on with --resume, and with fewer {fewer}"
                     ) from None
                 if isinstance(found, BaseException):
                     raise found
                 results[index] = found
                 process.join()
                 del running[receiver]
+                if done is not None:
+                    done(index)
     finally:
         for _, process in running.values():
             process.terminate()
@@ -164,7 +216,7 @@ def _side_by_side(
             process.join()
 
 
-def _work(run: Callable[[Job], Result], job: Job, sender: Connection) -> None:
+def _work(run: Callable[[AJob], AResult], job: AJob, sender: Connection) -> None:
     """One job in its own process, which outlives neither a request to end nor its parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent gets it too, and ends us
     signal.signal(signal.SIGTERM, _stop)

@@ -10,8 +10,10 @@ from typing import Any
 from compiler.errors import OptionError
 from compiler.frontends.checkpoint import WEIGHTS
 from compiler.frontends.systems import GRAPH_SYSTEMS, GRID_CNN, TACTILESGNET, TITLES, Grid
+from models.evtouch import Recordings
 from models.graphs import CHOICES, Graph
 from models.grasps import SYNTHETIC
+from models.schedule import DECAY_EPOCHS
 from models.systems import PADDINGS, sensor_grid, taxels_alone
 from runtime.inputs import asked_graph, asked_places, graph_words, progress, recordings, require_place, version
 from runtime.training import PICTURES, Job, check_seeds, draw_training, output_of, summary, training_text
@@ -29,18 +31,59 @@ def train(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], i
         require_place(arguments.picture, "--picture", arguments)
         if Path(arguments.picture).suffix not in PICTURES:
             raise OptionError(f"--picture {arguments.picture}: allowed are {', '.join(PICTURES)}; name one of these")
-    system = arguments.system or TACTILESGNET
-    graph, grid = _sensor(arguments, system)
+    sensor = _sensor(arguments)
+    training, test = both_splits(arguments.data, sensor[0].n_taxels, arguments.bin)
+    jobs = _jobs(arguments, sensor, training, test)
+    results = train_seeds(jobs, resume=arguments.resume)
+    records = [record for record, _ in results]
+    if arguments.picture is not None:
+        decided = [predicted for _, predicted in results if predicted is not None]
+        draw_training(arguments.picture, records, test.labels, decided)
+    return {"runs": records, "protocols": summary(records)}, training_text, 0
+
+
+def both_splits(data: str, taxels: int, bin_s: float) -> tuple[Recordings, Recordings]:
+    """Training and test recordings of a sensor, every one with its label.
+
+    Raises
+    ------
+    DataError, OptionError
+        If they cannot be used.
+    """
     progress("reading the recordings")
-    shared: dict[str, Any] = {"taxels": graph.n_taxels, "bin_s": arguments.bin, "labels_for": "training"}
-    training = recordings(arguments.data, "train", classes=None, **shared)
-    test = recordings(arguments.data, "test", classes=int(training.labels.max()) + 1, **shared)
+    shared: dict[str, Any] = {"taxels": taxels, "bin_s": bin_s, "labels_for": "training"}
+    training = recordings(data, "train", classes=None, **shared)
+    test = recordings(data, "test", classes=int(training.labels.max()) + 1, **shared)
     progress("")
+    return training, test
+
+
+def planned(arguments: argparse.Namespace, training: Recordings, test: Recordings) -> list[Job]:
+    """What the command would train, for whoever has read the recordings already.
+
+    Parameters
+    ----------
+    arguments : Namespace
+        Parsed options of ``train``.
+    training, test : Recordings
+        Both splits of its data.
+    """
+    return _jobs(arguments, _sensor(arguments), training, test)
+
+
+def _jobs(
+    arguments: argparse.Namespace, sensor: tuple[Graph, Grid | None], training: Recordings, test: Recordings
+) -> list[Job]:
+    """One job for each seed."""
+    graph, grid = sensor
+    system = arguments.system or TACTILESGNET
     data = arguments.data if arguments.data == SYNTHETIC else training.source
     words = [f"spikeloom train --data {data}", _system_words(arguments, system), graph_words(arguments)]
-    command = " ".join(filter(None, [*words, f"--epochs {arguments.epochs}"]))
+    words += [f"--epochs {arguments.epochs}"]
+    words += [f"--decay-epochs {arguments.decay_epochs}"] if arguments.decay_epochs != DECAY_EPOCHS else []
+    command = " ".join(filter(None, words))
     keep = tuple(dict.fromkeys(arguments.keep or WEIGHTS))
-    jobs = [
+    return [
         Job(
             training=training,
             test=test,
@@ -57,19 +100,15 @@ def train(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], i
             position=position,
             system=system,
             grid=grid,
+            decay_epochs=arguments.decay_epochs,
         )
         for position, seed in enumerate(range(arguments.seed, arguments.seed + arguments.seeds))
     ]
-    results = train_seeds(jobs, resume=arguments.resume)
-    records = [record for record, _ in results]
-    if arguments.picture is not None:
-        decided = [predicted for _, predicted in results if predicted is not None]
-        draw_training(arguments.picture, records, test.labels, decided)
-    return {"runs": records, "protocols": summary(records)}, training_text, 0
 
 
-def _sensor(arguments: argparse.Namespace, system: str) -> tuple[Graph, Grid | None]:
+def _sensor(arguments: argparse.Namespace) -> tuple[Graph, Grid | None]:
     """Taxels, their graph, and the grid over them, as far as the system has these."""
+    system = arguments.system or TACTILESGNET
     if arguments.padding is not None and system != GRID_CNN:
         raise OptionError(f"--padding: is for grid-cnn, {TITLES[system]} has no window; leave it away")
     graph = asked_graph(arguments, system)

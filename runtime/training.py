@@ -18,6 +18,7 @@ from compiler.frontends.checkpoint import WEIGHTS, read_checkpoint
 from compiler.frontends.systems import TACTILESGNET, Grid
 from models.evtouch import Recordings
 from models.graphs import Graph
+from models.schedule import DECAY_EPOCHS
 from models.systems import HOPS, filters_of, propagation_of
 from runtime.intervals import wilson
 from runtime.tables import table
@@ -55,6 +56,8 @@ class Job:
         One of :data:`compiler.frontends.systems.SYSTEMS`.
     grid : Grid, optional
         Of a grid-based CNN.
+    decay_epochs : int
+        Epochs after which the learning rate falls.
     """
 
     training: Recordings
@@ -72,6 +75,7 @@ class Job:
     position: int
     system: str = TACTILESGNET
     grid: Grid | None = None
+    decay_epochs: int = DECAY_EPOCHS
 
     def propagation(self) -> FloatArray:
         """What the first layer sees."""
@@ -126,12 +130,15 @@ def run_job(job: Job) -> tuple[dict[str, Any], IntArray | None]:
         architecture,
         epochs=job.epochs,
         seed=job.seed,
+        decay_epochs=job.decay_epochs,
         device=job.device,
         state=_stem(job),
         resume=job.resume,
         position=job.position,
     )
     record = training_record(reported, job.training, job.test, command=job.command, seed=job.seed) | dict(job.facts)
+    if job.decay_epochs != DECAY_EPOCHS:
+        record["decay_epochs"] = job.decay_epochs
     trained = reported.trained
     assert trained.kept is not None, "the clean epoch is one of the epochs"
     held = {"last": trained.last, "best": trained.best, "clean": trained.kept}
@@ -171,6 +178,8 @@ def recall(job: Job) -> tuple[dict[str, Any], IntArray | None]:
         "device": job.device,
     }
     differing = [name.removesuffix("_sha256") for name, value in wanted.items() if record.get(name) != value]
+    if record.get("decay_epochs", DECAY_EPOCHS) != job.decay_epochs:
+        differing.append("decay epochs")
     if found.graph != job.graph.name:
         differing.append("graph")
     ours, theirs = (None if grid is None else grid.to_json() for grid in (job.grid, found.grid))

@@ -20,7 +20,7 @@ from models.evtouch import load_recordings
 from models.grasps import synthetic_grasps
 from models.release import write_released
 from runtime.cli import main
-from runtime.seeds import _side_by_side
+from runtime.seeds import side_by_side
 from runtime.training import draw_training, summary
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -279,6 +279,22 @@ def test_resume_leaves_finished_seeds_alone_and_trains_the_rest(data, capsys):
     assert Path("a.png").read_bytes() == Path("b.png").read_bytes()
 
 
+def test_another_decay_is_stored_and_told_apart(data, capsys):
+    words = (*WORDS, "--epochs", "3", "-o", "x.pt")
+    report = as_json(capsys, *words, "--decay-epochs", "1")
+    (run,) = report["runs"]
+    assert run["decay_epochs"] == 1
+    assert run["command"] == "spikeloom train --data data --graph manual --epochs 3 --decay-epochs 1 --seed 0"
+    assert refused(capsys, "--epochs", "3", "-o", "x.pt", "--resume") == (
+        "x.pt: holds another training (other decay epochs); give its options, or another -o"
+    )
+    assert as_json(capsys, *words, "--decay-epochs", "1", "--resume") == report
+    Path("x.pt").unlink()
+    (usual,) = as_json(capsys, *words, "--decay-epochs", "40")["runs"]
+    assert "decay_epochs" not in usual
+    assert usual["command"] == "spikeloom train --data data --graph manual --epochs 3 --seed 0"
+
+
 def test_resume_does_not_take_another_training_for_this_one(data, capsys):
     as_json(capsys, *WORDS, "--epochs", "1", "--keep", "best", "-o", "x.pt")
     assert refused(capsys, "--epochs", "2", "--seed", "3", "-o", "x.pt", "--resume") == (
@@ -342,7 +358,7 @@ def fails(_job):
 def test_a_worker_that_fails_ends_all(run, error, line):
     job = SimpleNamespace(output=Path("x.pt"))
     with pytest.raises(error) as raised:
-        _side_by_side([job, job], [0, 1], {}, run)
+        side_by_side([job, job], [0, 1], {}, run)
     assert str(raised.value) == line
 
 

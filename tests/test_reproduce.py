@@ -1,0 +1,572 @@
+"""The reproduce command: cells trained, taken over and measured, tables from whatever is there."""
+
+import csv
+import io
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from made_cells import CAPACITY, kept, made_cell
+
+import models.train
+from compiler.errors import CapacityError, Violation
+from compiler.frontends.checkpoint import read_checkpoint
+from compiler.passes.expand import expand
+from compiler.pipeline import compile_network, without
+from models.grasps import synthetic_grasps
+from models.networks import Architecture
+from models.release import write_released
+from runtime import engine, paper_picture, paper_table, paper_text
+from runtime.cells import GRAPHS, Row, in_turn, plan, read_cells
+from runtime.cli import main
+from runtime.inputs import propagation
+from runtime.published import Published
+from runtime.seeds import side_by_side
+from runtime.votes import class_counts
+
+ROOT = Path(__file__).resolve().parents[1]
+
+SMALL = {"features": 4, "hidden": (12, 8)}
+
+
+@pytest.fixture
+def data(tmp_path, monkeypatch) -> Path:
+    """A small data set in the released layout, small networks, scales from weights alone, which takes no seconds.
+
+    The working folder is where the data is.
+    """
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("models.networks.Architecture", partial(Architecture, **SMALL))
+    monkeypatch.setattr("runtime.measured.compile_network", uncalibrated)
+    monkeypatch.setattr("runtime.paper_picture.DPI", 30)
+    made(tmp_path / "Ev-Grasps")
+    return tmp_path
+
+
+def uncalibrated(network, training_events=None):
+    return compile_network(network)
+
+
+def made(folder: Path, first: int = 1) -> None:
+    splits = [
+        replace(synthetic_grasps(per_class=3, steps=14, seed=seed), split=split)
+        for split, seed in (("train", first), ("test", first + 1))
+    ]
+    write_released(folder, splits)
+
+
+WORDS = ("reproduce", "--data", "Ev-Grasps", "--jobs", "1", "-o", "out")
+METHODS = (*WORDS, "--table", "methods", "--seeds", "1", "--epochs", "3")
+GCN_NAME = "grasps-gcn-manual-e3-s0"
+
+
+def as_json(capsys, *words, code=0):
+    assert main([*words, "--json"]) == code
+    return json.loads(capsys.readouterr().out)
+
+
+def refused(capsys, *words) -> str:
+    capsys.readouterr()
+    assert main([*words]) == 2
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1
+    return err.removeprefix("spikeloom: ").removesuffix("\n")
+
+
+def test_the_table_of_methods_from_nothing(data, capsys):
+    assert main([*METHODS, "--same-padding", "--json"]) == 0
+    out, err = capsys.readouterr()
+    report = json.loads(out)
+    names = [f"grasps-{name}-e3-s0" for name in ("tactilesgnet-manual", "grid-cnn-none", "grid-cnn-same", "mlp-none")]
+    names.append(GCN_NAME)
+    assert sorted(path.stem for path in Path("out/cells").iterdir()) == sorted(names)
+    assert sorted(path.stem for path in Path("out/networks").iterdir()) == sorted(names)
+    assert [row["cells"] for row in report["methods"]] == [[name] for name in names]
+    assert (report["planned"], report["finished"], report["missing"], report["elsewhere"]) == (5, 5, [], 0)
+    assert report["files"] == [f"out/methods.{kind}" for kind in ("csv", "md", "png")]
+    assert all(Path(name).stat().st_size > 500 for name in report["files"])
+    lines = err.splitlines()
+    assert lines[0] == "spikeloom: 0 of 5 cells are there; 0 more networks to measure, 5 to train"
+    assert [line.split(" min left: ")[1].split()[0] for line in lines[1:]] == names
+    assert lines[-1].startswith(f"spikeloom: 5 of 5 cells, 0 min left: {GCN_NAME} best ")
+    for row, name in zip(report["methods"], names, strict=True):
+        cell = json.loads(Path(f"out/cells/{name}.json").read_text())
+        record = read_checkpoint(f"out/networks/{name}.pt").training
+        assert cell["decay_epochs"] == record["decay_epochs"] == 1
+        for which in ("best", "last", "clean"):
+            assert cell[which] == record[which]
+            assert row[which]["values"] == [100 * record[which]["accuracy"]]
+        assert row["paper"] is None
+        for which in ("last", "clean"):
+            assert cell["chip"][which]["epoch"] == record[which]["epoch"]
+            assert cell["chip"][which]["float_correct"] == record[which]["correct"]
+
+
+def test_figures_are_those_of_compile_verify_and_estimate(data, capsys, monkeypatch):
+    monkeypatch.setattr("runtime.measured.compile_network", compile_network)
+    monkeypatch.setattr("runtime.cells.METHODS", (("gcn", "manual"),))
+    as_json(capsys, *METHODS)
+    network = f"out/networks/{GCN_NAME}.pt"
+    found = json.loads(Path(f"out/cells/{GCN_NAME}.json").read_text())["chip"]
+    for which in ("last", "clean"):
+        as_json(capsys, "compile", network, "--weights", which, "--calibrate", "Ev-Grasps", "-o", "x.loom")
+        checked = ("--checkpoint", network, "--weights", which, "--data", "Ev-Grasps", "--require", "E0")
+        verdict = as_json(capsys, "verify", "x.loom", *checked)
+        costs = as_json(capsys, "estimate", "x.loom", "--data", "Ev-Grasps")
+        ours = found[which]
+        assert ours["correct"] == round(verdict["accuracy"]["chip"] * 18)
+        assert ours["float_correct"] == round(verdict["accuracy"]["float"] * 18)
+        assert ours["equal"] == round(verdict["decision_agreement"] * 18)
+        assert ours["synaptic_operations"] == costs["per_inference"]["synaptic_operations"]
+        assert ours["energy_j"] == pytest.approx(costs["per_inference"]["energy_j"])
+        assert ours["first_layer_operations"] == costs["layers"][0]["synaptic_operations"]
+        assert ours["first_layer_energy_j"] == pytest.approx(costs["layers"][0]["energy_j"])
+        assert ours["cores"] == as_json(capsys, "inspect", "x.loom")["cores"]
+        first, lean = ours["first_layer"], ours["without_quiet"]
+        assert first["neurons"] == 39 * 4
+        assert 0 <= first["quiet_in_both"] <= first["quiet_in_training"] < 39 * 4 - first["cannot_fire"]
+        assert lean["first_layer_operations"] <= ours["first_layer_operations"]
+        assert lean["neurons"] == ours["neurons"] - first["quiet_in_training"]
+
+
+def test_leaving_out_what_never_fired_moves_no_other_spike(data, capsys):
+    as_json(capsys, *METHODS)
+    checkpoint = read_checkpoint("out/networks/grasps-tactilesgnet-manual-e3-s0.pt")
+    _, adjacency = propagation(checkpoint, None, "")
+    compilation = compile_network(expand(checkpoint, adjacency))
+    netlist = compilation.netlist
+    events = synthetic_grasps(per_class=2, steps=40, seed=5).events.reshape(12, -1, 40)
+    whole = engine.simulate(netlist, events).counts.spikes
+    unused = tuple(np.zeros(population.size, np.bool_) for population in compilation.integer.populations)
+    held = netlist.compartments_of(0)
+    quiet = netlist.neuron[held[whole[:, held].sum(axis=0) == 0]]
+    assert len(quiet) > 3
+    unused[0][quiet] = True
+    lean = without(compilation, unused)
+    rest = engine.simulate(lean, events).counts.spikes
+    assert lean.n_compartments == netlist.n_compartments - len(quiet)
+    for layer in range(len(netlist.layers)):
+        ids, left = netlist.compartments_of(layer), lean.compartments_of(layer)
+        by_neuron = {
+            neuron: spikes.tolist() for neuron, spikes in zip(netlist.neuron[ids], whole[:, ids].T, strict=True)
+        }
+        for neuron, spikes in zip(lean.neuron[left], rest[:, left].T, strict=True):
+            assert spikes.tolist() == by_neuron[neuron]
+    np.testing.assert_array_equal(class_counts(lean, rest), class_counts(netlist, whole))
+
+
+@pytest.mark.parametrize(("axons", "calibrated"), [(15808, False), (4100, True)])
+def test_a_network_that_the_chip_refuses_is_trained_and_says_why(data, capsys, monkeypatch, axons, calibrated):
+    line = f"core 0 (fc1): {axons} used, 4096 allowed (loihi1.core.axons_in); fewer inputs to the layer"
+
+    tried = []
+
+    def refusing(network, training_events=None):
+        if network.populations[0].size == 13 * 19 * 4:  # which a trained one of full size does by itself
+            tried.append(training_events is not None)
+            owner, remedy = "core 0 (fc1)", "fewer inputs to the layer"
+            rule = "loihi1.core.axons_in"
+            raise CapacityError((Violation(owner=owner, rule=rule, used=axons, allowed=4096, remedy=remedy),))
+        return compile_network(network)
+
+    monkeypatch.setattr("runtime.measured.compile_network", refusing)
+    monkeypatch.setattr("runtime.cells.METHODS", (("mlp", "none"), ("mlp", "none")))
+    report = as_json(capsys, *WORDS, "--table", "methods", "--seeds", "1", "--epochs", "1", "--same-padding")
+    rows = {row["form"]: row for row in report["methods"]}
+    assert rows["none"]["refused"] is None
+    assert rows["same"]["refused"] == [line]
+    assert tried == [False, True][: 1 + calibrated]
+    assert rows["same"]["chip"] is None
+    assert rows["same"]["last"]["n"] == 1
+    text = Path("out/methods.md").read_text()
+    assert f"- grid-based CNN, same padding: Loihi 1 refuses it: {line}" in text
+    assert "| grid-based CNN, same padding | refused |" in text
+
+
+def test_the_table_of_graphs(data, capsys):
+    words = (*WORDS, "--table", "graphs", "--graph", "knn:2", "--graph", "mst:2.0", "--seeds", "2", "--epochs", "1")
+    report = as_json(capsys, *words)
+    assert [(row["form"], row["seeds"]) for row in report["graphs"]] == [("knn:2", [0, 1]), ("mst:2", [0, 1])]
+    assert report["files"] == [f"out/graphs{end}" for end in (".csv", ".md", ".png", "-costs.png", "-quiet.png")]
+    assert read_checkpoint("out/networks/grasps-tactilesgnet-mst-2-e1-s1.pt").graph == "mst:2"
+    assert report["schedule"][0]["short"] is None
+    assert "Not shown everywhere yet: two seeds of both lengths are needed." in Path("out/graphs.md").read_text()
+
+
+def test_both_tables_share_their_cells_and_run_the_first_seed_of_all_rows_first():
+    parts = plan(["objects"], ("methods", "graphs"))
+    assert [(part.table, part.epochs, len(part.cells())) for part in parts] == [
+        ("methods", 100, 18),
+        ("graphs", 30, 48),
+    ]
+    same = plan(["objects"], ("methods", "graphs"), epochs=7, seeds=2)
+    cells = in_turn(same)
+    assert len(cells) == 2 * (4 + 16) - 2
+    assert [seed for _, seed in cells] == [0] * 19 + [1] * 19
+    full = plan(["objects", "containers"], ("methods", "graphs"), full=True, same_padding=True)
+    assert {row.epochs for part in full for row in part.seeds} == {100}
+    assert [len(part.cells()) for part in full] == [2 * 5 * 10, 2 * 16 * 10]
+    assert GRAPHS == (
+        *("manual", "knn:1", "knn:2", "knn:3", "knn:4", "knn:5", "knn:6", "knn:7", "knn:8"),
+        *("mst:0", "mst:1.5", "mst:2", "mst:2.5", "mst:3", "mst:3.5", "mst:4"),
+    )
+
+
+# --- what is there already --------------------------------------------------------------------------------------------
+
+
+def test_a_cell_is_what_train_writes_and_a_finished_network_is_taken_over(data, capsys):
+    Path("out/networks").mkdir(parents=True)
+    network = Path(f"out/networks/{GCN_NAME}.pt")
+    trained = ("--system", "gcn", "--graph", "manual", "--epochs", "3", "--decay-epochs", "1", "--seed", "0")
+    as_json(capsys, "train", "--data", "Ev-Grasps", *trained, "-o", str(network))
+    content, when = network.read_bytes(), network.stat().st_mtime_ns
+    assert refused(capsys, *METHODS) == (
+        "-o out: holds 0 of these cells and 1 more that are begun; go on with --resume, or give another folder"
+    )
+    report = as_json(capsys, *METHODS, "--resume")
+    assert report["finished"] == 4
+    assert network.stat().st_mtime_ns == when
+    cell = json.loads(Path(f"out/cells/{GCN_NAME}.json").read_text())
+    network.unlink()
+    Path(f"out/cells/{GCN_NAME}.json").unlink()
+    assert as_json(capsys, *METHODS, "--resume") == report
+    assert network.read_bytes() == content
+    assert json.loads(Path(f"out/cells/{GCN_NAME}.json").read_text()) == cell
+    assert cell["command"] == (
+        "spikeloom train --data Ev-Grasps --system gcn --graph manual --epochs 3 --decay-epochs 1 --seed 0"
+    )
+
+
+def test_a_network_of_another_training_is_not_taken_over(data, capsys):
+    Path("out/networks").mkdir(parents=True)
+    network = f"out/networks/{GCN_NAME}.pt"
+    trained = ("--system", "gcn", "--graph", "manual", "--epochs", "2", "--seed", "4")
+    as_json(capsys, "train", "--data", "Ev-Grasps", *trained, "-o", network)
+    capsys.readouterr()
+    assert main([*METHODS, "--resume"]) == 2
+    assert capsys.readouterr().err.splitlines()[-1] == (
+        f"spikeloom: {network}: holds another training (other epochs, seed, decay epochs); "
+        "give its options, or another -o"
+    )
+    assert len(list(Path("out/cells").iterdir())) == 3
+
+
+def test_interrupted_it_goes_on_to_the_same_bytes(data, capsys, monkeypatch):
+    words = [word if word != "out" else "whole" for word in METHODS]
+    whole = as_json(capsys, *words)
+    epochs = iter(range(9))
+    train_epoch = models.train._train_epoch
+
+    def interrupted(*arguments, **options):
+        if next(epochs) == 8:
+            raise KeyboardInterrupt
+        return train_epoch(*arguments, **options)
+
+    monkeypatch.setattr("models.train._train_epoch", interrupted)
+    assert main([*METHODS]) == 2
+    assert capsys.readouterr().err.splitlines()[-1] == (
+        "spikeloom: interrupted; 1 of 4 cells and the epochs so far are kept in out; go on with the same command and "
+        "--resume"
+    )
+    text = Path("out/methods.md").read_text()
+    assert "| grid-based CNN | 0 of 1 | not available here | missing |" in text
+    assert "\nMissing: 3 trainings; " in text
+    assert list(Path("out/networks").glob("*.state.validation"))
+    assert refused(capsys, *METHODS) == (
+        "-o out: holds 1 of these cells and 1 more that are begun; go on with --resume, or give another folder"
+    )
+    monkeypatch.setattr("models.train._train_epoch", train_epoch)
+    report = as_json(capsys, *METHODS, "--resume")
+    assert report["methods"] == whole["methods"]
+    for kind in ("cells/*", "networks/*", "methods.*"):
+        ours, theirs = ({file.name: file.read_bytes() for file in Path(name).glob(kind)} for name in ("out", "whole"))
+        assert ours == theirs
+
+
+def test_without_training_it_measures_what_is_finished_and_says_what_is_missing(data, capsys):
+    Path("out/networks").mkdir(parents=True)
+    trained = ("--system", "gcn", "--graph", "manual", "--epochs", "3", "--decay-epochs", "1")
+    as_json(capsys, "train", "--data", "Ev-Grasps", *trained, "-o", f"out/networks/{GCN_NAME}.pt")
+    report = as_json(capsys, *METHODS, "--no-train", code=1)
+    assert report["finished"] == 1
+    assert report["missing"] == [
+        f"grasps-{name}-e3-s0" for name in ("tactilesgnet-manual", "grid-cnn-none", "mlp-none")
+    ]
+    assert [file.stem for file in Path("out/networks").iterdir()] == [GCN_NAME]
+    again = as_json(capsys, *(word for word in METHODS if word not in ("--data", "Ev-Grasps")), "--no-train", code=1)
+    assert again == report
+    assert main([*METHODS, "--no-train"]) == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[1].split() == ["TactileSGNet,", "manual", "graph", "0", "of", "1", "—", *["missing"] * 4, "—"]
+    assert lines[-2] == (
+        "1 of 4 trainings are there; missing: grasps-tactilesgnet-manual-e3-s0, grasps-grid-cnn-none-e3-s0, "
+        "grasps-mlp-none-e3-s0"
+    )
+
+
+def test_tables_show_data_sets_that_were_made_before(data, capsys):
+    kept(Path("out"), made_cell("objects", "mlp", "none", 3, 0, (1, 1, 1), chip=(1, 1)))
+    report = as_json(capsys, *METHODS, "--seeds", "2", "--no-train", code=1)
+    assert [(row["data"], row["system"], len(row["seeds"]), row["planned"]) for row in report["methods"]] == [
+        (name, system, int(name == "objects" and system == "mlp"), 2)
+        for name in ("objects", "grasps")
+        for system in ("tactilesgnet", "grid-cnn", "mlp", "gcn")
+    ]
+    assert report["planned"] == 8  # of the data set that was asked for
+
+
+def test_cells_of_another_length_are_not_shown_but_told_of(tmp_path, capsys):
+    kept(tmp_path, made_cell("objects", "mlp", "none", 2, 0, (1, 1, 1), chip=(1, 1)))
+    assert main(["reproduce", "--no-train", "--table", "methods", "-o", str(tmp_path)]) == 1
+    assert "1 more cells in the folder are of other tables or lengths" in capsys.readouterr().out
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="signals as POSIX has them")
+def test_in_processes_of_its_own_it_keeps_what_it_has(data):
+    words = ["reproduce", "--data", "Ev-Grasps", "--table", "methods", "--epochs", "5000", "-o", "out", "--jobs", "2"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "runtime", *words],
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    deadline = time.monotonic() + 120
+    while len(list(data.glob("out/networks/*.state.*"))) < 2 and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 2
+    assert err.splitlines()[-1] == (
+        "spikeloom: interrupted; 0 of 18 cells and the epochs so far are kept in out; go on with the same command and "
+        "--resume"
+    )
+    assert not list(data.glob("out/networks/.*")), "half-written files are left"
+
+
+def named(job):
+    return job.output.name
+
+
+def test_side_by_side_tells_of_each_result():
+    jobs = [SimpleNamespace(output=Path(name)) for name in "abc"]
+    results, told = {}, []
+    side_by_side(jobs, [2, 0], results, named, most=1, done=told.append)
+    assert results == {2: "c", 0: "a"}
+    assert told == [2, 0]
+
+
+# --- statistics -------------------------------------------------------------------------------------------------------
+
+
+def test_means_and_intervals():
+    found = paper_table.spread([88.0, 90.0, 92.0, 94.0])
+    assert found["mean"] == 91.0
+    assert found["std"] == pytest.approx(math.sqrt(20 / 3))
+    reach = 3.182446305284263 * math.sqrt(20 / 3) / 2  # Student's t, 3 degrees of freedom
+    assert (found["low"], found["high"]) == pytest.approx((91 - reach, 91 + reach))
+
+
+@pytest.mark.parametrize(("mean", "within"), [(92.0, True), (87.05, True), (86.9, False), (95.2, False)])
+def test_a_mean_is_reproduced_within_two_combined_standard_errors(mean, within):
+    ours = paper_table.spread([88.0, 90.0, 92.0, 94.0])
+    found = paper_table.compare(ours, Published(mean=mean, std=5.0))
+    assert found["combined_se"] == pytest.approx(math.sqrt(20 / 3 / 4 + 25 / 10))
+    assert found["difference"] == pytest.approx(91 - mean)
+    assert found["within"] == within
+
+
+def test_a_comparison_needs_two_seeds_and_a_known_deviation():
+    two = paper_table.spread([1.0, 2.0])
+    assert paper_table.compare(paper_table.spread([1.0]), Published(mean=1.0, std=1.0)) is None
+    assert paper_table.compare(two, Published(mean=1.0, std=None)) is None
+    assert paper_table.compare(two, None) is None
+    assert paper_table.compare(None, Published(mean=1.0, std=1.0)) is None
+
+
+def test_a_shorter_training_is_compared_where_both_lengths_have_two_seeds():
+    made = [
+        made_cell("objects", "tactilesgnet", "manual", 30, seed, (130, right, 127))
+        for seed, right in enumerate((126, 128))
+    ]
+    made += [
+        made_cell("objects", "tactilesgnet", "manual", 100, seed, (130, right, 127))
+        for seed, right in enumerate((127, 131))
+    ]
+    entries = paper_table.schedules(dict(enumerate(made)), 30)
+    by_protocol = {entry["protocol"]: entry for entry in entries}
+    last = by_protocol["last"]
+    assert last["difference"] == pytest.approx(100 * (127 - 129) / 144)
+    assert last["se"] == pytest.approx(100 / 144 * math.sqrt(2 / 2 + 8 / 2))
+    assert last["within"]
+    assert by_protocol["best"]["within"]
+    assert not paper_table.schedules(dict(enumerate(made)), 100)
+    (alone, *_) = paper_table.schedules(dict(enumerate(made[:3])), 30)
+    assert "within" not in alone
+
+
+def made_folder(folder: Path) -> Path:
+    """Cells of some methods and graphs, not all."""
+    cells = [
+        made_cell("objects", "tactilesgnet", "manual", 100, seed, (131 - seed, 127 + seed, 126), chip=(126, 127))
+        for seed in range(5)
+    ]
+    cells += [made_cell("objects", "mlp", "none", 100, 0, (124, 120, 121), chip=(119, 121), scale=0.1)]
+    cells += [made_cell("objects", "grid-cnn", "same", 100, seed, (127, 125, 126 - seed)) for seed in range(2)]
+    cells += [
+        made_cell("containers", "tactilesgnet", "manual", 30, seed, (40, 35 + seed, 37), chip=(36, 36))
+        for seed in range(3)
+    ]
+    cells += [
+        made_cell("containers", "tactilesgnet", "knn:4", 30, seed, (39 + seed, 36, 37), chip=(36, 35), scale=1.3)
+        for seed in range(2)
+    ]
+    cells += [made_cell("containers", "tactilesgnet", "released:knn:4", 30, 0, (40, 36, 37), chip=(36, 35))]
+    kept(folder, *cells)
+    return folder
+
+
+def test_markdown_and_csv(tmp_path, golden, capsys):
+    assert main(["reproduce", "--no-train", "-o", str(made_folder(tmp_path))]) == 1
+    for name in ("methods.md", "methods.csv", "graphs.md", "graphs.csv"):
+        golden(name, (tmp_path / name).read_text("utf-8"))
+
+
+def test_csv_holds_the_figures(tmp_path, capsys):
+    report = as_json(capsys, "reproduce", "--no-train", "-o", str(made_folder(tmp_path)), code=1)
+    lines = list(csv.DictReader(io.StringIO((tmp_path / "methods.csv").read_text())))
+    first, row = lines[0], report["methods"][0]
+    assert (first["data"], first["system"], first["form"], first["seeds"]) == (
+        "objects",
+        "tactilesgnet",
+        "manual",
+        "0 1 2 3 4",
+    )
+    assert (float(first["paper_mean"]), float(first["paper_std"])) == (89.44, 0.55)
+    assert float(first["best_mean"]) == pytest.approx(row["best"]["mean"], abs=1e-3)
+    assert first["within"] == "True"
+    assert first["energy_davies2018_j"] == "0.0002"
+    missing = next(line for line in lines if line["system"] == "gcn" and line["data"] == "objects")
+    assert (missing["seeds"], missing["best_mean"], missing["synaptic_operations"]) == ("", "", "")
+    same = next(line for line in lines if line["form"] == "same")
+    assert same["chip_refused"] == CAPACITY
+    assert len({tuple(line) for line in lines}) == 1
+
+
+def test_pictures_show_what_is_there_and_are_equal_for_equal_cells(tmp_path, monkeypatch):
+    monkeypatch.setattr("runtime.paper_picture.DPI", 30)
+    cells = read_cells(made_folder(tmp_path))
+    parts = plan(["objects", "containers"], ("methods", "graphs"))
+    for part in parts:
+        rows = paper_table.rows(part, cells)
+        found = paper_picture.pictures(part.table, rows)
+        assert found == paper_picture.pictures(part.table, rows)
+        assert all(content[:4] == b"\x89PNG" for content in found.values())
+        nothing = paper_picture.pictures(part.table, paper_table.rows(part, {}))
+        assert all(content != nothing[name] for name, content in found.items())
+    assert paper_picture.pictures("graphs", []) == {}
+
+
+def test_the_paper_is_compared_on_its_recordings_only(tmp_path, capsys):
+    for seed in range(2):
+        kept(
+            tmp_path, made_cell("objects", "mlp", "none", 100, seed, (124, 120, 121), chip=(119, 121), sha256="0" * 64)
+        )
+    report = as_json(capsys, "reproduce", "--no-train", "--table", "methods", "-o", str(tmp_path), code=1)
+    row = next(row for row in report["methods"] if row["system"] == "mlp")
+    assert row["paper"] is None
+    assert row["comparison"] is None
+    assert paper_text.paper_words(row) == "not available here"
+
+
+# --- mistakes ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["--seeds", "0"], "--seeds 0: allowed are 1 or more; choose another"),
+        (["--epochs", "0"], "--epochs 0: allowed are 1 or more; choose another"),
+        (["--jobs", "-1"], "--jobs -1: allowed are 1 or more; choose another"),
+        (["--full", "--seeds", "3"], "--seeds 3: --full says how many; leave one of them away"),
+        (["--full", "--epochs", "3"], "--epochs 3: --full says how many; leave one of them away"),
+        (["--table", "x"], "--table x: unknown; choose from methods, graphs"),
+        (
+            ["--table", "methods", "--graph", "knn:1"],
+            "--graph: chooses rows of the table of graphs; leave it or --table methods away",
+        ),
+        (
+            ["--table", "graphs", "--same-padding"],
+            "--same-padding: adds a row to the table of methods; leave it or --table graphs away",
+        ),
+        (
+            ["--graph", "knn:9"],
+            "graph 'knn:9': K is '9', allowed are whole numbers 1..8; choose another K",
+        ),
+        (
+            ["--data", "more/Ev-Grasps"],
+            "--data more/Ev-Grasps: is called grasps as Ev-Grasps is; give each data set once",
+        ),
+        (["--device", "tpu"], "--device tpu: unknown; allowed: cpu, cuda"),
+        (
+            ["--data", "none.zip"],
+            "none.zip: no such file or folder; give the folder or zip that holds train/ and test/",
+        ),
+    ],
+)
+def test_wrong_options(data, capsys, words, line):
+    assert refused(capsys, *WORDS, *words) == line
+    assert not Path("out").exists()
+
+
+def test_wrong_places_and_no_data(data, capsys):
+    assert refused(capsys, "reproduce", "-o", "out") == "reproduce: no data set; name one or more with --data"
+    assert refused(capsys, "reproduce", "--no-train", "-o", "out") == (
+        "-o out: holds no cells to make tables of; name a data set with --data"
+    )
+    Path("file").write_text("")
+    assert refused(capsys, "reproduce", "--data", "Ev-Grasps", "-o", "file") == (
+        "-o file: is not a folder; give the name of one"
+    )
+    assert refused(capsys, "reproduce", "--data", "Ev-Grasps", "-o", "none/out") == (
+        "-o none/out: the folder that it shall be in does not exist; make it first"
+    )
+
+
+def test_cells_of_other_recordings_are_not_mixed(data, capsys):
+    as_json(capsys, *METHODS)
+    Path("others").mkdir()
+    made(data / "others" / "Ev-Grasps", first=7)
+    words = [word if word != "Ev-Grasps" else "others/Ev-Grasps" for word in METHODS]
+    assert refused(capsys, *words, "--resume") == (
+        f"out/cells/{GCN_NAME}.json: is of other recordings named grasps; give those, or another -o"
+    )
+
+
+def test_damaged_cells_are_named(tmp_path, capsys):
+    cell = made_cell("objects", "mlp", "none", 100, 0, (1, 1, 1), chip=(1, 1))
+    kept(tmp_path, cell)
+    (file,) = (tmp_path / "cells").iterdir()
+    line = f"{file}: no cell of that name, or one of another version; delete it to measure anew"
+    for content in ("", "[]", "{}", json.dumps(cell | {"seed": 1}), json.dumps(cell | {"format": 2}), '{"format": 1}'):
+        file.write_text(content)
+        assert refused(capsys, "reproduce", "--no-train", "-o", str(tmp_path)) == line
+
+
+def test_names_of_cells_are_those_of_files():
+    row = Row(data="objects", system="tactilesgnet", form="released:mst:3.5", epochs=30)
+    assert row.cell(0) == "objects-tactilesgnet-released-mst-3.5-e30-s0"
+    assert row.words() == ["--graph", "released:mst:3.5", "--epochs", "30", "--decay-epochs", "12"]
+    same = Row(data="objects", system="grid-cnn", form="same", epochs=100)
+    assert same.words() == ["--system", "grid-cnn", "--padding", "same", "--epochs", "100", "--decay-epochs", "40"]
