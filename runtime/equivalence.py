@@ -237,7 +237,7 @@ def _rows_scaled(weight: Sparse, factor: FloatArray) -> Sparse:
     return scaled
 
 
-def _spikes(
+def spikes_of(
     model: Checkpoint | Network, adjacency: FloatArray | None, events: npt.NDArray[np.uint8], dtype: str
 ) -> list[BoolArray]:
     """Float spikes of each layer: of a checkpoint in its own operator order, of a network as sums over synapses."""
@@ -249,7 +249,7 @@ def _spikes(
     return list(float_spikes(model, adjacency, events, dtype=dtype).values())
 
 
-def _membranes(
+def membranes_of(
     model: Checkpoint | Network, adjacency: FloatArray | None, events: npt.NDArray[np.uint8]
 ) -> list[npt.NDArray[np.floating]]:
     """Membranes of each layer in float32, likewise."""
@@ -354,11 +354,11 @@ def verify(
     further = onnx_check.prepare(netlist) if engine_name == "onnx" else None
 
     tell("float32 reference")
-    narrow = _spikes(model, adjacency, events, "float32")
+    narrow = spikes_of(model, adjacency, events, "float32")
     kept = [heard(netlist, layer) for layer in range(len(names))]
     reference = [cut(spikes, lengths)[..., keep] for spikes, keep in zip(narrow, kept, strict=True)]
     tell("float64 beside it")
-    double = _spikes(model, adjacency, events, "float64")
+    double = spikes_of(model, adjacency, events, "float64")
     wide = [cut(spikes, lengths)[..., keep] for spikes, keep in zip(double, kept, strict=True)]
 
     tell("chip")
@@ -404,7 +404,7 @@ def verify(
         wide,
         flat,
         files,
-        lambda sample, layer: _membranes(model, adjacency, events[sample : sample + 1])[layer][0],
+        lambda sample, layer: membranes_of(model, adjacency, events[sample : sample + 1])[layer][0],
     )
     if divergence is not None and (isinstance(model, Network) or model.system not in GRAPH_SYSTEMS):
         divergence = replace(divergence, taxel=None, feature=None)  # its neurons lie otherwise
