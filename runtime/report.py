@@ -27,9 +27,9 @@ Json = dict[str, Any]
 
 SUMMARY = "one self-contained page: verdict, accuracy, cores, taxels, spikes, membranes, energy, time, provenance"
 NOTES = """\
-The page opens from disk and loads nothing; its figures are inline SVG, each with its numbers as a table. What is printed
-is the same for people who open no page; --json prints the data behind both. The exit code is 1 if specification and
-engine differ.
+The page opens from disk and loads nothing; its figures are inline SVG, each with its numbers as a table. What is
+printed is the same for people who open no page; --json prints the data behind both. The exit code is 1 if specification
+and engine differ.
 """
 
 

@@ -141,7 +141,7 @@ def taxels_json(netlist: Netlist, asked: Asked, data: Recordings, counts: Counts
         edges = np.stack([source, target], axis=1)[source != target]
         ids = netlist.compartments_of(0)
         taxel = netlist.neuron[ids] // (netlist.layers[0].neurons // netlist.taxels)
-        spikes = np.bincount(taxel, counts.spikes[:, ids].mean(axis=0), netlist.taxels)
+        spikes = np.bincount(taxel, counts.spikes[:, ids].mean(axis=0), netlist.taxels).astype(np.float64)
     return {
         "sensor": "NeuTouch" if taxels is None and known and np.array_equal(places, NEUTOUCH) else None,
         "positions_mm": places[:, :2].tolist() if known else None,
@@ -196,11 +196,11 @@ def provenance_json(
         },
         "versions": {"spikeloom": version(), "python": platform.python_version()}
         | {name: metadata.version(name) for name in PACKAGES},
-        "commands": _commands(arguments, netlist, asked, recording),
+        "commands": _commands(arguments, netlist, recording),
     }
 
 
-def _commands(arguments: argparse.Namespace, netlist: Netlist, asked: Asked, recording: str) -> list[Json]:
+def _commands(arguments: argparse.Namespace, netlist: Netlist, recording: str) -> list[Json]:
     """What to type, and what each is for."""
     net, checkpoint = _name(arguments.netlist), _name(arguments.checkpoint)
     model, data = _model_words(arguments), ["--data", _name(arguments.data), *_data_words(arguments)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +23,7 @@ from runtime.asked import Asked
 from runtime.equivalence import membranes_of, spikes_of
 from runtime.estimate import Estimate, estimate
 from runtime.estimates import estimate_json
+from runtime.timing import DetailedTimes, SimpleTimes
 from runtime.trace import Counts, Trace, aligned, heard
 from runtime.votes import class_counts, predictions, readout_counts
 
@@ -245,7 +247,7 @@ def _by_step(
 ) -> Json:
     """Energy and time of each chip step of this recording, and the mean time over all recordings that still run."""
     energy = energy_by_step(netlist, target, events, trace)
-    models = {"simple": own.simple, "detailed": own.detailed}
+    models: dict[str, Mapping[str, SimpleTimes | DetailedTimes]] = {"simple": own.simple, "detailed": own.detailed}
     mean = {
         name: np.where(times.critical_core >= 0, times.duration_ns, 0).sum(axis=0)
         / np.maximum((times.critical_core >= 0).sum(axis=0), 1)

@@ -62,16 +62,18 @@ def verify_text(report: Json) -> str:
     ladder = [[rung["stage"], *(f"{rung['different'][name]:,}" for name in names)] for rung in report["ladder"]]
     lines += [table(["different, adding", *names], ladder), "", certificate_text(report["certificate"]), ""]
     first = report["first_divergence"]
-    if first is None:
-        lines.append("no spike differs")
-    else:
-        where = f"neuron {first['neuron']}"
-        if first["taxel"] is not None:
-            where = f"taxel {first['taxel']}, feature {first['feature']}"
-        lines.append(
-            f"first divergence: {first['file']}, step {first['step']}, {first['layer']} {where}: membrane "
-            f"{first['float_membrane']:.6f} float, {first['chip_membrane']:.6f} chip "
-            f"({first['chip_register']}/64 units); threshold {first['theta']:g} and {first['chip_theta']:.6f}"
-            + (" (ill-posed: float64 sides with the chip)" if first["ill_posed"] else "")
-        )
+    lines.append("no spike differs" if first is None else f"first divergence: {divergence_text(first)}")
     return "\n".join(lines)
+
+
+def divergence_text(first: Json) -> str:
+    """Where the first spike differs, and how near both membranes were to their thresholds."""
+    where = f"neuron {first['neuron']}"
+    if first["taxel"] is not None:
+        where = f"taxel {first['taxel']}, feature {first['feature']}"
+    return (
+        f"{first['file']}, step {first['step']}, {first['layer']} {where}: membrane "
+        f"{first['float_membrane']:.6f} float, {first['chip_membrane']:.6f} chip "
+        f"({first['chip_register']}/64 units); threshold {first['theta']:g} and {first['chip_theta']:.6f}"
+        + (" (ill-posed: float64 sides with the chip)" if first["ill_posed"] else "")
+    )

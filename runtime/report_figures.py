@@ -1,0 +1,218 @@
+"""Figures of the page that are of one kind: confusion matrices, cores on the mesh, taxels on the fingertip."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from runtime.report_text import sender
+from runtime.svg import LETTER, WIDTH, drawing, legend, shape, words
+
+Json = dict[str, Any]
+
+SIDES = {"float": "float model", "chip": "chip"}
+
+
+# -- decisions ---------------------------------------------------------------------------------------------------------
+
+
+def confusion(decisions: Json) -> str:
+    """Both matrices side by side: rows are labels, columns decisions."""
+    classes, size = decisions["classes"], 410.0
+    cell = size / classes
+    every = 1 if classes <= 12 else 5
+    content = []
+    for panel, (side, name) in enumerate(SIDES.items()):
+        left, top = 56.0 + panel * (size + 68), 44.0
+        content.append(words(left + size / 2, 14, f"{name}: decided as", "strong", "middle"))
+        content.append(shape("rect", "frame", x=left, y=top, width=size, height=size))
+        for k in range(0, classes, every):
+            at = (k + 0.5) * cell
+            content += [
+                words(left + at, top - 8, str(k), "small", "middle"),
+                words(left - 6, top + at + 4, str(k), "small", "end"),
+            ]
+        for label, row in enumerate(decisions["matrices"][side]):
+            for decided, count in enumerate(row):
+                if count:
+                    content.append(_cell(name, label, decided, count, sum(row), (left, top, cell)))
+    content.append(words(14, 44 + size / 2, "label", "strong", "middle").replace("<text ", _turned(14, 44 + size / 2)))
+    return drawing("confusion", "Confusion matrices of the float model and of the chip", 44 + size + 8, content)
+
+
+def _turned(x: float, y: float) -> str:
+    return f'<text transform="rotate(-90 {x:g} {y:g})" '
+
+
+def _cell(side: str, label: int, decided: int, count: int, total: int, at: tuple[float, float, float]) -> str:
+    left, top, cell = at
+    tip = f"{side}: label {label} decided as {decided}, {count} of {total}"
+    x, y = left + decided * cell, top + label * cell
+    style = "right" if label == decided else "wrong"
+    box = shape(
+        "rect", style, tip, x=x, y=y, width=cell, height=cell, fill_opacity=f"{0.35 + 0.65 * count / total:.2f}"
+    )
+    size = min(13.0, cell * 0.72)
+    number = words(x + cell / 2, y + cell / 2 + 0.36 * size, str(count), "in-cell", "middle")
+    return box + number.replace("<text ", f'<text font-size="{size:.1f}" ')
+
+
+# -- cores -------------------------------------------------------------------------------------------------------------
+
+MARGIN = 16.0
+INPUT = 46.0
+"""Width of the input's bar at the left."""
+
+DRAWN = 80
+"""Connections that are drawn, the busiest first; the table has all."""
+
+
+def core_map(cores: Json) -> str:
+    """Used part of each chip's mesh: tiles, their cores, how full the fullest limit is, and who sends how much."""
+    places, height, content = _places(cores)
+    for core in cores["cores"]:
+        content.append(_core(core, places[core["core"]]))
+    ways = sorted((way for way in cores["traffic"] if way["packets"] > 0), key=lambda way: -way["packets"])
+    most = ways[0]["packets"] if ways else 1.0
+    content.append(shape("rect", "input", x=0, y=24, width=INPUT - 16, height=height - 24, rx=4))
+    middle = (INPUT - 16) / 2, height / 2 + 12
+    content.append(words(*middle, "input", "strong", "middle").replace("<text ", _turned(*middle)))
+    content += [_way(way, places, most, height) for way in ways[:DRAWN]]
+    names = {"w-in": "packets from the input", "w-core": "packets between cores (arrow: direction; width: amount)"}
+    content.append(legend(names, INPUT, 12))
+    return drawing("cores", "Cores on the mesh, how full they are and the packets between them", height, content)
+
+
+Box = tuple[float, float, float, float]
+
+
+def _places(cores: Json) -> tuple[dict[int, Box], float, list[str]]:
+    """Box of each core, height of the figure, and the tiles, chip after chip from top to bottom."""
+    places: dict[int, Box] = {}
+    content: list[str] = []
+    top = 24.0
+    side = math.ceil(math.sqrt(cores["mesh"]["tile_cores"]))
+    for chip in sorted({core["chip"] for core in cores["cores"]}):
+        held = [core for core in cores["cores"] if core["chip"] == chip]
+        x0, y0 = (min(core[axis] for core in held) for axis in "xy")
+        across, down = (max(core[axis] for core in held) - first + 1 for axis, first in (("x", x0), ("y", y0)))
+        wide = min((WIDTH - INPUT) / across, 440.0)
+        high = min(wide * 0.62, 260.0)
+        for tile, x, y in sorted({(core["tile"], core["x"], core["y"]) for core in held}):
+            left, upper = INPUT + (x - x0) * wide, top + (y - y0) * high
+            content.append(shape("rect", "tile", x=left, y=upper, width=wide - MARGIN, height=high - MARGIN, rx=6))
+            if wide > 100:
+                place = f"tile {tile} (x {x}, y {y})" + (f", chip {chip}" if chip else "")
+                content.append(words(left + 8, upper + 15, place, "small"))
+            inner = (wide - MARGIN - 12) / side, (high - MARGIN - 26) / side
+            for slot, core in enumerate(core for core in held if core["tile"] == tile):
+                row, column = divmod(slot, side)
+                places[core["core"]] = (
+                    left + 8 + column * inner[0],
+                    upper + 22 + row * inner[1],
+                    inner[0] - 8,
+                    inner[1] - 6,
+                )
+        top += down * high
+    return places, top, content
+
+
+def _core(core: Json, box: Box) -> str:
+    x, y, wide, high = box
+    full = core["fill"][core["fullest"]]
+    limits = ", ".join(f"{name} {100 * use['share']:.0f} %" for name, use in core["fill"].items())
+    tip = f"core {core['core']}, {' '.join(core['layers'])}, {core['compartments']:,} compartments; {limits}"
+    level = high * min(full["share"], 1.0)
+    parts = [
+        shape("rect", "core", tip, x=x, y=y, width=wide, height=high, rx=3),
+        shape("rect", "fill", x=x, y=y + high - level, width=wide, height=level, rx=3),
+    ]
+    lines = [f"core {core['core']}: {' '.join(core['layers'])}", f"{100 * full['share']:.0f} % of {core['fullest']}"]
+    if wide < LETTER * len(lines[0]):
+        lines = [str(core["core"])]
+    lines = [line for line in lines if wide >= LETTER * len(line)]
+    parts += [
+        words(x + 6, y + 14 + 14 * i, line, "small strong" if i == 0 else "small") for i, line in enumerate(lines)
+    ]
+    return "".join(parts)
+
+
+def _way(way: Json, places: dict[int, Box], most: float, height: float) -> str:
+    """A bent line; those back are bent to the other side."""
+    tip = f"{sender(way)} to core {way['to']}: {way['packets']:,.0f} packets in a mean recording"
+    tip += "" if way["hops"] is None else f", {way['hops']} hops"
+    share = math.sqrt(way["packets"] / most)
+    x2, y2 = _port(places[way["to"]], 0.62)
+    if way["from"] is None:
+        x1, y1 = INPUT - 16, min(max(y2, 40.0), height - 10)
+        x2 = places[way["to"]][0] if abs(x2 - x1) < 200 else x2
+    elif way["from"] == way["to"]:
+        x, y = _port(places[way["to"]], 0.5)
+        return shape("circle", "way w-core", tip, cx=x, cy=y, r=9, stroke_width=1 + 5 * share)
+    else:
+        x1, y1 = _port(places[way["from"]], 0.38)
+    bend_x, bend_y = (x1 + x2) / 2 - 0.14 * (y2 - y1), (y1 + y2) / 2 + 0.14 * (x2 - x1)
+    along = math.atan2(y2 - bend_y, x2 - bend_x)
+    size = 5 + 4 * share
+    wings = [(x2 - size * math.cos(along + turn), y2 - size * math.sin(along + turn)) for turn in (0.45, -0.45)]
+    arrow = f"M{wings[0][0]:.1f} {wings[0][1]:.1f}L{x2:.1f} {y2:.1f}L{wings[1][0]:.1f} {wings[1][1]:.1f}"
+    path = f"M{x1:.1f} {y1:.1f}Q{bend_x:.1f} {bend_y:.1f} {x2:.1f} {y2:.1f}{arrow}"
+    return shape("path", "way w-in" if way["from"] is None else "way w-core", tip, d=path, stroke_width=1 + 5 * share)
+
+
+def _port(box: Box, along: float) -> tuple[float, float]:
+    x, y, wide, high = box
+    return x + wide * along, y + high * 0.7
+
+
+# -- taxels ------------------------------------------------------------------------------------------------------------
+
+FINGER = 400.0
+"""Most width and height of a fingertip."""
+
+
+def fingertip(taxels: Json) -> str:
+    """Taxels where they lie, joined as the graph joins them; discs grow with events, and with first-layer spikes."""
+    n = len(taxels["events"])
+    points = taxels["positions_mm"] or [
+        [math.cos(2 * math.pi * i / n - math.pi / 2), math.sin(2 * math.pi * i / n - math.pi / 2)] for i in range(n)
+    ]
+    low = [min(point[axis] for point in points) for axis in (0, 1)]
+    span = [max(point[axis] for point in points) - low[axis] for axis in (0, 1)]
+    scale = (FINGER - 60) / max(*span, 1e-9)
+    wide, high = (side * scale + 60 for side in span)
+    places = [(30 + (x - low[0]) * scale, high - 30 - (y - low[1]) * scale) for x, y in points]
+    reach = _reach(places)
+    panels = {"input events": taxels["events"]}
+    if taxels["spikes"] is not None:
+        panels[f"{taxels['layer']} spikes on the chip"] = taxels["spikes"]
+    content = []
+    for number, (name, values) in enumerate(panels.items()):
+        left = (number + 0.5) * WIDTH / len(panels) - wide / 2
+        content.append(words(left + wide / 2, 14, f"{name}, mean recording", "strong", "middle"))
+        content.append(f'<g transform="translate({left:.1f} 24)">')
+        content.append(_skin(wide, high) if taxels["positions_mm"] else "")
+        for a, b in sorted({(min(pair), max(pair)) for pair in taxels["edges"]}):
+            (x1, y1), (x2, y2) = places[a], places[b]
+            content.append(shape("line", "edge", x1=x1, y1=y1, x2=x2, y2=y2))
+        most = max(values) or 1.0
+        for taxel, ((x, y), value) in enumerate(zip(places, values, strict=True)):
+            tip = f"taxel {taxel}: {value:,.1f} {name} in a mean recording"
+            radius = reach * (0.25 + 0.75 * math.sqrt(value / most))
+            content.append(
+                shape("circle", "taxel", tip, cx=x, cy=y, r=radius, fill_opacity=f"{0.25 + 0.6 * value / most:.2f}")
+            )
+            content.append(words(x, y + 3.5, str(taxel), "number", "middle"))
+        content.append("</g>")
+    return drawing("taxels", "Taxels, the graph over them and their activity", high + 34, content)
+
+
+def _reach(places: list[tuple[float, float]]) -> float:
+    """Largest radius of discs that keep apart."""
+    nearest = min((math.dist(a, b) for i, a in enumerate(places) for b in places[:i]), default=40.0)
+    return min(max(nearest * 0.52, 5.0), 22.0)
+
+
+def _skin(wide: float, high: float) -> str:
+    """Outline of the fingertip's pad."""
+    return shape("rect", "skin", x=1, y=1, width=wide - 2, height=high - 2, rx=wide * 0.42, ry=min(wide, high) * 0.42)

@@ -1,0 +1,92 @@
+"""The page of ``report``: one HTML file that needs nothing else, the same bytes for the same report."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from html import escape
+from importlib import resources
+from typing import Any
+
+from runtime import report_sections
+from runtime.markup import paragraph, section, table
+
+Json = dict[str, Any]
+
+
+def page(report: Json) -> str:
+    """The whole page.
+
+    Parameters
+    ----------
+    report : dict
+        What ``report --json`` prints.
+    """
+    made = report["provenance"]
+    title = f"{made['netlist']['file']} on {made['data']['name']}"
+    body = "".join(section(name, heading, content(report)) for name, (heading, content) in SECTIONS.items())
+    links = "".join(f'<li><a href="#{name}">{escape(heading)}</a></li>' for name, (heading, _) in SECTIONS.items())
+    files = resources.files("runtime")
+    style, script = (files.joinpath(name).read_text("utf-8") for name in ("report.css", "report.js"))
+    return (
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{escape(title)} – spikeloom</title>\n<style>\n{style}</style></head>\n<body>"
+        '<a class="skip" href="#verdict">To the verdict</a>'
+        f"<header><h1>{escape(title)}</h1>{paragraph(_about(report))}"
+        f'<nav aria-label="Sections"><ul>{links}</ul></nav></header>\n<main>{body}</main>\n'
+        f"<footer><p>Made by spikeloom {escape(made['versions']['spikeloom'])}; this page loads nothing.</p></footer>"
+        f"\n<script>\n{script}</script></body></html>\n"
+    )
+
+
+def _about(report: Json) -> str:
+    net, made = report["netlist"], report["provenance"]
+    system = made["checkpoint"]["system"] or "network"
+    graph = f", graph {made['checkpoint']['graph']}" if report["taxels"]["graph"] else ""
+    return (
+        f"A {system}{graph}: {net['neurons']:,} neurons and {net['synapses']:,} synapses on {net['cores']} cores of "
+        f"{net['target']}, held against its float model on {made['data']['samples']} recordings."
+    )
+
+
+def _provenance(report: Json) -> list[str]:
+    """Files, hashes, versions, options, seeds; and what to type to get all of it again."""
+    made = report["provenance"]
+    files = [
+        ["netlist", made["netlist"]["file"], made["netlist"]["sha256"]],
+        ["checkpoint", made["checkpoint"]["file"], made["checkpoint"]["sha256"]],
+        ["recordings", f"{made['data']['name']}, {made['data']['split']} split", made["data"]["sha256"]],
+    ]
+    parts = [
+        table("Files; the hash of recordings is over their events and labels", ["", "name", "sha256"], files, left=True)
+    ]
+    facts: dict[str, Mapping[str, Any] | None] = {
+        "How the netlist was compiled": made["netlist"]["compiled"],
+        "How the network was trained": made["checkpoint"]["training"],
+        "Versions": made["versions"],
+        "Energy tables": made["chip"]["energy_tables"],
+        "Time tables": made["chip"]["time_tables"],
+    }
+    for caption, found in facts.items():
+        if found:
+            rows = [[key, value if isinstance(value, str) else json.dumps(value)] for key, value in found.items()]
+            parts.append(table(caption, ["", "value"], rows, left=True))
+    parts.append("<h3>Commands that repeat this page</h3>")
+    parts += [
+        f"<p>For {escape(line['for'])}:</p><pre><code>{escape(line['command'])}</code></pre>"
+        for line in made["commands"]
+    ]
+    return parts
+
+
+SECTIONS: dict[str, tuple[str, Callable[[Json], list[str]]]] = {
+    "verdict": ("Verdict", report_sections.verdict),
+    "decisions": ("Decisions", report_sections.decisions),
+    "cores-section": ("Cores", report_sections.cores),
+    "taxels-section": ("Taxels", report_sections.taxels),
+    "recording": ("One recording", report_sections.recording),
+    "costs": ("Energy and time", report_sections.costs),
+    "provenance": ("Provenance", _provenance),
+}
+"""Sections in their order: id, heading, and what makes the content; a further chart is a further entry."""
