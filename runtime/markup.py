@@ -44,12 +44,17 @@ def table(caption: str, head: Sequence[str], rows: Iterable[Sequence[str]], *, l
 
 def figure(drawing: str, caption: str, numbers: str = "", *, raster: str | None = None) -> str:
     """A figure, what is said of it, a line for values under the pointer, and its numbers to unfold."""
-    below = f"<details><summary>Numbers of this figure</summary>{numbers}</details>" if numbers else ""
+    below = unfold("Numbers of this figure", numbers) if numbers else ""
     kind = "" if raster is None else f' data-raster="{escape(raster)}"'
     return (
         f'<figure{kind}>{drawing}<output class="readout"></output><figcaption>{escape(caption)}</figcaption>'
         f"{below}</figure>"
     )
+
+
+def unfold(title: str, content: str) -> str:
+    """Something to open."""
+    return f"<details><summary>{escape(title)}</summary>{content}</details>"
 
 
 def facts(found: Mapping[str, tuple[str, str]]) -> str:

@@ -29,6 +29,9 @@ from runtime.trace import Counts
 
 Json = dict[str, Any]
 
+FILLS = ("core.compartments", "core.synapse_words", "core.axons_in", "core.axons_out")
+"""Limits of which the fullest says how full a core is: those that a larger network uses up."""
+
 PACKAGES = ("numpy", "scipy", "torch", "numba", "networkx")
 """Packages whose versions may move a float spike."""
 
@@ -83,7 +86,7 @@ def cores_json(netlist: Netlist, target: Target, counts: Counts) -> Json:
     cores = []
     for core, tile in enumerate(netlist.core_tile.tolist()):
         y, x = divmod(tile % chip_tiles(target), width)
-        fullest = max(fill[core], key=lambda name: fill[core][name]["share"])
+        fullest = max(FILLS, key=lambda name: fill[core][name]["share"])
         place = {"core": core, "chip": int(chip[core]), "tile": tile, "x": x, "y": y}
         held = {"layers": list(graph.nodes[core]["layers"]), "compartments": graph.nodes[core]["compartments"]}
         cores.append(place | held | {"fullest": fullest, "fill": fill[core]})

@@ -36,12 +36,8 @@ def confusion(decisions: Json) -> str:
             for decided, count in enumerate(row):
                 if count:
                     content.append(_cell(name, label, decided, count, sum(row), (left, top, cell)))
-    content.append(words(14, 44 + size / 2, "label", "strong", "middle").replace("<text ", _turned(14, 44 + size / 2)))
+    content.append(words(14, 44 + size / 2, "label", "strong", "middle", upwards=True))
     return drawing("confusion", "Confusion matrices of the float model and of the chip", 44 + size + 8, content)
-
-
-def _turned(x: float, y: float) -> str:
-    return f'<text transform="rotate(-90 {x:g} {y:g})" '
 
 
 def _cell(side: str, label: int, decided: int, count: int, total: int, at: tuple[float, float, float]) -> str:
@@ -49,12 +45,9 @@ def _cell(side: str, label: int, decided: int, count: int, total: int, at: tuple
     tip = f"{side}: label {label} decided as {decided}, {count} of {total}"
     x, y = left + decided * cell, top + label * cell
     style = "right" if label == decided else "wrong"
-    box = shape(
-        "rect", style, tip, x=x, y=y, width=cell, height=cell, fill_opacity=f"{0.35 + 0.65 * count / total:.2f}"
-    )
-    size = min(13.0, cell * 0.72)
-    number = words(x + cell / 2, y + cell / 2 + 0.36 * size, str(count), "in-cell", "middle")
-    return box + number.replace("<text ", f'<text font-size="{size:.1f}" ')
+    box = shape("rect", style, tip, x=x, y=y, width=cell, height=cell, fill_opacity=f"{0.2 + 0.35 * count / total:.2f}")
+    size = min(13.0, cell * 0.85)
+    return box + words(x + cell / 2, y + cell / 2 + 0.36 * size, str(count), "in-cell", "middle", size=size)
 
 
 # -- cores -------------------------------------------------------------------------------------------------------------
@@ -76,8 +69,9 @@ def core_map(cores: Json) -> str:
     most = ways[0]["packets"] if ways else 1.0
     content.append(shape("rect", "input", x=0, y=24, width=INPUT - 16, height=height - 24, rx=4))
     middle = (INPUT - 16) / 2, height / 2 + 12
-    content.append(words(*middle, "input", "strong", "middle").replace("<text ", _turned(*middle)))
+    content.append(words(*middle, "input", "strong", "middle", upwards=True))
     content += [_way(way, places, most, height) for way in ways[:DRAWN]]
+    content += [_name(core, places[core["core"]]) for core in cores["cores"]]
     names = {"w-in": "packets from the input", "w-core": "packets between cores (arrow: direction; width: amount)"}
     content.append(legend(names, INPUT, 12))
     return drawing("cores", "Cores on the mesh, how full they are and the packets between them", height, content)
@@ -123,18 +117,26 @@ def _core(core: Json, box: Box) -> str:
     limits = ", ".join(f"{name} {100 * use['share']:.0f} %" for name, use in core["fill"].items())
     tip = f"core {core['core']}, {' '.join(core['layers'])}, {core['compartments']:,} compartments; {limits}"
     level = high * min(full["share"], 1.0)
-    parts = [
-        shape("rect", "core", tip, x=x, y=y, width=wide, height=high, rx=3),
-        shape("rect", "fill", x=x, y=y + high - level, width=wide, height=level, rx=3),
-    ]
-    lines = [f"core {core['core']}: {' '.join(core['layers'])}", f"{100 * full['share']:.0f} % of {core['fullest']}"]
+    return "".join(
+        [
+            shape("rect", "core", tip, x=x, y=y, width=wide, height=high, rx=3),
+            shape("rect", "fill", x=x, y=y + high - level, width=wide, height=level, rx=3),
+        ]
+    )
+
+
+def _name(core: Json, box: Box) -> str:
+    """What a core is, as far as its box has room; it lies over the lines."""
+    x, y, wide, _ = box
+    full = core["fill"][core["fullest"]]
+    named = core["fullest"].removeprefix("core.").replace("_", " ")
+    lines = [f"core {core['core']}: {' '.join(core['layers'])}", f"{100 * full['share']:.0f} % of {named}"]
     if wide < LETTER * len(lines[0]):
         lines = [str(core["core"])]
     lines = [line for line in lines if wide >= LETTER * len(line)]
-    parts += [
-        words(x + 6, y + 14 + 14 * i, line, "small strong" if i == 0 else "small") for i, line in enumerate(lines)
-    ]
-    return "".join(parts)
+    return "".join(
+        words(x + 6, y + 14 + 14 * i, line, "over small" if i else "over small strong") for i, line in enumerate(lines)
+    )
 
 
 def _way(way: Json, places: dict[int, Box], most: float, height: float) -> str:

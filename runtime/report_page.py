@@ -8,7 +8,7 @@ from html import escape
 from importlib import resources
 from typing import Any
 
-from runtime import report_sections
+from runtime import report_costs, report_sections
 from runtime.markup import paragraph, section, table
 
 Json = dict[str, Any]
@@ -86,7 +86,7 @@ SECTIONS: dict[str, tuple[str, Callable[[Json], list[str]]]] = {
     "cores-section": ("Cores", report_sections.cores),
     "taxels-section": ("Taxels", report_sections.taxels),
     "recording": ("One recording", report_sections.recording),
-    "costs": ("Energy and time", report_sections.costs),
+    "costs": ("Energy and time", report_costs.costs),
     "provenance": ("Provenance", _provenance),
 }
 """Sections in their order: id, heading, and what makes the content; a further chart is a further entry."""

@@ -90,8 +90,11 @@ def _runs(pairs: Sequence[Sequence[int]], rows: dict[int, int]) -> str:
 def membranes(traces: Sequence[Json]) -> str:
     """Membranes of both sides and their thresholds, a panel for each trace."""
     panel = 250.0
-    names = {"k-float": "float model", "k-chip": "chip (dashed)", "k-theta": "threshold (dotted)"}
-    content = [legend(names, 70, 16), words(WIDTH - 15, 16, "▲ float model fires   ▼ chip fires", "small", "end")]
+    names = {"l-float": "float model", "l-chip": "chip", "theta": "threshold"}
+    content = [
+        legend(names, 78, 16, strokes=True),
+        words(WIDTH - 15, 16, "▲ float model fires   ▼ chip fires", "small", "end"),
+    ]
     for place, trace in enumerate(traces):
         content += _membrane(trace, 30 + place * panel, panel)
     return drawing("membranes", trace_title(traces[0]), 30 + panel * len(traces), content)

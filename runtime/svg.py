@@ -47,10 +47,21 @@ def shape(name: str, style: str, tip: str = "", /, **attributes: float | str) ->
     return f"<{name} {' '.join(words)}>{inner}</{name}>" if tip else f"<{name} {' '.join(words)}/>"
 
 
-def words(x: float, y: float, text: str, style: str = "", anchor: str = "start") -> str:
+def words(
+    x: float,
+    y: float,
+    text: str,
+    style: str = "",
+    anchor: str = "start",
+    *,
+    size: float | None = None,
+    upwards: bool = False,
+) -> str:
     """A line of text."""
     kind = f' class="{style}"' if style else ""
     where = "" if anchor == "start" else f' text-anchor="{anchor}"'
+    where += "" if size is None else f' style="font-size:{number(size)}px"'
+    where += f' transform="rotate(-90 {number(x)} {number(y)})"' if upwards else ""
     return f'<text x="{number(x)}" y="{number(y)}"{kind}{where}>{escape(text)}</text>'
 
 
@@ -83,12 +94,16 @@ def ticks(low: float, high: float, most: int = 5) -> list[float]:
     return [i * step for i in range(first, last + 1)]
 
 
-def legend(names: Mapping[str, str], x: float, y: float) -> str:
-    """A row of swatches; names by class."""
+def legend(names: Mapping[str, str], x: float, y: float, *, strokes: bool = False) -> str:
+    """A row of swatches, or of strokes; names by class."""
     parts = []
     for style, name in names.items():
-        parts += [shape("rect", style, x=x, y=y - 9, width=14, height=10), words(x + 19, y, name)]
-        x += 19 + LETTER * len(name) + 18
+        if strokes:
+            parts.append(shape("line", f"line {style}", x1=x - 8, y1=y - 4, x2=x + 14, y2=y - 4))
+        else:
+            parts.append(shape("rect", style, x=x, y=y - 9, width=14, height=10))
+        parts.append(words(x + 19, y, name))
+        x += 19 + LETTER * len(name) + 26
     return "".join(parts)
 
 
@@ -209,7 +224,10 @@ def lines(name: str, title: str, series: Mapping[str, Sequence[float]], label: s
     frame = Frame(
         left=80, top=30, right=WIDTH - 15, bottom=230, x_from=0, x_to=max(longest - 1, 1), y_from=0, y_to=most * 1.05
     )
-    content = [*frame.axes(label, unit), legend({f"k{i}": kind for i, kind in enumerate(series)}, frame.left, 16)]
+    content = [
+        *frame.axes(label, unit),
+        legend({f"l{i}": kind for i, kind in enumerate(series)}, frame.left + 8, 16, strokes=True),
+    ]
     content += [frame.line(values, f"l{i}") for i, values in enumerate(series.values())]
     tips = [
         f"step {step}: " + ", ".join(f"{si(v[step], unit)} {kind}" for kind, v in series.items() if step < len(v))
