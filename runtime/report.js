@@ -45,7 +45,7 @@ function keys(svg, go) {
 function read(svg) {
   const { left, top, across, down, steps } = Object.fromEntries(
     ["left", "top", "across", "down", "steps"].map((name) => [name, Number(svg.dataset[name])]));
-  const neurons = svg.dataset.neurons.split(" ");
+  const neurons = svg.dataset.neurons.split(" ").filter(Boolean);
   const cells = new Map();
   const path = (selector) => (svg.querySelector(selector) || { getAttribute: () => "" }).getAttribute("d");
   for (const [, x, row, run] of path(".both path").matchAll(/M(\d+) (\d+)\.5h(\d+)/g)) {

@@ -202,7 +202,7 @@ def fingertip(taxels: Json) -> str:
             tip = f"taxel {taxel}: {value:,.1f} {name} in a mean recording"
             radius = reach * (0.25 + 0.75 * math.sqrt(value / most))
             content.append(
-                shape("circle", "taxel", tip, cx=x, cy=y, r=radius, fill_opacity=f"{0.25 + 0.6 * value / most:.2f}")
+                shape("circle", "taxel", tip, cx=x, cy=y, r=radius, fill_opacity=f"{0.2 + 0.4 * value / most:.2f}")
             )
             content.append(words(x, y + 3.5, str(taxel), "number", "middle"))
         content.append("</g>")

@@ -57,7 +57,7 @@ def verdict(report: Json) -> list[str]:
     cards["cores"] = f"{report['netlist']['cores']}", f"{report['netlist']['compartments']:,} neurons on the chip"
     first = found["first_divergence"]
     levels = [
-        [level["name"], "–" if level["share"] is None else f"{100 * level['share']:.2f} %", level["text"]]
+        [level["name"], "–" if level["share"] is None else f"{100 * level['share']:.2f}\xa0%", level["text"]]
         for level in found["levels"]
     ]
     names = list(found["spikes"])
@@ -178,7 +178,8 @@ def cores(report: Json) -> list[str]:
         ),
         figure(
             report_figures.core_map(found),
-            "A core is filled as far as its fullest limit; lines are packets in a mean recording.",
+            "A core is filled as far as the fullest of its compartments, synaptic memory and axons; lines are packets "
+            "in a mean recording.",
             table("What each core uses of each limit", ["core", "tile", "layers", *short], fill)
             + table("Packets in a mean recording", ["from core", "to core", "packets", "axons", "hops"], ways),
         ),

@@ -50,6 +50,9 @@ def raster(name: str, layer: Json, steps: int) -> str:
             x, y = LEFT + (step + 0.5) * across + start[0], TOP + (rows[neuron] + 0.5) * down + start[1]
             marks.append(f"M{number(x)} {number(y)}{mark}")
         content.append(f'<path class="only-{side}" d="{"".join(marks)}"/>' if marks else "")
+    if not rows:
+        what = "no channel has an event" if layer["name"] == "input" else f"no neuron of {layer['name']} fires"
+        content.append(words(LEFT + 10, TOP + high / 2, what))
     drawn = drawing(name, f"Spikes of {layer['name']}, float model and chip", TOP + high + BOTTOM, content)
     neurons = " ".join(map(str, layer["active"]))
     facts = f'data-layer="{layer["name"]}" data-steps="{steps}" data-neurons="{neurons}"'

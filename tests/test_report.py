@@ -1,0 +1,544 @@
+"""The command ``report``: what is on the page, that it needs nothing else, and what is refused."""
+
+import hashlib
+import json
+import re
+import shutil
+from html.parser import HTMLParser
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from browser import Page
+from made_files import CLASSES, FEATURES, STEPS, TAXELS, own_file, recordings_folder, weights
+from numpy.testing import assert_allclose, assert_array_equal
+
+from compiler.frontends.checkpoint import read_checkpoint
+from compiler.frontends.systems import GRAPH_SYSTEMS, GRID_CNN, SYSTEMS
+from compiler.serialize import read_netlist, write_netlist
+from compiler.targets import load_target
+from models.events import load_data
+from models.graphs import normalised_adjacency
+from models.reference import float_membranes, float_spikes
+from runtime import cli, cost, engine
+from runtime.trace import aligned
+
+REPORT = ("report", "net.loom", "--checkpoint", "net.pt", "--data", "data", "-o", "out.html")
+HEADINGS = ["Verdict", "Decisions", "Cores", "Taxels", "One recording", "Energy and time", "Provenance"]
+LAYERS = ("conv1", "fc1", "fc2", "fc3")
+FIGURES = {
+    "ladder",
+    "confusion",
+    "cores",
+    "taxels",
+    "raster-input",
+    *(f"raster-{name}" for name in LAYERS),
+    "membranes",
+    "energy-layers",
+    "energy-parts",
+    "time-cores",
+    "energy-cores",
+    "energy-steps",
+    "time-steps",
+}
+MOST_BYTES = 5_000_000
+
+
+VOID = {"meta", "br", "input", "link"}
+"""Elements without an end."""
+
+
+class Tags(HTMLParser):
+    """Elements of a page in their order, with attributes, text and the elements around them."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.found, self._open = [], []
+        self.feed(text)
+        assert not self._open, f"never closed: {self._open}"
+
+    def handle_starttag(self, tag, attrs):
+        element = {"tag": tag, "attrs": dict(attrs), "text": "", "inside": list(self._open)}
+        self.found.append(element)
+        if tag not in VOID:
+            self._open.append(element)
+
+    def handle_startendtag(self, tag, attrs):
+        self.found.append({"tag": tag, "attrs": dict(attrs), "text": "", "inside": list(self._open)})
+
+    def handle_endtag(self, tag):
+        assert self._open.pop()["tag"] == tag
+
+    def handle_data(self, data):
+        for element in self._open:
+            element["text"] += data
+
+    def all(self, tag, within=None):
+        return [e for e in self.found if e["tag"] == tag and (within is None or within in e["inside"])]
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """A folder with recordings, checkpoints, a 4-bit netlist, its page and the page's data."""
+    folder = tmp_path_factory.mktemp("report")
+    recordings_folder(folder / "data")
+    own_file(folder / "net.pt", training={"seed": 17})
+    own_file(folder / "other.pt", last=weights(7))
+    own_file(folder / "wide.pt", last=weights(sizes=(10, 8, CLASSES)))
+    words = ["compile", folder / "net.pt", "--weight-bits", "4", "--keep-all", "-o", folder / "net.loom", "--json"]
+    assert cli.main([str(word) for word in words]) == 0
+    return folder
+
+
+@pytest.fixture
+def spikeloom(capsys, place, monkeypatch):
+    """Run a command in that folder; returns exit code, standard output and standard error."""
+    monkeypatch.chdir(place)
+
+    def command(*words):
+        capsys.readouterr()
+        code = cli.main([str(word) for word in words])
+        return code, *capsys.readouterr()
+
+    return command
+
+
+@pytest.fixture
+def made(spikeloom, place):
+    """The page and its data, made once."""
+    if not (place / "out.json").exists():
+        code, out, err = spikeloom(*REPORT, "--json")
+        assert (code, err) == (0, "")
+        (place / "out.json").write_text(out)
+    return (place / "out.html").read_text("utf-8"), json.loads((place / "out.json").read_text())
+
+
+@pytest.fixture
+def tags(made):
+    return Tags(made[0])
+
+
+# -- the page ----------------------------------------------------------------------------------------------------------
+
+
+def test_every_section_is_there_under_its_heading(tags):
+    assert [h["text"] for h in tags.all("h2")] == HEADINGS
+    assert [h["text"] for h in tags.all("h1")] == ["net.loom on data"]
+    sections = tags.all("section")
+    for section, heading in zip(sections, tags.all("h2"), strict=True):
+        assert section["attrs"]["aria-labelledby"] == heading["attrs"]["id"]
+    links = [a["attrs"]["href"] for a in tags.all("a", tags.all("nav")[0])]
+    assert links == [f"#{section['attrs']['id']}" for section in sections]
+
+
+def test_every_figure_is_drawn_titled_captioned_and_in_numbers(tags):
+    figures = tags.all("figure")
+    assert {tags.all("svg", figure)[0]["attrs"]["id"] for figure in figures} == FIGURES
+    for figure in figures:
+        (drawing,) = tags.all("svg", figure)
+        shapes = [e for kind in ("rect", "circle", "path", "line", "polyline") for e in tags.all(kind, drawing)]
+        assert len(shapes) >= 5, drawing["attrs"]["id"]
+        assert drawing["attrs"]["role"] == "img"
+        assert tags.all("figcaption", figure)[0]["text"].strip()
+        title = next(t for t in tags.all("title", drawing) if t["attrs"].get("id"))
+        assert drawing["attrs"]["aria-labelledby"] == title["attrs"]["id"]
+        assert title["text"]
+        if drawing["attrs"]["id"] != "raster-input":  # whose spikes cannot differ
+            assert tags.all("table", figure), drawing["attrs"]["id"]
+
+
+def test_nothing_is_loaded_from_anywhere(made, tags):
+    for element in tags.found:
+        for name, value in element["attrs"].items():
+            assert name not in {"src", "srcset", "data", "action", "poster", "background"}, element
+            assert not name.endswith("href") or value.startswith("#"), element
+    assert not {"link", "img", "iframe", "object", "embed", "image", "use"} & {e["tag"] for e in tags.found}
+    assert not re.search(r"url\(|@import|fetch\(|XMLHttpRequest|import\(", made[0])
+    # the one address is the name space that scripts need to make shapes
+    assert set(re.findall(r"https?://[^\"'\s<]+", made[0])) == {"http://www.w3.org/2000/svg"}
+    assert len(made[0].encode()) < MOST_BYTES
+
+
+def test_screen_readers_find_their_way(tags):
+    assert tags.all("html")[0]["attrs"]["lang"] == "en"
+    assert len(tags.all("main")) == len(tags.all("header")) == len(tags.all("nav")) == 1
+    ids = [e["attrs"]["id"] for e in tags.found if "id" in e["attrs"]]
+    assert len(ids) == len(set(ids))
+    for element in tags.found:
+        for name in ("aria-labelledby", "for"):
+            assert element["attrs"].get(name, ids[0]) in ids
+    levels = [int(e["tag"][1]) for e in tags.found if re.fullmatch("h[1-6]", e["tag"])]
+    assert all(later - level <= 1 for level, later in pairwise(levels))
+    for table in tags.all("table"):
+        assert tags.all("caption", table)[0]["text"]
+        assert {th["attrs"]["scope"] for th in tags.all("th", table)} == {"col", "row"}
+        columns = len(tags.all("th", tags.all("thead", table)[0]))
+        for row in tags.all("tr", tags.all("tbody", table)[0]):
+            assert len(tags.all("th", row)) + len(tags.all("td", row)) == columns
+    (label,) = tags.all("label")
+    assert label["text"].startswith("Layer")
+
+
+def test_the_same_input_gives_the_same_bytes(spikeloom, made, place):
+    assert spikeloom(*REPORT[:-1], "again.html")[0] == 0
+    assert (place / "again.html").read_bytes() == (place / "out.html").read_bytes()
+
+
+def test_the_raster_draws_every_spike(tags, made):
+    for layer in made[1]["recording"]["layers"]:
+        drawing = next(s for s in tags.all("svg") if s["attrs"]["id"] == f"raster-{layer['name']}")
+        neurons = [int(neuron) for neuron in drawing["attrs"]["data-neurons"].split()]
+        paths = tags.all("path", drawing)
+        both = [
+            [int(step) + i, neurons[int(row)]]
+            for step, row, run in re.findall(r"M(\d+) (\d+)\.5h(\d+)", paths[0]["attrs"]["d"])
+            for i in range(int(run))
+        ]
+        assert sorted(both) == layer["both"]
+        marks = {path["attrs"]["class"]: path["attrs"]["d"].count("M") for path in paths[1:]}
+        wanted = {f"only-{side}": len(layer[f"{side}_only"]) for side in ("float", "chip")}
+        assert marks == {name: count for name, count in wanted.items() if count}
+
+
+# -- its data ----------------------------------------------------------------------------------------------------------
+
+
+def test_spikes_and_membranes_are_those_of_both_sides(made, place):
+    recording = made[1]["recording"]
+    netlist, checkpoint = read_netlist(place / "net.loom"), read_checkpoint(place / "net.pt")
+    data = load_data(str(place / "data"), "test")[0]
+    one = data.events[recording["index"]][None]
+    seen = normalised_adjacency(checkpoint.edges, TAXELS)
+    ours = float_spikes(checkpoint, seen, one)
+    trace = engine.simulate(netlist, one.reshape(1, -1, STEPS), spikes=True, membranes=True)
+    for i, layer in enumerate(recording["layers"]):
+        chip = aligned(netlist, trace.spikes, i)[0]
+        for side, wanted in (("float", ours[layer["name"]][0]), ("chip", chip)):
+            pairs = np.array(layer["both"] + layer[f"{side}_only"])
+            found = np.zeros_like(wanted)
+            found[tuple(pairs.T)] = True
+            assert_array_equal(found, wanted)
+            assert layer[f"{side}_spikes"] == wanted.sum()
+        assert layer["different"] == (ours[layer["name"]][0] != chip).sum() > 0
+    membranes = float_membranes(checkpoint, seen, one)
+    for shown in recording["membranes"]:
+        window = slice(shown["first_step"], shown["first_step"] + len(shown["float"]))
+        assert_array_equal(shown["float"], membranes[shown["layer"]][0, window, shown["neuron"]])
+        index = LAYERS.index(shown["layer"])
+        register = aligned(netlist, trace.membranes, index)[0, window, shown["neuron"]]
+        (own,) = np.flatnonzero((netlist.layer == index) & (netlist.neuron == shown["neuron"]))
+        assert_allclose(shown["chip"], register / (64 * netlist.scale[own]))
+        fires = shown["step"] in shown["float_spikes"], shown["step"] in shown["chip_spikes"]
+        assert sum(fires) == 1
+    assert [shown["step"] for shown in recording["membranes"]] == sorted(s["step"] for s in recording["membranes"])
+    first, shown = made[1]["verify"]["first_divergence"], recording["membranes"][0]
+    assert (first["file"], first["layer"], first["neuron"]) == (recording["file"], shown["layer"], shown["neuron"])
+
+
+def test_energy_by_step_adds_up(made, place):
+    recording = made[1]["recording"]
+    netlist, target = read_netlist(place / "net.loom"), load_target("loihi1")
+    data = load_data(str(place / "data"), "test")[0]
+    events = data.events[recording["index"]].reshape(1, -1, STEPS)
+    costs = cost.estimate(cost.prepare(netlist, target), engine.simulate(netlist, events).counts, STEPS)
+    assert set(recording["by_step"]["energy_j"]) == set(costs.energy)
+    for name, steps in recording["by_step"]["energy_j"].items():
+        assert len(steps) == STEPS + netlist.max_depth
+        assert_allclose(sum(steps), costs.energy[name].sum())
+    for name, steps in recording["by_step"]["time_s"].items():
+        entry = next(t for t in recording["costs"]["time"] if f"{t['table']}, {t['model']} model" == name)
+        assert_allclose(sum(steps), entry["inference_s"]["mean"])
+    for name, steps in recording["by_step"]["mean_time_s"].items():
+        entry = next(t for t in made[1]["costs"]["time"] if f"{t['table']}, {t['model']} model" == name)
+        assert_allclose(sum(steps), entry["inference_s"]["mean"])
+
+
+def test_decisions_cores_and_taxels_agree_with_the_rest(made, place):
+    report = made[1]
+    netlist, data = read_netlist(place / "net.loom"), load_data(str(place / "data"), "test")[0]
+    for side in ("float", "chip"):
+        matrix = np.array(report["decisions"]["matrices"][side])
+        assert_array_equal(matrix.sum(axis=1), np.bincount(data.labels, minlength=CLASSES))
+        assert np.trace(matrix) / len(data) == report["verify"]["accuracy"][side]
+    sent = [way["packets"] for way in report["cores"]["traffic"] if way["from"] is not None]
+    assert_allclose(sum(sent), report["costs"]["per_inference"]["packets"])
+    assert [core["core"] for core in report["cores"]["cores"]] == list(range(netlist.n_cores))
+    for core in report["cores"]["cores"]:
+        assert 0 < core["fill"][core["fullest"]]["share"] <= 1
+    taxels = report["taxels"]
+    assert_allclose(taxels["events"], data.events.mean(axis=0).sum(axis=(1, 2)))
+    fired = engine.simulate(netlist, data.events.reshape(len(data), -1, STEPS)).counts.spikes[:, netlist.layer == 0]
+    assert_allclose(taxels["spikes"], fired.mean(axis=0).reshape(TAXELS, FEATURES).sum(axis=1))
+    assert sorted(map(tuple, taxels["edges"])) == sorted(map(tuple, read_checkpoint(place / "net.pt").edges.tolist()))
+    assert (taxels["graph"], taxels["positions_mm"]) == ("ring", None)
+
+
+def test_where_it_is_from_and_how_to_repeat_it(made, place, spikeloom):
+    origin = made[1]["provenance"]
+    for name, file in (("netlist", "net.loom"), ("checkpoint", "net.pt")):
+        assert origin[name]["sha256"] == hashlib.sha256((place / file).read_bytes()).hexdigest()
+        assert origin[name]["sha256"] in made[0]
+    assert origin["checkpoint"]["training"]["seed"] == 17
+    commands = {line["for"]: line["command"] for line in origin["commands"]}
+    assert commands["the netlist"] == "spikeloom compile net.pt --weight-bits 4 --keep-all -o net.loom"
+    before = (place / "net.loom").read_bytes()
+    for command in commands.values():
+        assert command in made[0]
+        assert spikeloom(*command.split()[1:])[0] in (0, 1)
+    assert (place / "net.loom").read_bytes() == before
+    assert (place / "report.html").read_bytes() == (place / "out.html").read_bytes()
+
+
+def test_the_terminal_shows_the_same(spikeloom, made):
+    code, out, err = spikeloom(*REPORT)
+    assert (code, err) == (0, "")
+    assert re.findall(r"^(\S.*)\n-+$", out, re.MULTILINE) == HEADINGS
+    report = made[1]
+    assert f"float accuracy:  {100 * report['verify']['accuracy']['float']:.2f} %" in out
+    for layer in report["recording"]["layers"]:
+        assert re.search(rf"{layer['name']} +\d+ +{layer['float_spikes']} +{layer['chip_spikes']} ", out)
+    for line in report["provenance"]["commands"]:
+        assert f"$ {line['command']}\n" in out
+    assert out.endswith("page: out.html\n")
+
+
+@pytest.mark.parametrize(("asked", "file"), [("3", "sample_3_label_3.npy"), ("sample_4_label_0.npy",) * 2])
+def test_another_recording_is_drawn(spikeloom, asked, file):
+    code, out, _ = spikeloom(*REPORT[:-1], "chosen.html", "--limit", "5", "--recording", asked, "--json")
+    assert code == 0
+    assert json.loads(out)["recording"]["file"] == file
+
+
+def test_where_no_spike_differs_the_widest_membranes_are_shown(spikeloom, place):
+    """Weights too small for a spike, so that every raster is empty, too."""
+    own_file(place / "quiet.pt", last=weights(gain=0.05))
+    assert spikeloom("compile", "quiet.pt", "--keep-all", "-o", "quiet.loom")[0] == 0
+    words = ("report", "quiet.loom", "--checkpoint", "quiet.pt", "--data", "data", "-o", "quiet.html")
+    code, out, _ = spikeloom(*words, "--json")
+    assert code == 0
+    found = json.loads(out)
+    assert found["verify"]["first_divergence"] is None
+    (shown,) = found["recording"]["membranes"]
+    assert not shown["diverges"]
+    assert max(abs(np.array(shown["float"]) - shown["chip"])) > 0
+    text = (place / "quiet.html").read_text("utf-8")
+    assert "No spike differs." in text
+    assert "no neuron of conv1 fires" in text
+    assert "no spike differs; the membranes lie furthest apart at" in text
+    assert {svg["attrs"]["id"] for svg in Tags(text).all("svg")} == FIGURES
+
+
+# -- every system ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+def test_every_system_has_its_page(spikeloom, tmp_path, system):
+    from test_systems import network_of, saved
+
+    saved(tmp_path, network_of(system))
+    recordings_folder(tmp_path / "data", train=_grasps(1), test=_grasps(2))
+    net, checkpoint = tmp_path / "x.loom", tmp_path / "x.pt"
+    assert spikeloom("compile", checkpoint, "-o", net)[0] == 0
+    words = ("report", net, "--checkpoint", checkpoint, "--data", tmp_path / "data", "-o", tmp_path / "x.html")
+    code, out, err = spikeloom(*words, "--json")
+    assert (code, err) == (0, "")
+    found, page = json.loads(out), Tags((tmp_path / "x.html").read_text("utf-8"))
+    assert {svg["attrs"]["id"] for svg in page.all("svg")} == FIGURES
+    taxels = found["taxels"]
+    assert taxels["sensor"] == "NeuTouch"
+    assert len(taxels["positions_mm"]) == 39
+    drawing = next(svg for svg in page.all("svg") if svg["attrs"]["id"] == "taxels")
+    graph = system in GRAPH_SYSTEMS
+    assert (taxels["graph"] is not None, taxels["spikes"] is not None, bool(taxels["edges"])) == (graph,) * 3
+    assert len(page.all("circle", drawing)) == 39 * (2 if graph else 1)
+    if system == GRID_CNN:
+        assert found["recording"]["membranes"][0]["of"].startswith("neuron ")
+
+
+def _grasps(seed):
+    return (np.random.default_rng(seed).random((3, 39, 2, 20)) < 0.15).astype(np.uint8)
+
+
+def test_an_onnx_network_has_its_page(spikeloom, place):
+    assert spikeloom("export", "net.pt", "--to", "onnx-float", "-o", "net.onnx")[0] == 0
+    assert spikeloom("compile", "net.onnx", "-o", "onnx.loom")[0] == 0
+    words = ("report", "onnx.loom", "--checkpoint", "net.onnx", "--data", "data", "-o", "onnx.html")
+    code, out, err = spikeloom(*words, "--json")
+    assert (code, err) == (0, "")
+    assert json.loads(out)["taxels"]["graph"] is None
+
+
+# -- what is refused ---------------------------------------------------------------------------------------------------
+
+
+def refused(spikeloom, *words):
+    code, out, err = spikeloom(*words)
+    assert (code, out) == (2, "")
+    assert err.count("\n") == 1
+    return err.removeprefix("spikeloom: ").removesuffix("\n")
+
+
+def test_another_checkpoint_is_refused(spikeloom, place):
+    made, other = (hashlib.sha256((place / name).read_bytes()).hexdigest()[:12] for name in ("net.pt", "other.pt"))
+    words = [word.replace("net.pt", "other.pt") for word in REPORT]
+    assert refused(spikeloom, *words) == (
+        f"net.loom: compiled from a checkpoint of sha256 {made}…, other.pt has {other}…; "
+        "give the one that it was compiled from"
+    )
+    words = [word.replace("net.pt", "wide.pt") for word in REPORT]
+    assert refused(spikeloom, *words) == (
+        "netlist and checkpoint disagree: the netlist has taxels 6, channels 2, conv1 30, fc1 9, fc2 8, fc3 4, the "
+        "checkpoint taxels 6, channels 2, conv1 30, fc1 10, fc2 8, fc3 4; give the checkpoint that the netlist was "
+        "compiled from"
+    )
+
+
+def test_another_graph_is_refused(spikeloom, place):
+    from dataclasses import replace
+
+    netlist = read_netlist(place / "net.loom")
+    write_netlist(replace(netlist, provenance=netlist.provenance | {"graph": "line"}), place / "line.loom")
+    words = [word.replace("net.loom", "line.loom") for word in REPORT]
+    assert refused(spikeloom, *words) == "line.loom: compiled for graph line, this is ring; give --graph line"
+
+
+def test_recordings_of_another_sensor_or_other_objects_are_refused(spikeloom, place, tmp_path):
+    recordings_folder(tmp_path / "wide", test=np.ones((2, 7, 2, STEPS), np.uint8))
+    recordings_folder(tmp_path / "many", test=np.ones((2, TAXELS, 2, STEPS), np.uint8))
+    one = sorted((tmp_path / "many" / "test").iterdir())[0]
+    one.rename(one.with_name("sample_9_label_9.npy"))
+    for data, words in (("wide", "7 taxels"), ("many", "label 9")):
+        assert words in refused(spikeloom, *REPORT[:5], tmp_path / data, *REPORT[6:])
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--recording", "6"), "--recording 6: there are 6; give a number from 0 to 5"),
+        (
+            ("--recording", "sample_9_label_3.npy"),
+            "--recording sample_9_label_3.npy: no such recording among 6 of split test; near are "
+            "sample_3_label_3.npy, sample_5_label_1.npy, sample_4_label_0.npy",
+        ),
+        (("--spec-samples", "0"), "--spec-samples 0: at least 1 recording is needed; give a positive number"),
+        (("-o", "net.loom"), "-o net.loom: is an input of this command (net.loom); give another name"),
+        (("-o", "no/out.html"), "-o no/out.html: the folder does not exist; make it first"),
+        (("-o", "data"), "-o data: is not a regular file; give the name of a file to write"),
+    ],
+)
+def test_options_that_are_refused(spikeloom, words, message):
+    assert refused(spikeloom, *REPORT, *words) == message
+
+
+def test_a_refused_report_leaves_an_old_page_alone(spikeloom, place):
+    shutil.copyfile(place / "net.pt", place / "old.html")
+    before = (place / "old.html").read_bytes()
+    refused(spikeloom, *REPORT, "-o", "old.html", "--recording", "99")
+    assert (place / "old.html").read_bytes() == before
+
+
+# -- in a browser ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def page(made, place, tmp_path):
+    with Page(tmp_path / "profile", place / "out.html") as page:
+        yield page
+
+
+def shown_rasters(page):
+    script = (
+        "[...document.querySelectorAll('figure[data-raster]')].filter(f => f.offsetHeight).map(f => f.dataset.raster)"
+    )
+    return page.run(script)
+
+
+def test_a_browser_shows_every_figure_without_complaint(page):
+    script = """[...document.querySelectorAll('svg')].map(svg => {
+        const box = svg.getBBox();
+        return [svg.id, box.width > 100 && box.height > 20 && svg.querySelectorAll('rect,circle,path,line').length > 4];
+    })"""
+    hidden = {f"raster-{name}" for name in ("input", *LAYERS[1:])}
+    found = dict(page.run(script))
+    assert set(found) == FIGURES
+    assert all(drawn for name, drawn in found.items() if name not in hidden)
+    assert page.console == []
+    assert [url for url in page.requested if not url.startswith("file:")] == []
+    assert len(page.requested) == 1
+    assert page.picture()[:4] == b"\x89PNG"
+
+
+def test_the_layer_of_the_raster_can_be_chosen(page):
+    assert shown_rasters(page) == ["conv1"]
+    page.run("document.getElementById('layer').focus()")
+    page.press("ArrowDown")
+    assert shown_rasters(page) == ["fc1"]
+    page.press("ArrowUp")
+    assert shown_rasters(page) == ["conv1"]
+    assert page.console == []
+
+
+def test_arrow_keys_walk_through_the_differences(page, made):
+    layer = made[1]["recording"]["layers"][0]
+    differing = sorted((step, neuron, side) for side in ("float", "chip") for step, neuron in layer[f"{side}_only"])
+    words = {
+        "float": "the float model fires, the chip does not",
+        "chip": "the chip fires, the float model does not",
+    }
+    page.run("document.getElementById('raster-conv1').focus()")
+    readout = "document.querySelector('#raster-conv1 ~ .readout').textContent"
+    for step, neuron, side in differing[:4]:
+        page.press("ArrowRight")
+        assert page.run(readout) == f"conv1 neuron {neuron}, step {step}: {words[side]}"
+    for _ in range(4):
+        page.press("ArrowLeft")
+    step, neuron, side = differing[-1]
+    assert page.run(readout) == f"conv1 neuron {neuron}, step {step}: {words[side]}"
+
+
+def test_the_pointer_reads_values(page, made):
+    layer = made[1]["recording"]["layers"][0]
+    step, neuron = layer["both"][len(layer["both"]) // 2]
+    x, y = page.run(f"""(() => {{
+        const svg = document.getElementById('raster-conv1'), d = svg.dataset;
+        svg.scrollIntoView({{block: 'center'}});
+        const row = d.neurons.split(' ').indexOf('{neuron}');
+        const at = new DOMPoint(+d.left + ({step} + .5) * d.across, +d.top + (row + .5) * d.down);
+        const there = at.matrixTransform(svg.getScreenCTM());
+        return [there.x, there.y];
+    }})()""")
+    page.point(x, y)
+    readout = "document.querySelector('#raster-conv1 ~ .readout').textContent"
+    assert page.run(readout) == f"conv1 neuron {neuron}, step {step}: both fire"
+    page.run("document.getElementById('energy-layers').focus()")
+    page.press("ArrowRight")
+    first = page.run("document.querySelector('#energy-layers .v title').textContent")
+    assert page.run("document.querySelector('#energy-layers ~ .readout').textContent") == first
+    assert first.startswith("conv1, davies2018: ")
+    assert page.console == []
+
+
+def test_paper_shows_all_layers_and_dark_is_dark(page):
+    background = "getComputedStyle(document.body).backgroundColor"
+    light = page.run(background)
+    page.media(scheme="dark")
+    assert page.run(background) != light == "rgb(255, 255, 255)"
+    page.media(scheme="dark", kind="print")
+    assert page.run(background) == light
+    assert shown_rasters(page) == ["input", *LAYERS]
+    assert page.pdf()[:4] == b"%PDF"
+
+
+def test_all_is_readable_without_script(made, place, tmp_path):
+    with Page(tmp_path / "profile", place / "out.html", script=False) as page:
+        assert page.console == []
+        document = page.call("DOM.getDocument", depth=1)["root"]["nodeId"]
+        nodes = page.call("DOM.querySelectorAll", nodeId=document, selector="figure[data-raster] svg")["nodeIds"]
+        heights = [page.call("DOM.getBoxModel", nodeId=node)["model"]["height"] for node in nodes]
+        assert len(heights) == 1 + len(LAYERS)
+        assert min(heights) > 50
+        for domain in ("DOM", "CSS"):
+            page.call(f"{domain}.enable")
+        (label,) = page.call("DOM.querySelectorAll", nodeId=document, selector="label.choose")["nodeIds"]
+        style = page.call("CSS.getComputedStyleForNode", nodeId=label)["computedStyle"]
+        assert {"name": "display", "value": "none"} in style  # nothing to choose from where nothing can be hidden
