@@ -37,7 +37,7 @@ def table(caption: str, head: Sequence[str], rows: Iterable[Sequence[str]], *, l
     )
     kind = ' class="left"' if left else ""
     return (
-        f'<div class="table" role="region" aria-label="{escape(caption)}" tabindex="0"><table{kind}>'
+        f'<div class="table"><table{kind}>'
         f"<caption>{escape(caption)}</caption><thead><tr>{above}</tr></thead><tbody>{body}</tbody></table></div>"
     )
 

@@ -34,6 +34,7 @@ def page(report: Json) -> str:
         f"<title>{escape(title)} – spikeloom</title>\n<style>\n{style}</style></head>\n<body>"
         '<a class="skip" href="#verdict">To the verdict</a>'
         f"<header><h1>{escape(title)}</h1>{paragraph(_about(report))}"
+        '<p class="hint">Point at a figure, or move to it with Tab and press arrow keys, to read its values.</p>'
         f'<nav aria-label="Sections"><ul>{links}</ul></nav></header>\n<main>{body}</main>\n'
         f"<footer><p>Made by spikeloom {escape(made['versions']['spikeloom'])}; this page loads nothing.</p></footer>"
         f"\n<script>\n{script}</script></body></html>\n"

@@ -7,7 +7,7 @@ from typing import Any
 from runtime import report_figures, svg
 from runtime.markup import facts, figure, paragraph, table, unfold
 from runtime.report_text import confusions, sender, trace_spikes, trace_title
-from runtime.report_traces import membranes, raster
+from runtime.report_traces import drawn, membranes, raster
 from runtime.tables import percent, si
 from runtime.verdicts import divergence_text
 
@@ -201,12 +201,16 @@ def taxels(report: Json) -> list[str]:
     sensor = f"{found['sensor'] or 'Sensor'}: {len(rows)} taxels"
     graph = "no taxel graph" if found["graph"] is None else f"graph {found['graph']} with {len(found['edges'])} edges"
     where = "" if found["positions_mm"] else " Their positions are not known, so they are drawn on a circle."
+    title = "Activity of each taxel in a mean recording"
+    if len(rows) > report_figures.DETAILED:
+        order = sorted(range(len(rows)), key=lambda taxel: -found["events"][taxel])[: report_figures.DETAILED]
+        rows, title = [rows[taxel] for taxel in order], f"Activity of the {len(order):,} busiest taxels"
     return [
         paragraph(f"{sensor}, {graph}.{where}"),
         figure(
             report_figures.fingertip(found),
             "Discs grow with what a taxel sends, and with what its first-layer neurons fire, in a mean recording.",
-            table("Activity of each taxel in a mean recording", head, rows),
+            table(title, head, rows),
         ),
     ]
 
@@ -257,7 +261,8 @@ def recording(report: Json) -> list[str]:
 
 def _raster(layer: Json, steps: int) -> str:
     channels = "channels with an event" if layer["name"] == "input" else "neurons that fire on either side"
-    caption = f"{layer['name']}: rows are the {len(layer['active']):,} {channels}, in order; columns are steps."
+    all_or_some = f"{len(drawn(layer)):,} of " if len(drawn(layer)) < len(layer["active"]) else ""
+    caption = f"{layer['name']}: rows are {all_or_some}the {len(layer['active']):,} {channels}, in order."
     entries = sorted((step, neuron, side) for side in ("float", "chip") for step, neuron in layer[f"{side}_only"])
     rows = [[str(step), str(neuron), f"{side} only"] for step, neuron, side in entries[:LISTED]]
     title = f"{layer['name']}: spikes of one side only"

@@ -13,8 +13,17 @@ Json = dict[str, Any]
 
 LEFT, TOP, BOTTOM = 70.0, 30.0, 40.0
 
+ROWS = 3000
+"""Rows of a raster, at most; a screen shows fewer."""
+
 MARK = 3.0
 """Half a mark of a difference, in units of the figure."""
+
+
+def drawn(layer: Json) -> list[int]:
+    """Neurons that have a row: all that fire, or `ROWS` of them at equal distances."""
+    active: list[int] = layer["active"]
+    return [active[i * len(active) // ROWS] for i in range(ROWS)] if len(active) > ROWS else active
 
 
 def raster(name: str, layer: Json, steps: int) -> str:
@@ -32,7 +41,8 @@ def raster(name: str, layer: Json, steps: int) -> str:
     steps : int
         Of the recording.
     """
-    rows = {neuron: row for row, neuron in enumerate(layer["active"])}
+    active = drawn(layer)
+    rows = {neuron: row for row, neuron in enumerate(active)}
     high = min(max(3.0 * len(rows), 90.0), 430.0)
     across, down = (WIDTH - LEFT - 12) / max(steps, 1), high / max(len(rows), 1)
     frame = Frame(
@@ -40,24 +50,24 @@ def raster(name: str, layer: Json, steps: int) -> str:
     )
     content = [
         legend({"k-both": "both fire", "k-float": "float model only (–)", "k-chip": "chip only (|)"}, LEFT, 16),
-        *_axes(frame, layer["active"], steps),
+        *_axes(frame, active, steps),
         f'<g class="both" transform="translate({number(LEFT)} {number(TOP)}) scale({across:.4f} {down:.4f})">',
         f'<path d="{_runs(layer["both"], rows)}" stroke-width="{max(0.9, 1.1 / down):.2f}"/></g>',
     ]
     for side, start, mark in (("float", (-MARK, 0.0), f"h{2 * MARK:g}"), ("chip", (0.0, -MARK), f"v{2 * MARK:g}")):
         marks = []
-        for step, neuron in layer[f"{side}_only"]:
+        for step, neuron in (pair for pair in layer[f"{side}_only"] if pair[1] in rows):
             x, y = LEFT + (step + 0.5) * across + start[0], TOP + (rows[neuron] + 0.5) * down + start[1]
             marks.append(f"M{number(x)} {number(y)}{mark}")
         content.append(f'<path class="only-{side}" d="{"".join(marks)}"/>' if marks else "")
     if not rows:
         what = "no channel has an event" if layer["name"] == "input" else f"no neuron of {layer['name']} fires"
         content.append(words(LEFT + 10, TOP + high / 2, what))
-    drawn = drawing(name, f"Spikes of {layer['name']}, float model and chip", TOP + high + BOTTOM, content)
-    neurons = " ".join(map(str, layer["active"]))
+    figure = drawing(name, f"Spikes of {layer['name']}, float model and chip", TOP + high + BOTTOM, content)
+    neurons = " ".join(map(str, active))
     facts = f'data-layer="{layer["name"]}" data-steps="{steps}" data-neurons="{neurons}"'
     box = f'data-left="{LEFT:g}" data-top="{TOP:g}" data-across="{across:.4f}" data-down="{down:.4f}"'
-    return drawn.replace("<svg ", f'<svg class="raster" {facts} {box} ', 1)
+    return figure.replace("<svg ", f'<svg class="raster" {facts} {box} ', 1)
 
 
 def _axes(frame: Frame, active: Sequence[int], steps: int) -> list[str]:
@@ -79,7 +89,9 @@ def _axes(frame: Frame, active: Sequence[int], steps: int) -> list[str]:
 def _runs(pairs: Sequence[Sequence[int]], rows: dict[int, int]) -> str:
     """A path of cells in which both fire: one stroke for steps in a row."""
     path = []
-    for row, cells in groupby(sorted((rows[neuron], step) for step, neuron in pairs), key=lambda cell: cell[0]):
+    for row, cells in groupby(
+        sorted((rows[neuron], step) for step, neuron in pairs if neuron in rows), key=lambda cell: cell[0]
+    ):
         first = last = -2
         for _, step in cells:
             if step != last + 1:

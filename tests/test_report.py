@@ -1,5 +1,6 @@
 """The command ``report``: what is on the page, that it needs nothing else, and what is refused."""
 
+import dataclasses
 import hashlib
 import json
 import re
@@ -21,6 +22,7 @@ from models.events import load_data
 from models.graphs import normalised_adjacency
 from models.reference import float_membranes, float_spikes
 from runtime import cli, cost, engine
+from runtime.report_traces import MARK, ROWS, drawn, raster
 from runtime.trace import aligned
 
 REPORT = ("report", "net.loom", "--checkpoint", "net.pt", "--data", "data", "-o", "out.html")
@@ -355,6 +357,53 @@ def test_every_system_has_its_page(spikeloom, tmp_path, system):
         assert found["recording"]["membranes"][0]["of"].startswith("neuron ")
 
 
+@pytest.mark.parametrize("asked", [None, "0"])
+def test_recordings_of_different_length(spikeloom, place, tmp_path, asked):
+    """The one that is drawn may be shorter than others."""
+    rng = np.random.default_rng(5)
+    for name, steps in (("a_label_0", 7), ("b_label_1", 30)):
+        grid = rng.random((steps, TAXELS, 2)) < 0.3
+        grid[-1, 0, 0] = True  # the last event says how long it is
+        lines = [f"{(step + 0.5) * 0.02:.2f},{taxel},{polarity}" for step, taxel, polarity in np.argwhere(grid)]
+        (tmp_path / "test").mkdir(exist_ok=True)
+        (tmp_path / "test" / f"{name}.csv").write_text("\n".join(["time_s,taxel,polarity", *lines, ""]))
+    chosen = [] if asked is None else ["--recording", asked]
+    code, out, _ = spikeloom(*REPORT[:5], tmp_path, "-o", tmp_path / "x.html", *chosen, "--json")
+    assert code == 0
+    recording = json.loads(out)["recording"]
+    assert (recording["file"], recording["steps"]) == ("a_label_0.csv", 7)
+    netlist = read_netlist(place / "net.loom")
+    assert {len(steps) for steps in recording["by_step"]["time_s"].values()} == {7 + netlist.max_depth}
+    assert {len(steps) for steps in recording["by_step"]["mean_time_s"].values()} == {30 + netlist.max_depth}
+
+
+def test_several_chips_are_drawn_one_below_the_other(spikeloom, place):
+    """Links between chips are not timed, so the page has no times and no energy by core."""
+    assert spikeloom("compile", "net.pt", "--cores-for", "conv1=3,fc1=2", "-o", "wide.loom")[0] == 0
+    netlist = read_netlist(place / "wide.loom")
+    tiles = np.arange(netlist.n_cores) * 20
+    write_netlist(dataclasses.replace(netlist, core_tile=tiles), place / "wide.loom")
+    words = [word.replace("net.loom", "wide.loom").replace("out.html", "wide.html") for word in REPORT]
+    code, out, err = spikeloom(*words, "--json")
+    assert (code, err) == (0, "")
+    found = json.loads(out)
+    assert [core["chip"] for core in found["cores"]["cores"]] == (tiles // 32).tolist()
+    figures = {svg["attrs"]["id"] for svg in Tags((place / "wide.html").read_text("utf-8")).all("svg")}
+    assert figures == FIGURES - {"time-cores", "energy-cores", "time-steps"}
+    assert spikeloom(*words)[0] == 0
+
+
+def test_large_layers_are_thinned_out():
+    layer = {"name": "conv1", "active": list(range(0, 20_000, 2)), "chip_only": [[1, 0], [1, 2]], "float_only": []}
+    text = raster("x", layer | {"both": [[0, neuron] for neuron in layer["active"]]}, 5)
+    rows = drawn(layer)
+    assert rows == sorted(set(rows))
+    assert set(rows) <= set(layer["active"])
+    assert len(rows) == ROWS
+    assert text.count("h1") == ROWS
+    assert text.count(f"v{2 * MARK:g}") == len({0, 2} & set(rows)) == 1
+
+
 def _grasps(seed):
     return (np.random.default_rng(seed).random((3, 39, 2, 20)) < 0.15).astype(np.uint8)
 
@@ -394,10 +443,8 @@ def test_another_checkpoint_is_refused(spikeloom, place):
 
 
 def test_another_graph_is_refused(spikeloom, place):
-    from dataclasses import replace
-
     netlist = read_netlist(place / "net.loom")
-    write_netlist(replace(netlist, provenance=netlist.provenance | {"graph": "line"}), place / "line.loom")
+    write_netlist(dataclasses.replace(netlist, provenance=netlist.provenance | {"graph": "line"}), place / "line.loom")
     words = [word.replace("net.loom", "line.loom") for word in REPORT]
     assert refused(spikeloom, *words) == "line.loom: compiled for graph line, this is ring; give --graph line"
 
