@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from typing import Any
 
 from runtime.report_text import sender
@@ -84,29 +85,29 @@ def _places(cores: Json) -> tuple[dict[int, Box], float, list[str]]:
     """Box of each core, height of the figure, and the tiles, chip after chip from top to bottom."""
     places: dict[int, Box] = {}
     content: list[str] = []
-    top = 24.0
-    side = math.ceil(math.sqrt(cores["mesh"]["tile_cores"]))
-    for chip in sorted({core["chip"] for core in cores["cores"]}):
+    top, fullest = 24.0, max(Counter(core["tile"] for core in cores["cores"]).values())
+    columns = min(fullest, 2)
+    rows = -(-fullest // columns)
+    chips = sorted({core["chip"] for core in cores["cores"]})
+    for chip in chips:
         held = [core for core in cores["cores"] if core["chip"] == chip]
         x0, y0 = (min(core[axis] for core in held) for axis in "xy")
         across, down = (max(core[axis] for core in held) - first + 1 for axis, first in (("x", x0), ("y", y0)))
         wide = min((WIDTH - INPUT) / across, 440.0)
-        high = min(wide * 0.62, 260.0)
+        high = min(max(wide * 0.62, 100.0), 130.0 * rows)
+        if len(chips) > 1:
+            content.append(words(INPUT, top + 12, f"chip {chip}", "small strong"))
+            top += 18
         for tile, x, y in sorted({(core["tile"], core["x"], core["y"]) for core in held}):
             left, upper = INPUT + (x - x0) * wide, top + (y - y0) * high
             content.append(shape("rect", "tile", x=left, y=upper, width=wide - MARGIN, height=high - MARGIN, rx=6))
-            if wide > 100:
-                place = f"tile {tile} (x {x}, y {y})" + (f", chip {chip}" if chip else "")
-                content.append(words(left + 8, upper + 15, place, "small"))
-            inner = (wide - MARGIN - 12) / side, (high - MARGIN - 26) / side
+            place = f"tile {tile} (x {x}, y {y})"
+            content.append(words(left + 8, upper + 15, place if wide > 180 else f"tile {tile}", "small"))
+            inner = (wide - MARGIN - 8) / columns, (high - MARGIN - 24) / rows
             for slot, core in enumerate(core for core in held if core["tile"] == tile):
-                row, column = divmod(slot, side)
-                places[core["core"]] = (
-                    left + 8 + column * inner[0],
-                    upper + 22 + row * inner[1],
-                    inner[0] - 8,
-                    inner[1] - 6,
-                )
+                row, column = divmod(slot, columns)
+                at = left + 8 + column * inner[0], upper + 22 + row * inner[1]
+                places[core["core"]] = (*at, inner[0] - 8, inner[1] - 6)
         top += down * high
     return places, top, content
 

@@ -162,7 +162,7 @@ def _traces(netlist: Netlist, model: Checkpoint | Network, sides: Sides) -> list
         places += [(int(step), index, int(neuron)) for step, neuron in np.argwhere(ours != chip)[:1]]
     diverges = bool(places)
     if not diverges:
-        gaps = [abs(sides.float_membranes[i] - _chip_membranes(netlist, sides, i)) for i in range(len(netlist.layers))]
+        gaps = [_gaps(netlist, sides, index) for index in range(len(netlist.layers))]
         widest = int(np.argmax([gap.max(initial=0.0) for gap in gaps]))
         step, neuron = np.unravel_index(int(gaps[widest].argmax()), gaps[widest].shape)
         places = [(int(step), widest, int(neuron))]
@@ -170,6 +170,13 @@ def _traces(netlist: Netlist, model: Checkpoint | Network, sides: Sides) -> list
         _trace_json(netlist, model, sides, step, index, neuron) | {"diverges": diverges}
         for step, index, neuron in sorted(places)
     ]
+
+
+def _gaps(netlist: Netlist, sides: Sides, index: int) -> FloatArray:
+    """Distance of both membranes in a layer, (steps, neurons); zero where the chip holds no neuron."""
+    held = np.isin(np.arange(netlist.layers[index].neurons), netlist.neuron[netlist.layer == index])
+    distance: FloatArray = abs(sides.float_membranes[index] - _chip_membranes(netlist, sides, index)) * held
+    return distance
 
 
 def _chip_membranes(netlist: Netlist, sides: Sides, index: int) -> FloatArray:

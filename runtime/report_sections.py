@@ -170,11 +170,12 @@ def cores(report: Json) -> list[str]:
         for way in found["traffic"]
     ]
     short = [name.removeprefix("core.").replace("_", " ") for name in limits]
-    mesh, held = found["mesh"], sorted({core["tile"] for core in found["cores"]})
+    mesh, tiles = found["mesh"], len({core["tile"] for core in found["cores"]})
+    chips = len({core["chip"] for core in found["cores"]})
     return [
         paragraph(
-            f"{len(found['cores'])} cores on {len(held)} of {mesh['width'] * mesh['height']} tiles "
-            f"({mesh['width']} by {mesh['height']}, {mesh['tile_cores']} cores each); only the used part is drawn."
+            f"Cores: {len(found['cores'])}, on {tiles} of {chips * mesh['width'] * mesh['height']} tiles (a chip has "
+            f"{mesh['width']} by {mesh['height']}, of {mesh['tile_cores']} cores each); only the used part is drawn."
         ),
         figure(
             report_figures.core_map(found),
@@ -209,7 +210,8 @@ def taxels(report: Json) -> list[str]:
         paragraph(f"{sensor}, {graph}.{where}"),
         figure(
             report_figures.fingertip(found),
-            "Discs grow with what a taxel sends, and with what its first-layer neurons fire, in a mean recording.",
+            "Discs grow with what a taxel sends"
+            + (", and with what its first-layer neurons fire." if found["spikes"] is not None else "."),
             table(title, head, rows),
         ),
     ]
