@@ -43,11 +43,11 @@ def table(caption: str, head: Sequence[str], rows: Iterable[Sequence[str]], *, l
 
 
 def figure(drawing: str, caption: str, numbers: str = "", *, raster: str | None = None) -> str:
-    """A figure, what is said of it, a line for values under the pointer, and its numbers to unfold."""
+    """What is said of a figure, the figure, a line for values under the pointer, and its numbers to unfold."""
     below = unfold("Numbers of this figure", numbers) if numbers else ""
     kind = "" if raster is None else f' data-raster="{escape(raster)}"'
     return (
-        f'<figure{kind}>{drawing}<output class="readout"></output><figcaption>{escape(caption)}</figcaption>'
+        f'<figure{kind}><figcaption>{escape(caption)}</figcaption>{drawing}<output class="readout"></output>'
         f"{below}</figure>"
     )
 

@@ -141,7 +141,9 @@ def test_every_figure_is_drawn_titled_captioned_and_in_numbers(tags):
         shapes = [e for kind in ("rect", "circle", "path", "line", "polyline") for e in tags.all(kind, drawing)]
         assert len(shapes) >= 5, drawing["attrs"]["id"]
         assert drawing["attrs"]["role"] == "img"
-        assert tags.all("figcaption", figure)[0]["text"].strip()
+        first = next(e for e in tags.found if e["inside"] and e["inside"][-1] is figure)
+        assert first["tag"] == "figcaption"
+        assert first["text"].strip()
         title = next(t for t in tags.all("title", drawing) if t["attrs"].get("id"))
         assert drawing["attrs"]["aria-labelledby"] == title["attrs"]["id"]
         assert title["text"]
@@ -415,6 +417,24 @@ def test_an_onnx_network_has_its_page(spikeloom, place):
     code, out, err = spikeloom(*words, "--json")
     assert (code, err) == (0, "")
     assert json.loads(out)["taxels"]["graph"] is None
+
+
+@pytest.mark.recordings
+def test_the_released_network_has_its_page(spikeloom, released_checkpoint, objects_zip, tmp_path):
+    model = ("--graph", "manual")
+    assert spikeloom("compile", released_checkpoint, *model, "-o", tmp_path / "x.loom")[0] == 0
+    words = ("report", tmp_path / "x.loom", "--checkpoint", released_checkpoint, *model, "--data", objects_zip)
+    code, out, err = spikeloom(*words, "--limit", "4", "--recording", "3", "-o", tmp_path / "x.html", "--json")
+    assert (code, err) == (0, "")
+    text = (tmp_path / "x.html").read_text("utf-8")
+    assert len(text.encode()) < MOST_BYTES
+    page, found = Tags(text), json.loads(out)
+    assert {svg["attrs"]["id"] for svg in page.all("svg")} == FIGURES
+    assert sum(layer["chip_spikes"] for layer in found["recording"]["layers"]) > 1000
+    drawing = next(svg for svg in page.all("svg") if svg["attrs"]["id"] == "taxels")
+    assert len(page.all("circle", drawing)) == 2 * 39
+    lines = [line for line in page.all("line", drawing) if line["attrs"]["class"] == "edge"]
+    assert len(lines) == 2 * 146 / 2  # two panels; each edge is there both ways
 
 
 # -- what is refused ---------------------------------------------------------------------------------------------------
