@@ -1,4 +1,6 @@
-"""Training by the released protocol: one recording at a time, Adam, the squared error of the spike rates.
+"""Training, by default by the released protocol: one recording at a time, Adam, the squared error of the spike rates.
+
+:mod:`models.recipes` has another way, as data.
 
 The released script reads recordings in the order that the folder lists them, unshuffled, which differs from machine
 to machine. Here each epoch shuffles them anew, from the seed.
@@ -31,6 +33,7 @@ from compiler.errors import DataError, OptionError
 from compiler.frontends.checkpoint import arrays_digest
 from models.evtouch import Recordings
 from models.networks import Architecture, SpikingNet, Weights
+from models.recipes import ADAMW, COSINE, CROSS_ENTROPY, RELEASED, Recipe
 from models.resume import TrainingState, pack, read_state, unpack, write_state
 
 DECAY_EPOCHS = 40
@@ -52,7 +55,8 @@ class Epoch:
     learning_rate : float
         While it ran.
     training_loss, test_loss : float
-        Mean squared error of the spike rates against zeros and a one, mean over the recordings.
+        The recipe's loss, by default the mean squared error of the spike rates against zeros and a one; mean over the
+        recordings.
     correct, tested : int
         Test recordings classified correctly after it, and all of them.
     """
@@ -105,7 +109,7 @@ def train(
     *,
     epochs: int = 100,
     seed: int = 0,
-    learning_rate: float = 1e-3,
+    recipe: Recipe = RELEASED,
     device: str = "cpu",
     keep_epoch: int | None = None,
     state: Path | None = None,
@@ -128,8 +132,8 @@ def train(
         Passes over the training recordings.
     seed : int
         Of the initial weights and of the order of recordings.
-    learning_rate : float
-        At the start.
+    recipe : Recipe
+        Batch, loss, surrogate, optimizer and schedule; its sizes and dynamics are already in the architecture.
     device : {"cpu", "cuda"}
         Where the network runs.
     keep_epoch : int, optional
@@ -160,7 +164,7 @@ def train(
         "test data": arrays_digest(test.identity()),
         "epochs": epochs,
         "seed": seed,
-        "learning rate": learning_rate,
+        "recipe": recipe.to_json(),
         "device": device,
         "kept epoch": keep_epoch,
     }
@@ -168,22 +172,22 @@ def train(
     history: list[Epoch] = []
     weights: dict[str, Weights] = {}
     with one_thread():
-        network = SpikingNet(architecture, propagation, seed=seed).to(device)
-        optimizer = torch.optim.Adam(network.parameters(), lr=learning_rate, amsgrad=True, fused=device == "cpu")
+        network = SpikingNet(architecture, propagation, seed=seed, surrogate=recipe.surrogate).to(device)
+        optimizer = _optimizer(recipe, network, device)
         if resume and state is not None and state.exists():
             found = read_state(state, options)
             history, weights = _restore(found, network, optimizer, order)
         bar = tqdm(total=epochs, initial=len(history), desc=label, unit="epoch", position=position, disable=None)
         with bar as progress:
             for index in range(len(history), epochs):
+                if recipe.schedule == COSINE:
+                    _set_rate(optimizer, recipe.learning_rate * 0.5 * (1 + math.cos(math.pi * index / epochs)))
                 rate = float(optimizer.param_groups[0]["lr"])
-                training_loss = _train_epoch(
-                    network, optimizer, training, order.permutation(len(training)), epoch=index + 1
-                )
-                if index % DECAY_EPOCHS == 0 and index > 1:
-                    for group in optimizer.param_groups:
-                        group["lr"] *= 0.1
-                test_loss, correct = evaluate(network, test)
+                shuffled = order.permutation(len(training))
+                training_loss = _train_epoch(network, optimizer, training, shuffled, recipe, epoch=index + 1)
+                if recipe.schedule != COSINE and index % DECAY_EPOCHS == 0 and index > 1:
+                    _set_rate(optimizer, rate * 0.1)
+                test_loss, correct = evaluate(network, test, recipe)
                 if correct > max((epoch.correct for epoch in history), default=-1):
                     weights["best"] = network.export_weights()
                 if index + 1 == keep_epoch:
@@ -226,6 +230,20 @@ def _check_options(epochs: int, seed: int, device: str) -> None:
         raise OptionError("--device cuda: this machine has no usable GPU; leave --device away")
 
 
+def _optimizer(recipe: Recipe, network: SpikingNet, device: str) -> torch.optim.Optimizer:
+    rate, fused = recipe.learning_rate, device == "cpu"
+    if recipe.optimizer == ADAMW:
+        return torch.optim.AdamW(
+            network.parameters(), lr=rate, weight_decay=recipe.weight_decay, amsgrad=True, fused=fused
+        )
+    return torch.optim.Adam(network.parameters(), lr=rate, amsgrad=True, fused=fused)
+
+
+def _set_rate(optimizer: torch.optim.Optimizer, rate: float) -> None:
+    for group in optimizer.param_groups:
+        group["lr"] = rate
+
+
 def _require_finite(loss: float, epoch: int, step: int) -> None:
     if not math.isfinite(loss):
         raise DataError(
@@ -266,14 +284,14 @@ def _state(
     return TrainingState(options=options, progress=progress, arrays=arrays)
 
 
-def evaluate(network: SpikingNet, recordings: Recordings) -> tuple[float, int]:
+def evaluate(network: SpikingNet, recordings: Recordings, recipe: Recipe = RELEASED) -> tuple[float, int]:
     """Mean loss, and how many recordings are classified correctly; equal top rates count for the lowest class."""
     loss, correct = 0.0, 0
     with torch.no_grad():
         for chosen, events in _batches(recordings):
             labels = recordings.labels[chosen]
             rates = _rates(network, events)
-            loss += float(rate_loss(rates, labels)) * len(labels)
+            loss += float(_loss(recipe, rates, labels)) * len(labels)
             correct += int(np.sum(rates.numpy().argmax(axis=1) == labels))
     return loss / len(recordings), correct
 
@@ -303,21 +321,31 @@ def _train_epoch(
     optimizer: torch.optim.Optimizer,
     recordings: Recordings,
     order: NDArray[np.int64],
+    recipe: Recipe,
     *,
     epoch: int,
 ) -> float:
     total = 0.0
-    for step, index in enumerate(order, 1):
-        chosen = slice(index, index + 1)
+    for step, start in enumerate(range(0, len(order), recipe.batch), 1):
+        chosen = order[start : start + recipe.batch]
         optimizer.zero_grad()
-        events = recordings.events[chosen, ..., : recordings.steps_of(int(index))]
-        loss = rate_loss(_rates(network, events), recordings.labels[chosen])
+        lengths = np.array([recordings.steps_of(int(index)) for index in chosen])
+        events = recordings.events[chosen][..., : lengths.max()]
+        filled = lengths if lengths.min() < lengths.max() else None
+        loss = _loss(recipe, _rates(network, events, filled), recordings.labels[chosen])
         found = float(loss.detach())
         _require_finite(found, epoch, step)
         loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
-        total += found
+        total += found * len(chosen)
     return total / len(order)
+
+
+def _loss(recipe: Recipe, rates: Tensor, labels: NDArray[np.int64]) -> Tensor:
+    if recipe.loss == CROSS_ENTROPY:
+        wanted = torch.tensor(labels)
+        return torch.nn.functional.cross_entropy(recipe.gain * rates, wanted, label_smoothing=recipe.smoothing)
+    return rate_loss(rates, labels)
 
 
 def rate_loss(rates: Tensor, labels: NDArray[np.int64]) -> Tensor:
@@ -327,9 +355,11 @@ def rate_loss(rates: Tensor, labels: NDArray[np.int64]) -> Tensor:
     return torch.nn.functional.mse_loss(rates, target)
 
 
-def _rates(network: SpikingNet, events: NDArray[np.uint8]) -> Tensor:
-    """Spike rates on the CPU, computed where the network is."""
-    rates: Tensor = network(_time_first(events).to(network.adjacency.device)).cpu()
+def _rates(network: SpikingNet, events: NDArray[np.uint8], lengths: NDArray[np.int64] | None = None) -> Tensor:
+    """Spike rates on the CPU, computed where the network is; `lengths` where some recordings were filled up."""
+    device = network.adjacency.device
+    inside = None if lengths is None else torch.tensor(lengths, device=device)
+    rates: Tensor = network(_time_first(events).to(device), inside).cpu()
     return rates
 
 

@@ -11,6 +11,7 @@ from compiler.passes.layout import GOALS
 from compiler.passes.quantize import RANGES
 from compiler.pipeline import STAGES
 from models.graphs import CHOICES
+from models.recipes import RECIPES, RELEASED
 from models.systems import PADDINGS
 from runtime.data_commands import add_bin_option
 
@@ -63,7 +64,23 @@ def add_training(parser: argparse.ArgumentParser) -> None:
         help="of a grid-cnn's window: none, moving by 2 (default), or same, which no Loihi core holds",
     )
     add_graph_options(parser, "to train on")
-    parser.add_argument("--epochs", type=int, default=100, metavar="N", help="default: 100, as released")
+    defaults = ", ".join(f"{recipe.epochs} ({name})" for name, recipe in RECIPES.items())
+    parser.add_argument(
+        "--recipe",
+        choices=tuple(RECIPES),
+        default=RELEASED.name,
+        help="how: as the released code does, or with lasting currents and clocks (default: released)",
+    )
+    parser.add_argument(
+        "--current-decay", metavar="LAYER=X[,…]", help="share of the synaptic current that a step keeps: fc1=0.95"
+    )
+    parser.add_argument(
+        "--membrane-decay", metavar="LAYER=X[,…]", help="share of the membrane, where it is not 0.2: fc1=0.5"
+    )
+    parser.add_argument("--clocks", type=int, metavar="K", help="inputs that tell which K-th of the recording it is")
+    parser.add_argument("--features", type=int, metavar="N", help="of the first layer, per place")
+    parser.add_argument("--batch", type=int, metavar="N", help="recordings to a step of the optimizer")
+    parser.add_argument("--epochs", type=int, metavar="N", help=f"default: {defaults}")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of weights and order (default: 0)")
     parser.add_argument("--seeds", type=int, default=1, metavar="N", help="train N seeds side by side (default: 1)")
     parser.add_argument("--resume", action="store_true", help="go on with an interrupted training of the same options")

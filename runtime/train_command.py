@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,10 @@ from compiler.frontends.checkpoint import WEIGHTS
 from compiler.frontends.systems import GRAPH_SYSTEMS, GRID_CNN, TACTILESGNET, TITLES, Grid
 from models.graphs import CHOICES, Graph
 from models.grasps import SYNTHETIC
+from models.recipes import RECIPES, RELEASED, Recipe, check_recipe, decays_asked
 from models.systems import PADDINGS, sensor_grid, taxels_alone
 from runtime.inputs import asked_graph, asked_places, graph_words, progress, recordings, require_place, version
-from runtime.training import PICTURES, Job, check_seeds, draw_training, output_of, summary, training_text
+from runtime.training import LAYERS, PICTURES, Job, check_seeds, draw_training, output_of, summary, training_text
 
 Json = dict[str, Any]
 
@@ -30,6 +32,8 @@ def train(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], i
         if Path(arguments.picture).suffix not in PICTURES:
             raise OptionError(f"--picture {arguments.picture}: allowed are {', '.join(PICTURES)}; name one of these")
     system = arguments.system or TACTILESGNET
+    recipe = _recipe(arguments)
+    epochs = recipe.epochs if arguments.epochs is None else arguments.epochs
     graph, grid = _sensor(arguments, system)
     progress("reading the recordings")
     shared: dict[str, Any] = {"taxels": graph.n_taxels, "bin_s": arguments.bin, "labels_for": "training"}
@@ -38,14 +42,14 @@ def train(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], i
     progress("")
     data = arguments.data if arguments.data == SYNTHETIC else training.source
     words = [f"spikeloom train --data {data}", _system_words(arguments, system), graph_words(arguments)]
-    command = " ".join(filter(None, [*words, f"--epochs {arguments.epochs}"]))
+    command = " ".join(filter(None, [*words, _recipe_words(arguments), f"--epochs {epochs}"]))
     keep = tuple(dict.fromkeys(arguments.keep or WEIGHTS))
     jobs = [
         Job(
             training=training,
             test=test,
             graph=graph,
-            epochs=arguments.epochs,
+            epochs=epochs,
             seed=seed,
             device=arguments.device,
             resume=arguments.resume,
@@ -57,6 +61,7 @@ def train(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], i
             position=position,
             system=system,
             grid=grid,
+            recipe=recipe,
         )
         for position, seed in enumerate(range(arguments.seed, arguments.seed + arguments.seeds))
     ]
@@ -66,6 +71,31 @@ def train(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], i
         decided = [predicted for _, predicted in results if predicted is not None]
         draw_training(arguments.picture, records, test.labels, decided)
     return {"runs": records, "protocols": summary(records)}, training_text, 0
+
+
+OVERRIDES = ("current_decay", "membrane_decay", "clocks", "features", "batch")
+"""Options that change single values of a recipe."""
+
+
+def _recipe(arguments: argparse.Namespace) -> Recipe:
+    """The recipe that was named, with the values that were given beside it."""
+    recipe = RECIPES[arguments.recipe]
+    whole = {name: getattr(arguments, name) for name in ("clocks", "features", "batch")}
+    recipe = replace(recipe, **{name: value for name, value in whole.items() if value is not None})
+    if arguments.current_decay is not None:
+        recipe = replace(recipe, alphas=decays_asked(arguments.current_decay, "--current-decay", LAYERS))
+    if arguments.membrane_decay is not None:
+        recipe = replace(recipe, betas=decays_asked(arguments.membrane_decay, "--membrane-decay", LAYERS))
+    check_recipe(recipe)
+    return recipe
+
+
+def _recipe_words(arguments: argparse.Namespace) -> str:
+    """Options that name the recipe, as they would be typed; none for the released one."""
+    words = [] if arguments.recipe == RELEASED.name else [f"--recipe {arguments.recipe}"]
+    given = {name: getattr(arguments, name) for name in OVERRIDES}
+    words += [f"--{name.replace('_', '-')} {value}" for name, value in given.items() if value is not None]
+    return " ".join(words)
 
 
 def _sensor(arguments: argparse.Namespace, system: str) -> tuple[Graph, Grid | None]:

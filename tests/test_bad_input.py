@@ -244,7 +244,7 @@ def test_newer_checkpoint(refusal, tmp_path):
     path = tmp_path / "net.pt"
     with zipfile.ZipFile(path, "w") as made:
         made.writestr("manifest.json", json.dumps({"format": "spikeloom-checkpoint", "version": 4}))
-    assert refusal("inspect", path) == f"{path}: has format version 4, this program reads up to 3; update spikeloom"
+    assert refusal("inspect", path) == f"{path}: has format version 5, this program reads up to 4; update spikeloom"
 
 
 def test_checkpoint_zip_bomb(refusal, tmp_path):

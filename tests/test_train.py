@@ -15,6 +15,7 @@ from models.graphs import build_graph, normalised_adjacency
 from models.grasps import synthetic_grasps
 from models.networks import Architecture, SpikingNet
 from models.protocols import state_files, train_both, validation_split
+from models.recipes import Recipe
 from models.train import Epoch, evaluate, train
 
 GRAPH = build_graph("manual")
@@ -96,7 +97,7 @@ def test_best_weights_are_those_of_the_first_epoch_with_the_most_right(monkeypat
     right = iter([2, 5, 5, 3])
     kept = []
 
-    def fake(network: SpikingNet, recordings: Recordings) -> tuple[float, int]:
+    def fake(network: SpikingNet, recordings: Recordings, recipe: Recipe) -> tuple[float, int]:
         kept.append(network.export_weights())
         return 0.5, next(right)
 
