@@ -52,6 +52,7 @@ def netlist_json(netlist: Netlist, uses: Sequence[LimitUse], sha256: str) -> Jso
                 "theta_realised": _one_or_many(netlist.threshold[ids] / netlist.scale[ids]),
                 "beta": layer.beta,
                 "beta_realised": _one_or_many((4096 - netlist.decay_v[ids]) / 4096),
+                **_lasting(netlist, index),
                 "depth": layer.depth,
                 "synapses_stored": int(np.count_nonzero(into)),
                 "cores": sorted({int(c) for c in core[ids]}),
@@ -60,6 +61,7 @@ def netlist_json(netlist: Netlist, uses: Sequence[LimitUse], sha256: str) -> Jso
     return {
         "target": netlist.target,
         "taxels": netlist.taxels,
+        **({"clocks": asdict(netlist.clocks)} if netlist.clocks.channels else {}),
         "classes": netlist.classes,
         "neurons": sum(layer.neurons for layer in netlist.layers),
         "compartments": netlist.n_compartments,
@@ -74,6 +76,14 @@ def netlist_json(netlist: Netlist, uses: Sequence[LimitUse], sha256: str) -> Jso
         "provenance": dict(netlist.provenance),
         "sha256": sha256,
     }
+
+
+def _lasting(netlist: Netlist, layer: int) -> Json:
+    """Current decay of a layer, where its current outlasts a step."""
+    realised = (4095 - netlist.decay_u[netlist.compartments_of(layer)]) / 4096
+    if not realised.any():
+        return {}
+    return {"alpha": netlist.layers[layer].alpha, "alpha_realised": _one_or_many(realised)}
 
 
 def _one_or_many(values: IntArray | FloatArray) -> Any:
@@ -108,6 +118,7 @@ def _expected(layout: Layout) -> Json:
 
 def netlist_text(report: Json) -> str:
     """Layers, cores and the fullest core of every limit."""
+    lasts = any("alpha" in layer for layer in report["layers"])
     layers = [
         [
             layer["name"],
@@ -121,6 +132,7 @@ def netlist_text(report: Json) -> str:
             _text(layer["threshold"]),
             _text(layer["theta_realised"]),
             _text(layer["beta_realised"]),
+            *([_text(layer.get("alpha_realised", 0))] if lasts else []),
             _text(layer["cores"], brief=False),
         ]
         for layer in report["layers"]
@@ -137,6 +149,7 @@ def netlist_text(report: Json) -> str:
         "threshold",
         "θ",
         "β",
+        *(["α"] if lasts else []),
         "cores",
     ]
     fullest: dict[str, Json] = {}
@@ -160,11 +173,20 @@ def netlist_text(report: Json) -> str:
             f"{report['target']}: {report['neurons']:,} neurons{left}, {report['synapses']:,} synapses "
             f"({report['synapses_stored']:,} stored, {report['synapses_nonzero']:,} non-zero), {report['cores']} cores "
             f"on {where}",
+            *_clock_lines(report),
             table(head, layers),
             "",
             table(["limit", "used", "allowed", "fill", "fullest core"], limits),
         ]
     )
+
+
+def _clock_lines(report: Json) -> list[str]:
+    """What the clocks of a network are; none for most."""
+    if "clocks" not in report:
+        return []
+    channels, steps = report["clocks"]["channels"], report["clocks"]["steps"]
+    return [f"  {channels} clocks of {steps} steps each, {channels * steps} in all, beside the sensor"]
 
 
 def _width(layer: Json) -> str:
@@ -299,11 +321,12 @@ def checkpoint_json(checkpoint: Checkpoint, given: tuple[str, ...]) -> Json:
         "classes": checkpoint.classes,
         **({"hops": int(checkpoint.hops.shape[0] - 1)} if checkpoint.system == TACTILESGNET else {}),
         "layers": [
-            {"name": "conv1", "neurons": checkpoint.places * int(checkpoint.hops.shape[1])},
+            {"name": "conv1", "neurons": int(checkpoint.dense[0].weight.shape[1])},
             *({"name": dense.name, "neurons": len(dense.bias)} for dense in checkpoint.dense),
         ],
         "beta": checkpoint.beta,
         "theta": checkpoint.theta,
+        **({} if checkpoint.dynamics.is_plain else {"dynamics": checkpoint.dynamics.to_json()}),
         "given": list(given),
         "assumed": list(checkpoint.assumed),
         "graph": checkpoint.graph,
@@ -327,6 +350,14 @@ def checkpoint_text(report: Json) -> str:
         if name in report["assumed"]:
             source = f"assumed; override with --{name}"
         lines.append(f"  {name}: {report[name]:g} ({source})")
+    if "dynamics" in report:
+        for key, word in (("betas", "membrane"), ("alphas", "current")):
+            if report["dynamics"][key]:
+                shown = ", ".join(
+                    f"{layer['name']} {d:g}" for layer, d in zip(report["layers"], report["dynamics"][key], strict=True)
+                )
+                lines.append(f"  {word} decay by layer: {shown}")
+        lines += _clock_lines(report["dynamics"] if report["dynamics"]["clocks"]["channels"] else {})
     for key, value in (report["training"] or {}).items():
         text = str(value)
         lines.append(f"  {key}: {text if len(text) <= 100 else text[:97] + '…'}")
