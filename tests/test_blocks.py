@@ -22,7 +22,14 @@ KEPT = {"spikes": True, "membranes": True, "updated": True}
 
 
 def pipeline(
-    seed: int, *, inputs: int, sizes: tuple[tuple[int, ...], ...], density: float, largest: int = 6, biases: float = 0.7, lasting: float = 0.0
+    seed: int,
+    *,
+    inputs: int,
+    sizes: tuple[tuple[int, ...], ...],
+    density: float,
+    largest: int = 6,
+    biases: float = 0.7,
+    lasting: float = 0.0,
 ) -> Netlist:
     """Layers of `sizes`, some at each depth, on random cores; each neuron hears the depth before."""
     rng = np.random.default_rng(seed)

@@ -10,12 +10,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
+from timed_networks import GRAPH, SMALL, TIMING, louder, written
 
 from compiler.dynamics import NO_CLOCKS, PLAIN, Clocks, Dynamics, clocks_over, dynamics_faults, with_clocks
 from compiler.errors import ModelError, OptionError
 from compiler.frontends.checkpoint import read_checkpoint
-from models.checkpoint import checkpoint_bytes
-from models.graphs import build_graph, normalised_adjacency
+from models.graphs import normalised_adjacency
 from models.grasps import synthetic_grasps
 from models.layers import LifSteps, lasting_current, lif
 from models.networks import Architecture, SpikingNet
@@ -23,15 +23,11 @@ from models.recipes import RECIPES, RELEASED, TIMED, Recipe, check_recipe, decay
 from models.reference import float_membranes, float_spikes
 from models.release import write_released
 from models.surrogate import FAST_SIGMOID, RECTANGLE, Surrogate
-from models.systems import propagation_of
 from models.train import evaluate, train
 from runtime.cli import main
 
-GRAPH = build_graph("manual")
 ADJACENCY = normalised_adjacency(GRAPH.edges, 39)
 SMOOTH = Surrogate(shape=FAST_SIGMOID, width=0.25, reset=False)
-TIMING = Dynamics(betas=(0.2, 0.3, 0.0, 0.9), alphas=(0.0, 0.95, 0.5, 0.0), clocks=Clocks(channels=3, steps=4))
-SMALL = Architecture(taxels=39, classes=4, hops=2, features=3, hidden=(8, 6), dynamics=TIMING)
 
 
 def surrogate_spike(surrogate):
@@ -189,9 +185,7 @@ def network_step_by_step(network, events, surrogate):
 def test_gradients_of_a_whole_network_equal_plain_autograd(surrogate, dynamics):
     sizes = replace(SMALL, dynamics=dynamics)
     network = SpikingNet(sizes, ADJACENCY, seed=3, surrogate=surrogate).double()
-    with torch.no_grad():
-        for parameter in network.parameters():
-            parameter.mul_(3)
+    louder(network)
     draw = torch.Generator().manual_seed(0)
     events = (torch.rand(14, 2, 39, 2, generator=draw) < 0.2).double()
     above = torch.randn(14, 2, 4, generator=draw, dtype=torch.float64)
@@ -209,9 +203,7 @@ def test_gradients_of_a_whole_network_equal_plain_autograd(surrogate, dynamics):
 
 def test_recordings_that_were_filled_up_count_as_long_as_they_are():
     network = SpikingNet(SMALL, ADJACENCY, seed=1)
-    with torch.no_grad():
-        for parameter in network.parameters():
-            parameter.mul_(3)
+    louder(network)
     events = (torch.rand(12, 2, 39, 2, generator=torch.Generator().manual_seed(2)) < 0.3).float()
     events[7:, 1] = 0
     together = network(events, torch.tensor([12, 7]))
@@ -221,19 +213,6 @@ def test_recordings_that_were_filled_up_count_as_long_as_they_are():
 
 
 # --- files ---------------------------------------------------------------------------------------------------------
-
-
-def written(path, system="tactilesgnet", dynamics=TIMING, seed=1):
-    """A network with random weights and its checkpoint."""
-    sizes = replace(SMALL, system=system, dynamics=dynamics)
-    seen = propagation_of(system, GRAPH.edges, 39, None, 3)
-    network = SpikingNet(sizes, seen, seed=seed)
-    with torch.no_grad():
-        for parameter in network.parameters():
-            parameter.mul_(3)
-    constants = {"beta": sizes.beta, "theta": sizes.theta, "training": {}, "system": system}
-    path.write_bytes(checkpoint_bytes({"last": network.export_weights()}, GRAPH, dynamics=dynamics, **constants))
-    return network, seen
 
 
 def manifest_of(path):
@@ -251,7 +230,7 @@ def test_a_checkpoint_holds_the_dynamics_and_its_float_model_is_the_network(tmp_
     manifest = manifest_of(tmp_path / "x.pt")
     assert (manifest["version"], manifest["architecture"]) == (4, system)
     assert manifest["dynamics"] == {
-        "betas": [0.2, 0.3, 0.0, 0.9],
+        "betas": [0.2, 0.3, 0.0, 0.4],
         "alphas": [0.0, 0.95, 0.5, 0.0],
         "clocks": {"channels": 3, "steps": 4},
     }
@@ -297,7 +276,7 @@ def test_another_beta_for_a_network_with_one_a_layer_is_refused(tmp_path):
     written(path)
     with pytest.raises(OptionError) as error:
         read_checkpoint(path, beta=0.5)
-    assert str(error.value) == (f"--beta 0.5: {path} has a decay for each layer, 0.2, 0.3, 0, 0.9; leave --beta away")
+    assert str(error.value) == (f"--beta 0.5: {path} has a decay for each layer, 0.2, 0.3, 0, 0.4; leave --beta away")
 
 
 # --- recipes -------------------------------------------------------------------------------------------------------
