@@ -65,7 +65,10 @@ class Architecture:
 
 
 class TagConvolution(nn.Module):
-    """K-hop graph convolution with filters (K + 1, features, channels)."""
+    """K-hop graph convolution with filters (K + 1, features, channels).
+
+    As all layers here it holds its parameters, and is called with them: the network may scale them first.
+    """
 
     def __init__(self, channels: int, features: int, hops: int, generator: torch.Generator) -> None:
         super().__init__()
@@ -73,9 +76,9 @@ class TagConvolution(nn.Module):
         self.bias = nn.Parameter(torch.zeros(features))
         _uniform(self.hops, channels, generator)
 
-    def forward(self, x: Tensor, adjacency: Tensor, bias: Tensor) -> Tensor:
+    def forward(self, x: Tensor, adjacency: Tensor, hops: Tensor, bias: Tensor) -> Tensor:
         """See :func:`models.layers.tag_convolution`."""
-        return tag_convolution(x, adjacency, self.hops, bias)
+        return tag_convolution(x, adjacency, hops, bias)
 
 
 class PlaceFilters(nn.Module):
@@ -95,9 +98,9 @@ class PlaceFilters(nn.Module):
             _uniform(self.hops, filters * channels, generator)
             _uniform(self.bias, filters * channels, generator)
 
-    def forward(self, x: Tensor, propagation: Tensor, bias: Tensor) -> Tensor:
+    def forward(self, x: Tensor, propagation: Tensor, hops: Tensor, bias: Tensor) -> Tensor:
         """See :func:`models.layers.filter_places`."""
-        return filter_places(x, propagation, self.hops, bias)
+        return filter_places(x, propagation, hops, bias)
 
 
 class TaxelWeights(nn.Module):
@@ -110,9 +113,9 @@ class TaxelWeights(nn.Module):
         _uniform(self.weight, inputs, generator)
         _uniform(self.bias, inputs, generator)
 
-    def forward(self, x: Tensor, _propagation: Tensor, bias: Tensor) -> Tensor:
+    def forward(self, x: Tensor, _propagation: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
         """See :func:`models.layers.spike_linear`."""
-        return spike_linear(x.flatten(2), self.weight, bias)
+        return spike_linear(x.flatten(2), weight, bias)
 
 
 class SpikeLinear(nn.Module):
@@ -125,9 +128,9 @@ class SpikeLinear(nn.Module):
         _uniform(self.weight, inputs, generator)
         _uniform(self.bias, inputs, generator)
 
-    def forward(self, spikes: Tensor, bias: Tensor) -> Tensor:
+    def forward(self, spikes: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
         """See :func:`models.layers.spike_linear`."""
-        return spike_linear(spikes, self.weight, bias)
+        return spike_linear(spikes, weight, bias)
 
 
 class SpikingNet(nn.Module):
@@ -149,6 +152,9 @@ class SpikingNet(nn.Module):
     -----
     Neurons of the first layer lie place by place here; exported weights are in the order of the system. The relays of
     clocks come last.
+
+    Where a layer's current outlasts its step, its parameters are ``W / (1 - alpha)``: a spike then brings as much in
+    all as it would without, at the start and by each step of the optimizer. Exported weights are ``W``.
     """
 
     def __init__(
@@ -161,6 +167,7 @@ class SpikingNet(nn.Module):
     ) -> None:
         super().__init__()
         self.architecture, self.surrogate = architecture, surrogate
+        self.gains = tuple(1 - alpha for alpha in architecture.dynamics.alphas)
         self.places = propagation.shape[-2]
         generator = torch.Generator().manual_seed(seed)
         self.conv1 = _first_layer(architecture, generator)
@@ -193,12 +200,17 @@ class SpikingNet(nn.Module):
         """Spikes and membranes of one layer; its bias goes past a current that outlasts its step."""
         dynamics = self.architecture.dynamics
         alpha, bias = dynamics.alpha(index), layer.get_parameter("bias")
+        (weight,) = (values for name, values in layer.named_parameters() if name != "bias")
         if alpha:
-            current = lasting_current(layer(*inputs, torch.zeros_like(bias)), alpha)
+            current = lasting_current(layer(*inputs, self._scaled(index, weight), torch.zeros_like(bias)), alpha)
             current = current + bias.repeat(current.shape[-1] // len(bias))
         else:
-            current = layer(*inputs, bias)
+            current = layer(*inputs, weight, bias)
         return lif(current, dynamics.beta(index, self.architecture.beta), self.architecture.theta, self.surrogate)
+
+    def _scaled(self, index: int, weight: Tensor) -> Tensor:
+        """Weight of a layer from its parameter."""
+        return weight * self.gains[index] if self.gains and self.gains[index] != 1 else weight
 
     def forward(self, events: Tensor, lengths: Tensor | None = None) -> Tensor:
         """Spikes per step of each output neuron, (samples, classes), for (steps, samples, taxels, channels).
@@ -216,8 +228,11 @@ class SpikingNet(nn.Module):
 
     def export_weights(self) -> Weights:
         """Copy of the weights."""
-        state = {name: parameter.detach().cpu().numpy() for name, parameter in self.named_parameters()}
-        found = {name: (array.T if _turned(name) else array) for name, array in state.items()}
+        state = {name: p.detach() for name, p in self.named_parameters()}
+        for index, layer in enumerate(("conv1", *self.dense)):
+            state |= {n: self._scaled(index, p) for n, p in state.items() if n.startswith(layer) and "bias" not in n}
+        arrays = {name: p.cpu().numpy() for name, p in state.items()}
+        found = {name: (array.T if _turned(name) else array) for name, array in arrays.items()}
         if self.architecture.system == MLP:
             weight = found.pop("conv1.weight")
             found = {"conv1.hops": weight.reshape(len(weight), self.architecture.taxels, -1).swapaxes(0, 1)} | found
@@ -226,7 +241,8 @@ class SpikingNet(nn.Module):
         return {name: array.copy(order="C") for name, array in found.items()}
 
     def load_weights(self, weights: Mapping[str, NDArray[np.float32]]) -> None:
-        """Take over what `export_weights` returned."""
+        """Take over what `export_weights` returned, as it is: the parameters are the weights from now on."""
+        self.gains = ()
         given = dict(weights)
         if self.architecture.system == MLP:
             hops = given.pop("conv1.hops")

@@ -180,12 +180,13 @@ def train(
         bar = tqdm(total=epochs, initial=len(history), desc=label, unit="epoch", position=position, disable=None)
         with bar as progress:
             for index in range(len(history), epochs):
-                if recipe.schedule == COSINE:
-                    _set_rate(optimizer, recipe.learning_rate * 0.5 * (1 + math.cos(math.pi * index / epochs)))
+                course = _course(recipe, index, epochs)
+                if course is not None:
+                    _set_rate(optimizer, course(0.0))
                 rate = float(optimizer.param_groups[0]["lr"])
                 shuffled = order.permutation(len(training))
-                training_loss = _train_epoch(network, optimizer, training, shuffled, recipe, epoch=index + 1)
-                if recipe.schedule != COSINE and index % DECAY_EPOCHS == 0 and index > 1:
+                training_loss = _train_epoch(network, optimizer, training, shuffled, recipe, course, epoch=index + 1)
+                if course is None and index % DECAY_EPOCHS == 0 and index > 1:
                     _set_rate(optimizer, rate * 0.1)
                 test_loss, correct = evaluate(network, test, recipe)
                 if correct > max((epoch.correct for epoch in history), default=-1):
@@ -237,6 +238,13 @@ def _optimizer(recipe: Recipe, network: SpikingNet, device: str) -> torch.optim.
             network.parameters(), lr=rate, weight_decay=recipe.weight_decay, amsgrad=True, fused=fused
         )
     return torch.optim.Adam(network.parameters(), lr=rate, amsgrad=True, fused=fused)
+
+
+def _course(recipe: Recipe, epoch: int, epochs: int) -> Callable[[float], float] | None:
+    """Learning rate within an epoch by the share of it that is done, counted from 0; None where it is constant."""
+    if recipe.schedule != COSINE:
+        return None
+    return lambda share: recipe.learning_rate * 0.5 * (1 + math.cos(math.pi * (epoch + share) / epochs))
 
 
 def _set_rate(optimizer: torch.optim.Optimizer, rate: float) -> None:
@@ -322,12 +330,15 @@ def _train_epoch(
     recordings: Recordings,
     order: NDArray[np.int64],
     recipe: Recipe,
+    course: Callable[[float], float] | None,
     *,
     epoch: int,
 ) -> float:
     total = 0.0
     for step, start in enumerate(range(0, len(order), recipe.batch), 1):
         chosen = order[start : start + recipe.batch]
+        if course is not None:
+            _set_rate(optimizer, course(start / len(order)))
         optimizer.zero_grad()
         lengths = np.array([recordings.steps_of(int(index)) for index in chosen])
         events = recordings.events[chosen][..., : lengths.max()]

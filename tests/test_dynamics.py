@@ -10,7 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
-from timed_networks import GRAPH, SMALL, TIMING, louder, written
+from timed_networks import GRAPH, SMALL, TIMING, events_of, louder, written
 
 from compiler.dynamics import NO_CLOCKS, PLAIN, Clocks, Dynamics, clocks_over, dynamics_faults, with_clocks
 from compiler.errors import ModelError, OptionError
@@ -162,6 +162,8 @@ def network_step_by_step(network, events, surrogate):
     sizes = network.architecture
     dynamics = sizes.dynamics
     weights = dict(network.named_parameters())
+    for alpha, name in zip(dynamics.alphas, ("conv1.hops", "fc1.weight", "fc2.weight", "fc3.weight"), strict=False):
+        weights[name] = weights[name] * (1 - alpha)
     steps = len(events)
     powers = [torch.linalg.matrix_power(network.adjacency.double(), k) for k in range(sizes.hops + 1)]
     seen = torch.stack([torch.einsum("ij,tnjc->tnic", power, events) for power in powers])
@@ -248,8 +250,19 @@ def test_weights_survive_a_round_trip(tmp_path):
     network, seen = written(tmp_path / "x.pt")
     other = SpikingNet(SMALL, seen, seed=9)
     other.load_weights(network.export_weights())
-    for ours, theirs in zip(network.parameters(), other.parameters(), strict=True):
+    for name, array in network.export_weights().items():
+        assert_array_equal(other.export_weights()[name], array, err_msg=name)
+    events = torch.from_numpy(events_of(1).transpose(3, 0, 1, 2).astype(np.float32))
+    for (ours, _), (theirs, _) in zip(network.layers(events).values(), other.layers(events).values(), strict=True):
         assert torch.equal(ours, theirs)
+
+
+def test_a_lasting_current_starts_as_loud_as_none():
+    """What a spike brings in all, W / (1 - alpha), is drawn alike, and so an optimizer's step moves it."""
+    loud = SpikingNet(SMALL, ADJACENCY, seed=4).export_weights()
+    plain = SpikingNet(replace(SMALL, dynamics=replace(TIMING, alphas=())), ADJACENCY, seed=4).export_weights()
+    for name, alpha in zip(("conv1.hops", "fc1.weight", "fc2.weight", "fc3.weight"), TIMING.alphas, strict=True):
+        assert_allclose(loud[name], plain[name] * (1 - alpha), rtol=1e-6)
 
 
 def test_a_network_without_dynamics_is_written_as_before(tmp_path):

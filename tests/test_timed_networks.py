@@ -121,7 +121,7 @@ def test_the_largest_current_stays_and_one_unit_more_overflows():
 
 @pytest.mark.parametrize("system", ["tactilesgnet", "gcn", "mlp"])
 def test_the_expanded_network_spikes_as_the_checkpoint(tmp_path, system):
-    checkpoint, seen, network = float_network(tmp_path, system)
+    checkpoint, seen, network = float_network(tmp_path, system, hidden=(32, 24))
     assert network.input == Input(taxels=39, polarities=2, clocks=TIMING.clocks)
     assert [p.alpha for p in network.populations] == list(TIMING.alphas)
     assert [p.beta for p in network.populations] == list(TIMING.betas)
