@@ -12,6 +12,7 @@ from typing import Any
 
 from compiler.dynamics import MOST_CLOCKS, Dynamics, clocks_over
 from compiler.errors import OptionError
+from compiler.forms import DECAY_ONE, decay_registers
 from models.surrogate import FAST_SIGMOID, RECTANGLE, Surrogate
 from models.systems import HOPS
 
@@ -52,7 +53,8 @@ class Recipe:
     features, hops : int
         Outputs of the first layer per place; K of a graph convolution.
     betas, alphas : pairs of layer and decay
-        Membrane decays that differ from the common one; current decays that are not zero.
+        Membrane decays of single layers, all others have the common one; current decays that are not zero. With the
+        first, every layer's is rounded to what the chip holds.
     clocks : int
         Clock channels, see :mod:`compiler.dynamics`.
     """
@@ -79,11 +81,14 @@ class Recipe:
         return asdict(self) | {"betas": dict(self.betas), "alphas": dict(self.alphas)}
 
     def dynamics(self, layers: Iterable[str], beta: float, steps: int) -> Dynamics:
-        """Dynamics of a network with these layers, a common membrane decay and recordings of so many steps."""
+        """Dynamics of a network with these layers, a common membrane decay and recordings of so many steps.
+
+        Decays are the nearest that the chip's registers hold: what is trained with them need not be rounded.
+        """
         betas, alphas = dict(self.betas), dict(self.alphas)
         return Dynamics(
-            betas=tuple(betas.get(name, beta) for name in layers) if betas else (),
-            alphas=tuple(alphas.get(name, 0.0) for name in layers) if alphas else (),
+            betas=tuple(held_decays(betas.get(name, beta), 0.0)[0] for name in layers) if betas else (),
+            alphas=tuple(held_decays(beta, alphas.get(name, 0.0))[1] for name in layers) if alphas else (),
             clocks=clocks_over(self.clocks, steps),
         )
 
@@ -102,12 +107,25 @@ TIMED = Recipe(
     weight_decay=0.01,
     schedule=COSINE,
     features=32,
+    betas=(("conv1", 0.2), ("fc1", 0.2), ("fc2", 0.2), ("fc3", 0.2)),
     alphas=(("fc1", 0.95), ("fc2", 0.95), ("fc3", 0.95)),
     clocks=8,
 )
 """For recordings that differ in when their events come: currents that last 20 steps, and clocks."""
 
 RECIPES = {recipe.name: recipe for recipe in (RELEASED, TIMED)}
+
+
+def held_decays(beta: float, alpha: float) -> tuple[float, float]:
+    """Decays of membrane and current that the chip's registers hold instead of these.
+
+    Examples
+    --------
+    >>> held_decays(0.5, 0.95) == (0.5, 3891 / 4096)
+    True
+    """
+    lost_u, lost_v = decay_registers(beta, alpha)
+    return (DECAY_ONE - lost_v) / DECAY_ONE, (DECAY_ONE - 1 - lost_u) / DECAY_ONE
 
 
 def decays_asked(words: str, option: str, layers: tuple[str, ...]) -> Decays:

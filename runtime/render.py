@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from compiler.fixedpoint import FloatArray, IntArray
+from compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, FloatArray, IntArray
 from compiler.frontends.checkpoint import Checkpoint
 from compiler.frontends.systems import GRAPH_SYSTEMS, TACTILESGNET
 from compiler.netlist import Netlist
@@ -181,6 +181,21 @@ def netlist_text(report: Json) -> str:
     )
 
 
+def _unproven(proofs: list[Json]) -> list[str]:
+    """Layers with a register that some input may bring out of its range, and what happens then."""
+    loose = [proof for proof in proofs if not proof["holds"]]
+
+    def may(proof: Json, register: str, most: int) -> bool:
+        return proof[register] is None or proof[register] > most
+
+    stops = [p["layer"] for p in loose if may(p, "accumulator", ACCUMULATOR_MAX) or may(p, "current", CURRENT_MAX)]
+    clips = [proof["layer"] for proof in loose if proof["layer"] not in stops]
+    lines = [f"no proof of range for {', '.join(stops)}: the simulator stops at the first overflow"] if stops else []
+    if clips:
+        lines.append(f"no register of {', '.join(clips)} overflows for any input, but some may saturate a membrane")
+    return lines
+
+
 def _clock_lines(report: Json) -> list[str]:
     """What the clocks of a network are; none for most."""
     if "clocks" not in report:
@@ -237,8 +252,7 @@ def compilation_text(report: Json) -> str:
             f"{100 * worst['accumulator'] / (2**21 - 1):.1f} % of 21 bits)"
         )
     else:
-        loose = ", ".join(proof["layer"] for proof in report["proofs"] if not proof["holds"])
-        lines.append(f"no proof of range for {loose}: the simulator stops at the first overflow")
+        lines += _unproven(report["proofs"])
     placement = report["placement"]
     optimal = "optimal" if placement["spike_hops"] <= placement["bound"] else f"bound {placement['bound']:.1f}"
     lines.append(

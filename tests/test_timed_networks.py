@@ -119,7 +119,7 @@ def test_the_largest_current_stays_and_one_unit_more_overflows():
 # --- the float stage -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("system", ["tactilesgnet", "gcn", "mlp"])
+@pytest.mark.parametrize("system", ["tactilesgnet", "gcn", "mlp", "grid-cnn"])
 def test_the_expanded_network_spikes_as_the_checkpoint(tmp_path, system):
     checkpoint, seen, network = float_network(tmp_path, system, hidden=(32, 24))
     assert network.input == Input(taxels=39, polarities=2, clocks=TIMING.clocks)
@@ -468,15 +468,28 @@ def test_every_command_takes_a_timed_network(data, capsys):
     assert inspected["layers"][0] == {"name": "conv1", "neurons": 39 * 8 + 4}
     netlist = as_json(capsys, f"inspect {data}/x.loom")
     assert netlist["clocks"] == {"channels": 4, "steps": 4}
-    assert [layer.get("alpha") for layer in netlist["layers"]] == [None, 0.95, 0.95, 0.95]
-    assert netlist["layers"][1]["alpha_realised"] == 3891 / 4096
+    held = 3891 / 4096
+    assert [layer.get("alpha") for layer in netlist["layers"]] == [None, held, held, held]
+    assert netlist["layers"][1]["alpha_realised"] == held
     verdict = as_json(capsys, f"verify {data}/x.loom --checkpoint {data}/x.pt {shared} --min-agreement 0.8")
     assert verdict["spec_equals_engine"] is True
+    rungs = {rung["stage"]: rung for rung in verdict["ladder"]}
+    assert rungs["beta"] == rungs["float64"] | {"stage": "beta"}, "trained with the decays of the chip"
     decided = as_json(capsys, f"run {data}/x.loom {shared}")
     assert len(decided["predictions"]) == decided["samples"]
     assert as_json(capsys, f"estimate {data}/x.loom {shared}")
     assert as_json(capsys, f"explain {data}/x.loom --checkpoint {data}/x.pt {shared}")["sample"]
     assert as_json(capsys, f"export {data}/x.loom --to onnx -o {data}/x.onnx")["form"] == "scan"
+    found = as_json(capsys, f"bits {data}/x.pt --calibrate {data}/data --agreement 0.5 --widths 4,8 --no-cache")
+    assert found["recommended"]["agreement"] >= 0.5
+
+
+def test_onnxruntime_runs_the_chip_with_its_clocks(data, capsys):
+    pytest.importorskip("onnxruntime")
+    capsys.readouterr()
+    words = f"verify {data}/x.loom --checkpoint {data}/x.pt --data {data}/data --engine onnx --min-agreement 0"
+    verdict = as_json(capsys, words)
+    assert (verdict["spec_equals_engine"], verdict["engine_different"]) == (True, 0)
 
 
 def test_watch_decides_as_run(data, capsys):
@@ -521,7 +534,7 @@ def test_text_shows_clocks_and_current_decay(data, capsys):
     capsys.readouterr()
     assert main(["inspect", f"{data}/x.pt"]) == 0
     shown = capsys.readouterr().out
-    assert "\n  current decay by layer: conv1 0, fc1 0.95, fc2 0.95, fc3 0.95\n" in shown
+    assert "\n  current decay by layer: conv1 0, fc1 0.949951, fc2 0.949951, fc3 0.949951\n" in shown
     assert "\n  4 clocks of 4 steps each, 16 in all, beside the sensor\n" in shown
     assert main(["inspect", f"{data}/x.loom"]) == 0
     shown = capsys.readouterr().out

@@ -7,9 +7,9 @@ import torch
 
 from compiler.dynamics import Clocks, Dynamics
 from models.checkpoint import checkpoint_bytes
-from models.graphs import build_graph
+from models.graphs import NEUTOUCH, build_graph
 from models.networks import Architecture, SpikingNet
-from models.systems import propagation_of
+from models.systems import filters_of, propagation_of, sensor_grid
 
 GRAPH = build_graph("manual")
 
@@ -29,9 +29,10 @@ def louder(network, factor=3.0):
 def written(path, system="tactilesgnet", dynamics=TIMING, seed=1, **sizes):
     """Write the checkpoint of a network with random weights; return the network and what its first layer sees."""
     architecture = replace(SMALL, system=system, dynamics=dynamics, **sizes)
-    seen = propagation_of(system, GRAPH.edges, 39, None, 3)
+    grid = sensor_grid(NEUTOUCH, "none") if system == "grid-cnn" else None
+    seen = propagation_of(system, GRAPH.edges, 39, grid, filters_of(system, 39, architecture.hops))
     network = louder(SpikingNet(architecture, seen, seed=seed))
-    constants = {"beta": architecture.beta, "theta": architecture.theta, "training": {}, "system": system}
+    constants = {"beta": architecture.beta, "theta": architecture.theta, "training": {}, "system": system, "grid": grid}
     path.write_bytes(checkpoint_bytes({"last": network.export_weights()}, GRAPH, dynamics=dynamics, **constants))
     return network, seen
 
