@@ -137,7 +137,7 @@ class _Lif(torch.autograd.Function):
         ctx.beta, ctx.theta, ctx.surrogate = beta, theta, surrogate
         current = current.contiguous()
         spikes, membrane = torch.empty_like(current), torch.empty_like(current)
-        kind = _kind(current)
+        kind = kind_of(current)
         _integrate(rows_of(current), kind(beta), kind(theta), rows_of(spikes), rows_of(membrane))
         ctx.save_for_backward(membrane)
         ctx.mark_non_differentiable(membrane)
@@ -195,48 +195,6 @@ class LifSteps(torch.autograd.Function):
         return out, None, None, None
 
 
-def lasting_current(drive: Tensor, alpha: float) -> Tensor:
-    """Synaptic currents along the first axis, from rest: ``i_t = alpha * i_{t-1} + drive_t``.
-
-    Parameters
-    ----------
-    drive : (steps, ...)
-        What the spikes of a step bring.
-    alpha : float
-        Share of the current that a step keeps, 0 to 1.
-
-    Examples
-    --------
-    >>> lasting_current(torch.tensor([1.0, 0.0, 2.0]), 0.5).tolist()
-    [1.0, 0.5, 2.25]
-    """
-    current: Tensor = _LastingCurrent.apply(drive, alpha)  # type: ignore[no-untyped-call]
-    return current
-
-
-class _LastingCurrent(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, drive: Tensor, alpha: float) -> Tensor:
-        ctx.alpha = alpha
-        current = drive.clone(memory_format=torch.contiguous_format)
-        if current.device.type == "cpu":
-            accumulate(rows_of(current), _kind(current)(alpha), False)
-        else:
-            for t in range(1, len(current)):
-                current[t] += alpha * current[t - 1]
-        return current
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
-        drive = gradients[0].clone(memory_format=torch.contiguous_format)
-        if drive.device.type == "cpu":
-            accumulate(rows_of(drive), _kind(drive)(ctx.alpha), True)
-        else:
-            for t in range(len(drive) - 2, -1, -1):
-                drive[t] += ctx.alpha * drive[t + 1]
-        return drive, None
-
-
 def spike_linear(spikes: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     """Affine layer over zeros and ones, which adds up the weights of the inputs that spiked.
 
@@ -289,7 +247,7 @@ def rows_of(tensor: Tensor) -> np.ndarray[Any, Any]:
     return view
 
 
-def _kind(like: Tensor) -> type[np.float32] | type[np.float64]:
+def kind_of(like: Tensor) -> type[np.float32] | type[np.float64]:
     """Precision in which the recurrence is defined: that of `like`."""
     return np.float32 if like.dtype == torch.float32 else np.float64
 
@@ -313,23 +271,6 @@ def _integrate(current: Any, beta: Any, theta: Any, spikes: Any, membrane: Any) 
     for t in range(steps):
         _integrate_step(current[t], before, beta, theta, spikes[t], membrane[t])
         before = membrane[t]
-
-
-@numba.njit(cache=True)
-def _accumulate_step(current: Any, before: Any, alpha: Any) -> None:
-    for i in range(len(current)):
-        current[i] += alpha * before[i]
-
-
-@numba.njit(cache=True)
-def accumulate(current: Any, alpha: Any, backwards: bool) -> None:
-    """Add to each row (steps, neurons) the share `alpha` of the one before, in place; from the end if backwards."""
-    steps = len(current)
-    for t in range(1, steps):
-        if backwards:
-            _accumulate_step(current[steps - 1 - t], current[steps - t], alpha)
-        else:
-            _accumulate_step(current[t], current[t - 1], alpha)
 
 
 @numba.njit(cache=True)

@@ -19,7 +19,8 @@ from torch import Tensor, nn
 
 from compiler.dynamics import PLAIN, RELAY_WEIGHT, Clocks, Dynamics
 from compiler.frontends.systems import GCN, GRID_CNN, MLP, TACTILESGNET, feature_major, in_order
-from models.layers import filter_places, lasting_current, lif, spike_linear, tag_convolution
+from models.currents import lasting_current
+from models.layers import filter_places, lif, spike_linear, tag_convolution
 from models.surrogate import RECTANGLE, Surrogate
 from models.systems import HOPS, filters_of
 

@@ -77,8 +77,10 @@ class Recipe:
     clocks: int = 0
 
     def to_json(self) -> dict[str, Any]:
-        """JSON values."""
-        return asdict(self) | {"betas": dict(self.betas), "alphas": dict(self.alphas)}
+        """JSON values; without the usual number of epochs, which a training states by itself."""
+        values = asdict(self) | {"betas": dict(self.betas), "alphas": dict(self.alphas)}
+        del values["epochs"]
+        return values
 
     def dynamics(self, layers: Iterable[str], beta: float, steps: int) -> Dynamics:
         """Dynamics of a network with these layers, a common membrane decay and recordings of so many steps.

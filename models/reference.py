@@ -17,7 +17,8 @@ import torch
 from compiler.dynamics import RELAY_WEIGHT
 from compiler.frontends.checkpoint import Checkpoint
 from compiler.frontends.systems import GCN, TACTILESGNET, feature_major, in_order
-from models.layers import filter_places, lasting_current, lif, tag_convolution
+from models.currents import lasting_current
+from models.layers import filter_places, lif, tag_convolution
 from models.networks import relayed
 
 BATCH = 8

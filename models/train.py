@@ -33,7 +33,8 @@ from compiler.errors import DataError, OptionError
 from compiler.frontends.checkpoint import arrays_digest
 from models.evtouch import Recordings
 from models.networks import Architecture, SpikingNet, Weights
-from models.recipes import ADAMW, COSINE, CROSS_ENTROPY, RELEASED, Recipe
+from models.optimizers import course_of, optimizer_of, set_rate
+from models.recipes import CROSS_ENTROPY, RELEASED, Recipe
 from models.resume import TrainingState, pack, read_state, unpack, write_state
 
 DECAY_EPOCHS = 40
@@ -173,21 +174,21 @@ def train(
     weights: dict[str, Weights] = {}
     with one_thread():
         network = SpikingNet(architecture, propagation, seed=seed, surrogate=recipe.surrogate).to(device)
-        optimizer = _optimizer(recipe, network, device)
+        optimizer = optimizer_of(recipe, network, device)
         if resume and state is not None and state.exists():
             found = read_state(state, options)
             history, weights = _restore(found, network, optimizer, order)
         bar = tqdm(total=epochs, initial=len(history), desc=label, unit="epoch", position=position, disable=None)
         with bar as progress:
             for index in range(len(history), epochs):
-                course = _course(recipe, index, epochs)
+                course = course_of(recipe, index, epochs)
                 if course is not None:
-                    _set_rate(optimizer, course(0.0))
+                    set_rate(optimizer, course(0.0))
                 rate = float(optimizer.param_groups[0]["lr"])
                 shuffled = order.permutation(len(training))
                 training_loss = _train_epoch(network, optimizer, training, shuffled, recipe, course, epoch=index + 1)
                 if course is None and index % DECAY_EPOCHS == 0 and index > 1:
-                    _set_rate(optimizer, rate * 0.1)
+                    set_rate(optimizer, rate * 0.1)
                 test_loss, correct = evaluate(network, test, recipe)
                 if correct > max((epoch.correct for epoch in history), default=-1):
                     weights["best"] = network.export_weights()
@@ -229,27 +230,6 @@ def _check_options(epochs: int, seed: int, device: str) -> None:
         raise OptionError(f"--device {device}: unknown; allowed: {', '.join(DEVICES)}")
     if device == "cuda" and not torch.cuda.is_available():
         raise OptionError("--device cuda: this machine has no usable GPU; leave --device away")
-
-
-def _optimizer(recipe: Recipe, network: SpikingNet, device: str) -> torch.optim.Optimizer:
-    rate, fused = recipe.learning_rate, device == "cpu"
-    if recipe.optimizer == ADAMW:
-        return torch.optim.AdamW(
-            network.parameters(), lr=rate, weight_decay=recipe.weight_decay, amsgrad=True, fused=fused
-        )
-    return torch.optim.Adam(network.parameters(), lr=rate, amsgrad=True, fused=fused)
-
-
-def _course(recipe: Recipe, epoch: int, epochs: int) -> Callable[[float], float] | None:
-    """Learning rate within an epoch by the share of it that is done, counted from 0; None where it is constant."""
-    if recipe.schedule != COSINE:
-        return None
-    return lambda share: recipe.learning_rate * 0.5 * (1 + math.cos(math.pi * (epoch + share) / epochs))
-
-
-def _set_rate(optimizer: torch.optim.Optimizer, rate: float) -> None:
-    for group in optimizer.param_groups:
-        group["lr"] = rate
 
 
 def _require_finite(loss: float, epoch: int, step: int) -> None:
@@ -338,7 +318,7 @@ def _train_epoch(
     for step, start in enumerate(range(0, len(order), recipe.batch), 1):
         chosen = order[start : start + recipe.batch]
         if course is not None:
-            _set_rate(optimizer, course(start / len(order)))
+            set_rate(optimizer, course(start / len(order)))
         optimizer.zero_grad()
         lengths = np.array([recordings.steps_of(int(index)) for index in chosen])
         events = recordings.events[chosen][..., : lengths.max()]

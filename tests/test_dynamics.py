@@ -15,9 +15,10 @@ from timed_networks import GRAPH, SMALL, TIMING, events_of, louder, written
 from compiler.dynamics import NO_CLOCKS, PLAIN, Clocks, Dynamics, clocks_over, dynamics_faults, with_clocks
 from compiler.errors import ModelError, OptionError
 from compiler.frontends.checkpoint import read_checkpoint
+from models.currents import accumulate, accumulate_steps, lasting_current
 from models.graphs import normalised_adjacency
 from models.grasps import synthetic_grasps
-from models.layers import LifSteps, lasting_current, lif
+from models.layers import LifSteps, lif
 from models.networks import Architecture, SpikingNet
 from models.recipes import RECIPES, RELEASED, TIMED, Recipe, check_recipe, decays_asked
 from models.reference import float_membranes, float_spikes
@@ -118,6 +119,15 @@ def test_the_surrogate_of_a_fast_sigmoid():
     current = torch.tensor([[0.5, 0.75, 0.0]], dtype=torch.float64, requires_grad=True)
     lif(current, 0.2, 0.5, SMOOTH)[0].sum().backward()
     assert_allclose(current.grad, [[1.0, 1 / 4, 1 / 9]], rtol=1e-12)
+
+
+@pytest.mark.parametrize("backwards", [False, True])
+def test_currents_in_torch_operations_equal_the_kernel(backwards):
+    found = [torch.randn(30, 4, generator=torch.Generator().manual_seed(1)) for _ in range(2)]
+    accumulate(found[0].numpy(), np.float32(0.95), backwards)
+    accumulate_steps(found[1], 0.95, backwards=backwards)
+    assert_allclose(found[0], found[1], rtol=1e-6, atol=1e-6)  # the kernel may fuse a product with its sum
+    assert found[0].abs().max() > 2
 
 
 # --- clocks --------------------------------------------------------------------------------------------------------
@@ -432,6 +442,8 @@ def test_train_writes_what_the_recipe_asks_for(data, capsys):
         "--clocks 4 --features 6 --batch 3 --epochs 1 --seed 0"
     )
     assert run["recipe"]["alphas"] == {"fc1": 0.5}
+    assert "epochs" not in run["recipe"]
+    assert (run["recipe"]["name"], run["epochs"]) == ("timed", 1)
     assert run["recipe"]["surrogate"] == {"shape": "fast-sigmoid", "width": 0.25, "reset": False}
     checkpoint = read_checkpoint("x.pt")
     assert checkpoint.dynamics == Dynamics(
