@@ -105,7 +105,7 @@ class Stream:
         ----------
         events : (taxels, polarities) or (taxels * polarities,)
             1 where a taxel sent an event of that polarity within the bin, 0 elsewhere, of any number type or bool;
-            channel ``taxel * polarities + polarity`` in the flat form.
+            channel ``taxel * polarities + polarity`` in the flat form. Clocks of the network tick by themselves.
 
         Raises
         ------

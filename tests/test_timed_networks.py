@@ -198,6 +198,21 @@ def test_both_kernels_are_the_specification(compiled):
             assert_array_equal(fast.counts.updates[index], slow.counts.updates)
 
 
+def test_recordings_without_their_clocks_are_refused(compiled):
+    events = events_of(12, samples=2).reshape(2, 78, -1)
+    for simulate in (
+        lambda: spec.simulate(compiled.netlist, events[0]),
+        lambda: engine.simulate(compiled.netlist, events),
+    ):
+        with pytest.raises(DataError) as error:
+            simulate()
+        assert str(error.value) == (
+            "recordings: 78 input channels found, the netlist has 81, 3 of them clocks "
+            "(compiler.dynamics.with_clocks); "
+            "use recordings of the sensor that the network was compiled for"
+        )
+
+
 def test_ranges_are_proven_for_any_input(compiled):
     assert all(proof.holds for proof in compiled.proofs)
     lasting = compiled.proofs[1]
