@@ -10,7 +10,6 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -46,11 +45,15 @@ def data(tmp_path, monkeypatch) -> Path:
     The working folder is where the data is.
     """
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("models.networks.Architecture", partial(Architecture, **SMALL))
+    monkeypatch.setattr("models.networks.Architecture", small)
     monkeypatch.setattr("runtime.measured.compile_network", uncalibrated)
     monkeypatch.setattr("runtime.paper_picture.DPI", 30)
     made(tmp_path / "Ev-Grasps")
     return tmp_path
+
+
+def small(**given):
+    return Architecture(**(given | SMALL))
 
 
 def uncalibrated(network, training_events=None):
@@ -102,7 +105,7 @@ def test_the_table_of_methods_from_nothing(data, capsys):
     for row, name in zip(report["methods"], names, strict=True):
         cell = json.loads(Path(f"out/cells/{name}.json").read_text())
         record = read_checkpoint(f"out/networks/{name}.pt").training
-        assert cell["decay_epochs"] == record["decay_epochs"] == 1
+        assert cell["decay_epochs"] == record["recipe"]["decay_epochs"] == 1
         for which in ("best", "last", "clean"):
             assert cell[which] == record[which]
             assert row[which]["values"] == [100 * record[which]["accuracy"]]
