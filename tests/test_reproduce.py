@@ -247,7 +247,7 @@ def test_a_cell_is_what_train_writes_and_a_finished_network_is_taken_over(data, 
     assert network.read_bytes() == content
     assert json.loads(Path(f"out/cells/{GCN_NAME}.json").read_text()) == cell
     assert cell["command"] == (
-        "spikeloom train --data Ev-Grasps --system gcn --graph manual --epochs 3 --decay-epochs 1 --seed 0"
+        "spikeloom train --data Ev-Grasps --system gcn --graph manual --decay-epochs 1 --epochs 3 --seed 0"
     )
 
 
@@ -259,7 +259,7 @@ def test_a_network_of_another_training_is_not_taken_over(data, capsys):
     capsys.readouterr()
     assert main([*METHODS, "--resume"]) == 2
     assert capsys.readouterr().err.splitlines()[-1] == (
-        f"spikeloom: {network}: holds another training (other epochs, seed, decay epochs); "
+        f"spikeloom: {network}: holds another training (other epochs, seed, recipe); "
         "give its options, or another -o"
     )
     assert len(list(Path("out/cells").iterdir())) == 3
