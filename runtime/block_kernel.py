@@ -561,28 +561,72 @@ def _list(words: AnyArray, start: int, width: int, steps: int, bounds: AnyArray,
 
 
 @compiled
-def _lasting_step(
+def _run_block(
     blocks: Blocks,
     s: int,
-    words: AnyArray,
-    at: int,
-    listed: AnyArray,
-    span: tuple[int, int],
     block: int,
+    steps: int,
+    words: AnyArray,
+    start: int,
+    width: int,
+    listed: AnyArray,
+    bounds: IntArray,
+    scratch: Scratch,
+) -> None:
+    """Run a block of a stage through a recording, on its sources as words and listed."""
+    begin, end = blocks.stage[s], blocks.stage[s + 1]
+    rests = blocks.restful[block] != 0
+    for t in range(steps):
+        place = steps * begin + t * (end - begin) + block - begin
+        kept = place * LANES if scratch.membranes.size else -1
+        if not blocks.dense[s]:
+            at = start + t * width
+            if rests:
+                fired = _restful_step(blocks, words, at, 0, block, scratch, None, place, kept)
+            else:
+                fired = _busy_step(blocks, words, at, 0, block, scratch, None, place, kept)
+        elif rests:
+            fired = _restful_listed_step(blocks, listed, bounds[t], bounds[t + 1], block, scratch, None, place, kept)
+        else:
+            fired = _busy_listed_step(blocks, listed, bounds[t], bounds[t + 1], block, scratch, None, place, kept)
+        scratch.raster[place] = fired
+
+
+@compiled
+def _run_lasting_block(
+    blocks: Blocks,
+    s: int,
+    block: int,
+    steps: int,
+    words: AnyArray,
+    start: int,
+    width: int,
+    listed: AnyArray,
+    bounds: IntArray,
     scratch: Scratch,
     lasting: Lasting,
-    place: int,
-    kept: int,
-) -> Any:
-    """One step of a block of a stage whose currents outlast it, on words from `at` or on a span of listed sources."""
+) -> None:
+    """The same where currents outlast a step."""
+    begin, end = blocks.stage[s], blocks.stage[s + 1]
     rests = blocks.restful[block] != 0
-    if not blocks.dense[s]:
-        if rests:
-            return _restful_lasting_step(blocks, words, at, 0, block, scratch, lasting, place, kept)
-        return _busy_lasting_step(blocks, words, at, 0, block, scratch, lasting, place, kept)
-    if rests:
-        return _restful_listed_lasting_step(blocks, listed, span[0], span[1], block, scratch, lasting, place, kept)
-    return _busy_listed_lasting_step(blocks, listed, span[0], span[1], block, scratch, lasting, place, kept)
+    for t in range(steps):
+        place = steps * begin + t * (end - begin) + block - begin
+        kept = place * LANES if scratch.membranes.size else -1
+        if not blocks.dense[s]:
+            at = start + t * width
+            if rests:
+                fired = _restful_lasting_step(blocks, words, at, 0, block, scratch, lasting, place, kept)
+            else:
+                fired = _busy_lasting_step(blocks, words, at, 0, block, scratch, lasting, place, kept)
+        elif rests:
+            fired = _restful_listed_lasting_step(
+                blocks, listed, bounds[t], bounds[t + 1], block, scratch, lasting, place, kept
+            )
+        else:
+            fired = _busy_listed_lasting_step(
+                blocks, listed, bounds[t], bounds[t + 1], block, scratch, lasting, place, kept
+            )
+        scratch.raster[place] = fired
 
 
 @compiled
@@ -598,32 +642,12 @@ def _run_stage(
     scratch: Scratch,
     lasting: Lasting | None,
 ) -> None:
-    """Let a stage integrate on its sources, as words and listed; a block's rows and membranes stay in cache."""
-    begin, end = blocks.stage[s], blocks.stage[s + 1]
-    for block in range(begin, end):
-        rests = blocks.restful[block] != 0
-        lasts = False
-        if lasting is not None:
-            lasts = lasting.keep_u[block] != 0
-        for t in range(steps):
-            place = steps * begin + t * (end - begin) + block - begin
-            kept = place * LANES if scratch.membranes.size else -1
-            at, fired = start + t * width, np.uint64(0)
-            if lasting is not None and lasts:
-                span = bounds[t], bounds[t + 1]
-                fired = _lasting_step(blocks, s, words, at, listed, span, block, scratch, lasting, place, kept)
-            elif not blocks.dense[s]:
-                if rests:
-                    fired = _restful_step(blocks, words, at, 0, block, scratch, None, place, kept)
-                else:
-                    fired = _busy_step(blocks, words, at, 0, block, scratch, None, place, kept)
-            elif rests:
-                fired = _restful_listed_step(
-                    blocks, listed, bounds[t], bounds[t + 1], block, scratch, None, place, kept
-                )
-            else:
-                fired = _busy_listed_step(blocks, listed, bounds[t], bounds[t + 1], block, scratch, None, place, kept)
-            scratch.raster[place] = fired
+    """Let a stage integrate, block by block: its rows and membranes stay in cache."""
+    for block in range(blocks.stage[s], blocks.stage[s + 1]):
+        if lasting is not None and lasting.keep_u[block] != 0:
+            _run_lasting_block(blocks, s, block, steps, words, start, width, listed, bounds, scratch, lasting)
+        else:
+            _run_block(blocks, s, block, steps, words, start, width, listed, bounds, scratch)
 
 
 @compiled
