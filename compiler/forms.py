@@ -16,7 +16,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from compiler.fixedpoint import MEMBRANE_SHIFT, FloatArray, IntArray, encode_bias, round_half_even, weight_step
+from compiler.fixedpoint import (
+    CURRENT_MAX,
+    DECAY_BITS,
+    MEMBRANE_MAX,
+    MEMBRANE_SHIFT,
+    ONE_STEP_SUM_MAX,
+    FloatArray,
+    IntArray,
+    encode_bias,
+    round_half_even,
+    weight_step,
+)
 from compiler.ir import (
     MANTISSA,
     IntegerPopulation,
@@ -27,6 +38,11 @@ from compiler.ir import (
     row_parts,
     with_data,
 )
+
+DECAY_ONE = 1 << DECAY_BITS
+
+FORGETS = DECAY_ONE - 1
+"""`decay_u` of a current that forgets everything in one step."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -48,15 +64,20 @@ class Form:
     threshold: IntArray
 
 
-def decay_registers(beta: float) -> tuple[int, int]:
-    """Registers of a current-less neuron: ``decay_u`` that forgets all, and the ``decay_v`` nearest to `beta`.
+def decay_registers(beta: float, alpha: float = 0.0) -> tuple[int, int]:
+    """Registers ``decay_u`` and ``decay_v`` nearest to a current decay and a membrane decay.
+
+    The chip's current loses one part in 4096 more than its register says. So it can forget all, which a membrane
+    cannot, and cannot keep all.
 
     Examples
     --------
     >>> decay_registers(0.2)
     (4095, 3277)
+    >>> decay_registers(0.2, 0.95)
+    (204, 3277)
     """
-    return 4095, min(4095, max(0, round(4096 * (1 - beta))))
+    return min(4095, max(0, round(4096 * (1 - alpha)) - 1)), min(4095, max(0, round(4096 * (1 - beta))))
 
 
 def plane_distance(bits: int) -> int:
@@ -196,11 +217,12 @@ def store(
     scale = scales(population, form)
     wanted = population.bias if bias is None else bias
     mantissa, exponent = encode_bias(wanted * scale * (1 << MEMBRANE_SHIFT))
-    decay_u, decay_v = decay_registers(population.beta)
+    decay_u, decay_v = decay_registers(population.beta, population.alpha)
     integer = IntegerPopulation(
         name=population.name,
         beta=population.beta,
         theta=population.theta,
+        alpha=population.alpha,
         scale=scale,
         decay_u=decay_u,
         decay_v=decay_v,
@@ -219,14 +241,54 @@ def round_population(
     return store(population, projections, form, [nearest_steps(population, p, form) for p in projections])
 
 
+def current_load(decay_u: int) -> float:
+    """Share of its register that a current can fill, against that of the accumulator which a sum of one step fills.
+
+    A current that loses ``(decay_u + 1) / 4096`` a step adds up to ``4096 / (decay_u + 1)`` sums, in a register four
+    times as wide. At least 1: the accumulator comes first.
+
+    Examples
+    --------
+    >>> current_load(4095), round(current_load(204), 3)
+    (1.0, 4.995)
+    """
+    return max(1.0, ONE_STEP_SUM_MAX * (4096 / (decay_u + 1)) * (1 << MEMBRANE_SHIFT) / CURRENT_MAX)
+
+
 def one_sided_sums(projections: tuple[IntegerProjection, ...], neurons: int) -> IntArray:
     """Largest one-sided synaptic sum that any input can bring to each neuron, weight units; shape (neurons,).
 
     Planes count one by one, which covers every order of their arrival.
     """
+    up, down = two_sums(projections, neurons)
+    return np.maximum(up, down)
+
+
+def two_sums(projections: tuple[IntegerProjection, ...], neurons: int) -> tuple[IntArray, IntArray]:
+    """Largest positive and negative synaptic sum of each neuron, as magnitudes; see :func:`one_sided_sums`."""
     up, down = np.zeros(neurons, np.int64), np.zeros(neurons, np.int64)
     for projection in projections:
         positive, negative = one_sided(projection)
         up += positive
         down += negative
-    return np.maximum(up, down)
+    return up, down
+
+
+def loads(population: IntegerPopulation, projections: tuple[IntegerProjection, ...]) -> FloatArray:
+    """One-sided sums, or more where a current that outlasts its step fills a register sooner; shape (neurons,).
+
+    What is within ``ONE_STEP_SUM_MAX`` overflows neither accumulator nor current, whatever the input. Nor does it
+    saturate a membrane, unless that keeps more than half of itself: the scale would then be too coarse.
+    """
+    up, down = two_sums(projections, population.size)
+    worst = np.maximum(up, down).astype(np.float64)
+    if population.decay_u == FORGETS:
+        return worst
+    fullest = worst * current_load(population.decay_u)
+    if 2 * population.decay_v >= DECAY_ONE:
+        gather, lost = (1 << MEMBRANE_SHIFT) * DECAY_ONE / (population.decay_u + 1), population.decay_v / DECAY_ONE
+        held = (1 - lost) * (population.threshold << MEMBRANE_SHIFT)
+        rise = held + gather * up + np.maximum(population.bias, 0)
+        fall = (gather * down + np.maximum(-population.bias, 0)) / lost
+        fullest = np.maximum(fullest, np.maximum(rise, fall) * (ONE_STEP_SUM_MAX / MEMBRANE_MAX))
+    return fullest

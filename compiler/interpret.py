@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from compiler.dynamics import NO_CLOCKS, Clocks, with_clocks
 from compiler.fixedpoint import MEMBRANE_MAX, MEMBRANE_SHIFT, IntArray
 from compiler.ir import INPUT, IntegerNetwork, IntegerPopulation, Network, Population, Sparse
 
@@ -70,10 +71,32 @@ def integer_sums(weight: Sparse, spikes: BoolArray) -> Floating:
     return product(weight, spikes, np.float32 if largest < 2**24 else np.float64)
 
 
+def lasting_currents(sums: Floating, alpha: float) -> Floating:
+    """Synaptic currents (samples, steps, neurons) that keep the share `alpha` from step to step, in the type of `sums`.
+
+    Examples
+    --------
+    >>> lasting_currents(np.array([[[1.0], [0.0], [2.0]]]), 0.5).ravel().tolist()
+    [1.0, 0.5, 2.25]
+    """
+    current = sums.copy()
+    kept = current.dtype.type(alpha)
+    for step in range(1, current.shape[1]):
+        current[:, step] += kept * current[:, step - 1]
+        if step % 16 == 15:
+            current[:, step][np.abs(current[:, step]) < DENORMAL] = 0
+    return current
+
+
 def float_recurrence(
-    population: Population, current: Floating, *, membranes: bool = False
+    population: Population, sums: Floating, *, membranes: bool = False
 ) -> tuple[BoolArray, Floating | None]:
-    """LIF in the type of `current`: ``u = beta * u * (1 - s) + I``, ``s = u > theta``, with ``I`` the given current."""
+    """LIF of the definition in :class:`compiler.ir.Population` on given synaptic sums, in their type.
+
+    `sums` is overwritten.
+    """
+    current = sums if not population.alpha else lasting_currents(sums, population.alpha)
+    current += population.bias.astype(current.dtype)
     spikes = np.empty(current.shape, np.bool_)
     kept = np.empty_like(current) if membranes else None
     u = np.zeros_like(current[:, 0])
@@ -147,9 +170,7 @@ def run_float(
     """
 
     def layer(post: int, sums: Floating) -> tuple[BoolArray, Floating | None]:
-        population = network.populations[post]
-        sums += population.bias.astype(dtype)
-        return float_recurrence(population, sums, membranes=membranes)
+        return float_recurrence(network.populations[post], sums, membranes=membranes)
 
     return _run(network, events, lambda p, spikes: product(p.weight, spikes, dtype), layer)
 
@@ -196,11 +217,12 @@ def _run(
     return Activity(spikes=spikes, membranes=tuple(traces))
 
 
-def channels_last(events: npt.NDArray[Any]) -> BoolArray:
-    """Reorder recordings (samples, taxels, polarities, steps) to the (samples, steps, channels) used here."""
-    samples, taxels, polarities, steps = events.shape
-    flat = events.reshape(samples, taxels * polarities, steps)
-    return np.ascontiguousarray(flat.transpose(0, 2, 1)).astype(np.bool_)
+def channels_last(events: npt.NDArray[Any], clocks: Clocks = NO_CLOCKS) -> BoolArray:
+    """Reorder recordings (samples, taxels, polarities, steps) to the (samples, steps, channels) used here.
+
+    The clocks of the network that is to hear them come last.
+    """
+    return np.ascontiguousarray(with_clocks(events, clocks).transpose(0, 2, 1)).astype(np.bool_)
 
 
 def cut(spikes: BoolArray, lengths: IntArray | None) -> BoolArray:

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
+from compiler.dynamics import NO_CLOCKS, Clocks
 from compiler.fixedpoint import DECAY_BITS, FloatArray, IntArray
 
 INPUT = -1
@@ -33,15 +34,16 @@ PART = 1 << 19
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Input:
-    """Event input: channel ``taxel * polarities + polarity``."""
+    """Event input: channel ``taxel * polarities + polarity``, then one channel for each clock."""
 
     taxels: int
     polarities: int
+    clocks: Clocks = NO_CLOCKS
 
     @property
     def size(self) -> int:
         """Number of channels."""
-        return self.taxels * self.polarities
+        return self.taxels * self.polarities + self.clocks.channels
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -62,7 +64,9 @@ class Readout:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Population:
-    """LIF neurons of the float model: ``u <- beta * u * (1 - s) + I + bias``, ``s = u > theta``.
+    """LIF neurons of the float model.
+
+    ``i <- alpha * i + W s``, ``u <- beta * u * (1 - s) + i + bias``, ``s = u > theta``.
 
     Parameters
     ----------
@@ -72,12 +76,18 @@ class Population:
         Decay (0 to 1) and threshold, in the model's membrane units.
     bias : (neurons,) float64
         Added in every step.
+    alpha : float
+        Share of the synaptic current that a step keeps, 0 to below 1.
+    relays : int
+        How many of the last neurons relay a clock each: whatever is rounded, they must spike when it ticks.
     """
 
     name: str
     beta: float
     theta: float
     bias: FloatArray
+    alpha: float = 0.0
+    relays: int = 0
 
     @property
     def size(self) -> int:
@@ -121,7 +131,7 @@ class IntegerPopulation:
     ----------
     name : str
         Unique in the network.
-    beta, theta : float
+    beta, theta, alpha : float
         What the float model asked for.
     scale : (neurons,) float64
         Weight units per membrane unit of the float model.
@@ -142,6 +152,7 @@ class IntegerPopulation:
     threshold: IntArray
     bias_mantissa: IntArray
     bias_exponent: IntArray
+    alpha: float = 0.0
 
     @property
     def size(self) -> int:
@@ -157,6 +168,11 @@ class IntegerPopulation:
     def realised_beta(self) -> float:
         """Decay factor of the membrane register."""
         return ((1 << DECAY_BITS) - self.decay_v) / (1 << DECAY_BITS)
+
+    @property
+    def realised_alpha(self) -> float:
+        """Decay factor of the current register, which loses one part more than it says."""
+        return ((1 << DECAY_BITS) - 1 - self.decay_u) / (1 << DECAY_BITS)
 
     @property
     def realised_theta(self) -> FloatArray:

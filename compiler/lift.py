@@ -52,6 +52,7 @@ def lift(netlist: Netlist) -> IntegerNetwork:
                 name=layer.name,
                 beta=layer.beta,
                 theta=layer.theta,
+                alpha=layer.alpha,
                 scale=whole(netlist.scale[ids], 1.0),
                 decay_u=_one(netlist, index, "decay_u"),
                 decay_v=_one(netlist, index, "decay_v"),
@@ -96,7 +97,7 @@ def lift(netlist: Netlist) -> IntegerNetwork:
     if len(voting) != 1:
         raise FormatError(f"netlist: {len(voting)} layers vote for classes, one is allowed; compile it again")
     return IntegerNetwork(
-        input=Input(taxels=netlist.taxels, polarities=netlist.polarities),
+        input=Input(taxels=netlist.taxels, polarities=netlist.polarities, clocks=netlist.clocks),
         populations=tuple(populations),
         projections=tuple(projections),
         readout=Readout(

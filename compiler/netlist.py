@@ -7,8 +7,8 @@ Ids
 same way through ``core_axons``; the synapses of axon ``a`` are ``axon_synapses[a] … axon_synapses[a+1]-1``.
 
 An axon listens to one *source*, a single integer: ``0 … n_inputs-1`` is an input channel (channel
-``taxel * polarities + polarity``), ``n_inputs + c`` is compartment ``c``. The output axons of a compartment are the
-axons that name it as source; they are not stored a second time.
+``taxel * polarities + polarity``, then the clocks), ``n_inputs + c`` is compartment ``c``. The output axons of a
+compartment are the axons that name it as source; they are not stored a second time.
 
 A synapse targets compartment ``synapse_target`` *of its core* (0-based within the core) with the signed mantissa
 ``synapse_weight``; it adds ``mantissa * 2**exponent`` of its list's format, shifted left by six, to the target's
@@ -31,6 +31,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from compiler.dynamics import NO_CLOCKS, Clocks
 from compiler.fixedpoint import FloatArray, IntArray
 
 
@@ -56,6 +57,8 @@ class Layer:
         Structural synapses into the layer, before zeros were dropped.
     max_fan_in : int
         Largest structural fan-in of a neuron.
+    alpha : float
+        Current decay of the float model.
     """
 
     name: str
@@ -67,6 +70,7 @@ class Layer:
     weight_bits: int
     synapses: int
     max_fan_in: int
+    alpha: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -78,7 +82,7 @@ class Netlist:
     target : str
         Name of the chip.
     taxels, polarities, classes : int
-        Sensor size and number of classes; ``n_inputs = taxels * polarities``.
+        Sensor size and number of classes; ``n_inputs = taxels * polarities``, and the clocks.
     layers : tuple of Layer
         In order of depth; ``readout_class`` says which of them votes.
     core_tile : (cores,) int64
@@ -108,6 +112,8 @@ class Netlist:
         Synapse formats of the whole netlist; a core uses some of them.
     provenance : mapping
         JSON values only: checkpoint hash, graph, options, version.
+    clocks : Clocks
+        Input channels beyond those of the sensor, whose events :func:`compiler.dynamics.with_clocks` makes.
     """
 
     target: str
@@ -136,11 +142,12 @@ class Netlist:
     format_exponent: IntArray
     format_index_bits: IntArray
     provenance: Mapping[str, Any]
+    clocks: Clocks = NO_CLOCKS
 
     @property
     def n_inputs(self) -> int:
         """Number of input channels."""
-        return self.taxels * self.polarities
+        return self.taxels * self.polarities + self.clocks.channels
 
     @property
     def n_cores(self) -> int:

@@ -166,7 +166,7 @@ def compile_network(
     calibration: Calibration | None = None
     rates: tuple[FloatArray, ...] | None = None
     if training_events is not None:
-        events = channels_last(training_events)
+        events = channels_last(training_events, network.input.clocks)
         several = any(recipe.planes > 1 for recipe in recipes or ())
         used = events if spike_exact or prune_unused else evenly_spaced(events, MANY if several else FEW)
         calibration = calibrate(network, used)

@@ -7,6 +7,9 @@ Members, format version 2
     ``classes``, ``layers`` (one object per :class:`compiler.netlist.Layer`) and ``provenance``.
 ``sha256``
     Hex digest (0-d string) over all other members in the order below: name, dtype, shape and bytes of each.
+Version 3 is for networks with currents that outlast their step, or with clocks: each layer has ``alpha``, and the
+manifest ``clocks`` (``channels`` and ``steps``), see :mod:`compiler.dynamics`.
+
 every array field of :class:`compiler.netlist.Netlist`
     Under its own name and meaning, in the narrowest little-endian signed type that holds it; ``scale`` as float64.
 
@@ -29,12 +32,14 @@ from typing import Any
 import numpy as np
 
 from compiler.atomic import write_atomically
+from compiler.dynamics import MOST_CLOCKS, MOST_STEPS, NO_CLOCKS, Clocks
 from compiler.errors import FormatError
 from compiler.netlist import Layer, Netlist, frozen, read_only, read_only_float
 from compiler.targets import known_targets
 
 FORMAT = "spikeloom-netlist"
-VERSION = 2
+VERSIONS = (2, 3)
+"""Of a usual netlist, and of one with current decay or clocks."""
 
 LARGE = frozenset({"synapse_target", "synapse_weight"})
 """Arrays that stay in the type that they are stored in."""
@@ -48,7 +53,7 @@ FLOATS = frozenset({"scale"})
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 _ZIP_ERRORS = (zipfile.BadZipFile, struct.error, ValueError, EOFError, OverflowError, MemoryError, RuntimeError)
 """What zipfile and numpy raise on content that is no netlist; a header may announce more than the memory holds."""
-_SCALARS = ("target", "taxels", "polarities", "classes", "layers", "provenance")
+_SCALARS = ("target", "taxels", "polarities", "classes", "layers", "provenance", "clocks")
 ARRAYS = tuple(field.name for field in fields(Netlist) if field.name not in _SCALARS)
 """Array members in file order."""
 
@@ -73,9 +78,10 @@ def _digest(members: dict[str, np.ndarray[Any, Any]]) -> str:
 
 def netlist_bytes(netlist: Netlist) -> bytes:
     """File content of a netlist; equal netlists give equal bytes."""
-    manifest = {
+    timed = bool(netlist.clocks.channels or any(layer.alpha for layer in netlist.layers))
+    manifest: dict[str, Any] = {
         "format": FORMAT,
-        "version": VERSION,
+        "version": VERSIONS[timed],
         "target": netlist.target,
         "taxels": netlist.taxels,
         "polarities": netlist.polarities,
@@ -83,6 +89,11 @@ def netlist_bytes(netlist: Netlist) -> bytes:
         "layers": [asdict(layer) for layer in netlist.layers],
         "provenance": dict(netlist.provenance),
     }
+    if timed:
+        manifest["clocks"] = asdict(netlist.clocks)
+    else:
+        for layer in manifest["layers"]:
+            del layer["alpha"]
     members: dict[str, np.ndarray[Any, Any]] = {"manifest": np.array(json.dumps(manifest, sort_keys=True))}
     members |= {name: _narrow(getattr(netlist, name)) for name in ARRAYS}
     members["sha256"] = np.array(_digest(members))
@@ -153,10 +164,10 @@ def read_netlist(path: str | os.PathLike[str]) -> Netlist:
         raise FormatError(f"{path}: has an unreadable manifest; compile it again") from error
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
         raise FormatError(f"{path}: is not a netlist; write one with spikeloom compile")
-    if manifest.get("version") != VERSION:
+    if manifest.get("version") not in VERSIONS:
         raise FormatError(
-            f"{path}: has format version {manifest.get('version')}, this program reads {VERSION}; "
-            "compile it again or update spikeloom"
+            f"{path}: has format version {manifest.get('version')}, this program reads "
+            f"{' and '.join(map(str, VERSIONS))}; compile it again or update spikeloom"
         )
     stated = str(members.pop("sha256"))
     names = {"manifest", *ARRAYS}
@@ -165,6 +176,8 @@ def read_netlist(path: str | os.PathLike[str]) -> Netlist:
         raise FormatError(f"{path}: has missing or unknown members ({odd}); compile it again")
     if _digest({"manifest": members["manifest"], **{name: members[name] for name in ARRAYS}}) != stated:
         raise FormatError(f"{path}: its content does not match its hash, so it was altered; compile it again")
+    if manifest["version"] == VERSIONS[0]:
+        manifest = _widened(manifest)
     faults = _type_faults(manifest, members)
     if faults:
         raise FormatError(f"{path}: {'; '.join(faults)}; compile it again")
@@ -179,6 +192,7 @@ def read_netlist(path: str | os.PathLike[str]) -> Netlist:
         classes=manifest["classes"],
         layers=tuple(Layer(**(layer | {"unheard": tuple(layer["unheard"])})) for layer in manifest["layers"]),
         provenance=manifest["provenance"],
+        clocks=Clocks(**manifest["clocks"]),
         scale=read_only_float(members["scale"]),
         **{name: (frozen if name in LARGE else read_only)(members[name]) for name in ARRAYS if name not in FLOATS},
     )
@@ -186,6 +200,14 @@ def read_netlist(path: str | os.PathLike[str]) -> Netlist:
     if faults:
         raise FormatError(f"{path}: {'; '.join(faults)}; compile it again")
     return netlist
+
+
+def _widened(manifest: dict[str, Any]) -> dict[str, Any]:
+    """A manifest of the first version with what the second adds."""
+    layers = manifest.get("layers")
+    if isinstance(layers, list):
+        layers = [layer | {"alpha": 0.0} if isinstance(layer, dict) else layer for layer in layers]
+    return manifest | {"clocks": asdict(NO_CLOCKS), "layers": layers}
 
 
 def is_netlist(path: str | os.PathLike[str]) -> bool:
@@ -206,6 +228,7 @@ def _type_faults(manifest: dict[str, Any], members: dict[str, np.ndarray[Any, An
         "target": isinstance(manifest.get("target"), str),
         "provenance": isinstance(manifest.get("provenance"), dict),
         "layers": isinstance(layers, list) and bool(layers) and all(map(_is_layer, layers)),
+        "clocks": _are_clocks(manifest.get("clocks")),
     }
     entries |= {name: _is(manifest.get(name), "int", 1) for name in ("taxels", "polarities", "classes")}
     faults = [f"the manifest has no usable {name}" for name, good in entries.items() if not good]
@@ -222,6 +245,13 @@ def _is(value: Any, kind: str, least: float = -math.inf) -> bool:
         return isinstance(value, str)
     numbers = (int, float) if kind == "float" else (int,)
     return isinstance(value, numbers) and not isinstance(value, bool) and least <= value < math.inf
+
+
+def _are_clocks(entry: Any) -> bool:
+    if not isinstance(entry, dict) or set(entry) != {"channels", "steps"}:
+        return False
+    channels, steps = entry["channels"], entry["steps"]
+    return _is(channels, "int", 0) and _is(steps, "int", 1) and channels <= MOST_CLOCKS and steps <= MOST_STEPS
 
 
 def _is_layer(entry: Any) -> bool:

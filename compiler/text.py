@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from compiler.fixedpoint import FloatArray, IntArray
-from compiler.ir import INPUT, IntegerNetwork, IntegerPopulation, IntegerProjection, Network, Population, Sparse
+from compiler.ir import INPUT, Input, IntegerNetwork, IntegerPopulation, IntegerProjection, Network, Population, Sparse
 from compiler.netlist import Netlist
 
 _COMPARTMENT_FIELDS = (
@@ -46,6 +46,7 @@ def _indices(weight: Sparse) -> tuple[IntArray, IntArray]:
 
 def _population(population: Population | IntegerPopulation) -> str:
     head = f"{population.name} (neurons {population.size}) (beta {population.beta!r}) (theta {population.theta!r})"
+    head += f" (alpha {population.alpha!r})" if population.alpha else ""
     if isinstance(population, Population):
         return f"{head} (bias {_span(population.bias)} #{_digest(population.bias)})"
     return (
@@ -56,10 +57,14 @@ def _population(population: Population | IntegerPopulation) -> str:
     )
 
 
+def _sensor(of: Input | Netlist) -> str:
+    clocks = f", {of.clocks.channels} clocks of {of.clocks.steps} steps" if of.clocks.channels else ""
+    return f"{of.taxels} taxels x {of.polarities}{clocks}"
+
+
 def _network_lines(network: Network | IntegerNetwork) -> Iterator[str]:
     stage = "float" if isinstance(network, Network) else "integer"
-    sensor = network.input
-    yield f"({stage} network (input {sensor.taxels} taxels x {sensor.polarities}) (classes {network.classes})"
+    yield f"({stage} network (input {_sensor(network.input)}) (classes {network.classes})"
     for population in network.populations:
         yield f"  (population {_population(population)})"
     for projection in network.projections:
@@ -75,12 +80,12 @@ def _network_lines(network: Network | IntegerNetwork) -> Iterator[str]:
 
 
 def _netlist_lines(netlist: Netlist) -> Iterator[str]:
-    sensor = f"{netlist.taxels} taxels x {netlist.polarities}"
-    yield f"(netlist {netlist.target} (input {sensor}) (classes {netlist.classes})"
+    yield f"(netlist {netlist.target} (input {_sensor(netlist)}) (classes {netlist.classes})"
     for layer in netlist.layers:
+        alpha = f"(alpha {layer.alpha!r}) " if layer.alpha else ""
         yield (
             f"  (layer {layer.name} (neurons {layer.neurons}) (depth {layer.depth}) (beta {layer.beta!r}) "
-            f"(theta {layer.theta!r}) (bits {layer.weight_bits}) "
+            f"(theta {layer.theta!r}) {alpha}(bits {layer.weight_bits}) "
             f"(synapses {layer.synapses}) (fan_in {layer.max_fan_in}))"
         )
     formats = zip(netlist.format_weight_bits, netlist.format_exponent, netlist.format_index_bits, strict=True)

@@ -98,6 +98,8 @@ def _values_are_finite(network: Network) -> Faults:
             yield f"population {population.name!r} has biases that are not finite"
         if not (0 <= population.beta <= 1 and population.theta > 0):
             yield f"population {population.name!r} has beta {population.beta} or theta {population.theta} out of range"
+        if not 0 <= population.alpha < 1:
+            yield f"population {population.name!r} has alpha {population.alpha} out of range"
     for i, projection in enumerate(network.projections):
         if projection.weight.dtype != np.float64 or not np.all(np.isfinite(projection.weight.data)):
             yield f"projection {i} has weights that are not finite float64"

@@ -14,6 +14,7 @@ import numpy.typing as npt
 import torch
 
 from compiler.atomic import write_atomically
+from compiler.dynamics import PLAIN, Dynamics
 from compiler.forms import Form
 from compiler.frontends.checkpoint import FORMAT, VERSIONS, content_digest
 from compiler.frontends.systems import TACTILESGNET, Grid
@@ -72,6 +73,7 @@ def checkpoint_bytes(
     forms: Sequence[Form] | None = None,
     system: str = TACTILESGNET,
     grid: Grid | None = None,
+    dynamics: Dynamics = PLAIN,
 ) -> bytes:
     """File content of a checkpoint; equal input gives equal bytes.
 
@@ -91,6 +93,8 @@ def checkpoint_bytes(
         One of :data:`compiler.frontends.systems.SYSTEMS`.
     grid : Grid, optional
         Of a grid-based CNN.
+    dynamics : Dynamics
+        Decays of single layers, and clocks.
     """
     tensors_of_one = next(iter(weights.values()))
     stages = sum(name.startswith("fc") and name.endswith(".weight") for name in tensors_of_one)
@@ -99,9 +103,10 @@ def checkpoint_bytes(
         for which, tensors in weights.items()
         for name, array in sorted(tensors.items())
     }
+    version = VERSIONS[2] if system != TACTILESGNET else VERSIONS[0] if forms is None else VERSIONS[1]
     manifest: dict[str, Any] = {
         "format": FORMAT,
-        "version": VERSIONS[2] if system != TACTILESGNET else VERSIONS[0] if forms is None else VERSIONS[1],
+        "version": version if dynamics.is_plain else VERSIONS[3],
         "architecture": system,
         "taxels": graph.n_taxels,
         "classes": len(tensors_of_one[f"fc{stages}.bias"]),
@@ -111,6 +116,8 @@ def checkpoint_bytes(
         "weights": list(weights),
         "training": dict(training),
     }
+    if not dynamics.is_plain:
+        manifest["dynamics"] = dynamics.to_json()
     if grid is not None:
         manifest["grid"] = grid.to_json()
     if forms is not None:
@@ -148,6 +155,7 @@ def save_checkpoint(
     forms: Sequence[Form] | None = None,
     system: str = TACTILESGNET,
     grid: Grid | None = None,
+    dynamics: Dynamics = PLAIN,
 ) -> None:
     """Write a checkpoint, whole or not at all; parameters as :func:`checkpoint_bytes`.
 
@@ -157,7 +165,15 @@ def save_checkpoint(
         If the file cannot be written; an older file is left as it was.
     """
     content = checkpoint_bytes(
-        weights, graph, beta=beta, theta=theta, training=training, forms=forms, system=system, grid=grid
+        weights,
+        graph,
+        beta=beta,
+        theta=theta,
+        training=training,
+        forms=forms,
+        system=system,
+        grid=grid,
+        dynamics=dynamics,
     )
     with write_atomically(path) as file:
         file.write(content)

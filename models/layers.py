@@ -8,7 +8,9 @@ References
 .. [1] J. Du et al., "Topology Adaptive Graph Convolutional Networks", 2017, arXiv:1710.10370.
 .. [2] Y. Wu et al., "Spatio-Temporal Backpropagation for Training High-Performance Spiking Neural Networks",
    Frontiers in Neuroscience 12, 2018: the rectangular surrogate.
-.. [3] F. Gu et al., "TactileSGNet: A Spiking Graph Neural Network for Event-based Tactile Object Recognition",
+.. [3] F. Zenke, S. Ganguli, "SuperSpike: Supervised Learning in Multilayer Spiking Neural Networks", Neural
+   Computation 30(6), 2018: the surrogate of a fast sigmoid.
+.. [4] F. Gu et al., "TactileSGNet: A Spiking Graph Neural Network for Event-based Tactile Object Recognition",
    IROS 2020.
 """
 
@@ -21,7 +23,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-SURROGATE_HALF_WIDTH = 0.5
+from models.surrogate import FAST_SIGMOID, RECTANGLE, Surrogate
+
+SURROGATE_HALF_WIDTH = RECTANGLE.width
 """The surrogate derivative of a spike is 1 where the membrane is nearer to the threshold than this, 0 elsewhere."""
 
 
@@ -101,11 +105,12 @@ def filter_places(x: Tensor, propagation: Tensor, filters: Tensor, bias: Tensor)
     return torch.addmm(bias, rows, weight).view(steps, samples, -1)
 
 
-def lif(current: Tensor, beta: float, theta: float) -> tuple[Tensor, Tensor]:
+def lif(current: Tensor, beta: float, theta: float, surrogate: Surrogate = RECTANGLE) -> tuple[Tensor, Tensor]:
     """Leaky integrate-and-fire neurons along the first axis, from rest.
 
     ``u_t = beta * u_{t-1} * (1 - s_{t-1}) + current_t`` and ``s_t = u_t > theta``, a strict comparison. The gradient
-    runs through the decay and through the reset, with the surrogate [2]_ for the derivative of the spike.
+    runs through the decay and, where the surrogate says so, through the reset, with the surrogate [2]_ [3]_ for the
+    derivative of the spike.
 
     Parameters
     ----------
@@ -113,6 +118,8 @@ def lif(current: Tensor, beta: float, theta: float) -> tuple[Tensor, Tensor]:
         Input current.
     beta, theta : float
         Decay (0 to 1) and threshold.
+    surrogate : Surrogate
+        Derivative of a spike.
 
     Returns
     -------
@@ -120,17 +127,17 @@ def lif(current: Tensor, beta: float, theta: float) -> tuple[Tensor, Tensor]:
         Zeros and ones, and the membrane that was compared with `theta`; no gradient flows from the membrane.
     """
     function = _Lif if current.device.type == "cpu" else LifSteps
-    spikes, membrane = function.apply(current, beta, theta)  # type: ignore[no-untyped-call]
+    spikes, membrane = function.apply(current, beta, theta, surrogate)  # type: ignore[no-untyped-call]
     return spikes, membrane
 
 
 class _Lif(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, current: Tensor, beta: float, theta: float) -> tuple[Tensor, Tensor]:
-        ctx.beta, ctx.theta = beta, theta
+    def forward(ctx: Any, current: Tensor, beta: float, theta: float, surrogate: Surrogate) -> tuple[Tensor, Tensor]:
+        ctx.beta, ctx.theta, ctx.surrogate = beta, theta, surrogate
         current = current.contiguous()
         spikes, membrane = torch.empty_like(current), torch.empty_like(current)
-        kind = _kind(current)
+        kind = kind_of(current)
         _integrate(rows_of(current), kind(beta), kind(theta), rows_of(spikes), rows_of(membrane))
         ctx.save_for_backward(membrane)
         ctx.mark_non_differentiable(membrane)
@@ -138,23 +145,23 @@ class _Lif(torch.autograd.Function):
         return spikes, membrane
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None, None]:
         (membrane,) = ctx.saved_tensors
-        spikes_gradient = gradients[0].contiguous()
         out = torch.empty_like(membrane)
-        kind = _kind(membrane)
-        beta, theta, half_width = kind(ctx.beta), kind(ctx.theta), kind(SURROGATE_HALF_WIDTH)
-        differentiate(rows_of(spikes_gradient), rows_of(membrane), beta, theta, half_width, rows_of(out))
-        return out, None, None
+        rows = rows_of(gradients[0].contiguous()), rows_of(membrane)
+        differentiate(*rows, ctx.beta, ctx.theta, ctx.surrogate, rows_of(out))
+        return out, None, None, None
 
 
 class LifSteps(torch.autograd.Function):
     """The same recurrence and gradient in torch operations, one step at a time: for devices without the kernels."""
 
     @staticmethod
-    def forward(ctx: Any, current: Tensor, beta: float, theta: float) -> tuple[Tensor, Tensor]:
+    def forward(
+        ctx: Any, current: Tensor, beta: float, theta: float, surrogate: Surrogate = RECTANGLE
+    ) -> tuple[Tensor, Tensor]:
         """See :func:`lif`."""
-        ctx.beta, ctx.theta = beta, theta
+        ctx.beta, ctx.theta, ctx.surrogate = beta, theta, surrogate
         spikes, membrane = torch.empty_like(current), torch.empty_like(current)
         u = torch.zeros_like(current[0])
         for t in range(len(current)):
@@ -167,18 +174,25 @@ class LifSteps(torch.autograd.Function):
         return spikes, membrane
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None, None]:
         """Gradient of the spikes through decay and reset."""
         (membrane,) = ctx.saved_tensors
+        surrogate: Surrogate = ctx.surrogate
         out = torch.empty_like(membrane)
         later = torch.zeros_like(membrane[0])
         for t in range(len(membrane) - 1, -1, -1):
             u = membrane[t]
-            through_spike = gradients[0][t] - later * (u * ctx.beta)
-            near = (u - ctx.theta).abs() < SURROGATE_HALF_WIDTH
-            later = torch.where(u > ctx.theta, 0.0, later * ctx.beta) + torch.where(near, through_spike, 0.0)
+            through_spike = gradients[0][t]
+            if surrogate.reset:
+                through_spike = through_spike - later * (u * ctx.beta)
+            distance = (u - ctx.theta).abs()
+            if surrogate.shape == FAST_SIGMOID:
+                spike_part = through_spike / (1 + distance / surrogate.width) ** 2
+            else:
+                spike_part = torch.where(distance < surrogate.width, through_spike, 0.0)
+            later = torch.where(u > ctx.theta, 0.0, later * ctx.beta) + spike_part
             out[t] = later
-        return out, None, None
+        return out, None, None, None
 
 
 def spike_linear(spikes: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
@@ -233,7 +247,7 @@ def rows_of(tensor: Tensor) -> np.ndarray[Any, Any]:
     return view
 
 
-def _kind(like: Tensor) -> type[np.float32] | type[np.float64]:
+def kind_of(like: Tensor) -> type[np.float32] | type[np.float64]:
     """Precision in which the recurrence is defined: that of `like`."""
     return np.float32 if like.dtype == torch.float32 else np.float64
 
@@ -261,23 +275,49 @@ def _integrate(current: Any, beta: Any, theta: Any, spikes: Any, membrane: Any) 
 
 @numba.njit(cache=True)
 def _differentiate_step(
-    from_above: Any, membrane: Any, later: Any, beta: Any, theta: Any, half_width: Any, out: Any
+    from_above: Any, membrane: Any, later: Any, beta: Any, theta: Any, half_width: Any, reset: Any, out: Any
 ) -> None:
     zero = membrane.dtype.type(0)
     for i in range(len(membrane)):
         u = membrane[i]
-        through_spike = from_above[i] - later[i] * (u * beta)
+        through_spike = from_above[i] - reset * (later[i] * (u * beta))
         through_decay = zero if u > theta else later[i] * beta
         out[i] = through_decay + (through_spike if abs(u - theta) < half_width else zero)
 
 
 @numba.njit(cache=True)
-def differentiate(spikes_gradient: Any, membrane: Any, beta: Any, theta: Any, half_width: Any, out: Any) -> None:
+def _differentiate_smooth_step(
+    from_above: Any, membrane: Any, later: Any, beta: Any, theta: Any, width: Any, reset: Any, out: Any
+) -> None:
+    zero, one = membrane.dtype.type(0), membrane.dtype.type(1)
+    for i in range(len(membrane)):
+        u = membrane[i]
+        through_spike = from_above[i] - reset * (later[i] * (u * beta))
+        through_decay = zero if u > theta else later[i] * beta
+        far = one + abs(u - theta) / width
+        out[i] = through_decay + through_spike / (far * far)
+
+
+def differentiate(
+    spikes_gradient: Any, membrane: Any, beta: float, theta: float, surrogate: Surrogate, out: Any
+) -> None:
     """Gradient of the current from that of the spikes, both (steps, neurons), through decay and reset."""
+    kind = np.float32 if membrane.dtype == np.float32 else np.float64
+    constants = kind(beta), kind(theta), kind(surrogate.width), kind(surrogate.reset)
+    _differentiate(spikes_gradient, membrane, *constants, surrogate.shape == FAST_SIGMOID, out)
+
+
+@numba.njit(cache=True)
+def _differentiate(
+    spikes_gradient: Any, membrane: Any, beta: Any, theta: Any, width: Any, reset: Any, smooth: bool, out: Any
+) -> None:
     steps, size = membrane.shape
     later = np.zeros(size, membrane.dtype)
     for t in range(steps - 1, -1, -1):
-        _differentiate_step(spikes_gradient[t], membrane[t], later, beta, theta, half_width, out[t])
+        if smooth:
+            _differentiate_smooth_step(spikes_gradient[t], membrane[t], later, beta, theta, width, reset, out[t])
+        else:
+            _differentiate_step(spikes_gradient[t], membrane[t], later, beta, theta, width, reset, out[t])
         later = out[t]
 
 

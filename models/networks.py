@@ -17,8 +17,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from compiler.dynamics import PLAIN, RELAY_WEIGHT, Clocks, Dynamics
 from compiler.frontends.systems import GCN, GRID_CNN, MLP, TACTILESGNET, feature_major, in_order
+from models.currents import lasting_current
 from models.layers import filter_places, lif, spike_linear, tag_convolution
+from models.surrogate import RECTANGLE, Surrogate
 from models.systems import HOPS, filters_of
 
 Weights = dict[str, NDArray[np.float32]]
@@ -46,6 +49,8 @@ class Architecture:
         Membrane decay per step and firing threshold of every neuron.
     system : str
         One of :data:`compiler.frontends.systems.SYSTEMS`.
+    dynamics : Dynamics
+        Decays of single layers, and clocks.
     """
 
     taxels: int
@@ -57,10 +62,14 @@ class Architecture:
     beta: float = 0.2
     theta: float = 0.5
     system: str = TACTILESGNET
+    dynamics: Dynamics = PLAIN
 
 
 class TagConvolution(nn.Module):
-    """K-hop graph convolution with filters (K + 1, features, channels)."""
+    """K-hop graph convolution with filters (K + 1, features, channels).
+
+    As all layers here it holds its parameters, and is called with them: the network may scale them first.
+    """
 
     def __init__(self, channels: int, features: int, hops: int, generator: torch.Generator) -> None:
         super().__init__()
@@ -68,9 +77,9 @@ class TagConvolution(nn.Module):
         self.bias = nn.Parameter(torch.zeros(features))
         _uniform(self.hops, channels, generator)
 
-    def forward(self, x: Tensor, adjacency: Tensor) -> Tensor:
+    def forward(self, x: Tensor, adjacency: Tensor, hops: Tensor, bias: Tensor) -> Tensor:
         """See :func:`models.layers.tag_convolution`."""
-        return tag_convolution(x, adjacency, self.hops, self.bias)
+        return tag_convolution(x, adjacency, hops, bias)
 
 
 class PlaceFilters(nn.Module):
@@ -90,9 +99,9 @@ class PlaceFilters(nn.Module):
             _uniform(self.hops, filters * channels, generator)
             _uniform(self.bias, filters * channels, generator)
 
-    def forward(self, x: Tensor, propagation: Tensor) -> Tensor:
+    def forward(self, x: Tensor, propagation: Tensor, hops: Tensor, bias: Tensor) -> Tensor:
         """See :func:`models.layers.filter_places`."""
-        return filter_places(x, propagation, self.hops, self.bias)
+        return filter_places(x, propagation, hops, bias)
 
 
 class TaxelWeights(nn.Module):
@@ -105,9 +114,9 @@ class TaxelWeights(nn.Module):
         _uniform(self.weight, inputs, generator)
         _uniform(self.bias, inputs, generator)
 
-    def forward(self, x: Tensor, _propagation: Tensor) -> Tensor:
+    def forward(self, x: Tensor, _propagation: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
         """See :func:`models.layers.spike_linear`."""
-        return spike_linear(x.flatten(2), self.weight, self.bias)
+        return spike_linear(x.flatten(2), weight, bias)
 
 
 class SpikeLinear(nn.Module):
@@ -120,9 +129,9 @@ class SpikeLinear(nn.Module):
         _uniform(self.weight, inputs, generator)
         _uniform(self.bias, inputs, generator)
 
-    def forward(self, spikes: Tensor) -> Tensor:
+    def forward(self, spikes: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
         """See :func:`models.layers.spike_linear`."""
-        return spike_linear(spikes, self.weight, self.bias)
+        return spike_linear(spikes, weight, bias)
 
 
 class SpikingNet(nn.Module):
@@ -137,19 +146,34 @@ class SpikingNet(nn.Module):
     seed : int
         Of the initial weights: uniform within 1/sqrt(fan-in), as torch and torch_geometric draw them; the bias of
         a graph convolution starts at zero. The global random state is neither used nor moved.
+    surrogate : Surrogate
+        Derivative of a spike.
 
     Notes
     -----
-    Neurons of the first layer lie place by place here; exported weights are in the order of the system.
+    Neurons of the first layer lie place by place here; exported weights are in the order of the system. The relays of
+    clocks come last.
+
+    Where a layer's current outlasts its step, its parameters are ``W / (1 - alpha)``: a spike then brings as much in
+    all as it would without, at the start and by each step of the optimizer. Exported weights are ``W``.
     """
 
-    def __init__(self, architecture: Architecture, propagation: NDArray[np.float64], *, seed: int = 0) -> None:
+    def __init__(
+        self,
+        architecture: Architecture,
+        propagation: NDArray[np.float64],
+        *,
+        seed: int = 0,
+        surrogate: Surrogate = RECTANGLE,
+    ) -> None:
         super().__init__()
-        self.architecture = architecture
+        self.architecture, self.surrogate = architecture, surrogate
+        self.gains = tuple(1 - alpha for alpha in architecture.dynamics.alphas)
         self.places = propagation.shape[-2]
         generator = torch.Generator().manual_seed(seed)
         self.conv1 = _first_layer(architecture, generator)
-        sizes = (self.places * architecture.features, *architecture.hidden, architecture.classes)
+        heard = self.places * architecture.features + architecture.dynamics.clocks.channels
+        sizes = (heard, *architecture.hidden, architecture.classes)
         self.dense = tuple(f"fc{i}" for i in range(1, len(sizes)))
         for name, inputs, outputs in zip(self.dense, sizes[:-1], sizes[1:], strict=True):
             self.add_module(name, SpikeLinear(inputs, outputs, generator))
@@ -159,24 +183,57 @@ class SpikingNet(nn.Module):
     def layers(self, events: Tensor) -> dict[str, tuple[Tensor, Tensor]]:
         """Spikes and membranes of every layer, each (steps, samples, neurons), for (steps, samples, taxels, channels).
 
-        Neurons of ``conv1`` lie place by place: ``place * features + feature``.
+        Neurons of ``conv1`` lie place by place, ``place * features + feature``, then come the relays of clocks.
         """
-        beta, theta = self.architecture.beta, self.architecture.theta
-        found = {"conv1": lif(self.conv1(events, self.adjacency), beta, theta)}
-        spikes = found["conv1"][0]
-        for name in self.dense:
-            found[name] = lif(self.get_submodule(name)(spikes), beta, theta)
+        clocks = self.architecture.dynamics.clocks
+        spikes, membranes = self._integrate(0, self.conv1, events, self.adjacency)
+        if clocks.channels:
+            ticks = relayed(clocks, spikes)
+            spikes = torch.cat([spikes, ticks], dim=2)
+            membranes = torch.cat([membranes, ticks * (RELAY_WEIGHT * self.architecture.theta)], dim=2)
+        found = {"conv1": (spikes, membranes)}
+        for index, name in enumerate(self.dense, 1):
+            found[name] = self._integrate(index, self.get_submodule(name), spikes)
             spikes = found[name][0]
         return found
 
-    def forward(self, events: Tensor) -> Tensor:
-        """Spikes per step of each output neuron, (samples, classes), for (steps, samples, taxels, channels)."""
-        return self.layers(events)[self.dense[-1]][0].mean(0)
+    def _integrate(self, index: int, layer: nn.Module, *inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Spikes and membranes of one layer; its bias goes past a current that outlasts its step."""
+        dynamics = self.architecture.dynamics
+        alpha, bias = dynamics.alpha(index), layer.get_parameter("bias")
+        (weight,) = (values for name, values in layer.named_parameters() if name != "bias")
+        if alpha:
+            current = lasting_current(layer(*inputs, self._scaled(index, weight), torch.zeros_like(bias)), alpha)
+            current = current + bias.repeat(current.shape[-1] // len(bias))
+        else:
+            current = layer(*inputs, weight, bias)
+        return lif(current, dynamics.beta(index, self.architecture.beta), self.architecture.theta, self.surrogate)
+
+    def _scaled(self, index: int, weight: Tensor) -> Tensor:
+        """Weight of a layer from its parameter."""
+        return weight * self.gains[index] if self.gains and self.gains[index] != 1 else weight
+
+    def forward(self, events: Tensor, lengths: Tensor | None = None) -> Tensor:
+        """Spikes per step of each output neuron, (samples, classes), for (steps, samples, taxels, channels).
+
+        Parameters
+        ----------
+        lengths : (samples,) int64, optional
+            Steps of each recording, where some were filled up with silence.
+        """
+        spikes = self.layers(events)[self.dense[-1]][0]
+        if lengths is None:
+            return spikes.mean(0)
+        inside = torch.arange(len(spikes), device=spikes.device)[:, None] < lengths
+        return torch.sum(spikes * inside[..., None], dim=0) / lengths[:, None]
 
     def export_weights(self) -> Weights:
         """Copy of the weights."""
-        state = {name: parameter.detach().cpu().numpy() for name, parameter in self.named_parameters()}
-        found = {name: (array.T if _turned(name) else array) for name, array in state.items()}
+        state = {name: p.detach() for name, p in self.named_parameters()}
+        for index, layer in enumerate(("conv1", *self.dense)):
+            state |= {n: self._scaled(index, p) for n, p in state.items() if n.startswith(layer) and "bias" not in n}
+        arrays = {name: p.cpu().numpy() for name, p in state.items()}
+        found = {name: (array.T if _turned(name) else array) for name, array in arrays.items()}
         if self.architecture.system == MLP:
             weight = found.pop("conv1.weight")
             found = {"conv1.hops": weight.reshape(len(weight), self.architecture.taxels, -1).swapaxes(0, 1)} | found
@@ -185,7 +242,8 @@ class SpikingNet(nn.Module):
         return {name: array.copy(order="C") for name, array in found.items()}
 
     def load_weights(self, weights: Mapping[str, NDArray[np.float32]]) -> None:
-        """Take over what `export_weights` returned."""
+        """Take over what `export_weights` returned, as it is: the parameters are the weights from now on."""
+        self.gains = ()
         given = dict(weights)
         if self.architecture.system == MLP:
             hops = given.pop("conv1.hops")
@@ -196,11 +254,16 @@ class SpikingNet(nn.Module):
 
     def _order(self) -> NDArray[np.int64]:
         """Neuron of ours that is the first, second … one in the order of the system."""
-        features = self.architecture.features
-        order: NDArray[np.int64] = in_order(
-            self.architecture.system, np.arange(self.places * features).reshape(self.places, features)
-        )
-        return order
+        features, clocks = self.architecture.features, self.architecture.dynamics.clocks.channels
+        own = np.arange(self.places * features).reshape(self.places, features)
+        return np.append(in_order(self.architecture.system, own), np.arange(own.size, own.size + clocks))
+
+
+def relayed(clocks: Clocks, like: Tensor) -> Tensor:
+    """Spikes of the relays, (steps, samples, clocks), for other spikes of the first layer."""
+    steps, samples, _ = like.shape
+    ticks = torch.from_numpy(clocks.events(steps).T.copy()).to(like)
+    return ticks[:, None].expand(steps, samples, clocks.channels)
 
 
 def _first_layer(architecture: Architecture, generator: torch.Generator) -> nn.Module:

@@ -17,7 +17,7 @@ from compiler.errors import DataError
 from compiler.frontends.checkpoint import arrays_digest
 from models.evtouch import Recordings
 from models.networks import Architecture
-from models.schedule import DECAY_EPOCHS
+from models.recipes import RELEASED, Recipe
 from models.train import Trained, train
 
 VALIDATION_SHARE = 0.2
@@ -98,7 +98,7 @@ def train_both(
     *,
     epochs: int,
     seed: int,
-    decay_epochs: int = DECAY_EPOCHS,
+    recipe: Recipe = RELEASED,
     device: str = "cpu",
     state: Path | None = None,
     resume: bool = False,
@@ -117,7 +117,7 @@ def train_both(
         architecture,
         epochs=epochs,
         seed=seed,
-        decay_epochs=decay_epochs,
+        recipe=recipe,
         device=device,
         state=files[0],
         resume=resume,
@@ -132,7 +132,7 @@ def train_both(
         architecture,
         epochs=epochs,
         seed=seed,
-        decay_epochs=decay_epochs,
+        recipe=recipe,
         device=device,
         keep_epoch=clean.epoch,
         state=files[1],

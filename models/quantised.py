@@ -30,7 +30,8 @@ from compiler.forms import Form, decay_registers, reach, round_steps, step_units
 from compiler.frontends.checkpoint import Checkpoint
 from compiler.frontends.systems import in_order
 from compiler.passes.expand import effective_weight, stack_of
-from models.layers import SURROGATE_HALF_WIDTH, differentiate, events_of, gather, scatter
+from models.layers import differentiate, events_of, gather, scatter
+from models.surrogate import RECTANGLE
 
 SHRINK = 0.98
 """A neuron whose weights would overflow the accumulator has them scaled by this, until they do not."""
@@ -212,9 +213,7 @@ class _ChipLayer(torch.autograd.Function):
         source, bounds, membrane, integers, theta, samples = ctx.kept
         above = gradients[0].contiguous().view(membrane.shape).numpy()
         current = np.empty_like(membrane)
-        kind = np.float32
-        beta = kind(integers.keep / (1 << DECAY_BITS))
-        differentiate(above, membrane, beta, kind(theta), kind(SURROGATE_HALF_WIDTH), current)
+        differentiate(above, membrane, integers.keep / (1 << DECAY_BITS), theta, RECTANGLE, current)
         rows = current.reshape(len(membrane) * samples, -1)
         weight = np.zeros_like(integers.units)
         scatter(source, bounds, rows, weight)

@@ -14,9 +14,12 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from compiler.dynamics import RELAY_WEIGHT
 from compiler.frontends.checkpoint import Checkpoint
-from compiler.frontends.systems import GCN, TACTILESGNET, feature_major
+from compiler.frontends.systems import GCN, TACTILESGNET, feature_major, in_order
+from models.currents import lasting_current
 from models.layers import filter_places, lif, tag_convolution
+from models.networks import relayed
 
 BATCH = 8
 """Recordings that run together: few enough for the caches."""
@@ -33,14 +36,36 @@ def _layers(
     def tensor(array: npt.NDArray[np.generic]) -> torch.Tensor:
         return torch.tensor(np.ascontiguousarray(array), dtype=kind)
 
+    def neurons(layer: int, drive: torch.Tensor, bias: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        alpha = dynamics.alpha(layer)
+        current = lasting_current(drive, alpha) + bias if alpha else drive
+        return lif(current, dynamics.beta(layer, checkpoint.beta), checkpoint.theta)
+
+    def inside(layer: int, bias: torch.Tensor) -> torch.Tensor:
+        """The bias as part of what the spikes bring, unless that outlasts its step."""
+        return torch.zeros_like(bias) if dynamics.alpha(layer) else bias
+
+    dynamics = checkpoint.dynamics
     x = tensor(events.transpose(3, 0, 1, 2))
-    current = _first(checkpoint.system, x, tensor(adjacency), tensor(checkpoint.hops), tensor(checkpoint.conv_bias))
-    spikes, membranes = lif(current, checkpoint.beta, checkpoint.theta)
+    bias = tensor(checkpoint.conv_bias)
+    drive = _first(checkpoint.system, x, tensor(adjacency), tensor(checkpoint.hops), inside(0, bias))
+    spikes, membranes = neurons(0, drive, _of_neurons(checkpoint, bias))
+    if dynamics.clocks.channels:
+        ticks = relayed(dynamics.clocks, spikes)
+        spikes = torch.cat([spikes, ticks], dim=2)
+        membranes = torch.cat([membranes, ticks * (RELAY_WEIGHT * checkpoint.theta)], dim=2)
     yield "conv1", spikes, membranes
-    for dense in checkpoint.dense:
-        current = torch.nn.functional.linear(spikes, tensor(dense.weight), tensor(dense.bias))
-        spikes, membranes = lif(current, checkpoint.beta, checkpoint.theta)
+    for layer, dense in enumerate(checkpoint.dense, 1):
+        bias = tensor(dense.bias)
+        drive = torch.nn.functional.linear(spikes, tensor(dense.weight), inside(layer, bias))
+        spikes, membranes = neurons(layer, drive, bias)
         yield dense.name, spikes, membranes
+
+
+def _of_neurons(checkpoint: Checkpoint, bias: torch.Tensor) -> torch.Tensor:
+    """Biases of the features as those of the first layer's neurons, in the order of the system."""
+    turned: torch.Tensor = in_order(checkpoint.system, bias.repeat(checkpoint.places, 1))
+    return turned
 
 
 def _first(system: str, x: torch.Tensor, propagation: torch.Tensor, hops: torch.Tensor, bias: torch.Tensor) -> Any:

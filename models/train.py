@@ -1,4 +1,6 @@
-"""Training by the released protocol: one recording at a time, Adam, the squared error of the spike rates.
+"""Training, by default by the released protocol: one recording at a time, Adam, the squared error of the spike rates.
+
+:mod:`models.recipes` has another way, as data.
 
 The released script reads recordings in the order that the folder lists them, unshuffled, which differs from machine
 to machine. Here each epoch shuffles them anew, from the seed.
@@ -31,8 +33,10 @@ from compiler.errors import DataError, OptionError
 from compiler.frontends.checkpoint import arrays_digest
 from models.evtouch import Recordings
 from models.networks import Architecture, SpikingNet, Weights
+from models.optimizers import course_of, optimizer_of, set_rate
+from models.recipes import CROSS_ENTROPY, RELEASED, Recipe
 from models.resume import TrainingState, pack, read_state, unpack, write_state
-from models.schedule import DECAY_EPOCHS, EPOCHS
+from models.schedule import EPOCHS
 
 DEVICES = ("cpu", "cuda")
 
@@ -50,7 +54,8 @@ class Epoch:
     learning_rate : float
         While it ran.
     training_loss, test_loss : float
-        Mean squared error of the spike rates against zeros and a one, mean over the recordings.
+        The recipe's loss, by default the mean squared error of the spike rates against zeros and a one; mean over the
+        recordings.
     correct, tested : int
         Test recordings classified correctly after it, and all of them.
     """
@@ -103,8 +108,7 @@ def train(
     *,
     epochs: int = EPOCHS,
     seed: int = 0,
-    learning_rate: float = 1e-3,
-    decay_epochs: int = DECAY_EPOCHS,
+    recipe: Recipe = RELEASED,
     device: str = "cpu",
     keep_epoch: int | None = None,
     state: Path | None = None,
@@ -127,10 +131,8 @@ def train(
         Passes over the training recordings.
     seed : int
         Of the initial weights and of the order of recordings.
-    learning_rate : float
-        At the start.
-    decay_epochs : int
-        It falls to a tenth after so many epochs, again and again; see :mod:`models.schedule`.
+    recipe : Recipe
+        Batch, loss, surrogate, optimizer and schedule; its sizes and dynamics are already in the architecture.
     device : {"cpu", "cuda"}
         Where the network runs.
     keep_epoch : int, optional
@@ -147,12 +149,12 @@ def train(
     Raises
     ------
     OptionError
-        If `epochs`, `decay_epochs` or `seed` is too small, there is no such device, or `state` belongs to another
-        training.
+        If `epochs`, the recipe's `decay_epochs` or `seed` is too small, there is no such device, or `state` belongs to
+        another training.
     DataError
         If recordings and architecture disagree, or the loss is no longer a number.
     """
-    _check_options(epochs, decay_epochs, seed, device)
+    _check_options(epochs, recipe.decay_epochs, seed, device)
     for recordings in (training, test):
         _check(recordings, architecture)
     options = {
@@ -162,32 +164,31 @@ def train(
         "test data": arrays_digest(test.identity()),
         "epochs": epochs,
         "seed": seed,
-        "learning rate": learning_rate,
+        "recipe": recipe.to_json(),
         "device": device,
         "kept epoch": keep_epoch,
-        # the released one goes without saying, as in every state that was written before there was a choice
-        **({} if decay_epochs == DECAY_EPOCHS else {"decay epochs": decay_epochs}),
     }
     order = np.random.default_rng(seed)
     history: list[Epoch] = []
     weights: dict[str, Weights] = {}
     with one_thread():
-        network = SpikingNet(architecture, propagation, seed=seed).to(device)
-        optimizer = torch.optim.Adam(network.parameters(), lr=learning_rate, amsgrad=True, fused=device == "cpu")
+        network = SpikingNet(architecture, propagation, seed=seed, surrogate=recipe.surrogate).to(device)
+        optimizer = optimizer_of(recipe, network, device)
         if resume and state is not None and state.exists():
             found = read_state(state, options)
             history, weights = _restore(found, network, optimizer, order)
         bar = tqdm(total=epochs, initial=len(history), desc=label, unit="epoch", position=position, disable=None)
         with bar as progress:
             for index in range(len(history), epochs):
+                course = course_of(recipe, index, epochs)
+                if course is not None:
+                    set_rate(optimizer, course(0.0))
                 rate = float(optimizer.param_groups[0]["lr"])
-                training_loss = _train_epoch(
-                    network, optimizer, training, order.permutation(len(training)), epoch=index + 1
-                )
-                if index % decay_epochs == 0 and index > 1:
-                    for group in optimizer.param_groups:
-                        group["lr"] *= 0.1
-                test_loss, correct = evaluate(network, test)
+                shuffled = order.permutation(len(training))
+                training_loss = _train_epoch(network, optimizer, training, shuffled, recipe, course, epoch=index + 1)
+                if course is None and index % recipe.decay_epochs == 0 and index > 1:
+                    set_rate(optimizer, rate * 0.1)
+                test_loss, correct = evaluate(network, test, recipe)
                 if correct > max((epoch.correct for epoch in history), default=-1):
                     weights["best"] = network.export_weights()
                 if index + 1 == keep_epoch:
@@ -281,14 +282,14 @@ def _state(
     return TrainingState(options=options, progress=progress, arrays=arrays)
 
 
-def evaluate(network: SpikingNet, recordings: Recordings) -> tuple[float, int]:
+def evaluate(network: SpikingNet, recordings: Recordings, recipe: Recipe = RELEASED) -> tuple[float, int]:
     """Mean loss, and how many recordings are classified correctly; equal top rates count for the lowest class."""
     loss, correct = 0.0, 0
     with torch.no_grad():
         for chosen, events in _batches(recordings):
             labels = recordings.labels[chosen]
             rates = _rates(network, events)
-            loss += float(rate_loss(rates, labels)) * len(labels)
+            loss += float(_loss(recipe, rates, labels)) * len(labels)
             correct += int(np.sum(rates.numpy().argmax(axis=1) == labels))
     return loss / len(recordings), correct
 
@@ -318,21 +319,34 @@ def _train_epoch(
     optimizer: torch.optim.Optimizer,
     recordings: Recordings,
     order: NDArray[np.int64],
+    recipe: Recipe,
+    course: Callable[[float], float] | None,
     *,
     epoch: int,
 ) -> float:
     total = 0.0
-    for step, index in enumerate(order, 1):
-        chosen = slice(index, index + 1)
+    for step, start in enumerate(range(0, len(order), recipe.batch), 1):
+        chosen = order[start : start + recipe.batch]
+        if course is not None:
+            set_rate(optimizer, course(start / len(order)))
         optimizer.zero_grad()
-        events = recordings.events[chosen, ..., : recordings.steps_of(int(index))]
-        loss = rate_loss(_rates(network, events), recordings.labels[chosen])
+        lengths = np.array([recordings.steps_of(int(index)) for index in chosen])
+        events = recordings.events[chosen][..., : lengths.max()]
+        filled = lengths if lengths.min() < lengths.max() else None
+        loss = _loss(recipe, _rates(network, events, filled), recordings.labels[chosen])
         found = float(loss.detach())
         _require_finite(found, epoch, step)
         loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
-        total += found
+        total += found * len(chosen)
     return total / len(order)
+
+
+def _loss(recipe: Recipe, rates: Tensor, labels: NDArray[np.int64]) -> Tensor:
+    if recipe.loss == CROSS_ENTROPY:
+        wanted = torch.tensor(labels)
+        return torch.nn.functional.cross_entropy(recipe.gain * rates, wanted, label_smoothing=recipe.smoothing)
+    return rate_loss(rates, labels)
 
 
 def rate_loss(rates: Tensor, labels: NDArray[np.int64]) -> Tensor:
@@ -342,9 +356,11 @@ def rate_loss(rates: Tensor, labels: NDArray[np.int64]) -> Tensor:
     return torch.nn.functional.mse_loss(rates, target)
 
 
-def _rates(network: SpikingNet, events: NDArray[np.uint8]) -> Tensor:
-    """Spike rates on the CPU, computed where the network is."""
-    rates: Tensor = network(_time_first(events).to(network.adjacency.device)).cpu()
+def _rates(network: SpikingNet, events: NDArray[np.uint8], lengths: NDArray[np.int64] | None = None) -> Tensor:
+    """Spike rates on the CPU, computed where the network is; `lengths` where some recordings were filled up."""
+    device = network.adjacency.device
+    inside = None if lengths is None else torch.tensor(lengths, device=device)
+    rates: Tensor = network(_time_first(events).to(device), inside).cpu()
     return rates
 
 

@@ -224,7 +224,7 @@ def _found(
     found = search(
         expand(checkpoint, adjacency),
         target,
-        channels_last(training.events),
+        channels_last(training.events, checkpoint.dynamics.clocks),
         training.labels,
         widths=widths,
         groups=arguments.scale_groups,

@@ -12,6 +12,9 @@ order they come.
 *Decay in 32 bits.* It also proves that no membrane leaves its register and that none times its factor reaches 2**32; so
 the magnitude is multiplied without a sign, and nothing saturates.
 
+*Currents.* Most layers have none beyond a step. Where the current outlasts its step it is one more register of 32 bits;
+a product of two wide factors is then taken in two parts, as :mod:`runtime.kernel` does.
+
 *Idle neurons.* A compartment has nothing to do in a step if its membrane, its current, its bias and the number of
 synapses that reach it are all zero. Only those without a bias can be idle, the others are not looked at.
 
@@ -79,8 +82,8 @@ class Blocks(NamedTuple):
         Positions that hold a compartment.
     bias, threshold : (blocks * 64,) int32
         In membrane units; a position without a compartment has a threshold that nothing reaches.
-    keep : (blocks,) uint32
-        What a membrane keeps in a step, in 1/4096.
+    keep, keep_u : (blocks,) uint32
+        What a membrane and a current keep in a step, in 1/4096.
     depth, layer : (blocks,) int64
         Depth and layer of each block.
     compartment : (blocks * 64,) int64
@@ -103,6 +106,7 @@ class Blocks(NamedTuple):
     bias: AnyArray
     threshold: AnyArray
     keep: AnyArray
+    keep_u: AnyArray
     depth: IntArray
     layer: IntArray
     compartment: IntArray
@@ -169,6 +173,21 @@ class Scratch(NamedTuple):
     membrane: AnyArray
     before: AnyArray
     membranes: AnyArray
+
+
+class Lasting(NamedTuple):
+    """Currents that outlast their step, in a recording.
+
+    Parameters
+    ----------
+    keep_u : (blocks,) uint32
+        As in :class:`Blocks`; 0 where there is no such current.
+    current : (blocks * 64,) int32
+        Last currents.
+    """
+
+    keep_u: AnyArray
+    current: AnyArray
 
 
 # -- vectors -----------------------------------------------------------------------------------------------------------
@@ -306,22 +325,40 @@ def _sum_listed(builder: Any, tables: Any, sources: Any, bounds: Any, block: Any
     return total, arrived
 
 
-def _integrate(builder: Any, tables: Any, scratch: Any, sums: Any, block: Any, kept_at: Any) -> tuple[Any, Any]:
-    """Emit one step of the 64 neurons; returns their membranes before it, and who fired."""
+def _decayed(builder: Any, old: Any, keep: Any, *, wide: bool) -> Any:
+    """Emit the decay of 64 registers, rounding toward zero; `wide` where a product may leave 32 bits."""
+    zero, bits = _all(_STATES, 0), _all(_STATES, DECAY_BITS)
+    below = builder.icmp_signed("<", old, zero)
+    magnitude = builder.select(below, builder.sub(zero, old), old)
+    if wide:
+        low = builder.and_(magnitude, _all(_STATES, 2**DECAY_BITS - 1))
+        low = builder.lshr(builder.mul(low, keep), bits)
+        magnitude = builder.add(builder.mul(builder.lshr(magnitude, bits), keep), low)
+    else:
+        magnitude = builder.lshr(builder.mul(magnitude, keep), bits)
+    return builder.select(below, builder.sub(zero, magnitude), magnitude)
+
+
+def _integrate(
+    builder: Any, tables: Any, scratch: Any, sums: Any, block: Any, kept_at: Any, lasting: Any
+) -> tuple[Any, Any, Any]:
+    """Emit one step of the 64 neurons; returns their membranes and lasting currents before it, and who fired."""
     position = builder.mul(block, _number(LANES))
     zero = _all(_STATES, 0)
 
-    # decay membrane, rounding toward zero
+    # decay membrane
     old, place = _vector(builder, scratch["membrane"], position, _STATES)
-    below = builder.icmp_signed("<", old, zero)
-    magnitude = builder.select(below, builder.sub(zero, old), old)
-    magnitude = builder.mul(magnitude, _lanes(builder, _element(builder, tables["keep"], block)))
-    magnitude = builder.lshr(magnitude, _all(_STATES, DECAY_BITS))
-    v = builder.select(below, builder.sub(zero, magnitude), magnitude)
+    keep = _lanes(builder, _element(builder, tables["keep"], block))
+    v = _decayed(builder, old, keep, wide=lasting is not None)
     # add input and bias
-    v = builder.add(
-        v, builder.shl(builder.sext(sums, _STATES), _lanes(builder, _element(builder, tables["shift"], block)))
-    )
+    arrived = builder.shl(builder.sext(sums, _STATES), _lanes(builder, _element(builder, tables["shift"], block)))
+    before = None
+    if lasting is not None:
+        before, current_place = _vector(builder, lasting["current"], position, _STATES)
+        keep_u = _lanes(builder, _element(builder, lasting["keep_u"], block))
+        arrived = builder.add(_decayed(builder, before, keep_u, wide=True), arrived)
+        _store(builder, arrived, current_place)
+    v = builder.add(v, arrived)
     v = builder.add(v, _vector(builder, tables["bias"], position, _STATES)[0])
     # compare
     fired = builder.icmp_signed(">", v, _vector(builder, tables["threshold"], position, _STATES)[0])
@@ -329,36 +366,49 @@ def _integrate(builder: Any, tables: Any, scratch: Any, sums: Any, block: Any, k
         _store(builder, v, _vector(builder, scratch["membranes"], kept_at, _STATES)[1])
     # reset
     _store(builder, builder.select(fired, zero, v), place)
-    return old, fired
+    return old, before, fired
 
 
-def _block_step(*, listed: bool, rests: bool) -> Function:
+def _block_step(*, listed: bool, rests: bool, lasts: bool) -> Function:
     """Make one step of one block.
 
-    Sources come as words, or listed where every source reaches the block; it `rests` where compartments can be idle.
+    Sources come as words, or listed where every source reaches the block; it `rests` where compartments can be idle,
+    and `lasts` where their currents outlast a step.
     """
 
     @_intrinsic
     def step(
-        typing: Any, tables: Any, active: Any, at: Any, end: Any, block: Any, scratch: Any, place: Any, kept_at: Any
+        typing: Any,
+        tables: Any,
+        active: Any,
+        at: Any,
+        end: Any,
+        block: Any,
+        scratch: Any,
+        lasting: Any,
+        place: Any,
+        kept_at: Any,
     ) -> Any:
-        signature = types.uint64(tables, active, *[types.int64] * 3, scratch, *[types.int64] * 2)
+        signature = types.uint64(tables, active, *[types.int64] * 3, scratch, lasting, *[types.int64] * 2)
 
         def emit(context: Any, builder: Any, _signature: Any, values: Any) -> Any:
             table = _arrays(context, builder, tables, values[0])
             own = _arrays(context, builder, scratch, values[5])
+            currents = _arrays(context, builder, lasting, values[6]) if lasts else None
             sources = context.make_array(active)(context, builder, values[1]).data
-            (at, end, block), (place, kept_at) = values[2:5], values[6:8]
+            (at, end, block), (place, kept_at) = values[2:5], values[7:9]
             if listed:
                 sums, arrived = _sum_listed(builder, table, sources, (at, end), block, marks=rests)
             else:
                 sums, arrived = _sum_rows(builder, table, sources, at, block, marks=rests)
-            old, fired = _integrate(builder, table, own, sums, block, kept_at)
+            old, last, fired = _integrate(builder, table, own, sums, block, kept_at, currents)
             if rests:
-                last, last_at = _vector(builder, own["before"], builder.mul(block, _number(LANES)), _SUMS)
-                _store(builder, sums, last_at)
+                if last is None:
+                    last, last_at = _vector(builder, own["before"], builder.mul(block, _number(LANES)), _SUMS)
+                    _store(builder, sums, last_at)
                 silent = builder.and_(
-                    builder.icmp_signed("==", old, _all(_STATES, 0)), builder.icmp_signed("==", last, _all(_SUMS, 0))
+                    builder.icmp_signed("==", old, _all(_STATES, 0)),
+                    builder.icmp_signed("==", last, _all(last.type, 0)),
                 )
                 idle = builder.and_(builder.bitcast(silent, _WORD), builder.not_(arrived))
                 idle = builder.and_(idle, _element(builder, table["restful"], block))
@@ -370,8 +420,15 @@ def _block_step(*, listed: bool, rests: bool) -> Function:
     return step
 
 
-_busy_step, _restful_step = (_block_step(listed=False, rests=rests) for rests in (False, True))
-_busy_listed_step, _restful_listed_step = (_block_step(listed=True, rests=rests) for rests in (False, True))
+def _steps(*, lasts: bool) -> tuple[Function, ...]:
+    """By words, at rest or not, then listed, at rest or not."""
+    return tuple(
+        _block_step(listed=listed, rests=rests, lasts=lasts) for listed in (False, True) for rests in (True, False)
+    )
+
+
+_restful_step, _busy_step, _restful_listed_step, _busy_listed_step = _steps(lasts=False)
+_restful_lasting_step, _busy_lasting_step, _restful_listed_lasting_step, _busy_listed_lasting_step = _steps(lasts=True)
 
 
 def _charging(*, narrow: bool) -> Function:
@@ -504,6 +561,75 @@ def _list(words: AnyArray, start: int, width: int, steps: int, bounds: AnyArray,
 
 
 @compiled
+def _run_block(
+    blocks: Blocks,
+    s: int,
+    block: int,
+    steps: int,
+    words: AnyArray,
+    start: int,
+    width: int,
+    listed: AnyArray,
+    bounds: IntArray,
+    scratch: Scratch,
+) -> None:
+    """Run a block of a stage through a recording, on its sources as words and listed."""
+    begin, end = blocks.stage[s], blocks.stage[s + 1]
+    rests = blocks.restful[block] != 0
+    for t in range(steps):
+        place = steps * begin + t * (end - begin) + block - begin
+        kept = place * LANES if scratch.membranes.size else -1
+        if not blocks.dense[s]:
+            at = start + t * width
+            if rests:
+                fired = _restful_step(blocks, words, at, 0, block, scratch, None, place, kept)
+            else:
+                fired = _busy_step(blocks, words, at, 0, block, scratch, None, place, kept)
+        elif rests:
+            fired = _restful_listed_step(blocks, listed, bounds[t], bounds[t + 1], block, scratch, None, place, kept)
+        else:
+            fired = _busy_listed_step(blocks, listed, bounds[t], bounds[t + 1], block, scratch, None, place, kept)
+        scratch.raster[place] = fired
+
+
+@compiled
+def _run_lasting_block(
+    blocks: Blocks,
+    s: int,
+    block: int,
+    steps: int,
+    words: AnyArray,
+    start: int,
+    width: int,
+    listed: AnyArray,
+    bounds: IntArray,
+    scratch: Scratch,
+    lasting: Lasting,
+) -> None:
+    """The same where currents outlast a step."""
+    begin, end = blocks.stage[s], blocks.stage[s + 1]
+    rests = blocks.restful[block] != 0
+    for t in range(steps):
+        place = steps * begin + t * (end - begin) + block - begin
+        kept = place * LANES if scratch.membranes.size else -1
+        if not blocks.dense[s]:
+            at = start + t * width
+            if rests:
+                fired = _restful_lasting_step(blocks, words, at, 0, block, scratch, lasting, place, kept)
+            else:
+                fired = _busy_lasting_step(blocks, words, at, 0, block, scratch, lasting, place, kept)
+        elif rests:
+            fired = _restful_listed_lasting_step(
+                blocks, listed, bounds[t], bounds[t + 1], block, scratch, lasting, place, kept
+            )
+        else:
+            fired = _busy_listed_lasting_step(
+                blocks, listed, bounds[t], bounds[t + 1], block, scratch, lasting, place, kept
+            )
+        scratch.raster[place] = fired
+
+
+@compiled
 def _run_stage(
     blocks: Blocks,
     s: int,
@@ -514,25 +640,14 @@ def _run_stage(
     listed: AnyArray,
     bounds: IntArray,
     scratch: Scratch,
+    lasting: Lasting | None,
 ) -> None:
-    """Let a stage integrate on its sources, as words and listed; a block's rows and membranes stay in cache."""
-    begin, end = blocks.stage[s], blocks.stage[s + 1]
-    for block in range(begin, end):
-        rests = blocks.restful[block] != 0
-        for t in range(steps):
-            place = steps * begin + t * (end - begin) + block - begin
-            kept = place * LANES if scratch.membranes.size else -1
-            if not blocks.dense[s]:
-                at = start + t * width
-                if rests:
-                    fired = _restful_step(blocks, words, at, 0, block, scratch, place, kept)
-                else:
-                    fired = _busy_step(blocks, words, at, 0, block, scratch, place, kept)
-            elif rests:
-                fired = _restful_listed_step(blocks, listed, bounds[t], bounds[t + 1], block, scratch, place, kept)
-            else:
-                fired = _busy_listed_step(blocks, listed, bounds[t], bounds[t + 1], block, scratch, place, kept)
-            scratch.raster[place] = fired
+    """Let a stage integrate, block by block: its rows and membranes stay in cache."""
+    for block in range(blocks.stage[s], blocks.stage[s + 1]):
+        if lasting is not None and lasting.keep_u[block] != 0:
+            _run_lasting_block(blocks, s, block, steps, words, start, width, listed, bounds, scratch, lasting)
+        else:
+            _run_block(blocks, s, block, steps, words, start, width, listed, bounds, scratch)
 
 
 @compiled
@@ -574,7 +689,13 @@ def _charge_updates(blocks: Blocks, steps: int, idle: AnyArray, charges: ChargeR
 
 @compiled
 def _run_stages(
-    blocks: Blocks, n_words: int, steps: int, scratch: Scratch, charges: ChargeRows, sums: IntArray
+    blocks: Blocks,
+    n_words: int,
+    steps: int,
+    scratch: Scratch,
+    charges: ChargeRows,
+    sums: IntArray,
+    lasting: Lasting | None,
 ) -> None:
     """Let all stages integrate, one after the other, and count spikes and events."""
     bounds = np.empty(steps + 1, np.int64)
@@ -583,7 +704,7 @@ def _run_stages(
     for s in range(blocks.stage.size - 1):
         listed = _list(active, start, width, steps, bounds, count)
         _charge_all(listed, bounds, steps, charges, at * LANES * charges.width, delay, sums)
-        _run_stage(blocks, s, steps, active, start, width, listed, bounds, scratch)
+        _run_stage(blocks, s, steps, active, start, width, listed, bounds, scratch, lasting)
         begin, end = blocks.stage[s], blocks.stage[s + 1]
         active, start, width, count = scratch.raster, steps * begin, end - begin, scratch.spikes[begin * LANES :]
         at, delay = n_words + begin, s
@@ -673,6 +794,7 @@ def run_recordings(
     charges: ChargeRows,
     charged: IntArray,
     packed: AnyArray,
+    keep_u: AnyArray | None,
 ) -> None:
     """Run some recordings.
 
@@ -694,6 +816,8 @@ def run_recordings(
         Zeros; filled with these sums.
     packed : (recordings, chip steps, words) uint64
         Zeros; filled, see :class:`runtime.trace.Trace`. No recordings where it is not wanted.
+    keep_u : (blocks,) uint32, or None
+        That of the blocks, where some current outlasts its step: other networks do without the code for it.
     """
     n_words, n_blocks = (events.shape[1] + LANES - 1) // LANES, blocks.keep.size
     for r in range(events.shape[0]):
@@ -709,7 +833,11 @@ def run_recordings(
             np.empty(steps * n_blocks * LANES if membranes.shape[0] else 0, np.int32),
         )
         _pack(events[r], steps, scratch.words)
-        _run_stages(blocks, n_words, steps, scratch, charges, charged[r])
+        if keep_u is None:
+            _run_stages(blocks, n_words, steps, scratch, charges, charged[r], None)
+        else:
+            lasting = Lasting(keep_u, np.zeros(n_blocks * LANES, np.int32))
+            _run_stages(blocks, n_words, steps, scratch, charges, charged[r], lasting)
 
         inputs[r] = scratch.inputs[: events.shape[1]]
         for position in range(n_blocks * LANES):

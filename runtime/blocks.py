@@ -7,16 +7,13 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from compiler.fixedpoint import DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT, IntArray
+from compiler.fixedpoint import CURRENT_MAX, DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT, IntArray
 from compiler.netlist import Netlist, one_step_bounds
 from runtime.block_kernel import CHARGES, LANES, Blocks, ChargeRows
 from runtime.trace import BoolArray, Charges
 
 SUM_MAX = 2**15 - 1
 """Largest sum that the kernel holds."""
-
-NO_MEMORY = 2**DECAY_BITS - 1
-"""`decay_u` of a current that forgets everything in one step."""
 
 SPARE = 2**23
 """Bytes that rows may take in any case; beyond that they may take ``BYTES_A_SYNAPSE``."""
@@ -36,16 +33,22 @@ def _in_range(netlist: Netlist) -> bool:
     if max(int(positive.max(initial=0)), int(negative.max(initial=0))) > SUM_MAX:
         return False
     bias = netlist.bias_mantissa << netlist.bias_exponent
-    keep = 2**DECAY_BITS - netlist.decay_v
+    keep, lost_u = 2**DECAY_BITS - netlist.decay_v, netlist.decay_u + 1
+    lasts = lost_u != 2**DECAY_BITS
+    # a current that loses lost_u/4096 a step and gains x cannot climb beyond x * 4096 / lost_u
+    up, down = ((sums << MEMBRANE_SHIFT + DECAY_BITS) // lost_u for sums in (positive, negative))
+    if np.any(np.maximum(up, down) > CURRENT_MAX):
+        return False
     # a membrane is left at the threshold at most; below zero it loses as much as it can gain at the far end
     above = np.maximum(netlist.threshold << MEMBRANE_SHIFT, 0)
-    gained = (negative << MEMBRANE_SHIFT) + np.maximum(-bias, 0)
+    gained = down + np.maximum(-bias, 0)
     if np.any((keep == 2**DECAY_BITS) & (gained > 0)):
         return False
     below = (gained << DECAY_BITS) // np.maximum(2**DECAY_BITS - keep, 1) + 1
-    highest = (above * keep >> DECAY_BITS) + (positive << MEMBRANE_SHIFT) + np.maximum(bias, 0)
+    highest = (above * keep >> DECAY_BITS) + up + np.maximum(bias, 0)
     stored = np.maximum(above, below)
-    return bool(np.all(highest <= MEMBRANE_MAX) and np.all(stored <= MEMBRANE_MAX) and np.all(stored * keep < 2**32))
+    narrow = np.all((stored * keep < 2**32) | lasts)  # beside a lasting current products are taken in two parts
+    return bool(np.all(highest <= MEMBRANE_MAX) and np.all(stored <= MEMBRANE_MAX) and narrow)
 
 
 def _is_pipeline(netlist: Netlist) -> bool:
@@ -65,10 +68,10 @@ def lay_out_blocks(netlist: Netlist) -> Blocks | None:
     Returns
     -------
     Blocks or None
-        None where currents have a memory, a register could overflow or saturate, a layer hears others than the one
-        before it, or synapses are so scattered that rows of 64 would waste memory.
+        None where a register could overflow or saturate, a layer hears others than the one before it, or synapses are
+        so scattered that rows of 64 would waste memory.
     """
-    if np.any(netlist.decay_u != NO_MEMORY) or not _is_pipeline(netlist) or not _in_range(netlist):
+    if not _is_pipeline(netlist) or not _in_range(netlist):
         return None
     seats = _seats(netlist)
 
@@ -124,6 +127,7 @@ def lay_out_blocks(netlist: Netlist) -> Blocks | None:
         bias=bias,
         threshold=threshold,
         keep=seats.keep.astype(np.uint32),
+        keep_u=seats.keep_u.astype(np.uint32),
         depth=seats.depth[seats.layer],
         layer=seats.layer,
         compartment=compartment,
@@ -171,8 +175,8 @@ class _Seats(NamedTuple):
     ----------
     position : (compartments,) int64
         Block and lane of each.
-    layer, keep : (blocks,) int64
-        Layer of each block, and what its membranes keep, in 1/4096.
+    layer, keep, keep_u : (blocks,) int64
+        Layer of each block, and what its membranes and currents keep, in 1/4096.
     stage : (stages + 1,) int64
         Bounds of the stages in the blocks.
     depth : (layers,) int64
@@ -182,6 +186,7 @@ class _Seats(NamedTuple):
     position: IntArray
     layer: IntArray
     keep: IntArray
+    keep_u: IntArray
     stage: IntArray
     depth: IntArray
 
@@ -189,18 +194,18 @@ class _Seats(NamedTuple):
 def _seats(netlist: Netlist) -> _Seats:
     """Seat compartments by depth, layer and neuron; a layer begins a block, and so does another decay within it."""
     depth = np.array([layer.depth for layer in netlist.layers])
-    keep = 2**DECAY_BITS - netlist.decay_v
-    order = np.lexsort((netlist.neuron, keep, netlist.layer, depth[netlist.layer]))
-    groups = np.stack([netlist.layer, keep])[:, order]
+    keep, keep_u = 2**DECAY_BITS - netlist.decay_v, 2**DECAY_BITS - 1 - netlist.decay_u
+    order = np.lexsort((netlist.neuron, keep_u, keep, netlist.layer, depth[netlist.layer]))
+    groups = np.stack([netlist.layer, keep, keep_u])[:, order]
     begins = np.flatnonzero(np.append(True, np.any(np.diff(groups) != 0, axis=0))[: len(order)])
     sizes = np.diff(np.append(begins, len(order)))
     blocks = -(-sizes // LANES)
     first = np.repeat((np.cumsum(blocks) - blocks) * LANES - begins, sizes)
     position = np.empty(len(order), np.int64)
     position[order] = first + np.arange(len(order))
-    layer, keep_of_block = np.repeat(groups[:, begins], blocks, axis=1)
+    layer, keep_of_block, keep_u_of_block = np.repeat(groups[:, begins], blocks, axis=1)
     stage = np.searchsorted(depth[layer], np.arange(netlist.max_depth + 2))
-    return _Seats(position=position, layer=layer, keep=keep_of_block, stage=stage, depth=depth)
+    return _Seats(position=position, layer=layer, keep=keep_of_block, keep_u=keep_u_of_block, stage=stage, depth=depth)
 
 
 def _rows(netlist: Netlist, seats: _Seats, pairs: list[IntArray], width: int) -> tuple[IntArray, BoolArray]:

@@ -239,7 +239,8 @@ class _Layer:
         stored, rounded, real = (r.weight[rows] for r in (self.check.stored, self.check.rounded, self.check.ideal))
         whole = np.where(self.check.clipped[rows], stored + real - rounded, stored)
         inflows = np.stack([arrived @ w.T for w in (stored, rounded, stored + real - rounded, whole)])
-        margins, early = run_variants(variants, inflows, begins, steps)
+        both = (ideal.spikes[self.post][0] & seen[0])[:, rows]
+        margins, early = run_variants(variants, inflows, begins, steps, both)
 
         unit = self.integer.populations[self.post].scale[rows] * (1 << MEMBRANE_SHIFT)
         threshold = self.check.stored.threshold[rows]

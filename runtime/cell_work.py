@@ -70,7 +70,7 @@ def run_cell(work: Work) -> Json:
         "system": work.row.system,
         "form": work.row.form,
         "epochs": work.row.epochs,
-        "decay_epochs": job.decay_epochs,
+        "decay_epochs": job.recipe.decay_epochs,
         "seed": work.seed,
         "data_sha256": work.sha256,
         "checkpoint_sha256": record["sha256"],

@@ -109,8 +109,8 @@ class _Layer:
         Roundings in a current, beside one for each input spike where `per_spike`.
     per_spike : bool
         Whether the current is one plain sum over input spikes; a product with a zero is exact and adds exactly.
-    beta, theta : float
-        Decay and threshold.
+    alpha, beta, theta : float
+        Decays of current and membrane, and threshold.
     sources : tuple of int
         Populations whose neurons lie side by side in the rows, ``INPUT`` among them.
     """
@@ -120,6 +120,7 @@ class _Layer:
     bias: FloatArray
     roundings: int
     per_spike: bool
+    alpha: float
     beta: float
     theta: float
     sources: tuple[int, ...]
@@ -141,7 +142,10 @@ def _layers(model: Checkpoint | Network, adjacency: FloatArray | None) -> list[_
     layers = []
     for post, (population, projection) in enumerate(zip(network.populations, network.projections, strict=True)):
         weight = projection.weight.toarray()
-        magnitude = np.abs(weight) if post else spelled.reshape(weight.shape)
+        magnitude = np.abs(weight)
+        if not post:  # the relays of clocks come after the neurons
+            neurons, channels = len(spelled), spelled[0].size
+            magnitude[:neurons, :channels] = spelled.reshape(neurons, channels)
         layers.append(
             _Layer(
                 weight=np.ascontiguousarray(weight.T),
@@ -149,6 +153,7 @@ def _layers(model: Checkpoint | Network, adjacency: FloatArray | None) -> list[_
                 bias=population.bias,
                 roundings=SPARE if post else SPARE + chain,
                 per_spike=post > 0,
+                alpha=population.alpha,
                 beta=population.beta,
                 theta=population.theta,
                 sources=(projection.pre,),
@@ -168,6 +173,7 @@ def _plain(network: Network, post: int) -> _Layer:
         bias=population.bias,
         roundings=SPARE + len(into),
         per_spike=True,
+        alpha=population.alpha,
         beta=population.beta,
         theta=population.theta,
         sources=tuple(projection.pre for projection in into),
@@ -198,16 +204,36 @@ def _currents(layer: _Layer, certain: BoolArray, open_: BoolArray | None) -> tup
         inputs[rows] += 0.5 * doubt[rows]
         possible[rows] += doubt[rows]
     centre = inputs @ layer.weight
-    centre += layer.bias
     radius: npt.NDArray[np.float32] = possible @ layer.magnitude
-    radius += np.abs(layer.bias).astype(np.float32)
+    if not layer.alpha:
+        centre += layer.bias
+        radius += np.abs(layer.bias).astype(np.float32)
     added = np.full(len(sure), float(layer.roundings))
     if layer.per_spike:
         added += possible.sum(axis=1, dtype=np.float64)
     radius *= (SLACK * added * UNIT / (1 - added * UNIT))[:, None].astype(np.float32)
     if doubt is not None and len(rows):
         radius[rows] += 0.5 * SLACK * (doubt[rows].astype(np.float32) @ layer.magnitude)
-    return centre.reshape(samples, steps, -1), radius.reshape(samples, steps, -1)
+    centre, radius = centre.reshape(samples, steps, -1), radius.reshape(samples, steps, -1)
+    if layer.alpha:
+        _outlast(layer, centre, radius)
+    return centre, radius
+
+
+def _outlast(layer: _Layer, centre: FloatArray, radius: npt.NDArray[np.float32]) -> None:
+    """Make currents of what the spikes of each step bring, in place; the bias comes last, past the current."""
+    alpha = layer.alpha
+    for step in range(1, centre.shape[1]):
+        # Decay as in _recurrence: alpha itself rounded, the product, and the sum that follows.
+        before = centre[:, step - 1]
+        lost = alpha * (1 + 8 * UNIT) * radius[:, step - 1] + 8 * UNIT * alpha * np.abs(before) + FLOOR
+        radius[:, step] = np.nextafter((radius[:, step] + lost).astype(np.float32), np.float32(np.inf))
+        centre[:, step] += alpha * before
+        if step % 16 == 15:
+            centre[:, step][np.abs(centre[:, step]) < DENORMAL] = 0
+    # The bias is rounded, added, and the sum is added to the membrane.
+    radius += SLACK * np.float32(4 * UNIT) * (np.abs(centre) + np.abs(layer.bias)).astype(np.float32)
+    centre += layer.bias
 
 
 def _recurrence(
@@ -268,7 +294,7 @@ def float_certainty(
         may not. All others surely do not.
     """
     layers = _layers(model, adjacency)
-    inputs = channels_last(events)
+    inputs = channels_last(events, model.input.clocks if isinstance(model, Network) else model.dynamics.clocks)
 
     def batch(part: BoolArray) -> list[tuple[BoolArray, BoolArray]]:
         done: list[tuple[BoolArray, BoolArray]] = []

@@ -18,6 +18,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from compiler.atomic import write_atomically
+from compiler.dynamics import with_clocks
 from compiler.errors import OptionError, SpikeloomError
 from compiler.fixedpoint import IntArray
 from compiler.netlist import Netlist
@@ -111,7 +112,7 @@ def _run(arguments: Arguments) -> Outcome:
     netlist = read_netlist(arguments.netlist)
     data = _recordings(arguments, netlist)
     progress("running")
-    events = data.events.reshape(len(data), -1, data.steps)
+    events = with_clocks(data.events, netlist.clocks)
     found: Report | None = None
     if arguments.detail == "spikes" or arguments.spikes is not None:
         trace = engine.simulate(netlist, events, lengths=data.lengths, spikes=arguments.spikes is not None)
@@ -188,7 +189,7 @@ def _costs(arguments: Arguments, netlist: Netlist, data: Recordings) -> tuple[In
     counts, found = estimate(
         netlist,
         target,
-        data.events.reshape(len(data), -1, data.steps),
+        with_clocks(data.events, netlist.clocks),
         lengths=data.lengths,
         detail=arguments.detail,
         progress=lambda done: progress(f"running: {done} of {len(data)}"),

@@ -296,6 +296,7 @@ def _run_layers(
         rows,
         charged[part].reshape(len(events), -1),
         np.zeros(nothing, np.uint64) if trace.packed is None else trace.packed[part],
+        blocks.keep_u if blocks.keep_u.any() else None,
     )
 
 

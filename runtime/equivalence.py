@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from compiler.dynamics import Clocks, with_clocks
 from compiler.errors import DataError, ModelError
 from compiler.fixedpoint import MEMBRANE_SHIFT, FloatArray, IntArray
 from compiler.frontends.checkpoint import Checkpoint
@@ -136,14 +137,14 @@ def require_match(netlist: Netlist, model: Checkpoint | Network) -> None:
         If taxels, channels, or layer names or sizes differ.
     """
     ours = {"taxels": netlist.taxels, "channels": netlist.polarities}
-    ours |= {layer.name: layer.neurons for layer in netlist.layers}
+    ours |= _clock_sizes(netlist.clocks) | {layer.name: layer.neurons for layer in netlist.layers}
     what = "network" if isinstance(model, Network) else "checkpoint"
     if isinstance(model, Network):
         theirs = {"taxels": model.input.taxels, "channels": model.input.polarities}
-        theirs |= {population.name: population.size for population in model.populations}
+        theirs |= _clock_sizes(model.input.clocks) | {p.name: p.size for p in model.populations}
     else:
         theirs = {"taxels": model.taxels, "channels": model.hops.shape[2]}
-        theirs |= {"conv1": model.places * model.hops.shape[1]}
+        theirs |= _clock_sizes(model.dynamics.clocks) | {"conv1": model.dense[0].weight.shape[1]}
         theirs |= {dense.name: len(dense.bias) for dense in model.dense}
     if ours != theirs:
         sizes = [", ".join(f"{name} {neurons}" for name, neurons in side.items()) for side in (ours, theirs)]
@@ -151,6 +152,10 @@ def require_match(netlist: Netlist, model: Checkpoint | Network) -> None:
             f"netlist and {what} disagree: the netlist has {sizes[0]}, the {what} {sizes[1]}; "
             f"give the {what} that the netlist was compiled from"
         )
+
+
+def _clock_sizes(clocks: Clocks) -> dict[str, int]:
+    return {"clocks": clocks.channels, "steps of a clock": clocks.steps} if clocks.channels else {}
 
 
 def _same_run(slow: Trace, prepared: engine.Engine, events: npt.NDArray[np.uint8]) -> bool:
@@ -189,7 +194,7 @@ def _held_to_specification(
 
 
 def realised(network: Network, integer: IntegerNetwork) -> tuple[Network, Network, Network]:
-    """Float networks that carry the chip's decay; that and its weights; and all of these and its biases and thresholds.
+    """Float networks that carry the chip's decays; these and its weights; all of these, its biases and thresholds.
 
     Returns
     -------
@@ -199,7 +204,7 @@ def realised(network: Network, integer: IntegerNetwork) -> tuple[Network, Networ
     beta = replace(
         network,
         populations=tuple(
-            replace(population, beta=chip.realised_beta)
+            replace(population, beta=chip.realised_beta, alpha=chip.realised_alpha)
             for population, chip in zip(network.populations, integer.populations, strict=True)
         ),
     )
@@ -244,7 +249,8 @@ def spikes_of(
     from models.reference import float_spikes  # torch, so only here
 
     if isinstance(model, Network):
-        return list(run_float(model, channels_last(events), dtype=np.dtype(dtype)).spikes)
+        inputs = channels_last(events, model.input.clocks)
+        return list(run_float(model, inputs, dtype=np.dtype(dtype)).spikes)
     assert adjacency is not None, "a checkpoint has a graph"
     return list(float_spikes(model, adjacency, events, dtype=dtype).values())
 
@@ -256,7 +262,8 @@ def membranes_of(
     from models.reference import float_membranes  # torch, so only here
 
     if isinstance(model, Network):
-        kept = run_float(model, channels_last(events), dtype=np.float32, membranes=True).membranes
+        inputs = channels_last(events, model.input.clocks)
+        kept = run_float(model, inputs, dtype=np.float32, membranes=True).membranes
         assert kept is not None, "membranes were asked for"
         return list(kept)
     assert adjacency is not None, "a checkpoint has a graph"
@@ -349,7 +356,7 @@ def verify(
     require_match(netlist, model)
     network, integer = _network(model, adjacency), lift(netlist)
     names = [layer.name for layer in netlist.layers]
-    flat = events.reshape(len(events), -1, events.shape[3])
+    flat = with_clocks(events, netlist.clocks)
     check_channels(netlist, flat.shape[1])
     further = onnx_check.prepare(netlist) if engine_name == "onnx" else None
 
@@ -386,7 +393,7 @@ def verify(
     def compared(stage: tuple[BoolArray, ...]) -> list[BoolArray]:
         return [cut(spikes, lengths)[..., keep] for spikes, keep in zip(stage, kept, strict=True)]
 
-    inputs = channels_last(events)
+    inputs = channels_last(events, netlist.clocks)
     ladder = [("float64", differences(wide))]
     for stage, rung in zip(LADDER[1:4], realised(network, integer), strict=True):
         tell(f"ladder: {stage}")

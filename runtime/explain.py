@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from compiler.dynamics import with_clocks
 from compiler.errors import DataError, OptionError
 from compiler.frontends.checkpoint import Checkpoint
 from compiler.frontends.systems import GRAPH_SYSTEMS, TACTILESGNET
@@ -91,7 +92,7 @@ def explain(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str],
         taxels=netlist.taxels,
         bin_s=arguments.bin,
     )
-    check_channels(netlist, data.events.shape[1] * data.events.shape[2])
+    check_channels(netlist, data.events.shape[1] * data.events.shape[2] + netlist.clocks.channels)
     chosen = range(len(data)) if arguments.sample is None else [_index(data, arguments.sample)]
 
     network, integer, prepared = asked.network, lift(netlist), engine.prepare(netlist)
@@ -103,7 +104,7 @@ def explain(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str],
         found = causes.explain(
             network,
             integer,
-            channels_last(events)[0],
+            channels_last(events, netlist.clocks)[0],
             _observe(netlist, prepared, events),
             convolution=None
             if checkpoint is None or checkpoint.system != TACTILESGNET or asked.adjacency is None
@@ -157,7 +158,7 @@ def _observe(netlist: Netlist, prepared: Engine, events: np.ndarray[Any, Any]) -
     """What the chip does on one recording."""
     from runtime import engine
 
-    trace = engine.simulate(prepared, events.reshape(1, -1, events.shape[3]), spikes=True, membranes=True)
+    trace = engine.simulate(prepared, with_clocks(events, netlist.clocks), spikes=True, membranes=True)
     assert trace.spikes is not None, "spikes were asked for"
     assert trace.membranes is not None, "membranes were asked for"
     layers = range(len(netlist.layers))

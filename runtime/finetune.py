@@ -100,6 +100,10 @@ def finetune(arguments: argparse.Namespace) -> tuple[Report, Callable[[Report], 
     checkpoint = asked_checkpoint(path, arguments)
     if checkpoint.forms is not None:
         raise ModelError(f"{path}: was fine-tuned already; give the network that it was made from")
+    if not checkpoint.dynamics.is_plain:
+        raise ModelError(
+            f"{path}: has clocks, or decays of single layers, which fine-tuning does not know; compile it as it is"
+        )
     asked = asked_graph(arguments, checkpoint.system)
     name, adjacency = propagation(checkpoint, asked, arguments.checkpoint)
     training, test = (

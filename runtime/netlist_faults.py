@@ -146,7 +146,7 @@ def check_layer(
     threshold = chip.threshold.astype(np.float64) * unit
     stored = Registers(units * unit, chip.bias.astype(np.float64), threshold, *kept_shares(chip))
     theta: FloatArray = wanted.theta * scale * unit
-    ideal = Registers(real * unit, wanted.bias * scale * unit, theta, 0.0, wanted.beta)
+    ideal = Registers(real * unit, wanted.bias * scale * unit, theta, wanted.alpha, wanted.beta)
     suspects = []
 
     def suspect(cause: str, part: str, found: str, change: str) -> None:
@@ -160,7 +160,8 @@ def check_layer(
     wrong = grid.missed(units, real) & asked
     weight, compensated = units, False
     if wrong.any():
-        cause, words = _misread(network, real, units, asked, scale, grid, convolution)
+        inside = slice(len(real) - wanted.relays), slice(real.shape[1] - wanted.relays)  # relays are no convolution
+        cause, words = _misread(network, real, units, asked, scale, grid, convolution, inside)
         compensated = cause == WEIGHTS and may_compensate and bool(np.mean(wrong) <= MOVED)
         if not compensated:
             weight = np.where(wrong, np.clip(np.rint(real / grid.step), -grid.limit, grid.limit) * grid.step, units)
@@ -193,13 +194,14 @@ def check_layer(
         )
     right = np.where(off, np.rint(ideal.threshold / unit) * unit, stored.threshold)
 
-    u, v = decay_registers(wanted.beta)
+    u, v = decay_registers(wanted.beta, wanted.alpha)
     if (chip.decay_u, chip.decay_v) != (u, v):
         suspect(
             BETA,
             "decay",
-            f"decay registers of {wanted.name} are {chip.decay_u} and {chip.decay_v}, beta {wanted.beta:g} asks for "
-            f"{u} and {v}",
+            f"decay registers of {wanted.name} are {chip.decay_u} and {chip.decay_v}, "
+            f"{f'alpha {wanted.alpha:g} and ' if wanted.alpha else ''}beta {wanted.beta:g} "
+            f"{'ask' if wanted.alpha else 'asks'} for {u} and {v}",
             f"set decay_u to {u} and decay_v to {v}: compile it again",
         )
     return LayerCheck(
@@ -244,6 +246,7 @@ def _misread(
     scale: FloatArray,
     grid: _Grid,
     convolution: Convolution | None,
+    inside: tuple[slice, slice],
 ) -> tuple[str, str]:
     """Say what stored weights are that are not the nearest to the checkpoint's: cause, and in words.
 
@@ -255,7 +258,11 @@ def _misread(
         Weights between neurons that the chip holds.
     scale : (neurons,) float64
         Weight units per membrane unit.
+    inside : pair of slice
+        Neurons and sources that the checkpoint has weights for.
     """
+    every = units - real, grid.missed(units, real) & asked
+    real, units, asked, scale = real[inside], units[inside], asked[inside], scale[inside[0]]
     missed = grid.missed(units, real) & asked
     for words, other in _orders(network, real / scale[:, None], convolution):
         if np.mean(grid.missed(units, other * scale[:, None]) & asked) <= LEFT * np.mean(missed):
@@ -279,9 +286,10 @@ def _misread(
                 else "it connects the same taxels otherwise, as if edges were listed twice or repeats collapsed"
             )
             return GRAPH, f"the checkpoint's filters on another graph: {how}"
-    worst = float(np.max(np.abs(units - real)[missed]) / grid.step)
+    gap, missed = every
+    worst = float(np.max(np.abs(gap)[missed]) / grid.step)
     return WEIGHTS, (
-        f"not the nearest to the checkpoint's: {np.count_nonzero(missed):,} of {real.size:,} are off, "
+        f"not the nearest to the checkpoint's: {np.count_nonzero(missed):,} of {missed.size:,} are off, "
         f"by up to {worst:.3g} steps of the grid"
     )
 

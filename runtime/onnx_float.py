@@ -25,6 +25,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from compiler.errors import ModelError
 from compiler.fixedpoint import FloatArray
 from compiler.frontends.checkpoint import Checkpoint
 from runtime.inputs import version
@@ -49,10 +50,15 @@ def export_float(checkpoint: Checkpoint, adjacency: FloatArray, form: str, *, gr
     Raises
     ------
     ModelError
-        If its weights are more than a file holds.
+        If its weights are more than a file holds, or it has clocks or decays of single layers.
     OptionError
         If the package ``onnx`` is not installed.
     """
+    if not checkpoint.dynamics.is_plain:
+        raise ModelError(
+            "--to onnx-float: the network has clocks, or decays of single layers, which this form does not say; "
+            "compile it and export the netlist with --to onnx"
+        )
     require_room(4 * (sum(dense.weight.size for dense in checkpoint.dense) + checkpoint.hops.size + adjacency.size))
     nodes, channels = Nodes(), checkpoint.taxels * checkpoint.hops.shape[2]
     sizes = {"conv1": checkpoint.taxels * checkpoint.hops.shape[1]}

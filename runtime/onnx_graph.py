@@ -41,6 +41,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from compiler.dynamics import Clocks
 from compiler.ir import INPUT
 from compiler.netlist import Netlist
 from compiler.serialize import netlist_bytes
@@ -97,7 +98,7 @@ def export(netlist: Netlist, form: str) -> bytes:
             "netlist_sha256": hashlib.sha256(netlist_bytes(netlist)).hexdigest(),
             "form": form,
             "input": f"{netlist.taxels} taxels x {netlist.polarities} polarities; "
-            f"channel = taxel * {netlist.polarities} + polarity; 0 or 1",
+            f"channel = taxel * {netlist.polarities} + polarity; 0 or 1{_clock_words(netlist.clocks)}",
             "max_depth": netlist.max_depth,
             "layers": [
                 {
@@ -110,6 +111,14 @@ def export(netlist: Netlist, form: str) -> bytes:
                 for layer in layers
             ],
         },
+    )
+
+
+def _clock_words(clocks: Clocks) -> str:
+    if not clocks.channels:
+        return ""
+    return (
+        f"; then {clocks.channels} clocks: the k-th, from 0, is 1 in the {clocks.steps} steps from k * {clocks.steps}"
     )
 
 

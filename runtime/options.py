@@ -11,7 +11,8 @@ from compiler.passes.layout import GOALS
 from compiler.passes.quantize import RANGES
 from compiler.pipeline import STAGES
 from models.graphs import CHOICES
-from models.schedule import DECAY_EPOCHS, EPOCHS
+from models.recipes import RECIPES, RELEASED
+from models.schedule import DECAY_EPOCHS
 from models.systems import PADDINGS
 from runtime.data_commands import add_bin_option
 
@@ -64,11 +65,26 @@ def add_training(parser: argparse.ArgumentParser) -> None:
         help="of a grid-cnn's window: none, moving by 2 (default), or same, which no Loihi core holds",
     )
     add_graph_options(parser, "to train on")
-    parser.add_argument("--epochs", type=int, default=EPOCHS, metavar="N", help=f"default: {EPOCHS}, as released")
+    defaults = ", ".join(f"{recipe.epochs} ({name})" for name, recipe in RECIPES.items())
+    parser.add_argument(
+        "--recipe",
+        choices=tuple(RECIPES),
+        default=RELEASED.name,
+        help="how: as the released code does, or with lasting currents and clocks (default: released)",
+    )
+    parser.add_argument(
+        "--current-decay", metavar="LAYER=X[,…]", help="share of the synaptic current that a step keeps: fc1=0.95"
+    )
+    parser.add_argument(
+        "--membrane-decay", metavar="LAYER=X[,…]", help="share of the membrane, where it is not 0.2: fc1=0.5"
+    )
+    parser.add_argument("--clocks", type=int, metavar="K", help="inputs that tell which K-th of the recording it is")
+    parser.add_argument("--features", type=int, metavar="N", help="of the first layer, per place")
+    parser.add_argument("--batch", type=int, metavar="N", help="recordings to a step of the optimizer")
+    parser.add_argument("--epochs", type=int, metavar="N", help=f"default: {defaults}")
     parser.add_argument(
         "--decay-epochs",
         type=int,
-        default=DECAY_EPOCHS,
         metavar="N",
         help=f"the learning rate falls to a tenth after N epochs (default: {DECAY_EPOCHS}, as released)",
     )

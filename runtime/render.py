@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from compiler.fixedpoint import FloatArray, IntArray
+from compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, FloatArray, IntArray
 from compiler.frontends.checkpoint import Checkpoint
 from compiler.frontends.systems import GRAPH_SYSTEMS, TACTILESGNET
 from compiler.netlist import Netlist
@@ -52,6 +52,7 @@ def netlist_json(netlist: Netlist, uses: Sequence[LimitUse], sha256: str) -> Jso
                 "theta_realised": _one_or_many(netlist.threshold[ids] / netlist.scale[ids]),
                 "beta": layer.beta,
                 "beta_realised": _one_or_many((4096 - netlist.decay_v[ids]) / 4096),
+                **_lasting(netlist, index),
                 "depth": layer.depth,
                 "synapses_stored": int(np.count_nonzero(into)),
                 "cores": sorted({int(c) for c in core[ids]}),
@@ -60,6 +61,7 @@ def netlist_json(netlist: Netlist, uses: Sequence[LimitUse], sha256: str) -> Jso
     return {
         "target": netlist.target,
         "taxels": netlist.taxels,
+        **({"clocks": asdict(netlist.clocks)} if netlist.clocks.channels else {}),
         "classes": netlist.classes,
         "neurons": sum(layer.neurons for layer in netlist.layers),
         "compartments": netlist.n_compartments,
@@ -74,6 +76,14 @@ def netlist_json(netlist: Netlist, uses: Sequence[LimitUse], sha256: str) -> Jso
         "provenance": dict(netlist.provenance),
         "sha256": sha256,
     }
+
+
+def _lasting(netlist: Netlist, layer: int) -> Json:
+    """Current decay of a layer, where its current outlasts a step."""
+    realised = (4095 - netlist.decay_u[netlist.compartments_of(layer)]) / 4096
+    if not realised.any():
+        return {}
+    return {"alpha": netlist.layers[layer].alpha, "alpha_realised": _one_or_many(realised)}
 
 
 def _one_or_many(values: IntArray | FloatArray) -> Any:
@@ -108,6 +118,7 @@ def _expected(layout: Layout) -> Json:
 
 def netlist_text(report: Json) -> str:
     """Layers, cores and the fullest core of every limit."""
+    lasts = any("alpha" in layer for layer in report["layers"])
     layers = [
         [
             layer["name"],
@@ -121,6 +132,7 @@ def netlist_text(report: Json) -> str:
             _text(layer["threshold"]),
             _text(layer["theta_realised"]),
             _text(layer["beta_realised"]),
+            *([_text(layer.get("alpha_realised", 0))] if lasts else []),
             _text(layer["cores"], brief=False),
         ]
         for layer in report["layers"]
@@ -137,6 +149,7 @@ def netlist_text(report: Json) -> str:
         "threshold",
         "θ",
         "β",
+        *(["α"] if lasts else []),
         "cores",
     ]
     fullest: dict[str, Json] = {}
@@ -160,11 +173,35 @@ def netlist_text(report: Json) -> str:
             f"{report['target']}: {report['neurons']:,} neurons{left}, {report['synapses']:,} synapses "
             f"({report['synapses_stored']:,} stored, {report['synapses_nonzero']:,} non-zero), {report['cores']} cores "
             f"on {where}",
+            *_clock_lines(report),
             table(head, layers),
             "",
             table(["limit", "used", "allowed", "fill", "fullest core"], limits),
         ]
     )
+
+
+def _unproven(proofs: list[Json]) -> list[str]:
+    """Layers with a register that some input may bring out of its range, and what happens then."""
+    loose = [proof for proof in proofs if not proof["holds"]]
+
+    def may(proof: Json, register: str, most: int) -> bool:
+        return proof[register] is None or proof[register] > most
+
+    stops = [p["layer"] for p in loose if may(p, "accumulator", ACCUMULATOR_MAX) or may(p, "current", CURRENT_MAX)]
+    clips = [proof["layer"] for proof in loose if proof["layer"] not in stops]
+    lines = [f"no proof of range for {', '.join(stops)}: the simulator stops at the first overflow"] if stops else []
+    if clips:
+        lines.append(f"no register of {', '.join(clips)} overflows for any input, but some may saturate a membrane")
+    return lines
+
+
+def _clock_lines(report: Json) -> list[str]:
+    """What the clocks of a network are; none for most."""
+    if "clocks" not in report:
+        return []
+    channels, steps = report["clocks"]["channels"], report["clocks"]["steps"]
+    return [f"  {channels} clocks of {steps} steps each, {channels * steps} in all, beside the sensor"]
 
 
 def _width(layer: Json) -> str:
@@ -215,8 +252,7 @@ def compilation_text(report: Json) -> str:
             f"{100 * worst['accumulator'] / (2**21 - 1):.1f} % of 21 bits)"
         )
     else:
-        loose = ", ".join(proof["layer"] for proof in report["proofs"] if not proof["holds"])
-        lines.append(f"no proof of range for {loose}: the simulator stops at the first overflow")
+        lines += _unproven(report["proofs"])
     placement = report["placement"]
     optimal = "optimal" if placement["spike_hops"] <= placement["bound"] else f"bound {placement['bound']:.1f}"
     lines.append(
@@ -299,11 +335,12 @@ def checkpoint_json(checkpoint: Checkpoint, given: tuple[str, ...]) -> Json:
         "classes": checkpoint.classes,
         **({"hops": int(checkpoint.hops.shape[0] - 1)} if checkpoint.system == TACTILESGNET else {}),
         "layers": [
-            {"name": "conv1", "neurons": checkpoint.places * int(checkpoint.hops.shape[1])},
+            {"name": "conv1", "neurons": int(checkpoint.dense[0].weight.shape[1])},
             *({"name": dense.name, "neurons": len(dense.bias)} for dense in checkpoint.dense),
         ],
         "beta": checkpoint.beta,
         "theta": checkpoint.theta,
+        **({} if checkpoint.dynamics.is_plain else {"dynamics": checkpoint.dynamics.to_json()}),
         "given": list(given),
         "assumed": list(checkpoint.assumed),
         "graph": checkpoint.graph,
@@ -327,6 +364,14 @@ def checkpoint_text(report: Json) -> str:
         if name in report["assumed"]:
             source = f"assumed; override with --{name}"
         lines.append(f"  {name}: {report[name]:g} ({source})")
+    if "dynamics" in report:
+        for key, word in (("betas", "membrane"), ("alphas", "current")):
+            if report["dynamics"][key]:
+                shown = ", ".join(
+                    f"{layer['name']} {d:g}" for layer, d in zip(report["layers"], report["dynamics"][key], strict=True)
+                )
+                lines.append(f"  {word} decay by layer: {shown}")
+        lines += _clock_lines(report["dynamics"] if report["dynamics"]["clocks"]["channels"] else {})
     for key, value in (report["training"] or {}).items():
         text = str(value)
         lines.append(f"  {key}: {text if len(text) <= 100 else text[:97] + '…'}")

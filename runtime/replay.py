@@ -1,7 +1,8 @@
 """Run single neurons again, with one deviation taken away at a time.
 
-The neurons start from rest and get the synaptic sums of given steps; until their last step they do not fire, or the
-replay says that they would.
+The neurons start from rest and get the synaptic sums of given steps. They fire where float model and chip both did,
+which resets a membrane but no current; at any other step but their last they do not fire, or the replay says that they
+would.
 """
 
 from __future__ import annotations
@@ -91,14 +92,20 @@ def variants_of(check: LayerCheck, rows: IntArray) -> list[Variant]:
         replace(asked, part="", cause=WEIGHTS, inflow=UNROUNDED, bias=with_weights),
         replace(asked, part="", cause=BIAS, bias=alone),
         replace(asked, part="", cause=THRESHOLD, threshold=threshold),
-        replace(asked, part="", cause=BETA, keep_v=asked.keep_v + ideal.keep_v - rounded.keep_v),
+        replace(
+            asked,
+            part="",
+            cause=BETA,
+            keep_u=asked.keep_u + ideal.keep_u - rounded.keep_u,
+            keep_v=asked.keep_v + ideal.keep_v - rounded.keep_v,
+        ),
         replace(asked, part="", cause=SATURATION, limit=np.inf),
         replace(asked, part="", cause=TRUNCATION, rounds=False),  # last, see run_variants
     ]
 
 
 def run_variants(
-    variants: list[Variant], inflows: FloatArray, begins: IntArray, steps: IntArray
+    variants: list[Variant], inflows: FloatArray, begins: IntArray, steps: IntArray, fired: BoolArray
 ) -> tuple[FloatArray, BoolArray]:
     """Run neurons from rest over what they remember.
 
@@ -110,13 +117,15 @@ def run_variants(
         Shifted synaptic sums, by ``Variant.inflow``.
     begins, steps : (neurons,) int64
         First and last step of each; the longest come first.
+    fired : (steps, neurons) bool
+        Where float model and chip both fired.
 
     Returns
     -------
     margins : (variants, neurons) float64
         Membrane minus threshold in the last step.
     early : (variants, neurons) bool
-        Whether the neuron fired before it.
+        Whether the neuron fired before it, where it should not.
     """
 
     def column(values: list[float]) -> FloatArray:
@@ -145,6 +154,8 @@ def run_variants(
         np.clip(v, -limit, limit, out=v)
         left = int(np.count_nonzero(length > k + 1))
         margins[:, left:running] = v[:, left:] - threshold[:, left:running]
-        early[:, :left] |= v[:, :left] > threshold[:, :left]
+        both = fired[begins[:left] + k, place[:left]]
+        early[:, :left] |= (v[:, :left] > threshold[:, :left]) & ~both
+        v[:, :left] *= ~both
         running = left
     return margins, early

@@ -147,6 +147,9 @@ def export(netlist: Netlist, target: Target) -> Iterator[str]:
     room = target.limit("core.compartments")
     names, number, places = group_names(netlist), members(netlist), cores(netlist, target)
     yield f"# spikeloom netlist for SANA-FE {VERSION} and its loihi.yaml; give the neurons of group {INPUT} 'spikes'"
+    if netlist.clocks.channels:
+        length, first = netlist.clocks.steps, netlist.n_inputs - netlist.clocks.channels
+        yield f"# from neuron {first} on they are clocks: each spikes in {length} steps, one after the other"
     yield "network:"
     yield "  name: spikeloom"
     yield "  groups:"

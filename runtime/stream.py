@@ -103,9 +103,9 @@ class Stream:
 
         Parameters
         ----------
-        events : (taxels, polarities) or (n_inputs,)
+        events : (taxels, polarities) or (taxels * polarities,)
             1 where a taxel sent an event of that polarity within the bin, 0 elsewhere, of any number type or bool;
-            channel ``taxel * polarities + polarity`` in the flat form.
+            channel ``taxel * polarities + polarity`` in the flat form. Clocks of the network tick by themselves.
 
         Raises
         ------
@@ -119,7 +119,10 @@ class Stream:
                 "stream: a step after the end found, finish() or an overflow ends a stream; "
                 "call reset() to begin the next grasp"
             )
-        self._column[:, 0] = _one_bin(self._engine.netlist, events)
+        netlist = self._engine.netlist
+        bin_ = _one_bin(netlist, events)
+        self._column[: len(bin_), 0] = bin_
+        self._column[len(bin_) :] = netlist.clocks.events(1, first=self.index)
         return self._advance(NO_END)
 
     def finish(self) -> tuple[Step, ...]:
@@ -210,7 +213,8 @@ def _one_bin(netlist: Netlist, events: npt.ArrayLike) -> npt.NDArray[np.generic]
         array = np.asarray(events)
     except ValueError as error:
         raise DataError("stream: a bin with rows of unequal length found; give one row per taxel") from error
-    n_inputs, sensor = netlist.n_inputs, (netlist.taxels, netlist.polarities)
+    sensor = netlist.taxels, netlist.polarities
+    n_inputs = netlist.taxels * netlist.polarities  # the stream itself lets the clocks tick
     if array.shape not in ((n_inputs,), sensor):
         raise DataError(
             f"stream: a bin of shape {array.shape} found, allowed are {sensor} (taxels, polarities) and ({n_inputs},); "

@@ -156,8 +156,10 @@ def heard(netlist: Netlist, layer: int) -> slice | IntArray:
 def check_channels(netlist: Netlist, channels: int) -> None:
     """Raise DataError unless recordings of so many input channels fit the network."""
     if channels != netlist.n_inputs:
+        ticking = netlist.clocks.channels
+        clocks = f", {ticking} of them clocks (compiler.dynamics.with_clocks)" if ticking else ""
         raise DataError(
-            f"recordings: {channels} input channels found, the netlist has {netlist.n_inputs}; "
+            f"recordings: {channels} input channels found, the netlist has {netlist.n_inputs}{clocks}; "
             "use recordings of the sensor that the network was compiled for"
         )
 

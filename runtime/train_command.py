@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,10 @@ from compiler.frontends.systems import GRAPH_SYSTEMS, GRID_CNN, TACTILESGNET, TI
 from models.evtouch import Recordings
 from models.graphs import CHOICES, Graph
 from models.grasps import SYNTHETIC
-from models.schedule import DECAY_EPOCHS
+from models.recipes import RECIPES, RELEASED, STEPS, Recipe, check_recipe, decays_asked
 from models.systems import PADDINGS, sensor_grid, taxels_alone
 from runtime.inputs import asked_graph, asked_places, graph_words, progress, recordings, require_place, version
-from runtime.training import PICTURES, Job, check_seeds, draw_training, output_of, summary, training_text
+from runtime.training import LAYERS, PICTURES, Job, check_seeds, draw_training, output_of, summary, training_text
 
 Json = dict[str, Any]
 
@@ -79,16 +80,16 @@ def _jobs(
     system = arguments.system or TACTILESGNET
     data = arguments.data if arguments.data == SYNTHETIC else training.source
     words = [f"spikeloom train --data {data}", _system_words(arguments, system), graph_words(arguments)]
-    words += [f"--epochs {arguments.epochs}"]
-    words += [f"--decay-epochs {arguments.decay_epochs}"] if arguments.decay_epochs != DECAY_EPOCHS else []
-    command = " ".join(filter(None, words))
+    recipe = _recipe(arguments)
+    epochs = recipe.epochs if arguments.epochs is None else arguments.epochs
+    command = " ".join(filter(None, [*words, _recipe_words(arguments), f"--epochs {epochs}"]))
     keep = tuple(dict.fromkeys(arguments.keep or WEIGHTS))
     return [
         Job(
             training=training,
             test=test,
             graph=graph,
-            epochs=arguments.epochs,
+            epochs=epochs,
             seed=seed,
             device=arguments.device,
             resume=arguments.resume,
@@ -100,10 +101,45 @@ def _jobs(
             position=position,
             system=system,
             grid=grid,
-            decay_epochs=arguments.decay_epochs,
+            recipe=recipe,
         )
         for position, seed in enumerate(range(arguments.seed, arguments.seed + arguments.seeds))
     ]
+
+
+OVERRIDES = ("current_decay", "membrane_decay", "clocks", "features", "batch", "decay_epochs")
+"""Options that change single values of a recipe."""
+
+
+def _recipe(arguments: argparse.Namespace) -> Recipe:
+    """The recipe that was named, with the values that were given beside it."""
+    recipe = RECIPES[arguments.recipe]
+    whole = {name: getattr(arguments, name) for name in ("clocks", "features", "batch", "decay_epochs")}
+    recipe = replace(recipe, **{name: value for name, value in whole.items() if value is not None})
+    if arguments.decay_epochs is not None and recipe.schedule != STEPS:
+        raise OptionError(
+            f"--decay-epochs {arguments.decay_epochs}: the recipe {recipe.name} lowers its learning rate all along; "
+            "leave it away"
+        )
+    if arguments.current_decay is not None:
+        recipe = replace(recipe, alphas=decays_asked(arguments.current_decay, "--current-decay", LAYERS))
+    if arguments.membrane_decay is not None:
+        recipe = replace(recipe, betas=decays_asked(arguments.membrane_decay, "--membrane-decay", LAYERS))
+    check_recipe(recipe)
+    return recipe
+
+
+def _recipe_words(arguments: argparse.Namespace) -> str:
+    """Options that name the recipe, as they would be typed; none for the released one."""
+    words = [] if arguments.recipe == RELEASED.name else [f"--recipe {arguments.recipe}"]
+    given = {name: getattr(arguments, name) for name in OVERRIDES}
+    usual = RECIPES[arguments.recipe]
+    words += [
+        f"--{name.replace('_', '-')} {value}"
+        for name, value in given.items()
+        if value is not None and value != getattr(usual, name, None)
+    ]
+    return " ".join(words)
 
 
 def _sensor(arguments: argparse.Namespace) -> tuple[Graph, Grid | None]:

@@ -6,9 +6,9 @@ import hashlib
 import statistics
 import textwrap
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,10 +18,16 @@ from compiler.frontends.checkpoint import WEIGHTS, read_checkpoint
 from compiler.frontends.systems import TACTILESGNET, Grid
 from models.evtouch import Recordings
 from models.graphs import Graph
-from models.schedule import DECAY_EPOCHS
+from models.recipes import MSE, RELEASED, Recipe
 from models.systems import HOPS, filters_of, propagation_of
 from runtime.intervals import wilson
 from runtime.tables import table
+
+if TYPE_CHECKING:
+    from models.networks import Architecture
+
+LAYERS = ("conv1", "fc1", "fc2", "fc3")
+"""Layers of the networks that are trained."""
 
 PICTURES = (".png", ".svg", ".pdf")
 """Kinds of picture that `draw_training` writes."""
@@ -56,8 +62,8 @@ class Job:
         One of :data:`compiler.frontends.systems.SYSTEMS`.
     grid : Grid, optional
         Of a grid-based CNN.
-    decay_epochs : int
-        Epochs after which the learning rate falls.
+    recipe : Recipe
+        How it is trained.
     """
 
     training: Recordings
@@ -75,12 +81,25 @@ class Job:
     position: int
     system: str = TACTILESGNET
     grid: Grid | None = None
-    decay_epochs: int = DECAY_EPOCHS
+    recipe: Recipe = RELEASED
 
     def propagation(self) -> FloatArray:
         """What the first layer sees."""
         taxels = self.graph.n_taxels
         return propagation_of(self.system, self.graph.edges, taxels, self.grid, filters_of(self.system, taxels, HOPS))
+
+    def architecture(self) -> Architecture:
+        """Sizes and dynamics of the network, which the recordings decide, too."""
+        from models.networks import Architecture
+
+        plain = Architecture(
+            taxels=self.graph.n_taxels,
+            classes=int(self.training.labels.max()) + 1,
+            system=self.system,
+            features=self.recipe.features,
+            hops=self.recipe.hops,
+        )
+        return replace(plain, dynamics=self.recipe.dynamics(LAYERS, plain.beta, self.training.steps))
 
 
 def output_of(output: str, seed: int, seeds: int) -> Path:
@@ -117,12 +136,9 @@ def run_job(job: Job) -> tuple[dict[str, Any], IntArray | None]:
         Of the last epoch, where they are drawn.
     """
     from models.checkpoint import save_checkpoint, training_record
-    from models.networks import Architecture
     from models.protocols import train_both
 
-    architecture = Architecture(
-        taxels=job.graph.n_taxels, classes=int(job.training.labels.max()) + 1, system=job.system
-    )
+    architecture = job.architecture()
     reported = train_both(
         job.training,
         job.test,
@@ -130,15 +146,15 @@ def run_job(job: Job) -> tuple[dict[str, Any], IntArray | None]:
         architecture,
         epochs=job.epochs,
         seed=job.seed,
-        decay_epochs=job.decay_epochs,
+        recipe=job.recipe,
         device=job.device,
         state=_stem(job),
         resume=job.resume,
         position=job.position,
     )
     record = training_record(reported, job.training, job.test, command=job.command, seed=job.seed) | dict(job.facts)
-    if job.decay_epochs != DECAY_EPOCHS:
-        record["decay_epochs"] = job.decay_epochs
+    if job.recipe != RELEASED:
+        record["recipe"] = job.recipe.to_json()
     trained = reported.trained
     assert trained.kept is not None, "the clean epoch is one of the epochs"
     held = {"last": trained.last, "best": trained.best, "clean": trained.kept}
@@ -151,6 +167,7 @@ def run_job(job: Job) -> tuple[dict[str, Any], IntArray | None]:
         training=record,
         system=job.system,
         grid=job.grid,
+        dynamics=architecture.dynamics,
     )
     for file in state_of(job):
         file.unlink(missing_ok=True)
@@ -178,10 +195,10 @@ def recall(job: Job) -> tuple[dict[str, Any], IntArray | None]:
         "device": job.device,
     }
     differing = [name.removesuffix("_sha256") for name, value in wanted.items() if record.get(name) != value]
-    if record.get("decay_epochs", DECAY_EPOCHS) != job.decay_epochs:
-        differing.append("decay epochs")
     if found.graph != job.graph.name:
         differing.append("graph")
+    if record.get("recipe", RELEASED.to_json()) != job.recipe.to_json():
+        differing.append("recipe")
     ours, theirs = (None if grid is None else grid.to_json() for grid in (job.grid, found.grid))
     if found.system != job.system or ours != theirs:
         differing.append("system")
@@ -207,13 +224,10 @@ def _with_file(job: Job, record: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _predictions(job: Job, weights: Mapping[str, Any]) -> IntArray:
-    from models.networks import Architecture, SpikingNet
+    from models.networks import SpikingNet
     from models.train import predict
 
-    architecture = Architecture(
-        taxels=job.graph.n_taxels, classes=int(job.training.labels.max()) + 1, system=job.system
-    )
-    network = SpikingNet(architecture, job.propagation())
+    network = SpikingNet(job.architecture(), job.propagation())
     network.load_weights(weights)
     return predict(network, job.test)
 
@@ -306,7 +320,9 @@ def draw_training(path: str, records: list[dict[str, Any]], labels: IntArray, pr
         middle.plot(epochs, 100 * history[:, 2] / samples, color=colour, label=f"seed {record['seed']}")
         clean = record["clean"]
         middle.plot(clean["epoch"], 100 * clean["accuracy"], "o", color=colour, markeredgecolor="black")
-    left.set(xlabel="epoch", ylabel="squared error of spike rates", title="loss: training solid, test dashed")
+    loss = (records[0].get("recipe") or {}).get("loss", MSE)
+    measured = "squared error of spike rates" if loss == MSE else loss
+    left.set(xlabel="epoch", ylabel=measured, title="loss: training solid, test dashed")
     middle.set(xlabel="epoch", ylabel="test accuracy (%)", title="accuracy; circle: epoch of the clean protocol")
     for axes in (left, middle):
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))

@@ -272,7 +272,7 @@ def watch(arguments: argparse.Namespace) -> tuple[dict[str, Any], Callable[[dict
             stream,
             EventLines(file, name, netlist.taxels),
             Display(bin_s, as_json=arguments.json),
-            channels=netlist.n_inputs,
+            channels=netlist.taxels * netlist.polarities,
             bin_s=bin_s,
             bins=arguments.bins,
             from_first=arguments.origin == "first",

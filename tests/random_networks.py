@@ -9,6 +9,7 @@ from hypothesis import assume
 from hypothesis import strategies as st
 from scipy import sparse
 
+from compiler.dynamics import PLAIN
 from compiler.errors import CapacityError
 from compiler.fixedpoint import weight_step
 from compiler.frontends.checkpoint import Checkpoint, Dense
@@ -128,6 +129,7 @@ def random_checkpoint(*, taxels=5, features=3, hops=4, sizes=(6, 5, 4), seed=0, 
         "beta": beta,
         "theta": theta,
         "system": "tactilesgnet",
+        "dynamics": PLAIN,
     }
     # where the weights come from is nothing to the passes
     return Checkpoint(**{field.name: None for field in dataclasses.fields(Checkpoint)} | known)

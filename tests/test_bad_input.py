@@ -243,8 +243,8 @@ def test_altered_checkpoint(refusal, tmp_path):
 def test_newer_checkpoint(refusal, tmp_path):
     path = tmp_path / "net.pt"
     with zipfile.ZipFile(path, "w") as made:
-        made.writestr("manifest.json", json.dumps({"format": "spikeloom-checkpoint", "version": 4}))
-    assert refusal("inspect", path) == f"{path}: has format version 4, this program reads up to 3; update spikeloom"
+        made.writestr("manifest.json", json.dumps({"format": "spikeloom-checkpoint", "version": 5}))
+    assert refusal("inspect", path) == f"{path}: has format version 5, this program reads up to 4; update spikeloom"
 
 
 def test_checkpoint_zip_bomb(refusal, tmp_path):
@@ -687,8 +687,8 @@ def test_flipped_bits_of_a_netlist(refusal, tmp_path, place):
     ("change", "why"),
     [
         (
-            lambda manifest, _: manifest.update(version=3),
-            "has format version 3, this program reads 2; compile it again or update spikeloom",
+            lambda manifest, _: manifest.update(version=4),
+            "has format version 4, this program reads 2 and 3; compile it again or update spikeloom",
         ),
         (lambda manifest, _: manifest.update(format="x"), "is not a netlist; write one with spikeloom compile"),
         (

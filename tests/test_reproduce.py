@@ -10,7 +10,6 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -46,11 +45,15 @@ def data(tmp_path, monkeypatch) -> Path:
     The working folder is where the data is.
     """
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("models.networks.Architecture", partial(Architecture, **SMALL))
+    monkeypatch.setattr("models.networks.Architecture", small)
     monkeypatch.setattr("runtime.measured.compile_network", uncalibrated)
     monkeypatch.setattr("runtime.paper_picture.DPI", 30)
     made(tmp_path / "Ev-Grasps")
     return tmp_path
+
+
+def small(**given):
+    return Architecture(**(given | SMALL))
 
 
 def uncalibrated(network, training_events=None):
@@ -102,7 +105,7 @@ def test_the_table_of_methods_from_nothing(data, capsys):
     for row, name in zip(report["methods"], names, strict=True):
         cell = json.loads(Path(f"out/cells/{name}.json").read_text())
         record = read_checkpoint(f"out/networks/{name}.pt").training
-        assert cell["decay_epochs"] == record["decay_epochs"] == 1
+        assert cell["decay_epochs"] == record["recipe"]["decay_epochs"] == 1
         for which in ("best", "last", "clean"):
             assert cell[which] == record[which]
             assert row[which]["values"] == [100 * record[which]["accuracy"]]
@@ -244,7 +247,7 @@ def test_a_cell_is_what_train_writes_and_a_finished_network_is_taken_over(data, 
     assert network.read_bytes() == content
     assert json.loads(Path(f"out/cells/{GCN_NAME}.json").read_text()) == cell
     assert cell["command"] == (
-        "spikeloom train --data Ev-Grasps --system gcn --graph manual --epochs 3 --decay-epochs 1 --seed 0"
+        "spikeloom train --data Ev-Grasps --system gcn --graph manual --decay-epochs 1 --epochs 3 --seed 0"
     )
 
 
@@ -256,7 +259,7 @@ def test_a_network_of_another_training_is_not_taken_over(data, capsys):
     capsys.readouterr()
     assert main([*METHODS, "--resume"]) == 2
     assert capsys.readouterr().err.splitlines()[-1] == (
-        f"spikeloom: {network}: holds another training (other epochs, seed, decay epochs); "
+        f"spikeloom: {network}: holds another training (other epochs, seed, recipe); "
         "give its options, or another -o"
     )
     assert len(list(Path("out/cells").iterdir())) == 3

@@ -1,6 +1,7 @@
 """The training loop: the released protocol, repeatable to the byte."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from models.graphs import build_graph, normalised_adjacency
 from models.grasps import synthetic_grasps
 from models.networks import Architecture, SpikingNet
 from models.protocols import state_files, train_both, validation_split
+from models.recipes import RELEASED, Recipe
 from models.schedule import DECAY_EPOCHS, scaled_decay
 from models.train import Epoch, evaluate, train
 
@@ -96,38 +98,29 @@ def test_the_learning_rate_falls_after_the_first_epoch_of_a_block_of_forty():
 def test_another_decay_is_an_option_that_a_state_remembers(tmp_path):
     one = synthetic_grasps(per_class=1, steps=10, seed=0, classes=("sphere",))
     tiny = Architecture(taxels=39, classes=1, hops=0, features=1, hidden=(1,))
-    trained = train(one, one, ADJACENCY, tiny, epochs=7, decay_epochs=2, state=tmp_path / "s")
+    trained = train(one, one, ADJACENCY, tiny, epochs=7, recipe=replace(RELEASED, decay_epochs=2), state=tmp_path / "s")
     rates = [epoch.learning_rate for epoch in trained.history]
     assert_allclose(rates, [1e-3] * 3 + [1e-4] * 2 + [1e-5] * 2, rtol=1e-12)
     with pytest.raises(OptionError) as refused:
         train(one, one, ADJACENCY, tiny, epochs=7, state=tmp_path / "s", resume=True)
     assert str(refused.value) == (
-        f"{tmp_path / 's'}: belongs to a training with other decay epochs; give the same options and data, "
+        f"{tmp_path / 's'}: belongs to a training with other recipe; give the same options and data, "
         "or delete it to train anew"
     )
     with pytest.raises(OptionError) as refused:
-        train(one, one, ADJACENCY, tiny, decay_epochs=0)
+        train(one, one, ADJACENCY, tiny, recipe=replace(RELEASED, decay_epochs=0))
     assert str(refused.value) == "--decay-epochs 0: allowed are 1 or more; choose another"
 
 
-def test_the_released_decay_leaves_states_as_they_were(tmp_path):
-    one = synthetic_grasps(per_class=1, steps=10, seed=0, classes=("sphere",))
-    tiny = Architecture(taxels=39, classes=1, hops=0, features=1, hidden=(1,))
-    train(one, one, ADJACENCY, tiny, epochs=1, state=tmp_path / "s")
-    with np.load(tmp_path / "s") as file:
-        options = json.loads(str(file["header"]))["options"]
-    assert set(options) == {
-        *("architecture", "graph", "training data", "test data", "epochs", "seed", "learning rate", "device"),
-        "kept epoch",
-    }
-    assert scaled_decay(100) == DECAY_EPOCHS
+def test_a_shorter_schedule_falls_in_proportion():
+    assert scaled_decay(100) == DECAY_EPOCHS == RELEASED.decay_epochs
 
 
 def test_best_weights_are_those_of_the_first_epoch_with_the_most_right(monkeypatch):
     right = iter([2, 5, 5, 3])
     kept = []
 
-    def fake(network: SpikingNet, recordings: Recordings) -> tuple[float, int]:
+    def fake(network: SpikingNet, recordings: Recordings, recipe: Recipe) -> tuple[float, int]:
         kept.append(network.export_weights())
         return 0.5, next(right)
 

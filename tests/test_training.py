@@ -283,15 +283,15 @@ def test_another_decay_is_stored_and_told_apart(data, capsys):
     words = (*WORDS, "--epochs", "3", "-o", "x.pt")
     report = as_json(capsys, *words, "--decay-epochs", "1")
     (run,) = report["runs"]
-    assert run["decay_epochs"] == 1
-    assert run["command"] == "spikeloom train --data data --graph manual --epochs 3 --decay-epochs 1 --seed 0"
+    assert run["recipe"]["decay_epochs"] == 1
+    assert run["command"] == "spikeloom train --data data --graph manual --decay-epochs 1 --epochs 3 --seed 0"
     assert refused(capsys, "--epochs", "3", "-o", "x.pt", "--resume") == (
-        "x.pt: holds another training (other decay epochs); give its options, or another -o"
+        "x.pt: holds another training (other recipe); give its options, or another -o"
     )
     assert as_json(capsys, *words, "--decay-epochs", "1", "--resume") == report
     Path("x.pt").unlink()
     (usual,) = as_json(capsys, *words, "--decay-epochs", "40")["runs"]
-    assert "decay_epochs" not in usual
+    assert "recipe" not in usual
     assert usual["command"] == "spikeloom train --data data --graph manual --epochs 3 --seed 0"
 
 

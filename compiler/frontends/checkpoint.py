@@ -17,6 +17,10 @@ Version 3 is for the other systems: ``architecture`` is "mlp", "gcn" or "grid-cn
 for each taxel, one filter, or one for each cell of the window, row by row; ``grid`` says of the last where the taxels
 lie (``rows``, ``columns``, ``stride``, ``padding``, ``cells``). ``forms`` may be there or not.
 
+Version 4 is for networks with decays of single layers or with clocks, of any system: ``dynamics`` holds ``betas`` and
+``alphas`` (one a layer, or none) and ``clocks`` (``channels`` and ``steps``), see :mod:`compiler.dynamics`; ``fc1`` has
+one more input for each clock, at the end. ``forms`` may be there or not.
+
 Files of ``torch.save`` are read by :mod:`compiler.frontends.released`.
 """
 
@@ -38,6 +42,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from compiler.dynamics import PLAIN, Dynamics, dynamics_from_json
 from compiler.errors import ModelError, OptionError
 from compiler.fixedpoint import THRESHOLD_MANTISSA_MAX, IntArray
 from compiler.forms import Form, plane_distance
@@ -58,8 +63,9 @@ from compiler.frontends.systems import (
 from compiler.frontends.tensors import Arrays, faults_of, size, taxel_faults, wanted_dense
 
 FORMAT = "spikeloom-checkpoint"
-VERSIONS = (1, 2, 3)
-"""Of a plain file of a TactileSGNet, of one that holds the forms of a fine-tuning, and of another system's."""
+VERSIONS = (1, 2, 3, 4)
+"""Of a plain file of a TactileSGNet, of one that holds the forms of a fine-tuning, of another system's, and of one with
+decays of single layers or with clocks."""
 
 BETA, THETA = 0.2, 0.5
 """Decay and threshold of the released code; files in its layout do not hold them."""
@@ -130,6 +136,8 @@ class Checkpoint:
         Of the file.
     grid : Grid or None
         Of a grid-based CNN.
+    dynamics : Dynamics
+        Decays of single layers, and clocks.
     """
 
     hops: Float32Array
@@ -148,11 +156,12 @@ class Checkpoint:
     sha256: str
     system: str = TACTILESGNET
     grid: Grid | None = None
+    dynamics: Dynamics = PLAIN
 
     @property
     def places(self) -> int:
         """Number of places that the first fully connected stage was trained on."""
-        return int(self.dense[0].weight.shape[1] // self.hops.shape[1])
+        return int((self.dense[0].weight.shape[1] - self.dynamics.clocks.channels) // self.hops.shape[1])
 
     @property
     def taxels(self) -> int:
@@ -234,12 +243,14 @@ def read_checkpoint(
         if weights not in (None, "last"):
             raise ModelError(f"{where}: --weights {weights}: the file holds the last epoch only; leave --weights away")
         graph, edges, chosen, held = None, None, "last", {"beta": BETA, "theta": THETA}
-        forms = None
+        forms, dynamics = None, PLAIN
         assumed = tuple(name for name, value in given.items() if value is None)
     else:
         if run != 0:
             raise ModelError(f"{where}: --run {run}: the file holds only run 0; leave --run away")
-        arrays, chosen, (graph, edges, held, training), (found, grid), forms = _own_arrays(where, members, weights)
+        arrays, chosen, (graph, edges, held, training), (found, grid, dynamics), forms = _own_arrays(
+            where, members, weights
+        )
         if system not in (None, found):
             raise OptionError(f"--system {system}: {where} holds a {found}; leave --system away")
         layout, runs, assumed = "spikeloom", 1, ()
@@ -248,6 +259,11 @@ def read_checkpoint(
                 raise OptionError(
                     f"--{name} {value:g}: {where} was fine-tuned with {held[name]:g}; leave --{name} away"
                 )
+        if beta is not None and dynamics.betas:
+            raise OptionError(
+                f"--beta {beta:g}: {where} has a decay for each layer, {', '.join(f'{b:g}' for b in dynamics.betas)}; "
+                "leave --beta away"
+            )
     stages = sorted({key.split(".")[0] for key in arrays if key.startswith("fc")}, key=lambda name: int(name[2:]))
     return Checkpoint(
         hops=_plain(arrays["conv1.hops"]),
@@ -269,6 +285,7 @@ def read_checkpoint(
         sha256=hashlib.sha256(content).hexdigest(),
         system=found,
         grid=grid,
+        dynamics=dynamics,
     )
 
 
@@ -362,10 +379,10 @@ def _own_arrays(
     Arrays,
     str,
     tuple[str, IntArray, dict[str, float], dict[str, Any]],
-    tuple[str, Grid | None],
+    tuple[str, Grid | None, Dynamics],
     tuple[Form, ...] | None,
 ]:
-    """Arrays of one set, its name; graph name, edges, neuron constants and training record; system and grid; forms."""
+    """Arrays of one set, its name; graph, edges, constants and training record; system, grid and dynamics; forms."""
     manifest = _manifest(where, members.pop("manifest.json"))
     try:
         arrays: Arrays = {name.removesuffix(".npy"): _read_npy(content) for name, content in members.items()}
@@ -381,11 +398,15 @@ def _own_arrays(
         held = {name: float(manifest[name]) for name in ("beta", "theta")}
         taxels, classes = int(manifest["taxels"]), int(manifest["classes"])
         facts = str(graph["name"]), edges, held, dict(manifest["training"])
-        system = str(manifest["architecture"]) if manifest["version"] == VERSIONS[2] else TACTILESGNET
+        system = str(manifest["architecture"]) if manifest["version"] >= VERSIONS[2] else TACTILESGNET
         if system not in SYSTEMS:
             raise ValueError(f"architecture {system}")
         grid = grid_from_json(manifest["grid"]) if system == GRID_CNN else None
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        dynamics = PLAIN
+        if manifest["version"] == VERSIONS[3]:
+            stages = sum(re.fullmatch(r"[a-z]+/fc\d+\.weight", name) is not None for name in arrays) // len(sets)
+            dynamics = dynamics_from_json(manifest["dynamics"], 1 + stages)
+    except (KeyError, TypeError, ValueError, OverflowError, ZeroDivisionError) as error:
         raise ModelError(f"{where}: has an incomplete manifest ({error!r}); {_AGAIN}") from error
     _require_constants(f"{where}: ", ModelError, held["beta"], held["theta"])
     if weights is None and sets:
@@ -393,17 +414,17 @@ def _own_arrays(
     if weights not in sets:
         raise ModelError(f"{where}: --weights {weights}: the file holds {', '.join(sets)}; choose one that it holds")
     chosen = {name.removeprefix(f"{weights}/"): a for name, a in arrays.items() if name.startswith(f"{weights}/")}
-    faults = _own_faults(chosen, taxels, classes, system, grid)
+    faults = _own_faults(chosen, taxels, classes, (system, grid, dynamics))
     if edges.size and (edges.min() < 0 or edges.max() >= taxels):
         faults.append(f"the graph joins taxels outside 0..{taxels - 1}")
     if faults:
         raise ModelError(f"{where}: {'; '.join(faults)}; {_AGAIN}")
-    return chosen, weights, facts, (system, grid), _forms(where, manifest, chosen)
+    return chosen, weights, facts, (system, grid, dynamics), _forms(where, manifest, chosen)
 
 
 def _forms(where: str, manifest: dict[str, Any], arrays: Arrays) -> tuple[Form, ...] | None:
     """Storage of every layer of a fine-tuned network; None for a plain file."""
-    if manifest["version"] == VERSIONS[0] or (manifest["version"] == VERSIONS[2] and "forms" not in manifest):
+    if manifest["version"] == VERSIONS[0] or (manifest["version"] >= VERSIONS[2] and "forms" not in manifest):
         return None
     sizes = {"conv1": arrays["fc1.weight"].shape[1]}
     stages = sum(key.endswith(".weight") for key in arrays)
@@ -432,15 +453,17 @@ def _forms(where: str, manifest: dict[str, Any], arrays: Arrays) -> tuple[Form, 
     return tuple(found)
 
 
-def _own_faults(arrays: Arrays, taxels: int, classes: int, system: str, grid: Grid | None) -> list[str]:
+def _own_faults(arrays: Arrays, taxels: int, classes: int, kind: tuple[str, Grid | None, Dynamics]) -> list[str]:
+    system, grid, dynamics = kind
     stages = max((int(m[1]) for key in arrays if (m := re.fullmatch(r"fc([1-9]\d?)\.weight", key))), default=1)
     features = size(arrays, "conv1.hops", 3, 1, "features")
     wanted = {"conv1.hops": ("K + 1", features, "channels"), "conv1.bias": (features,)} | wanted_dense(arrays, stages)
     faults = faults_of(arrays, wanted, TITLES[system])
     if not faults:
         assert isinstance(features, int)
-        faults = taxel_faults(arrays, features)
-        places, made_classes = arrays["fc1.weight"].shape[1] // features, len(arrays[f"fc{stages}.bias"])
+        faults = taxel_faults(arrays, features, dynamics.clocks.channels)
+        heard = arrays["fc1.weight"].shape[1] - dynamics.clocks.channels
+        places, made_classes = heard // features, len(arrays[f"fc{stages}.bias"])
         faults = faults or shape_faults(system, len(arrays["conv1.hops"]), places, taxels, grid)
         made_for = places if system in GRAPH_SYSTEMS else taxels, made_classes
         if not faults and made_for != (taxels, classes):

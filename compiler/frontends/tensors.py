@@ -51,11 +51,12 @@ def wanted_dense(
     return wanted
 
 
-def taxel_faults(arrays: Mapping[str, npt.NDArray[Any]], features: int) -> list[str]:
-    """Whether the first dense stage was made for a whole number of taxels."""
+def taxel_faults(arrays: Mapping[str, npt.NDArray[Any]], features: int, clocks: int = 0) -> list[str]:
+    """Whether the first dense stage was made for a whole number of taxels, and the clocks beside them."""
     inputs = arrays["fc1.weight"].shape[1]
-    if inputs % features:
-        return [f"fc1.weight has {inputs} inputs, not a whole number of taxels with {features} features each"]
+    if inputs <= clocks or (inputs - clocks) % features:
+        beside = f" beside {clocks} clocks" if clocks else ""
+        return [f"fc1.weight has {inputs} inputs, not a whole number of taxels with {features} features each{beside}"]
     return []
 
 

@@ -156,6 +156,7 @@ def _run_stack(
         name=population.name,
         beta=population.beta,
         theta=population.theta,
+        alpha=population.alpha,
         scale=np.concatenate([layer.population.scale for layer in layers]),
         decay_u=population.decay_u,
         decay_v=population.decay_v,

@@ -18,7 +18,7 @@ from scipy import sparse
 from scipy.linalg import solve_triangular
 
 from compiler.fixedpoint import ONE_STEP_SUM_MAX, FloatArray, IntArray
-from compiler.forms import Form, one_sided_sums, reach, scales, step_units, store
+from compiler.forms import Form, loads, reach, scales, step_units, store
 from compiler.ir import Population, Projection
 from compiler.passes.calibrate import Calibration
 from compiler.passes.scales import Rounded, flips
@@ -72,18 +72,19 @@ def compensated(
             integer, planes = store(population, projections, form, [steps[place] for place in places], bias)
         except ValueError:
             return None
-        sums = one_sided_sums(planes, population.size) if observed is None else observed * scale
+        sums = loads(integer, planes) if observed is None else observed * scale
         return Rounded(form=form, population=integer, projections=planes, reached=float(np.max(sums, initial=0)))
 
     nearest = np.rint(held).astype(np.int64)
     plain = stored_as(nearest, np.zeros(population.size))
     errors = (held - steps) @ rate * step / scale
+    errors[population.size - population.relays :] = 0  # a relay has no bias
     layer = stored_as(steps, errors)
     if layer is None or plain is None:
         return None
     back = flips(layer, post, calibration) > flips(plain, post, calibration)
     if observed is None:
-        back |= one_sided_sums(layer.projections, population.size) > ONE_STEP_SUM_MAX
+        back |= loads(layer.population, layer.projections) > ONE_STEP_SUM_MAX
     steps[back], errors[back] = nearest[back], 0
     return stored_as(steps, errors)
 

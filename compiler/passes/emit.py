@@ -81,6 +81,7 @@ def _layers(origin: Origin) -> tuple[Layer, ...]:
             depth=depth,
             beta=population.beta,
             theta=population.theta,
+            alpha=population.alpha,
             weight_bits=max(p.bits for p in network.projections if p.post == post),
             synapses=int(fan_in(network, post).sum()),
             max_fan_in=int(fan_in(network, post).max()),
@@ -187,4 +188,5 @@ def emit(
         format_exponent=read_only([key[1] for key in columns]),
         format_index_bits=read_only([key[2] for key in columns]),
         provenance=dict(provenance),
+        clocks=network.input.clocks,
     )

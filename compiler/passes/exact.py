@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from compiler.fixedpoint import THRESHOLD_MANTISSA_MAX, IntArray
-from compiler.forms import decay_registers, reach, step_units
+from compiler.forms import current_load, decay_registers, reach, step_units
 from compiler.interpret import float_recurrence, product
 from compiler.ir import IntegerNetwork, Network
 from compiler.passes.calibrate import Calibration, fewer
@@ -153,7 +153,8 @@ def _limits(
     form = candidate.layer.form
     population, projections = network.populations[post], incoming(network, post)
     finest = finest_thresholds(population, projections, form.bits, form.exponents, 1.0, None)
-    cause = np.full(population.size, "21-bit accumulator", dtype=object)
+    fullest = "24-bit current" if current_load(candidate.layer.population.decay_u) > 1 else "21-bit accumulator"
+    cause = np.full(population.size, fullest, dtype=object)
     cause[_full_range(network, post, candidate)] = "range of the planes"
     cause[form.threshold >= AT_LIMIT * THRESHOLD_MANTISSA_MAX] = "17-bit threshold"
     cause[form.threshold < SHARED * finest] = f"{slots} thresholds a core"
@@ -163,11 +164,12 @@ def _limits(
 
 def _decay_flips(network: Network, post: int, calibration: Calibration) -> int:
     population, projections = network.populations[post], incoming(network, post)
-    realised = replace(population, beta=(4096 - decay_registers(population.beta)[1]) / 4096)
+    lost_u, lost_v = decay_registers(population.beta, population.alpha)
+    realised = replace(population, alpha=(4095 - lost_u) / 4096, beta=(4096 - lost_v) / 4096)
 
     def moved(part: slice) -> IntArray:
-        current = sum(product(p.weight, calibration.source(p.pre)[part], np.float64) for p in projections)
-        spikes, _ = float_recurrence(realised, np.asarray(current) + population.bias)
+        sums = sum(product(p.weight, calibration.source(p.pre)[part], np.float64) for p in projections)
+        spikes, _ = float_recurrence(realised, np.asarray(sums))
         return np.asarray(np.count_nonzero(spikes != calibration.spikes[post][part]))
 
     return int(np.sum(in_batches(calibration, moved)))

@@ -15,6 +15,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy import sparse
 
+from compiler.dynamics import RELAY_WEIGHT
 from compiler.errors import ModelError
 from compiler.fixedpoint import FloatArray
 from compiler.frontends.checkpoint import Checkpoint
@@ -76,6 +77,17 @@ def expand_first_layer(checkpoint: Checkpoint, propagation: FloatArray) -> tuple
     flat = [in_order(checkpoint.system, array) for array in (weight, structure)]
     columns = weight.shape[2] * weight.shape[3]
     return _stored(*(array.reshape(-1, columns) for array in flat)), in_order(checkpoint.system, bias)
+
+
+def _with_relays(checkpoint: Checkpoint, weight: Sparse, bias: FloatArray) -> tuple[Sparse, FloatArray]:
+    """Weights and biases of the first layer with a relay for each clock, see :mod:`compiler.dynamics`."""
+    clocks = checkpoint.dynamics.clocks.channels
+    if not clocks:
+        return weight, bias
+    relays = sparse.diags_array(np.full(clocks, RELAY_WEIGHT * checkpoint.theta), format="csr")
+    both = sparse.csr_array(sparse.block_diag([weight, relays], format="csr"))
+    both.sort_indices()
+    return both, np.append(bias, np.zeros(clocks))
 
 
 def expand_graph_convolution(adjacency: FloatArray | Sparse, hops: FloatArray) -> Sparse:
@@ -210,14 +222,23 @@ def expand(checkpoint: Checkpoint, propagation: FloatArray) -> Network:
             f"{TITLES[checkpoint.system]} with {(len(checkpoint.hops), checkpoint.places, checkpoint.taxels)}; "
             "give the sensor that it was trained on"
         )
-    stages = [("conv1", *expand_first_layer(checkpoint, propagation))]
+    dynamics = checkpoint.dynamics
+    stages = [("conv1", *_with_relays(checkpoint, *expand_first_layer(checkpoint, propagation)))]
     for dense in checkpoint.dense:
         weight = dense.weight.astype(np.float64)
         stages.append((dense.name, _stored(weight, np.ones(weight.shape, np.bool_)), dense.bias.astype(np.float64)))
     return Network(
-        input=Input(taxels=checkpoint.taxels, polarities=checkpoint.hops.shape[2]),
+        input=Input(taxels=checkpoint.taxels, polarities=checkpoint.hops.shape[2], clocks=dynamics.clocks),
         populations=tuple(
-            Population(name=name, beta=checkpoint.beta, theta=checkpoint.theta, bias=bias) for name, _, bias in stages
+            Population(
+                name=name,
+                beta=dynamics.beta(layer, checkpoint.beta),
+                theta=checkpoint.theta,
+                bias=bias,
+                alpha=dynamics.alpha(layer),
+                relays=0 if layer else dynamics.clocks.channels,
+            )
+            for layer, (name, _, bias) in enumerate(stages)
         ),
         projections=tuple(
             Projection(pre=post - 1 if post else INPUT, post=post, weight=weight)

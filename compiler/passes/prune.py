@@ -52,7 +52,8 @@ def never_fires(network: Network) -> tuple[Mask, ...]:
 
     Neurons that vote are never among them.
 
-    A neuron that has not fired holds at most ``sum(positive weights) + bias``, added up by the leak.
+    A neuron that has not fired holds at most ``sum(positive weights) + bias``, added up by the leak, where a current
+    that outlasts its step has added up the weights already.
     """
     silent: dict[int, Mask] = {INPUT: np.zeros(network.input.size, np.bool_)}
     for post, population in enumerate(network.populations):
@@ -66,8 +67,11 @@ def never_fires(network: Network) -> tuple[Mask, ...]:
                     up[rows] += weight.maximum(0) @ heard
                     total[rows] += abs(weight) @ heard
                 inputs += p.weight.shape[1]
-        slack = (inputs + 8) * FLOAT32_ROUNDING * total
-        most = np.maximum(up + population.bias + slack, 0)
+        lasts = population.alpha * (1 + 8 * FLOAT32_ROUNDING)
+        gathered = np.inf if lasts >= 1 else 1 / (1 - lasts)
+        slack = (inputs + 8) * FLOAT32_ROUNDING * total * gathered
+        with np.errstate(invalid="ignore"):
+            most = np.maximum(np.where(up > 0, up * gathered, 0.0) + population.bias + slack, 0)
         with np.errstate(divide="ignore", invalid="ignore"):
             kept = population.beta * (1 + 8 * FLOAT32_ROUNDING)
             settled = most / (1 - kept) if kept < 1 else np.where(most > 0, np.inf, 0)

@@ -15,9 +15,9 @@ import numpy as np
 
 from compiler.errors import ModelError, OptionError
 from compiler.fixedpoint import ONE_STEP_SUM_MAX, FloatArray
-from compiler.forms import Form, reach, step_units
+from compiler.forms import Form, current_load, decay_registers, reach, step_units
 from compiler.interpret import run_integer
-from compiler.ir import IntegerNetwork, Network, Projection, row_parts
+from compiler.ir import IntegerNetwork, Network, Population, Projection, row_parts
 from compiler.passes.calibrate import MANY, Calibration, fewer
 from compiler.passes.compensate import compensated
 from compiler.passes.scales import Rounded, candidate, flips, grouped, observed_sums, rounded
@@ -78,7 +78,8 @@ class Choice:
     flips, spikes : int or None
         Calibration spikes that differ from float64, and how many the float64 model has; None without calibration.
     headroom : float
-        Share of the accumulator that the worst case (proven) or the largest observed step leaves free.
+        Share of the accumulator that the worst case (proven) or the largest observed step leaves free; of the
+        current's register where a current that outlasts its step fills that sooner.
     """
 
     layer: str
@@ -113,6 +114,18 @@ def incoming(network: Network, post: int) -> tuple[Projection, ...]:
     return tuple(p for p in network.projections if p.post == post)
 
 
+def _register(population: Population) -> str:
+    """Register that the sums of a population fill first."""
+    full = current_load(decay_registers(population.beta, population.alpha)[0]) > 1
+    return "current" if full else "accumulator"
+
+
+def _current_words(population: Population) -> str:
+    if _register(population) == "accumulator":
+        return ""
+    return f" and its current, of which a step keeps {population.alpha:g}, within its register"
+
+
 def shortlist(
     network: Network,
     post: int,
@@ -140,7 +153,8 @@ def shortlist(
     if not found:
         raise ModelError(
             f"{population.name}: no scale at {recipe.bits} bits keeps its threshold of at least one unit within the "
-            f"accumulator ({ONE_STEP_SUM_MAX} units a step); use more bits or smaller weights"
+            f"accumulator ({ONE_STEP_SUM_MAX} units a step){_current_words(population)}; use more bits or smaller "
+            "weights"
         )
     if calibration is None:
         counted = [Candidate(layer=found[0], flips=None, tried=1)]
@@ -320,11 +334,18 @@ def quantize(
     few = None if calibration is None else fewer(calibration)
     limits: list[FloatArray | None] = [None] * len(recipes)
     if ranges == "observed" and few is not None:
-        limits = [observed_sums(incoming(network, post), few) * (1 + margin) for post in range(len(recipes))]
-    shortlists = [
-        shortlist(network, post, recipe, exponents, few, observed)
-        for post, (recipe, observed) in enumerate(zip(recipes, limits, strict=True))
-    ]
+        limits = [
+            observed_sums(population, incoming(network, post), few) * (1 + margin)
+            for post, population in enumerate(network.populations)
+        ]
+    shortlists, faults = [], []
+    for post, (recipe, observed) in enumerate(zip(recipes, limits, strict=True)):
+        try:
+            shortlists.append(shortlist(network, post, recipe, exponents, few, observed))
+        except ModelError as error:
+            faults.append(str(error))
+    if faults:
+        raise ModelError("\n".join(faults))
     if calibration is None or few is None:
         chosen = [candidates[0] for candidates in shortlists]
     else:
@@ -351,7 +372,7 @@ def round_to_forms(
     for post, (population, form) in enumerate(zip(network.populations, forms, strict=True)):
         layer = rounded(population, incoming(network, post), form)
         if layer is None or layer.reached > ONE_STEP_SUM_MAX:
-            what = "a bias has no register value" if layer is None else "the accumulator may overflow"
+            what = "a bias has no register value" if layer is None else f"the {_register(population)} may overflow"
             raise ModelError(f"{population.name}: at the scale that it was fine-tuned for, {what}; fine-tune it again")
         moved = None if calibration is None else int(flips(layer, post, calibration).sum())
         chosen.append(Candidate(layer=layer, flips=moved, tried=1))

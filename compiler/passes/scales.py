@@ -15,6 +15,7 @@ import numpy as np
 from compiler.fixedpoint import (
     BIAS_EXPONENT_MAX,
     BIAS_MANTISSA_MAX,
+    CURRENT_MAX,
     MEMBRANE_SHIFT,
     ONE_STEP_SUM_MAX,
     THRESHOLD_MANTISSA_MAX,
@@ -22,8 +23,8 @@ from compiler.fixedpoint import (
     IntArray,
     weight_step,
 )
-from compiler.forms import Form, one_sided_sums, plane_distance, reach, round_population, step_units
-from compiler.interpret import BATCH, integer_recurrence, integer_sums, product
+from compiler.forms import Form, loads, plane_distance, reach, round_population, step_units
+from compiler.interpret import BATCH, integer_recurrence, integer_sums, lasting_currents, product
 from compiler.ir import IntegerPopulation, IntegerProjection, Population, Projection, Sparse
 from compiler.passes.calibrate import Calibration
 
@@ -49,7 +50,8 @@ class Rounded:
     population : IntegerPopulation
     projections : tuple of IntegerProjection
     reached : float
-        Largest one-sided sum of one step, weight units: proven, or observed with its margin.
+        Largest one-sided sum of one step, weight units: proven, or observed with its margin. A current that outlasts
+        its step counts as the sum that fills the accumulator as far as it fills its own register.
     """
 
     form: Form
@@ -61,19 +63,28 @@ class Rounded:
 def rounded(
     population: Population, projections: tuple[Projection, ...], form: Form, observed: FloatArray | None = None
 ) -> Rounded | None:
-    """Round one population, or None where a bias has no register value.
+    """Round one population, or None where a bias has no register value or a relay would miss its clock.
 
     Parameters
     ----------
     observed : (neurons,) float64, optional
-        Largest one-sided sums that were observed, membrane units; without it the proven ones count.
+        Largest sums that were observed, membrane units, see :func:`observed_sums`; without it the proven ones count.
     """
     try:
         integer, planes = round_population(population, projections, form)
     except ValueError:
         return None
-    sums = one_sided_sums(planes, population.size) if observed is None else observed * integer.scale
+    if population.relays and not _relays_follow(population, integer, planes):
+        return None
+    sums = loads(integer, planes) if observed is None else observed * integer.scale
     return Rounded(form=form, population=integer, projections=planes, reached=float(np.max(sums, initial=0)))
+
+
+def _relays_follow(population: Population, integer: IntegerPopulation, planes: tuple[IntegerProjection, ...]) -> bool:
+    """Whether the one synapse of every relay crosses its threshold."""
+    last = slice(population.size - population.relays, population.size)
+    weight = sum(np.asarray(plane.effective()[last].sum(axis=1)) for plane in planes)
+    return bool(np.all(weight > integer.threshold[last]))
 
 
 def in_batches(calibration: Calibration, measure: Callable[[slice], IntArray | FloatArray]) -> list[FloatArray]:
@@ -83,13 +94,20 @@ def in_batches(calibration: Calibration, measure: Callable[[slice], IntArray | F
         return [np.asarray(part, np.float64) for part in pool.map(measure, parts)]
 
 
-def observed_sums(projections: tuple[Projection, ...], calibration: Calibration) -> FloatArray:
-    """Largest one-sided sum of each neuron of the float model on the calibration recordings, membrane units."""
+def observed_sums(population: Population, projections: tuple[Projection, ...], calibration: Calibration) -> FloatArray:
+    """Largest one-sided sum of each neuron of the float model on the calibration recordings, membrane units.
+
+    A current that outlasts its step counts, too, by the share of its register that it fills.
+    """
+    narrower = ONE_STEP_SUM_MAX * (1 << MEMBRANE_SHIFT) / CURRENT_MAX
 
     def largest(part: slice) -> FloatArray:
         up = sum(product(p.weight.maximum(0), calibration.source(p.pre)[part], np.float64) for p in projections)
         down = sum(product(p.weight.minimum(0), calibration.source(p.pre)[part], np.float64) for p in projections)
         both: FloatArray = np.maximum(np.max(up, axis=(0, 1)), -np.min(down, axis=(0, 1)))
+        if population.alpha:
+            lasting = lasting_currents(np.asarray(up + down), population.alpha)
+            both = np.maximum(both, np.abs(lasting).max(axis=(0, 1)) * narrower)
         return both
 
     found: FloatArray = np.max(in_batches(calibration, largest), axis=0)
@@ -159,7 +177,8 @@ def fit(
     def tried(units: int) -> tuple[Rounded | None, float]:
         form = Form(bits=bits, exponents=exponents, threshold=np.full(population.size, units, np.int64))
         layer = rounded(population, projections, form, observed)
-        return layer, np.inf if layer is None else layer.reached  # None: a bias that rounds just out of its register
+        # None: a bias that rounds just out of its register, or a relay whose clipped weight no longer reaches
+        return layer, np.inf if layer is None else layer.reached
 
     high = int(min(population.theta * mantissa_scale * 2.0 ** exponents[0], _largest_threshold(population)))
     if high < 1:
@@ -248,7 +267,7 @@ def finest_thresholds(
         middle = np.where(high - low > 1, middle, np.maximum(low, 1))
         form = Form(bits=bits, exponents=exponents, threshold=np.maximum(middle, 1))
         integer, planes = round_population(population, projections, form)
-        sums = one_sided_sums(planes, population.size) if observed is None else observed * integer.scale
+        sums = loads(integer, planes) if observed is None else observed * integer.scale
         good = sums <= ONE_STEP_SUM_MAX
         low, high = np.where(good & (high - low > 1), middle, low), np.where(good | (high - low <= 1), high, middle)
     return low
@@ -337,8 +356,11 @@ def grouped(
     """Population with up to `groups` thresholds, stored with the width and planes of a `uniform` one.
 
     With several planes, or without calibration, neurons are grouped by the finest threshold that each allows; else
-    by the calibration spikes that each keeps under ``LEVELS`` thresholds.
+    by the calibration spikes that each keeps under ``LEVELS`` thresholds. None where some neurons relay clocks: these
+    bind the threshold of all.
     """
+    if population.relays:
+        return None
     form = uniform.form
     finest = finest_thresholds(population, projections, form.bits, form.exponents, clipping[-1], observed)
     floor = int(uniform.form.threshold[0])

@@ -1,0 +1,175 @@
+"""What a network may use of the chip beside one membrane decay for all: decays of its own a layer, and clocks.
+
+*Decays.* ``i_t = alpha * i_{t-1} + W s_t`` and ``u_t = beta * u_{t-1} * (1 - s_{t-1}) + i_t + b``: a synaptic current
+that outlasts its step. The bias goes to the membrane, past the current, and the reset leaves the current as it is.
+
+*Clocks.* K input channels beside those of the sensor. The k-th has an event in each of the steps
+``k * S … (k + 1) * S - 1``; after ``K * S`` steps there are none. A layer hears the one before it and nothing else, so
+each clock channel is relayed by a neuron of its own, one of K at the end of the first layer: its only synapse has
+twice the threshold, its bias is zero, so that it spikes when its channel has an event and at no other time. The first
+dense layer hears them: a bias that changes with time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+RELAY_WEIGHT = 2.0
+"""Weight of a clock channel to its relay, in thresholds."""
+
+MOST_CLOCKS = 64
+"""Clock channels that a network may have."""
+
+MOST_STEPS = 2**20
+"""Steps that a clock may tick."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Clocks:
+    """Input channels that tell the time.
+
+    Parameters
+    ----------
+    channels : int
+        How many; none by default.
+    steps : int
+        How long each of them has events.
+    """
+
+    channels: int = 0
+    steps: int = 1
+
+    def events(self, steps: int, *, first: int = 0) -> npt.NDArray[np.uint8]:
+        """Events of the steps ``first … first + steps - 1``, (channels, steps).
+
+        Examples
+        --------
+        >>> Clocks(channels=2, steps=2).events(5).tolist()
+        [[1, 1, 0, 0, 0], [0, 0, 1, 1, 0]]
+        """
+        part = np.arange(first, first + steps) // self.steps
+        ticks: npt.NDArray[np.uint8] = (part == np.arange(self.channels)[:, None]).astype(np.uint8)
+        return ticks
+
+
+NO_CLOCKS = Clocks()
+
+
+def clocks_over(channels: int, steps: int) -> Clocks:
+    """Clocks that share recordings of so many steps among them.
+
+    Examples
+    --------
+    >>> clocks_over(8, 250)
+    Clocks(channels=8, steps=32)
+    """
+    return Clocks(channels=channels, steps=-(-steps // channels)) if channels else NO_CLOCKS
+
+
+def with_clocks(events: npt.NDArray[Any], clocks: Clocks) -> npt.NDArray[Any]:
+    """Recordings as the input channels of a network: those of the sensor, then its clocks.
+
+    Parameters
+    ----------
+    events : (samples, taxels, polarities, steps)
+        Zeros and ones.
+
+    Returns
+    -------
+    (samples, taxels * polarities + clocks, steps) of the same type
+    """
+    samples, taxels, polarities, steps = events.shape
+    flat = events.reshape(samples, taxels * polarities, steps)
+    if not clocks.channels:
+        return flat
+    ticks = clocks.events(steps).astype(events.dtype)
+    return np.concatenate([flat, np.broadcast_to(ticks, (samples, *ticks.shape))], axis=1)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Dynamics:
+    """Decays of each layer, and clocks.
+
+    Parameters
+    ----------
+    betas, alphas : tuple of float
+        Shares of the membrane and of the synaptic current that a step keeps, by layer; empty where all layers have
+        the common membrane decay, or no current outlasts its step.
+    clocks : Clocks
+    """
+
+    betas: tuple[float, ...] = ()
+    alphas: tuple[float, ...] = ()
+    clocks: Clocks = NO_CLOCKS
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether nothing of this is used."""
+        return self == PLAIN
+
+    def beta(self, layer: int, common: float) -> float:
+        """Membrane decay of a layer, 0 for the first."""
+        return self.betas[layer] if self.betas else common
+
+    def alpha(self, layer: int) -> float:
+        """Current decay of a layer."""
+        return self.alphas[layer] if self.alphas else 0.0
+
+    def to_json(self) -> dict[str, Any]:
+        """JSON values."""
+        clocks = {"channels": self.clocks.channels, "steps": self.clocks.steps}
+        return {"betas": list(self.betas), "alphas": list(self.alphas), "clocks": clocks}
+
+
+PLAIN = Dynamics()
+"""One membrane decay for all layers, no current that outlasts its step, no clocks."""
+
+
+def dynamics_from_json(values: Mapping[str, Any], layers: int) -> Dynamics:
+    """Inverse of :meth:`Dynamics.to_json`, checked for a network of so many layers.
+
+    Raises
+    ------
+    KeyError, TypeError, ValueError
+        If they are no dynamics.
+    """
+    clocks = [values["clocks"][name] for name in ("channels", "steps")]
+    if any(type(number) is not int for number in clocks):
+        raise ValueError(f"clocks of {clocks}")
+    found = Dynamics(
+        betas=tuple(float(beta) for beta in values["betas"]),
+        alphas=tuple(float(alpha) for alpha in values["alphas"]),
+        clocks=Clocks(channels=clocks[0], steps=clocks[1]),
+    )
+    faults = dynamics_faults(found, layers)
+    if faults:
+        raise ValueError("; ".join(faults))
+    return found
+
+
+def dynamics_faults(dynamics: Dynamics, layers: int) -> list[str]:
+    """What is wrong about the dynamics of a network of so many layers.
+
+    Examples
+    --------
+    >>> dynamics_faults(Dynamics(alphas=(0.5, 1.0)), 2)
+    ['a current decay of 1, allowed are 0 <= decay < 1']
+    """
+    faults = []
+    for what, decays in (("membrane", dynamics.betas), ("current", dynamics.alphas)):
+        if len(decays) not in (0, layers):
+            faults.append(f"{len(decays)} {what} decays for {layers} layers")
+        faults += [f"a {what} decay of {d:g}, allowed are 0 <= decay < 1" for d in decays if not 0 <= d < 1]
+    clocks = dynamics.clocks
+    if not 0 <= clocks.channels <= MOST_CLOCKS:
+        faults.append(f"{clocks.channels} clocks, allowed are 0 to {MOST_CLOCKS}")
+    if not 1 <= clocks.steps <= MOST_STEPS:
+        faults.append(f"clocks of {clocks.steps} steps, allowed are 1 to {MOST_STEPS}")
+    if clocks.channels and dynamics.alpha(0):
+        faults.append("clocks need a first layer without current decay, which relays them step for step")
+    return faults

@@ -1,0 +1,466 @@
+"""Currents that outlast their step, decays of single layers, and clocks: float network, gradients, recipes, files."""
+
+import json
+import zipfile
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+from timed_networks import GRAPH, SMALL, TIMING, events_of, louder, written
+
+from compiler.dynamics import NO_CLOCKS, PLAIN, Clocks, Dynamics, clocks_over, dynamics_faults, with_clocks
+from compiler.errors import ModelError, OptionError
+from compiler.frontends.checkpoint import read_checkpoint
+from models.currents import accumulate, accumulate_steps, lasting_current
+from models.graphs import normalised_adjacency
+from models.grasps import synthetic_grasps
+from models.layers import LifSteps, lif
+from models.networks import Architecture, SpikingNet
+from models.recipes import RECIPES, RELEASED, TIMED, Recipe, check_recipe, decays_asked
+from models.reference import float_membranes, float_spikes
+from models.release import write_released
+from models.surrogate import FAST_SIGMOID, RECTANGLE, Surrogate
+from models.train import evaluate, train
+from runtime.cli import main
+
+ADJACENCY = normalised_adjacency(GRAPH.edges, 39)
+SMOOTH = Surrogate(shape=FAST_SIGMOID, width=0.25, reset=False)
+
+
+def surrogate_spike(surrogate):
+    class Spike(torch.autograd.Function):
+        @staticmethod
+        def forward(ctx, membrane, theta):
+            ctx.save_for_backward(membrane)
+            ctx.theta = theta
+            return membrane.gt(theta).to(membrane.dtype)
+
+        @staticmethod
+        def backward(ctx, gradient):
+            (membrane,) = ctx.saved_tensors
+            distance = (membrane - ctx.theta).abs()
+            if surrogate.shape == FAST_SIGMOID:
+                return gradient / (1 + distance / surrogate.width) ** 2, None
+            return gradient * (distance < surrogate.width), None
+
+    return Spike.apply
+
+
+def neurons_step_by_step(drive, bias, alpha, beta, theta, surrogate):
+    """Spikes of neurons in plain autograd code, from what their synapses bring."""
+    spike_of = surrogate_spike(surrogate)
+    current = membrane = spike = torch.zeros_like(drive[0])
+    found = []
+    for step in drive:
+        current = alpha * current + step
+        held = spike if surrogate.reset else spike.detach()
+        membrane = beta * membrane * (1.0 - held) + current + bias
+        spike = spike_of(membrane, theta)
+        found.append(spike)
+    return torch.stack(found)
+
+
+# --- one layer -----------------------------------------------------------------------------------------------------
+
+
+def test_a_current_outlasts_its_step_and_the_bias_goes_past_it():
+    drive = torch.tensor([1.0, 0.0, 0.0, 2.0], dtype=torch.float64)
+    assert lasting_current(drive, 0.5).tolist() == [1.0, 0.5, 0.25, 2.125]
+    network = SpikingNet(SMALL, ADJACENCY)
+    with torch.no_grad():
+        network.fc1.weight.zero_()
+        network.fc1.bias.fill_(0.25)
+    _, membranes = network.layers(torch.zeros(3, 1, 39, 2))["fc1"]
+    # 0.25, 0.25 * 0.3 + 0.25 …: were the bias part of the current, the second would be far above
+    assert_allclose(membranes[:, 0, 0].detach(), [0.25, 0.325, 0.3475], rtol=1e-6)
+
+
+def test_the_reset_leaves_the_current_as_it_is():
+    spikes, membranes = lif(lasting_current(torch.tensor([[2.0], [0.0], [0.0], [0.0]]), 0.5), 0.9, 0.5)
+    assert spikes[:, 0].tolist() == [1, 1, 0, 1]
+    assert membranes[:, 0].tolist() == [2.0, 1.0, 0.5, pytest.approx(0.7)]
+
+
+@pytest.mark.parametrize("surrogate", [RECTANGLE, SMOOTH, replace(SMOOTH, reset=True), replace(RECTANGLE, reset=False)])
+@given(seed=st.integers(0, 2**31), steps=st.integers(1, 30), alpha=st.sampled_from([0.0, 0.5, 0.95]))
+@settings(max_examples=25, deadline=None)
+def test_gradients_equal_plain_autograd(surrogate, seed, steps, alpha):
+    draw = torch.Generator().manual_seed(seed)
+    drive = 0.4 * torch.randn(steps, 2, 5, generator=draw, dtype=torch.float64)
+    above = torch.randn(drive.shape, generator=draw, dtype=torch.float64)
+    beta, theta, found = 0.7, 0.5, []
+
+    def kernels(drive, bias):
+        return lif(lasting_current(drive, alpha) + bias, beta, theta, surrogate)[0]
+
+    def torch_steps(drive, bias):
+        return LifSteps.apply(lasting_current(drive, alpha) + bias, beta, theta, surrogate)[0]
+
+    def plain(drive, bias):
+        return neurons_step_by_step(drive, bias, alpha, beta, theta, surrogate)
+
+    for function in (kernels, torch_steps, plain):
+        inputs = drive.clone().requires_grad_(), torch.full((5,), 0.1, dtype=torch.float64, requires_grad=True)
+        spikes = function(*inputs)
+        (spikes * above).sum().backward()
+        found.append((spikes.detach(), *(tensor.grad for tensor in inputs)))
+    for tensors in found[:2]:
+        assert torch.equal(tensors[0], found[2][0])
+        assert_allclose(tensors[1], found[2][1], rtol=1e-10, atol=1e-12)
+        assert_allclose(tensors[2], found[2][2], rtol=1e-10, atol=1e-12)
+    assert found[0][1].abs().max() > 0 or surrogate.shape != FAST_SIGMOID
+
+
+def test_the_surrogate_of_a_fast_sigmoid():
+    current = torch.tensor([[0.5, 0.75, 0.0]], dtype=torch.float64, requires_grad=True)
+    lif(current, 0.2, 0.5, SMOOTH)[0].sum().backward()
+    assert_allclose(current.grad, [[1.0, 1 / 4, 1 / 9]], rtol=1e-12)
+
+
+@pytest.mark.parametrize("backwards", [False, True])
+def test_currents_in_torch_operations_equal_the_kernel(backwards):
+    found = [torch.randn(30, 4, generator=torch.Generator().manual_seed(1)) for _ in range(2)]
+    accumulate(found[0].numpy(), np.float32(0.95), backwards)
+    accumulate_steps(found[1], 0.95, backwards=backwards)
+    assert_allclose(found[0], found[1], rtol=1e-6, atol=1e-6)  # the kernel may fuse a product with its sum
+    assert found[0].abs().max() > 2
+
+
+# --- clocks --------------------------------------------------------------------------------------------------------
+
+
+def test_a_clock_ticks_in_every_step_of_its_part_and_none_after_the_last():
+    assert clocks_over(8, 250) == Clocks(channels=8, steps=32)
+    assert clocks_over(0, 250) == NO_CLOCKS
+    ticks = Clocks(channels=2, steps=3).events(8)
+    assert ticks.tolist() == [[1, 1, 1, 0, 0, 0, 0, 0], [0, 0, 0, 1, 1, 1, 0, 0]]
+    assert Clocks(channels=2, steps=3).events(2, first=2).tolist() == [[1, 0], [0, 1]]
+
+
+def test_recordings_get_the_clocks_after_their_own_channels():
+    events = np.arange(2 * 3 * 2 * 5).reshape(2, 3, 2, 5).astype(np.uint8)
+    fed = with_clocks(events, Clocks(channels=2, steps=2))
+    assert fed.shape == (2, 8, 5)
+    assert fed.dtype == np.uint8
+    assert_array_equal(fed[:, :6], events.reshape(2, 6, 5))
+    assert fed[1, 6:].tolist() == [[1, 1, 0, 0, 0], [0, 0, 1, 1, 0]]
+    assert with_clocks(events, NO_CLOCKS).shape == (2, 6, 5)
+
+
+def test_every_fault_of_the_dynamics_is_listed():
+    wrong = Dynamics(betas=(0.5,), alphas=(1.0, -0.5), clocks=Clocks(channels=-1, steps=0))
+    assert dynamics_faults(wrong, 4) == [
+        "1 membrane decays for 4 layers",
+        "2 current decays for 4 layers",
+        "a current decay of 1, allowed are 0 <= decay < 1",
+        "a current decay of -0.5, allowed are 0 <= decay < 1",
+        "-1 clocks, allowed are 0 to 64",
+        "clocks of 0 steps, allowed are 1 to 1048576",
+        "clocks need a first layer without current decay, which relays them step for step",
+    ]
+
+
+# --- the whole network ---------------------------------------------------------------------------------------------
+
+
+def network_step_by_step(network, events, surrogate):
+    """The network of the docs in plain autograd code; spikes of the last layer."""
+    sizes = network.architecture
+    dynamics = sizes.dynamics
+    weights = dict(network.named_parameters())
+    for alpha, name in zip(dynamics.alphas, ("conv1.hops", "fc1.weight", "fc2.weight", "fc3.weight"), strict=False):
+        weights[name] = weights[name] * (1 - alpha)
+    steps = len(events)
+    powers = [torch.linalg.matrix_power(network.adjacency.double(), k) for k in range(sizes.hops + 1)]
+    seen = torch.stack([torch.einsum("ij,tnjc->tnic", power, events) for power in powers])
+    drive = torch.einsum("ktnic,kfc->tnif", seen, weights["conv1.hops"]).flatten(2)
+    bias = weights["conv1.bias"].repeat(39)
+    spikes = neurons_step_by_step(drive, bias, dynamics.alpha(0), dynamics.beta(0, 0.2), sizes.theta, surrogate)
+    ticks = torch.zeros(steps, events.shape[1], dynamics.clocks.channels, dtype=torch.float64)
+    for t in range(steps):
+        if t // dynamics.clocks.steps < dynamics.clocks.channels:
+            ticks[t, :, t // dynamics.clocks.steps] = 1
+    spikes = torch.cat([spikes, ticks], dim=2)
+    for layer, name in enumerate(network.dense, 1):
+        drive = spikes @ weights[f"{name}.weight"]
+        decays = dynamics.alpha(layer), dynamics.beta(layer, 0.2)
+        spikes = neurons_step_by_step(drive, weights[f"{name}.bias"], *decays, sizes.theta, surrogate)
+    return spikes
+
+
+@pytest.mark.parametrize("surrogate", [RECTANGLE, SMOOTH])
+@pytest.mark.parametrize("dynamics", [TIMING, replace(TIMING, alphas=()), Dynamics(alphas=(0.6, 0.0, 0.0, 0.9)), PLAIN])
+def test_gradients_of_a_whole_network_equal_plain_autograd(surrogate, dynamics):
+    sizes = replace(SMALL, dynamics=dynamics)
+    network = SpikingNet(sizes, ADJACENCY, seed=3, surrogate=surrogate).double()
+    louder(network)
+    draw = torch.Generator().manual_seed(0)
+    events = (torch.rand(14, 2, 39, 2, generator=draw) < 0.2).double()
+    above = torch.randn(14, 2, 4, generator=draw, dtype=torch.float64)
+    found = []
+    for spikes in (network.layers(events)["fc3"][0], network_step_by_step(network, events, surrogate)):
+        network.zero_grad()
+        (spikes * above).sum().backward()
+        found.append((spikes.detach(), [p.grad.clone() for p in network.parameters()]))
+    assert torch.equal(found[0][0], found[1][0])
+    assert found[0][0].sum() > 0
+    for ours, plain in zip(found[0][1], found[1][1], strict=True):
+        assert_allclose(ours, plain, rtol=1e-9, atol=1e-10)
+        assert plain.abs().max() > 0
+
+
+def test_recordings_that_were_filled_up_count_as_long_as_they_are():
+    network = SpikingNet(SMALL, ADJACENCY, seed=1)
+    louder(network)
+    events = (torch.rand(12, 2, 39, 2, generator=torch.Generator().manual_seed(2)) < 0.3).float()
+    events[7:, 1] = 0
+    together = network(events, torch.tensor([12, 7]))
+    assert_allclose(together[0].detach(), network(events[:, :1])[0].detach(), atol=1e-6)
+    assert_allclose(together[1].detach(), network(events[:7, 1:])[0].detach(), atol=1e-6)
+    assert together.max() > 0
+
+
+# --- files ---------------------------------------------------------------------------------------------------------
+
+
+def manifest_of(path):
+    with zipfile.ZipFile(path) as archive:
+        return json.loads(archive.read("manifest.json"))
+
+
+@pytest.mark.parametrize("system", ["tactilesgnet", "gcn", "mlp", "grid-cnn"])
+def test_a_checkpoint_holds_the_dynamics_and_its_float_model_is_the_network(tmp_path, system):
+    network, seen = written(tmp_path / "x.pt", system)
+    checkpoint = read_checkpoint(tmp_path / "x.pt")
+    assert checkpoint.dynamics == TIMING
+    assert checkpoint.taxels == 39
+    assert checkpoint.dense[0].weight.shape == (8, checkpoint.places * 3 + 3)
+    manifest = manifest_of(tmp_path / "x.pt")
+    assert (manifest["version"], manifest["architecture"]) == (4, system)
+    assert manifest["dynamics"] == {
+        "betas": [0.2, 0.3, 0.0, 0.4],
+        "alphas": [0.0, 0.95, 0.5, 0.0],
+        "clocks": {"channels": 3, "steps": 4},
+    }
+    events = (np.random.default_rng(4).random((2, 39, 2, 15)) < 0.2).astype(np.uint8)
+    time_first = torch.from_numpy(events.transpose(3, 0, 1, 2).astype(np.float32))
+    spikes, membranes = float_spikes(checkpoint, seen, events), float_membranes(checkpoint, seen, events)
+    for name, (ours, values) in network.layers(time_first).items():
+        if (system, name) == ("grid-cnn", "conv1"):
+            continue  # these neurons lie in another order
+        assert_array_equal(spikes[name], ours.bool().transpose(0, 1), err_msg=name)
+        assert_allclose(membranes[name], values.detach().transpose(0, 1), atol=2e-5, err_msg=name)
+    assert spikes["fc3"].any()
+    assert_array_equal(spikes["conv1"][0, :, -3:], TIMING.clocks.events(15).T)
+
+
+def test_weights_survive_a_round_trip(tmp_path):
+    network, seen = written(tmp_path / "x.pt")
+    other = SpikingNet(SMALL, seen, seed=9)
+    other.load_weights(network.export_weights())
+    for name, array in network.export_weights().items():
+        assert_array_equal(other.export_weights()[name], array, err_msg=name)
+    events = torch.from_numpy(events_of(1).transpose(3, 0, 1, 2).astype(np.float32))
+    for (ours, _), (theirs, _) in zip(network.layers(events).values(), other.layers(events).values(), strict=True):
+        assert torch.equal(ours, theirs)
+
+
+def test_a_lasting_current_starts_as_loud_as_none():
+    """What a spike brings in all, W / (1 - alpha), is drawn alike, and so an optimizer's step moves it."""
+    loud = SpikingNet(SMALL, ADJACENCY, seed=4).export_weights()
+    plain = SpikingNet(replace(SMALL, dynamics=replace(TIMING, alphas=())), ADJACENCY, seed=4).export_weights()
+    for name, alpha in zip(("conv1.hops", "fc1.weight", "fc2.weight", "fc3.weight"), TIMING.alphas, strict=True):
+        assert_allclose(loud[name], plain[name] * (1 - alpha), rtol=1e-6)
+
+
+def test_a_network_without_dynamics_is_written_as_before(tmp_path):
+    written(tmp_path / "x.pt", dynamics=PLAIN)
+    manifest = manifest_of(tmp_path / "x.pt")
+    assert manifest["version"] == 1
+    assert "dynamics" not in manifest
+    assert read_checkpoint(tmp_path / "x.pt").dynamics == PLAIN
+
+
+def test_an_impossible_dynamic_in_a_file_is_refused(tmp_path):
+    path = tmp_path / "x.pt"
+    written(path, dynamics=replace(TIMING, alphas=(0.0, 1.5, 0.0, 0.0)))
+    with pytest.raises(ModelError) as error:
+        read_checkpoint(path)
+    assert str(error.value) == (
+        f"{path}: has an incomplete manifest (ValueError('a current decay of 1.5, allowed are 0 <= decay < 1')); "
+        "copy or train it again"
+    )
+
+
+def test_another_beta_for_a_network_with_one_a_layer_is_refused(tmp_path):
+    path = tmp_path / "x.pt"
+    written(path)
+    with pytest.raises(OptionError) as error:
+        read_checkpoint(path, beta=0.5)
+    assert str(error.value) == (f"--beta 0.5: {path} has a decay for each layer, 0.2, 0.3, 0, 0.4; leave --beta away")
+
+
+# --- recipes -------------------------------------------------------------------------------------------------------
+
+
+def test_the_released_recipe_is_the_released_code():
+    assert RECIPES == {"released": RELEASED, "timed": TIMED}
+    assert RELEASED == Recipe(
+        name="released", epochs=100, batch=1, loss="mse", optimizer="adam", learning_rate=1e-3, schedule="steps"
+    )
+    assert RELEASED.surrogate == Surrogate(shape="rectangular", width=0.5, reset=True)
+    assert RELEASED.dynamics(("conv1", "fc1"), 0.2, 250) == PLAIN
+    layers = ("conv1", "fc1", "fc2", "fc3")
+    assert TIMED.dynamics(layers, 0.2, 325).clocks == clocks_over(TIMED.clocks, 325)
+    assert TIMED.dynamics(layers, 0.2, 325).alphas == (0.0, *[3891 / 4096] * 3), "what the register holds"
+    held = 819 / 4096
+    assert replace(RELEASED, betas=(("fc2", 0.5),)).dynamics(layers, 0.2, 9).betas == (held, held, 0.5, held)
+    assert TIMED.dynamics(layers, 0.2, 325).betas == (held,) * 4
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("fc1", "'fc1' is not LAYER=DECAY with 0 <= DECAY < 1; write for example fc1=0.95"),
+        ("fc1=1", "'fc1=1' is not LAYER=DECAY with 0 <= DECAY < 1; write for example fc1=0.95"),
+        ("fc1=nan", "'fc1=nan' is not LAYER=DECAY with 0 <= DECAY < 1; write for example fc1=0.95"),
+        ("fc9=0.5", "no layer 'fc9'; the layers are conv1, fc1"),
+        ("fc1=0.5,fc1=0.6", "names fc1 twice; give it once"),
+    ],
+)
+def test_decays_that_are_none_are_refused(words, message):
+    with pytest.raises(OptionError) as error:
+        decays_asked(words, "--current-decay", ("conv1", "fc1"))
+    assert str(error.value) == f"--current-decay {words}: {message}"
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"features": 0}, "--features 0: allowed are 1 to 1024; choose another"),
+        ({"batch": 0}, "--batch 0: allowed are 1 to 1024; choose another"),
+        ({"clocks": 65}, "--clocks 65: allowed are 0 to 64; choose another"),
+        (
+            {"alphas": (("conv1", 0.5),)},
+            "--clocks 8: conv1 relays the clocks step for step, so its current cannot last; leave conv1 out of "
+            "--current-decay, or give --clocks 0",
+        ),
+    ],
+)
+def test_sizes_that_no_network_has_are_refused(values, message):
+    with pytest.raises(OptionError) as error:
+        check_recipe(replace(TIMED, **values))
+    assert str(error.value) == message
+
+
+def grasps(seed, per_class=3, steps=14):
+    return replace(synthetic_grasps(per_class=per_class, steps=steps, seed=seed), split="train" if seed else "test")
+
+
+def small_timed(recordings, **values):
+    recipe = replace(TIMED, **values)
+    sizes = Architecture(taxels=39, classes=int(recordings.labels.max()) + 1, features=4, hidden=(8, 6))
+    layers = ("conv1", "fc1", "fc2", "fc3")
+    return recipe, replace(sizes, dynamics=recipe.dynamics(layers, sizes.beta, recordings.steps))
+
+
+def test_an_interrupted_timed_training_resumes_to_the_same_weights(tmp_path):
+    training, test = grasps(1), grasps(0)
+    recipe, sizes = small_timed(training)
+    whole = train(training, test, ADJACENCY, sizes, epochs=4, seed=5, recipe=recipe)
+
+    def stop(epoch):
+        if epoch.epoch == 2:
+            raise KeyboardInterrupt
+
+    options = {"epochs": 4, "seed": 5, "recipe": recipe, "state": tmp_path / "state"}
+    with pytest.raises(KeyboardInterrupt):
+        train(training, test, ADJACENCY, sizes, after_epoch=stop, **options)
+    resumed = train(training, test, ADJACENCY, sizes, resume=True, **options)
+    assert resumed.history == whole.history
+    for name, array in whole.last.items():
+        assert_array_equal(resumed.last[name], array, err_msg=name)
+    assert [epoch.learning_rate for epoch in whole.history] == pytest.approx(
+        [1e-3 * 0.5 * (1 + np.cos(np.pi * index / 4)) for index in range(4)]
+    )
+
+
+def test_another_recipe_does_not_resume(tmp_path):
+    training, test = grasps(1), grasps(0)
+    recipe, sizes = small_timed(training)
+    state = tmp_path / "state"
+    train(training, test, ADJACENCY, sizes, epochs=1, recipe=recipe, state=state)
+    with pytest.raises(OptionError) as error:
+        train(training, test, ADJACENCY, sizes, epochs=1, recipe=replace(recipe, gain=5.0), state=state, resume=True)
+    assert str(error.value) == (
+        f"{state}: belongs to a training with other recipe; give the same options and data, or delete it to train anew"
+    )
+
+
+def test_a_batch_is_one_step_of_the_optimizer_on_the_mean_loss(monkeypatch):
+    """One epoch of one batch moves every weight by the learning rate at most: Adam's first step."""
+    training = grasps(1)
+    recipe, sizes = small_timed(training, batch=len(training), weight_decay=0.0)
+    start = SpikingNet(sizes, ADJACENCY, seed=0).export_weights()
+    trained = train(training, training, ADJACENCY, sizes, epochs=1, seed=0, recipe=recipe)
+    moved = max(float(np.abs(trained.last[name] - start[name]).max()) for name in start)
+    assert moved == pytest.approx(1e-3, rel=1e-3)
+
+
+def test_the_loss_is_the_cross_entropy_of_the_scaled_rates():
+    training = grasps(1)
+    recipe, sizes = small_timed(training, gain=7.0, smoothing=0.25)
+    network = SpikingNet(sizes, ADJACENCY, seed=2)
+    time_first = torch.from_numpy(training.events.transpose(3, 0, 1, 2).astype(np.float32))
+    rates = network(time_first).detach().double()
+    target = np.full(rates.shape, 0.25 / rates.shape[1])
+    target[np.arange(len(rates)), training.labels] += 0.75
+    logits = 7.0 * rates.numpy()
+    expected = -(target * (logits - np.log(np.exp(logits).sum(axis=1, keepdims=True)))).sum(axis=1).mean()
+    assert evaluate(network, training, recipe)[0] == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.fixture
+def data(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    splits = [replace(synthetic_grasps(per_class=2, steps=14, seed=s), split=n) for n, s in (("train", 1), ("test", 2))]
+    write_released(tmp_path / "data", splits)
+    return tmp_path
+
+
+def test_train_writes_what_the_recipe_asks_for(data, capsys):
+    words = "train --data data --graph manual --recipe timed --current-decay fc1=0.5 --membrane-decay fc3=0.75"
+    words = f"{words} --clocks 4 --features 6 --batch 3 --epochs 1"
+    assert main([*words.split(), "-o", "x.pt", "--picture", "x.png", "--json"]) == 0
+    (run,) = json.loads(capsys.readouterr().out)["runs"]
+    assert run["command"] == (
+        "spikeloom train --data data --graph manual --recipe timed --current-decay fc1=0.5 --membrane-decay fc3=0.75 "
+        "--clocks 4 --features 6 --batch 3 --epochs 1 --seed 0"
+    )
+    assert run["recipe"]["alphas"] == {"fc1": 0.5}
+    assert "epochs" not in run["recipe"]
+    assert (run["recipe"]["name"], run["epochs"]) == ("timed", 1)
+    assert run["recipe"]["surrogate"] == {"shape": "fast-sigmoid", "width": 0.25, "reset": False}
+    checkpoint = read_checkpoint("x.pt")
+    assert checkpoint.dynamics == Dynamics(
+        betas=(*[819 / 4096] * 3, 0.75), alphas=(0.0, 0.5, 0.0, 0.0), clocks=Clocks(channels=4, steps=4)
+    )
+    assert checkpoint.hops.shape == (4, 6, 2)
+    assert main([*words.split(), "-o", "x.pt", "--resume", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["runs"] == [run]
+    assert main([*words.replace("--clocks 4", "--clocks 3").split(), "-o", "x.pt", "--resume"]) == 2
+    assert capsys.readouterr().err == (
+        "spikeloom: x.pt: holds another training (other recipe); give its options, or another -o\n"
+    )
+
+
+def test_the_released_recipe_leaves_no_trace_in_the_record(data, capsys):
+    assert main(["train", "--data", "data", "--graph", "manual", "--epochs", "1", "-o", "x.pt", "--json"]) == 0
+    (run,) = json.loads(capsys.readouterr().out)["runs"]
+    assert "recipe" not in run
+    assert run["command"] == "spikeloom train --data data --graph manual --epochs 1 --seed 0"
+    assert manifest_of("x.pt")["version"] == 1

@@ -1,0 +1,558 @@
+"""Currents that outlast their step and clocks from checkpoint to chip: every pass and every command."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+from random_netlists import Axon, Neuron, build
+from random_networks import chain, integer_population
+from timed_networks import TIMING, events_of, written
+
+from compiler.dynamics import NO_CLOCKS, PLAIN, Clocks, Dynamics, with_clocks
+from compiler.errors import DataError, ModelError, NumericRangeError
+from compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, MEMBRANE_MAX, ONE_STEP_SUM_MAX
+from compiler.forms import current_load, decay_registers
+from compiler.frontends.checkpoint import read_checkpoint
+from compiler.interpret import channels_last, run_float, run_integer
+from compiler.ir import Input
+from compiler.lift import lift
+from compiler.netlist import one_step_bounds
+from compiler.passes.bounds import prove_ranges
+from compiler.passes.expand import expand
+from compiler.passes.prune import never_fires
+from compiler.passes.quantize import Recipe, quantize
+from compiler.pipeline import compile_network
+from compiler.serialize import netlist_bytes, read_netlist, write_netlist
+from compiler.targets import load_target
+from compiler.text import text
+from models.grasps import synthetic_grasps
+from models.reference import float_spikes
+from models.release import write_released
+from runtime import engine, spec
+from runtime.blocks import lay_out_blocks
+from runtime.causes import explain
+from runtime.certificates import float_certainty
+from runtime.cli import main
+from runtime.equivalence import require_match, verify
+from runtime.explain import _observe
+from runtime.stream import open_stream
+from runtime.trace import aligned
+from runtime.votes import class_counts
+
+REPEATABLE = settings(max_examples=25, deadline=None, derandomize=True)
+
+LAYERS = ("conv1", "fc1", "fc2", "fc3")
+
+
+def float_network(path, system="tactilesgnet", dynamics=TIMING, **options):
+    """Checkpoint, what its first layer sees, and its float stage."""
+    _, seen = written(path / "x.pt", system, dynamics, **options)
+    checkpoint = read_checkpoint(path / "x.pt")
+    return checkpoint, seen, expand(checkpoint, seen)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("timed")
+
+
+@pytest.fixture(scope="module")
+def timed(folder):
+    return float_network(folder)
+
+
+@pytest.fixture(scope="module")
+def compiled(timed):
+    return compile_network(timed[2], training_events=events_of(5, samples=12))
+
+
+# --- registers -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("alpha", "register", "realised"),
+    [(0.0, 4095, 0.0), (0.5, 2047, 0.5), (0.95, 204, 3891 / 4096), (0.9999, 0, 4095 / 4096), (0.0001, 4095, 0.0)],
+)
+def test_the_current_register_is_the_nearest(alpha, register, realised):
+    assert decay_registers(0.2, alpha) == (register, 3277)
+    assert replace(integer_population("fc1", 1), decay_u=register).realised_alpha == realised
+    assert abs(realised - alpha) <= 1.5e-4  # half a step, at the end of the register a little more
+
+
+def test_a_current_counts_by_the_register_that_it_fills_first():
+    """Loses 205/4096 a step: 6,559 units a step add up to 6,559 * 64 * 4096 / 205 = 8,387,4xx of 8,388,607."""
+    assert current_load(4095) == current_load(1023) == 1.0  # four times as wide a register
+    assert current_load(204) == pytest.approx((4096 / 205) * 32767 * 64 / 8388607, rel=1e-12)
+    most = int(ONE_STEP_SUM_MAX / current_load(204))
+    assert most * 64 * 4096 // 205 <= CURRENT_MAX < (most + 1) * 64 * 4096 // 205
+
+
+def one_synapse(weight, exponent, **neuron):
+    return build(
+        [Neuron(**neuron)], [Axon(source=0, targets=((0, weight),), exponent=exponent)], n_inputs=1, depths=[0]
+    )
+
+
+def test_the_largest_current_stays_and_one_unit_more_overflows():
+    """52 * 2**7 = 6,656 units a step against 6,554 that fit: the step in which it leaves the register is found."""
+    events = np.ones((1, 400), np.uint8)
+    fits = one_synapse(102, 6, decay_u=204, threshold=2**17 - 1)  # 6,528
+    trace = spec.simulate(fits, events)
+    current = 0
+    for _ in range(400):
+        current = current * 3891 // 4096 + 6528 * 64
+    assert trace.membranes[-1, 0] == current  # no membrane outlasts its step here
+    assert 0.99 * CURRENT_MAX < current <= CURRENT_MAX
+    over = one_synapse(104, 6, decay_u=204, threshold=2**17 - 1)  # 6,656
+    messages = []
+    for simulate in (spec.simulate, lambda n, e: engine.simulate(n, e[None])):
+        with pytest.raises(NumericRangeError, match="current") as error:
+            simulate(over, events)
+        messages.append(str(error.value))
+    assert messages[0] == messages[1]
+
+
+# --- the float stage -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("system", ["tactilesgnet", "gcn", "mlp", "grid-cnn"])
+def test_the_expanded_network_spikes_as_the_checkpoint(tmp_path, system):
+    checkpoint, seen, network = float_network(tmp_path, system, hidden=(32, 24))
+    assert network.input == Input(taxels=39, polarities=2, clocks=TIMING.clocks)
+    assert [p.alpha for p in network.populations] == list(TIMING.alphas)
+    assert [p.beta for p in network.populations] == list(TIMING.betas)
+    assert [p.relays for p in network.populations] == [3, 0, 0, 0]
+    events = events_of(3)
+    wanted = float_spikes(checkpoint, seen, events, dtype="float64")
+    found = run_float(network, channels_last(events, TIMING.clocks)).spikes
+    for name, spikes in zip(LAYERS, found, strict=True):
+        assert_array_equal(spikes, wanted[name], err_msg=name)
+        assert spikes.any(), name
+
+
+def test_relays_hear_their_clock_and_nothing_else(timed):
+    _, _, network = timed
+    weight = network.projections[0].weight.toarray()
+    assert weight.shape == (39 * 3 + 3, 39 * 2 + 3)
+    assert_array_equal(weight[-3:, -3:], np.eye(3))  # twice the threshold of 0.5
+    assert not weight[-3:, :-3].any()
+    assert not weight[:-3, -3:].any()
+    assert not network.populations[0].bias[-3:].any()
+
+
+def test_a_neuron_that_only_fires_from_its_gathered_current_is_kept():
+    """0.04 a step is 0.05 with the membrane alone, but 0.4 with a current that keeps nine tenths: 0.5 at the limit."""
+    network = chain([[0.04]], [[1.0]])
+    lasting = replace(network, populations=(replace(network.populations[0], alpha=0.9), network.populations[1]))
+    assert [mask.tolist() for mask in never_fires(network)] == [[True], [False]]
+    stronger = chain([[0.0401]], [[1.0]])
+    stronger = replace(stronger, populations=(replace(stronger.populations[0], alpha=0.9), stronger.populations[1]))
+    assert [mask.tolist() for mask in never_fires(stronger)] == [[False], [False]]
+    events = np.ones((1, 400, 1), np.bool_)
+    assert not run_float(network, events).spikes[0].any()
+    assert run_float(stronger, events).spikes[0].any()
+    assert never_fires(lasting)[0].tolist() == [False]  # exactly at its threshold: rounding may decide
+
+
+# --- rounding ------------------------------------------------------------------------------------------------------
+
+
+def test_the_chip_follows_the_float_network(timed, compiled):
+    _, _, network = timed
+    events = events_of(9, samples=8, steps=40)
+    inputs = channels_last(events, TIMING.clocks)
+    truth = run_float(network, inputs).spikes
+    trace = engine.simulate(compiled.netlist, with_clocks(events, TIMING.clocks), spikes=True)
+    for layer, (name, wanted) in enumerate(zip(LAYERS, truth, strict=True)):
+        found = aligned(compiled.netlist, trace.spikes, layer)
+        heard = ~np.isin(np.arange(wanted.shape[2]), compiled.netlist.layers[layer].unheard)
+        assert np.mean(found[..., heard] != wanted[..., heard]) < 0.02, name
+        assert wanted.any(), name
+
+
+def test_netlist_and_integer_network_are_the_same(compiled):
+    events = events_of(11)
+    back = lift(compiled.netlist)
+    assert [p.alpha for p in back.populations] == list(TIMING.alphas)
+    assert back.input.clocks == TIMING.clocks
+    found = run_integer(back, channels_last(events, TIMING.clocks)).spikes
+    trace = engine.simulate(compiled.netlist, with_clocks(events, TIMING.clocks), spikes=True)
+    for layer, spikes in enumerate(found):
+        assert_array_equal(aligned(compiled.netlist, trace.spikes, layer), spikes)
+
+
+def test_both_kernels_are_the_specification(compiled):
+    events = with_clocks(events_of(12, samples=3), TIMING.clocks)
+    assert lay_out_blocks(compiled.netlist) is not None, "the fast kernel holds such networks"
+    kept = {"spikes": True, "membranes": True, "updated": True}
+    for stepwise in (False, True):
+        fast = engine.simulate(engine.prepare(compiled.netlist, stepwise=stepwise), events, **kept)
+        for index, recording in enumerate(events):
+            slow = spec.simulate(compiled.netlist, recording)
+            for name in kept:
+                assert_array_equal(getattr(fast, name)[index], getattr(slow, name), err_msg=name)
+            assert_array_equal(fast.counts.updates[index], slow.counts.updates)
+
+
+def test_recordings_without_their_clocks_are_refused(compiled):
+    events = events_of(12, samples=2).reshape(2, 78, -1)
+    for simulate in (
+        lambda: spec.simulate(compiled.netlist, events[0]),
+        lambda: engine.simulate(compiled.netlist, events),
+    ):
+        with pytest.raises(DataError) as error:
+            simulate()
+        assert str(error.value) == (
+            "recordings: 78 input channels found, the netlist has 81, 3 of them clocks "
+            "(compiler.dynamics.with_clocks); "
+            "use recordings of the sensor that the network was compiled for"
+        )
+
+
+def test_ranges_are_proven_for_any_input(compiled):
+    assert all(proof.holds for proof in compiled.proofs)
+    lasting = compiled.proofs[1]
+    assert 0.8 * MEMBRANE_MAX < max(lasting.current, lasting.membrane) <= MEMBRANE_MAX, "the scale is as fine as can be"
+    assert lasting.accumulator < 0.3 * ACCUMULATOR_MAX
+    assert_allclose(
+        [p.accumulator for p in prove_ranges(lift(compiled.netlist))], [p.accumulator for p in compiled.proofs]
+    )
+    positive, negative = one_step_bounds(compiled.netlist)
+    ids = compiled.netlist.compartments_of(1)
+    assert np.all(np.maximum(positive, negative)[ids] * 64 * 4096 // 205 <= CURRENT_MAX)
+
+
+@pytest.mark.parametrize("value", [0, 1])
+def test_no_input_leaves_a_register(compiled, value):
+    """Everything or nothing at once for long, the clocks too: what the proof is about."""
+    events = np.full((compiled.netlist.n_inputs, 150), value, np.uint8)
+    trace = spec.simulate(compiled.netlist, events)
+    assert not trace.counts.saturations.any()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"recipes": (Recipe(bits=2),)},
+        {"recipes": (Recipe(bits=4, groups=4),)},
+        {"recipes": (Recipe(planes=2, groups=8),)},
+        {"spike_exact": True},
+        {"keep_all": True},
+        {"ranges": "observed"},
+        {"recipes": (Recipe(bits=2),), "training_events": None},
+    ],
+)
+def test_relays_tick_with_their_clocks_however_weights_are_stored(timed, options):
+    _, _, network = timed
+    netlist = compile_network(network, **{"training_events": events_of(5, samples=12), **options}).netlist
+    events = events_of(13, steps=14)
+    trace = engine.simulate(netlist, with_clocks(events, TIMING.clocks), spikes=True)
+    conv = aligned(netlist, trace.spikes, 0)
+    held = np.isin(np.arange(120), netlist.neuron[netlist.compartments_of(0)])[-3:]
+    assert held.any()
+    for sample in conv:
+        assert_array_equal(sample[:, -3:][:, held], TIMING.clocks.events(14).T[:, held])
+
+
+def test_all_layers_without_a_scale_are_listed(timed):
+    """A current that keeps 4095/4096 of itself leaves 2 units a step: not even a threshold of one fits beside these."""
+    _, _, network = timed
+    tight = replace(
+        network,
+        populations=tuple(
+            replace(p, alpha=0.9999, theta=1e-4) if p.name in ("fc1", "fc2") else p for p in network.populations
+        ),
+    )
+    with pytest.raises(ModelError) as error:
+        quantize(tight, load_target("loihi1"))
+    assert str(error.value).splitlines() == [
+        f"{name}: no scale at 8 bits keeps its threshold of at least one unit within the accumulator (32767 units a "
+        "step) and its current, of which a step keeps 0.9999, within its register; use more bits or smaller weights"
+        for name in ("fc1", "fc2")
+    ]
+
+
+def test_observed_ranges_count_what_a_current_gathers(timed):
+    _, _, network = timed
+    training = events_of(5, samples=12)
+    observed = compile_network(network, training_events=training, ranges="observed")
+    proven = compile_network(network, training_events=training)
+    assert observed.choices[1].scale > 1.5 * proven.choices[1].scale
+    trace = engine.simulate(observed.netlist, with_clocks(training, TIMING.clocks), membranes=True)
+    assert trace.counts.spikes.any()  # nothing overflowed on what was observed
+
+
+# --- files ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_netlist_survives_its_file(compiled, tmp_path):
+    write_netlist(compiled.netlist, tmp_path / "x.loom")
+    back = read_netlist(tmp_path / "x.loom")
+    assert back.clocks == TIMING.clocks
+    assert back.layers == compiled.netlist.layers
+    assert netlist_bytes(back) == (tmp_path / "x.loom").read_bytes()
+    assert text(back) == text(compiled.netlist)
+    assert "(input 39 taxels x 2, 3 clocks of 4 steps)" in text(back)
+    assert "(alpha 0.95)" in text(back)
+    assert version_of(compiled.netlist) == 3
+
+
+def version_of(netlist):
+    import io
+
+    with np.load(io.BytesIO(netlist_bytes(netlist)), allow_pickle=False) as file:
+        return json.loads(str(file["manifest"]))["version"]
+
+
+def test_a_netlist_without_dynamics_keeps_its_version(tmp_path):
+    _, _, network = float_network(tmp_path, dynamics=PLAIN)
+    netlist = compile_network(network).netlist
+    assert (version_of(netlist), netlist.clocks) == (2, NO_CLOCKS)
+    assert "alpha" not in text(netlist)
+    _, _, network = float_network(tmp_path, dynamics=Dynamics(betas=TIMING.betas))
+    assert version_of(compile_network(network).netlist) == 2  # decays of membranes were always by compartment
+
+
+def test_a_netlist_of_other_clocks_does_not_match(timed, compiled, tmp_path):
+    checkpoint, _, network = timed
+    require_match(compiled.netlist, checkpoint)
+    require_match(compiled.netlist, network)
+    other = replace(checkpoint, dynamics=replace(TIMING, clocks=Clocks(channels=3, steps=5)))
+    with pytest.raises(ModelError) as error:
+        require_match(compiled.netlist, other)
+    assert str(error.value) == (
+        "netlist and checkpoint disagree: the netlist has taxels 39, channels 2, clocks 3, steps of a clock 4, conv1 "
+        "120, fc1 8, fc2 6, fc3 4, the checkpoint taxels 39, channels 2, clocks 3, steps of a clock 5, conv1 120, fc1 "
+        "8, fc2 6, fc3 4; give the checkpoint that the netlist was compiled from"
+    )
+
+
+# --- what judges the chip ------------------------------------------------------------------------------------------
+
+
+@REPEATABLE
+@given(seed=st.integers(0, 10**6), alpha=st.sampled_from([0.3, 0.95, 0.999]), beta=st.sampled_from([0.0, 0.2, 0.9]))
+def test_what_is_certain_is_so_in_both_precisions(folder, seed, alpha, beta):
+    dynamics = Dynamics(betas=(0.2, beta, beta, beta), alphas=(0.0, alpha, alpha, alpha), clocks=TIMING.clocks)
+    checkpoint, seen, network = float_network(folder, dynamics=dynamics, seed=seed)
+    events = events_of(seed, samples=2, steps=30)
+    certainty = float_certainty(checkpoint, seen, events)
+    runs = [list(float_spikes(checkpoint, seen, events, dtype=kind).values()) for kind in ("float32", "float64")]
+    runs.append(list(run_float(network, channels_last(events, TIMING.clocks), dtype=np.float32).spikes))
+    for layer, (sure, doubt) in enumerate(certainty):
+        for run in runs:
+            assert not (sure & ~run[layer]).any()
+            assert not (run[layer] & ~sure & ~doubt).any()
+    assert np.mean(certainty[1][1]) < 0.05, "next to nothing is left open"
+
+
+def test_a_radius_covers_the_gathered_rounding():
+    """An entry whose current gathers to its threshold within the rounding of float32 is open, not certain."""
+    network = chain([[0.025]], beta=0.0)
+    network = replace(network, populations=(replace(network.populations[0], alpha=0.95),))
+    network = replace(network, input=Input(taxels=1, polarities=1))
+    events = np.ones((1, 1, 1, 2000), np.uint8)  # the current climbs to 0.5, the threshold, and stays below
+    ((sure, doubt),) = float_certainty(network, None, events)
+    assert not sure[0, :100].any()
+    assert not doubt[0, :100].any()
+    assert doubt[0, -1].all()
+
+
+def test_verify_holds_the_chip_to_the_checkpoint(timed, compiled):
+    checkpoint, seen, _ = timed
+    events = events_of(17, samples=6, steps=25)
+    labels, files = np.arange(6) % 4, tuple(f"r{i}" for i in range(6))
+    verdict = verify(compiled.netlist, checkpoint, seen, events, labels, files, spec_samples=6)
+    assert verdict.spec_equals_engine
+    assert verdict.certificate.unproven == ()
+    ladder = dict(verdict.ladder)
+    assert ladder["float64"] == dict.fromkeys(LAYERS, 0)
+    assert ladder["beta"]["conv1"] <= ladder["weights"]["conv1"]
+    assert ladder["rounding"] == ladder["saturation"]
+    for name in LAYERS:
+        assert verdict.spikes[name].different <= 0.02 * 6 * 25 * 120
+        assert verdict.spikes[name].float > 0
+
+
+def test_the_decay_alone_is_a_rung_of_the_ladder(tmp_path):
+    """A decay that the register holds exactly moves nothing; one between two of its values does."""
+    moved = []
+    for alpha in (0.5, 0.50012):
+        dynamics = Dynamics(betas=(0.5,) * 4, alphas=(0.0, alpha, alpha, alpha))
+        checkpoint, seen, network = float_network(tmp_path, dynamics=dynamics, hidden=(64, 64))
+        integer = lift(compile_network(network).netlist)
+        assert [p.realised_alpha for p in integer.populations[1:]] == [0.5] * 3
+        events = events_of(21, samples=8, steps=200)
+        netlist = compile_network(network).netlist
+        verdict = verify(netlist, checkpoint, seen, events, np.zeros(8, np.int64), ("r",) * 8, spec_samples=1)
+        moved.append(sum(dict(verdict.ladder)["beta"].values()) - sum(dict(verdict.ladder)["float64"].values()))
+    assert moved[0] == 0
+    assert moved[1] > 0
+
+
+def test_explain_finds_the_cause_of_every_root(timed, compiled):
+    _, _, network = timed
+    causes = set()
+    for seed in range(6):
+        events = events_of(30 + seed, samples=1, steps=40)
+        found = explain(
+            network,
+            lift(compiled.netlist),
+            channels_last(events, TIMING.clocks)[0],
+            _observe(compiled.netlist, engine.prepare(compiled.netlist), events),
+            may_compensate=True,
+            absent=[np.zeros(p.size, np.bool_) for p in network.populations],
+        )
+        assert found.suspects == ()
+        causes |= {root.cause for root in found.roots}
+        for root in found.roots:
+            assert root.cause != "not known" or root.root.layer == 1
+    assert causes <= {"weight rounding", "bias rounding", "realised beta", "round toward zero", "tie (> or >=)"}
+    assert causes
+
+
+def test_a_wrong_current_register_is_named(timed, compiled):
+    _, _, network = timed
+    integer = lift(compiled.netlist)
+    wrong = replace(
+        integer,
+        populations=(integer.populations[0], replace(integer.populations[1], decay_u=100), *integer.populations[2:]),
+    )
+    events = events_of(40, samples=1, steps=40)
+    run = run_integer(wrong, channels_last(events, TIMING.clocks), membranes=True)
+    from runtime.causes import Observed
+
+    observed = Observed(spikes=tuple(s[0] for s in run.spikes), membranes=tuple(m[0] for m in run.membranes))
+    found = explain(network, wrong, channels_last(events, TIMING.clocks)[0], observed, may_compensate=True)
+    (suspect,) = [s for s in found.suspects if s.part == "decay"]
+    assert suspect.found == ("decay registers of fc1 are 100 and 2867, alpha 0.95 and beta 0.3 ask for 204 and 2867")
+
+
+# --- live ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_stream_lets_the_clocks_tick_by_itself(compiled):
+    events = events_of(50, samples=1, steps=20)[0]
+    whole = engine.simulate(compiled.netlist, with_clocks(events[None], TIMING.clocks))
+    stream = open_stream(compiled.netlist)
+    for _ in range(2):
+        for step in range(20):
+            stream.step(events[..., step])
+        last = stream.finish()[-1]
+        assert_array_equal(last.counts, class_counts(compiled.netlist, whole.counts.spikes)[0])
+        stream.reset()
+    with pytest.raises(DataError) as error:
+        stream.step(np.zeros(81))
+    assert str(error.value) == (
+        "stream: a bin of shape (81,) found, allowed are (39, 2) (taxels, polarities) and (78,); "
+        "give the events of one bin of this network's sensor"
+    )
+
+
+# --- commands ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    """Recordings, and a network trained on them for one epoch, compiled."""
+    place = tmp_path_factory.mktemp("timed-data")
+    splits = [replace(synthetic_grasps(per_class=3, steps=14, seed=s), split=n) for n, s in (("train", 1), ("test", 2))]
+    write_released(place / "data", splits)
+    words = (
+        f"train --data {place}/data --graph manual --recipe timed --clocks 4 --features 8 --epochs 2 -o {place}/x.pt"
+    )
+    assert main(words.split()) == 0
+    assert main(f"compile {place}/x.pt --calibrate {place}/data -o {place}/x.loom".split()) == 0
+    return place
+
+
+def as_json(capsys, words):
+    assert main([*words.split(), "--json"]) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def test_every_command_takes_a_timed_network(data, capsys):
+    capsys.readouterr()
+    shared = f"--data {data}/data"
+    inspected = as_json(capsys, f"inspect {data}/x.pt")
+    assert inspected["dynamics"]["clocks"] == {"channels": 4, "steps": 4}
+    assert inspected["layers"][0] == {"name": "conv1", "neurons": 39 * 8 + 4}
+    netlist = as_json(capsys, f"inspect {data}/x.loom")
+    assert netlist["clocks"] == {"channels": 4, "steps": 4}
+    held = 3891 / 4096
+    assert [layer.get("alpha") for layer in netlist["layers"]] == [None, held, held, held]
+    assert netlist["layers"][1]["alpha_realised"] == held
+    verdict = as_json(capsys, f"verify {data}/x.loom --checkpoint {data}/x.pt {shared} --min-agreement 0.8")
+    assert verdict["spec_equals_engine"] is True
+    rungs = {rung["stage"]: rung for rung in verdict["ladder"]}
+    assert rungs["beta"] == rungs["float64"] | {"stage": "beta"}, "trained with the decays of the chip"
+    decided = as_json(capsys, f"run {data}/x.loom {shared}")
+    assert len(decided["predictions"]) == decided["samples"]
+    assert as_json(capsys, f"estimate {data}/x.loom {shared}")
+    assert as_json(capsys, f"explain {data}/x.loom --checkpoint {data}/x.pt {shared}")["sample"]
+    assert as_json(capsys, f"export {data}/x.loom --to onnx -o {data}/x.onnx")["form"] == "scan"
+    found = as_json(capsys, f"bits {data}/x.pt --calibrate {data}/data --agreement 0.5 --widths 4,8 --no-cache")
+    assert found["recommended"]["agreement"] >= 0.5
+
+
+def test_onnxruntime_runs_the_chip_with_its_clocks(data, capsys):
+    pytest.importorskip("onnxruntime")
+    capsys.readouterr()
+    words = f"verify {data}/x.loom --checkpoint {data}/x.pt --data {data}/data --engine onnx --min-agreement 0"
+    verdict = as_json(capsys, words)
+    assert (verdict["spec_equals_engine"], verdict["engine_different"]) == (True, 0)
+
+
+def test_watch_decides_as_run(data, capsys):
+    from models.evtouch import load_recordings
+
+    capsys.readouterr()
+    decided = as_json(capsys, f"run {data}/x.loom --data {data}/data")
+    recordings = load_recordings(data / "data", "test")
+    lines = []
+    for events in recordings.events:
+        step, taxel, polarity = np.nonzero(events.transpose(2, 0, 1))
+        lines += [f"{0.02 * s + 0.001:.3f},{x},{p}" for s, x, p in zip(step, taxel, polarity, strict=True)] + [""]
+    (data / "lines.csv").write_text("\n".join(lines) + "\n")
+    assert main(f"watch {data}/x.loom --input {data}/lines.csv --bins 14 --json".split()) == 0
+    shown = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    counts = [entry["counts"] for entry in shown if entry["kind"] == "grasp"]
+    assert counts == decided["counts"]
+
+
+def refusal(capsys, words):
+    capsys.readouterr()
+    assert main(words.split()) == 2
+    return capsys.readouterr().err
+
+
+def test_what_does_not_know_such_networks_says_so(data, capsys):
+    assert refusal(capsys, f"finetune {data}/x.pt --data {data}/data --weight-bits 4 -o {data}/y.pt") == (
+        f"spikeloom: {data}/x.pt: has clocks, or decays of single layers, which fine-tuning does not know; "
+        "compile it as it is\n"
+    )
+    assert refusal(capsys, f"export {data}/x.pt --to onnx-float -o {data}/y.onnx") == (
+        "spikeloom: --to onnx-float: the network has clocks, or decays of single layers, which this form does not say; "
+        "compile it and export the netlist with --to onnx\n"
+    )
+    assert refusal(capsys, f"export {data}/x.loom --to sanafe -o {data}/y.yaml") == (
+        "spikeloom: fc2: a current that outlasts its step found (decay_u 204), SANA-FE keeps currents as floats, "
+        "not as the chip does; export networks without currents\n"
+    )
+
+
+def test_text_shows_clocks_and_current_decay(data, capsys):
+    capsys.readouterr()
+    assert main(["inspect", f"{data}/x.pt"]) == 0
+    shown = capsys.readouterr().out
+    assert "\n  current decay by layer: conv1 0, fc1 0.949951, fc2 0.949951, fc3 0.949951\n" in shown
+    assert "\n  4 clocks of 4 steps each, 16 in all, beside the sensor\n" in shown
+    assert main(["inspect", f"{data}/x.loom"]) == 0
+    shown = capsys.readouterr().out
+    assert "\n  4 clocks of 4 steps each, 16 in all, beside the sensor\n" in shown
+    head = next(line for line in shown.splitlines() if line.lstrip().startswith("layer"))
+    assert head.split()[-3:] == ["β", "α", "cores"]
