@@ -8,6 +8,7 @@ from difflib import get_close_matches
 from typing import Any
 
 from compiler.atomic import write_atomically
+from compiler.dynamics import with_clocks
 from compiler.errors import DataError, ModelError, OptionError
 from compiler.netlist import Netlist
 from compiler.passes.legalize import measure
@@ -73,7 +74,7 @@ def report(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], 
         bin_s=arguments.bin,
         labels_for="report",
     )
-    check_channels(netlist, data.events.shape[1] * data.events.shape[2])
+    check_channels(netlist, data.events.shape[1] * data.events.shape[2] + netlist.clocks.channels)
     chosen = None if arguments.recording is None else find_recording(data, arguments.recording)
     found, code = _facts(arguments, netlist, asked, data, chosen)
     with write_atomically(arguments.output) as file:
@@ -154,7 +155,7 @@ def _facts(
     if chosen is None:
         chosen = 0 if verdict.first_divergence is None else data.files.index(verdict.first_divergence.file)
     progress("costs")
-    counts, costs = estimate(netlist, target, data.events.reshape(len(data), -1, data.steps), lengths=data.lengths)
+    counts, costs = estimate(netlist, target, with_clocks(data.events, netlist.clocks), lengths=data.lengths)
     progress("the recording")
     provenance = report_facts.provenance_json(arguments, netlist, target, asked, data, data.files[chosen])
     found = {

@@ -135,16 +135,18 @@ def taxels_json(netlist: Netlist, asked: Asked, data: Recordings, counts: Counts
     places = asked_places(taxels)
     known = len(places) == netlist.taxels and places.shape[1] > 1
     events: IntArray = data.events.sum(axis=(2, 3), dtype=np.int64)
-    has_graph = asked.checkpoint is not None and asked.checkpoint.system in GRAPH_SYSTEMS
+    checkpoint = asked.checkpoint
     edges: IntArray = np.zeros((0, 2), np.int64)
     spikes: FloatArray | None = None
-    if has_graph and asked.adjacency is not None:
+    has_graph = checkpoint is not None and checkpoint.system in GRAPH_SYSTEMS
+    if checkpoint is not None and asked.adjacency is not None and has_graph:
         seen = asked.adjacency.reshape(-1, netlist.taxels, netlist.taxels)[0]
         target, source = np.nonzero(seen)
         edges = np.stack([source, target], axis=1)[source != target]
         ids = netlist.compartments_of(0)
-        taxel = netlist.neuron[ids] // (netlist.layers[0].neurons // netlist.taxels)
-        spikes = np.bincount(taxel, counts.spikes[:, ids].mean(axis=0), netlist.taxels).astype(np.float64)
+        taxel = netlist.neuron[ids] // checkpoint.hops.shape[1]  # those of clocks come after the last
+        fired = np.bincount(taxel, counts.spikes[:, ids].mean(axis=0), netlist.taxels)
+        spikes = fired[: netlist.taxels].astype(np.float64)
     return {
         "sensor": "NeuTouch" if taxels is None and known and np.array_equal(places, NEUTOUCH) else None,
         "positions_mm": places[:, :2].tolist() if known else None,
@@ -183,6 +185,7 @@ def provenance_json(
             "system": None if checkpoint is None else checkpoint.system,
             "weights": None if checkpoint is None else checkpoint.weights,
             "graph": asked.graph,
+            "dynamics": None if checkpoint is None or checkpoint.dynamics.is_plain else checkpoint.dynamics.to_json(),
             "training": None if checkpoint is None or checkpoint.training is None else dict(checkpoint.training),
         },
         "data": {

@@ -64,6 +64,7 @@ def _provenance(report: Json) -> list[str]:
     ]
     facts: dict[str, Mapping[str, Any] | None] = {
         "How the netlist was compiled": made["netlist"]["compiled"],
+        "Decays by layer, and clocks": made["checkpoint"]["dynamics"],
         "How the network was trained": made["checkpoint"]["training"],
         "Versions": made["versions"],
         "Energy tables": made["chip"]["energy_tables"],

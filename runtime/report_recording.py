@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from compiler.dynamics import with_clocks
 from compiler.fixedpoint import MEMBRANE_SHIFT, FloatArray, IntArray
 from compiler.frontends.checkpoint import Checkpoint
 from compiler.frontends.systems import GRAPH_SYSTEMS
@@ -56,9 +57,8 @@ class Sides:
 def run_both(netlist: Netlist, asked: Asked, events: npt.NDArray[np.uint8]) -> Sides:
     """Run one recording, (taxels, polarities, steps), on both sides."""
     one = events[None]
-    trace = engine.simulate(
-        engine.prepare(netlist), one.reshape(1, -1, one.shape[3]), spikes=True, membranes=True, updated=True
-    )
+    inputs = with_clocks(one, netlist.clocks)
+    trace = engine.simulate(engine.prepare(netlist), inputs, spikes=True, membranes=True, updated=True)
     assert trace.spikes is not None, "spikes were asked for"
     layers = range(len(netlist.layers))
     return Sides(
@@ -103,6 +103,7 @@ def recording_json(
     """
     steps = data.steps_of(index)
     events = data.events[index, ..., :steps]
+    channels = with_clocks(events[None], netlist.clocks)
     sides = run_both(netlist, asked, events)
     readout = asked.network.readout
     float_votes = readout_counts(readout, netlist.classes, sides.float_spikes[readout.population][None])
@@ -112,7 +113,7 @@ def recording_json(
         for i, (a, b) in enumerate(zip(sides.float_spikes, sides.chip_spikes, strict=True))
     ]
     timed = "cycle" if chip_count(netlist.core_tile, target) == 1 else "counts"
-    _, own = estimate(netlist, target, events.reshape(1, -1, steps), detail=timed)
+    _, own = estimate(netlist, target, channels, detail=timed)
     return {
         "file": data.files[index],
         "index": index,
@@ -120,11 +121,11 @@ def recording_json(
         "label": int(data.labels[index]),
         "decision": {"float": int(float_votes[0].argmax()), "chip": int(predictions(netlist, chip_spikes)[0])},
         "votes": {"float": float_votes[0].tolist(), "chip": class_counts(netlist, chip_spikes)[0].tolist()},
-        "input": _pairs(events.transpose(2, 0, 1).reshape(steps, -1).astype(np.bool_)),
+        "input": _pairs(channels[0].T.astype(np.bool_)),
         "layers": layers,
         "membranes": _traces(netlist, asked.model, sides),
         "costs": estimate_json(netlist, target, own, bin_s=bin_s),
-        "by_step": _by_step(netlist, target, events, sides.trace, own, found),
+        "by_step": _by_step(netlist, target, channels[0], sides.trace, own, found),
     }
 
 
@@ -215,8 +216,10 @@ def neuron_name(netlist: Netlist, model: Checkpoint | Network, layer: int, neuro
     """A neuron in the terms of its layer: taxel and feature in a graph convolution, its number elsewhere."""
     if layer or isinstance(model, Network) or model.system not in GRAPH_SYSTEMS:
         return f"neuron {neuron}"
-    features = netlist.layers[0].neurons // netlist.taxels
-    return f"taxel {neuron // features}, feature {neuron % features}"
+    taxel, feature = divmod(neuron, model.hops.shape[1])
+    if taxel >= netlist.taxels:
+        return f"neuron {neuron}, a clock's"
+    return f"taxel {taxel}, feature {feature}"
 
 
 # -- energy and time by step -------------------------------------------------------------------------------------------
@@ -231,8 +234,8 @@ def energy_by_step(
     ----------
     netlist, target : Netlist, Target
         What ran, on which chip.
-    events : (taxels, polarities, steps) uint8
-        The recording.
+    events : (channels, steps) uint8
+        The recording, with the network's clocks.
     trace : Trace
         Of a batch of this one recording, with spikes and updates.
     """
@@ -240,7 +243,7 @@ def energy_by_step(
     assert trace.updated is not None, "updates were asked for"
     spikes: IntArray = trace.spikes[0].astype(np.int64)
     inputs = np.zeros((len(spikes), netlist.n_inputs), np.int64)
-    inputs[: events.shape[2]] = events.reshape(netlist.n_inputs, -1).T
+    inputs[: events.shape[1]] = events.T
     of_layer = np.eye(len(netlist.layers), dtype=np.int64)[netlist.layer]
     updates = trace.updated[0].astype(np.int64) @ of_layer
     counts = Counts(inputs=inputs, spikes=spikes, updates=updates, saturations=np.zeros_like(updates))

@@ -13,7 +13,9 @@ import pytest
 from browser import Page
 from made_files import CLASSES, FEATURES, STEPS, TAXELS, own_file, recordings_folder, weights
 from numpy.testing import assert_allclose, assert_array_equal
+from timed_networks import written
 
+from compiler.dynamics import with_clocks
 from compiler.frontends.checkpoint import read_checkpoint
 from compiler.frontends.systems import GRAPH_SYSTEMS, GRID_CNN, SYSTEMS
 from compiler.serialize import read_netlist, write_netlist
@@ -408,6 +410,32 @@ def test_large_layers_are_thinned_out():
 
 def _grasps(seed):
     return (np.random.default_rng(seed).random((3, 39, 2, 20)) < 0.15).astype(np.uint8)
+
+
+def test_clocks_and_lasting_currents_have_their_page(spikeloom, tmp_path):
+    written(tmp_path / "x.pt")
+    recordings_folder(tmp_path / "data", train=_grasps(1), test=_grasps(2))
+    net, checkpoint, data = tmp_path / "x.loom", tmp_path / "x.pt", tmp_path / "data"
+    assert spikeloom("compile", checkpoint, "--keep-all", "-o", net)[0] == 0
+    words = ("report", net, "--checkpoint", checkpoint, "--data", data, "-o", tmp_path / "x.html", "--json")
+    code, out, err = spikeloom(*words)
+    assert (code, err) == (0, "")
+    found = json.loads(out)
+    assert found["provenance"]["checkpoint"]["dynamics"]["clocks"] == {"channels": 3, "steps": 4}
+    assert "Decays by layer, and clocks" in (tmp_path / "x.html").read_text("utf-8")
+    channels = {channel for _, channel in found["recording"]["input"]}
+    assert channels >= {78, 79, 80}  # the clocks' come after those of 39 taxels
+    netlist = read_netlist(net)
+    events = with_clocks(load_data(str(data), "test")[0].events, netlist.clocks)
+    counts = engine.simulate(netlist, events).counts
+    features = read_checkpoint(checkpoint).hops.shape[1]
+    heard = (netlist.layer == 0) & (netlist.neuron < 39 * features)
+    assert_allclose(sum(found["taxels"]["spikes"]), counts.spikes[:, heard].sum(axis=1).mean())
+    assert len(found["taxels"]["spikes"]) == 39
+    recording = found["recording"]
+    costs = cost.estimate(cost.prepare(netlist, load_target("loihi1")), counts, events.shape[2])
+    for name, steps in recording["by_step"]["energy_j"].items():
+        assert_allclose(sum(steps), costs.energy[name][recording["index"]].sum())
 
 
 def test_an_onnx_network_has_its_page(spikeloom, place):
