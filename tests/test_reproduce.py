@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -259,8 +260,7 @@ def test_a_network_of_another_training_is_not_taken_over(data, capsys):
     capsys.readouterr()
     assert main([*METHODS, "--resume"]) == 2
     assert capsys.readouterr().err.splitlines()[-1] == (
-        f"spikeloom: {network}: holds another training (other epochs, seed, recipe); "
-        "give its options, or another -o"
+        f"spikeloom: {network}: holds another training (other epochs, seed, recipe); give its options, or another -o"
     )
     assert len(list(Path("out/cells").iterdir())) == 3
 
@@ -344,6 +344,7 @@ def test_in_processes_of_its_own_it_keeps_what_it_has(data):
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,
+        preexec_fn=partial(signal.signal, signal.SIGINT, signal.SIG_DFL),  # a job in the background would not hear it
     )
     deadline = time.monotonic() + 120
     while len(list(data.glob("out/networks/*.state.*"))) < 2 and process.poll() is None and time.monotonic() < deadline:
