@@ -7,15 +7,14 @@ import math
 import os
 import signal
 import subprocess
-import sys
 import time
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from commands import RUNTIME
 from made_cells import CAPACITY, kept, made_cell
 
 import models.train
@@ -339,12 +338,11 @@ def test_cells_of_another_length_are_not_shown_but_told_of(tmp_path, capsys):
 def test_in_processes_of_its_own_it_keeps_what_it_has(data):
     words = ["reproduce", "--data", "Ev-Grasps", "--table", "methods", "--epochs", "5000", "-o", "out", "--jobs", "2"]
     process = subprocess.Popen(
-        [sys.executable, "-m", "runtime", *words],
+        [*RUNTIME, *words],
         env=os.environ | {"PYTHONPATH": str(ROOT)},
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,
-        preexec_fn=partial(signal.signal, signal.SIGINT, signal.SIG_DFL),  # a job in the background would not hear it
     )
     deadline = time.monotonic() + 120
     while len(list(data.glob("out/networks/*.state.*"))) < 2 and process.poll() is None and time.monotonic() < deadline:

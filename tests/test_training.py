@@ -8,12 +8,12 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from commands import RUNTIME
 
 from compiler.errors import DataError, OptionError
 from compiler.frontends.checkpoint import read_checkpoint
@@ -184,12 +184,11 @@ WORDS = ("train", "--data", "data", "--graph", "manual")
 def started(*words, until):
     """A training in a process of its own, once `until` is true."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "runtime", *WORDS, *words],
+        [*RUNTIME, *WORDS, *words],
         env=os.environ | {"PYTHONPATH": str(ROOT)},
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,
-        preexec_fn=partial(signal.signal, signal.SIGINT, signal.SIG_DFL),  # a job in the background would not hear it
     )
     deadline = time.monotonic() + 120
     while not until() and process.poll() is None and time.monotonic() < deadline:
