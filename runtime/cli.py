@@ -27,7 +27,19 @@ from compiler.serialize import is_netlist, read_netlist
 from compiler.targets import load_target, with_tables
 from models.evtouch import Recordings
 from models.grasps import SYNTHETIC
-from runtime import bits, decisions, explain, export, finetune, render, reproduce, verdicts, watch, yardstick_command
+from runtime import (
+    bits,
+    decisions,
+    explain,
+    export,
+    finetune,
+    join,
+    render,
+    reproduce,
+    verdicts,
+    watch,
+    yardstick_command,
+)
 from runtime.asked import asked_network
 from runtime.compile_command import compile_netlist
 from runtime.data_commands import add_data_commands
@@ -277,6 +289,7 @@ def build_parser() -> argparse.ArgumentParser:
     explain.add_arguments(command("explain", explain.explain, explain.SUMMARY))
     export.add_arguments(command("export", export.export, export.SUMMARY))
     finetune.add_arguments(command("finetune", finetune.finetune, finetune.SUMMARY))
+    join.add_arguments(command("join", join.join, join.SUMMARY))
     reproduce.add_arguments(command("reproduce", reproduce.reproduce, reproduce.SUMMARY))
     watch.add_arguments(command("watch", watch.watch, watch.SUMMARY))
     yardstick_command.add_arguments(command("yardsticks", yardstick_command.measure, yardstick_command.SUMMARY))
