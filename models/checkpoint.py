@@ -74,6 +74,7 @@ def checkpoint_bytes(
     system: str = TACTILESGNET,
     grid: Grid | None = None,
     dynamics: Dynamics = PLAIN,
+    towers: int = 1,
 ) -> bytes:
     """File content of a checkpoint; equal input gives equal bytes.
 
@@ -95,6 +96,8 @@ def checkpoint_bytes(
         Of a grid-based CNN.
     dynamics : Dynamics
         Decays of single layers, and clocks.
+    towers : int
+        Networks that lie side by side in the tensors, see :mod:`compiler.frontends.towers`.
     """
     tensors_of_one = next(iter(weights.values()))
     stages = sum(name.startswith("fc") and name.endswith(".weight") for name in tensors_of_one)
@@ -106,16 +109,18 @@ def checkpoint_bytes(
     version = VERSIONS[2] if system != TACTILESGNET else VERSIONS[0] if forms is None else VERSIONS[1]
     manifest: dict[str, Any] = {
         "format": FORMAT,
-        "version": version if dynamics.is_plain else VERSIONS[3],
+        "version": VERSIONS[4] if towers > 1 else version if dynamics.is_plain else VERSIONS[3],
         "architecture": system,
         "taxels": graph.n_taxels,
-        "classes": len(tensors_of_one[f"fc{stages}.bias"]),
+        "classes": len(tensors_of_one[f"fc{stages}.bias"]) // towers,
         "beta": beta,
         "theta": theta,
         "graph": {"name": graph.name, "edges": graph.edges.tolist()},
         "weights": list(weights),
         "training": dict(training),
     }
+    if towers > 1:
+        manifest["towers"] = towers
     if not dynamics.is_plain:
         manifest["dynamics"] = dynamics.to_json()
     if grid is not None:
@@ -156,6 +161,7 @@ def save_checkpoint(
     system: str = TACTILESGNET,
     grid: Grid | None = None,
     dynamics: Dynamics = PLAIN,
+    towers: int = 1,
 ) -> None:
     """Write a checkpoint, whole or not at all; parameters as :func:`checkpoint_bytes`.
 
@@ -174,6 +180,7 @@ def save_checkpoint(
         system=system,
         grid=grid,
         dynamics=dynamics,
+        towers=towers,
     )
     with write_atomically(path) as file:
         file.write(content)

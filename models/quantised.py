@@ -29,6 +29,7 @@ from compiler.fixedpoint import (
 from compiler.forms import Form, decay_registers, reach, round_steps, step_units
 from compiler.frontends.checkpoint import Checkpoint
 from compiler.frontends.systems import in_order
+from compiler.frontends.towers import members, side_by_side
 from compiler.passes.expand import effective_weight, stack_of
 from models.layers import differentiate, events_of, gather, scatter
 from models.surrogate import RECTANGLE
@@ -262,6 +263,8 @@ def quantised_spikes(
     dict of str to (samples, steps, neurons) bool
         One entry per layer, in order.
     """
+    if checkpoint.towers > 1:
+        return side_by_side(checkpoint, [quantised_spikes(m, adjacency, events) for m in members(checkpoint)])
     assert checkpoint.forms is not None, "only a fine-tuned checkpoint has a quantised model"
     network = QuantisedNet(checkpoint, adjacency, checkpoint.forms)
     found: dict[str, list[NDArray[np.bool_]]] = {name: [] for name in network.names}

@@ -2,7 +2,8 @@
 
 Released order: hop 0 first, then one propagation and one linear map per hop, added up, bias last; then the
 recurrence. In float32 this gives every spike of the released code on the released test recordings. A GCN is mapped
-first and then propagated, as torch_geometric does it; the sums of the others are one product.
+first and then propagated, as torch_geometric does it; the sums of the others are one product. Towers of a joined
+network run one after the other, so that each has every spike that it has alone.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import torch
 from compiler.dynamics import RELAY_WEIGHT
 from compiler.frontends.checkpoint import Checkpoint
 from compiler.frontends.systems import GCN, TACTILESGNET, feature_major, in_order
+from compiler.frontends.towers import members, side_by_side
 from models.currents import lasting_current
 from models.layers import filter_places, lif, tag_convolution
 from models.networks import relayed
@@ -105,6 +107,8 @@ def float_spikes(
     dict of str to (samples, steps, neurons) bool
         One entry per layer, in order.
     """
+    if checkpoint.towers > 1:
+        return side_by_side(checkpoint, [float_spikes(m, adjacency, events, dtype=dtype) for m in members(checkpoint)])
     batches: dict[str, list[npt.NDArray[np.bool_]]] = {}
     with torch.no_grad():
         for start in range(0, len(events), BATCH):
@@ -121,6 +125,9 @@ def float_membranes(
     dtype: str = "float32",
 ) -> dict[str, npt.NDArray[np.floating]]:
     """Membranes of every layer before the comparison; as :func:`float_spikes`, (samples, steps, neurons) of `dtype`."""
+    if checkpoint.towers > 1:
+        every = [float_membranes(m, adjacency, events, dtype=dtype) for m in members(checkpoint)]
+        return side_by_side(checkpoint, every)
     with torch.no_grad():
         return {
             name: membranes.transpose(0, 1).contiguous().numpy()

@@ -33,6 +33,7 @@ from runtime import (
     explain,
     export,
     finetune,
+    join,
     render,
     report,
     reproduce,
@@ -289,6 +290,7 @@ def build_parser() -> argparse.ArgumentParser:
     explain.add_arguments(command("explain", explain.explain, explain.SUMMARY))
     export.add_arguments(command("export", export.export, export.SUMMARY))
     finetune.add_arguments(command("finetune", finetune.finetune, finetune.SUMMARY))
+    join.add_arguments(command("join", join.join, join.SUMMARY))
     report.add_arguments(command("report", report.report, report.SUMMARY))
     reproduce.add_arguments(command("reproduce", reproduce.reproduce, reproduce.SUMMARY))
     watch.add_arguments(command("watch", watch.watch, watch.SUMMARY))

@@ -82,6 +82,7 @@ def compile_netlist(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json
                 if checkpoint is None
                 else {"run": arguments.run, "weights": checkpoint.weights, "graph": asked.graph}
             ),
+            **({"towers": checkpoint.towers} if checkpoint is not None and checkpoint.towers > 1 else {}),
             **_storage(recipes, checkpoint),
             "spike_exact": arguments.spike_exact,
             "keep_all": arguments.keep_all,

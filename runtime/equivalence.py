@@ -144,8 +144,7 @@ def require_match(netlist: Netlist, model: Checkpoint | Network) -> None:
         theirs |= _clock_sizes(model.input.clocks) | {p.name: p.size for p in model.populations}
     else:
         theirs = {"taxels": model.taxels, "channels": model.hops.shape[2]}
-        theirs |= _clock_sizes(model.dynamics.clocks) | {"conv1": model.dense[0].weight.shape[1]}
-        theirs |= {dense.name: len(dense.bias) for dense in model.dense}
+        theirs |= _clock_sizes(model.dynamics.clocks) | model.neurons
     if ours != theirs:
         sizes = [", ".join(f"{name} {neurons}" for name, neurons in side.items()) for side in (ours, theirs)]
         raise ModelError(

@@ -55,7 +55,7 @@ def _widths(words: str) -> list[int]:
         ) from None
 
 
-def _graph(checkpoint: Checkpoint, asked: Graph | None, name: str) -> Graph:
+def stored_graph(checkpoint: Checkpoint, asked: Graph | None, name: str) -> Graph:
     """Graph to store: the one in the checkpoint, or the one that was asked for; `propagation` has compared them."""
     if checkpoint.edges is None and checkpoint.system in GRAPH_SYSTEMS:
         assert asked is not None, "propagation needs a graph"
@@ -103,6 +103,11 @@ def finetune(arguments: argparse.Namespace) -> tuple[Report, Callable[[Report], 
     if not checkpoint.dynamics.is_plain:
         raise ModelError(
             f"{path}: has clocks, or decays of single layers, which fine-tuning does not know; compile it as it is"
+        )
+    if checkpoint.towers > 1:
+        raise ModelError(
+            f"{path}: has {checkpoint.towers} towers, which fine-tuning takes one by one; fine-tune what it was joined "
+            "from, then join that"
         )
     asked = asked_graph(arguments, checkpoint.system)
     name, adjacency = propagation(checkpoint, asked, arguments.checkpoint)
@@ -157,7 +162,7 @@ def finetune(arguments: argparse.Namespace) -> tuple[Report, Callable[[Report], 
     save_checkpoint(
         output,
         {"last": tuned.weights},
-        _graph(checkpoint, asked, name),
+        stored_graph(checkpoint, asked, name),
         beta=checkpoint.beta,
         theta=checkpoint.theta,
         training=record,

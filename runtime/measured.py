@@ -21,7 +21,7 @@ from models.evtouch import Recordings
 from runtime import engine
 from runtime.estimate import estimate
 from runtime.inputs import propagation
-from runtime.votes import predictions
+from runtime.votes import predictions, readout_counts
 
 Json = dict[str, Any]
 
@@ -84,13 +84,13 @@ def float_decisions(checkpoint: Checkpoint, adjacency: FloatArray, test: Recordi
     """Class of each recording by the float32 model, in the released operator order."""
     from models.reference import float_spikes  # torch, so only here
 
-    votes = []
+    counts = []
     for first in range(0, len(test), PART):
         part = slice(first, first + PART)
         *_, spikes = float_spikes(checkpoint, adjacency, test.events[part]).values()
         lengths = None if test.lengths is None else test.lengths[part]
-        votes.append(cut(spikes, lengths).sum(axis=1, dtype=np.int64))
-    return vote(np.concatenate(votes))
+        counts.append(readout_counts(checkpoint.readout, checkpoint.classes, cut(spikes, lengths)))
+    return vote(np.concatenate(counts))
 
 
 def _flat(recordings: Recordings) -> engine.EventArray:

@@ -28,6 +28,7 @@ import numpy as np
 from compiler.errors import ModelError
 from compiler.fixedpoint import FloatArray
 from compiler.frontends.checkpoint import Checkpoint
+from compiler.passes.expand import expand_dense
 from runtime.inputs import version
 from runtime.onnx_nodes import Nodes, Port, model_bytes, require_room
 from runtime.onnx_time import counted, decided, read_sizes, rest
@@ -59,7 +60,8 @@ def export_float(checkpoint: Checkpoint, adjacency: FloatArray, form: str, *, gr
             "--to onnx-float: the network has clocks, or decays of single layers, which this form does not say; "
             "compile it and export the netlist with --to onnx"
         )
-    require_room(4 * (sum(dense.weight.size for dense in checkpoint.dense) + checkpoint.hops.size + adjacency.size))
+    held = sum(checkpoint.towers * dense.weight.size for dense in checkpoint.dense)  # as whole matrices
+    require_room(4 * (held + checkpoint.hops.size + adjacency.size))
     nodes, channels = Nodes(), checkpoint.taxels * checkpoint.hops.shape[2]
     sizes = {"conv1": checkpoint.taxels * checkpoint.hops.shape[1]}
     sizes |= {dense.name: len(dense.bias) for dense in checkpoint.dense}
@@ -100,7 +102,8 @@ def _steps(
         inputs.append(Port(name=f"{name}.membrane", kind=np.float32, shape=("batch", size)))
         outputs += [trains, Port(name=f"{name}.membrane_next", kind=np.float32, shape=("batch", size))]
     votes = Port(name="votes", kind=np.int32, shape=("batch", checkpoint.classes))
-    nodes.add("Add", ["votes", nodes.cast(heard, "votes/more", np.int32)], "votes_next")
+    more = nodes.cast(heard, "votes/more", np.int32)
+    nodes.add("Add", ["votes", _by_class(nodes, checkpoint, more, "votes/classes")], "votes_next")
     return [*inputs, votes], [*outputs, Port(name="votes_next", kind=np.int32, shape=votes.shape)]
 
 
@@ -123,9 +126,20 @@ def _recordings(
         )
         heard = nodes.cast(f"{name}/trains", f"{name}.spikes", np.uint8)
         outputs += counted(nodes, name, size)
-    nodes.add("Identity", [outputs[-1].name], "votes")
+    if checkpoint.towers > 1:
+        _by_class(nodes, checkpoint, outputs[-1].name, "votes")
+    else:
+        nodes.add("Identity", [outputs[-1].name], "votes")
     events = Port(name="events", kind=np.uint8, shape=("time", "batch", channels))
     return [events], outputs + decided(nodes, checkpoint.classes)
+
+
+def _by_class(nodes: Nodes, checkpoint: Checkpoint, counts: str, name: str) -> str:
+    """Sum the counts of the output neurons by class, where towers vote together."""
+    if checkpoint.towers == 1:
+        return counts
+    poll = checkpoint.readout.label[:, None] == np.arange(checkpoint.classes)
+    return nodes.add("MatMul", [counts, nodes.constant("votes/label", poll, np.int32)], name)
 
 
 def _current(
@@ -136,11 +150,10 @@ def _current(
         total = _convolution(nodes, checkpoint, adjacency)
         form = nodes.add("Concat", [*rows, nodes.constant("conv1/size", [size], np.int64)], "conv1/form", {"axis": 0})
         return nodes.add("Reshape", [total, form], "conv1/current")
-    dense = next(dense for dense in checkpoint.dense if dense.name == name)
+    layer, dense = next((i, dense) for i, dense in enumerate(checkpoint.dense, 1) if dense.name == name)
+    weight = dense.weight if checkpoint.towers == 1 else expand_dense(checkpoint, layer).toarray()
     spikes = nodes.cast(heard, f"{name}/spikes", np.float32)
-    product = nodes.add(
-        "MatMul", [spikes, nodes.constant(f"{name}/weight", dense.weight.T, np.float32)], f"{name}/product"
-    )
+    product = nodes.add("MatMul", [spikes, nodes.constant(f"{name}/weight", weight.T, np.float32)], f"{name}/product")
     return nodes.add("Add", [product, nodes.constant(f"{name}/bias", dense.bias, np.float32)], f"{name}/current")
 
 

@@ -334,10 +334,8 @@ def checkpoint_json(checkpoint: Checkpoint, given: tuple[str, ...]) -> Json:
         "taxels": checkpoint.taxels,
         "classes": checkpoint.classes,
         **({"hops": int(checkpoint.hops.shape[0] - 1)} if checkpoint.system == TACTILESGNET else {}),
-        "layers": [
-            {"name": "conv1", "neurons": int(checkpoint.dense[0].weight.shape[1])},
-            *({"name": dense.name, "neurons": len(dense.bias)} for dense in checkpoint.dense),
-        ],
+        **({"towers": checkpoint.towers} if checkpoint.towers > 1 else {}),
+        "layers": [{"name": name, "neurons": neurons} for name, neurons in checkpoint.neurons.items()],
         "beta": checkpoint.beta,
         "theta": checkpoint.theta,
         **({} if checkpoint.dynamics.is_plain else {"dynamics": checkpoint.dynamics.to_json()}),
@@ -347,6 +345,12 @@ def checkpoint_json(checkpoint: Checkpoint, given: tuple[str, ...]) -> Json:
         "training": None if checkpoint.training is None else dict(checkpoint.training),
         "sha256": checkpoint.sha256,
     }
+
+
+def tower_line(tower: Json) -> str:
+    """Where a tower of a joined network is from, in one line."""
+    facts = (f"{key} {tower[key]}" for key in ("weights", "seed", "sha256") if key in tower)
+    return f"{tower.get('file')}, {', '.join(facts)}"
 
 
 def checkpoint_text(report: Json) -> str:
@@ -372,7 +376,12 @@ def checkpoint_text(report: Json) -> str:
                 )
                 lines.append(f"  {word} decay by layer: {shown}")
         lines += _clock_lines(report["dynamics"] if report["dynamics"]["clocks"]["channels"] else {})
-    for key, value in (report["training"] or {}).items():
+    training = dict(report["training"] or {})
+    if "towers" in report:
+        lines.append(f"  {report['towers']} towers vote together, each with a neuron for every class")
+        for index, tower in enumerate(training.pop("towers", ())):
+            lines.append(f"    {index}: {tower_line(tower)}")
+    for key, value in training.items():
         text = str(value)
         lines.append(f"  {key}: {text if len(text) <= 100 else text[:97] + '…'}")
     lines.append(f"  sha256: {report['sha256']}")

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from compiler.dynamics import with_clocks
 from compiler.errors import DataError
 from compiler.fixedpoint import FloatArray
 from compiler.frontends.checkpoint import Checkpoint
@@ -164,7 +165,7 @@ def measure(
     last = np.full(samples, steps) if lengths is None else lengths
     counted = np.arange(steps) < last[:, None]
     trains = [train & counted[:, :, None] for train in given]
-    inputs = events.reshape(samples, -1, steps).transpose(0, 2, 1) * counted[:, :, None]
+    inputs = with_clocks(events, checkpoint.dynamics.clocks).transpose(0, 2, 1) * counted[:, :, None]
 
     bench = _neurobench(network, inputs, trains, last)
     mean_steps = float(last.mean())
@@ -205,15 +206,17 @@ def _neurobench(
     for projection in network.projections:
         source = inputs if projection.pre == INPUT else trains[projection.pre]
         post, pre = projection.weight.shape
+        # towers have no weights from one another; the convolution is its effective matrix, with its zeros
+        held = post * pre if projection.pre == INPUT else projection.weight.nnz
         fan_out = np.count_nonzero(projection.weight.toarray(), axis=0)
         # one recording at a time: the product would make float64 of all spikes
         visited = np.stack([(recording != 0) @ fan_out.astype(np.float64) for recording in source])
         binary = np.all(source <= 1, axis=2)
         acs += float(visited[binary].sum())
         macs += float(visited[~binary].sum())
-        zeros += post * pre - int(fan_out.sum())
-        weights += post * pre
-        parameters += post * pre + post
+        zeros += held - int(fan_out.sum())
+        weights += held
+        parameters += held + post
     neurons = sum(train.shape[2] for train in trains)
     # a mean of the recordings' shares, not a share of all: they differ where lengths do
     fired = sum(train.sum(axis=(1, 2)) for train in trains)
@@ -228,11 +231,11 @@ def _neurobench(
 
 
 def _factored(checkpoint: Checkpoint, adjacency: FloatArray) -> int:
-    """Multiply-accumulates of the first layer in one step: its maps, and of a graph its hops over the edges."""
+    """Multiply-accumulates of the first layer in one step: its maps, of a graph its hops over the edges, its relays."""
     hops, _, channels = checkpoint.hops.shape
     maps = checkpoint.places * int(checkpoint.hops.size)
     times = {TACTILESGNET: int(hops) - 1, GCN: 1}.get(checkpoint.system, 0)
-    return maps + times * int(np.count_nonzero(adjacency)) * int(channels)
+    return maps + times * int(np.count_nonzero(adjacency)) * int(channels) + checkpoint.dynamics.clocks.channels
 
 
 def yardsticks_json(found: Yardsticks) -> Json:

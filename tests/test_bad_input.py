@@ -243,8 +243,8 @@ def test_altered_checkpoint(refusal, tmp_path):
 def test_newer_checkpoint(refusal, tmp_path):
     path = tmp_path / "net.pt"
     with zipfile.ZipFile(path, "w") as made:
-        made.writestr("manifest.json", json.dumps({"format": "spikeloom-checkpoint", "version": 5}))
-    assert refusal("inspect", path) == f"{path}: has format version 5, this program reads up to 4; update spikeloom"
+        made.writestr("manifest.json", json.dumps({"format": "spikeloom-checkpoint", "version": 6}))
+    assert refusal("inspect", path) == f"{path}: has format version 6, this program reads up to 5; update spikeloom"
 
 
 def test_checkpoint_zip_bomb(refusal, tmp_path):

@@ -21,6 +21,11 @@ Version 4 is for networks with decays of single layers or with clocks, of any sy
 ``alphas`` (one a layer, or none) and ``clocks`` (``channels`` and ``steps``), see :mod:`compiler.dynamics`; ``fc1`` has
 one more input for each clock, at the end. ``forms`` may be there or not.
 
+Version 5 is for networks joined of several, of any system: ``towers`` says how many lie side by side, all of the same
+sizes. Arrays hold one tower after the other: ``conv1.hops`` along its features, the others along their first axis, so
+that ``fc1.weight`` has the inputs of one tower. Neuron ``tower * classes + class`` of the last layer votes for that
+class; ``classes`` counts classes. ``dynamics`` and ``forms`` may be there or not; see :mod:`compiler.frontends.towers`.
+
 Files of ``torch.save`` are read by :mod:`compiler.frontends.released`.
 """
 
@@ -60,12 +65,13 @@ from compiler.frontends.systems import (
     shape_faults,
     window_forms,
 )
-from compiler.frontends.tensors import Arrays, faults_of, size, taxel_faults, wanted_dense
+from compiler.frontends.tensors import Arrays, apart, faults_of, size, taxel_faults, tower_faults, wanted_dense
+from compiler.ir import Readout
 
 FORMAT = "spikeloom-checkpoint"
-VERSIONS = (1, 2, 3, 4)
-"""Of a plain file of a TactileSGNet, of one that holds the forms of a fine-tuning, of another system's, and of one with
-decays of single layers or with clocks."""
+VERSIONS = (1, 2, 3, 4, 5)
+"""Of a plain file of a TactileSGNet, of one that holds the forms of a fine-tuning, of another system's, of one with
+decays of single layers or with clocks, and of several joined ones."""
 
 BETA, THETA = 0.2, 0.5
 """Decay and threshold of the released code; files in its layout do not hold them."""
@@ -93,6 +99,7 @@ class Dense:
     name : str
         ``fc1`` …
     weight : (outputs, inputs) float32
+        Of a joined network with the inputs of one tower: no row has weights from another one.
     bias : (outputs,) float32
     """
 
@@ -138,6 +145,8 @@ class Checkpoint:
         Of a grid-based CNN.
     dynamics : Dynamics
         Decays of single layers, and clocks.
+    towers : int
+        Networks that lie side by side and vote together, see :mod:`compiler.frontends.towers`.
     """
 
     hops: Float32Array
@@ -157,11 +166,13 @@ class Checkpoint:
     system: str = TACTILESGNET
     grid: Grid | None = None
     dynamics: Dynamics = PLAIN
+    towers: int = 1
 
     @property
     def places(self) -> int:
         """Number of places that the first fully connected stage was trained on."""
-        return int((self.dense[0].weight.shape[1] - self.dynamics.clocks.channels) // self.hops.shape[1])
+        heard = self.dense[0].weight.shape[1] - self.dynamics.clocks.channels
+        return int(heard * self.towers // self.hops.shape[1])
 
     @property
     def taxels(self) -> int:
@@ -173,7 +184,19 @@ class Checkpoint:
     @property
     def classes(self) -> int:
         """Number of classes."""
-        return len(self.dense[-1].bias)
+        return len(self.dense[-1].bias) // self.towers
+
+    @property
+    def neurons(self) -> dict[str, int]:
+        """Neurons of each layer, the relays of clocks among those of the first."""
+        first = self.places * self.hops.shape[1] + self.dynamics.clocks.channels
+        return {"conv1": int(first)} | {dense.name: len(dense.bias) for dense in self.dense}
+
+    @property
+    def readout(self) -> Readout:
+        """The vote: each tower has one neuron for each class."""
+        label = np.arange(len(self.dense[-1].bias)) % self.classes
+        return Readout(population=len(self.dense), label=label)
 
 
 def arrays_digest(arrays: Mapping[str, npt.NDArray[Any]]) -> str:
@@ -243,12 +266,12 @@ def read_checkpoint(
         if weights not in (None, "last"):
             raise ModelError(f"{where}: --weights {weights}: the file holds the last epoch only; leave --weights away")
         graph, edges, chosen, held = None, None, "last", {"beta": BETA, "theta": THETA}
-        forms, dynamics = None, PLAIN
+        forms, dynamics, towers = None, PLAIN, 1
         assumed = tuple(name for name, value in given.items() if value is None)
     else:
         if run != 0:
             raise ModelError(f"{where}: --run {run}: the file holds only run 0; leave --run away")
-        arrays, chosen, (graph, edges, held, training), (found, grid, dynamics), forms = _own_arrays(
+        arrays, chosen, (graph, edges, held, training), (found, grid, dynamics), (forms, towers) = _own_arrays(
             where, members, weights
         )
         if system not in (None, found):
@@ -286,6 +309,7 @@ def read_checkpoint(
         system=found,
         grid=grid,
         dynamics=dynamics,
+        towers=towers,
     )
 
 
@@ -380,9 +404,9 @@ def _own_arrays(
     str,
     tuple[str, IntArray, dict[str, float], dict[str, Any]],
     tuple[str, Grid | None, Dynamics],
-    tuple[Form, ...] | None,
+    tuple[tuple[Form, ...] | None, int],
 ]:
-    """Arrays of one set, its name; graph, edges, constants and training record; system, grid and dynamics; forms."""
+    """Arrays of one set, its name; graph, edges, constants, training record; system, grid, dynamics; forms, towers."""
     manifest = _manifest(where, members.pop("manifest.json"))
     try:
         arrays: Arrays = {name.removesuffix(".npy"): _read_npy(content) for name, content in members.items()}
@@ -402,8 +426,12 @@ def _own_arrays(
         if system not in SYSTEMS:
             raise ValueError(f"architecture {system}")
         grid = grid_from_json(manifest["grid"]) if system == GRID_CNN else None
-        dynamics = PLAIN
-        if manifest["version"] == VERSIONS[3]:
+        dynamics, towers = PLAIN, 1
+        if manifest["version"] == VERSIONS[4]:
+            towers = manifest["towers"]
+            if type(towers) is not int or towers < 2:
+                raise ValueError(f"{towers} towers")
+        if manifest["version"] == VERSIONS[3] or (towers > 1 and "dynamics" in manifest):
             stages = sum(re.fullmatch(r"[a-z]+/fc\d+\.weight", name) is not None for name in arrays) // len(sets)
             dynamics = dynamics_from_json(manifest["dynamics"], 1 + stages)
     except (KeyError, TypeError, ValueError, OverflowError, ZeroDivisionError) as error:
@@ -414,19 +442,22 @@ def _own_arrays(
     if weights not in sets:
         raise ModelError(f"{where}: --weights {weights}: the file holds {', '.join(sets)}; choose one that it holds")
     chosen = {name.removeprefix(f"{weights}/"): a for name, a in arrays.items() if name.startswith(f"{weights}/")}
-    faults = _own_faults(chosen, taxels, classes, (system, grid, dynamics))
+    faults = tower_faults(chosen, towers)
+    for tower in () if faults else apart(chosen, towers):
+        faults = faults or _own_faults(tower, taxels, classes, (system, grid, dynamics))
     if edges.size and (edges.min() < 0 or edges.max() >= taxels):
         faults.append(f"the graph joins taxels outside 0..{taxels - 1}")
     if faults:
         raise ModelError(f"{where}: {'; '.join(faults)}; {_AGAIN}")
-    return chosen, weights, facts, (system, grid, dynamics), _forms(where, manifest, chosen)
+    forms = _forms(where, manifest, chosen, towers, dynamics.clocks.channels)
+    return chosen, weights, facts, (system, grid, dynamics), (forms, towers)
 
 
-def _forms(where: str, manifest: dict[str, Any], arrays: Arrays) -> tuple[Form, ...] | None:
+def _forms(where: str, manifest: dict[str, Any], arrays: Arrays, towers: int, clocks: int) -> tuple[Form, ...] | None:
     """Storage of every layer of a fine-tuned network; None for a plain file."""
     if manifest["version"] == VERSIONS[0] or (manifest["version"] >= VERSIONS[2] and "forms" not in manifest):
         return None
-    sizes = {"conv1": arrays["fc1.weight"].shape[1]}
+    sizes = {"conv1": (arrays["fc1.weight"].shape[1] - clocks) * towers + clocks}
     stages = sum(key.endswith(".weight") for key in arrays)
     sizes |= {f"fc{stage}": len(arrays[f"fc{stage}.bias"]) for stage in range(1, stages + 1)}
     found = []

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -58,6 +58,38 @@ def taxel_faults(arrays: Mapping[str, npt.NDArray[Any]], features: int, clocks: 
         beside = f" beside {clocks} clocks" if clocks else ""
         return [f"fc1.weight has {inputs} inputs, not a whole number of taxels with {features} features each{beside}"]
     return []
+
+
+def apart(arrays: Mapping[str, npt.NDArray[Any]], towers: int) -> tuple[Arrays, ...]:
+    """Arrays of each tower of a joined network, whose filters, rows and biases lie one tower after the other.
+
+    Examples
+    --------
+    >>> both = {"conv1.hops": np.ones((1, 4, 2)), "conv1.bias": np.arange(4), "fc1.weight": np.ones((6, 5))}
+    >>> [{name: array.shape for name, array in one.items()} for one in apart(both, 2)][1]
+    {'conv1.hops': (1, 2, 2), 'conv1.bias': (2,), 'fc1.weight': (3, 5)}
+    """
+    parts = {name: np.split(array, towers, axis=_tower_axis(name)) for name, array in arrays.items()}
+    return tuple({name: part[tower] for name, part in parts.items()} for tower in range(towers))
+
+
+def together(towers: Sequence[Mapping[str, npt.NDArray[Any]]]) -> Arrays:
+    """Inverse of :func:`apart`."""
+    return {name: np.concatenate([one[name] for one in towers], axis=_tower_axis(name)) for name in towers[0]}
+
+
+def tower_faults(arrays: Mapping[str, npt.NDArray[Any]], towers: int) -> list[str]:
+    """Arrays that do not hold as much for every tower."""
+    return [
+        f"{printable(name)} is {array.shape}, not as much for each of {towers} towers"
+        for name, array in arrays.items()
+        if array.ndim <= _tower_axis(name) or array.shape[_tower_axis(name)] % towers
+    ]
+
+
+def _tower_axis(name: str) -> int:
+    """Axis along which the towers of a joined network lie: the features of filters, the rows of all else."""
+    return 1 if name == "conv1.hops" else 0
 
 
 def size(arrays: Mapping[str, npt.NDArray[Any]], name: str, dimensions: int, axis: int, word: str) -> int | str:

@@ -20,7 +20,8 @@ from compiler.errors import ModelError
 from compiler.fixedpoint import FloatArray
 from compiler.frontends.checkpoint import Checkpoint
 from compiler.frontends.systems import TACTILESGNET, TITLES, in_order
-from compiler.ir import INPUT, Input, Network, Population, Projection, Readout, Sparse
+from compiler.frontends.towers import inputs_of
+from compiler.ir import INPUT, Input, Network, Population, Projection, Sparse
 
 AFFINE_TOLERANCE = 1e-9
 """Largest deviation from affinity, relative to the stage's largest response, that rounding in float64 explains."""
@@ -88,6 +89,18 @@ def _with_relays(checkpoint: Checkpoint, weight: Sparse, bias: FloatArray) -> tu
     both = sparse.csr_array(sparse.block_diag([weight, relays], format="csr"))
     both.sort_indices()
     return both, np.append(bias, np.zeros(clocks))
+
+
+def expand_dense(checkpoint: Checkpoint, layer: int) -> Sparse:
+    """Weights of a fully connected layer, (neurons, neurons of the layer before) float64.
+
+    The stored entries are all pairs within a tower, and those from the relays of clocks, whatever their weight.
+    """
+    weight, inputs = checkpoint.dense[layer - 1].weight, inputs_of(checkpoint, layer)
+    before = list(checkpoint.neurons.values())[layer - 1]
+    column = np.repeat(inputs, len(weight) // len(inputs), axis=0)
+    first = np.arange(0, weight.size + 1, weight.shape[1])
+    return sparse.csr_array((weight.astype(np.float64).ravel(), column.ravel(), first), shape=(len(weight), before))
 
 
 def expand_graph_convolution(adjacency: FloatArray | Sparse, hops: FloatArray) -> Sparse:
@@ -224,9 +237,8 @@ def expand(checkpoint: Checkpoint, propagation: FloatArray) -> Network:
         )
     dynamics = checkpoint.dynamics
     stages = [("conv1", *_with_relays(checkpoint, *expand_first_layer(checkpoint, propagation)))]
-    for dense in checkpoint.dense:
-        weight = dense.weight.astype(np.float64)
-        stages.append((dense.name, _stored(weight, np.ones(weight.shape, np.bool_)), dense.bias.astype(np.float64)))
+    for layer, dense in enumerate(checkpoint.dense, 1):
+        stages.append((dense.name, expand_dense(checkpoint, layer), dense.bias.astype(np.float64)))
     return Network(
         input=Input(taxels=checkpoint.taxels, polarities=checkpoint.hops.shape[2], clocks=dynamics.clocks),
         populations=tuple(
@@ -244,6 +256,6 @@ def expand(checkpoint: Checkpoint, propagation: FloatArray) -> Network:
             Projection(pre=post - 1 if post else INPUT, post=post, weight=weight)
             for post, (_, weight, _) in enumerate(stages)
         ),
-        readout=Readout(population=len(stages) - 1, label=np.arange(checkpoint.classes)),
+        readout=checkpoint.readout,
         classes=checkpoint.classes,
     )

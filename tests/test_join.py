@@ -1,0 +1,563 @@
+"""Joined networks: towers side by side, from files to the chip and through every command."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from made_files import released, state_dict, weights
+from numpy.testing import assert_array_equal
+from test_checkpoint import rebuilt
+from timed_networks import GRAPH, TIMING, events_of, written
+
+from compiler.dynamics import PLAIN, Clocks, Dynamics, with_clocks
+from compiler.errors import ModelError
+from compiler.forms import Form
+from compiler.frontends.checkpoint import read_checkpoint
+from compiler.frontends.onnx import read_onnx
+from compiler.frontends.towers import SHARED, arrays_of, join, members, side_by_side, towers_of
+from compiler.interpret import channels_last, run_float, run_integer, vote
+from compiler.passes.expand import expand
+from compiler.passes.quantize import round_to_forms
+from compiler.pipeline import compile_network
+from models.checkpoint import checkpoint_bytes, save_checkpoint
+from models.events import load_data
+from models.graphs import build_graph
+from models.grasps import synthetic_grasps
+from models.quantised import quantised_spikes
+from models.reference import float_membranes, float_spikes
+from models.release import write_released
+from runtime import engine, yardsticks
+from runtime.cli import main
+from runtime.equivalence import verify
+from runtime.measured import float_decisions
+from runtime.trace import aligned
+from runtime.votes import class_counts, readout_counts
+
+SYSTEMS = ("tactilesgnet", "gcn", "mlp", "grid-cnn")
+SEEDS = (1, 2, 3)
+FORMS = ((8, (0,)), (4, (-1,)), (8, (0, 4)), (6, (1,)))
+"""Width and exponents of each layer in the tests of fine-tuned networks."""
+
+
+def stored(path, checkpoint):
+    """Write a checkpoint as the command does, and read it back."""
+    save_checkpoint(
+        path,
+        {"last": arrays_of(checkpoint)},
+        GRAPH,
+        beta=checkpoint.beta,
+        theta=checkpoint.theta,
+        training={},
+        forms=checkpoint.forms,
+        system=checkpoint.system,
+        grid=checkpoint.grid,
+        dynamics=checkpoint.dynamics,
+        towers=checkpoint.towers,
+    )
+    return read_checkpoint(path)
+
+
+def joined(folder, system="tactilesgnet", dynamics=TIMING, seeds=SEEDS, **sizes):
+    """Networks, the one joined of them and what their first layer sees."""
+    singles = []
+    for seed in seeds:
+        _, seen = written(folder / f"{seed}.pt", system, dynamics, seed=seed, **sizes)
+        singles.append(read_checkpoint(folder / f"{seed}.pt"))
+    return singles, stored(folder / "wide.pt", join(singles, [f"{seed}.pt" for seed in seeds])), seen
+
+
+def one_by_one(single_runs, wide, name, kind=bool):
+    """Values of a joined layer, spelled out: those of each network where its neurons lie, relays after them."""
+    layers = list(wide.neurons)
+    index, width = layers.index(name), single_runs[0][name].shape[-1]
+    clocks = 0 if index else wide.dynamics.clocks.channels
+    own, many = width - clocks, len(single_runs)
+    found = np.zeros((*single_runs[0][name].shape[:-1], own * many + clocks), kind)
+    for tower, run in enumerate(single_runs):
+        for neuron in range(own):
+            place = tower * own + neuron
+            if not index:
+                features = wide.hops.shape[1] // many
+                if wide.system == "grid-cnn":
+                    feature, position = divmod(neuron, wide.places)
+                    place = (tower * features + feature) * wide.places + position
+                else:
+                    position, feature = divmod(neuron, features)
+                    place = position * features * many + tower * features + feature
+            found[..., place] = run[name][..., neuron]
+        if clocks:
+            found[..., -clocks:] = run[name][..., -clocks:]
+    return found
+
+
+# --- files ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+@pytest.mark.parametrize("dynamics", [PLAIN, TIMING], ids=["plain", "timed"])
+def test_a_file_holds_its_towers_and_nothing_between_them(tmp_path, system, dynamics):
+    singles, wide, _ = joined(tmp_path, system, dynamics)
+    assert (wide.towers, wide.classes, wide.taxels, wide.places) == (3, 4, 39, singles[0].places)
+    assert wide.dynamics == dynamics
+    clocks = dynamics.clocks.channels
+    assert wide.neurons == {
+        "conv1": 3 * (singles[0].neurons["conv1"] - clocks) + clocks,
+        "fc1": 24,
+        "fc2": 18,
+        "fc3": 12,
+    }
+    size = (tmp_path / "wide.pt").stat().st_size
+    assert size < sum((tmp_path / f"{seed}.pt").stat().st_size for seed in SEEDS)
+    for single, member in zip(singles, members(wide), strict=True):
+        assert member.towers == 1
+        for name, array in arrays_of(single).items():
+            assert_array_equal(arrays_of(member)[name], array)
+
+
+def test_ordinary_files_are_written_as_before(tmp_path):
+    """Which version a file has, and what its manifest names, depends on what is used."""
+    network, _ = written(tmp_path / "x.pt")
+    content = (tmp_path / "x.pt").read_bytes()
+    assert b'"version": 4' in content
+    assert b"towers" not in content
+    weights = {"last": network.export_weights()}
+    known = {"beta": 0.2, "theta": 0.5, "training": {}}
+    assert checkpoint_bytes(weights, GRAPH, dynamics=TIMING, towers=1, **known) == content
+    assert b'"version": 1' in checkpoint_bytes(weights, GRAPH, **known)
+    stored(tmp_path / "x.pt", join([read_checkpoint(tmp_path / "x.pt")] * 2, ["a", "a"]))
+    assert b'"version": 5' in (tmp_path / "x.pt").read_bytes()
+
+
+def test_joined_networks_join_again(tmp_path):
+    singles, wide, _ = joined(tmp_path)
+    again = join([wide, singles[1]], ["wide.pt", "2.pt"])
+    assert again.towers == 4
+    for single, member in zip([*singles, singles[1]], members(again), strict=True):
+        assert_array_equal(member.dense[1].weight, single.dense[1].weight)
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (lambda m, _: m.update(towers=1), "has an incomplete manifest (ValueError('1 towers'))"),
+        (lambda m, _: m.update(towers="3"), "has an incomplete manifest (ValueError('3 towers'))"),
+        (lambda m, _: m.pop("towers"), "has an incomplete manifest (KeyError('towers'))"),
+        (
+            lambda m, _: m.update(towers=2),
+            "conv1.bias is (9,), not as much for each of 2 towers; conv1.hops is (3, 9, 2), not as much for each of "
+            "2 towers",
+        ),
+        (
+            lambda m, _: m.update(classes=12),
+            "made for 39 taxels and 4 classes, the manifest says 39 taxels and 12 classes",
+        ),
+    ],
+)
+def test_signed_but_wrong(tmp_path, change, expected):
+    joined(tmp_path)
+    path = tmp_path / "wide.pt"
+    path.write_bytes(rebuilt(path.read_bytes(), change))
+    with pytest.raises(ModelError) as error:
+        read_checkpoint(path)
+    assert str(error.value) == f"{path}: {expected}; copy or train it again"
+
+
+# --- the float network ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_towers_spike_as_the_single_networks_bit_for_bit(tmp_path, system, dtype):
+    singles, wide, seen = joined(tmp_path, system)
+    events = events_of(5, samples=4, steps=30)
+    alone = [float_spikes(single, seen, events, dtype=dtype) for single in singles]
+    found = float_spikes(wide, seen, events, dtype=dtype)
+    assert list(found) == ["conv1", "fc1", "fc2", "fc3"]
+    for name, spikes in found.items():
+        assert_array_equal(spikes, one_by_one(alone, wide, name), err_msg=name)
+        assert spikes.any(), name
+    still = float_membranes(wide, seen, events, dtype=dtype)
+    single_membranes = [float_membranes(single, seen, events, dtype=dtype) for single in singles]
+    for name, membranes in still.items():
+        assert_array_equal(membranes, one_by_one(single_membranes, wide, name, membranes.dtype), err_msg=name)
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+def test_decisions_are_those_of_summed_counts(tmp_path, system):
+    singles, wide, seen = joined(tmp_path, system, hidden=(32, 24))
+    events = events_of(6, samples=40, steps=25)
+    counts = sum(float_spikes(single, seen, events)["fc3"].sum(axis=1, dtype=np.int64) for single in singles)
+    found = readout_counts(wide.readout, wide.classes, float_spikes(wide, seen, events)["fc3"])
+    assert_array_equal(found, counts)
+    assert len(np.unique(counts, axis=0)) > 1
+    labels = np.zeros(40, np.int64)
+    data = replace(synthetic_grasps(per_class=1, steps=25, seed=0), events=events, labels=labels, files=("r",) * 40)
+    assert_array_equal(float_decisions(wide, seen, data), vote(counts))
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+@pytest.mark.parametrize("dynamics", [PLAIN, TIMING], ids=["plain", "timed"])
+def test_the_expanded_network_is_sparse_in_blocks(tmp_path, system, dynamics):
+    singles, wide, seen = joined(tmp_path, system, dynamics)
+    network, alone = expand(wide, seen), [expand(single, seen) for single in singles]
+    owners = towers_of(wide)
+    clocks = dynamics.clocks.channels
+    for layer, projection in enumerate(network.projections):
+        stored_in_all = sum(single.projections[layer].weight.nnz for single in alone)
+        assert projection.weight.nnz == stored_in_all - (0 if layer else 2 * clocks), layer  # one set of relays
+        rows, columns = projection.weight.tocoo().coords
+        if layer:
+            before = owners[layer - 1][columns]
+            assert np.all((before == owners[layer][rows]) | (before == SHARED))
+            assert projection.weight.has_sorted_indices
+    assert [population.relays for population in network.populations] == [clocks, 0, 0, 0]
+    assert network.classes == 4
+    assert network.readout.label.tolist() == [0, 1, 2, 3] * 3
+    events = events_of(7)
+    wanted = float_spikes(wide, seen, events, dtype="float64")
+    found = run_float(network, channels_last(events, dynamics.clocks)).spikes
+    for (name, spikes), ours in zip(wanted.items(), found, strict=True):
+        assert_array_equal(ours, spikes, err_msg=name)
+
+
+def test_one_tower_expands_as_ever(tmp_path):
+    """Dense stages store every pair, zeros too."""
+    written(tmp_path / "x.pt", dynamics=PLAIN)
+    checkpoint = read_checkpoint(tmp_path / "x.pt")
+    weight = np.where(np.abs(checkpoint.dense[0].weight) < 0.1, 0, checkpoint.dense[0].weight)
+    sparse = replace(checkpoint, dense=(replace(checkpoint.dense[0], weight=weight), *checkpoint.dense[1:]))
+    _, seen = written(tmp_path / "x.pt", dynamics=PLAIN)
+    projection = expand(sparse, seen).projections[1]
+    assert projection.weight.nnz == weight.size
+    assert_array_equal(projection.weight.toarray(), weight)
+
+
+# --- the chip ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+@pytest.mark.parametrize("dynamics", [PLAIN, TIMING], ids=["plain", "timed"])
+def test_compiled_and_verified(tmp_path, system, dynamics):
+    _, wide, seen = joined(tmp_path, system, dynamics)
+    compilation = compile_network(expand(wide, seen), training_events=events_of(8, samples=12))
+    events = events_of(9, samples=6, steps=25)
+    labels, files = np.arange(6) % 4, tuple(f"r{i}" for i in range(6))
+    verdict = verify(compilation.netlist, wide, seen, events, labels, files, spec_samples=3)
+    assert verdict.spec_equals_engine
+    assert verdict.certificate.unproven == ()
+    assert dict(verdict.ladder)["float64"] == dict.fromkeys(wide.neurons, 0)
+    assert verdict.float_counts.shape == verdict.chip_counts.shape == (6, 4)
+    assert_array_equal(
+        verdict.float_counts, float_spikes(wide, seen, events)["fc3"].sum(axis=1).reshape(6, 3, 4).sum(axis=1)
+    )
+    for name, found in verdict.spikes.items():
+        assert found.float > 0, name
+        assert found.different <= 0.03 * 6 * 25 * wide.neurons[name], name
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+@pytest.mark.parametrize("dynamics", [PLAIN, TIMING], ids=["plain", "timed"])
+def test_towers_spike_on_the_chip_as_their_members_with_the_same_storage(tmp_path, system, dynamics):
+    """Rounding looks at one neuron at a time, so that equal scales give equal integers."""
+    singles, wide, seen = joined(tmp_path, system, dynamics)
+    shared = [Form(bits=8, exponents=(0,), threshold=np.full(n, 40, np.int64)) for n in wide.neurons.values()]
+    events = channels_last(events_of(9, samples=6, steps=25), dynamics.clocks)
+    one = [
+        tuple(
+            replace(form, threshold=form.threshold[: single.neurons[name]])
+            for form, name in zip(shared, wide.neurons, strict=True)
+        )
+        for single in singles
+    ]
+    alone = [
+        dict(zip(wide.neurons, run_integer(round_to_forms(expand(s, seen), f)[0], events).spikes, strict=True))
+        for s, f in zip(singles, one, strict=True)
+    ]
+    found = run_integer(round_to_forms(expand(wide, seen), shared)[0], events).spikes
+    for name, spikes in zip(wide.neurons, found, strict=True):
+        assert_array_equal(spikes, one_by_one(alone, wide, name), err_msg=name)
+    assert found[-1].any()
+
+
+def tuned(checkpoint, seed):
+    """A network with storage of its own, as fine-tuning leaves it: a threshold for each neuron."""
+    rng = np.random.default_rng(seed)
+    forms = tuple(
+        Form(bits=bits, exponents=exponents, threshold=rng.integers(20, 60, size=neurons))
+        for (bits, exponents), neurons in zip(FORMS, checkpoint.neurons.values(), strict=True)
+    )
+    return replace(checkpoint, forms=forms)
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+def test_fine_tuned_networks_keep_every_spike(tmp_path, system):
+    singles, _, seen = joined(tmp_path, system, PLAIN)
+    singles = [tuned(single, seed) for seed, single in enumerate(singles)]
+    wide = stored(tmp_path / "tuned.pt", join(singles, ["a", "b", "c"]))
+    events = events_of(10, samples=5, steps=25)
+    parts = [compile_network(expand(s, seen), forms=s.forms, keep_all=True).netlist for s in singles]
+    netlist = compile_network(expand(wide, seen), forms=wide.forms, keep_all=True).netlist
+    flat = with_clocks(events, wide.dynamics.clocks)
+    traces = [engine.simulate(part, flat, spikes=True) for part in parts]
+    alone = [
+        {name: aligned(part, trace.spikes, layer) for layer, name in enumerate(wide.neurons)}
+        for part, trace in zip(parts, traces, strict=True)
+    ]
+    trace = engine.simulate(netlist, flat, spikes=True)
+    torch_model = quantised_spikes(wide, seen, events)
+    for layer, name in enumerate(wide.neurons):
+        found = aligned(netlist, trace.spikes, layer)
+        assert_array_equal(found, one_by_one(alone, wide, name), err_msg=name)
+        assert_array_equal(torch_model[name], found, err_msg=name)
+    summed = sum(class_counts(part, t.counts.spikes) for part, t in zip(parts, traces, strict=True))
+    assert_array_equal(class_counts(netlist, trace.counts.spikes), summed)
+    assert summed.any()
+
+
+def test_values_lie_side_by_side(tmp_path):
+    _, wide, _ = joined(tmp_path, "grid-cnn")
+    every = [
+        {name: np.arange(100 * tower, 100 * tower + neurons) for name, neurons in member.neurons.items()}
+        for tower, member in enumerate(members(wide))
+    ]
+    found = side_by_side(wide, every)
+    for name in wide.neurons:
+        expected = one_by_one(every, wide, name, np.int64)
+        clocks = 3 if name == "conv1" else 0
+        assert_array_equal(found[name][: len(expected) - clocks], expected[: len(expected) - clocks])
+
+
+def test_yardsticks_count_no_weights_between_towers(tmp_path):
+    singles, wide, seen = joined(tmp_path, dynamics=PLAIN)
+    events = events_of(3, samples=4)
+
+    def bench(checkpoint):
+        return yardsticks.measure(checkpoint, seen, events, float_spikes(checkpoint, seen, events)).neurobench
+
+    alone, found = [bench(single) for single in singles], bench(wide)
+    for name in ("footprint", "effective_acs", "effective_macs", "dense"):
+        assert getattr(found, name) == pytest.approx(sum(getattr(each, name) for each in alone), rel=1e-12), name
+
+
+# --- commands ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    """Recordings, three networks trained on them with clocks and three without, joined and compiled."""
+    place = tmp_path_factory.mktemp("joined-data")
+    splits = [replace(synthetic_grasps(per_class=3, steps=14, seed=s), split=n) for n, s in (("train", 1), ("test", 2))]
+    write_released(place / "data", splits)
+    timed = "--recipe timed --clocks 4 --features 4 --epochs 2"
+    for seed in SEEDS:
+        for name, options in (("timed", timed), ("plain", "--features 4 --epochs 1")):
+            words = f"train --data {place}/data --graph manual {options} --seed {seed} -o {place}/{name}{seed}.pt"
+            assert main(words.split()) == 0
+    for name in ("timed", "plain"):
+        words = " ".join(f"{place}/{name}{seed}.pt" for seed in SEEDS)
+        assert main(f"join {words} -o {place}/{name}.pt --weights last".split()) == 0
+        assert main(f"compile {place}/{name}.pt --calibrate {place}/data -o {place}/{name}.loom".split()) == 0
+    return place
+
+
+def as_json(capsys, words):
+    assert main([*words.split(), "--json"]) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def refusal(capsys, words):
+    capsys.readouterr()
+    assert main(words.split()) == 2
+    return capsys.readouterr().err
+
+
+def test_the_record_tells_every_tower(data, capsys):
+    capsys.readouterr()
+    inspected = as_json(capsys, f"inspect {data}/timed.pt")
+    assert inspected["towers"] == 3
+    assert inspected["classes"] == 6
+    record = inspected["training"]
+    assert record["command"] == "spikeloom join timed1.pt timed2.pt timed3.pt --weights last"
+    assert [tower["seed"] for tower in record["towers"]] == list(SEEDS)
+    for seed, tower in zip(SEEDS, record["towers"], strict=True):
+        single = as_json(capsys, f"inspect {data}/timed{seed}.pt")
+        assert tower["file"] == f"timed{seed}.pt"
+        assert (tower["sha256"], tower["weights"]) == (single["sha256"], "last")
+        for key in ("command", "seed", "data_sha256", "last"):
+            assert tower[key] == single["training"][key], key
+    assert main(["inspect", f"{data}/timed.pt"]) == 0
+    shown = capsys.readouterr().out
+    assert "\n  3 towers vote together, each with a neuron for every class\n" in shown
+    assert f"\n    1: timed2.pt, weights last, seed 2, sha256 {record['towers'][1]['sha256']}\n" in shown
+
+
+def test_equal_input_gives_equal_bytes_and_other_sets_other_ones(data, capsys):
+    words = " ".join(f"{data}/timed{seed}.pt" for seed in SEEDS)
+    for name in ("a", "b"):
+        assert main(f"join {words} --weights last -o {data}/{name}.pt".split()) == 0
+    assert (data / "a.pt").read_bytes() == (data / "b.pt").read_bytes() == (data / "timed.pt").read_bytes()
+    report = as_json(capsys, f"join {words} --weights clean -o {data}/c.pt") if not capsys.readouterr().err else None
+    assert report is not None
+    assert [tower["weights"] for tower in report["towers"]] == ["clean"] * 3
+    wide = read_checkpoint(data / "c.pt")
+    assert wide.weights == "last"
+    for seed, member in zip(SEEDS, members(wide), strict=True):
+        clean = read_checkpoint(data / f"timed{seed}.pt", weights="clean")
+        assert_array_equal(member.dense[0].weight, clean.dense[0].weight)
+
+
+@pytest.mark.parametrize("name", ["timed", "plain"])
+def test_every_command_takes_a_joined_network(data, capsys, name):
+    capsys.readouterr()
+    wide, netlist, shared = f"{data}/{name}.pt", f"{data}/{name}.loom", f"--data {data}/data"
+    inspected = as_json(capsys, f"inspect {netlist}")
+    assert inspected["layers"][-1]["neurons"] == 18
+    assert inspected["provenance"]["towers"] == 3
+    verdict = as_json(capsys, f"verify {netlist} --checkpoint {wide} {shared} --min-agreement 0.8")
+    assert verdict["spec_equals_engine"] is True
+    decided = as_json(capsys, f"run {netlist} {shared}")
+    assert len(decided["counts"][0]) == 6
+    assert decided["predictions"] == np.argmax(decided["counts"], axis=1).tolist()
+    assert as_json(capsys, f"estimate {netlist} {shared}")
+    assert as_json(capsys, f"explain {netlist} --checkpoint {wide} {shared}")["sample"]
+    assert as_json(capsys, f"yardsticks {wide} {shared}")["samples"] == decided["samples"]
+    found = as_json(capsys, f"bits {wide} --calibrate {data}/data --agreement 0.5 --widths 4,8 --no-cache")
+    assert found["recommended"]["agreement"] >= 0.5
+    assert as_json(capsys, f"export {netlist} --to onnx -o {data}/x.onnx")["form"] == "scan"
+
+
+def test_onnxruntime_and_watch_decide_as_run(data, capsys):
+    pytest.importorskip("onnxruntime")
+    capsys.readouterr()
+    for name in ("timed", "plain"):
+        words = f"verify {data}/{name}.loom --checkpoint {data}/{name}.pt --data {data}/data --engine onnx"
+        verdict = as_json(capsys, f"{words} --min-agreement 0")
+        assert (verdict["spec_equals_engine"], verdict["engine_different"]) == (True, 0)
+    decided = as_json(capsys, f"run {data}/timed.loom --data {data}/data")
+    recordings, _ = load_data(f"{data}/data", "test", limit=None, classes=6, taxels=39)
+    lines = []
+    for events in recordings.events:
+        step, taxel, polarity = np.nonzero(events.transpose(2, 0, 1))
+        lines += [f"{0.02 * s + 0.001:.3f},{x},{p}" for s, x, p in zip(step, taxel, polarity, strict=True)] + [""]
+    (data / "lines.csv").write_text("\n".join(lines) + "\n")
+    assert main(f"watch {data}/timed.loom --input {data}/lines.csv --bins 14 --json".split()) == 0
+    shown = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [entry["counts"] for entry in shown if entry["kind"] == "grasp"] == decided["counts"]
+
+
+@pytest.mark.parametrize("form", ["step", "scan"])
+def test_the_float_graph_sums_the_votes(tmp_path, capsys, form):
+    onnxruntime = pytest.importorskip("onnxruntime")
+    _, wide, seen = joined(tmp_path, dynamics=PLAIN)
+    report = as_json(capsys, f"export {tmp_path}/wide.pt --to onnx-float --form {form} -o {tmp_path}/x.onnx")
+    assert report["neurons"] == sum(wide.neurons.values())
+    session = onnxruntime.InferenceSession(f"{tmp_path}/x.onnx", providers=["CPUExecutionProvider"])
+    events = events_of(12, samples=5, steps=20)
+    counts = readout_counts(wide.readout, 4, float_spikes(wide, seen, events)["fc3"])
+    flat = np.ascontiguousarray(events.reshape(5, 78, -1).transpose(2, 0, 1))
+    if form == "scan":
+        votes, decided = session.run(["votes", "class"], {"events": flat})
+        assert_array_equal(decided, vote(counts))
+    else:
+        state = {port.name: np.zeros((5, port.shape[1]), np.float32) for port in session.get_inputs()}
+        state["votes"] = state["votes"].astype(np.int32)
+        names = [port.name for port in session.get_outputs()]
+        for step in flat:
+            out = dict(zip(names, session.run(None, state | {"events": step}), strict=True))
+            state = {name: out[f"{name}_next"] for name in state if name != "events"}
+        votes = state["votes"]
+    assert_array_equal(votes, counts)
+    assert len(np.unique(counts, axis=0)) > 1
+
+
+@pytest.mark.parametrize("form", ["step", "scan"])
+def test_a_float_graph_comes_back_with_its_groups(tmp_path, capsys, form):
+    """From the ONNX file the compiler reads four classes of three neurons, and no synapses between towers."""
+    _, wide, seen = joined(tmp_path, dynamics=PLAIN)
+    as_json(capsys, f"export {tmp_path}/wide.pt --to onnx-float --form {form} -o {tmp_path}/back.onnx")
+    found, ours = read_onnx(f"{tmp_path}/back.onnx").network, expand(wide, seen)
+    assert found.classes == 4
+    assert found.readout.label.tolist() == ours.readout.label.tolist()
+    for theirs, projection in zip(found.projections[1:], ours.projections[1:], strict=True):
+        assert theirs.weight.count_nonzero() == projection.weight.count_nonzero()
+
+
+def test_what_disagrees_is_listed_in_one_line(tmp_path, capsys):
+    written(tmp_path / "a.pt")
+    other = Dynamics(betas=(0.2, 0.3, 0.1, 0.4), alphas=(0.0, 0.9, 0.5, 0.0), clocks=Clocks(channels=2, steps=5))
+    written(tmp_path / "b.pt", "gcn", other, classes=5, features=2, hidden=(8, 7))
+    written(tmp_path / "c.pt", theta=0.75)
+    place = str(tmp_path)
+    assert refusal(capsys, f"join {place}/a.pt {place}/b.pt {place}/c.pt -o {place}/x.pt") == (
+        f"spikeloom: join: the networks differ in system ({place}/a.pt: tactilesgnet; {place}/b.pt: gcn), "
+        f"classes ({place}/a.pt: 4; {place}/b.pt: 5), "
+        f"layers ({place}/a.pt: 3 filters of 3 features, fc1 8, fc2 6, fc3 4; "
+        f"{place}/b.pt: 1 filters of 2 features, fc1 8, fc2 7, fc3 5), "
+        f"membrane decays ({place}/a.pt: 0.2, 0.3, 0.0, 0.4; {place}/b.pt: 0.2, 0.3, 0.1, 0.4), "
+        f"current decays ({place}/a.pt: 0.0, 0.95, 0.5, 0.0; {place}/b.pt: 0.0, 0.9, 0.5, 0.0), "
+        f"threshold ({place}/a.pt: 0.5; {place}/c.pt: 0.75), "
+        f"clocks ({place}/a.pt: 3 of 4 steps; {place}/b.pt: 2 of 5 steps); "
+        "give networks of one system, sensor and timing\n"
+    )
+    assert not (tmp_path / "x.pt").exists()
+
+
+def test_graphs_and_storage_must_agree(tmp_path):
+    written(tmp_path / "a.pt", dynamics=PLAIN)
+    one = read_checkpoint(tmp_path / "a.pt")
+    turned = replace(one, edges=one.edges[::-1], graph="the same, listed the other way round")
+    assert join([one, turned], ["a", "b"]).towers == 2
+    another = replace(one, edges=build_graph("knn:1").edges, graph="knn:1")
+    with pytest.raises(ModelError, match=r"differ in graph \(a: \d+ edges #[0-9a-f]{8}; b: \d+ edges #[0-9a-f]{8}\);"):
+        join([one, another], ["a", "b"])
+    with pytest.raises(ModelError) as error:
+        join([one, tuned(one, 1)], ["a", "b"])
+    assert str(error.value) == (
+        "join: the networks differ in storage (a: none; b: 8 bits with exponents [0], 4 bits with exponents [-1], "
+        "8 bits with exponents [0, 4], 6 bits with exponents [1]); give networks of one system, sensor and timing"
+    )
+
+
+def test_what_cannot_be_joined_says_so(data, tmp_path, capsys):
+    one = f"{data}/plain1.pt"
+    assert refusal(capsys, f"join {one} -o {tmp_path}/x.pt") == (
+        f"spikeloom: join: {one} is one network already; give two or more\n"
+    )
+    assert refusal(capsys, f"join {one} {one} -o {one}") == (
+        f"spikeloom: -o {one}: is an input of this command ({one}); give another name\n"
+    )
+    assert refusal(capsys, f"join {one} {data}/plain.loom -o {tmp_path}/x.pt") == (
+        f"spikeloom: {data}/plain.loom: is a netlist, its weights are rounded already; "
+        "give the checkpoint it was made from\n"
+    )
+    assert refusal(capsys, f"join {one} {data}/plain.pt --weights best -o {tmp_path}/x.pt") == (
+        f"spikeloom: {data}/plain.pt: --weights best: the file holds last; choose one that it holds\n"
+    )
+    old = tmp_path / "old.t7"
+    torch.save(released(state_dict(weights())), old)
+    assert refusal(capsys, f"join {one} {old} -o {tmp_path}/x.pt") == (
+        f"spikeloom: {old}: does not say its graph and constants; give checkpoints that spikeloom train wrote\n"
+    )
+    assert refusal(capsys, f"finetune {data}/plain.pt --data {data}/data --weight-bits 4 -o {tmp_path}/x.pt") == (
+        f"spikeloom: {data}/plain.pt: has 3 towers, which fine-tuning takes one by one; fine-tune what it was joined "
+        "from, then join that\n"
+    )
+    assert not (tmp_path / "x.pt").exists()
+
+
+def test_fine_tuned_members_join_and_verify(data, tmp_path, capsys):
+    """What was trained on chip integers is on the chip together with its neighbours, spike for spike."""
+    for seed in SEEDS[:2]:
+        words = f"finetune {data}/plain{seed}.pt --data {data}/data --weight-bits 4 --scale-groups 2 --epochs 1"
+        assert main(f"{words} -o {tmp_path}/{seed}.pt".split()) == 0
+    assert main(f"join {tmp_path}/1.pt {tmp_path}/2.pt -o {tmp_path}/x.pt".split()) == 0
+    assert main(f"compile {tmp_path}/x.pt -o {tmp_path}/x.loom".split()) == 0
+    capsys.readouterr()
+    verdict = as_json(
+        capsys, f"verify {tmp_path}/x.loom --checkpoint {tmp_path}/x.pt --data {data}/data --min-agreement 0"
+    )
+    assert verdict["quantised_different"] == 0
+    towers = as_json(capsys, f"inspect {tmp_path}/x.pt")["training"]["towers"]
+    assert all(tower["fine_tuned_from"] for tower in towers)
