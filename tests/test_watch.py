@@ -439,8 +439,9 @@ def test_a_reader_that_goes_away_ends_it(pair_file, lines, monkeypatch):
 
 
 SCRIPT = """
-import argparse, sys
+import argparse, signal, sys
 from runtime import watch
+signal.signal(signal.SIGINT, signal.default_int_handler)  # jobs in the background start with interrupts ignored
 parser = argparse.ArgumentParser()
 parser.add_argument("--json", action="store_true")
 watch.add_arguments(parser)
