@@ -1,4 +1,4 @@
-"""Write our own checkpoint format; :mod:`compiler.frontends.checkpoint` describes and reads it."""
+"""Write our own checkpoint format; :mod:`compiler.frontends.own` describes and reads it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import torch
 from compiler.atomic import write_atomically
 from compiler.dynamics import PLAIN, Dynamics
 from compiler.forms import Form
-from compiler.frontends.checkpoint import FORMAT, VERSIONS, content_digest
+from compiler.frontends.own import FORMAT, VERSIONS, content_digest
 from compiler.frontends.systems import TACTILESGNET, Grid
 from models.evtouch import Recordings
 from models.graphs import Graph

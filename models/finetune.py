@@ -29,7 +29,8 @@ from tqdm import tqdm
 from compiler.errors import DataError, ModelError, OptionError
 from compiler.fixedpoint import BIAS_EXPONENT_MAX, BIAS_MANTISSA_MAX, MEMBRANE_SHIFT, THRESHOLD_MANTISSA_MAX
 from compiler.forms import Form, reach, step_units
-from compiler.frontends.checkpoint import Checkpoint, arrays_digest
+from compiler.frontends.checkpoint import Checkpoint
+from compiler.frontends.own import arrays_digest
 from compiler.interpret import channels_last
 from compiler.ir import Network
 from compiler.passes.calibrate import Calibration, calibrate, evenly_spaced

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compiler.errors import DataError
-from compiler.frontends.checkpoint import arrays_digest
+from compiler.frontends.own import arrays_digest
 from models.evtouch import Recordings
 from models.networks import Architecture
 from models.recipes import RELEASED, Recipe

@@ -30,7 +30,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from compiler.errors import DataError, OptionError
-from compiler.frontends.checkpoint import arrays_digest
+from compiler.frontends.own import arrays_digest
 from models.evtouch import Recordings
 from models.networks import Architecture, SpikingNet, Weights
 from models.optimizers import course_of, optimizer_of, set_rate

@@ -21,7 +21,8 @@ from typing import Any
 from compiler.atomic import write_atomically
 from compiler.errors import ModelError, OptionError
 from compiler.fixedpoint import FloatArray
-from compiler.frontends.checkpoint import Checkpoint, arrays_digest
+from compiler.frontends.checkpoint import Checkpoint
+from compiler.frontends.own import arrays_digest
 from compiler.interpret import channels_last
 from compiler.passes.expand import expand
 from compiler.passes.widths import Found, Point, check_widths, front, search

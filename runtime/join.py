@@ -11,7 +11,8 @@ from typing import Any
 
 from compiler.atomic import remove_leftovers
 from compiler.errors import ModelError, OptionError
-from compiler.frontends.checkpoint import WEIGHTS, Checkpoint, read_checkpoint
+from compiler.frontends.checkpoint import Checkpoint, read_checkpoint
+from compiler.frontends.own import WEIGHTS
 from compiler.frontends.towers import arrays_of
 from compiler.frontends.towers import join as join_networks
 from compiler.serialize import is_netlist

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from compiler.errors import OptionError
-from compiler.frontends.checkpoint import WEIGHTS
+from compiler.frontends.own import WEIGHTS
 from compiler.frontends.systems import GRAPH_SYSTEMS, SYSTEMS, TACTILESGNET
 from compiler.passes.layout import GOALS
 from compiler.passes.quantize import RANGES

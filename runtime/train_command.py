@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from compiler.errors import OptionError
-from compiler.frontends.checkpoint import WEIGHTS
+from compiler.frontends.own import WEIGHTS
 from compiler.frontends.systems import GRAPH_SYSTEMS, GRID_CNN, TACTILESGNET, TITLES, Grid
 from models.evtouch import Recordings
 from models.graphs import CHOICES, Graph

@@ -14,7 +14,8 @@ import numpy as np
 
 from compiler.errors import OptionError
 from compiler.fixedpoint import FloatArray, IntArray
-from compiler.frontends.checkpoint import WEIGHTS, read_checkpoint
+from compiler.frontends.checkpoint import read_checkpoint
+from compiler.frontends.own import WEIGHTS
 from compiler.frontends.systems import TACTILESGNET, Grid
 from models.evtouch import Recordings
 from models.graphs import Graph

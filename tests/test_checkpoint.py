@@ -16,7 +16,8 @@ import pytest
 import torch
 
 from compiler.errors import ModelError, OptionError
-from compiler.frontends.checkpoint import SIZE_LIMIT, content_digest, read_checkpoint
+from compiler.frontends.checkpoint import SIZE_LIMIT, read_checkpoint
+from compiler.frontends.own import content_digest
 from models.checkpoint import checkpoint_bytes, save_checkpoint, training_record
 from models.evtouch import Recordings
 from models.graphs import Graph

@@ -10,7 +10,8 @@ from made_files import ring, small_checkpoint, weights
 
 from compiler.errors import DataError, ModelError, OptionError
 from compiler.fixedpoint import ONE_STEP_SUM_MAX
-from compiler.frontends.checkpoint import content_digest, read_checkpoint
+from compiler.frontends.checkpoint import read_checkpoint
+from compiler.frontends.own import content_digest
 from compiler.interpret import channels_last, run_integer
 from compiler.lift import lift
 from compiler.passes.calibrate import calibrate
