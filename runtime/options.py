@@ -81,6 +81,9 @@ def add_training(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--clocks", type=int, metavar="K", help="inputs that tell which K-th of the recording it is")
     parser.add_argument("--features", type=int, metavar="N", help="of the first layer, per place")
     parser.add_argument("--batch", type=int, metavar="N", help="recordings to a step of the optimizer")
+    parser.add_argument(
+        "--spike-penalty", type=float, metavar="X", help="loss of a spike on every synapse in every step: fewer spikes"
+    )
     parser.add_argument("--epochs", type=int, metavar="N", help=f"default: {defaults}")
     parser.add_argument(
         "--decay-epochs",
