@@ -20,7 +20,7 @@ from models.graphs import normalised_adjacency
 from models.grasps import synthetic_grasps
 from models.layers import LifSteps, lif
 from models.networks import Architecture, SpikingNet
-from models.recipes import RECIPES, RELEASED, TIMED, Recipe, check_recipe, decays_asked
+from models.recipes import RECIPES, RELEASED, SMOOTH, TIMED, Recipe, check_recipe, decays_asked
 from models.reference import float_membranes, float_spikes
 from models.release import write_released
 from models.surrogate import FAST_SIGMOID, RECTANGLE, Surrogate
@@ -28,7 +28,7 @@ from models.train import evaluate, train
 from runtime.cli import main
 
 ADJACENCY = normalised_adjacency(GRAPH.edges, 39)
-SMOOTH = Surrogate(shape=FAST_SIGMOID, width=0.25, reset=False)
+SIGMOID = Surrogate(shape=FAST_SIGMOID, width=0.25, reset=False)
 
 
 def surrogate_spike(surrogate):
@@ -85,7 +85,9 @@ def test_the_reset_leaves_the_current_as_it_is():
     assert membranes[:, 0].tolist() == [2.0, 1.0, 0.5, pytest.approx(0.7)]
 
 
-@pytest.mark.parametrize("surrogate", [RECTANGLE, SMOOTH, replace(SMOOTH, reset=True), replace(RECTANGLE, reset=False)])
+@pytest.mark.parametrize(
+    "surrogate", [RECTANGLE, SIGMOID, replace(SIGMOID, reset=True), replace(RECTANGLE, reset=False)]
+)
 @given(seed=st.integers(0, 2**31), steps=st.integers(1, 30), alpha=st.sampled_from([0.0, 0.5, 0.95]))
 @settings(max_examples=25, deadline=None)
 def test_gradients_equal_plain_autograd(surrogate, seed, steps, alpha):
@@ -117,7 +119,7 @@ def test_gradients_equal_plain_autograd(surrogate, seed, steps, alpha):
 
 def test_the_surrogate_of_a_fast_sigmoid():
     current = torch.tensor([[0.5, 0.75, 0.0]], dtype=torch.float64, requires_grad=True)
-    lif(current, 0.2, 0.5, SMOOTH)[0].sum().backward()
+    lif(current, 0.2, 0.5, SIGMOID)[0].sum().backward()
     assert_allclose(current.grad, [[1.0, 1 / 4, 1 / 9]], rtol=1e-12)
 
 
@@ -192,7 +194,7 @@ def network_step_by_step(network, events, surrogate):
     return spikes
 
 
-@pytest.mark.parametrize("surrogate", [RECTANGLE, SMOOTH])
+@pytest.mark.parametrize("surrogate", [RECTANGLE, SIGMOID])
 @pytest.mark.parametrize("dynamics", [TIMING, replace(TIMING, alphas=()), Dynamics(alphas=(0.6, 0.0, 0.0, 0.9)), PLAIN])
 def test_gradients_of_a_whole_network_equal_plain_autograd(surrogate, dynamics):
     sizes = replace(SMALL, dynamics=dynamics)
@@ -308,7 +310,8 @@ def test_another_beta_for_a_network_with_one_a_layer_is_refused(tmp_path):
 
 
 def test_the_released_recipe_is_the_released_code():
-    assert RECIPES == {"released": RELEASED, "timed": TIMED}
+    assert RECIPES == {"released": RELEASED, "timed": TIMED, "smooth": SMOOTH}
+    assert SMOOTH.dynamics(("conv1", "fc1"), 0.2, 250) == RELEASED.dynamics(("conv1", "fc1"), 0.2, 250)
     assert RELEASED == Recipe(
         name="released", epochs=100, batch=1, loss="mse", optimizer="adam", learning_rate=1e-3, schedule="steps"
     )
