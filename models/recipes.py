@@ -1,4 +1,4 @@
-"""How a network is trained, as data: the released way, one for networks that tell the time, one in between.
+"""How a network is trained, as data: the released way, and one for networks that tell the time.
 
 A recipe is what ``train --recipe`` names; single values may be overridden there. It says nothing of the data, the
 system or the graph, and nothing of how a training is reported (:mod:`models.protocols`).
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from compiler.dynamics import MOST_CLOCKS, Dynamics, clocks_over
@@ -126,10 +126,7 @@ TIMED = Recipe(
 )
 """For recordings that differ in when their events come: currents that last 20 steps, and clocks."""
 
-SMOOTH = replace(TIMED, name="smooth", smoothing=0.1, weight_decay=0.5, betas=(), alphas=(), clocks=0)
-"""The same training of networks without either, with smoother labels."""
-
-RECIPES = {recipe.name: recipe for recipe in (RELEASED, TIMED, SMOOTH)}
+RECIPES = {recipe.name: recipe for recipe in (RELEASED, TIMED)}
 
 
 def held_decays(beta: float, alpha: float) -> tuple[float, float]:

@@ -70,7 +70,7 @@ def add_training(parser: argparse.ArgumentParser) -> None:
         "--recipe",
         choices=tuple(RECIPES),
         default=RELEASED.name,
-        help="how: as the released code does, with lasting currents and clocks (timed), or as the latter without these",
+        help="how: as the released code does, or with lasting currents and clocks (default: released)",
     )
     parser.add_argument(
         "--current-decay", metavar="LAYER=X[,…]", help="share of the synaptic current that a step keeps: fc1=0.95"

@@ -20,7 +20,7 @@ from models.graphs import normalised_adjacency
 from models.grasps import synthetic_grasps
 from models.layers import LifSteps, lif
 from models.networks import Architecture, SpikingNet
-from models.recipes import RECIPES, RELEASED, SMOOTH, TIMED, Recipe, check_recipe, decays_asked
+from models.recipes import RECIPES, RELEASED, TIMED, Recipe, check_recipe, decays_asked
 from models.reference import float_membranes, float_spikes
 from models.release import write_released
 from models.surrogate import FAST_SIGMOID, RECTANGLE, Surrogate
@@ -310,8 +310,7 @@ def test_another_beta_for_a_network_with_one_a_layer_is_refused(tmp_path):
 
 
 def test_the_released_recipe_is_the_released_code():
-    assert RECIPES == {"released": RELEASED, "timed": TIMED, "smooth": SMOOTH}
-    assert SMOOTH.dynamics(("conv1", "fc1"), 0.2, 250) == RELEASED.dynamics(("conv1", "fc1"), 0.2, 250)
+    assert RECIPES == {"released": RELEASED, "timed": TIMED}
     assert RELEASED == Recipe(
         name="released", epochs=100, batch=1, loss="mse", optimizer="adam", learning_rate=1e-3, schedule="steps"
     )
