@@ -49,8 +49,8 @@ class ProcessDied(Exception):  # noqa: N818 - it is handed over, not raised
 
 
 def cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """Cores of this machine."""
+    return os.cpu_count() or 1
 
 
 @contextmanager
