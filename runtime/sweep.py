@@ -14,16 +14,18 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from tqdm import tqdm
 
 from compiler.errors import OptionError, SpikeloomError, UnfinishedError
+from runtime.cluster import ClusterLostError, run_on_cluster
 from runtime.sweep_store import Store, opened
-from runtime.workers import ProcessDied, cores, ended_by_signal, one_thread_each, run_side_by_side
+from runtime.workers import ProcessDied, attempt, cores, ended_by_signal, one_thread_each, run_side_by_side
 
 Json = dict[str, Any]
 Measure = Callable[[Any], Json]
+AResult = TypeVar("AResult")
 
 TRIES = 3
 """How often a point whose process dies is begun."""
@@ -42,7 +44,7 @@ class Point:
     label : str
         For messages.
     payload : picklable
-        What `measure` is given: paths and options, no arrays.
+        What `measure` is given: absolute paths and options, no arrays; it may travel to another machine.
     """
 
     key: str
@@ -147,10 +149,10 @@ def sweep(
         there = tqdm(total=len(keys), initial=len(keys) - len(waiting), desc=label, unit="point", disable=None)
         with there as bar, ended_by_signal(), one_thread_each():
             try:
-                with closing(_measured(waiting, measure, jobs or cores(), scheduler)) as measured:
+                with closing(spread(waiting, measure, processes=jobs or cores(), scheduler=scheduler)) as measured:
                     for point, found in measured:
                         if isinstance(found, ProcessDied):
-                            lost.append(f"{point.label}: {found} {TRIES} times, perhaps for lack of memory; left out")
+                            lost.append(f"{point.label}: {found}, perhaps for lack of memory; left out")
                         elif isinstance(found, Exception):
                             found.add_note(point.label)
                             raise found
@@ -159,6 +161,8 @@ def sweep(
                             bar.update()
             except KeyboardInterrupt as interrupt:
                 raise KeyboardInterrupt(f"{_kept(kept, keys)}; go on with the same command") from interrupt
+            except ClusterLostError:
+                lost.append(f"--scheduler {scheduler}: was lost")
             except SpikeloomError as error:
                 error.add_note(_kept(kept, keys))
                 raise
@@ -172,26 +176,41 @@ def _kept(store: Store, keys: Sequence[str]) -> str:
     return f"{sum(key in store.results for key in keys)} of {len(keys)} points are kept in {store.path}"
 
 
-def _measured(
-    points: Sequence[Point], measure: Measure, processes: int, scheduler: str | None
-) -> Generator[tuple[Point, Json | Exception]]:
-    """Points and what came of them, as they come."""
-    if scheduler is not None:
-        raise OptionError("--scheduler: is not there yet")
-    if min(processes, len(points)) <= 1:
-        for point in points:
-            try:
-                found: Json | Exception = measure(point.payload)
-            except (SpikeloomError, OSError, MemoryError) as error:
-                found = error
-            yield point, found
-        return
+def spread(
+    points: Sequence[Point], measure: Callable[[Any], AResult], *, processes: int, scheduler: str | None = None
+) -> Generator[tuple[Point, AResult | Exception]]:
+    """Measure points wherever that was asked for; what `sweep` does without its store.
 
-    def again(index: int, died: ProcessDied) -> None:
-        tqdm.write(f"spikeloom: {points[index].label}: {died}; tried again", file=sys.stderr)
+    Yields
+    ------
+    (Point, result)
+        As they come: what was measured, the exception that the measurement raised, or
+        :class:`runtime.workers.ProcessDied` where that ended its process `TRIES` times.
 
+    Raises
+    ------
+    OptionError, ClusterLostError
+        See :func:`runtime.cluster.run_on_cluster`.
+    """
     payloads = [point.payload for point in points]
-    at_work = run_side_by_side(payloads, measure, processes=processes, tries=TRIES, again=again)
-    with closing(at_work):
-        for index, come in at_work:
-            yield points[index], come
+    if not points:
+        return
+    if scheduler is not None:
+        measured = run_on_cluster(payloads, measure, scheduler=scheduler, tell=_tell)
+    elif min(processes, len(points)) == 1:
+        measured = ((index, attempt(measure, payload)) for index, payload in enumerate(payloads))
+    else:
+        measured = run_side_by_side(
+            payloads,
+            measure,
+            processes=processes,
+            tries=TRIES,
+            again=lambda index, died: _tell(f"{points[index].label}: {died}; tried again"),
+        )
+    with closing(measured):
+        for index, found in measured:
+            yield points[index], found
+
+
+def _tell(line: str) -> None:
+    tqdm.write(f"spikeloom: {line}", file=sys.stderr)
