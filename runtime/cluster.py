@@ -68,7 +68,7 @@ def run_on_cluster(
         If the scheduler is lost.
     """
     with _connected(scheduler) as client:
-        _require_alike(client, scheduler)
+        require_alike(client, scheduler)
         blamed = []
         for index, found in _handed_out(client, scheduler, range(len(payloads)), payloads, run, tell):
             if isinstance(found, ProcessDied):
@@ -216,7 +216,7 @@ def source_digest() -> str:
     return digest.hexdigest()[:12]
 
 
-def _require_alike(client: Any, scheduler: str) -> None:
+def require_alike(client: Any, scheduler: str) -> None:
     """Refuse, before anything is measured, workers that are there and cannot take part."""
     for worker, found in sorted(client.run(refusal, facts(), on_error="return").items()):
         if isinstance(found, Exception):
