@@ -11,6 +11,7 @@ import logging
 import platform
 import re
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from concurrent.futures import CancelledError
 from contextlib import contextmanager
 from functools import cache
 from importlib import metadata, resources
@@ -36,6 +37,21 @@ PACKAGES = ("compiler", "runtime", "models")
 
 class ClusterLostError(Exception):
     """The scheduler was there and is no more, or dropped the work."""
+
+    def __str__(self) -> str:
+        return f"--scheduler {self.args[0]}: was lost"
+
+
+def require_address(scheduler: str) -> None:
+    """Refuse what is no address of a scheduler.
+
+    Raises
+    ------
+    OptionError
+        If it is none.
+    """
+    if re.fullmatch(r"(tcp|tls)://.+:\d{1,5}", scheduler) is None:
+        raise OptionError(f"--scheduler {scheduler}: is no address; give one as in tcp://10.0.0.1:8786")
 
 
 def run_on_cluster(
@@ -106,7 +122,11 @@ def _handed_out(
             continue
         index = places.pop(future)
         if future.status == "finished":
-            yield index, future.result()
+            try:
+                found = future.result()
+            except (OSError, CancelledError):  # it came to its end, but not to us
+                raise ClusterLostError(scheduler) from None
+            yield index, found
         elif future.status == "error":
             error = future.exception()
             if not isinstance(error, KilledWorker):
@@ -132,15 +152,14 @@ def _look_after(client: Any, scheduler: str, tell: Callable[[str], object], *, t
 @contextmanager
 def _connected(scheduler: str) -> Iterator[Any]:
     """A client, closed at the end with all that it asked for."""
-    if re.fullmatch(r"(tcp|tls)://.+:\d{1,5}", scheduler) is None:
-        raise OptionError(f"--scheduler {scheduler}: is no address; give one as in tcp://10.0.0.1:8786")
+    require_address(scheduler)
     try:
         from distributed import Client
     except ImportError:
         raise OptionError(
             f"--scheduler {scheduler}: needs Dask, which is not installed; install distributed, or leave it away"
         ) from None
-    for name in ("distributed", "tornado"):
+    for name in ("distributed", "distributed.client", "tornado"):
         logging.getLogger(name).setLevel(logging.CRITICAL)  # what matters is told in one line
     try:
         client = Client(scheduler, timeout=CONNECT_S, set_as_default=False)

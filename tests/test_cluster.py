@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
@@ -10,6 +11,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from socket import create_server
 from types import SimpleNamespace
@@ -17,7 +19,12 @@ from types import SimpleNamespace
 import pytest
 from swept import KIND, VIOLATION, begun, points, square
 
-from compiler.errors import CapacityError, OptionError, UnfinishedError
+from compiler.errors import CapacityError, DataError, OptionError, UnfinishedError
+from models.grasps import synthetic_grasps
+from models.protocols import data_digest
+from models.release import write_released
+from runtime.cell_work import splits_on_worker
+from runtime.cli import main
 from runtime.cluster import facts, refusal, require_alike, source_digest
 from runtime.sweep import sweep
 
@@ -150,7 +157,7 @@ def test_a_scheduler_that_is_lost_leaves_what_came(made, tmp_path, monkeypatch):
     asked = points(log, 5, hold={3: str(held)})
 
     def kill() -> None:
-        until(lambda: 3 in begun(log))
+        until(lambda: 3 in begun(log) and len((tmp_path / "x.store").read_text().splitlines()) == 4)
         cluster.scheduler.kill()
 
     killer = meanwhile(kill)
@@ -272,3 +279,60 @@ def test_without_dask(tmp_path, monkeypatch):
 def test_dask_is_loaded_where_it_is_asked_for_only():
     code = "import sys, runtime.cli, runtime.cluster; sys.exit('distributed' in sys.modules or 'dask' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0
+
+
+# --- reproduce --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_cells_of_the_paper_made_on_a_cluster_are_those_made_here(made, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("runtime.cells.METHODS", (("mlp", "none"), ("gcn", "manual")))
+    splits = [
+        replace(synthetic_grasps(per_class=2, steps=10, seed=seed), split=split)
+        for split, seed in (("train", 1), ("test", 2))
+    ]
+    write_released(tmp_path / "Ev-Grasps", splits)
+    words = ("reproduce", "--data", "Ev-Grasps", "--table", "methods", "--seeds", "1", "--epochs", "1", "-o")
+    cluster = made()
+    cluster.worker()
+    cluster.worker()
+    cluster.reachable(2)
+    assert main([*words, "there", "--scheduler", cluster.address]) == 0
+    assert main([*words, "here", "--jobs", "1"]) == 0
+    capsys.readouterr()
+    files = sorted(path.name for path in Path("here/cells").iterdir())
+    assert files == ["grasps-gcn-manual-e1-s0.json", "grasps-mlp-none-e1-s0.json"]
+    for name in files:
+        here, there = (json.loads((Path(where) / "cells" / name).read_text()) for where in ("here", "there"))
+        here["command"] = here["command"].replace("here/", "there/")
+        assert without_hash(there) == without_hash(here)
+    assert Path("here/methods.csv").read_bytes() == Path("there/methods.csv").read_bytes()
+
+    cluster.scheduler.kill()
+    shutil.rmtree("there")
+    assert main([*words, "there", "--scheduler", cluster.address]) == 2
+    assert capsys.readouterr().err.splitlines()[-1] == (
+        f"spikeloom: --scheduler {cluster.address}: nobody answers there within 5 s; start dask scheduler, or mend the "
+        "address"
+    )
+
+
+def without_hash(cell: dict) -> dict:
+    return {name: value for name, value in cell.items() if name != "checkpoint_sha256"}  # which holds the command
+
+
+def test_recordings_that_differ_on_a_worker(tmp_path):
+    splits = [
+        replace(synthetic_grasps(per_class=1, steps=10, seed=seed), split=split)
+        for split, seed in (("train", 1), ("test", 2))
+    ]
+    write_released(tmp_path / "Ev-Grasps", splits)
+    where = str(tmp_path / "Ev-Grasps")
+    training, test = splits_on_worker(where, data_digest(*splits))
+    assert (len(training), len(test)) == (len(splits[0]), len(splits[1]))
+    with pytest.raises(DataError) as raised:
+        splits_on_worker(where, "0" * 64)
+    assert str(raised.value) == (
+        f"{where}: holds other recordings on a worker than here; share the folder, or copy it there"
+    )
