@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import shlex
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
@@ -19,7 +20,7 @@ import numpy as np
 
 from compiler.atomic import write_atomically
 from compiler.dynamics import with_clocks
-from compiler.errors import OptionError, SpikeloomError
+from compiler.errors import OptionError, SpikeloomError, UnfinishedError
 from compiler.fixedpoint import IntArray
 from compiler.netlist import Netlist
 from compiler.passes.legalize import measure
@@ -310,6 +311,17 @@ def _mistake(error: Exception) -> str:
     return " ".join([str(error), *(f"({note})" for note in getattr(error, "__notes__", ()))])
 
 
+def _go_on(words: Sequence[str], more: Sequence[str]) -> str:
+    """Command that goes on where one has left off.
+
+    Examples
+    --------
+    >>> _go_on(["chart", "a b.pt", "--fresh"], ()), _go_on(["reproduce", "--resume"], ["--resume"])
+    ("spikeloom chart 'a b.pt'", 'spikeloom reproduce --resume')
+    """
+    return shlex.join(["spikeloom", *(w for w in words if w != "--fresh"), *(w for w in more if w not in words)])
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; return its exit code."""
     words = sys.argv[1:] if argv is None else argv
@@ -324,6 +336,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         if "--debug" in words:
             raise
         sys.stderr.writelines(f"spikeloom: {line}\n" for line in _mistake(error).splitlines())
+        if isinstance(error, UnfinishedError):
+            sys.stderr.write(f"spikeloom: go on with: {_go_on(words, error.resume)}\n")
+            return 1
         return 2
     except KeyboardInterrupt as interrupt:
         progress("")
