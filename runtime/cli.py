@@ -28,6 +28,7 @@ from compiler.targets import load_target, with_tables
 from models.evtouch import Recordings
 from models.grasps import SYNTHETIC
 from runtime import (
+    anytime,
     bits,
     decisions,
     explain,
@@ -286,6 +287,7 @@ def build_parser() -> argparse.ArgumentParser:
 
     sub = command("train", train, "train a network by the released protocol, reported by the paper's and a clean one")
     add_training(sub)
+    anytime.add_arguments(command("anytime", anytime.anytime, anytime.SUMMARY))
     bits.add_arguments(command("bits", bits.bits, bits.SUMMARY))
     explain.add_arguments(command("explain", explain.explain, explain.SUMMARY))
     export.add_arguments(command("export", export.export, export.SUMMARY))

@@ -23,7 +23,7 @@ from compiler.targets import Target
 from runtime import charges, cost, energy, engine, timing
 from runtime.cost import Costs
 from runtime.timing import DetailedTimes, SimpleTimes
-from runtime.trace import Charges, Counts
+from runtime.trace import Counts
 
 DETAILS = ("spikes", "counts", "cycle")
 
@@ -134,12 +134,7 @@ def _charged(netlist: Netlist, clocks: Mapping[str, timing.Clock]) -> engine.Eng
     """An engine that adds up the times of the simple model, one table's after the other's."""
     if not clocks:
         return engine.prepare(netlist)
-    each = [charges.charges(clock) for clock in clocks.values()]
-    wanted = Charges(
-        channels=np.concatenate([found.channels for found in each], axis=1),
-        spikes=np.concatenate([found.spikes for found in each], axis=1),
-        updates=np.concatenate([found.updates for found in each], axis=1),
-    )
+    wanted = charges.side_by_side([charges.charges(clock) for clock in clocks.values()])
     return engine.prepare(netlist, charges=wanted)
 
 
