@@ -135,6 +135,17 @@ def lay_out_blocks(netlist: Netlist) -> Blocks | None:
     )
 
 
+def obstacle(netlist: Netlist) -> str | None:
+    """Why there are no blocks of a netlist; None if there are."""
+    if not _is_pipeline(netlist):
+        return "a layer hears others than the one before it"
+    if not _in_range(netlist):
+        return "a sum may leave 16 bits, or a membrane or current its register"
+    if lay_out_blocks(netlist) is None:
+        return "synapses too scattered for rows of 64"
+    return None
+
+
 def charge_rows(netlist: Netlist, blocks: Blocks, charges: Charges | None) -> ChargeRows:
     """Lay charges out for the kernel: padded, by channel and position."""
     if charges is None:
