@@ -53,14 +53,13 @@ def _windows(axes: Any, report: Json) -> None:
 
 
 def _drawn(report: Json) -> list[tuple[Json, str, str, str]]:
-    """The proof, the strictest calibrated rule and the chosen one: each with label, colour and line."""
+    """The proof, the chosen rule and the loosest one: each with label, colour and line."""
     rules = report["rules"]
     found = [(rules[0], "proven", "C0", "-")]
     if len(rules) > 1:
-        found.append((rules[1], f"sure, {100 * rules[1]['allowed']:g} %", "C2", "--"))
-    if report.get("chosen", 1) > 1:
-        rule = rules[report["chosen"]]
-        found.append((rule, f"sure, {100 * rule['allowed']:g} %", "C3", ":"))
+        shown = dict.fromkeys((report["chosen"], len(rules) - 1))
+        for index, colour, line in zip(shown, ("C2", "C3"), ("--", ":"), strict=False):
+            found.append((rules[index], f"sure, {100 * rules[index]['allowed']:g} %", colour, line))
     return found
 
 

@@ -208,6 +208,7 @@ class _Session:
         )
         self.loose = replace(self.strict, allowed=allowed)
         self.rows: list[Json] = []
+        self.overflowing: list[str] = []
         self._kept: list[tuple[int, Netlist]] = []
 
     def report(self) -> Json:
@@ -242,6 +243,7 @@ class _Session:
             "layers": self._layers(),
             "taxels": self._taxels(changed, changed_test),
             "rows": self.rows,
+            "overflowing": self.overflowing,
         }
 
     def _trials(self) -> tuple[Trial, ...]:
@@ -306,9 +308,11 @@ class _Session:
         for hops in tried:
             progress(f"without hops {', '.join(map(str, hops))}")
             integer = without_hops(self.compilation, checkpoint, adjacency, hops)
-            if integer is not None:
+            name = f"hop {hops[0]}" if len(hops) == 1 else f"hops {hops[0]} to {hops[-1]}"
+            if integer is None:
+                self.overflowing.append(name)
+            else:
                 built = replace(self.strict, integer=integer).built()
-                name = f"hop {hops[0]}" if len(hops) == 1 else f"hops {hops[0]} to {hops[-1]}"
                 row = self._add(name, {"hops": list(hops)}, built, keep=True)
                 if row["training"]["differ"] <= self.loose.allowed:
                     best = min(best, (row["operations"], hops))

@@ -27,6 +27,7 @@ def lean_text(report: Json) -> str:
         _taxels(report["taxels"]),
         "",
         _rows(report),
+        *(f"without {name}: not tried, what is left could leave a register" for name in report["overflowing"]),
         "",
         f"least energy in training: {rows[report['taken']]['name']}",
         *_removed(rows[report["taken"]]),

@@ -207,6 +207,8 @@ def test_without_hops(compiled):
     own = np.arange(2 * TAXELS) // 2 == features[:, None]
     assert not lean[~own].any()
     assert lean[own].any()
+    louder = replace(checkpoint, hops=checkpoint.hops * 1e4)
+    assert leaner.without_hops(compilation, louder, adjacency, (1,)) is None
     assert gone.projections[1:] == tuple(p for p in compilation.integer.projections if p.post)
 
 
