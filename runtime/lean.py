@@ -21,6 +21,7 @@ from compiler.targets import Target, load_target
 from models.evtouch import Recordings
 from runtime import engine
 from runtime.asked import Asked, asked_network
+from runtime.compile_command import storage
 from runtime.estimate import estimate
 from runtime.inputs import progress, recordings, require_place, version
 from runtime.lean_text import lean_text
@@ -100,7 +101,7 @@ def lean(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], in
         for split, limit in (("train", None), (arguments.split, arguments.limit))
     )
     candidates, compilations = _candidates(arguments, found, training, test)
-    chosen = _cheapest(candidates, len(training))
+    chosen = _cheapest(candidates)
     session = _Session(
         found[chosen], compilations[chosen], training, test, int(arguments.differ * len(training) + 1e-9)
     )
@@ -141,7 +142,8 @@ def _provenance(arguments: argparse.Namespace, asked: Asked) -> Json:
     of = asked.checkpoint
     known = {"format": "onnx"} if of is None else {"run": arguments.run, "weights": of.weights, "graph": asked.graph}
     made = {"spikeloom": version(), "checkpoint_sha256": asked.sha256, **known}
-    return made | {"weight_bits": 8, "keep_all": False, "prune_unused": True, "ranges": "proven", "calibrated": True}
+    made |= storage(None, of)
+    return made | {"keep_all": False, "prune_unused": True, "ranges": "proven", "calibrated": True}
 
 
 def _candidates(
@@ -155,21 +157,20 @@ def _candidates(
         compilation = compile_network(asked.network, forms=forms, target=TARGET, training_events=training.events)
         netlist = compilation.netlist
         seen, reported = scene(training, netlist), scene(test, netlist)
-        counts, entry = _costs(netlist, target, reported)
-        right = int(np.count_nonzero(decisions(netlist, seen) == training.labels))
-        entry |= {"name": path, "graph": asked.graph, "training_right": right}
-        entry["test_right"] = int(np.count_nonzero(counts == test.labels))
+        (decided, cost), (decided_test, entry) = (_costs(netlist, target, of) for of in (seen, reported))
+        entry |= {"name": path, "graph": asked.graph, "training_operations": cost["operations"]}
+        entry["training_right"] = int(np.count_nonzero(decided == training.labels))
+        entry["test_right"] = int(np.count_nonzero(decided_test == test.labels))
         candidates.append(entry)
         compilations.append(compilation)
     return candidates, compilations
 
 
-def _cheapest(candidates: list[Json], samples: int) -> int:
-    """The candidate of fewest operations among those within one training recording of the best."""
+def _cheapest(candidates: list[Json]) -> int:
+    """The candidate of fewest operations in training among those within one training recording of the best."""
     least = max(entry["training_right"] for entry in candidates) - 1
     fitting = [i for i, entry in enumerate(candidates) if entry["training_right"] >= least]
-    assert samples > 0, "a split that was read has recordings"
-    return min(fitting, key=lambda i: candidates[i]["operations"])
+    return min(fitting, key=lambda i: candidates[i]["training_operations"])
 
 
 def _costs(netlist: Netlist, target: Target, of: Scene) -> tuple[IntArray, Json]:

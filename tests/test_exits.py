@@ -13,6 +13,7 @@ from compiler.dynamics import with_clocks
 from compiler.errors import NumericRangeError
 from compiler.frontends.checkpoint import read_checkpoint
 from compiler.interpret import vote
+from compiler.lift import lift
 from compiler.netlist import read_only
 from compiler.passes.expand import expand
 from compiler.pipeline import compile_network
@@ -207,6 +208,21 @@ def test_no_recording_is_decided_otherwise_by_proof(which, split, shipped_netlis
     counts = engine.simulate(netlist, with_clocks(data.events, netlist.clocks)).counts.spikes
     assert_array_equal(at.decision, predictions(netlist, counts))
     assert ends.mean() < 0.95 * data.steps
+
+
+@pytest.mark.parametrize(("which", "classes"), [("objects", 36), ("containers", 20)])
+def test_the_last_layer_alone_allows_no_earlier_proof(which, classes, shipped_netlists):
+    network = lift(shipped_netlists[which])
+    weight = sum(p.effective().toarray() for p in network.projections if p.post == 3)
+    last = network.populations[3]
+    bias, overturned = last.bias / 64, 0
+    for leader in range(classes):
+        for rival in set(range(classes)) - {leader}:
+            spikes = (weight[rival] > 0) & (weight[leader] <= 0)
+            always = weight[rival, spikes].sum() + bias[rival] > last.threshold[rival]
+            never = weight[leader, spikes].sum() + bias[leader] <= 0
+            overturned += bool(always and never)
+    assert overturned == classes * (classes - 1)
 
 
 @pytest.fixture(scope="module")

@@ -140,7 +140,7 @@ def test_the_cheapest_of_several_networks_within_a_recording_of_the_best(spikelo
     report = json.loads(spikeloom("lean", "net.pt", "thin.pt", "--data", "data", "--json")[1])
     right = [entry["training_right"] for entry in report["candidates"]]
     fitting = [entry for entry in report["candidates"] if entry["training_right"] >= max(right) - 1]
-    assert report["chosen"] == min(fitting, key=lambda entry: entry["operations"])["name"]
+    assert report["chosen"] == min(fitting, key=lambda entry: entry["training_operations"])["name"]
     code, out, _ = spikeloom("lean", "net.pt", "thin.pt", "--data", "data")
     assert code == 0
     assert f"taken: {report['chosen']}" in out.splitlines()
