@@ -83,7 +83,7 @@ def compile_netlist(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json
                 else {"run": arguments.run, "weights": checkpoint.weights, "graph": asked.graph}
             ),
             **({"towers": checkpoint.towers} if checkpoint is not None and checkpoint.towers > 1 else {}),
-            **_storage(recipes, checkpoint),
+            **storage(recipes, checkpoint),
             "spike_exact": arguments.spike_exact,
             "keep_all": arguments.keep_all,
             "prune_unused": arguments.prune_unused,
@@ -144,7 +144,7 @@ def _recipes(arguments: argparse.Namespace) -> tuple[Recipe, ...] | None:
     return tuple(Recipe(bits=b, planes=p, groups=g) for b, p, g in zip(*columns, strict=True))
 
 
-def _storage(recipes: tuple[Recipe, ...] | None, checkpoint: Checkpoint | None) -> Json:
+def storage(recipes: tuple[Recipe, ...] | None, checkpoint: Checkpoint | None) -> Json:
     """The same for the provenance of a netlist."""
     if checkpoint is not None and checkpoint.forms is not None:
         return {"weight_bits": _one_or_list([form.bits for form in checkpoint.forms]), "fine_tuned": True}

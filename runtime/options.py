@@ -52,6 +52,14 @@ def add_detail(parser: argparse.ArgumentParser, choices: tuple[str, ...], defaul
     told = "; ".join(f"{choice}: {what[choice]}" for choice in choices)
     parser.add_argument("--detail", choices=choices, default=default, help=f"{told} (default: {default})")
     parser.add_argument("--table", metavar="NAME|FILE.toml", help="price and time by this table only, or by your own")
+    add_explain_cost(parser)
+
+
+def add_explain_cost(parser: argparse.ArgumentParser) -> None:
+    """Add the option that tells what was simulated."""
+    parser.add_argument(
+        "--explain-cost", action="store_true", help="say on stderr (and in --json) what was simulated, and why"
+    )
 
 
 def add_training(parser: argparse.ArgumentParser) -> None:
