@@ -34,7 +34,7 @@ def why_not(name: str, pair: Pair, sensor: Sensor) -> str | None:
             return f"{TITLES[sensor.checkpoint.system]} has no taxel graph"
         if name == "other_graph" and sensor.places is None:
             return "positions of the taxels are not known, no graph can be built on them"
-    if name in ("fewer_bits", "outlier_weight"):
+    if name == "fewer_bits":
         target = netlist.synapse_compartment()
         form = netlist.axon_format[netlist.axon_of_synapse()]
         kinds = {*zip(netlist.layer[target].tolist(), netlist.format_exponent[form].tolist(), strict=True)}
@@ -72,10 +72,18 @@ def level_of(name: str, words: str) -> Level:
     return int(level) if level == int(level) else level
 
 
-def levels_of(name: str, *, full: bool, also: Sequence[Level] = ()) -> tuple[Level, ...]:
-    """Levels to measure, from mild to harsh, others among them that were asked for."""
+def levels_of(name: str, taxels: int, *, full: bool, also: Sequence[Level] = ()) -> tuple[Level, ...]:
+    """Levels to measure on a sensor of so many taxels, from mild to harsh, others among them that were asked for.
+
+    Examples
+    --------
+    >>> levels_of("taxels_dead", 6, full=False, also=[2])
+    (1, 2, 3, 5)
+    """
     known = NAMES[name]
     levels = known.full if full else known.levels
+    if known.unit == "taxels":
+        levels = tuple(level for level in levels if float(level) <= taxels)
     numbers = [float(level) for level in levels if not isinstance(level, str)]
     more = tuple(level for level in dict.fromkeys(also) if level not in levels)
     if not numbers:

@@ -105,7 +105,7 @@ def _fallen(name: str, before: IntArray, after: IntArray, ids: IntArray) -> list
 
 
 def undecided(before: IntArray, after: IntArray, files: Sequence[str]) -> list[Breakdown]:
-    """Decisions that say nothing about the recording, from votes (samples, classes) of the reference and of the chip."""
+    """Decisions that say nothing about the recording; votes (samples, classes) of the reference and of the chip."""
     found = []
     decided, wanted = vote(after), vote(before)
     if len(set(decided)) == 1 and len(set(wanted)) > 1:

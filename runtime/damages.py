@@ -1,8 +1,8 @@
 """What may happen to a network on its chip, done to the netlist and to the float network alike.
 
-A damage takes a :class:`Pair` and hands back another. What is stored in integers is changed there; the float weight moves
-by as much in its own units, which is the same relative change up to rounding. Compartments alone are damaged: a neuron
-that the chip does not hold stays as it is in the float network.
+A damage takes a :class:`Pair` and hands back another. What is stored in integers is changed there; the float weight
+moves by as much in its own units, which is the same relative change up to rounding. Compartments alone are damaged: a
+neuron that the chip does not hold stays as it is in the float network.
 """
 
 from __future__ import annotations
@@ -101,42 +101,6 @@ def fewer_bits(pair: Pair, width: int) -> Pair:
     most = (np.int64(1) << (np.minimum(bits, width) - 1)) - 1
     kept = np.clip(round_half_even(code / factor), -most, most) * factor
     return with_weights(pair, kept * weight_steps(bits))
-
-
-def add_outliers(pair: Pair, factor: int, rng: np.random.Generator) -> Pair:
-    """In each layer one weight grows to a multiple (a power of two) of the largest, and takes the scale with it.
-
-    On the chip all weights are rounded to a grid that is as much coarser; in the float network nothing else changes.
-    """
-    netlist, network = pair.netlist, pair.network
-    shift = int(factor).bit_length() - 1
-    code, bits = _codes(netlist)
-    most = (np.int64(1) << (bits - 1)) - 1
-    weight = np.clip(round_half_even(code / factor), -most, most)
-    axon = netlist.axon_of_synapse()
-    target = netlist.synapse_compartment()
-    grown = np.array([rng.choice(np.flatnonzero(netlist.layer[target] == i)) for i in range(len(netlist.layers))])
-    weight[grown] = np.where(code[grown] < 0, -most[grown], most[grown])
-    form = netlist.axon_format[axon[grown]]
-    units = in_units(weight[grown] * weight_steps(bits[grown]), netlist.format_exponent[form] + shift)
-    projections = list(network.projections)
-    for synapse, unit in zip(grown.tolist(), units.tolist(), strict=True):
-        compartment, source = int(target[synapse]), int(netlist.axon_source[axon[synapse]])
-        inner = source >= netlist.n_inputs
-        pre = int(netlist.layer[source - netlist.n_inputs]) if inner else INPUT
-        column = int(netlist.neuron[source - netlist.n_inputs]) if inner else source
-        post, row = int(netlist.layer[compartment]), int(netlist.neuron[compartment])
-        place = next(i for i, p in enumerate(projections) if (p.pre, p.post) == (pre, post))
-        old = projections[place].weight
-        step = unit / netlist.scale[compartment] - old[row, column]
-        more = sparse.csr_array(([step], ([row], [column])), shape=old.shape)
-        projections[place] = replace(projections[place], weight=old + more)
-    coarse = replace(
-        netlist,
-        synapse_weight=frozen((weight * weight_steps(bits)).astype(netlist.synapse_weight.dtype)),
-        format_exponent=read_only(netlist.format_exponent + shift),
-    )
-    return Pair(netlist=coarse, network=replace(network, projections=tuple(projections)))
 
 
 # -- neurons -----------------------------------------------------------------------------------------------------------

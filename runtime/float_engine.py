@@ -1,7 +1,7 @@
 """The float network driven by its events: as fast as the chip's engine, for runs by the thousand.
 
-What :func:`compiler.interpret.run_float` means, in float32, without a dense product: a spike adds the weights that it has
-to others, source by source, and the bias comes last. Sums are taken in another order than in the released code, so
+What :func:`compiler.interpret.run_float` means, in float32, without a dense product: a spike adds the weights that it
+has to others, source by source, and the bias comes last. Sums are taken in another order than in the released code, so
 that a spike decided by the last bit of a sum may differ from :mod:`models.reference`; ``verify`` counts such spikes as
 ill-posed, and the released network has none on the released recordings.
 

@@ -1,4 +1,4 @@
-"""The part of the battery that happens to a network; :mod:`runtime.damages` and :mod:`runtime.other_graphs` do it."""
+"""The part of the battery that happens to a network; :mod:`runtime.damages` and :mod:`runtime.other_networks` do it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from compiler.fixedpoint import IntArray
 from compiler.passes.expand import expand
 from models.graphs import build_graph
 from models.systems import propagation_of
-from runtime import damages, other_graphs
+from runtime import damages, other_networks
 from runtime.damages import Pair
 from runtime.perturbation import Damage, Level, Perturbation, Sensor
 
@@ -40,11 +40,11 @@ def _on_graph(pair: Pair, sensor: Sensor, edges: IntArray) -> Pair:
     checkpoint = sensor.checkpoint
     assert checkpoint is not None, "asked in why_not"
     seen = propagation_of(checkpoint.system, edges, checkpoint.taxels, checkpoint.grid, len(checkpoint.hops))
-    return other_graphs.stored_alike(pair, expand(checkpoint, seen))
+    return other_networks.stored_alike(pair, expand(checkpoint, seen))
 
 
 def _doubled(edges: IntArray, _taxels: int, share: float, rng: np.random.Generator) -> IntArray:
-    return other_graphs.double(edges, share, rng)
+    return other_networks.double(edges, share, rng)
 
 
 def _ties(pair: Pair, level: float) -> Pair:
@@ -141,7 +141,7 @@ NETWORK: tuple[Perturbation, ...] = (
         unit="share of edges",
         levels=(0.05, 0.1, 0.25, 0.5),
         full=(0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.75, 1),
-        damage=_on_edges(other_graphs.rewire),
+        damage=_on_edges(other_networks.rewire),
     ),
     Perturbation(
         name="edges_doubled",
@@ -172,7 +172,7 @@ NETWORK: tuple[Perturbation, ...] = (
         least=1,
         most=64,
         whole=True,
-        damage=_damaged(lambda pair, level, rng: damages.add_outliers(pair, int(level), rng)),
+        damage=_damaged(lambda pair, level, rng: other_networks.add_outliers(pair, int(level), rng)),
     ),
     Perturbation(
         name="shorter_decay",

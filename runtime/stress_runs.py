@@ -149,9 +149,7 @@ def ready(pair: Pair) -> Ready:
 def evaluate(prepared: Ready, inputs: Inputs, *, threads: int = 1) -> Outcome:
     """Run both sides from rest."""
     netlist = prepared.chip.netlist
-    model = float_engine.run(
-        prepared.model, inputs.events, lengths=inputs.lengths, begin=inputs.begin, threads=threads
-    )
+    model = float_engine.run(prepared.model, inputs.events, lengths=inputs.lengths, begin=inputs.begin, threads=threads)
     packed, stopped, saturated = _chip(prepared.chip, inputs, threads)
     spikes = np.zeros((len(inputs.events), len(netlist.layers), 3), np.int64)
     votes = np.zeros((len(inputs.events), netlist.classes), np.int64)
@@ -174,9 +172,7 @@ def evaluate(prepared: Ready, inputs: Inputs, *, threads: int = 1) -> Outcome:
     return Outcome(votes={"float": model.votes, "chip": votes}, spikes=spikes, stopped=stopped, saturated=saturated)
 
 
-def _chip(
-    prepared: engine.Engine, inputs: Inputs, threads: int
-) -> tuple[Words, npt.NDArray[np.bool_], IntArray]:
+def _chip(prepared: engine.Engine, inputs: Inputs, threads: int) -> tuple[Words, npt.NDArray[np.bool_], IntArray]:
     """Packed spikes, which recordings stopped the simulator, and clipped membranes."""
 
     def simulate(part: slice) -> tuple[Words, IntArray]:
@@ -224,7 +220,7 @@ def _tally(
     spikes: Any,
     votes: Any,
 ) -> None:
-    """Count spikes of the chip and those that differ, (recordings, layers, 3), and its votes, in the steps that count."""
+    """Count spikes of the chip and those that differ, (recordings, layers, 3), and its votes, where steps count."""
     for i in range(len(chip)):
         for layer in range(len(masks)):
             for word in range(masks.shape[1]):
@@ -279,9 +275,7 @@ def going_round(bench: Bench, rounds: int) -> Inputs:
     for i, length in enumerate(bench.lengths.tolist()):
         events[i, ..., : length * rounds] = np.tile(bench.events[i, ..., :length], rounds)
     lengths = bench.lengths * rounds
-    return Inputs(
-        events=with_clocks(events, bench.pair.netlist.clocks), lengths=lengths, begin=lengths - bench.lengths
-    )
+    return Inputs(events=with_clocks(events, bench.pair.netlist.clocks), lengths=lengths, begin=lengths - bench.lengths)
 
 
 # -- one point ---------------------------------------------------------------------------------------------------------
@@ -311,8 +305,8 @@ def measure(bench: Bench, name: str, level: Level, seeds: Sequence[int], referen
     Returns
     -------
     list of dict
-        For each seed: ``right`` by side, ``equal`` decisions, ``layers`` (spikes of float, chip, and different; entries),
-        ``signs`` of breakdowns by side, ``most`` decided class and how often, ``stopped``, ``saturated``.
+        For each seed: ``right`` by side, ``equal`` decisions, ``layers`` (spikes of float, of chip, different ones,
+        entries), ``signs`` of breakdowns by side, ``most`` decided class and how often, ``stopped``, ``saturated``.
     """
     known, count = NAMES[name], len(bench.events)
     if known.damage is not None:
@@ -351,9 +345,7 @@ def _filled_up(events: npt.NDArray[np.uint8], steps: int) -> npt.NDArray[np.uint
     return np.pad(events, ((0, 0), (0, 0), (0, steps - events.shape[2])))
 
 
-def _run(
-    bench: Bench, found: Outcome, seed: int | None, part: slice, inputs: Inputs, reference: Outcome
-) -> Json:
+def _run(bench: Bench, found: Outcome, seed: int | None, part: slice, inputs: Inputs, reference: Outcome) -> Json:
     """Counts over the recordings of one seed."""
     netlist = bench.pair.netlist
     decided = {side: found.decisions(side)[part] for side in SIDES}
@@ -370,7 +362,9 @@ def _run(
             for layer, counts, neurons in zip(netlist.layers, spikes, held, strict=True)
         },
         "signs": {
-            side: {sign.kind: sign.count for sign in undecided(reference.votes[side], found.votes[side][part], bench.files)}
+            side: {
+                sign.kind: sign.count for sign in undecided(reference.votes[side], found.votes[side][part], bench.files)
+            }
             for side in SIDES
         },
         "most": {

@@ -1,6 +1,6 @@
-"""The network on another taxel graph, stored on the scales of a netlist, and graphs that went wrong.
+"""Another float network stored on the scales of a netlist: on a taxel graph that went wrong, or with outlier weights.
 
-Compiling anew would choose other scales and cores; here nothing changes but what the other graph changes. The result
+Compiling anew would choose other scales and cores; here nothing changes but what the other network changes. The result
 is a netlist to simulate, not one to load: it is not cut to the size of cores.
 """
 
@@ -14,18 +14,19 @@ import numpy.typing as npt
 from scipy import sparse
 
 from compiler.errors import OptionError
-from compiler.fixedpoint import IntArray
+from compiler.fixedpoint import IntArray, round_half_even
 from compiler.forms import Form, round_population
 from compiler.ir import INPUT, IntegerNetwork, Network
 from compiler.netlist import Netlist, frozen, read_only, read_only_float
 from runtime.damages import Pair
 
 
-def stored_alike(pair: Pair, network: Network) -> Pair:
+def stored_alike(pair: Pair, network: Network, *, coarser: int = 1) -> Pair:
     """Another float network of the same sizes, stored as the netlist stores its own.
 
     Widths, exponents and thresholds are the netlist's, weights are rounded to the nearest; a neuron that the netlist
-    does not hold gets its layer's median threshold.
+    does not hold gets its layer's median threshold. With `coarser` scales, and thresholds with them, are so many times
+    smaller.
 
     Raises
     ------
@@ -41,13 +42,14 @@ def stored_alike(pair: Pair, network: Network) -> Pair:
         ids = netlist.compartments_of(post)
         threshold = np.full(layer.neurons, round(float(np.median(netlist.threshold[ids]))))
         threshold[netlist.neuron[ids]] = netlist.threshold[ids]
+        threshold = np.maximum(round_half_even(threshold / coarser), 1)
         used = tuple(sorted(set(exponents[listener == post].tolist()))) or (0,)
         form = Form(bits=layer.weight_bits, exponents=used, threshold=threshold)
         into = tuple(projection for projection in network.projections if projection.post == post)
         try:
             integer, planes = round_population(population, into, form)
         except ValueError as error:
-            raise OptionError(f"{population.name}: {error}; leave the other graph away") from error
+            raise OptionError(f"{population.name}: {error}; leave this perturbation away") from error
         populations.append(integer)
         projections += planes
     whole = IntegerNetwork(
@@ -114,6 +116,21 @@ def unplaced(network: IntegerNetwork, like: Netlist) -> Netlist:
         format_exponent=read_only([exponent for _, exponent in forms]),
         format_index_bits=read_only([1] * len(forms)),
     )
+
+
+def add_outliers(pair: Pair, factor: int, rng: np.random.Generator) -> Pair:
+    """In each layer one weight grows to a multiple of the largest and takes the scale with it.
+
+    The float network has that one weight more; on the chip all others are stored on a grid that is as much coarser.
+    """
+    projections = []
+    for projection in pair.network.projections:
+        weight = projection.weight.copy()
+        if weight.nnz:
+            place = int(rng.integers(weight.nnz))
+            weight.data[place] = np.copysign(factor * np.abs(weight.data).max(), weight.data[place])
+        projections.append(replace(projection, weight=weight))
+    return stored_alike(pair, replace(pair.network, projections=tuple(projections)), coarser=factor)
 
 
 # -- taxel graphs ------------------------------------------------------------------------------------------------------

@@ -1,0 +1,349 @@
+"""The command ``stress``: where float network and chip break, and whether at the same place."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import tempfile
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import redirect_stderr
+from functools import lru_cache
+from io import StringIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from compiler.atomic import write_atomically
+from compiler.errors import OptionError
+from compiler.fixedpoint import FloatArray, IntArray
+from compiler.frontends.systems import GRAPH_SYSTEMS
+from compiler.serialize import read_netlist
+from models.graphs import NEUTOUCH
+from models.sensors import read_layout, sensor_graph
+from runtime.asked import Asked, asked_network
+from runtime.battery import NAMES, SEEDS, levels_of, why_not
+from runtime.inputs import progress, recordings, require_place, version
+from runtime.options import add_network, add_recordings
+from runtime.perturbation import Level, Sensor
+from runtime.stress_text import stress_text
+from runtime.stress_verdicts import Requirement, curve, parse_requirement, shown, unmet
+from runtime.sweep import Point, add_sweep_arguments, content_key, sweep
+
+if TYPE_CHECKING:
+    from runtime.stress_runs import Bench
+
+Json = dict[str, Any]
+
+SUMMARY = "where float network and chip break: a seeded battery of perturbations, with curves, verdicts and reasons"
+NOTES = """\
+Perturbations: {names}.
+Accuracies are means over the seeds with a 95 % interval; a level leaves where the mean is below the interval of the
+clean accuracy. --full and --jobs measure in processes of their own and go on where an earlier run ended.
+"""
+KIND, VERSION = "stress", 1
+"""Of the store of measured points; the version goes up when a result means something else."""
+
+CHUNK = 5
+"""Seeds of a point."""
+
+UNKEPT = (
+    "action",
+    "output",
+    "picture",
+    "json",
+    "debug",
+    "jobs",
+    "scheduler",
+    "fresh",
+    "require",
+    "only",
+    "full",
+    "seeds",
+)
+"""Options that change no run."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Describe the options of the command."""
+    parser.add_argument("netlist", metavar="NET.loom")
+    parser.add_argument("--checkpoint", required=True, metavar="CKPT|NET.onnx")
+    add_network(parser)
+    add_recordings(parser)
+    parser.add_argument("--only", metavar="NAME[,…]", help="some perturbations (default: all)")
+    parser.add_argument("--full", action="store_true", help="dense curves")
+    parser.add_argument("--seeds", type=int, default=SEEDS, metavar="N", help=f"draws of each (default: {SEEDS})")
+    parser.add_argument(
+        "--require",
+        action="append",
+        default=[],
+        metavar="NAME:LEVEL>=SHARE",
+        help="accuracy that the chip must keep, as in taxels_dead:3>=0.85; else exit code 1; may be repeated",
+    )
+    add_sweep_arguments(parser)
+    parser.add_argument("--picture", metavar="OUT.png", help="draw the curves")
+    parser.add_argument("-o", "--output", metavar="OUT.json", help="write what --json prints; report --stress shows it")
+    parser.epilog = NOTES.format(names=", ".join(NAMES))
+
+
+def stress(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
+    """Run the command; exit code 1 where a requirement is missed.
+
+    Raises
+    ------
+    SpikeloomError
+        If an option, the netlist, the checkpoint or the recordings cannot be used, or do not belong together.
+    """
+    names, requirements = _check(arguments)
+    bench, asked, data = _made(arguments)
+    from runtime.stress_runs import clean
+
+    sensor = bench.sensor
+    reasons = {name: why_not(name, bench.pair, sensor) for name in names}
+    for wanted in requirements:
+        if reasons[wanted.name] is not None:
+            raise OptionError(f"--require {wanted}: does not apply, {reasons[wanted.name]}; leave it away")
+        if NAMES[wanted.name].unit == "taxels" and float(wanted.level) > sensor.taxels:
+            raise OptionError(f"--require {wanted}: the sensor has {sensor.taxels} taxels; give a smaller level")
+    plan = {
+        name: levels_of(
+            name,
+            sensor.taxels,
+            full=arguments.full,
+            also=[wanted.level for wanted in requirements if wanted.name == name],
+        )
+        for name in names
+        if reasons[name] is None
+    }
+    progress("clean recordings")
+    _, undisturbed = clean(bench)
+    places = [(name, level) for name, levels in plan.items() for level in levels]
+    measured = _measured(arguments, bench, places, _facts(arguments, asked, data))
+    curves = {
+        name: _described(name)
+        | curve(
+            [(level, measured[name, level]) for level in levels],
+            undisturbed,
+            len(bench.labels),
+            bench.pair.netlist.classes,
+        )
+        for name, levels in plan.items()
+    }
+    missed = unmet(requirements, curves)
+    found: Json = {
+        "recordings": len(bench.labels),
+        "classes": bench.pair.netlist.classes,
+        "seeds": arguments.seeds,
+        "full": arguments.full,
+        "clean": undisturbed,
+        "perturbations": curves,
+        "not_applicable": {name: reason for name, reason in reasons.items() if reason is not None},
+        "required": [str(wanted) for wanted in requirements],
+        "missed": missed,
+        "provenance": _facts(arguments, asked, data),
+    }
+    if arguments.picture is not None:
+        from runtime.stress_picture import picture
+
+        with write_atomically(arguments.picture) as file:
+            file.write(picture(found))
+    if arguments.output is not None:
+        with write_atomically(arguments.output) as file:
+            file.write(json.dumps(found).encode())
+    return found, stress_text, 1 if missed else 0
+
+
+def _check(arguments: argparse.Namespace) -> tuple[tuple[str, ...], list[Requirement]]:
+    """Refuse options that cannot be meant; return perturbations in the battery's order, and requirements."""
+    for option, place in (("-o", arguments.output), ("--picture", arguments.picture)):
+        if place is not None:
+            require_place(place, option, arguments)
+    if arguments.seeds < 1:
+        raise OptionError(f"--seeds {arguments.seeds}: allowed are 1 or more; choose another")
+    asked = list(NAMES) if arguments.only is None else [name.strip() for name in arguments.only.split(",")]
+    for name in asked:
+        if name not in NAMES:
+            raise OptionError(f"--only {name}: no such perturbation; choose from {', '.join(NAMES)}")
+    requirements = [parse_requirement(words) for words in arguments.require]
+    for wanted in requirements:
+        if wanted.name not in asked:
+            raise OptionError(f"--require {wanted}: --only leaves {wanted.name} out; add it there")
+    return tuple(name for name in NAMES if name in asked), requirements
+
+
+def _described(name: str) -> Json:
+    known = NAMES[name]
+    return {"what": known.what, "unit": known.unit, "seeded": known.seeded}
+
+
+# -- what is stressed --------------------------------------------------------------------------------------------------
+
+
+def _made(arguments: argparse.Namespace) -> tuple[Bench, Asked, str]:
+    """Everything that is stressed, the float network, and a hash of the recordings."""
+    from runtime.damages import Pair
+    from runtime.equivalence import require_match
+    from runtime.stress_runs import Bench, ready
+
+    netlist = read_netlist(arguments.netlist)
+    asked = asked_network(arguments.checkpoint, arguments)
+    require_match(netlist, asked.model)
+    progress("reading the recordings")
+    data = recordings(
+        arguments.data,
+        arguments.split,
+        limit=arguments.limit,
+        classes=netlist.classes,
+        taxels=netlist.taxels,
+        bin_s=arguments.bin,
+        labels_for="stress",
+    )
+    pair = Pair(netlist=netlist, network=asked.network)
+    places, edges = _places(arguments, netlist.taxels), _edges(arguments, asked)
+    digest = hashlib.sha256()
+    for array in data.identity().values():
+        digest.update(np.ascontiguousarray(array).tobytes())
+    bench = Bench(
+        pair=pair,
+        ready=ready(pair),
+        sensor=Sensor(
+            distance=distances(netlist.taxels, places, edges), places=places, edges=edges, checkpoint=asked.checkpoint
+        ),
+        events=data.events,
+        labels=data.labels,
+        files=data.files,
+        lengths=np.full(len(data), data.steps) if data.lengths is None else np.asarray(data.lengths),
+    )
+    return bench, asked, digest.hexdigest()
+
+
+def _places(arguments: argparse.Namespace, taxels: int) -> FloatArray | None:
+    """Positions of the taxels, where they are known."""
+    if arguments.taxels is not None:
+        return read_layout(arguments.taxels)[1]
+    return NEUTOUCH if taxels == len(NEUTOUCH) and not arguments.edges else None
+
+
+def _edges(arguments: argparse.Namespace, asked: Asked) -> IntArray | None:
+    """Edges of the taxel graph, where there is one."""
+    checkpoint = asked.checkpoint
+    if checkpoint is None or checkpoint.system not in GRAPH_SYSTEMS:
+        return None
+    if checkpoint.edges is not None:
+        return checkpoint.edges
+    graph, _ = sensor_graph(
+        graph=arguments.graph, taxels=arguments.taxels, edges=arguments.edges, directed=arguments.directed
+    )
+    return graph.edges
+
+
+def distances(taxels: int, places: FloatArray | None, edges: IntArray | None) -> FloatArray:
+    """Distances between taxels: of their positions, else on their graph, else of their numbers; (taxels, taxels).
+
+    Examples
+    --------
+    >>> distances(3, None, None)[0].tolist(), distances(3, None, np.array([[0, 2], [2, 1]]))[0].tolist()
+    ([0.0, 1.0, 2.0], [0.0, 2.0, 1.0])
+    """
+    if places is None and edges is not None:
+        from scipy.sparse import coo_array, csgraph
+
+        graph = coo_array((np.ones(len(edges)), edges.T), shape=(taxels, taxels))
+        hops: FloatArray = csgraph.shortest_path(graph, directed=False, unweighted=True)
+        return hops
+    where = np.arange(float(taxels))[:, None] if places is None else places
+    found: FloatArray = np.linalg.norm(where[:, None] - where, axis=2)
+    return found
+
+
+def _facts(arguments: argparse.Namespace, asked: Asked, data: str) -> Json:
+    """What the runs depend on beside perturbation, level and seed."""
+    return {
+        "spikeloom": version(),
+        "netlist_sha256": hashlib.sha256(Path(arguments.netlist).read_bytes()).hexdigest(),
+        "checkpoint_sha256": asked.sha256,
+        "graph": asked.graph,
+        "data_sha256": data,
+        "netlist": Path(arguments.netlist).name,
+        "checkpoint": Path(arguments.checkpoint).name,
+        "data": Path(arguments.data).name,
+        "split": arguments.split,
+    }
+
+
+# -- runs --------------------------------------------------------------------------------------------------------------
+
+
+def _measured(
+    arguments: argparse.Namespace, bench: Bench, places: Sequence[tuple[str, Level]], facts: Json
+) -> dict[tuple[str, Level], list[Json]]:
+    """Runs of each seed, by perturbation and level."""
+    seeds = {name: range(arguments.seeds if NAMES[name].seeded else 1) for name, _ in places}
+    if not (arguments.full or arguments.jobs or arguments.scheduler):
+        return _here(bench, places, seeds)
+    options = {name: value for name, value in vars(arguments).items() if name not in UNKEPT}
+    keyed: dict[tuple[str, Level], list[Point]] = {}
+    for name, level in places:
+        chunks = [list(seeds[name][i : i + CHUNK]) for i in range(0, len(seeds[name]), CHUNK)]
+        keyed[name, level] = [
+            Point(
+                key=content_key(facts | {"perturbation": name, "level": level, "seeds": chunk}),
+                label=f"{name} {shown(level)}",
+                payload={"options": options, "name": name, "level": level, "seeds": chunk},
+            )
+            for chunk in chunks
+        ]
+    with tempfile.TemporaryDirectory(prefix="spikeloom-") as folder:
+        store = Path(folder) / "points" if arguments.output is None else Path(f"{arguments.output}.points")
+        results = sweep(
+            [point for points in keyed.values() for point in points],
+            measure_point,
+            store,
+            kind=KIND,
+            version=VERSION,
+            jobs=arguments.jobs,
+            scheduler=arguments.scheduler,
+            fresh=arguments.fresh,
+            label="stress",
+        )
+    return {place: [run for point in points for run in results[point.key]["runs"]] for place, points in keyed.items()}
+
+
+def _here(
+    bench: Bench, places: Sequence[tuple[str, Level]], seeds: dict[str, range]
+) -> dict[tuple[str, Level], list[Json]]:
+    """Measure in this process, several points at a time."""
+    from runtime.stress_runs import clean, measure
+
+    reference, _ = clean(bench)
+    found: dict[tuple[str, Level], list[Json]] = {}
+    pool = ThreadPoolExecutor(os.cpu_count())
+    try:
+        waiting = {pool.submit(measure, bench, *place, seeds[place[0]], reference): place for place in places}
+        for done in as_completed(waiting):
+            found[waiting[done]] = done.result()
+            progress(f"stress: {len(found)} of {len(places)} points")
+    finally:
+        pool.shutdown(cancel_futures=True)
+    return found
+
+
+@lru_cache(maxsize=1)
+def _kept(options: str) -> tuple[Bench, Any]:
+    """The bench of a process, and what its clean recordings do."""
+    from runtime.stress_runs import clean
+
+    with redirect_stderr(StringIO()):  # the command has said it
+        bench, _, _ = _made(argparse.Namespace(**json.loads(options)))
+    return bench, clean(bench)[0]
+
+
+def measure_point(payload: Json) -> Json:
+    """One perturbation at one level in a process of its own: ``runs``, one for each seed."""
+    from runtime.stress_runs import measure
+
+    bench, reference = _kept(json.dumps(payload["options"], sort_keys=True))
+    return {"runs": measure(bench, payload["name"], payload["level"], payload["seeds"], reference)}
