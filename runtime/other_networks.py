@@ -14,9 +14,9 @@ import numpy.typing as npt
 from scipy import sparse
 
 from compiler.errors import OptionError
-from compiler.fixedpoint import IntArray, round_half_even
-from compiler.forms import Form, round_population
-from compiler.ir import INPUT, IntegerNetwork, Network
+from compiler.fixedpoint import ONE_STEP_SUM_MAX, IntArray, round_half_even
+from compiler.forms import Form, loads, round_population
+from compiler.ir import INPUT, IntegerNetwork, IntegerPopulation, IntegerProjection, Network, Population, Projection
 from compiler.netlist import Netlist, frozen, read_only, read_only_float
 from runtime.damages import Pair
 
@@ -26,7 +26,7 @@ def stored_alike(pair: Pair, network: Network, *, coarser: int = 1) -> Pair:
 
     Widths, exponents and thresholds are the netlist's, weights are rounded to the nearest; a neuron that the netlist
     does not hold gets its layer's median threshold. With `coarser` scales, and thresholds with them, are so many times
-    smaller.
+    smaller; so they are where a register could overflow otherwise.
 
     Raises
     ------
@@ -47,7 +47,7 @@ def stored_alike(pair: Pair, network: Network, *, coarser: int = 1) -> Pair:
         form = Form(bits=layer.weight_bits, exponents=used, threshold=threshold)
         into = tuple(projection for projection in network.projections if projection.post == post)
         try:
-            integer, planes = round_population(population, into, form)
+            integer, planes = _fitted(population, into, form)
         except ValueError as error:
             raise OptionError(f"{population.name}: {error}; leave this perturbation away") from error
         populations.append(integer)
@@ -60,6 +60,19 @@ def stored_alike(pair: Pair, network: Network, *, coarser: int = 1) -> Pair:
         classes=network.classes,
     )
     return Pair(netlist=unplaced(whole, netlist), network=network)
+
+
+def _fitted(
+    population: Population, into: tuple[Projection, ...], form: Form
+) -> tuple[IntegerPopulation, tuple[IntegerProjection, ...]]:
+    """Round to a form, with thresholds so much smaller that no register can overflow where one could."""
+    while True:
+        integer, planes = round_population(population, into, form)
+        fullest = float(loads(integer, planes).max(initial=0))
+        smaller = np.maximum(np.floor(form.threshold * (ONE_STEP_SUM_MAX / max(fullest, 1.0))), 1).astype(np.int64)
+        if fullest <= ONE_STEP_SUM_MAX or np.array_equal(smaller, form.threshold):
+            return integer, planes
+        form = replace(form, threshold=smaller)
 
 
 def unplaced(network: IntegerNetwork, like: Netlist) -> Netlist:
@@ -123,7 +136,7 @@ def add_outliers(pair: Pair, factor: int, rng: np.random.Generator) -> Pair:
 
     The float network has that one weight more; on the chip all others are stored on a grid that is as much coarser.
     """
-    projections = []
+    projections = list[Projection]()
     for projection in pair.network.projections:
         weight = projection.weight.copy()
         if weight.nnz:

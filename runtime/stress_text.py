@@ -15,6 +15,11 @@ ACROSS = 10
 
 NONE = "–"
 
+KEY = """\
+leaves: first level below the clean interval; chance: first level no better than chance; least: fewest decisions equal
+curves in per cent: accuracy ± 95 % interval of the mean over seeds; equal decisions; spikes in common in the layer that
+has fewest of them"""
+
 
 def stress_text(report: Json) -> str:
     """Clean accuracy, verdicts, curves, and what was not measured."""
@@ -22,7 +27,7 @@ def stress_text(report: Json) -> str:
     lines = [f"{side} accuracy, clean: {percent(clean['right'][side], recordings)}" for side in SIDES]
     lines.append(f"decisions equal, clean: {clean['equal']} of {recordings}; chance {100 / report['classes']:.1f} %")
     lines += ["", verdict_table(report["perturbations"]), ""]
-    lines.append("leaves: below the clean interval; chance: no better than chance; least: fewest decisions equal")
+    lines.append(KEY)
     for name, found in report["perturbations"].items():
         lines += ["", f"{name}: {found['what']} ({found['unit']})", *_curves(found)]
     for name, reason in report["not_applicable"].items():
@@ -39,7 +44,7 @@ def verdict_table(found: Json) -> str:
     head = ["perturbation", "verdict", "leaves, float", "chip", "chance, float", "chip", "least", "why"]
     rows = verdict_rows(found)
     widest = max((len(row[-1]) for row in rows), default=0)
-    return table(head, [[*row[:-1], row[-1].ljust(widest)] for row in rows])
+    return table([*head[:-1], head[-1].ljust(widest)], [[*row[:-1], row[-1].ljust(widest)] for row in rows])
 
 
 def verdict_rows(found: Json) -> list[list[str]]:
@@ -71,7 +76,7 @@ def why(one: Json) -> str:
         ranks = [len(order) if place is None else order.index(place) for place in places]
         words.append("chip first" if ranks[1] < ranks[0] else "float first")
     for place in (chip["chance"], chip["leaves"]):
-        reasons = next((point["why"]["chip"] for point in one["levels"] if point["level"] == place), [])
+        reasons: list[str] = next((point["why"]["chip"] for point in one["levels"] if point["level"] == place), [])
         if reasons:
             return "; ".join([*words, *reasons])
     return "; ".join([*words, *([] if chip["leaves"] is None else ["other spikes, as many"])])
@@ -87,6 +92,7 @@ def _curves(found: Json) -> list[str]:
 def _curve(levels: Sequence[Json]) -> str:
     rows = [[side, *(_accuracy(point[side]) for point in levels)] for side in SIDES]
     rows.append(["equal", *(f"{100 * point['equal']:.0f}" for point in levels)])
+    rows.append(["spikes", *(f"{100 * min(point['common'].values()):.0f}" for point in levels)])
     return table(["", *(shown(point["level"]) for point in levels)], rows)
 
 
