@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import hashlib
 import json
 import os
 import tempfile
@@ -15,20 +14,12 @@ from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from compiler.atomic import write_atomically
 from compiler.errors import OptionError
-from compiler.fixedpoint import FloatArray, IntArray
-from compiler.frontends.systems import GRAPH_SYSTEMS
-from compiler.serialize import read_netlist
-from models.graphs import NEUTOUCH
-from models.sensors import read_layout, sensor_graph
-from runtime.asked import Asked, asked_network
 from runtime.battery import NAMES, SEEDS, levels_of, why_not
-from runtime.inputs import progress, recordings, require_place, version
+from runtime.inputs import progress, require_place
 from runtime.options import add_network, add_recordings
-from runtime.perturbation import Level, Sensor
+from runtime.perturbation import Level
 from runtime.stress_text import stress_text
 from runtime.stress_verdicts import Requirement, curve, parse_requirement, shown, unmet
 from runtime.sweep import Point, add_sweep_arguments, content_key, sweep
@@ -98,8 +89,10 @@ def stress(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], 
         If an option, the netlist, the checkpoint or the recordings cannot be used, or do not belong together.
     """
     names, requirements = _check(arguments)
-    bench, asked, data = _made(arguments)
+    from runtime.stress_bench import bench_of, facts_of
     from runtime.stress_runs import clean
+
+    bench, asked, data = bench_of(arguments)
 
     sensor = bench.sensor
     reasons = {name: why_not(name, bench.pair, sensor) for name in names}
@@ -121,7 +114,7 @@ def stress(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], 
     progress("clean recordings")
     _, undisturbed = clean(bench)
     places = [(name, level) for name, levels in plan.items() for level in levels]
-    measured = _measured(arguments, bench, places, _facts(arguments, asked, data))
+    measured = _measured(arguments, bench, places, facts_of(arguments, asked, data))
     curves = {
         name: _described(name)
         | curve(
@@ -143,7 +136,7 @@ def stress(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], 
         "not_applicable": {name: reason for name, reason in reasons.items() if reason is not None},
         "required": [str(wanted) for wanted in requirements],
         "missed": missed,
-        "provenance": _facts(arguments, asked, data),
+        "provenance": facts_of(arguments, asked, data),
     }
     if arguments.picture is not None:
         from runtime.stress_picture import picture
@@ -177,101 +170,6 @@ def _check(arguments: argparse.Namespace) -> tuple[tuple[str, ...], list[Require
 def _described(name: str) -> Json:
     known = NAMES[name]
     return {"what": known.what, "unit": known.unit, "seeded": known.seeded}
-
-
-# -- what is stressed --------------------------------------------------------------------------------------------------
-
-
-def _made(arguments: argparse.Namespace) -> tuple[Bench, Asked, str]:
-    """Everything that is stressed, the float network, and a hash of the recordings."""
-    from runtime.damages import Pair
-    from runtime.equivalence import require_match
-    from runtime.stress_runs import Bench, ready
-
-    netlist = read_netlist(arguments.netlist)
-    asked = asked_network(arguments.checkpoint, arguments)
-    require_match(netlist, asked.model)
-    progress("reading the recordings")
-    data = recordings(
-        arguments.data,
-        arguments.split,
-        limit=arguments.limit,
-        classes=netlist.classes,
-        taxels=netlist.taxels,
-        bin_s=arguments.bin,
-        labels_for="stress",
-    )
-    pair = Pair(netlist=netlist, network=asked.network)
-    places, edges = _places(arguments, netlist.taxels), _edges(arguments, asked)
-    digest = hashlib.sha256()
-    for array in data.identity().values():
-        digest.update(np.ascontiguousarray(array).tobytes())
-    bench = Bench(
-        pair=pair,
-        ready=ready(pair),
-        sensor=Sensor(
-            distance=distances(netlist.taxels, places, edges), places=places, edges=edges, checkpoint=asked.checkpoint
-        ),
-        events=data.events,
-        labels=data.labels,
-        files=data.files,
-        lengths=np.full(len(data), data.steps) if data.lengths is None else np.asarray(data.lengths),
-    )
-    return bench, asked, digest.hexdigest()
-
-
-def _places(arguments: argparse.Namespace, taxels: int) -> FloatArray | None:
-    """Positions of the taxels, where they are known."""
-    if arguments.taxels is not None:
-        return read_layout(arguments.taxels)[1]
-    return NEUTOUCH if taxels == len(NEUTOUCH) and not arguments.edges else None
-
-
-def _edges(arguments: argparse.Namespace, asked: Asked) -> IntArray | None:
-    """Edges of the taxel graph, where there is one."""
-    checkpoint = asked.checkpoint
-    if checkpoint is None or checkpoint.system not in GRAPH_SYSTEMS:
-        return None
-    if checkpoint.edges is not None:
-        return checkpoint.edges
-    graph, _ = sensor_graph(
-        graph=arguments.graph, taxels=arguments.taxels, edges=arguments.edges, directed=arguments.directed
-    )
-    return graph.edges
-
-
-def distances(taxels: int, places: FloatArray | None, edges: IntArray | None) -> FloatArray:
-    """Distances between taxels: of their positions, else on their graph, else of their numbers; (taxels, taxels).
-
-    Examples
-    --------
-    >>> distances(3, None, None)[0].tolist(), distances(3, None, np.array([[0, 2], [2, 1]]))[0].tolist()
-    ([0.0, 1.0, 2.0], [0.0, 2.0, 1.0])
-    """
-    if places is None and edges is not None:
-        from scipy.sparse import coo_array, csgraph
-
-        graph = coo_array((np.ones(len(edges)), edges.T), shape=(taxels, taxels))
-        hops: FloatArray = csgraph.shortest_path(graph, directed=False, unweighted=True)
-        return hops
-    where = np.arange(float(taxels))[:, None] if places is None else places
-    found: FloatArray = np.linalg.norm(where[:, None] - where, axis=2)
-    return found
-
-
-def _facts(arguments: argparse.Namespace, asked: Asked, data: str) -> Json:
-    """What the runs depend on beside perturbation, level and seed."""
-    return {
-        "spikeloom": version(),
-        "netlist_sha256": hashlib.sha256(Path(arguments.netlist).read_bytes()).hexdigest(),
-        "checkpoint_sha256": asked.sha256,
-        "graph": asked.graph,
-        "data_sha256": data,
-        "netlist": Path(arguments.netlist).name,
-        "checkpoint": Path(arguments.checkpoint).name,
-        "data": Path(arguments.data).name,
-        "split": arguments.split,
-    }
 
 
 # -- runs --------------------------------------------------------------------------------------------------------------
@@ -334,10 +232,11 @@ def _here(
 @lru_cache(maxsize=1)
 def _kept(options: str) -> tuple[Bench, Any]:
     """The bench of a process, and what its clean recordings do."""
+    from runtime.stress_bench import bench_of
     from runtime.stress_runs import clean
 
     with redirect_stderr(StringIO()):  # the command has said it
-        bench, _, _ = _made(argparse.Namespace(**json.loads(options)))
+        bench, _, _ = bench_of(argparse.Namespace(**json.loads(options)))
     return bench, clean(bench)[0]
 
 

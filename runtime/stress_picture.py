@@ -13,10 +13,10 @@ if TYPE_CHECKING:
 Json = dict[str, Any]
 
 LOOKS: dict[str, tuple[str, str, Literal["-", "--"]]] = {
-    "float": ("#0072B2", "o", "-"),
-    "chip": ("#D55E00", "s", "--"),
+    "float": ("#D55E00", "o", "-"),
+    "chip": ("#0072B2", "s", "--"),
 }
-"""Colour (blue and vermilion of Okabe and Ito), marker and dash."""
+"""Colour (vermilion and blue of Okabe and Ito), marker and dash."""
 
 ACROSS = 5
 

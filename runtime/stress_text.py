@@ -15,6 +15,10 @@ ACROSS = 10
 
 NONE = "–"
 
+VERDICT_HEAD = ["perturbation", "verdict", "leaves, float", "chip", "chance, float", "chip", "least", "why"]
+
+CURVE_ROWS = (*SIDES, "equal", "spikes")
+
 KEY = """\
 leaves: first level below the clean interval; chance: first level no better than chance; least: fewest decisions equal
 curves in per cent: accuracy ± 95 % interval of the mean over seeds; equal decisions; spikes in common in the layer that
@@ -41,10 +45,10 @@ def stress_text(report: Json) -> str:
 
 def verdict_table(found: Json) -> str:
     """One line for each perturbation."""
-    head = ["perturbation", "verdict", "leaves, float", "chip", "chance, float", "chip", "least", "why"]
-    rows = verdict_rows(found)
-    widest = max((len(row[-1]) for row in rows), default=0)
-    return table([*head[:-1], head[-1].ljust(widest)], [[*row[:-1], row[-1].ljust(widest)] for row in rows])
+    rows = [VERDICT_HEAD, *verdict_rows(found)]
+    widest = max(len(row[-1]) for row in rows)
+    head, *others = [[*row[:-1], row[-1].ljust(widest)] for row in rows]
+    return table(head, others)
 
 
 def verdict_rows(found: Json) -> list[list[str]]:
@@ -86,14 +90,15 @@ def _curves(found: Json) -> list[str]:
     """Levels side by side, accuracies of both sides and equal decisions below."""
     levels = found["levels"]
     parts = [levels[i : i + ACROSS] for i in range(0, len(levels), ACROSS)]
-    return [_curve(part) for part in parts]
+    return [table(["", *(shown(point["level"]) for point in part)], curve_cells(part)) for part in parts]
 
 
-def _curve(levels: Sequence[Json]) -> str:
+def curve_cells(levels: Sequence[Json]) -> list[list[str]]:
+    """Cells of the curves, one row for each of ``CURVE_ROWS``, per cent."""
     rows = [[side, *(_accuracy(point[side]) for point in levels)] for side in SIDES]
     rows.append(["equal", *(f"{100 * point['equal']:.0f}" for point in levels)])
     rows.append(["spikes", *(f"{100 * min(point['common'].values()):.0f}" for point in levels)])
-    return table(["", *(shown(point["level"]) for point in levels)], rows)
+    return rows
 
 
 def _accuracy(spread: Json) -> str:
