@@ -180,7 +180,7 @@ def _measured(
 ) -> dict[tuple[str, Level], list[Json]]:
     """Runs of each seed, by perturbation and level."""
     seeds = {name: range(arguments.seeds if NAMES[name].seeded else 1) for name, _ in places}
-    if not (arguments.full or arguments.jobs or arguments.scheduler):
+    if not (arguments.full or arguments.jobs is not None or arguments.scheduler):
         return _here(bench, places, seeds)
     options = {name: value for name, value in vars(arguments).items() if name not in UNKEPT}
     keyed: dict[tuple[str, Level], list[Point]] = {}

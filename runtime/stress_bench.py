@@ -88,9 +88,9 @@ def distances(taxels: int, places: FloatArray | None, edges: IntArray | None) ->
     ([0.0, 1.0, 2.0], [0.0, 2.0, 1.0])
     """
     if places is None and edges is not None:
-        from scipy.sparse import coo_array, csgraph
+        from scipy.sparse import csgraph, csr_array
 
-        graph = coo_array((np.ones(len(edges)), edges.T), shape=(taxels, taxels))
+        graph = csr_array((np.ones(len(edges)), edges.T), shape=(taxels, taxels))
         hops: FloatArray = csgraph.shortest_path(graph, directed=False, unweighted=True)
         return hops
     where = np.arange(float(taxels))[:, None] if places is None else places

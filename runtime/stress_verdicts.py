@@ -3,7 +3,8 @@
 *Intervals.* Over several seeds the 95 % interval of Student for the mean; of a single run Wilson's. *Leaves*: the first
 level at which the mean accuracy is below Wilson's interval of the clean one. *Chance*: the first of these at which
 Wilson's interval, for as many recordings as there are, holds one in as many as there are classes. *Verdict*, from the
-chip: *robust* if it never leaves, *breaks* if it comes down to chance, else *degrades*.
+chip: *robust* if it never leaves, *breaks* if it comes down to chance, else *degrades*. Both sides break at the *same
+place* if the second has left, or has an interval that overlaps the other's, at the first level at which one leaves.
 """
 
 from __future__ import annotations
@@ -139,12 +140,14 @@ def curve(runs: Sequence[tuple[Level, Sequence[Json]]], clean: Json, recordings:
         }
     chip = breaks["chip"]
     verdict = ROBUST if chip["leaves"] is None else DEGRADES if chip["chance"] is None else BREAKS
-    return {
-        "levels": levels,
-        "breaks": breaks,
-        "same_place": chip["leaves"] == breaks["float"]["leaves"],
-        "verdict": verdict,
-    }
+    first = [point for point in levels if point["level"] in {breaks[side]["leaves"] for side in SIDES}][:1]
+    together = all(breaks[side]["leaves"] == point["level"] or _overlap(point) for point in first for side in SIDES)
+    return {"levels": levels, "breaks": breaks, "same_place": together, "verdict": verdict}
+
+
+def _overlap(point: Json) -> bool:
+    """Whether the intervals of both sides do."""
+    return bool(max(point[side]["low"] for side in SIDES) <= min(point[side]["high"] for side in SIDES))
 
 
 def _point(level: Level, runs: Sequence[Json], clean: Json, recordings: int) -> Json:
