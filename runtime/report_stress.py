@@ -70,7 +70,7 @@ def stability(report: Json) -> list[str]:
             f"left to chance. Without any, the float model decides {100 * clean['float']:.1f} % right, the chip "
             f"{100 * clean['chip']:.1f} %."
         ),
-        table("Where they break and why", VERDICT_HEAD, verdict_rows(curves)),
+        table("Where they break and why", VERDICT_HEAD, verdict_rows(curves), left=True),
         paragraph(f"{KEY.splitlines()[0]}."),
         figure(
             panels(found),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import os
 import tempfile
@@ -41,21 +42,11 @@ KIND, VERSION = "stress", 1
 CHUNK = 5
 """Seeds of a point."""
 
-UNKEPT = (
-    "action",
-    "output",
-    "picture",
-    "json",
-    "debug",
-    "jobs",
-    "scheduler",
-    "fresh",
-    "require",
-    "only",
-    "full",
-    "seeds",
-)
+UNKEPT = tuple("action command output picture json debug jobs scheduler fresh require only full seeds".split())
 """Options that change no run."""
+
+HASHED = ("netlist", "checkpoint", "data")
+"""Files that a point knows by their hash."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -182,13 +173,15 @@ def _measured(
     seeds = {name: range(arguments.seeds if NAMES[name].seeded else 1) for name, _ in places}
     if not (arguments.full or arguments.jobs is not None or arguments.scheduler):
         return _here(bench, places, seeds)
-    options = {name: value for name, value in vars(arguments).items() if name not in UNKEPT}
+    options = {name: _absolute(value) for name, value in vars(arguments).items() if name not in UNKEPT}
+    chosen = {name: value for name, value in vars(arguments).items() if name not in (*UNKEPT, *HASHED)}
+    known = facts | {"options": chosen, "sensor": _digest(bench)}
     keyed: dict[tuple[str, Level], list[Point]] = {}
     for name, level in places:
         chunks = [list(seeds[name][i : i + CHUNK]) for i in range(0, len(seeds[name]), CHUNK)]
         keyed[name, level] = [
             Point(
-                key=content_key(facts | {"perturbation": name, "level": level, "seeds": chunk}),
+                key=content_key(known | {"perturbation": name, "level": level, "seeds": chunk}),
                 label=f"{name} {shown(level)}",
                 payload={"options": options, "name": name, "level": level, "seeds": chunk},
             )
@@ -208,6 +201,17 @@ def _measured(
             label="stress",
         )
     return {place: [run for point in points for run in results[point.key]["runs"]] for place, points in keyed.items()}
+
+
+def _absolute(value: Any) -> Any:
+    """A path as processes elsewhere find it; anything else as it is."""
+    return str(Path(value).resolve()) if isinstance(value, str) and Path(value).exists() else value
+
+
+def _digest(bench: Bench) -> str:
+    """Hash over distances and edges of the sensor."""
+    edges = bench.sensor.edges
+    return hashlib.sha256(bench.sensor.distance.tobytes() + (b"" if edges is None else edges.tobytes())).hexdigest()
 
 
 def _here(
