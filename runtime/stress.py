@@ -42,7 +42,10 @@ KIND, VERSION = "stress", 1
 CHUNK = 5
 """Seeds of a point."""
 
-UNKEPT = tuple("action command output picture json debug jobs scheduler fresh require only full seeds".split())
+UNKEPT = (
+    *("action", "command", "debug", "json", "output", "picture"),
+    *("only", "require", "full", "seeds", "jobs", "scheduler", "fresh"),
+)
 """Options that change no run."""
 
 HASHED = ("netlist", "checkpoint", "data")
