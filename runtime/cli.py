@@ -40,6 +40,7 @@ from runtime import (
     render,
     report,
     reproduce,
+    stress,
     verdicts,
     watch,
     yardstick_command,
@@ -324,6 +325,7 @@ def build_parser() -> argparse.ArgumentParser:
     lean.add_arguments(command("lean", lean.lean, lean.SUMMARY))
     report.add_arguments(command("report", report.report, report.SUMMARY))
     reproduce.add_arguments(command("reproduce", reproduce.reproduce, reproduce.SUMMARY))
+    stress.add_arguments(command("stress", stress.stress, stress.SUMMARY))
     watch.add_arguments(command("watch", watch.watch, watch.SUMMARY))
     yardstick_command.add_arguments(command("yardsticks", yardstick_command.measure, yardstick_command.SUMMARY))
     add_data_commands(commands)

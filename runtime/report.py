@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import hashlib
 from collections.abc import Callable
 from difflib import get_close_matches
+from pathlib import Path
 from typing import Any
 
 from compiler.atomic import write_atomically
@@ -47,6 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--spec-samples", type=int, default=3, metavar="N", help="recordings for spec = engine (default: 3)"
     )
+    parser.add_argument("--stress", metavar="STRESS.json", help="show what stress -o wrote about this netlist")
     parser.add_argument("-o", "--output", required=True, metavar="OUT.html")
     add_explain_cost(parser)
     parser.epilog = NOTES
@@ -64,6 +67,12 @@ def report(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], 
 
     require_place(arguments.output, "-o", arguments)
     netlist = read_netlist(arguments.netlist)
+    stability: Json = {}
+    if arguments.stress is not None:
+        from runtime.report_stress import read_stress
+
+        sha256 = hashlib.sha256(Path(arguments.netlist).read_bytes()).hexdigest()
+        stability = {"stress": read_stress(arguments.stress, arguments.netlist, sha256)}
     asked = asked_network(arguments.checkpoint, arguments)
     _require_origin(arguments, netlist, asked)
     progress("reading the recordings")
@@ -79,6 +88,7 @@ def report(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], 
     check_channels(netlist, data.events.shape[1] * data.events.shape[2] + netlist.clocks.channels)
     chosen = None if arguments.recording is None else find_recording(data, arguments.recording)
     found, code = _facts(arguments, netlist, asked, data, chosen)
+    found |= stability
     with write_atomically(arguments.output) as file:
         file.write(page(found).encode())
     return found | {"output": arguments.output}, report_text, code

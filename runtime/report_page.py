@@ -8,7 +8,7 @@ from html import escape
 from importlib import resources
 from typing import Any
 
-from runtime import report_costs, report_sections
+from runtime import report_costs, report_sections, report_stress
 from runtime.markup import paragraph, section, table
 
 Json = dict[str, Any]
@@ -24,8 +24,9 @@ def page(report: Json) -> str:
     """
     made = report["provenance"]
     title = f"{made['netlist']['file']} on {made['data']['name']}"
-    body = "".join(section(name, heading, content(report)) for name, (heading, content) in SECTIONS.items())
-    links = "".join(f'<li><a href="#{name}">{escape(heading)}</a></li>' for name, (heading, _) in SECTIONS.items())
+    shown = {name: entry for name, entry in SECTIONS.items() if name not in OPTIONAL or name in report}
+    body = "".join(section(name, heading, content(report)) for name, (heading, content) in shown.items())
+    links = "".join(f'<li><a href="#{name}">{escape(heading)}</a></li>' for name, (heading, _) in shown.items())
     files = resources.files("runtime")
     style, script = (files.joinpath(name).read_text("utf-8") for name in ("report.css", "report.js"))
     return (
@@ -89,6 +90,10 @@ SECTIONS: dict[str, tuple[str, Callable[[Json], list[str]]]] = {
     "taxels-section": ("Taxels", report_sections.taxels),
     "recording": ("One recording", report_sections.recording),
     "costs": ("Energy and time", report_costs.costs),
+    "stress": ("Stability", report_stress.stability),
     "provenance": ("Provenance", _provenance),
 }
 """Sections in their order: id, heading, and what makes the content; a further chart is a further entry."""
+
+OPTIONAL = ("stress",)
+"""Sections that are there where their part of the report is."""

@@ -8,6 +8,7 @@ import numpy as np
 
 from runtime.estimates import estimate_text
 from runtime.render import netlist_text
+from runtime.stress_text import stress_text
 from runtime.tables import si, table
 from runtime.verdicts import verify_text
 
@@ -26,6 +27,7 @@ def report_text(report: Json) -> str:
         "Taxels": _taxels(report["taxels"]),
         "One recording": _recording(report["recording"]),
         "Energy and time": estimate_text(report["costs"]),
+        **({"Stability": stress_text(report["stress"])} if "stress" in report else {}),
         "Provenance": _provenance(report["provenance"]),
     }
     parts = [f"{title}\n{'-' * len(title)}\n{text}" for title, text in sections.items()]
