@@ -42,6 +42,13 @@ def add_recordings(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--limit", type=int, metavar="N", help="first N recordings only")
 
 
+def add_window(parser: argparse.ArgumentParser) -> None:
+    """Add the option that names a part of the recordings."""
+    parser.add_argument(
+        "--window", default="100%", metavar="PERCENT", help="first part of every recording, as in 50%% (default: 100%%)"
+    )
+
+
 def add_detail(parser: argparse.ArgumentParser, choices: tuple[str, ...], default: str) -> None:
     """Add the option that says how deep a run is simulated."""
     what = {

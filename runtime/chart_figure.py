@@ -1,0 +1,214 @@
+"""A chart's figure as inline SVG: test accuracy over a cost, one mark a point, the front, and the points to take."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from runtime import svg
+from runtime.chart_text import NAMES, label
+from runtime.tables import si
+
+Json = dict[str, Any]
+
+SERIES = 8
+"""Colours and shapes, each pair its own; more series begin again, with hollow marks."""
+
+LEFT, TOP, RIGHT, BOTTOM = 62.0, 22.0, svg.WIDTH - 16.0, 380.0
+
+SMALLEST, LARGEST = 4.2, 6.6
+"""Size of marks, by the part of the recording that has passed."""
+
+Shape = tuple[tuple[float, float], ...]
+
+SHAPES: tuple[Shape, ...] = (
+    (),  # a circle
+    ((-0.9, -0.9), (0.9, -0.9), (0.9, 0.9), (-0.9, 0.9)),
+    ((0, -1.15), (1.05, 0.8), (-1.05, 0.8)),
+    ((0, -1.25), (1.25, 0), (0, 1.25), (-1.25, 0)),
+    ((0, 1.15), (1.05, -0.8), (-1.05, -0.8)),
+    ((-0.4, -1.1), (0.4, -1.1), (0.4, -0.4), (1.1, -0.4), (1.1, 0.4), (0.4, 0.4))
+    + ((0.4, 1.1), (-0.4, 1.1), (-0.4, 0.4), (-1.1, 0.4), (-1.1, -0.4), (-0.4, -0.4)),
+    ((-1.15, 0), (0.8, -1.05), (0.8, 1.05)),
+    ((1.15, 0), (-0.8, -1.05), (-0.8, 1.05)),
+)
+"""Corners of marks, in units of their size: circle, square, triangles, diamond, plus."""
+
+
+def series_of(points: Sequence[Json]) -> tuple[str, list[str]]:
+    """Which axis the colours and shapes are for, and its values: networks where there are several.
+
+    Examples
+    --------
+    >>> series_of([{"network": "a", "storage": "4b"}, {"network": "a", "storage": "8b"}])
+    ('storage', ['4b', '8b'])
+    """
+    for axis in ("network", "storage", "cores", "window"):
+        values = list(dict.fromkeys(str(point.get(axis)) for point in points))
+        if len(values) > 1:
+            return axis, values
+    return "network", [str(points[0]["network"])]
+
+
+def tip(point: Json, report: Json) -> str:
+    """What is said of a point."""
+    test = point["test"]
+    costs = [f"{si(joule, 'J')} ({name})" for name, joule in test["energy_j"].items()]
+    costs += [f"{si(seconds, 's')} ({name})" for name, seconds in test["time_s"].items()]
+    return (
+        f"#{point['number']} {label(point)}: test {100 * test['accuracy']:.2f} % "
+        f"({100 * test['low']:.1f} … {100 * test['high']:.1f}), float {100 * test['float']['accuracy']:.2f} %, "
+        f"expected {100 * point['expected']:.2f} %, {test['equal']} of {report['data']['test']} decisions equal, "
+        f"{', '.join(costs)}, {test['synaptic_operations']:,.0f} synaptic operations, {point['n_cores']} cores"
+    )
+
+
+def costs_of(report: Json) -> dict[str, tuple[str, str, str]]:
+    """Costs that a chart is drawn over: id to key, table and unit."""
+    energy, time = report["chosen_by"]["energy"], report["chosen_by"]["time"]
+    found = {"energy": ("energy_j", energy, "J")}
+    return found | ({} if time is None else {"latency": ("time_s", time, "s")})
+
+
+def scatter(report: Json, cost: str, *, prefix: str = "chart") -> str:
+    """Accuracy over one cost, on a logarithmic axis.
+
+    Parameters
+    ----------
+    report : dict
+        A chart.
+    cost : str
+        ``energy`` or ``latency``.
+    prefix : str
+        Of the figure's id.
+    """
+    key, table, unit = costs_of(report)[cost]
+    points = report["points"]
+    values = [point["test"][key][table] for point in points]
+    frame = _frame(report, values)
+    axis, names = series_of(points)
+    content = [_legend(names), *_axes(frame, cost, table, unit), *_float(report, frame)]
+    on = sorted((v, p["test"]["accuracy"]) for v, p in zip(values, points, strict=True) if p["front"][cost] and v > 0)
+    if len(on) > 1:
+        path = " ".join(f"{svg.number(frame.x(math.log10(v)))},{svg.number(frame.y(100 * a))}" for v, a in on)
+        content.append(svg.shape("polyline", "line front", points=path))
+    taken = {number for number in report["recommended"].values() if number is not None}
+    for point, value in zip(points, values, strict=True):
+        if value > 0:
+            x, y = frame.x(math.log10(value)), frame.y(100 * point["test"]["accuracy"])
+            if point["number"] in taken:
+                low, high = (frame.y(100 * point["test"][end]) for end in ("low", "high"))
+                content.append(svg.shape("line", "whisker", x1=x, y1=low, x2=x, y2=high))
+                content.append(svg.shape("circle", "taken", cx=x, cy=y, r=LARGEST + 5))
+            content.append(_mark(point, x, y, names.index(str(point[axis])), tip(point, report)))
+    content += _names(report, frame, key, table)
+    title = f"Test accuracy over {'energy' if cost == 'energy' else 'time on the chip'} of a mean inference"
+    return svg.drawing(f"{prefix}-{cost}", title, BOTTOM + 42, content)
+
+
+def _frame(report: Json, values: Sequence[float]) -> svg.Frame:
+    positive = [math.log10(value) for value in values if value > 0] or [0.0]
+    shares = [100 * point["test"]["accuracy"] for point in report["points"]]
+    shares += [100 * net["float"][max(net["float"], key=int)]["test"]["accuracy"] for net in report["networks"]]
+    room = max(0.08, 0.05 * (max(positive) - min(positive)))
+    low, high = min(shares), max(shares)
+    reach = max(2.0, 0.08 * (high - low))
+    return svg.Frame(
+        left=LEFT,
+        top=TOP + 14,
+        right=RIGHT,
+        bottom=BOTTOM,
+        x_from=min(positive) - room,
+        x_to=max(positive) + room,
+        y_from=max(0.0, low - reach),
+        y_to=min(100.0, high + reach),
+    )
+
+
+def _axes(frame: svg.Frame, cost: str, table: str, unit: str) -> list[str]:
+    content = []
+    for value in svg.ticks(frame.y_from, frame.y_to, 6):
+        y = frame.y(value)
+        content.append(svg.shape("line", "grid", x1=frame.left, y1=y, x2=frame.right, y2=y))
+        content.append(svg.words(frame.left - 6, y + 4, f"{value:g} %", "small", "end"))
+    for value in log_ticks(frame.x_from, frame.x_to):
+        x = frame.x(math.log10(value))
+        content.append(svg.shape("line", "grid", x1=x, y1=frame.top, x2=x, y2=frame.bottom))
+        content.append(svg.words(x, frame.bottom + 16, si(value, unit), "small", "middle"))
+    what = "energy of a mean inference" if cost == "energy" else "time of a mean inference on the chip, simple model"
+    content.append(svg.shape("line", "axis", x1=frame.left, y1=frame.bottom, x2=frame.right, y2=frame.bottom))
+    content.append(svg.words((frame.left + frame.right) / 2, frame.bottom + 34, f"{what} ({table})", "small", "middle"))
+    return content
+
+
+def log_ticks(low: float, high: float) -> list[float]:
+    """Numbers 1, 2, 5 times a power of ten between two logarithms; powers of ten alone over three decades.
+
+    Examples
+    --------
+    >>> log_ticks(-4.1, -3.2)
+    [0.0001, 0.0002, 0.0005]
+    """
+    digits = (1, 2, 5) if high - low < 3 else (1,)
+    powers = range(math.floor(low), math.ceil(high) + 1)
+    found = [float(f"{digit}e{power}") for power in powers for digit in digits]
+    inside = [value for value in found if low <= math.log10(value) <= high]
+    return inside if len(inside) > 1 else [10**low, 10**high]
+
+
+def _float(report: Json, frame: svg.Frame) -> list[str]:
+    """The float model of the network with the highest expectation, on whole recordings."""
+    network = max(report["networks"], key=lambda net: net["expected"])
+    found = network["float"][max(network["float"], key=int)]["test"]
+    y = frame.y(100 * found["accuracy"])
+    text = f"float model of {network['name']}: {100 * found['accuracy']:.2f} %"
+    line = svg.shape("line", "float-line", x1=frame.left, y1=y, x2=frame.right, y2=y)
+    return [line, svg.words(frame.right - 4, y - 5, text, "small over", "end")]
+
+
+def _mark(point: Json, x: float, y: float, series: int, said: str) -> str:
+    size = SMALLEST + (LARGEST - SMALLEST) * point["window"] / 100
+    style = f"mark c{series % SERIES}{' hollow' if series // SERIES % 2 else ''}"
+    return _shape(SHAPES[series % SERIES], x, y, size, style, said, point["number"])
+
+
+def _shape(corners: Shape, x: float, y: float, size: float, style: str, said: str, number: int | None) -> str:
+    own = {} if number is None else {"data_n": str(number)}
+    if not corners:
+        return svg.shape("circle", style, said, cx=x, cy=y, r=size, **own)
+    path = " ".join(f"{svg.number(x + size * dx)},{svg.number(y + size * dy)}" for dx, dy in corners)
+    return svg.shape("polygon", style, said, points=path, **own)
+
+
+def _legend(names: Sequence[str]) -> str:
+    parts, x, y = [], LEFT, 12.0
+    for index, name in enumerate(names[: 2 * SERIES]):
+        wide = 20 + svg.LETTER * len(name) + 16
+        if x + wide > RIGHT and index:
+            break
+        hollow = " hollow" if index // SERIES % 2 else ""
+        style = f"mark c{index % SERIES}{hollow}"
+        parts += [_shape(SHAPES[index % SERIES], x + 7, y - 4, 5.5, style, "", None), svg.words(x + 18, y, name, "small")]
+        x += wide
+    return "".join(parts)
+
+
+def _names(report: Json, frame: svg.Frame, key: str, table: str) -> list[str]:
+    """Names beside the points to take; of a point that is taken twice both."""
+    points = {point["number"]: point for point in report["points"]}
+    said: dict[int, list[str]] = {}
+    for name, number in report["recommended"].items():
+        if number is not None:
+            said.setdefault(number, []).append(NAMES[name].partition(" within")[0])
+    content = []
+    for number, names in said.items():
+        point = points[number]
+        value = point["test"][key][table]
+        if value > 0:
+            x, y = frame.x(math.log10(value)), frame.y(100 * point["test"]["accuracy"])
+            left = x > (frame.left + frame.right) / 2
+            place = x - 16 if left else x + 16
+            anchor = "end" if left else "start"
+            content.append(svg.words(place, y - 12, f"#{number} {', '.join(names)}", "over strong", anchor))
+    return content

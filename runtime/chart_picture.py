@@ -1,0 +1,167 @@
+"""A chart as pictures to print: SVG and PNG, told apart by shape as well as by colour."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from runtime.chart_figure import costs_of, series_of
+from runtime.chart_text import NAMES
+from runtime.tables import si
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Json = dict[str, Any]
+
+COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9", "#000000", "#B8A800")
+"""Okabe and Ito's, which people with any colour vision tell apart; the yellow darkened for white paper."""
+
+MARKERS = ("o", "s", "^", "D", "v", "P", "<", ">")
+
+DPI = 150
+
+SIZE = (7.2, 5.0)
+"""Of a panel, in inches."""
+
+
+def pictures(report: Json) -> dict[str, bytes]:
+    """``chart.svg`` and ``chart.png``; the same bytes for the same chart.
+
+    Parameters
+    ----------
+    report : dict
+        A chart.
+    """
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
+
+    with mpl.rc_context({"svg.hashsalt": "spikeloom", "font.size": 9}):
+        figure = _drawn(report)
+        found = {}
+        for kind in ("svg", "png"):
+            content = io.BytesIO()
+            metadata = {"Date": None} if kind == "svg" else {"Software": None}
+            figure.savefig(content, format=kind, dpi=DPI, metadata=metadata)
+            found[f"chart.{kind}"] = content.getvalue()
+        plt.close(figure)
+    return found
+
+
+def _drawn(report: Json) -> Figure:
+    from matplotlib import pyplot as plt
+
+    costs = costs_of(report)
+    width, height = SIZE
+    figure, (panels,) = plt.subplots(
+        1, len(costs), figsize=(width * len(costs), height), layout="constrained", squeeze=False, sharey=True
+    )
+    for axes, cost in zip(panels, costs, strict=True):
+        _panel(axes, report, cost)
+    panels[0].set_ylabel("test accuracy on the chip (%)")
+    handles, names = panels[0].get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside lower center", ncols=min(len(names), 6), fontsize=8)
+    data = report["data"]
+    figure.suptitle(
+        f"{len(report['points'])} configurations, {data['test']} test recordings of {_name(data['path'])}; larger marks "
+        "have seen more of each recording",
+        fontsize=10,
+    )
+    return figure
+
+
+def _name(path: str) -> str:
+    return path.rstrip("/").rsplit("/", 1)[-1]
+
+
+def _panel(axes: Axes, report: Json, cost: str) -> None:
+    key, table, unit = costs_of(report)[cost]
+    points = report["points"]
+    axis, names = series_of(points)
+    for index, name in enumerate(names):
+        own = [point for point in points if str(point[axis]) == name]
+        colour = COLOURS[index % len(COLOURS)]
+        hollow = index // len(COLOURS) % 2 == 1
+        axes.scatter(
+            [point["test"][key][table] for point in own],
+            [100 * point["test"]["accuracy"] for point in own],
+            s=[14 + 0.3 * point["window"] for point in own],
+            marker=MARKERS[index % len(MARKERS)],
+            facecolors="none" if hollow else colour,
+            edgecolors=colour if hollow else "white",
+            linewidths=0.9 if hollow else 0.4,
+            label=name,
+            zorder=3,
+        )
+    on = sorted((p["test"][key][table], 100 * p["test"]["accuracy"]) for p in points if p["front"][cost])
+    axes.plot(
+        [value for value, _ in on],
+        [right for _, right in on],
+        color="0.25",
+        linewidth=1.0,
+        linestyle=(0, (5, 2)),
+        label="front on the test split",
+        zorder=2,
+    )
+    _float_line(axes, report)
+    _taken(axes, report, key, table)
+    axes.set_xscale("log")
+    _ticks(axes, [p["test"][key][table] for p in points], unit)
+    what = "energy of a mean inference" if cost == "energy" else "time of a mean inference on the chip, simple model"
+    axes.set_xlabel(f"{what} ({table})")
+    axes.grid(alpha=0.25)
+    axes.margins(0.06, 0.08)
+
+
+def _float_line(axes: Axes, report: Json) -> None:
+    network = max(report["networks"], key=lambda net: net["expected"])
+    found = network["float"][max(network["float"], key=int)]["test"]
+    axes.axhline(
+        100 * found["accuracy"],
+        color="0.45",
+        linewidth=0.9,
+        linestyle=":",
+        label=f"float model of {network['name']}",
+        zorder=1,
+    )
+
+
+def _taken(axes: Axes, report: Json, key: str, table: str) -> None:
+    """Rings, intervals and names of the points to take."""
+    points = {point["number"]: point for point in report["points"]}
+    said: dict[int, list[str]] = {}
+    for name, number in report["recommended"].items():
+        if number is not None:
+            said.setdefault(number, []).append(NAMES[name].partition(" within")[0])
+    for place, (number, names) in enumerate(said.items()):
+        test = points[number]["test"]
+        x, y = test[key][table], 100 * test["accuracy"]
+        axes.plot([x, x], [100 * test["low"], 100 * test["high"]], color="0.15", linewidth=0.9, zorder=2)
+        axes.scatter([x], [y], s=150, facecolors="none", edgecolors="black", linewidths=1.2, zorder=4)
+        axes.annotate(
+            f"#{number} {', '.join(names)}",
+            (x, y),
+            xytext=(10, (10, -16, 24)[place % 3]),
+            textcoords="offset points",
+            fontsize=8,
+            fontweight="bold",
+            bbox={"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.75},
+            zorder=5,
+        )
+
+
+def _ticks(axes: Axes, values: Sequence[float], unit: str) -> None:
+    import math
+
+    from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter
+
+    from runtime.chart_figure import log_ticks
+
+    positive = [math.log10(value) for value in values if value > 0] or [0.0]
+    axes.xaxis.set_major_locator(FixedLocator(log_ticks(min(positive) - 0.1, max(positive) + 0.1)))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: si(value, unit)))
+    axes.xaxis.set_minor_formatter(NullFormatter())
