@@ -107,7 +107,8 @@ def make(
     KeyboardInterrupt
         On an interrupt or a request to end; its text says what is kept.
     """
-    from runtime.seeds import ended_by_signal, finished, side_by_side
+    from runtime.seeds import finished, side_by_side
+    from runtime.workers import ended_by_signal
 
     costs = [_cost(each, trained=finished(each.job)) for each in work]
     began, results = time.monotonic(), dict[int, Json]()

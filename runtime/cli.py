@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import shlex
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
@@ -19,7 +20,7 @@ import numpy as np
 
 from compiler.atomic import write_atomically
 from compiler.dynamics import with_clocks
-from compiler.errors import OptionError, SpikeloomError
+from compiler.errors import OptionError, SpikeloomError, UnfinishedError
 from compiler.fixedpoint import IntArray
 from compiler.netlist import Netlist
 from compiler.passes.legalize import measure
@@ -332,6 +333,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         if "--debug" in words:
             raise
         sys.stderr.writelines(f"spikeloom: {line}\n" for line in _mistake(error).splitlines())
+        if isinstance(error, UnfinishedError):
+            again = [word for word in words if word != "--fresh"] + [w for w in error.resume if w not in words]
+            sys.stderr.write(f"spikeloom: go on with: spikeloom {shlex.join(again)}\n")
+            return 1
         return 2
     except KeyboardInterrupt as interrupt:
         progress("")
