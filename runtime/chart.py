@@ -115,7 +115,9 @@ def _command(arguments: argparse.Namespace) -> str:
     """The words that ask for the same chart."""
     words = ["spikeloom", "chart", *arguments.checkpoints, "--data", arguments.data]
     names = ("graph", "taxels", "edges", "system", "weights", "beta", "theta", "grid", "table")
-    words += [word for name in names if (value := getattr(arguments, name)) is not None for word in (f"--{name}", str(value))]
+    words += [
+        word for name in names if (value := getattr(arguments, name)) is not None for word in (f"--{name}", str(value))
+    ]
     words += ["--directed"] if arguments.directed else []
     words += ["--run", str(arguments.run)] if arguments.run else []
     words += [] if math.isclose(arguments.bin, BIN_S) else ["--bin", f"{arguments.bin:g}"]
@@ -157,7 +159,9 @@ def _measured(arguments: argparse.Namespace, networks: Sequence[Given], grid: Gr
             runs = chart_plan.runs(each, layout, found["sha256"], grid, facts)
             planned += [(each, layout, found, window, point) for window, point in runs.items()]
     if not planned:
-        raise OptionError(f"--grid: the chip refuses all {len(refused)} configurations; the first: {refused[0]['why'][0]}")
+        raise OptionError(
+            f"--grid: the chip refuses all {len(refused)} configurations; the first: {refused[0]['why'][0]}"
+        )
     second = _sweep(arguments, facts, [point for *_, point in planned], "measuring")
     points, rates = [], {}
     for number, (each, layout, found, window, point) in enumerate(planned, 1):
@@ -183,7 +187,8 @@ def _sweep(arguments: argparse.Namespace, facts: Facts, points: Sequence[sweep.P
         version=FORMAT,
         jobs=arguments.jobs,
         scheduler=arguments.scheduler,
-        fresh=arguments.fresh and label == "compiling",  # what the first half found is not to be forgotten by the second
+        fresh=arguments.fresh
+        and label == "compiling",  # what the first half found is not to be forgotten by the second
         label=label,
     )
 

@@ -100,7 +100,10 @@ def pick(points: Sequence[Json], budgets: Sequence[Budget], *, energy: str, time
     if not fitting:
         nearest = min(points, key=lambda p: (max(_excess(p, b, energy, time) for b in budgets), cost_of(energy)(p)))
         missed = [b for b in budgets if _excess(nearest, b, energy, time) > 1 + NEAR]
-        chosen, misses = nearest, {b.what: {"limit": b.limit, "found": _found(nearest, b, energy, time)} for b in missed}
+        chosen, misses = (
+            nearest,
+            {b.what: {"limit": b.limit, "found": _found(nearest, b, energy, time)} for b in missed},
+        )
     elif any(budget.what == "accuracy" for budget in budgets):
         chosen, misses = min(fitting, key=cost_of(energy)), {}
     else:

@@ -189,7 +189,10 @@ def _legend(names: Sequence[str]) -> str:
             break
         hollow = " hollow" if index // SERIES % 2 else ""
         style = f"mark c{index % SERIES}{hollow}"
-        parts += [_shape(SHAPES[index % SERIES], x + 7, y - 4, 5.5, style, "", None), svg.words(x + 18, y, name, "small")]
+        parts += [
+            _shape(SHAPES[index % SERIES], x + 7, y - 4, 5.5, style, "", None),
+            svg.words(x + 18, y, name, "small"),
+        ]
         x += wide
     return "".join(parts)
 

@@ -221,9 +221,7 @@ def _provenance(report: Json) -> list[str]:
     data = report["data"]
     rows = [["recordings", data["path"], data["sha256"]]]
     rows += [[network["name"], network["path"], network["sha256"]] for network in report["networks"]]
-    tables = [
-        [f"{kind}, {name}", title] for kind, found in report["tables"].items() for name, title in found.items()
-    ]
+    tables = [[f"{kind}, {name}", title] for kind, found in report["tables"].items() for name, title in found.items()]
     grid = [[axis, ", ".join(_shown(value) for value in values) or "all"] for axis, values in report["grid"].items()]
     return [
         table("Files", ["", "name", "sha256"], rows, left=True),

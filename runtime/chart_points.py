@@ -23,8 +23,12 @@ NEAR = 1e-9
 LOSS = 0.01
 """Accuracy that a saving may cost against the usual mapping: a point."""
 
-VALIDATION = "what their trainings reached on recordings that these left out, less what a point loses on the training split"
-TRAINING = "accuracy on the training split (not every checkpoint knows what its training reached on left-out recordings)"
+VALIDATION = (
+    "what their trainings reached on recordings that these left out, less what a point loses on the training split"
+)
+TRAINING = (
+    "accuracy on the training split (not every checkpoint knows what its training reached on left-out recordings)"
+)
 
 
 # -- one point ---------------------------------------------------------------------------------------------------------

@@ -82,9 +82,7 @@ def chart_text(report: Json, folder: str) -> str:
     ]
 
     def rows(numbers: Sequence[int], names: Sequence[str] | None = None) -> str:
-        shown = [
-            [str(number), label(points[number]), *figures(points[number], energy, time)] for number in numbers
-        ]
+        shown = [[str(number), label(points[number]), *figures(points[number], energy, time)] for number in numbers]
         above = head(energy, time)
         if names is None:
             return table(above, shown)

@@ -151,9 +151,7 @@ def both_splits(data: Data, taxels: int, classes: int) -> dict[str, Recordings]:
         If they cannot be used, or do not suit the network.
     """
     return {
-        split: recordings(
-            data.path, split, classes=classes, taxels=taxels, bin_s=data.bin_s, labels_for="chart"
-        )
+        split: recordings(data.path, split, classes=classes, taxels=taxels, bin_s=data.bin_s, labels_for="chart")
         for split in SPLITS
     }
 

@@ -1,20 +1,12 @@
 """Sweeps: nothing is lost and nothing is done twice, whoever is killed; every message."""
 
 import json
-import os
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import pytest
-import swept
 from swept import KIND, begun, points, square
 
-from compiler.errors import CapacityError, DataError, OptionError, UnfinishedError
-from runtime.sweep import Point, content_key, sweep
-from runtime.sweep_store import opened
+from runtime.sweep import Point, sweep
 
 ROOT = Path(__file__).resolve().parents[1]
 HEADER = '{"spikeloom": "sweep", "format": 1, "kind": "test", "version": 1}\n'
