@@ -53,7 +53,7 @@ class Grid:
     graph: tuple[str, ...] = ()
 
 
-class _Fault(Exception):
+class _BadValueError(Exception):
     """What is wrong, and at which character of the value."""
 
     def __init__(self, offset: int, text: str) -> None:
@@ -106,7 +106,7 @@ def parse_grid(text: str, target: Target) -> Grid:
             raise _error(text, at, f"{axis} has an empty value; write one, or take the separator away")
         try:
             found[axis] |= dict.fromkeys(readers[axis](value.strip()))
-        except _Fault as fault:
+        except _BadValueError as fault:
             raise _error(text, at + fault.offset, fault.text) from None
     grid = Grid(**{name: tuple(values) for name, values in found.items()})
     points = len(grid.bits) * len(grid.planes) * len(grid.groups) * len(grid.prune) * len(grid.cores) * len(grid.window)
@@ -152,9 +152,9 @@ def _readers(target: Target) -> Mapping[str, Reader]:
 
 def _number(words: str, offset: int, allowed: Sequence[int], what: str) -> int:
     if not (words.isascii() and words.isdecimal() and len(words) < 10):
-        raise _Fault(offset, f"{words!r} is not {what}; allowed: {_listed(allowed)}")
+        raise _BadValueError(offset, f"{words!r} is not {what}; allowed: {_listed(allowed)}")
     if int(words) not in allowed:
-        raise _Fault(offset, f"{int(words)} is not {what}; allowed: {_listed(allowed)}")
+        raise _BadValueError(offset, f"{int(words)} is not {what}; allowed: {_listed(allowed)}")
     return int(words)
 
 
@@ -172,7 +172,7 @@ def _range(words: str, allowed: Sequence[int], what: str) -> tuple[int, int] | N
     first = _number(low, 0, allowed, what)
     last = _number(high, len(low) + 1, allowed, what)
     if last < first:
-        raise _Fault(0, f"{words!r} runs backwards; write {last}-{first}")
+        raise _BadValueError(0, f"{words!r} runs backwards; write {last}-{first}")
     return first, last
 
 
@@ -183,7 +183,7 @@ def _numbers(words: str, allowed: Sequence[int], what: str) -> list[int]:
     found = list(range(ends[0], ends[1] + 1))
     for value in found:
         if value not in allowed:
-            raise _Fault(0, f"{words!r} holds {value}, which is not {what}; allowed: {_listed(allowed)}")
+            raise _BadValueError(0, f"{words!r} holds {value}, which is not {what}; allowed: {_listed(allowed)}")
     return found
 
 
@@ -207,13 +207,13 @@ def _windows(words: str) -> list[int]:
         low = low[:-1]
     if not dash:
         if colon:
-            raise _Fault(len(body), f"{words!r} is no range, so it has no step; write {bare}%")
+            raise _BadValueError(len(body), f"{words!r} is no range, so it has no step; write {bare}%")
         return [_number(low, 0, allowed, what)]
     first = _number(low, 0, allowed, what)
     last = _number(high, bare.index("-") + 1, allowed, what)
     by = _number(step.removesuffix("%"), len(body) + 1, allowed, "a step in per cent") if colon else WINDOW_STEP
     if last < first:
-        raise _Fault(0, f"{words!r} runs backwards; write {last}-{first}%")
+        raise _BadValueError(0, f"{words!r} runs backwards; write {last}-{first}%")
     return list(dict.fromkeys([*range(first, last, by), last]))
 
 
@@ -221,14 +221,14 @@ def _cores(words: str) -> list[str]:
     if words in GOALS:
         return [words]
     if ":" not in words:
-        raise _Fault(0, f"{words!r} is no layout; allowed: {', '.join(GOALS)}, or LAYER:N as in fc1:6+conv1:4")
+        raise _BadValueError(0, f"{words!r} is no layout; allowed: {', '.join(GOALS)}, or LAYER:N as in fc1:6+conv1:4")
     offset, seen = 0, dict[str, int]()
     for part in words.split("+"):
         layer, _, count = part.partition(":")
         if not layer:
-            raise _Fault(offset, f"{part!r} names no layer; write LAYER:N as in fc1:6")
+            raise _BadValueError(offset, f"{part!r} names no layer; write LAYER:N as in fc1:6")
         if layer in seen:
-            raise _Fault(offset, f"{layer} is given twice; give it once")
+            raise _BadValueError(offset, f"{layer} is given twice; give it once")
         seen[layer] = _number(count, offset + len(layer) + 1, range(1, 10_000), "a number of cores")
         offset += len(part) + 1
     return ["+".join(f"{layer}:{count}" for layer, count in seen.items())]

@@ -148,21 +148,23 @@ def _shipped_for(graph: str, paths: Iterable[str], there: Sequence[str], data: s
             continue
         return name
     command = ["spikeloom", "train", "--data", data, "--graph", graph, "--epochs", str(SHORT_EPOCHS["graphs"])]
+    others = ", ".join(dict.fromkeys(there))
     raise OptionError(
-        f"--grid graph={graph}: no checkpoint was trained on that graph, those given on {', '.join(dict.fromkeys(there))}"
-        f"; train one and name it: {shlex.join([*command, '-o', f'{_plain(graph)}.pt'])}"
+        f"--grid graph={graph}: no checkpoint was trained on that graph, those given on {others}; train one and "
+        f"name it: {shlex.join([*command, '-o', f'{_plain(graph)}.pt'])}"
     )
 
 
 def _named(read: Sequence[Given]) -> tuple[Given, ...]:
     """Networks with names of their own: files of one name in different folders are counted."""
-    names = [own.name for own in read]
-    found = []
-    for index, own in enumerate(read):
-        again = names[:index].count(own.name)
-        name = own.name if not again else f"{own.name}-{again + 1}"
-        found.append(replace(own, name=name))
-    return tuple(found)
+    found: dict[str, Given] = {}
+    for own in read:
+        name, again = own.name, 1
+        while name in found:
+            again += 1
+            name = f"{own.name}-{again}"
+        found[name] = replace(own, name=name)
+    return tuple(found.values())
 
 
 def require_suited(networks: Sequence[Given], splits: Mapping[str, Recordings]) -> None:
@@ -212,7 +214,7 @@ def require_grid(networks: Sequence[Given], grid: Grid, target: Target) -> None:
                 layer = part.partition(":")[0]
                 if layer not in own.layers:
                     raise OptionError(
-                        f"--grid cores={layout}: {own.path} has no layer {layer}; its layers are {', '.join(own.layers)}"
+                        f"--grid cores={layout}: {own.path} has no layer {layer}; it has {', '.join(own.layers)}"
                     )
 
 

@@ -144,8 +144,8 @@ def _figures(report: Json, prefix: str) -> list[str]:
     return [
         figure(
             scatter(report, cost, prefix=prefix),
-            f"Test accuracy over {words[cost]} by the table {of}. Dashed: the front. Rings and lines: recommended points "
-            "and their 95 % intervals. Larger marks have seen more of each recording.",
+            f"Test accuracy over {words[cost]} by the table {of}. Dashed: the front. Rings and lines: recommended "
+            "points and their 95 % intervals. Larger marks have seen more of each recording.",
         )
         for cost, (_, of, _) in costs_of(report).items()
     ]
@@ -182,8 +182,8 @@ def _points(report: Json) -> list[str]:
         first = f'<th scope="row"><button type="button" data-n="{number}">#{number}</button></th>'
         rows.append(f'<tr data-n="{number}">{first}{"".join(f"<td>{escape(cell)}</td>" for cell in cells)}</tr>')
     made = (
-        f'<div class="table"><table><caption>{len(report["points"])} points; the last column is measured on the machine '
-        f"that made the chart</caption><thead><tr>{above}</tr></thead><tbody>{''.join(rows)}</tbody></table></div>"
+        f'<div class="table"><table><caption>{len(report["points"])} points; the last column is measured on the '
+        f"machine that charts</caption><thead><tr>{above}</tr></thead><tbody>{''.join(rows)}</tbody></table></div>"
     )
     commands = unfold("Commands of every point", "".join(_commands(report["points"])))
     return [made, commands, *_refused(report["refused"])]

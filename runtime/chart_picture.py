@@ -67,8 +67,8 @@ def _drawn(report: Json) -> Figure:
     figure.legend(handles, names, loc="outside lower center", ncols=min(len(names), 6), fontsize=8)
     data = report["data"]
     figure.suptitle(
-        f"{len(report['points'])} configurations, {data['test']} test recordings of {_name(data['path'])}; larger marks "
-        "have seen more of each recording",
+        f"{len(report['points'])} configurations, {data['test']} test recordings of {_name(data['path'])}; larger "
+        "marks have seen more of each recording",
         fontsize=10,
     )
     return figure

@@ -140,8 +140,8 @@ def saving_lines(report: Json) -> list[str]:
     ):
         own = found[name]
         lines.append(
-            f"  {words}: #{own['point']} {label(points[own['point']])}: {_times(own['energy'], 'energy')}, test accuracy "
-            f"{100 * own['accuracy']:+.2f} points"
+            f"  {words}: #{own['point']} {label(points[own['point']])}: {_times(own['energy'], 'energy')}, test "
+            f"accuracy {100 * own['accuracy']:+.2f} points"
         )
     return lines
 
@@ -193,8 +193,16 @@ def csv_text(report: Json) -> str:
     out = csv.writer(file, lineterminator="\n")
     fronts = ["energy", "latency"]
     out.writerow(
-        [*columns, *sizes, "expected", *(f"{s}_{name}" for s in ("test", "train") for name in split_head)]
-        + [*(f"front_{name}" for name in fronts), "compile", "run", "measured_recordings_per_s"]
+        [
+            *columns,
+            *sizes,
+            "expected",
+            *(f"{split}_{name}" for split in ("test", "train") for name in split_head),
+            *(f"front_{name}" for name in fronts),
+            "compile",
+            "run",
+            "measured_recordings_per_s",
+        ]
     )
     for point in report["points"]:
         cells = [point[name] for name in columns]
