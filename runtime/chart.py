@@ -15,14 +15,13 @@ from compiler.atomic import write_atomically
 from compiler.errors import OptionError
 from compiler.targets import load_target
 from models.events import BIN_S
-from models.protocols import data_digest
 from runtime import chart_networks, chart_plan, chart_points, sweep
 from runtime.chart_budget import Budget, parse_budgets, pick
 from runtime.chart_grid import Grid, parse_grid
 from runtime.chart_networks import Given
 from runtime.chart_plan import Facts, Stored
+from runtime.chart_tasks import FORMAT, SPLITS, Data
 from runtime.chart_text import chart_text, csv_text
-from runtime.chart_work import FORMAT, SPLITS, Data, both_splits, measure
 from runtime.data_commands import add_bin_option
 from runtime.inputs import progress, version
 from runtime.options import DATA_HELP, add_model
@@ -77,6 +76,9 @@ def chart(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], i
     KeyboardInterrupt
         On an interrupt; its text says what is kept.
     """
+    from models.protocols import data_digest  # torch, and the engine: no other command waits for them
+    from runtime.chart_work import both_splits
+
     target = load_target(TARGET)
     grid = Grid() if arguments.grid is None else parse_grid(arguments.grid, target)
     budgets = parse_budgets(arguments.budget)
@@ -90,9 +92,9 @@ def chart(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], i
     checkpoint = networks[0].checkpoint
     progress("reading the recordings")
     splits = both_splits(data, checkpoint.taxels, checkpoint.classes)
-    chart_networks.require_suited(networks, splits)
-    chart_networks.require_grid(networks, grid, target)
     digest = data_digest(splits["train"], splits["test"])
+    chart_networks.require_suited(networks, splits, digest)
+    chart_networks.require_grid(networks, grid, target)
     facts = Facts(data=data, data_sha256=digest, target=target, folder=folder)
     folder.mkdir(exist_ok=True)
     points, refused, decided, rates = _measured(arguments, networks, grid, facts)
@@ -179,9 +181,11 @@ def _measured(arguments: argparse.Namespace, networks: Sequence[Given], grid: Gr
 
 
 def _sweep(arguments: argparse.Namespace, facts: Facts, points: Sequence[sweep.Point], label: str) -> dict[str, Json]:
+    from runtime import chart_work
+
     return sweep.sweep(
         points,
-        measure,
+        chart_work.measure,
         facts.folder / STORE,
         kind=KIND,
         version=FORMAT,

@@ -95,8 +95,7 @@ def scatter(report: Json, cost: str, *, prefix: str = "chart") -> str:
     content = [_legend(names), *_axes(frame, cost, table, unit), *_float(report, frame)]
     on = sorted((v, p["test"]["accuracy"]) for v, p in zip(values, points, strict=True) if p["front"][cost] and v > 0)
     if len(on) > 1:
-        path = " ".join(f"{svg.number(frame.x(math.log10(v)))},{svg.number(frame.y(100 * a))}" for v, a in on)
-        content.append(svg.shape("polyline", "line front", points=path))
+        content.append(_stairs([(frame.x(math.log10(v)), frame.y(100 * a)) for v, a in on]))
     taken = {number for number in report["recommended"].values() if number is not None}
     for point, value in zip(points, values, strict=True):
         if value > 0:
@@ -111,13 +110,24 @@ def scatter(report: Json, cost: str, *, prefix: str = "chart") -> str:
     return svg.drawing(f"{prefix}-{cost}", title, BOTTOM + 42, content)
 
 
+def _stairs(corners: Sequence[tuple[float, float]]) -> str:
+    """A front: between two of its points nothing better than the cheaper one is to be had."""
+    path = [corners[0]]
+    for x, y in corners[1:]:
+        path += [(x, path[-1][1]), (x, y)]
+    points = " ".join(f"{svg.number(x)},{svg.number(y)}" for x, y in path)
+    return svg.shape("polyline", "line front", points=points)
+
+
 def _frame(report: Json, values: Sequence[float]) -> svg.Frame:
     positive = [math.log10(value) for value in values if value > 0] or [0.0]
+    taken = taken_points(report)
     shares = [100 * point["test"]["accuracy"] for point in report["points"]]
+    shares += [100 * p["test"][end] for p in report["points"] if p["number"] in taken for end in ("low", "high")]
     shares += [100 * net["float"][max(net["float"], key=int)]["test"]["accuracy"] for net in report["networks"]]
     room = max(0.08, 0.05 * (max(positive) - min(positive)))
     low, high = min(shares), max(shares)
-    reach = max(2.0, 0.08 * (high - low))
+    reach = max(2.5, 0.07 * (high - low))
     return svg.Frame(
         left=LEFT,
         top=TOP + 14,
@@ -168,7 +178,7 @@ def _float(report: Json, frame: svg.Frame) -> list[str]:
     y = frame.y(100 * found["accuracy"])
     text = f"float model of {network['name']}: {100 * found['accuracy']:.2f} %"
     line = svg.shape("line", "float-line", x1=frame.left, y1=y, x2=frame.right, y2=y)
-    return [line, svg.words(frame.right - 4, y - 5, text, "small over", "end")]
+    return [line, svg.words(frame.left + 6, y - 5, text, "small over")]
 
 
 def _mark(point: Json, x: float, y: float, series: int, said: str) -> str:
@@ -201,21 +211,26 @@ def _legend(names: Sequence[str]) -> str:
     return "".join(parts)
 
 
-def _names(report: Json, frame: svg.Frame, key: str, table: str) -> list[str]:
-    """Names beside the points to take; of a point that is taken twice both."""
-    points = {point["number"]: point for point in report["points"]}
+def taken_points(report: Json) -> dict[int, str]:
+    """Points to take by number, with what for: ``best``, or ``cheapest, best``."""
     said: dict[int, list[str]] = {}
     for name, number in report["recommended"].items():
         if number is not None:
             said.setdefault(number, []).append(NAMES[name].partition(" within")[0])
+    return {number: ", ".join(names) for number, names in said.items()}
+
+
+def _names(report: Json, frame: svg.Frame, key: str, table: str) -> list[str]:
+    """Names of the points to take, in turn above and below their intervals, where there are no marks."""
+    points = {point["number"]: point for point in report["points"]}
     content = []
-    for number, names in said.items():
-        point = points[number]
-        value = point["test"][key][table]
+    for place, (number, names) in enumerate(taken_points(report).items()):
+        test = points[number]["test"]
+        value = test[key][table]
         if value > 0:
-            x, y = frame.x(math.log10(value)), frame.y(100 * point["test"]["accuracy"])
-            left = x > (frame.left + frame.right) / 2
-            place = x - 16 if left else x + 16
-            anchor = "end" if left else "start"
-            content.append(svg.words(place, y - 12, f"#{number} {', '.join(names)}", "over strong", anchor))
+            x = frame.x(math.log10(value))
+            y = frame.y(100 * test["low"]) + 13 if place % 2 else frame.y(100 * test["high"]) - 5
+            wide = svg.LETTER * len(f"#{number} {names}") / 2
+            x = min(max(x, frame.left + wide), frame.right - wide)
+            content.append(svg.words(x, y, f"#{number} {names}", "over strong", "middle"))
     return content

@@ -17,7 +17,6 @@ from compiler.passes.quantize import Recipe, check_recipes
 from compiler.serialize import is_netlist
 from compiler.targets import Target
 from models.evtouch import Recordings
-from models.protocols import data_digest
 from models.systems import NO_GRAPH
 from runtime.cells import SHORT_EPOCHS, file_safe
 from runtime.chart_grid import Grid
@@ -167,15 +166,23 @@ def _named(read: Sequence[Given]) -> tuple[Given, ...]:
     return tuple(found.values())
 
 
-def require_suited(networks: Sequence[Given], splits: Mapping[str, Recordings]) -> None:
+def require_suited(networks: Sequence[Given], splits: Mapping[str, Recordings], digest: str) -> None:
     """Refuse networks that do not belong together, or were trained on other recordings.
+
+    Parameters
+    ----------
+    networks : sequence of Given
+        Of the chart.
+    splits : mapping of str to Recordings
+        Its data, by split.
+    digest : str
+        Hash over both, as trainings note it.
 
     Raises
     ------
     ModelError
         Naming both.
     """
-    digest = data_digest(splits["train"], splits["test"])
     first = networks[0]
     for own in networks:
         sizes = [(each.checkpoint.taxels, each.checkpoint.classes) for each in (first, own)]

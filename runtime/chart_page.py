@@ -25,8 +25,8 @@ AXES = {
 """Axes that the page filters by, in words; ``storage`` is bits, planes, groups and pruning together."""
 
 MEANINGS = (
-    "Expected: what the training reached on recordings that it had left out, less what the point loses on the training "
-    "split; choices are made by this alone.",
+    "Expected: what the training reached on recordings that it left out, times the share of training accuracy that the "
+    "point keeps; choices are made by this alone.",
     "Front: no other point is right more often on the test split for the same cost. It describes, nothing is chosen by "
     "it.",
     "Storage: bits of a weight (b), times that a synapse is stored (p), scales in a layer (g).",

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from runtime.chart_figure import costs_of, series_of
-from runtime.chart_text import NAMES
+from runtime.chart_figure import costs_of, log_ticks, series_of, taken_points
 from runtime.tables import si
 
 if TYPE_CHECKING:
@@ -104,6 +104,7 @@ def _panel(axes: Axes, report: Json, cost: str) -> None:
         color="0.25",
         linewidth=1.0,
         linestyle=(0, (5, 2)),
+        drawstyle="steps-post",
         label="front on the test split",
         zorder=2,
     )
@@ -131,35 +132,27 @@ def _float_line(axes: Axes, report: Json) -> None:
 
 
 def _taken(axes: Axes, report: Json, key: str, table: str) -> None:
-    """Rings, intervals and names of the points to take."""
+    """Rings and intervals of the points to take; their names in turn above and below, where there are no marks."""
     points = {point["number"]: point for point in report["points"]}
-    said: dict[int, list[str]] = {}
-    for name, number in report["recommended"].items():
-        if number is not None:
-            said.setdefault(number, []).append(NAMES[name].partition(" within")[0])
-    for place, (number, names) in enumerate(said.items()):
+    for place, (number, names) in enumerate(taken_points(report).items()):
         test = points[number]["test"]
-        x, y = test[key][table], 100 * test["accuracy"]
-        axes.plot([x, x], [100 * test["low"], 100 * test["high"]], color="0.15", linewidth=0.9, zorder=2)
+        x, y, low, high = test[key][table], *(100 * test[name] for name in ("accuracy", "low", "high"))
+        axes.plot([x, x], [low, high], color="0.15", linewidth=0.9, zorder=2)
         axes.scatter([x], [y], s=150, facecolors="none", edgecolors="black", linewidths=1.2, zorder=4)
         axes.annotate(
-            f"#{number} {', '.join(names)}",
-            (x, y),
-            xytext=(10, (10, -16, 24)[place % 3]),
+            f"#{number} {names}",
+            (x, low if place % 2 else high),
+            xytext=(0, -11 if place % 2 else 4),
             textcoords="offset points",
+            ha="center",
             fontsize=8,
             fontweight="bold",
-            bbox={"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.75},
             zorder=5,
         )
 
 
 def _ticks(axes: Axes, values: Sequence[float], unit: str) -> None:
-    import math
-
     from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter
-
-    from runtime.chart_figure import log_ticks
 
     positive = [math.log10(value) for value in values if value > 0] or [0.0]
     axes.xaxis.set_major_locator(FixedLocator(log_ticks(min(positive) - 0.1, max(positive) + 0.1)))

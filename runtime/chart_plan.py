@@ -14,7 +14,7 @@ from compiler.targets import Target
 from models.events import BIN_S
 from runtime.chart_grid import Grid
 from runtime.chart_networks import Given
-from runtime.chart_work import FORMAT, Build, Data, Decide, Run
+from runtime.chart_tasks import FORMAT, Build, Data, Decide, Run
 from runtime.inputs import version
 from runtime.sweep import Point, content_key
 from runtime.windows import WHOLE

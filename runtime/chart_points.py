@@ -1,9 +1,9 @@
 """Points of a chart: accuracies with intervals, fronts, and which points to take.
 
 *Choices* are made on the training split alone; test figures are reported beside. What a point is expected to reach is
-what the network's training reached on the recordings that it had left out (its validation), less what the point loses
-on the training split against its float model on whole recordings. Where a checkpoint knows no validation, the training
-split's own accuracy takes its place for all networks. *Fronts* are drawn on the test split: they describe.
+what the network's training reached on the recordings that it had left out (its validation), times the share of the
+float model's accuracy on whole training recordings that the point keeps. Where a checkpoint knows no validation, the
+training split's own accuracy takes its place for all networks. *Fronts* are drawn on the test split: they describe.
 """
 
 from __future__ import annotations
@@ -23,9 +23,7 @@ NEAR = 1e-9
 LOSS = 0.01
 """Accuracy that a saving may cost against the usual mapping: a point."""
 
-VALIDATION = (
-    "what their trainings reached on recordings that these left out, less what a point loses on the training split"
-)
+VALIDATION = "what a training reached on recordings that it left out, times what a point keeps of training accuracy"
 TRAINING = (
     "accuracy on the training split (not every checkpoint knows what its training reached on left-out recordings)"
 )
@@ -84,8 +82,8 @@ def with_expectations(points: Sequence[Json], networks: Sequence[Json]) -> str:
         network["expected"] = network["validation"] if validated else network["float_training"]
     for point in points:
         network = by_name[point["network"]]
-        lost = network["float_training"] - point["train"]["accuracy"]
-        point["expected"] = network["expected"] - lost
+        whole = network["float_training"]
+        point["expected"] = network["expected"] * point["train"]["accuracy"] / whole if whole else 0.0
     return VALIDATION if validated else TRAINING
 
 

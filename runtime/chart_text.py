@@ -60,7 +60,7 @@ def head(energy: str, time: str | None) -> list[str]:
 
 def chart_text(report: Json, folder: str) -> str:
     """What people read on the terminal."""
-    energy, time = report["chosen_by"]["energy"], report["chosen_by"]["time"]
+    energy = report["chosen_by"]["energy"]
     points = {point["number"]: point for point in report["points"]}
     samples = report["data"]["test"]
     refused = f", {len(report['refused'])} more configurations do not fit" if report["refused"] else ""
@@ -71,34 +71,31 @@ def chart_text(report: Json, folder: str) -> str:
         "beside",
         "",
         table(
-            ["network", "graph", "float, training %", "float, test"],
+            ["network", "graph", "validation %", "float, training %", "float, test"],
             [
-                [net["name"], net["graph"], f"{100 * net['float_training']:.2f}", _float_test(net, samples)]
+                [
+                    net["name"],
+                    net["graph"],
+                    "–" if net["validation"] is None else f"{100 * net['validation']:.2f}",
+                    f"{100 * net['float_training']:.2f}",
+                    _float_test(net, samples),
+                ]
                 for net in report["networks"]
             ],
         ),
         "",
-        "recommended:",
+        recommended_text(report),
     ]
-
-    def rows(numbers: Sequence[int], names: Sequence[str] | None = None) -> str:
-        shown = [[str(number), label(points[number]), *figures(points[number], energy, time)] for number in numbers]
-        above = head(energy, time)
-        if names is None:
-            return table(above, shown)
-        return table(["", *above], [[name, *row] for name, row in zip(names, shown, strict=True)])
-
-    chosen = {name: number for name, number in report["recommended"].items() if number is not None}
-    lines.append(rows(list(chosen.values()), [NAMES[name] for name in chosen]))
-    lines += [f"  {NAMES[name]}: no point" for name, number in report["recommended"].items() if number is None]
-    for number in dict.fromkeys(chosen.values()):
-        lines += [f"  #{number}: {command}" for command in points[number]["commands"]]
     for name in ("energy", "latency"):
         on = [number for number, point in points.items() if point["front"].get(name)]
         if on:
             on.sort(key=lambda number: points[number]["test"]["energy_j"][energy])
             more = f", {len(on) - LISTED} more in the files" if len(on) > LISTED else ""
-            lines += ["", f"front of test accuracy and {name} (a description, no choice){more}:", rows(on[:LISTED])]
+            lines += [
+                "",
+                f"front of test accuracy and {name} (a description, no choice){more}:",
+                _rows(report, on[:LISTED]),
+            ]
     lines += ["", *saving_lines(report)]
     if report["budget"] is not None:
         lines += ["", *budget_lines(report)]
@@ -107,6 +104,28 @@ def chart_text(report: Json, folder: str) -> str:
         lines.append(f"does not fit: {len(report['refused']) - LISTED} more, see chart.json")
     lines += ["", f"written: {folder}/chart.html, .svg, .png, .csv, .json; netlists in {folder}/netlists"]
     return "\n".join(lines)
+
+
+def recommended_text(report: Json) -> str:
+    """Points to take, and the commands that make them."""
+    points = {point["number"]: point for point in report["points"]}
+    chosen = {name: number for name, number in report["recommended"].items() if number is not None}
+    lines = ["recommended:", _rows(report, list(chosen.values()), [NAMES[name] for name in chosen])]
+    lines += [f"  {NAMES[name]}: no point" for name, number in report["recommended"].items() if number is None]
+    for number in dict.fromkeys(chosen.values()):
+        lines += [f"  #{number}: {command}" for command in points[number]["commands"]]
+    return "\n".join(lines)
+
+
+def _rows(report: Json, numbers: Sequence[int], names: Sequence[str] = ()) -> str:
+    """A table of points; with names before them, where there are any."""
+    energy, time = report["chosen_by"]["energy"], report["chosen_by"]["time"]
+    points = {point["number"]: point for point in report["points"]}
+    shown = [[str(number), label(points[number]), *figures(points[number], energy, time)] for number in numbers]
+    above = head(energy, time)
+    if not names:
+        return table(above, shown)
+    return table(["", *above], [[name, *row] for name, row in zip(names, shown, strict=True)])
 
 
 def _float_test(network: Json, samples: int) -> str:

@@ -10,8 +10,6 @@ from __future__ import annotations
 import argparse
 import hashlib
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -29,6 +27,7 @@ from compiler.targets import load_target
 from models.evtouch import Recordings
 from runtime import engine
 from runtime.asked import Asked, asked_network
+from runtime.chart_tasks import SPLITS, Build, Data, Decide, Run
 from runtime.compile_command import provenance, recipes_asked
 from runtime.estimate import estimate
 from runtime.inputs import recordings
@@ -38,91 +37,11 @@ from runtime.windows import first_part
 
 Json = dict[str, Any]
 
-FORMAT = 1
-"""Of what is measured; goes up when a figure means something else."""
-
-SPLITS = ("train", "test")
-
 PART = 16
 """Recordings whose float spikes are held at a time."""
 
 SUMS = 1 << 24
 """Sums of the time model that are held at a time: 128 MiB."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Data:
-    """Where recordings are, and how they are read.
-
-    Parameters
-    ----------
-    path : str
-        As ``--data`` names them.
-    bin_s : float
-        Seconds of a step.
-    """
-
-    path: str
-    bin_s: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Decide:
-    """Decisions of a float model when parts of each recording have passed.
-
-    Parameters
-    ----------
-    words : tuple of str
-        Of a ``compile`` command that names the network.
-    data : Data
-    windows : tuple of int
-        Per cent.
-    """
-
-    words: tuple[str, ...]
-    data: Data
-    windows: tuple[int, ...]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Build:
-    """Layouts of a network, rounded once.
-
-    Parameters
-    ----------
-    layouts : mapping of str to tuple of str
-        Words of a ``compile`` command by layout; they differ in the layout alone.
-    files : mapping of str to Path
-        Where each netlist is kept.
-    data : Data
-        Whose training split chooses the scales.
-    """
-
-    layouts: Mapping[str, tuple[str, ...]]
-    files: Mapping[str, Path]
-    data: Data
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Run:
-    """A netlist on a part of every recording.
-
-    Parameters
-    ----------
-    build : Build
-        What makes the netlist, should its file be gone.
-    layout : str
-        Which one.
-    sha256 : str
-        Of the file.
-    window : int
-        Per cent.
-    """
-
-    build: Build
-    layout: str
-    sha256: str
-    window: int
 
 
 def measure(work: Decide | Build | Run) -> Json:

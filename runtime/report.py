@@ -16,6 +16,7 @@ from compiler.serialize import read_netlist
 from compiler.targets import load_target
 from models.evtouch import Recordings
 from runtime.asked import Asked, asked_network
+from runtime.chart_file import read_chart
 from runtime.inputs import progress, recordings, require_place
 from runtime.levels import levels_of, unmet
 from runtime.options import add_network, add_recordings
@@ -46,6 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--spec-samples", type=int, default=3, metavar="N", help="recordings for spec = engine (default: 3)"
     )
+    parser.add_argument("--chart", metavar="FOLDER", help="show what spikeloom chart found of this network, too")
     parser.add_argument("-o", "--output", required=True, metavar="OUT.html")
     parser.epilog = NOTES
 
@@ -64,6 +66,7 @@ def report(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], 
     netlist = read_netlist(arguments.netlist)
     asked = asked_network(arguments.checkpoint, arguments)
     _require_origin(arguments, netlist, asked)
+    chart = None if arguments.chart is None else read_chart(arguments.chart, asked.sha256, arguments.checkpoint)
     progress("reading the recordings")
     data = recordings(
         arguments.data,
@@ -77,6 +80,7 @@ def report(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], 
     check_channels(netlist, data.events.shape[1] * data.events.shape[2] + netlist.clocks.channels)
     chosen = None if arguments.recording is None else find_recording(data, arguments.recording)
     found, code = _facts(arguments, netlist, asked, data, chosen)
+    found |= {} if chart is None else {"chart": chart}
     with write_atomically(arguments.output) as file:
         file.write(page(found).encode())
     return found | {"output": arguments.output}, report_text, code

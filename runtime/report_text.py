@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from runtime.chart_text import recommended_text
 from runtime.estimates import estimate_text
 from runtime.render import netlist_text
 from runtime.tables import si, table
@@ -26,6 +27,7 @@ def report_text(report: Json) -> str:
         "Taxels": _taxels(report["taxels"]),
         "One recording": _recording(report["recording"]),
         "Energy and time": estimate_text(report["costs"]),
+        **({"Configurations": recommended_text(report["chart"])} if "chart" in report else {}),
         "Provenance": _provenance(report["provenance"]),
     }
     parts = [f"{title}\n{'-' * len(title)}\n{text}" for title, text in sections.items()]

@@ -1,6 +1,7 @@
 """The words of ``--grid``: what they mean, and where exactly they are wrong."""
 
 import re
+from itertools import product
 
 import pytest
 from hypothesis import given
@@ -113,10 +114,8 @@ def test_an_empty_grid(text):
 
 
 def test_a_grid_that_nobody_waits_for():
+    every = "/".join("+".join(map(str, widths)) for widths in product(WIDTHS, repeat=4))
     with pytest.raises(OptionError) as caught:
-        every = "/".join(
-            "+".join(map(str, [a, b, c, d])) for a in WIDTHS for b in WIDTHS for c in WIDTHS for d in WIDTHS
-        )
         parsed(f"bits={every},planes=1-3,window=1-100%:1")
     assert str(caught.value) == "--grid: 388,800 points a network, allowed are 100,000; give fewer values"
 

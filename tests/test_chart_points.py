@@ -98,11 +98,11 @@ def test_fronts_are_of_test_accuracy_and_each_cost(points):
 # -- what is expected --------------------------------------------------------------------------------------------------
 
 
-def test_expected_is_validation_less_what_is_lost_on_training_recordings():
+def test_expected_is_validation_times_what_is_kept_on_training_recordings():
     found = [point(1, 380, 50, 1, 1)]
     networks = [network(validation=0.9, training=0.99)]
     assert with_expectations(found, networks) == VALIDATION
-    assert found[0]["expected"] == pytest.approx(0.9 - (0.99 - 0.95))
+    assert found[0]["expected"] == pytest.approx(0.9 * 0.95 / 0.99)
     assert networks[0]["expected"] == 0.9
 
 
@@ -117,7 +117,7 @@ def test_where_one_checkpoint_knows_no_validation_training_figures_stand_for_all
 
 
 def test_recommended_points(points):
-    # within one of a hundred test recordings: expected at least 89 %, that is 396 of 400 training recordings
+    # within one of a hundred test recordings: expected at least 89 %, that is 395.6 of 400 training recordings
     found = recommended(points, [network() | {"expected": 0.9}], energy="one", time="clock", bin_s=0.02)
     assert found == {"cheapest": 3, "fastest": 5, "best": 1}
 
@@ -216,7 +216,7 @@ def test_without_a_budget_nothing_is_picked(points):
 def test_energy_buys_the_best_that_fits(points):
     found = picked(points, "energy=150uJ")
     assert (found["fits"], found["fitting"], found["point"], found["best"]) == (True, 3, 2, 1)
-    assert found["given_up"]["expected"] == pytest.approx(-0.005)
+    assert found["given_up"]["expected"] == pytest.approx(-0.0045)
     assert found["given_up"]["accuracy"] == pytest.approx(0.02)
     assert found["given_up"]["energy"]["one"] == pytest.approx(200 / 120)
     assert found["given_up"]["time"]["clock"] == pytest.approx(4 / 3)
@@ -224,7 +224,7 @@ def test_energy_buys_the_best_that_fits(points):
 
 def test_an_accuracy_is_reached_as_cheaply_as_can_be(points):
     assert picked(points, "accuracy=89")["point"] == 3
-    assert picked(points, "accuracy=89.5")["point"] == 2
+    assert picked(points, "accuracy=89.2")["point"] == 2
     assert picked(points, "accuracy=90")["point"] == 1
 
 
