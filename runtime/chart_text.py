@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from runtime.chart_budget import UNITS
+from runtime.found import number
 from runtime.tables import percent, si, table
 
 Json = dict[str, Any]
@@ -60,12 +61,11 @@ def head(energy: str, time: str | None) -> list[str]:
 
 def chart_text(report: Json, folder: str) -> str:
     """What people read on the terminal."""
-    energy = report["chosen_by"]["energy"]
     points = {point["number"]: point for point in report["points"]}
     samples = report["data"]["test"]
-    refused = f", {len(report['refused'])} more configurations do not fit" if report["refused"] else ""
+    refused = f", {number(len(report['refused']), 'more configuration')} refused" if report["refused"] else ""
     lines = [
-        f"{len(points)} points of {len(report['networks'])} networks on {report['data']['test']} test and "
+        f"{number(len(points), 'point')} of {number(len(report['networks']), 'network')} on {samples} test and "
         f"{report['data']['train']} training recordings{refused}",
         f"choices are made on the training split by what is expected: {report['expected']}; test figures are reported "
         "beside",
@@ -87,9 +87,9 @@ def chart_text(report: Json, folder: str) -> str:
         recommended_text(report),
     ]
     for name in ("energy", "latency"):
-        on = [number for number, point in points.items() if point["front"].get(name)]
+        on = [index for index, point in points.items() if point["front"].get(name)]
         if on:
-            on.sort(key=lambda number: points[number]["test"]["energy_j"][energy])
+            on.sort(key=lambda index: points[index]["test"]["accuracy"])
             more = f", {len(on) - LISTED} more in the files" if len(on) > LISTED else ""
             lines += [
                 "",
@@ -109,11 +109,11 @@ def chart_text(report: Json, folder: str) -> str:
 def recommended_text(report: Json) -> str:
     """Points to take, and the commands that make them."""
     points = {point["number"]: point for point in report["points"]}
-    chosen = {name: number for name, number in report["recommended"].items() if number is not None}
+    chosen = {name: index for name, index in report["recommended"].items() if index is not None}
     lines = ["recommended:", _rows(report, list(chosen.values()), [NAMES[name] for name in chosen])]
-    lines += [f"  {NAMES[name]}: no point" for name, number in report["recommended"].items() if number is None]
-    for number in dict.fromkeys(chosen.values()):
-        lines += [f"  #{number}: {command}" for command in points[number]["commands"]]
+    lines += [f"  {NAMES[name]}: no point" for name, index in report["recommended"].items() if index is None]
+    for index in dict.fromkeys(chosen.values()):
+        lines += [f"  #{index}: {command}" for command in points[index]["commands"]]
     return "\n".join(lines)
 
 
@@ -121,7 +121,7 @@ def _rows(report: Json, numbers: Sequence[int], names: Sequence[str] = ()) -> st
     """A table of points; with names before them, where there are any."""
     energy, time = report["chosen_by"]["energy"], report["chosen_by"]["time"]
     points = {point["number"]: point for point in report["points"]}
-    shown = [[str(number), label(points[number]), *figures(points[number], energy, time)] for number in numbers]
+    shown = [[str(index), label(points[index]), *figures(points[index], energy, time)] for index in numbers]
     above = head(energy, time)
     if not names:
         return table(above, shown)

@@ -15,6 +15,7 @@ import pytest
 from commands import RUNTIME
 from made_files import CLASSES, events, own_file, recordings_folder, ring, weights
 
+from compiler.errors import CapacityError, Violation
 from compiler.serialize import netlist_bytes, read_netlist
 from models.evtouch import load_recordings
 from models.graphs import Graph
@@ -25,6 +26,8 @@ from runtime.chart_text import chart_text
 ROOT = Path(__file__).resolve().parents[1]
 
 GRID = "bits=4,8,window=50-100%:50,cores=cores/fc1:2"
+VIOLATION = Violation(owner="core 0", rule="loihi1.core.axons_in", used=5, allowed=4, remedy="use fewer inputs")
+
 CHART = ("chart", "ring.pt", "--data", "data", "--grid", GRID, "--jobs", "1")
 
 
@@ -158,8 +161,10 @@ def test_the_table_of_points(made, place):
         assert float(row["measured_recordings_per_s"]) >= 0
 
 
-def test_what_the_terminal_shows(made, golden):
-    golden("chart.txt", chart_text(made, "out") + "\n")
+def test_what_the_terminal_shows(made):
+    told = chart_text(made, "out").splitlines()
+    assert told[0] == "8 points of 1 network on 8 test and 16 training recordings"
+    assert told[-1] == "written: out/chart.html, .svg, .png, .csv, .json; netlists in out/netlists"
 
 
 def test_pictures_and_page_are_written(made, place):
@@ -209,6 +214,7 @@ def test_a_netlist_that_is_gone_or_damaged_is_made_again(made, spikeloom, place)
     spikeloom(*CHART, "-o", "out", "--json")
 
 
+@pytest.mark.slow
 def test_two_processes_find_the_same(made, spikeloom, place):
     words = [*CHART[:-1], "2", "-o", "two", "--json"]
     code, out, _ = spikeloom(*words)
@@ -288,11 +294,38 @@ def test_where_validation_is_not_known_the_text_says_what_chose(spikeloom):
     assert "by what is expected: accuracy on the training split (not every checkpoint knows" in out
 
 
-def test_what_the_chip_refuses_is_listed(spikeloom):
-    words = ("chart", "ring.pt", "--data", "data", "--jobs", "1", "-o", "refused", "--grid")
-    code, out, _ = spikeloom(*words, "bits=8,window=100%,cores=cores/fc1:9+conv1:30+fc2:8+fc3:4")
+@pytest.fixture
+def refusing(monkeypatch):
+    """A chip on which widths in a set do not fit."""
+    refused, store = set(), chart_work.store
+
+    def picky(network, *, recipes, **options):
+        if recipes is not None and recipes[0].bits in refused:
+            raise CapacityError((VIOLATION,))
+        return store(network, recipes=recipes, **options)
+
+    monkeypatch.setattr("runtime.chart_work.store", picky)
+    return refused
+
+
+def test_what_the_chip_refuses_is_listed(spikeloom, refusing, place):
+    refusing.add(4)
+    words = ("chart", "ring.pt", "--data", "data", "--jobs", "1", "-o", "refused", "--grid", "bits=4,3,window=100%")
+    code, out, _ = spikeloom(*words)
     assert code == 0
-    assert "1 points" in out.splitlines()[0] or "2 points" in out.splitlines()[0]
+    assert out.startswith("1 point of 1 network on 8 test and 16 training recordings, 1 more configuration refused\n")
+    assert f"does not fit: ring 4b, cores: {VIOLATION}\n" in out
+    found = json.loads((place / "refused" / "chart.json").read_text())
+    assert [(each["bits"], each["why"]) for each in found["refused"]] == [([4], [str(VIOLATION)])]
+
+
+def test_where_nothing_fits_there_is_no_chart(spikeloom, refusing, place):
+    refusing |= {5, 6}
+    words = ("chart", "ring.pt", "--data", "data", "--jobs", "1", "-o", "nothing", "--grid", "bits=5-6,window=100%")
+    code, out, err = spikeloom(*words)
+    assert (code, out) == (2, "")
+    assert err == f"spikeloom: --grid: the chip refuses all 2 configurations; the first: {VIOLATION}\n"
+    assert not (place / "nothing" / "chart.json").exists()
 
 
 def test_a_fine_tuned_network_keeps_its_storage(spikeloom, place):
@@ -363,7 +396,7 @@ OUT = ("-o", "bad")
         ),
         (
             ("ring.pt", "--data", "data", "--table", "mine", *OUT),
-            "--table mine: Loihi 1 has no such energy table; give davies2018 or sanafe",
+            "--table mine: Intel Loihi 1 has no such energy table; give davies2018 or sanafe",
         ),
         (("ring.pt", "--data", "data", "-o", "file"), "-o file: is not a folder; give the name of one"),
         (
