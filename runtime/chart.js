@@ -19,6 +19,13 @@ function filter() {
 }
 boxes.forEach((box) => box.addEventListener("change", filter));
 
+const axis = document.getElementById("axis");
+const draw = () => document.querySelectorAll("#chart figure").forEach((figure) => {
+  figure.hidden = figure.dataset.raster !== axis.value;
+});
+axis.addEventListener("change", draw);
+draw();
+
 function keep(number) {
   document.querySelectorAll(".kept").forEach((element) => element.classList.remove("kept"));
   all(number).forEach((element) => element.classList.add("kept"));

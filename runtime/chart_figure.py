@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from runtime import svg
+from runtime.chart_costs import Cost, costs_of
 from runtime.chart_text import NAMES, label
 from runtime.tables import si
 
@@ -68,13 +69,6 @@ def tip(point: Json, report: Json) -> str:
     )
 
 
-def costs_of(report: Json) -> dict[str, tuple[str, str, str]]:
-    """Costs that a chart is drawn over: id to key, table and unit."""
-    energy, time = report["chosen_by"]["energy"], report["chosen_by"]["time"]
-    found = {"energy": ("energy_j", energy, "J")}
-    return found | ({} if time is None else {"latency": ("time_s", time, "s")})
-
-
 def scatter(report: Json, cost: str, *, prefix: str = "chart") -> str:
     """Accuracy over one cost, on a logarithmic axis.
 
@@ -83,17 +77,19 @@ def scatter(report: Json, cost: str, *, prefix: str = "chart") -> str:
     report : dict
         A chart.
     cost : str
-        ``energy`` or ``latency``.
+        Name of one of its axes, see :func:`runtime.chart_costs.costs_of`.
     prefix : str
         Of the figure's id.
     """
-    key, table, unit = costs_of(report)[cost]
+    over = costs_of(report, measured=True)[cost]
     points = report["points"]
-    values = [point["test"][key][table] for point in points]
+    values = [over.value(point) for point in points]
     frame = _frame(report, values)
     axis, names = series_of(points)
-    content = [_legend(names), *_axes(frame, cost, table, unit), *_float(report, frame)]
-    on = sorted((v, p["test"]["accuracy"]) for v, p in zip(values, points, strict=True) if p["front"][cost] and v > 0)
+    content = [_legend(names), *_axes(frame, over), *_float(report, frame)]
+    on = sorted(
+        (v, p["test"]["accuracy"]) for v, p in zip(values, points, strict=True) if p["front"].get(cost) and v > 0
+    )
     if len(on) > 1:
         content.append(_stairs([(frame.x(math.log10(v)), frame.y(100 * a)) for v, a in on]))
     taken = {number for number in report["recommended"].values() if number is not None}
@@ -105,9 +101,8 @@ def scatter(report: Json, cost: str, *, prefix: str = "chart") -> str:
                 content.append(svg.shape("line", "whisker", x1=x, y1=low, x2=x, y2=high))
                 content.append(svg.shape("circle", "taken", cx=x, cy=y, r=LARGEST + 5))
             content.append(_mark(point, x, y, names.index(str(point[axis])), tip(point, report)))
-    content += _names(report, frame, key, table)
-    title = f"Test accuracy over {'energy' if cost == 'energy' else 'time on the chip'} of a mean inference"
-    return svg.drawing(f"{prefix}-{cost}", title, BOTTOM + 42, content)
+    content += _names(report, frame, over)
+    return svg.drawing(f"{prefix}-{cost}", f"Test accuracy over {over.title}", BOTTOM + 42, content)
 
 
 def _stairs(corners: Sequence[tuple[float, float]]) -> str:
@@ -140,7 +135,7 @@ def _frame(report: Json, values: Sequence[float]) -> svg.Frame:
     )
 
 
-def _axes(frame: svg.Frame, cost: str, table: str, unit: str) -> list[str]:
+def _axes(frame: svg.Frame, over: Cost) -> list[str]:
     content = []
     for value in svg.ticks(frame.y_from, frame.y_to, 6):
         y = frame.y(value)
@@ -149,10 +144,9 @@ def _axes(frame: svg.Frame, cost: str, table: str, unit: str) -> list[str]:
     for value in log_ticks(frame.x_from, frame.x_to):
         x = frame.x(math.log10(value))
         content.append(svg.shape("line", "grid", x1=x, y1=frame.top, x2=x, y2=frame.bottom))
-        content.append(svg.words(x, frame.bottom + 16, si(value, unit), "small", "middle"))
-    what = "energy of a mean inference" if cost == "energy" else "time of a mean inference on the chip, simple model"
+        content.append(svg.words(x, frame.bottom + 16, over.said(value), "small", "middle"))
     content.append(svg.shape("line", "axis", x1=frame.left, y1=frame.bottom, x2=frame.right, y2=frame.bottom))
-    content.append(svg.words((frame.left + frame.right) / 2, frame.bottom + 34, f"{what} ({table})", "small", "middle"))
+    content.append(svg.words((frame.left + frame.right) / 2, frame.bottom + 34, over.axis, "small", "middle"))
     return content
 
 
@@ -220,13 +214,13 @@ def taken_points(report: Json) -> dict[int, str]:
     return {number: ", ".join(names) for number, names in said.items()}
 
 
-def _names(report: Json, frame: svg.Frame, key: str, table: str) -> list[str]:
+def _names(report: Json, frame: svg.Frame, over: Cost) -> list[str]:
     """Names of the points to take, in turn above and below their intervals, where there are no marks."""
     points = {point["number"]: point for point in report["points"]}
     content = []
     for place, (number, names) in enumerate(taken_points(report).items()):
         test = points[number]["test"]
-        value = test[key][table]
+        value = over.value(points[number])
         if value > 0:
             x = frame.x(math.log10(value))
             y = frame.y(100 * test["low"]) + 13 if place % 2 else frame.y(100 * test["high"]) - 5

@@ -8,7 +8,8 @@ from html import escape
 from importlib import resources
 from typing import Any
 
-from runtime.chart_figure import costs_of, scatter, tip
+from runtime.chart_costs import costs_of
+from runtime.chart_figure import scatter, tip
 from runtime.chart_text import NAMES, budget_lines, figures, head, label, saving_lines
 from runtime.markup import facts, figure, paragraph, section, table, unfold
 from runtime.tables import percent, si
@@ -136,19 +137,34 @@ def _commands(points: Iterable[Json]) -> list[str]:
 
 def _chart(report: Json) -> list[str]:
     chosen = '<div id="chosen" class="chosen" aria-live="polite"></div>'
-    return [_filters(report), *_figures(report, "chart"), chosen, *(paragraph(line) for line in MEANINGS)]
+    return [
+        _filters(report),
+        _axis(report),
+        *_figures(report, "chart", measured=True),
+        chosen,
+        *(paragraph(line) for line in MEANINGS),
+    ]
 
 
-def _figures(report: Json, prefix: str) -> list[str]:
-    words = {"energy": "energy", "latency": "time on the chip"}
+def _figures(report: Json, prefix: str, *, measured: bool = False) -> list[str]:
     return [
         figure(
-            scatter(report, cost, prefix=prefix),
-            f"Test accuracy over {words[cost]} by the table {of}. Dashed: the front. Rings and lines: recommended "
-            "points and their 95 % intervals. Larger marks have seen more of each recording.",
+            scatter(report, name, prefix=prefix),
+            f"Test accuracy over {cost.title}. {'' if name == 'speed' else 'Dashed: the front. '}Rings and lines: "
+            "recommended points and their 95 % intervals. Larger marks have seen more of each recording.",
+            raster=f"{prefix}-{name}" if measured else None,
         )
-        for cost, (_, of, _) in costs_of(report).items()
+        for name, cost in costs_of(report, measured=measured).items()
     ]
+
+
+def _axis(report: Json) -> str:
+    """A choice of the figure that is shown; without scripts all of them are."""
+    options = "".join(
+        f'<option value="chart-{name}">{escape(cost.title)}</option>'
+        for name, cost in costs_of(report, measured=True).items()
+    )
+    return f'<label class="choose">Accuracy against <select id="axis">{options}</select></label>'
 
 
 def _filters(report: Json) -> str:

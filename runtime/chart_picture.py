@@ -7,8 +7,8 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from runtime.chart_figure import costs_of, log_ticks, series_of, taken_points
-from runtime.tables import si
+from runtime.chart_costs import Cost, costs_of
+from runtime.chart_figure import log_ticks, series_of, taken_points
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -23,8 +23,11 @@ MARKERS = ("o", "s", "^", "D", "v", "P", "<", ">")
 
 DPI = 150
 
-SIZE = (7.2, 5.0)
+SIZE = (7.2, 4.4)
 """Of a panel, in inches."""
+
+ACROSS = 2
+"""Panels side by side."""
 
 
 def pictures(report: Json) -> dict[str, bytes]:
@@ -57,12 +60,17 @@ def _drawn(report: Json) -> Figure:
 
     costs = costs_of(report)
     width, height = SIZE
-    figure, (panels,) = plt.subplots(
-        1, len(costs), figsize=(width * len(costs), height), layout="constrained", squeeze=False, sharey=True
+    down = -(-len(costs) // ACROSS)
+    figure, rows = plt.subplots(
+        down, ACROSS, figsize=(width * ACROSS, height * down), layout="constrained", squeeze=False, sharey=True
     )
-    for axes, cost in zip(panels, costs, strict=True):
-        _panel(axes, report, cost)
-    panels[0].set_ylabel("test accuracy on the chip (%)")
+    panels = list(rows.flat)
+    for axes, (name, cost) in zip(panels, costs.items(), strict=False):
+        _panel(axes, report, name, cost)
+    for axes in panels[len(costs) :]:
+        axes.set_visible(False)
+    for row in rows:
+        row[0].set_ylabel("test accuracy on the chip (%)")
     handles, names = panels[0].get_legend_handles_labels()
     figure.legend(handles, names, loc="outside lower center", ncols=min(len(names), 6), fontsize=8)
     data = report["data"]
@@ -78,28 +86,27 @@ def _name(path: str) -> str:
     return path.rstrip("/").rsplit("/", 1)[-1]
 
 
-def _panel(axes: Axes, report: Json, cost: str) -> None:
-    key, table, unit = costs_of(report)[cost]
+def _panel(axes: Axes, report: Json, name: str, cost: Cost) -> None:
     points = report["points"]
     axis, names = series_of(points)
-    for index, name in enumerate(names):
-        own = [point for point in points if str(point[axis]) == name]
+    for index, value in enumerate(names):
+        own = [point for point in points if str(point[axis]) == value]
         colour = COLOURS[index % len(COLOURS)]
         hollow = index // len(COLOURS) % 2 == 1
         axes.scatter(
-            [point["test"][key][table] for point in own],
+            [cost.value(point) for point in own],
             [100 * point["test"]["accuracy"] for point in own],
             s=[14 + 0.3 * point["window"] for point in own],
             marker=MARKERS[index % len(MARKERS)],
             facecolors="none" if hollow else colour,
             edgecolors=colour if hollow else "white",
             linewidths=0.9 if hollow else 0.4,
-            label=name,
+            label=value,
             zorder=3,
         )
-    on = sorted((p["test"][key][table], 100 * p["test"]["accuracy"]) for p in points if p["front"][cost])
+    on = sorted((cost.value(p), 100 * p["test"]["accuracy"]) for p in points if p["front"][name])
     axes.plot(
-        [value for value, _ in on],
+        [spent for spent, _ in on],
         [right for _, right in on],
         color="0.25",
         linewidth=1.0,
@@ -109,11 +116,10 @@ def _panel(axes: Axes, report: Json, cost: str) -> None:
         zorder=2,
     )
     _float_line(axes, report)
-    _taken(axes, report, key, table)
+    _taken(axes, report, cost)
     axes.set_xscale("log")
-    _ticks(axes, [p["test"][key][table] for p in points], unit)
-    what = "energy of a mean inference" if cost == "energy" else "time of a mean inference on the chip, simple model"
-    axes.set_xlabel(f"{what} ({table})")
+    _ticks(axes, [cost.value(point) for point in points], cost)
+    axes.set_xlabel(cost.axis)
     axes.grid(alpha=0.25)
     axes.margins(0.06, 0.08)
 
@@ -131,12 +137,12 @@ def _float_line(axes: Axes, report: Json) -> None:
     )
 
 
-def _taken(axes: Axes, report: Json, key: str, table: str) -> None:
+def _taken(axes: Axes, report: Json, cost: Cost) -> None:
     """Rings and intervals of the points to take; their names in turn above and below, where there are no marks."""
     points = {point["number"]: point for point in report["points"]}
     for place, (number, names) in enumerate(taken_points(report).items()):
         test = points[number]["test"]
-        x, y, low, high = test[key][table], *(100 * test[name] for name in ("accuracy", "low", "high"))
+        x, y, low, high = cost.value(points[number]), *(100 * test[name] for name in ("accuracy", "low", "high"))
         axes.plot([x, x], [low, high], color="0.15", linewidth=0.9, zorder=2)
         axes.scatter([x], [y], s=150, facecolors="none", edgecolors="black", linewidths=1.2, zorder=4)
         axes.annotate(
@@ -151,10 +157,10 @@ def _taken(axes: Axes, report: Json, key: str, table: str) -> None:
         )
 
 
-def _ticks(axes: Axes, values: Sequence[float], unit: str) -> None:
+def _ticks(axes: Axes, values: Sequence[float], cost: Cost) -> None:
     from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter
 
     positive = [math.log10(value) for value in values if value > 0] or [0.0]
     axes.xaxis.set_major_locator(FixedLocator(log_ticks(min(positive) - 0.1, max(positive) + 0.1)))
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: si(value, unit)))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: cost.said(value)))
     axes.xaxis.set_minor_formatter(NullFormatter())

@@ -109,9 +109,13 @@ def front(gains: Sequence[float], costs: Sequence[float]) -> list[bool]:
 
 
 def with_fronts(points: Sequence[Json], energy: str, time: str | None) -> None:
-    """Mark the points on the fronts of test accuracy and energy, and of test accuracy and time; in place."""
+    """Mark the points on the fronts of test accuracy and energy, time, operations and cores; in place."""
     gains = [point["test"]["accuracy"] for point in points]
-    on = {"energy": front(gains, [point["test"]["energy_j"][energy] for point in points])}
+    on = {
+        "energy": front(gains, [point["test"]["energy_j"][energy] for point in points]),
+        "operations": front(gains, [point["test"]["synaptic_operations"] for point in points]),
+        "cores": front(gains, [point["n_cores"] for point in points]),
+    }
     if time is not None:
         on["latency"] = front(gains, [point["test"]["time_s"][time] for point in points])
     for i, point in enumerate(points):

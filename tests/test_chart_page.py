@@ -138,7 +138,14 @@ def test_in_a_browser_filters_keys_and_pointer_work(page_file, chart, tmp_path):
         assert page.run(readout).startswith("#2 grasps 2b, 100 %")
         page.run("document.querySelector('button[data-n=\"12\"]').click()")
         assert chart["points"][11]["commands"][0] in page.run(kept)
-        assert page.run("document.querySelectorAll('.mark.kept').length") == 2
+        assert page.run("document.querySelectorAll('.mark.kept').length") == 5
+        visible = "[...document.querySelectorAll('#chart figure:not([hidden]) svg')].map((svg) => svg.id).join()"
+        assert page.run(visible) == "chart-energy"
+        page.run(
+            "document.getElementById('axis').value = 'chart-cores';"
+            "document.getElementById('axis').dispatchEvent(new Event('change'))"
+        )
+        assert page.run(visible) == "chart-cores"
         assert page.console == []
 
 
@@ -158,7 +165,7 @@ def test_without_scripts_the_page_is_complete(page_file, tmp_path):
         assert page.console == []
     text = page_file.read_text("utf-8").partition("<script")[0]
     assert text.count("<tr data-n=") == 12
-    assert text.count("data-n=") == 12 * 4  # a mark in both figures, a row, a button
+    assert text.count("data-n=") == 12 * 7  # a mark in each of five figures, a row, a button
 
 
 # -- the page of a report ----------------------------------------------------------------------------------------------
@@ -203,7 +210,8 @@ def test_a_report_shows_the_chart_of_its_network(reported, chart, place):
     page = (place / "out.html").read_text("utf-8")
     assert page.count("<h2 id=") == 8
     assert '<h2 id="configurations-h">Configurations</h2>' in page
-    assert {"pareto-energy", "pareto-latency"} <= set(re.findall(r'<svg id="([^"]+)"', page))
+    drawn = [name for name in re.findall(r'<svg id="([^"]+)"', page) if name.startswith("pareto")]
+    assert drawn == ["pareto-energy", "pareto-latency", "pareto-operations", "pareto-cores"]
     assert "Configurations\n--------------\nrecommended:" in out
     reported()
     assert 'id="configurations' not in (place / "out.html").read_text("utf-8")

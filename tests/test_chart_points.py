@@ -39,6 +39,7 @@ def point(number, train, test, energy, time, *, step=20e-6, **axes):
         "number": number,
         "network": "net",
         "fine_tuned": False,
+        "n_cores": 4,
         **usual,
         **axes,
         "train": split(train, energy, time, 400, step),
