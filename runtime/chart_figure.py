@@ -9,6 +9,7 @@ from typing import Any
 from runtime import svg
 from runtime.chart_costs import Cost, costs_of
 from runtime.chart_text import NAMES, label
+from runtime.found import number as counted
 from runtime.tables import si
 
 Json = dict[str, Any]
@@ -61,12 +62,11 @@ def tip(point: Json, report: Json) -> str:
     test = point["test"]
     costs = [f"{si(joule, 'J')} ({name})" for name, joule in test["energy_j"].items()]
     costs += [f"{si(seconds, 's')} ({name})" for name, seconds in test["time_s"].items()]
-    return (
-        f"#{point['number']} {label(point)}: test {100 * test['accuracy']:.2f} % "
-        f"({100 * test['low']:.1f} … {100 * test['high']:.1f}), float {100 * test['float']['accuracy']:.2f} %, "
-        f"expected {100 * point['expected']:.2f} %, {test['equal']} of {report['data']['test']} decisions equal, "
-        f"{', '.join(costs)}, {test['synaptic_operations']:,.0f} synaptic operations, {point['n_cores']} cores"
-    )
+    right = f"test {100 * test['accuracy']:.2f} % ({100 * test['low']:.1f} … {100 * test['high']:.1f})"
+    right += f", float {100 * test['float']['accuracy']:.2f} %, expected {100 * point['expected']:.2f} %"
+    equal = f"{test['equal']} of {report['data']['test']} decisions equal"
+    size = f"{test['synaptic_operations']:,.0f} synaptic operations, {counted(point['n_cores'], 'core')}"
+    return f"#{point['number']} {label(point)}: {right}, {equal}, {', '.join(costs)}, {size}"
 
 
 def scatter(report: Json, cost: str, *, prefix: str = "chart") -> str:
