@@ -122,10 +122,6 @@ def side_by_side(
     waiting: Sequence[int],
     results: dict[int, AResult],
     run: Callable[[AJob], AResult],
-    *,
-    most: int | None = None,
-    fewer: str = "--seeds",
-    done: Callable[[int], object] | None = None,
 ) -> None:
     """Run jobs in processes of their own; whatever ends this ends them all.
 
@@ -139,12 +135,6 @@ def side_by_side(
         Takes the result of each job by its place among `jobs`.
     run : callable
         Does the work; a function of a module, since it crosses process borders.
-    most : int, optional
-        Processes at a time; as many as there are cores by default.
-    fewer : str
-        Option that makes them fewer, for the message of a lack of memory.
-    done : callable, optional
-        Told the place of each job whose result has come.
 
     Raises
     ------
@@ -152,16 +142,14 @@ def side_by_side(
         What ended a job.
     """
     work = [jobs[index] for index in waiting]
-    with closing(run_side_by_side(work, run, processes=most or cores())) as at_work:
+    with closing(run_side_by_side(work, run, processes=cores())) as at_work:
         for place, found in at_work:
             index = waiting[place]
             if isinstance(found, ProcessDied):
                 raise OptionError(
                     f"{jobs[index].output}: {found}, perhaps for lack of memory; go on with --resume, and with fewer "
-                    f"{fewer}"
+                    "--seeds"
                 )
             if isinstance(found, Exception):
                 raise found
             results[index] = found
-            if done is not None:
-                done(index)

@@ -14,16 +14,16 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-
-from tqdm import tqdm
+from typing import Any, TypeVar
 
 from compiler.errors import OptionError, SpikeloomError, UnfinishedError
+from runtime.cluster import ClusterLostError, require_address, run_on_cluster
 from runtime.sweep_store import Store, opened
-from runtime.workers import ProcessDied, cores, ended_by_signal, one_thread_each, run_side_by_side
+from runtime.workers import ProcessDied, attempt, cores, ended_by_signal, one_thread_each, run_side_by_side
 
 Json = dict[str, Any]
 Measure = Callable[[Any], Json]
+AResult = TypeVar("AResult")
 
 TRIES = 3
 """How often a point whose process dies is begun."""
@@ -42,7 +42,7 @@ class Point:
     label : str
         For messages.
     payload : picklable
-        What `measure` is given: paths and options, no arrays.
+        What `measure` is given: absolute paths and options, no arrays; it may travel to another machine.
     """
 
     key: str
@@ -69,12 +69,36 @@ def content_key(facts: Mapping[str, Any]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:KEY_DIGITS]
 
 
-def add_sweep_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options that say where a sweep runs, and whether it begins anew."""
+def add_place_arguments(parser: argparse.ArgumentParser, note: str = "") -> None:
+    """Add the options that say where many things are measured."""
     parser.add_argument("--jobs", type=int, metavar="N", help="processes at a time (default: one a core)")
     parser.add_argument(
-        "--scheduler", metavar="tcp://HOST:PORT", help="measure on the workers of this Dask scheduler instead"
+        "--scheduler", metavar="tcp://HOST:PORT", help=f"work on the workers of this Dask scheduler instead{note}"
     )
+
+
+def require_place_to_work(jobs: int | None, scheduler: str | None) -> None:
+    """Refuse `--jobs` and `--scheduler` that cannot be meant.
+
+    Raises
+    ------
+    OptionError
+        If there are no processes, both are given, or the address is none.
+    """
+    if jobs is not None and jobs < 1:
+        raise OptionError(f"--jobs {jobs}: allowed are 1 or more; choose another")
+    if scheduler is None:
+        return
+    require_address(scheduler)
+    if jobs is not None:
+        raise OptionError(
+            f"--jobs {jobs}: counts processes on this machine, --scheduler has workers of its own; leave one away"
+        )
+
+
+def add_sweep_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options that say where a sweep runs, and whether it begins anew."""
+    add_place_arguments(parser)
     parser.add_argument("--fresh", action="store_true", help="measure anew what an earlier run left")
 
 
@@ -133,24 +157,21 @@ def sweep(
     KeyboardInterrupt
         On an interrupt or a request to end; its text says what is kept.
     """
-    if jobs is not None and jobs < 1:
-        raise OptionError(f"--jobs {jobs}: allowed are 1 or more; choose another")
-    if jobs is not None and scheduler is not None:
-        raise OptionError(
-            f"--jobs {jobs}: counts processes on this machine, --scheduler has workers of its own; leave one away"
-        )
+    from tqdm import tqdm  # here, since every command loads this module
+
+    require_place_to_work(jobs, scheduler)
     keys = list(dict.fromkeys(point.key for point in points))
     with opened(store, kind=kind, version=version, fresh=fresh) as kept:
         first = {point.key: point for point in reversed(points)}
         waiting = [first[key] for key in keys if key not in kept.results]
         lost = []
         there = tqdm(total=len(keys), initial=len(keys) - len(waiting), desc=label, unit="point", disable=None)
-        with there as bar, ended_by_signal(), one_thread_each():
+        with there as bar, ended_by_signal():
             try:
-                with closing(_measured(waiting, measure, jobs or cores(), scheduler)) as measured:
+                with closing(spread(waiting, measure, jobs=jobs, scheduler=scheduler)) as measured:
                     for point, found in measured:
                         if isinstance(found, ProcessDied):
-                            lost.append(f"{point.label}: {found} {TRIES} times, perhaps for lack of memory; left out")
+                            lost.append(left_out(point, found))
                         elif isinstance(found, Exception):
                             found.add_note(point.label)
                             raise found
@@ -159,6 +180,8 @@ def sweep(
                             bar.update()
             except KeyboardInterrupt as interrupt:
                 raise KeyboardInterrupt(f"{_kept(kept, keys)}; go on with the same command") from interrupt
+            except ClusterLostError as error:
+                lost.append(str(error))
             except SpikeloomError as error:
                 error.add_note(_kept(kept, keys))
                 raise
@@ -172,26 +195,50 @@ def _kept(store: Store, keys: Sequence[str]) -> str:
     return f"{sum(key in store.results for key in keys)} of {len(keys)} points are kept in {store.path}"
 
 
-def _measured(
-    points: Sequence[Point], measure: Measure, processes: int, scheduler: str | None
-) -> Generator[tuple[Point, Json | Exception]]:
-    """Points and what came of them, as they come."""
-    if scheduler is not None:
-        raise OptionError("--scheduler: is not there yet")
-    if min(processes, len(points)) <= 1:
-        for point in points:
-            try:
-                found: Json | Exception = measure(point.payload)
-            except (SpikeloomError, OSError, MemoryError) as error:
-                found = error
-            yield point, found
+def spread(
+    points: Sequence[Point], measure: Callable[[Any], AResult], *, jobs: int | None = None, scheduler: str | None = None
+) -> Generator[tuple[Point, AResult | Exception]]:
+    """Measure points wherever that was asked for; what `sweep` does without its store.
+
+    Yields
+    ------
+    (Point, result)
+        As they come: what was measured, the exception that the measurement raised, or
+        :class:`runtime.workers.ProcessDied` where that ended its process too often.
+
+    Raises
+    ------
+    OptionError, ClusterLostError
+        See :func:`runtime.cluster.run_on_cluster`.
+    """
+    if not points:
         return
-
-    def again(index: int, died: ProcessDied) -> None:
-        tqdm.write(f"spikeloom: {points[index].label}: {died}; tried again", file=sys.stderr)
-
     payloads = [point.payload for point in points]
-    at_work = run_side_by_side(payloads, measure, processes=processes, tries=TRIES, again=again)
-    with closing(at_work):
-        for index, come in at_work:
-            yield points[index], come
+    processes = min(jobs or cores(), len(points))
+    if scheduler is not None:
+        measured = run_on_cluster(payloads, measure, scheduler=scheduler, tell=tell)
+    elif processes == 1:
+        measured = ((index, attempt(measure, payload)) for index, payload in enumerate(payloads))
+    else:
+        measured = run_side_by_side(
+            payloads,
+            measure,
+            processes=processes,
+            tries=TRIES,
+            again=lambda index, died: tell(f"{points[index].label}: {died}; tried again"),
+        )
+    with closing(measured), one_thread_each():
+        for index, found in measured:
+            yield points[index], found
+
+
+def left_out(point: Point, died: ProcessDied) -> str:
+    """What is told of a point without a result."""
+    return f"{point.label}: {died}, perhaps for lack of memory; left out"
+
+
+def tell(line: str) -> None:
+    """Say something on stderr, above the progress bar where there is one."""
+    from tqdm import tqdm
+
+    tqdm.write(f"spikeloom: {line}", file=sys.stderr)

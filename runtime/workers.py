@@ -27,7 +27,7 @@ PATIENCE_S = 5.0
 STOPPED = 143
 """Exit code of a process that a signal ended, as a shell gives it."""
 
-THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """Variables that say how many threads the libraries inside a process start; read when they are loaded."""
 
 
@@ -36,21 +36,24 @@ class ProcessDied(Exception):  # noqa: N818 - it is handed over, not raised
 
     Parameters
     ----------
-    code : int or None
-        Its exit code; negative: the signal that ended it.
+    what : str
+        Which, and how.
+    times : int
+        How often that was so for what it worked on.
     """
 
-    def __init__(self, code: int | None) -> None:
-        self.code = code
-        super().__init__(code)
+    def __init__(self, what: str, times: int = 1) -> None:
+        self.what = what
+        self.times = times
+        super().__init__(what, times)
 
     def __str__(self) -> str:
-        return f"its process ended early (exit code {self.code})"
+        return self.what if self.times == 1 else f"{self.what}, {self.times} times"
 
 
 def cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """Cores of this machine."""
+    return os.cpu_count() or 1
 
 
 @contextmanager
@@ -138,8 +141,8 @@ def run_side_by_side(
                 except (EOFError, ConnectionResetError):
                     ours.close()
                     process.join()
-                    found = ProcessDied(process.exitcode)
                     deaths[index] += 1
+                    found = ProcessDied(f"its process ended early (exit code {process.exitcode})", deaths[index])
                     if deaths[index] < tries:
                         queue.append(index)
                         if again is not None:
@@ -160,6 +163,16 @@ def run_side_by_side(
             process.join()
 
 
+def attempt(run: Callable[[APayload], AResult], payload: APayload) -> AResult | Exception:
+    """What `run` makes of a payload, or the exception that it raised, such that it can cross process borders."""
+    try:
+        return run(payload)
+    except (SpikeloomError, OSError, MemoryError) as error:
+        return error.with_traceback(None)
+    except Exception:  # a defect; not every exception survives the way
+        return RuntimeError(traceback.format_exc())
+
+
 def _begin(context: SpawnContext, run: Callable[[APayload], AResult]) -> tuple[Connection, SpawnProcess]:
     ours, theirs = context.Pipe()
     process = context.Process(target=_work, args=(run, theirs))
@@ -178,13 +191,7 @@ def _work(run: Callable[[APayload], AResult], connection: Connection) -> None:
             payload = connection.recv()
         except EOFError:
             return
-        try:
-            found: AResult | Exception = run(payload)
-        except (SpikeloomError, OSError, MemoryError) as error:
-            found = error
-        except Exception:  # a defect; not every exception survives the way to the other process
-            found = RuntimeError(traceback.format_exc())
-        connection.send(found)
+        connection.send(attempt(run, payload))
 
 
 def _stop(_signal: int, _frame: object) -> None:

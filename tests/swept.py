@@ -38,12 +38,14 @@ def square(payload: dict[str, Any]) -> dict[str, Any]:
             raise DataError("x.zip: is empty; give another")
         case "capacity":
             raise CapacityError((VIOLATION,))
+        case "interrupt":
+            raise KeyboardInterrupt
         case "defect":
             raise ZeroDivisionError("a defect")
     return {"square": number**2, "third": number / 3, "pair": (number, None), "threads": os.environ["OMP_NUM_THREADS"]}
 
 
-def begun(log: str) -> list[int]:
+def begun(log: str | Path) -> list[int]:
     """Numbers whose measurement began, in that order."""
     return [int(line) for line in Path(log).read_text().splitlines()] if Path(log).exists() else []
 

@@ -10,7 +10,6 @@ import subprocess
 import time
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -30,7 +29,6 @@ from runtime.cells import GRAPHS, Row, in_turn, plan, read_cells
 from runtime.cli import main
 from runtime.inputs import propagation
 from runtime.published import Published
-from runtime.seeds import side_by_side
 from runtime.votes import class_counts
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -357,18 +355,6 @@ def test_in_processes_of_its_own_it_keeps_what_it_has(data):
     assert not list(data.glob("out/networks/.*")), "half-written files are left"
 
 
-def named(job):
-    return job.output.name
-
-
-def test_side_by_side_tells_of_each_result():
-    jobs = [SimpleNamespace(output=Path(name)) for name in "abc"]
-    results, told = {}, []
-    side_by_side(jobs, [2, 0], results, named, most=1, done=told.append)
-    assert results == {2: "c", 0: "a"}
-    assert told == [2, 0]
-
-
 # --- statistics -------------------------------------------------------------------------------------------------------
 
 
@@ -501,6 +487,11 @@ def test_the_paper_is_compared_on_its_recordings_only(tmp_path, capsys):
         (["--seeds", "0"], "--seeds 0: allowed are 1 or more; choose another"),
         (["--epochs", "0"], "--epochs 0: allowed are 1 or more; choose another"),
         (["--jobs", "-1"], "--jobs -1: allowed are 1 or more; choose another"),
+        (
+            ["--scheduler", "tcp://h:1"],
+            "--jobs 1: counts processes on this machine, --scheduler has workers of its own; leave one away",
+        ),
+        (["--scheduler", "h:1"], "--scheduler h:1: is no address; give one as in tcp://10.0.0.1:8786"),
         (["--full", "--seeds", "3"], "--seeds 3: --full says how many; leave one of them away"),
         (["--full", "--epochs", "3"], "--epochs 3: --full says how many; leave one of them away"),
         (["--table", "x"], "--table x: unknown; choose from methods, graphs"),
