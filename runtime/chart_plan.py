@@ -125,7 +125,8 @@ def identity(network: Given) -> Json:
 
 def decisions(network: Given, grid: Grid, facts: Facts) -> Point:
     """Work that finds the decisions of a float network."""
-    work = Decide(words=(*network.words, "-o", "x.loom"), data=facts.data, windows=tuple(sorted(grid.window)))
+    words = from_anywhere([*network.words, "-o", "x.loom"])
+    work = Decide(words=words, sha256=network.checkpoint.sha256, data=_data(facts), windows=tuple(sorted(grid.window)))
     key = facts.key(what="float", **identity(network), windows=list(work.windows))
     return Point(key=key, label=f"{network.name} float", payload=work)
 
@@ -154,11 +155,10 @@ def stored_networks(networks: Sequence[Given], grid: Grid, facts: Facts) -> list
         for storage in storages(network, grid):
             layouts, files = {}, {}
             for layout in grid.cores:
-                words = [*network.words, *storage.words(), "--calibrate", facts.data.path, *_bin_words(facts)]
-                layouts[layout] = (*words, *layout_words(layout), "-o", file_name(network, storage, layout))
+                layouts[layout] = from_anywhere(compile_words(network, storage, layout, facts))
                 key = facts.key(what="netlist", **identity(network), storage=storage.words(), layout=layout)
-                files[layout] = facts.folder / "netlists" / f"{key}.loom"
-            work = Build(layouts=layouts, files=files, data=facts.data)
+                files[layout] = facts.folder.resolve() / "netlists" / f"{key}.loom"
+            work = Build(layouts=layouts, sha256=network.checkpoint.sha256, files=files, data=_data(facts))
             key = facts.key(what="build", **identity(network), storage=storage.words(), layouts=list(grid.cores))
             found.append(Stored(network=network, storage=storage, build=work, key=key))
     return found
@@ -177,6 +177,36 @@ def runs(stored: Stored, layout: str, sha256: str, grid: Grid, facts: Facts) -> 
 
 
 # -- commands ----------------------------------------------------------------------------------------------------------
+
+
+def compile_words(network: Given, storage: Storage, layout: str, facts: Facts) -> list[str]:
+    """What to type after ``spikeloom`` to get a netlist."""
+    words = [*network.words, *storage.words(), "--calibrate", facts.data.path, *_bin_words(facts)]
+    return [*words, *layout_words(layout), "-o", file_name(network, storage, layout)]
+
+
+READ = ("--calibrate", "--taxels", "--edges")
+"""Options of ``compile`` that may name what is read."""
+
+
+def from_anywhere(words: Sequence[str]) -> tuple[str, ...]:
+    """The same words for a process that works in another folder: what they read is named by its whole path.
+
+    Examples
+    --------
+    >>> from_anywhere(["compile", "pretrained:grasps", "--calibrate", "synthetic", "-o", "x.loom"])
+    ('compile', 'pretrained:grasps', '--calibrate', 'synthetic', '-o', 'x.loom')
+    """
+    reads = {1, *(at + 1 for at, word in enumerate(words) if word in READ)}
+    return tuple(_whole(word) if at in reads else word for at, word in enumerate(words))
+
+
+def _whole(path: str) -> str:
+    return str(Path(path).resolve()) if Path(path).exists() else path
+
+
+def _data(facts: Facts) -> Data:
+    return Data(path=_whole(facts.data.path), bin_s=facts.data.bin_s, sha256=facts.data_sha256)
 
 
 def layout_words(layout: str) -> list[str]:
@@ -202,7 +232,7 @@ def file_name(network: Given, storage: Storage, layout: str) -> str:
 
 def commands(stored: Stored, layout: str, window: int, facts: Facts) -> list[str]:
     """What to type to get a point: its netlist, then its figures."""
-    compiled = stored.build.layouts[layout]
+    compiled = compile_words(stored.network, stored.storage, layout, facts)
     words = ["run", compiled[-1], "--data", facts.data.path, *_bin_words(facts), "--detail", "counts"]
     words += [] if window == WHOLE else ["--window", f"{window}%"]
     return [shlex.join(["spikeloom", *each]) for each in (compiled, words)]

@@ -22,10 +22,13 @@ class Data:
         As ``--data`` names them.
     bin_s : float
         Seconds of a step.
+    sha256 : str, optional
+        Of both splits; another process holds its own against it.
     """
 
     path: str
     bin_s: float
+    sha256: str | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,12 +39,15 @@ class Decide:
     ----------
     words : tuple of str
         Of a ``compile`` command that names the network.
+    sha256 : str
+        Of the checkpoint.
     data : Data
     windows : tuple of int
         Per cent.
     """
 
     words: tuple[str, ...]
+    sha256: str
     data: Data
     windows: tuple[int, ...]
 
@@ -54,6 +60,8 @@ class Build:
     ----------
     layouts : mapping of str to tuple of str
         Words of a ``compile`` command by layout; they differ in the layout alone.
+    sha256 : str
+        Of the checkpoint.
     files : mapping of str to Path
         Where each netlist is kept.
     data : Data
@@ -61,6 +69,7 @@ class Build:
     """
 
     layouts: Mapping[str, tuple[str, ...]]
+    sha256: str
     files: Mapping[str, Path]
     data: Data
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from compiler.dynamics import with_clocks
-from compiler.errors import CapacityError, FormatError, ModelError
+from compiler.errors import CapacityError, DataError, FormatError, ModelError
 from compiler.fixedpoint import FloatArray, IntArray
 from compiler.interpret import cut, vote
 from compiler.netlist import Netlist
@@ -67,18 +67,24 @@ def both_splits(data: Data, taxels: int, classes: int) -> dict[str, Recordings]:
     Raises
     ------
     DataError, OptionError
-        If they cannot be used, or do not suit the network.
+        If they cannot be used, do not suit the network, or are others than those of who asks for the work.
     """
-    return {
-        split: recordings(data.path, split, classes=classes, taxels=taxels, bin_s=data.bin_s, labels_for="chart")
-        for split in SPLITS
-    }
+    from models.protocols import data_digest
+
+    shared: dict[str, Any] = {"classes": classes, "taxels": taxels, "bin_s": data.bin_s, "labels_for": "chart"}
+    found = {split: recordings(data.path, split, **shared) for split in SPLITS}
+    if data.sha256 not in (None, data_digest(found["train"], found["test"])):
+        raise DataError(f"{data.path}: holds other recordings than where the chart was asked for; copy those here")
+    return found
 
 
 @lru_cache(maxsize=2)
-def _network(words: tuple[str, ...]) -> Asked:
+def _network(words: tuple[str, ...], sha256: str) -> Asked:
     arguments = parsed(words)
-    return asked_network(arguments.checkpoint, arguments)
+    found = asked_network(arguments.checkpoint, arguments)
+    if found.sha256 != sha256:
+        raise ModelError(f"{arguments.checkpoint}: is another file than where the chart was asked for; copy that here")
+    return found
 
 
 def parsed(words: tuple[str, ...]) -> argparse.Namespace:
@@ -106,7 +112,7 @@ def _decide(work: Decide) -> Json:
     """Decisions of the float32 model by split and window; one run each, since what comes later changes nothing."""
     from models.reference import float_spikes  # torch, so only here
 
-    asked = _network(work.words)
+    asked = _network(work.words, work.sha256)
     checkpoint, adjacency = asked.checkpoint, asked.adjacency
     assert checkpoint is not None, "a chart takes checkpoints"
     assert adjacency is not None, "and these have a first layer that sees something"
@@ -131,7 +137,7 @@ def _build(work: Build) -> Json:
     """Compile what is not there; by layout the netlist's size and hash, or the limits that it breaks."""
     arguments = {layout: parsed(words) for layout, words in work.layouts.items()}
     some = next(iter(arguments.values()))
-    asked = _network(model_words(next(iter(work.layouts.values()))))
+    asked = _network(model_words(next(iter(work.layouts.values()))), work.sha256)
     training = both_splits(work.data, asked.network.input.taxels, asked.network.classes)["train"]
     try:
         stored = store(

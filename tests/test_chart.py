@@ -8,6 +8,7 @@ import shlex
 import signal
 import subprocess
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ import pytest
 from commands import RUNTIME
 from made_files import CLASSES, events, own_file, recordings_folder, ring, weights
 
-from compiler.errors import CapacityError, Violation
+from compiler.errors import CapacityError, OptionError, SpikeloomError, Violation
 from compiler.serialize import netlist_bytes, read_netlist
 from models.evtouch import load_recordings
 from models.graphs import Graph
@@ -287,6 +288,29 @@ def test_the_graph_of_the_grid_chooses_among_the_networks(spikeloom):
     assert [point["network"] for point in json.loads(out)["points"]] == ["ring", "chain"]
 
 
+def test_a_shipped_checkpoint_stands_in_for_a_graph_that_is_asked_for(spikeloom, monkeypatch):
+    files = {"pretrained:rings": "ring.pt", "pretrained:rings-knn1": "chain.pt"}
+
+    def shipped(path):
+        if path not in files:
+            raise OptionError(f"{path}: no such shipped checkpoint")
+        return files[path]
+
+    monkeypatch.setattr("runtime.chart_networks.shipped", shipped)
+    monkeypatch.setattr("runtime.inputs.shipped", shipped)
+    words = ("chart", "pretrained:rings", "--data", "data", "--jobs", "1", "-o", "shipped", "--json", "--grid")
+    code, out, _ = spikeloom(*words, "bits=8,window=100%,graph=ring/knn:1")
+    assert code == 0
+    found = json.loads(out)
+    assert [(net["name"], net["graph"]) for net in found["networks"]] == [("rings", "ring"), ("rings-knn1", "knn:1")]
+    assert found["points"][1]["commands"][0].startswith("spikeloom compile pretrained:rings-knn1 --calibrate data ")
+    code, _, err = spikeloom(*words, "graph=knn:4")
+    assert code == 2
+    assert err.startswith(
+        "spikeloom: --grid graph=knn:4: no checkpoint was trained on that graph, those given on ring;"
+    )
+
+
 def test_where_validation_is_not_known_the_text_says_what_chose(spikeloom):
     words = ("chart", "unknown.pt", "--data", "data", "--jobs", "1", "-o", "unknown", "--grid", "bits=8,window=100%")
     code, out, _ = spikeloom(*words)
@@ -439,3 +463,41 @@ def test_the_netlists_are_read_back_whole(made, place):
     for point in made["points"]:
         file = place / "out" / point["netlist"]
         assert netlist_bytes(read_netlist(file)) == file.read_bytes()
+
+
+@pytest.mark.slow
+def test_workers_of_a_scheduler_in_another_folder_find_the_same(made, spikeloom):
+    pytest.importorskip("distributed", reason="distributed is not installed (extra 'cluster')")
+    from test_cluster import Cluster
+
+    cluster = Cluster()
+    try:
+        cluster.worker()
+        cluster.reachable(1)
+        code, out, _ = spikeloom(*CHART[:-2], "--scheduler", cluster.address, "-o", "cluster", "--json")
+    finally:
+        cluster.end()
+    assert code == 0
+    assert json.loads(out)["points"] == made["points"]
+
+
+@pytest.mark.parametrize("what", ["data", "network"])
+def test_a_worker_that_has_other_files_says_so(made, spikeloom, place, monkeypatch, what):
+    handed, measure = [], chart_work.measure
+    monkeypatch.setattr("runtime.chart_work.measure", lambda work: handed.append(work) or measure(work))
+    spikeloom(*[word if word != GRID else "bits=6,window=100%" for word in CHART], "-o", f"files-{what}")
+    work = next(each for each in handed if isinstance(each, chart_tasks.Build))
+    chart_work.both_splits.cache_clear()
+    if what == "data":
+        other = place / "other"
+        changed = replace(work, data=replace(work.data, path=str(other)))
+        told = f"{other}: holds other recordings than where the chart was asked for; copy those here"
+    else:
+        other = place / "unknown.pt"
+        changed = replace(
+            work, layouts={key: (words[0], str(other), *words[2:]) for key, words in work.layouts.items()}
+        )
+        told = f"{other}: is another file than where the chart was asked for; copy that here"
+    with pytest.raises(SpikeloomError) as caught:
+        measure(changed)
+    assert str(caught.value) == told
