@@ -183,7 +183,7 @@ def _filters(report: Json) -> str:
     if not parts:
         return ""
     shown = f'<output id="shown">{len(report["points"])} points</output>'
-    return f'<form class="filters" aria-label="Filters">{"".join(parts)}{shown}</form>'
+    return f'<div class="filters" role="group" aria-label="Filters">{"".join(parts)}{shown}</div>'
 
 
 def _points(report: Json) -> list[str]:
