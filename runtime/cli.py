@@ -29,6 +29,7 @@ from compiler.targets import load_target, with_tables
 from models.evtouch import Recordings
 from models.grasps import SYNTHETIC
 from runtime import (
+    anytime,
     bits,
     chart,
     decisions,
@@ -36,6 +37,7 @@ from runtime import (
     export,
     finetune,
     join,
+    lean,
     render,
     report,
     reproduce,
@@ -54,9 +56,19 @@ from runtime.inputs import (
     require_place,
     version,
 )
-from runtime.options import add_compile, add_detail, add_model, add_network, add_recordings, add_training, add_window
+from runtime.options import (
+    add_compile,
+    add_detail,
+    add_explain_cost,
+    add_model,
+    add_network,
+    add_recordings,
+    add_training,
+    add_window,
+)
+from runtime.spent import Account, explained
 from runtime.tables import show
-from runtime.trace import ENGINES
+from runtime.trace import ENGINES, BoolArray
 from runtime.train_command import train
 from runtime.windows import first_part, window_asked
 
@@ -119,19 +131,26 @@ def _run(arguments: Arguments) -> Outcome:
     data = _recordings(arguments, netlist)
     progress("running")
     events = with_clocks(data.events, netlist.clocks)
+    account = Account(netlist, data)
     found: Report | None = None
-    if arguments.detail == "spikes" or arguments.spikes is not None:
+    if arguments.detail == "spikes":
+        account.begin("spikes" if arguments.spikes is None else "spikes kept")
         trace = engine.simulate(netlist, events, lengths=data.lengths, spikes=arguments.spikes is not None)
-        spikes = trace.counts.spikes
-        if trace.spikes is not None:
-            layers = {layer.name: aligned(netlist, trace.spikes, i) for i, layer in enumerate(netlist.layers)}
-            with write_atomically(arguments.spikes) as file:
-                np.savez_compressed(file, **layers)  # type: ignore[arg-type]
-    if arguments.detail != "spikes":
-        spikes, found = _costs(arguments, netlist, data)
+        spikes, kept = trace.counts.spikes, trace.spikes
+    else:
+        shape = len(data), data.steps + netlist.max_depth, netlist.n_compartments
+        kept = None if arguments.spikes is None else np.zeros(shape, np.bool_)
+        account.begin(arguments.detail)
+        spikes, found = _costs(arguments, netlist, data, kept)
+    account.begin("no float")
+    if kept is not None:
+        layers = {layer.name: aligned(netlist, kept, i) for i, layer in enumerate(netlist.layers)}
+        with write_atomically(arguments.spikes) as file:
+            np.savez_compressed(file, **layers)  # type: ignore[arg-type]
     decided = predictions(netlist, spikes)
     report = decisions.run_json(data.files, data.labels, class_counts(netlist, spikes), decided)
-    return report | ({} if found is None else {"costs": found}), decisions.run_text, 0
+    report |= {} if found is None else {"costs": found}
+    return report | explained(arguments, account), decisions.run_text, 0
 
 
 def _verify(arguments: Arguments) -> Outcome:
@@ -152,6 +171,7 @@ def _verify(arguments: Arguments) -> Outcome:
     asked = asked_network(arguments.checkpoint, arguments)
     original = None if arguments.original is None else asked_network(arguments.original, arguments)
     data = _recordings(arguments, netlist, labels_for="verify")
+    account = Account(netlist, data, checked=arguments.spec_samples)
     verdict = verify(
         netlist,
         asked.model,
@@ -164,8 +184,9 @@ def _verify(arguments: Arguments) -> Outcome:
         spec_samples=arguments.spec_samples,
         engine_name=arguments.engine,
         lengths=data.lengths,
-        progress=progress,
+        progress=account.begin,
     )
+    told = explained(arguments, account)
     compiled_for = netlist.provenance.get("graph", asked.graph)
     if asked.graph not in (None, compiled_for):
         sys.stderr.write(
@@ -173,19 +194,25 @@ def _verify(arguments: Arguments) -> Outcome:
         )
     levels = levels_of(verdict)
     missed = unmet(levels, required)
-    return verdicts.verify_json(verdict, levels, missed), verdicts.verify_text, 1 if missed else 0
+    return verdicts.verify_json(verdict, levels, missed) | told, verdicts.verify_text, 1 if missed else 0
 
 
 def _estimate(arguments: Arguments) -> Outcome:
     from runtime.estimates import estimate_text
 
     netlist = read_netlist(arguments.netlist)
-    _, report = _costs(arguments, netlist, _recordings(arguments, netlist))
-    return report, estimate_text, 0
+    data = _recordings(arguments, netlist)
+    account = Account(netlist, data)
+    account.begin(arguments.detail)
+    _, report = _costs(arguments, netlist, data)
+    account.begin("no float")
+    return report | explained(arguments, account), estimate_text, 0
 
 
-def _costs(arguments: Arguments, netlist: Netlist, data: Recordings) -> tuple[IntArray, Report]:
-    """Spikes of each compartment, and what the recordings cost at the detail that was asked for."""
+def _costs(
+    arguments: Arguments, netlist: Netlist, data: Recordings, spikes: BoolArray | None = None
+) -> tuple[IntArray, Report]:
+    """Spikes of each compartment, and what the recordings cost at the detail that was asked for; fills `spikes`."""
     from runtime.estimate import estimate
     from runtime.estimates import estimate_json
 
@@ -198,6 +225,7 @@ def _costs(arguments: Arguments, netlist: Netlist, data: Recordings) -> tuple[In
         with_clocks(data.events, netlist.clocks),
         lengths=data.lengths,
         detail=arguments.detail,
+        spikes=spikes,
         progress=lambda done: progress(f"running: {done} of {len(data)}"),
     )
     return counts.spikes, estimate_json(netlist, target, found, bin_s=arguments.bin)
@@ -285,6 +313,7 @@ def build_parser() -> argparse.ArgumentParser:
         metavar="E0,E2=X,E3=X",
         help="levels to pass instead: E0 specification = engine, E2 share of spikes in every layer, E3 of decisions",
     )
+    add_explain_cost(sub)
 
     sub = command("estimate", _estimate, "synaptic operations, energy and time of an inference")
     sub.add_argument("netlist")
@@ -294,12 +323,14 @@ def build_parser() -> argparse.ArgumentParser:
 
     sub = command("train", train, "train a network by the released protocol, reported by the paper's and a clean one")
     add_training(sub)
+    anytime.add_arguments(command("anytime", anytime.anytime, anytime.SUMMARY))
     bits.add_arguments(command("bits", bits.bits, bits.SUMMARY))
     chart.add_arguments(command("chart", chart.chart, chart.SUMMARY))
     explain.add_arguments(command("explain", explain.explain, explain.SUMMARY))
     export.add_arguments(command("export", export.export, export.SUMMARY))
     finetune.add_arguments(command("finetune", finetune.finetune, finetune.SUMMARY))
     join.add_arguments(command("join", join.join, join.SUMMARY))
+    lean.add_arguments(command("lean", lean.lean, lean.SUMMARY))
     report.add_arguments(command("report", report.report, report.SUMMARY))
     reproduce.add_arguments(command("reproduce", reproduce.reproduce, reproduce.SUMMARY))
     watch.add_arguments(command("watch", watch.watch, watch.SUMMARY))

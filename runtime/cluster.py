@@ -1,7 +1,7 @@
 """Work on the machines of a Dask cluster that is there already: its scheduler hands out, its workers measure.
 
 Dask itself is loaded only here, and only where a scheduler is asked for. On this machine alone processes of our own
-(:mod:`runtime.workers`) do: they start in a fifth of the time and open no port.
+(:mod:`runtime.workers`) do: they start several times faster and open no port.
 """
 
 from __future__ import annotations

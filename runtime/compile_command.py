@@ -110,7 +110,7 @@ def provenance(arguments: argparse.Namespace, asked: Asked, *, calibrated: bool)
         "checkpoint_sha256": asked.sha256,
         **origin,
         **({"towers": checkpoint.towers} if checkpoint is not None and checkpoint.towers > 1 else {}),
-        **_storage(recipes_asked(arguments), checkpoint),
+        **storage(recipes_asked(arguments), checkpoint),
         "spike_exact": arguments.spike_exact,
         "keep_all": arguments.keep_all,
         "prune_unused": arguments.prune_unused,
@@ -169,7 +169,7 @@ def recipes_asked(arguments: argparse.Namespace) -> tuple[Recipe, ...] | None:
     return tuple(Recipe(bits=b, planes=p, groups=g) for b, p, g in zip(*columns, strict=True))
 
 
-def _storage(recipes: tuple[Recipe, ...] | None, checkpoint: Checkpoint | None) -> Json:
+def storage(recipes: tuple[Recipe, ...] | None, checkpoint: Checkpoint | None) -> Json:
     """The same for the provenance of a netlist."""
     if checkpoint is not None and checkpoint.forms is not None:
         return {"weight_bits": _one_or_list([form.bits for form in checkpoint.forms]), "fine_tuned": True}

@@ -59,6 +59,14 @@ def add_detail(parser: argparse.ArgumentParser, choices: tuple[str, ...], defaul
     told = "; ".join(f"{choice}: {what[choice]}" for choice in choices)
     parser.add_argument("--detail", choices=choices, default=default, help=f"{told} (default: {default})")
     parser.add_argument("--table", metavar="NAME|FILE.toml", help="price and time by this table only, or by your own")
+    add_explain_cost(parser)
+
+
+def add_explain_cost(parser: argparse.ArgumentParser) -> None:
+    """Add the option that tells what was simulated."""
+    parser.add_argument(
+        "--explain-cost", action="store_true", help="say on stderr (and in --json) what was simulated, and why"
+    )
 
 
 def add_training(parser: argparse.ArgumentParser) -> None:
@@ -88,6 +96,9 @@ def add_training(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--clocks", type=int, metavar="K", help="inputs that tell which K-th of the recording it is")
     parser.add_argument("--features", type=int, metavar="N", help="of the first layer, per place")
     parser.add_argument("--batch", type=int, metavar="N", help="recordings to a step of the optimizer")
+    parser.add_argument(
+        "--spike-penalty", type=float, metavar="X", help="loss of a spike on every synapse in every step: fewer spikes"
+    )
     parser.add_argument("--epochs", type=int, metavar="N", help=f"default: {defaults}")
     parser.add_argument(
         "--decay-epochs",

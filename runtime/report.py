@@ -19,9 +19,10 @@ from runtime.asked import Asked, asked_network
 from runtime.chart_file import read_chart
 from runtime.inputs import progress, recordings, require_place
 from runtime.levels import levels_of, unmet
-from runtime.options import add_network, add_recordings
+from runtime.options import add_explain_cost, add_network, add_recordings
 from runtime.render import netlist_json
 from runtime.report_text import report_text
+from runtime.spent import Account, explained
 from runtime.trace import check_channels
 from runtime.verdicts import verify_json
 
@@ -49,6 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--chart", metavar="FOLDER", help="show what spikeloom chart found of this network, too")
     parser.add_argument("-o", "--output", required=True, metavar="OUT.html")
+    add_explain_cost(parser)
     parser.epilog = NOTES
 
 
@@ -142,6 +144,7 @@ def _facts(
     from runtime.estimates import estimate_json
     from runtime.report_recording import recording_json
 
+    account = Account(netlist, data, checked=arguments.spec_samples)
     target = load_target(netlist.target)
     verdict = verify(
         netlist,
@@ -153,14 +156,14 @@ def _facts(
         sha256=asked.sha256,
         spec_samples=arguments.spec_samples,
         lengths=data.lengths,
-        progress=progress,
+        progress=account.begin,
     )
     levels = levels_of(verdict)
     if chosen is None:
         chosen = 0 if verdict.first_divergence is None else data.files.index(verdict.first_divergence.file)
-    progress("costs")
+    account.begin("costs")
     counts, costs = estimate(netlist, target, with_clocks(data.events, netlist.clocks), lengths=data.lengths)
-    progress("the recording")
+    account.begin("the recording")
     provenance = report_facts.provenance_json(arguments, netlist, target, asked, data, data.files[chosen])
     found = {
         "verify": verify_json(verdict, levels, unmet(levels, {"E0": 1.0})),
@@ -172,4 +175,4 @@ def _facts(
         "costs": estimate_json(netlist, target, costs, bin_s=arguments.bin),
         "provenance": provenance,
     }
-    return found, 1 if found["verify"]["missed"] else 0
+    return found | explained(arguments, account), 1 if found["verify"]["missed"] else 0

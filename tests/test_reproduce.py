@@ -27,9 +27,11 @@ from models.release import write_released
 from runtime import engine, paper_picture, paper_table, paper_text
 from runtime.cells import GRAPHS, Row, in_turn, plan, read_cells
 from runtime.cli import main
+from runtime.cluster import ClusterLostError
 from runtime.inputs import propagation
 from runtime.published import Published
 from runtime.votes import class_counts
+from runtime.workers import ProcessDied
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -353,6 +355,33 @@ def test_in_processes_of_its_own_it_keeps_what_it_has(data):
         "--resume"
     )
     assert not list(data.glob("out/networks/.*")), "half-written files are left"
+
+
+@pytest.mark.parametrize(
+    ("ending", "line"),
+    [
+        (ProcessDied("its process ended early (exit code -9)", 3), None),
+        (ClusterLostError("tcp://h:1"), "--scheduler tcp://h:1: was lost"),
+    ],
+)
+def test_cells_that_are_lost_are_told_and_can_be_gone_on_with(data, capsys, monkeypatch, ending, line):
+    def losing(points, run, **_where):
+        yield points[0], run(points[0].payload)
+        if isinstance(ending, ClusterLostError):
+            raise ending
+        yield points[1], ending
+
+    monkeypatch.setattr("runtime.cells.METHODS", (("mlp", "none"), ("gcn", "manual")))
+    monkeypatch.setattr("runtime.cell_work.spread", losing)
+    assert main([*METHODS]) == 1
+    died = f"{GCN_NAME}: its process ended early (exit code -9), 3 times, perhaps for lack of memory; left out"
+    assert capsys.readouterr().err.splitlines()[-3:] == [
+        f"spikeloom: {line or died}",
+        "spikeloom: 1 of 2 cells and the epochs so far are kept in out",
+        f"spikeloom: go on with: spikeloom {' '.join(METHODS)} --resume",
+    ]
+    monkeypatch.undo()
+    assert "grasps" in Path(data / "out/methods.md").read_text()
 
 
 # --- statistics -------------------------------------------------------------------------------------------------------
