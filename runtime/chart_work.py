@@ -33,7 +33,7 @@ from runtime.estimate import estimate
 from runtime.inputs import recordings
 from runtime.options import cores_asked
 from runtime.votes import predictions, readout_counts
-from runtime.windows import first_part
+from runtime.windows import first_part, steps_of
 
 Json = dict[str, Any]
 
@@ -124,7 +124,7 @@ def _decide(work: Decide) -> Json:
             part = slice(first, first + PART)
             *_, spikes = float_spikes(checkpoint, adjacency, data.events[part]).values()
             for window in work.windows:
-                heard = cut(spikes, -(-own[part] * window // 100))
+                heard = cut(spikes, steps_of(own[part], window))
                 counts[window].append(readout_counts(checkpoint.readout, checkpoint.classes, heard))
         found[split] = {str(window): vote(np.concatenate(each)).tolist() for window, each in counts.items()}
     return found

@@ -64,7 +64,6 @@ from runtime.options import (
     add_network,
     add_recordings,
     add_training,
-    add_window,
 )
 from runtime.spent import Account, explained
 from runtime.tables import show
@@ -279,8 +278,7 @@ def build_parser() -> argparse.ArgumentParser:
 
     sub = command("run", _run, "run a netlist exactly as the chip would")
     sub.add_argument("netlist")
-    add_recordings(sub)
-    add_window(sub)
+    add_recordings(sub, window=True)
     add_detail(sub, ("spikes", "counts", "cycle"), "spikes")
     sub.add_argument("--spikes", metavar="OUT.npz", help="write the spikes of every layer, aligned with the data")
 
@@ -288,8 +286,7 @@ def build_parser() -> argparse.ArgumentParser:
     sub.add_argument("netlist")
     sub.add_argument("--checkpoint", required=True, metavar="CKPT|NET.onnx")
     add_network(sub)
-    add_recordings(sub)
-    add_window(sub)
+    add_recordings(sub, window=True)
     sub.add_argument(
         "--original", metavar="CKPT", help="float model for E2 and E3 (default: the weights of --checkpoint)"
     )
@@ -317,8 +314,7 @@ def build_parser() -> argparse.ArgumentParser:
 
     sub = command("estimate", _estimate, "synaptic operations, energy and time of an inference")
     sub.add_argument("netlist")
-    add_recordings(sub)
-    add_window(sub)
+    add_recordings(sub, window=True)
     add_detail(sub, ("counts", "cycle"), "counts")
 
     sub = command("train", train, "train a network by the released protocol, reported by the paper's and a clean one")

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from compiler.errors import OptionError
+from compiler.fixedpoint import IntArray
 from models.evtouch import Recordings
 
 WHOLE = 100
@@ -33,8 +34,19 @@ def window_asked(words: str) -> int:
     return int(found[1])
 
 
+def steps_of(lengths: IntArray, percent: int) -> IntArray:
+    """Whole steps of a part of each recording, one at least.
+
+    Examples
+    --------
+    >>> steps_of(np.array([325, 3, 1]), 50).tolist()
+    [162, 1, 1]
+    """
+    return np.maximum(lengths * percent // WHOLE, 1)
+
+
 def first_part(recordings: Recordings, percent: int) -> Recordings:
-    """The first steps of every recording, rounded up; labels, names and order stay.
+    """The first steps of every recording; labels, names and order stay.
 
     Parameters
     ----------
@@ -46,7 +58,7 @@ def first_part(recordings: Recordings, percent: int) -> Recordings:
     if percent == WHOLE:
         return recordings
     own = np.full(len(recordings), recordings.steps) if recordings.lengths is None else recordings.lengths
-    kept = -(-own * percent // WHOLE)
+    kept = steps_of(own, percent)
     longest = int(kept.max(initial=0))
     return replace(
         recordings,

@@ -21,9 +21,9 @@ def made(lengths=None, *, samples=3, steps=10):
     )
 
 
-def test_steps_are_rounded_up():
+def test_whole_steps_and_one_at_least():
     whole = made()
-    for percent, steps in ((1, 1), (10, 1), (11, 2), (25, 3), (50, 5), (99, 10)):
+    for percent, steps in ((1, 1), (10, 1), (19, 1), (20, 2), (25, 2), (50, 5), (99, 9)):
         found = first_part(whole, percent)
         assert found.lengths is None
         np.testing.assert_array_equal(found.events, whole.events[..., :steps])
@@ -33,7 +33,7 @@ def test_steps_are_rounded_up():
 
 def test_every_recording_keeps_its_part_of_its_own_length():
     found = first_part(made(np.array([10, 5, 1])), 50)
-    assert found.lengths.tolist() == [5, 3, 1]
+    assert found.lengths.tolist() == [5, 2, 1]
     assert found.steps == 5
 
 
@@ -67,7 +67,7 @@ def test_the_chip_decides_a_part_as_it_does_when_more_follows(tmp_path):
     for percent in (30, 50, 90):
         part = first_part(data, percent)
         counts = engine.simulate(netlist, with_clocks(part.events, netlist.clocks)).counts.spikes
-        kept = last[:, : -(-STEPS * percent // 100)].sum(axis=1)
+        kept = last[:, : STEPS * percent // 100].sum(axis=1)
         assert kept.shape == (8, CLASSES)
         np.testing.assert_array_equal(class_counts(netlist, counts), kept)
         np.testing.assert_array_equal(predictions(netlist, counts), kept.argmax(axis=1))
