@@ -43,6 +43,34 @@ STAGES = ("expand", "quantize", "place")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Stored:
+    """A network in the integers of the chip, from which any layout can be made.
+
+    Parameters
+    ----------
+    network : Network
+        Float stage, expanded.
+    integer : IntegerNetwork
+        Integer stage.
+    choices, exactness : tuple of Choice, tuple of Exactness
+        As in :class:`Compilation`.
+    calibration : Calibration or None
+        What the float model did on training recordings, where there are any.
+    silent, unheard, unused : tuple of (neurons,) bool
+        Neurons to leave out, by population, and why: they cannot fire, nobody hears them, they never fired.
+    """
+
+    network: Network
+    integer: IntegerNetwork
+    choices: tuple[Choice, ...]
+    exactness: tuple[Exactness, ...]
+    calibration: Calibration | None
+    silent: tuple[npt.NDArray[np.bool_], ...]
+    unheard: tuple[npt.NDArray[np.bool_], ...]
+    unused: tuple[npt.NDArray[np.bool_], ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Compilation:
     """Everything that one compilation produced.
 
@@ -155,22 +183,58 @@ def compile_network(
         As the passes say.
     """
     chip = load_target(target)
+    require_goal(optimize, cores_for, chip, calibrated=training_events is not None, chips=chips)
+    publish = after or (lambda _stage, _artefact: None)
+    stored = store(
+        network,
+        forms=forms,
+        target=target,
+        recipes=recipes,
+        spike_exact=spike_exact,
+        keep_all=keep_all,
+        prune_unused=prune_unused,
+        training_events=training_events,
+        ranges=ranges,
+        margin=margin,
+        after=publish,
+    )
+    made = place(stored, target=target, cores_for=cores_for, chips=chips, optimize=optimize, provenance=provenance)
+    publish("place", made.netlist)
+    return made
+
+
+def store(
+    network: Network,
+    *,
+    forms: Sequence[Form] | None = None,
+    target: str = "loihi1",
+    recipes: Sequence[Recipe] | None = None,
+    spike_exact: bool = False,
+    keep_all: bool = False,
+    prune_unused: bool = False,
+    training_events: npt.NDArray[Any] | None = None,
+    ranges: str = "proven",
+    margin: float = 0.1,
+    after: Callable[[str, Network | IntegerNetwork], object] | None = None,
+) -> Stored:
+    """Round a float network to the integers of the chip: the longest part of a compilation, before any layout.
+
+    Parameters and errors as of :func:`compile_network`.
+    """
+    chip = load_target(target)
     if not 0 <= margin < math.inf:
         raise OptionError(f"--margin {margin:g}: is no share to add to a range; give a number from 0")
-    require_goal(optimize, cores_for, chip, calibrated=training_events is not None, chips=chips)
     publish = after or (lambda _stage, _artefact: None)
 
     verify(network)
     publish("expand", network)
 
     calibration: Calibration | None = None
-    rates: tuple[FloatArray, ...] | None = None
     if training_events is not None:
         events = channels_last(training_events, network.input.clocks)
         several = any(recipe.planes > 1 for recipe in recipes or ())
         used = events if spike_exact or prune_unused else evenly_spaced(events, MANY if several else FEW)
         calibration = calibrate(network, used)
-        rates = tuple(spikes.mean(axis=(0, 1)) for spikes in calibration.spikes)
     unused = nobody(network)
     if prune_unused:
         if calibration is None or keep_all or forms is not None:
@@ -200,11 +264,39 @@ def compile_network(
         )
     verify(integer)
     publish("quantize", integer)
-
     silent, unheard = (nobody(network), nobody(network)) if keep_all else removable(integer)
-    laid, identity = compact(integer, either(silent, unheard))
-    if rates is not None:
-        rates = tuple(rate[ids] for rate, ids in zip(rates, identity, strict=True))
+    return Stored(
+        network=whole,
+        integer=integer,
+        choices=choices,
+        exactness=exactness,
+        calibration=calibration,
+        silent=silent,
+        unheard=unheard,
+        unused=unused,
+    )
+
+
+def place(
+    stored: Stored,
+    *,
+    target: str = "loihi1",
+    cores_for: Mapping[str, int] | None = None,
+    chips: int = 1,
+    optimize: str = "cores",
+    provenance: Mapping[str, Any] | None = None,
+) -> Compilation:
+    """Lay out a rounded network: which neuron sits where has no influence on any spike.
+
+    Parameters and errors as of :func:`compile_network`.
+    """
+    chip, integer, calibration = load_target(target), stored.integer, stored.calibration
+    require_goal(optimize, cores_for, chip, calibrated=calibration is not None, chips=chips)
+    laid, identity = compact(integer, either(stored.silent, stored.unheard))
+    rates: tuple[FloatArray, ...] | None = None
+    if calibration is not None:
+        each = (spikes.mean(axis=(0, 1)) for spikes in calibration.spikes)
+        rates = tuple(rate[ids] for rate, ids in zip(each, identity, strict=True))
     layout, usual = lay_out(
         laid,
         chip,
@@ -215,19 +307,17 @@ def compile_network(
         calibration=calibration,
         identity=identity,
     )
-    origin = Origin(network=integer, identity=identity, unheard=unheard)
+    origin = Origin(network=integer, identity=identity, unheard=stored.unheard)
     netlist = emit(laid, layout.parts, layout.placement.tiles, chip, provenance or {}, origin)
-    uses = require_legal(netlist, chip)
-    publish("place", netlist)
     return Compilation(
-        network=whole,
+        network=stored.network,
         integer=integer,
         netlist=netlist,
-        choices=choices,
-        exactness=exactness,
+        choices=stored.choices,
+        exactness=stored.exactness,
         proofs=prove_ranges(integer),
-        uses=uses,
-        removals=removals(whole, silent, unheard, unused),
+        uses=require_legal(netlist, chip),
+        removals=removals(stored.network, stored.silent, stored.unheard, stored.unused),
         goal=optimize,
         layout=layout,
         usual=usual,

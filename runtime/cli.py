@@ -31,6 +31,7 @@ from models.grasps import SYNTHETIC
 from runtime import (
     anytime,
     bits,
+    chart,
     decisions,
     explain,
     export,
@@ -69,6 +70,7 @@ from runtime.spent import Account, explained
 from runtime.tables import show
 from runtime.trace import ENGINES, BoolArray
 from runtime.train_command import train
+from runtime.windows import first_part, window_asked
 
 Arguments = argparse.Namespace
 Report = dict[str, Any]
@@ -90,8 +92,9 @@ def _sha256(path: str) -> str:
 
 
 def _recordings(arguments: Arguments, netlist: Netlist, *, labels_for: str | None = None) -> Recordings:
+    percent = window_asked(arguments.window)
     progress("reading the recordings")
-    return recordings(
+    found = recordings(
         arguments.data,
         arguments.split,
         limit=arguments.limit,
@@ -100,6 +103,7 @@ def _recordings(arguments: Arguments, netlist: Netlist, *, labels_for: str | Non
         bin_s=arguments.bin,
         labels_for=labels_for,
     )
+    return first_part(found, percent)
 
 
 def _inspect(arguments: Arguments) -> Outcome:
@@ -275,7 +279,7 @@ def build_parser() -> argparse.ArgumentParser:
 
     sub = command("run", _run, "run a netlist exactly as the chip would")
     sub.add_argument("netlist")
-    add_recordings(sub)
+    add_recordings(sub, window=True)
     add_detail(sub, ("spikes", "counts", "cycle"), "spikes")
     sub.add_argument("--spikes", metavar="OUT.npz", help="write the spikes of every layer, aligned with the data")
 
@@ -283,7 +287,7 @@ def build_parser() -> argparse.ArgumentParser:
     sub.add_argument("netlist")
     sub.add_argument("--checkpoint", required=True, metavar="CKPT|NET.onnx")
     add_network(sub)
-    add_recordings(sub)
+    add_recordings(sub, window=True)
     sub.add_argument(
         "--original", metavar="CKPT", help="float model for E2 and E3 (default: the weights of --checkpoint)"
     )
@@ -311,13 +315,14 @@ def build_parser() -> argparse.ArgumentParser:
 
     sub = command("estimate", _estimate, "synaptic operations, energy and time of an inference")
     sub.add_argument("netlist")
-    add_recordings(sub)
+    add_recordings(sub, window=True)
     add_detail(sub, ("counts", "cycle"), "counts")
 
     sub = command("train", train, "train a network by the released protocol, reported by the paper's and a clean one")
     add_training(sub)
     anytime.add_arguments(command("anytime", anytime.anytime, anytime.SUMMARY))
     bits.add_arguments(command("bits", bits.bits, bits.SUMMARY))
+    chart.add_arguments(command("chart", chart.chart, chart.SUMMARY))
     explain.add_arguments(command("explain", explain.explain, explain.SUMMARY))
     export.add_arguments(command("export", export.export, export.SUMMARY))
     finetune.add_arguments(command("finetune", finetune.finetune, finetune.SUMMARY))

@@ -19,7 +19,7 @@ from compiler.serialize import read_netlist, write_netlist
 from compiler.targets import load_target
 from compiler.text import text
 from runtime import render
-from runtime.asked import asked_network
+from runtime.asked import Asked, asked_network
 from runtime.inputs import progress, recordings, require_place, version
 from runtime.options import MARGIN, cores_asked
 
@@ -36,9 +36,8 @@ def compile_netlist(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json
         raise OptionError(
             f"--margin {arguments.margin:g}: only observed ranges have one; add --ranges observed or leave it away"
         )
-    margin = MARGIN if arguments.margin is None else arguments.margin
     chip = load_target(arguments.target)
-    recipes = _recipes(arguments)
+    recipes = recipes_asked(arguments)
     cores_for = cores_asked(arguments.cores_for)
     require_goal(arguments.optimize, cores_for, chip, calibrated=arguments.calibrate is not None, chips=arguments.chips)
     other = None if arguments.against is None else lift(read_netlist(arguments.against))
@@ -70,30 +69,11 @@ def compile_netlist(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json
         prune_unused=arguments.prune_unused,
         training_events=training,
         ranges=arguments.ranges,
-        margin=margin,
+        margin=_margin(arguments),
         cores_for=cores_for,
         chips=arguments.chips,
         optimize=arguments.optimize,
-        provenance={
-            "spikeloom": version(),
-            "checkpoint_sha256": asked.sha256,
-            **(
-                {"format": "onnx"}
-                if checkpoint is None
-                else {"run": arguments.run, "weights": checkpoint.weights, "graph": asked.graph}
-            ),
-            **({"towers": checkpoint.towers} if checkpoint is not None and checkpoint.towers > 1 else {}),
-            **storage(recipes, checkpoint),
-            "spike_exact": arguments.spike_exact,
-            "keep_all": arguments.keep_all,
-            "prune_unused": arguments.prune_unused,
-            "ranges": arguments.ranges,
-            "margin": margin,
-            "calibrated": training is not None,
-            **({"cores_for": cores_for} if cores_for else {}),
-            **({"chips": arguments.chips} if arguments.chips != 1 else {}),
-            **({"optimize": arguments.optimize} if arguments.optimize != "cores" else {}),
-        },
+        provenance=provenance(arguments, asked, calibrated=training is not None),
         after=dump,
     )
     report = render.compilation_json(compilation, write_netlist(compilation.netlist, arguments.output))
@@ -106,6 +86,45 @@ def compile_netlist(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json
             "registers": list(found.registers),
         }
     return report, _text, 0
+
+
+def provenance(arguments: argparse.Namespace, asked: Asked, *, calibrated: bool) -> Json:
+    """What a netlist remembers of its compilation.
+
+    Parameters
+    ----------
+    arguments : Namespace
+        Options of ``compile``.
+    asked : Asked
+        The network.
+    calibrated : bool
+        Whether recordings chose its scales.
+    """
+    checkpoint, cores_for = asked.checkpoint, cores_asked(arguments.cores_for)
+    if checkpoint is None:
+        origin: Json = {"format": "onnx"}
+    else:
+        origin = {"run": arguments.run, "weights": checkpoint.weights, "graph": asked.graph}
+    return {
+        "spikeloom": version(),
+        "checkpoint_sha256": asked.sha256,
+        **origin,
+        **({"towers": checkpoint.towers} if checkpoint is not None and checkpoint.towers > 1 else {}),
+        **storage(recipes_asked(arguments), checkpoint),
+        "spike_exact": arguments.spike_exact,
+        "keep_all": arguments.keep_all,
+        "prune_unused": arguments.prune_unused,
+        "ranges": arguments.ranges,
+        "margin": _margin(arguments),
+        "calibrated": calibrated,
+        **({"cores_for": cores_for} if cores_for else {}),
+        **({"chips": arguments.chips} if arguments.chips != 1 else {}),
+        **({"optimize": arguments.optimize} if arguments.optimize != "cores" else {}),
+    }
+
+
+def _margin(arguments: argparse.Namespace) -> float:
+    return float(MARGIN if arguments.margin is None else arguments.margin)
 
 
 def _text(report: Json) -> str:
@@ -127,8 +146,14 @@ def _numbers(text: str, option: str) -> list[int]:
         raise OptionError(f"{option} {text}: not a number; give one, or one for each layer as in 8,4,4,8") from None
 
 
-def _recipes(arguments: argparse.Namespace) -> tuple[Recipe, ...] | None:
-    """Storage that the options ask for, or None where they do not."""
+def recipes_asked(arguments: argparse.Namespace) -> tuple[Recipe, ...] | None:
+    """Storage that the options of ``compile`` ask for, or None where they do not.
+
+    Raises
+    ------
+    OptionError
+        If they are no numbers, or disagree about the number of layers.
+    """
     if not (arguments.weight_bits or arguments.planes or arguments.scale_groups):
         return None
     asked = {

@@ -34,12 +34,19 @@ def add_system(parser: argparse.ArgumentParser, default: str) -> None:
     parser.add_argument("--system", choices=SYSTEMS, help=f"{', '.join(SYSTEMS)} ({default})")
 
 
-def add_recordings(parser: argparse.ArgumentParser) -> None:
-    """Add the options that name recordings to run."""
+def add_recordings(parser: argparse.ArgumentParser, *, window: bool = False) -> None:
+    """Add the options that name recordings to run; with `window` also the one that names a part of each."""
     parser.add_argument("--data", required=True, metavar="PATH", help=DATA_HELP)
     add_bin_option(parser)
     parser.add_argument("--split", default="test", help="split to read (default: test)")
     parser.add_argument("--limit", type=int, metavar="N", help="first N recordings only")
+    if window:
+        parser.add_argument(
+            "--window",
+            default="100%",
+            metavar="PERCENT",
+            help="first part of every recording, as in 50%% (default: 100%%)",
+        )
 
 
 def add_detail(parser: argparse.ArgumentParser, choices: tuple[str, ...], default: str) -> None:

@@ -18,6 +18,7 @@ from compiler.serialize import read_netlist
 from compiler.targets import load_target
 from models.evtouch import Recordings
 from runtime.asked import Asked, asked_network
+from runtime.chart_file import read_chart
 from runtime.inputs import progress, recordings, require_place
 from runtime.levels import levels_of, unmet
 from runtime.options import add_explain_cost, add_network, add_recordings
@@ -50,6 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--spec-samples", type=int, default=3, metavar="N", help="recordings for spec = engine (default: 3)"
     )
     parser.add_argument("--stress", metavar="STRESS.json", help="show what stress -o wrote about this netlist")
+    parser.add_argument("--chart", metavar="FOLDER", help="show what spikeloom chart found of this network, too")
     parser.add_argument("-o", "--output", required=True, metavar="OUT.html")
     add_explain_cost(parser)
     parser.epilog = NOTES
@@ -75,6 +77,7 @@ def report(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], 
         stability = {"stress": read_stress(arguments.stress, arguments.netlist, sha256)}
     asked = asked_network(arguments.checkpoint, arguments)
     _require_origin(arguments, netlist, asked)
+    chart = None if arguments.chart is None else read_chart(arguments.chart, asked.sha256, arguments.checkpoint)
     progress("reading the recordings")
     data = recordings(
         arguments.data,
@@ -89,6 +92,7 @@ def report(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], 
     chosen = None if arguments.recording is None else find_recording(data, arguments.recording)
     found, code = _facts(arguments, netlist, asked, data, chosen)
     found |= stability
+    found |= {} if chart is None else {"chart": chart}
     with write_atomically(arguments.output) as file:
         file.write(page(found).encode())
     return found | {"output": arguments.output}, report_text, code
