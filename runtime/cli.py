@@ -58,17 +58,17 @@ from runtime.inputs import (
     version,
 )
 from runtime.options import (
+    MIN_AGREEMENT,
     add_compile,
     add_detail,
-    add_explain_cost,
     add_model,
-    add_network,
     add_recordings,
     add_training,
+    add_verify,
 )
 from runtime.spent import Account, explained
 from runtime.tables import show
-from runtime.trace import ENGINES, BoolArray
+from runtime.trace import BoolArray
 from runtime.train_command import train
 from runtime.windows import first_part, window_asked
 
@@ -83,8 +83,6 @@ DEMO = (
     ("estimate", "{folder}/grasps.loom", "--data", SYNTHETIC),
 )
 """The main job on what the package ships; ``demo`` runs these commands in a temporary folder."""
-
-MIN_AGREEMENT = 0.95
 
 
 def _sha256(path: str) -> str:
@@ -284,34 +282,7 @@ def build_parser() -> argparse.ArgumentParser:
     sub.add_argument("--spikes", metavar="OUT.npz", help="write the spikes of every layer, aligned with the data")
 
     sub = command("verify", _verify, "compare chip and float model, spike for spike")
-    sub.add_argument("netlist")
-    sub.add_argument("--checkpoint", required=True, metavar="CKPT|NET.onnx")
-    add_network(sub)
-    add_recordings(sub, window=True)
-    sub.add_argument(
-        "--original", metavar="CKPT", help="float model for E2 and E3 (default: the weights of --checkpoint)"
-    )
-    sub.add_argument(
-        "--spec-samples", type=int, default=3, metavar="N", help="recordings for spec = engine (default: 3)"
-    )
-    sub.add_argument(
-        "--engine",
-        choices=ENGINES,
-        default=ENGINES[0],
-        help=f"onnx: onnxruntime runs the integer graph beside our engine (default: {ENGINES[0]})",
-    )
-    sub.add_argument(
-        "--min-agreement",
-        type=float,
-        metavar="X",
-        help=f"share of equal decisions to pass (default: {MIN_AGREEMENT:g})",
-    )
-    sub.add_argument(
-        "--require",
-        metavar="E0,E2=X,E3=X",
-        help="levels to pass instead: E0 specification = engine, E2 share of spikes in every layer, E3 of decisions",
-    )
-    add_explain_cost(sub)
+    add_verify(sub)
 
     sub = command("estimate", _estimate, "synaptic operations, energy and time of an inference")
     sub.add_argument("netlist")

@@ -15,8 +15,12 @@ from models.recipes import RECIPES, RELEASED
 from models.schedule import DECAY_EPOCHS
 from models.systems import PADDINGS
 from runtime.data_commands import add_bin_option
+from runtime.trace import ENGINES
 
 MARGIN = 0.1
+
+MIN_AGREEMENT = 0.95
+"""Share of equal decisions that ``verify`` wants."""
 
 DATA_HELP = "recordings: released layout, event files (csv, npz), one recording, 'synthetic', 'objects' or 'containers'"
 
@@ -67,6 +71,38 @@ def add_explain_cost(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--explain-cost", action="store_true", help="say on stderr (and in --json) what was simulated, and why"
     )
+
+
+def add_verify(parser: argparse.ArgumentParser) -> None:
+    """Add the options of ``verify``."""
+    parser.add_argument("netlist")
+    parser.add_argument("--checkpoint", required=True, metavar="CKPT|NET.onnx")
+    add_network(parser)
+    add_recordings(parser, window=True)
+    parser.add_argument(
+        "--original", metavar="CKPT", help="float model for E2 and E3 (default: the weights of --checkpoint)"
+    )
+    parser.add_argument(
+        "--spec-samples", type=int, default=3, metavar="N", help="recordings for spec = engine (default: 3)"
+    )
+    parser.add_argument(
+        "--engine",
+        choices=ENGINES,
+        default=ENGINES[0],
+        help=f"onnx: onnxruntime runs the integer graph beside our engine (default: {ENGINES[0]})",
+    )
+    parser.add_argument(
+        "--min-agreement",
+        type=float,
+        metavar="X",
+        help=f"share of equal decisions to pass (default: {MIN_AGREEMENT:g})",
+    )
+    parser.add_argument(
+        "--require",
+        metavar="E0,E2=X,E3=X",
+        help="levels to pass instead: E0 specification = engine, E2 share of spikes in every layer, E3 of decisions",
+    )
+    add_explain_cost(parser)
 
 
 def add_training(parser: argparse.ArgumentParser) -> None:
