@@ -21,6 +21,9 @@ from compiler.errors import FormatError
 
 Array = np.ndarray[Any, Any]
 
+FORMATS = {"spikeloom-netlist": "cores of compartments (Loihi)", "spikeloom-crossbars": "crossbar cores (TrueNorth)"}
+"""What a manifest may say that an archive is."""
+
 SIZE_LIMIT = 2**32
 """Bytes that a netlist file may have, 4 GiB: some hundred times the synapses of a whole chip."""
 
@@ -103,8 +106,8 @@ def stated_format(path: Path) -> str | None:
     return stated if isinstance(stated, str) else None
 
 
-def read_manifest(path: Path, members: Mapping[str, Array], formats: tuple[str, ...]) -> dict[str, Any]:
-    """Manifest of an archive that claims to be of one of these formats.
+def read_manifest(path: Path, members: Mapping[str, Array], wanted: str) -> dict[str, Any]:
+    """Manifest of an archive that claims to be of a format, one of ``FORMATS``.
 
     Raises
     ------
@@ -118,9 +121,12 @@ def read_manifest(path: Path, members: Mapping[str, Array], formats: tuple[str, 
         manifest = json.loads(str(members["manifest"]))
     except (ValueError, RecursionError) as error:
         raise FormatError(f"{path}: has an unreadable manifest; compile it again") from error
-    if not isinstance(manifest, dict) or manifest.get("format") not in formats:
+    stated = manifest.get("format") if isinstance(manifest, dict) else None
+    if isinstance(stated, str) and stated in FORMATS and stated != wanted:
+        raise FormatError(f"{path}: holds {FORMATS[stated]}, this is for {FORMATS[wanted]}; give such a file")
+    if stated != wanted:
         raise FormatError(f"{path}: is not a netlist; write one with spikeloom compile")
-    return manifest
+    return dict(manifest)
 
 
 def require_whole(

@@ -100,7 +100,7 @@ def read_netlist(path: str | os.PathLike[str]) -> Netlist:
         found = "is not a file" if path.exists() else "no such file"
         raise FormatError(f"{path}: {found}; write one with spikeloom compile")
     members = read_members(path)
-    manifest = read_manifest(path, members, (FORMAT,))
+    manifest = read_manifest(path, members, FORMAT)
     require_whole(path, manifest, members, VERSIONS, ARRAYS)
     if manifest["version"] == VERSIONS[0]:
         manifest = _widened(manifest)

@@ -26,7 +26,8 @@ from made_files import (
 from made_files import weights as made_weights
 
 import compiler.atomic
-from compiler import archive, serialize
+from compiler import serialize
+from compiler.archive import digest, read_members
 from compiler.errors import FormatError
 from models.graphs import CHOICES
 from runtime import cli, inputs
@@ -607,14 +608,14 @@ def test_recordings_of_another_number_of_channels(refusal, tmp_path):
 
 def rewritten(place: Path, path: Path, change, *, sign: bool = True) -> Path:
     """Write the netlist after `change` was applied to its manifest and its members; with a fitting hash if `sign`."""
-    members = archive.read_members(place / "net.loom")
+    members = read_members(place / "net.loom")
     manifest = json.loads(str(members["manifest"]))
     stated = members.pop("sha256")
     change(manifest, members)
     members["manifest"] = np.array(json.dumps(manifest, sort_keys=True))
     if sign:
         held = {name: members[name] for name in serialize.ARRAYS if name in members}
-        stated = np.array(archive.digest({"manifest": members["manifest"], **held}))
+        stated = np.array(digest({"manifest": members["manifest"], **held}))
     with zipfile.ZipFile(path, "w") as archive:
         for name, array in (members | {"sha256": stated}).items():
             content = io.BytesIO()

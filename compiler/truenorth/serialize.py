@@ -89,7 +89,7 @@ def read_crossbars(path: str | os.PathLike[str]) -> CrossbarNetlist:
         found = "is not a file" if path.exists() else "no such file"
         raise FormatError(f"{path}: {found}; write one with spikeloom compile")
     members = read_members(path)
-    manifest = read_manifest(path, members, (FORMAT,))
+    manifest = read_manifest(path, members, FORMAT)
     require_whole(path, manifest, members, VERSIONS, ARRAYS)
     wrong = _kind_faults(manifest, members)
     if not wrong and manifest["target"] not in known_targets(CROSSBARS):

@@ -1,4 +1,4 @@
-"""Machine code of the engine: one recording, all its ticks; see :mod:`runtime.truenorth.engine` for the arrays.
+"""Machine code of the engine: one recording, all its ticks; :mod:`runtime.truenorth.engine` makes the arrays.
 
 Work follows events: a tick visits the axons that have a spike and the neurons that are reached or awake. A neuron
 sleeps while a tick without arrivals would change nothing about it.
@@ -6,13 +6,17 @@ sleeps while a tick without arrivals would change nothing about it.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
+from compiler.fixedpoint import IntArray
 from compiler.truenorth.netlist import RESET_LINEAR, RESET_TO
 from runtime.kernel import compiled, compiled_and_cached
 from runtime.truenorth.trace import MIX_1, MIX_2, STEP_NEURON, STEP_TICK
+
+Int32 = npt.NDArray[np.int32]
 
 (
     LEAK,
@@ -33,9 +37,82 @@ from runtime.truenorth.trace import MIX_1, MIX_2, STEP_NEURON, STEP_TICK
 
 NO_REST = -(2**31)
 
+HALF, LOWER = 32, 2**32 - 1
+"""Positive and negative weights are added up in one number: in its upper half, and as magnitudes in its lower."""
+
 _STEP_NEURON, _STEP_TICK = np.uint64(STEP_NEURON), np.uint64(STEP_TICK)
 _MIX_1, _MIX_2 = np.uint64(MIX_1), np.uint64(MIX_2)
 _30, _27, _31, _64, _ONE = np.uint64(30), np.uint64(27), np.uint64(31), np.uint64(64), np.uint64(1)
+
+
+class Wiring(NamedTuple):
+    """What does not change while a recording runs.
+
+    Parameters
+    ----------
+    offsets : (offsets,) int64
+        Ticks of a data step in which channels are fed.
+    feed_bounds : (offsets, channels + 1) int64
+        Rows of `feed_axon` that a channel feeds at an offset.
+    feed_axon : (feeds,) int32
+        Axons that are fed and that something else may reach, too.
+    burst_bounds : (offsets, channels + 1) int64
+        Rows of the next two, likewise.
+    burst_neuron : (bursts,) int32
+        Neurons that a channel reaches through axons that nothing else reaches.
+    burst_weight : (bursts,) int64
+        What that adds, in halves.
+    clocks : (clocks, 3) int64
+        Axon, period, phase.
+    axon_synapses : (axons + 1,) int64
+    synapse_neuron : (synapses,) int32
+        Neuron id of each crossing point.
+    synapse_weight : (synapses,) int64
+        In halves.
+    parameters : (neurons, 12) int32
+    instant : (neurons,) int32
+        The leak, below zero, of neurons that start each tick at zero and spike where they do not end it below zero;
+        0 for all others.
+    initial : (neurons,) int32
+    """
+
+    offsets: IntArray
+    feed_bounds: IntArray
+    feed_axon: Int32
+    burst_bounds: IntArray
+    burst_neuron: Int32
+    burst_weight: IntArray
+    clocks: IntArray
+    axon_synapses: IntArray
+    synapse_neuron: Int32
+    synapse_weight: IntArray
+    parameters: Int32
+    instant: Int32
+    initial: Int32
+
+
+class State(NamedTuple):
+    """What changes: membranes, arrivals, who works this tick, and spikes on their way by the slot of their tick."""
+
+    membrane: Int32
+    arrived: IntArray
+    listed: npt.NDArray[np.bool_]
+    work: Int32
+    due: Int32
+    dues: IntArray
+    flagged: npt.NDArray[np.bool_]
+
+
+class Tallies(NamedTuple):
+    """Counts of a recording, and its traces, empty where they are not wanted."""
+
+    fed: IntArray
+    axons: IntArray
+    spikes: IntArray
+    votes: IntArray
+    overflows: IntArray
+    raster: npt.NDArray[np.bool_]
+    membranes: Int32
 
 
 @compiled
@@ -48,174 +125,156 @@ def draw(seed: Any, neuron: Any, tick: Any, bits: Any) -> Any:
 
 
 @compiled
-def neuron_tick(p: Any, v: Any, positive: Any, negative: Any, random: Any, low: Any, high: Any) -> Any:
-    """As :func:`runtime.truenorth.spec.neuron_tick`: membrane, whether it spiked, whether its register was left."""
-    left = v + positive > high or v - negative < low
-    v = min(max(v + positive - negative, low), high)
-    leak = np.int64(p[LEAK])
-    if p[REVERSAL]:
-        if v == 0:
-            leak = np.int64(0)
-        elif v < 0:
-            leak = -leak
-            if v + leak > 0:
-                leak = -v
-        elif v + leak < 0:
-            leak = -v
-    leaked = v + leak
-    v = min(max(leaked, low), high)
-    left = left or v != leaked
-    threshold = p[THRESHOLD] + random
-    spiked = v >= threshold
-    if spiked:
-        if p[RESET_MODE] == RESET_TO:
-            v = np.int64(p[RESET])
-        elif p[RESET_MODE] == RESET_LINEAR:
-            v -= threshold
-    elif p[SATURATES]:
-        v = max(v, -np.int64(p[NEGATIVE]))
-    elif v < -(p[NEGATIVE] + random):
-        if p[RESET_MODE] == RESET_TO:
-            v = -np.int64(p[RESET])
-        elif p[RESET_MODE] == RESET_LINEAR:
-            v += p[NEGATIVE] + random
-    held = min(max(v, low), high)
-    return held, spiked, left or held != v
+def leaked(v: Any, leak: Any, reversal: Any) -> Any:
+    """Membrane with its leak, which with reversal takes the membrane's sign and stops at zero."""
+    if not reversal:
+        return v + leak
+    if v == 0:
+        return v
+    return min(v - leak, 0) if v < 0 else max(v + leak, 0)
 
 
 @compiled
-def at_rest(p: Any, v: Any) -> bool:
-    """Whether a tick without arrivals leaves a neuron as it is, silent; may say no where it does."""
-    if p[MASK_BITS]:
-        return False
-    return v == p[REST] or (p[LEAK] == 0 and -p[NEGATIVE] <= v < p[THRESHOLD])
+def after(v: Any, spiked: Any, threshold: Any, random: Any, mode: Any, reset: Any, below: Any, saturates: Any) -> Any:
+    """Membrane after the resets; the threshold holds the random number already."""
+    if spiked:
+        if mode == RESET_TO:
+            return reset
+        return v - threshold if mode == RESET_LINEAR else v
+    if saturates:
+        return max(v, -below)
+    if v < -(below + random):
+        if mode == RESET_TO:
+            return -reset
+        return v + below + random if mode == RESET_LINEAR else v
+    return v
+
+
+@compiled
+def _queue(state: Any, slot: Any, axon: Any) -> Any:
+    """Let an axon have a spike in the tick of a slot; 1 where it has one already."""
+    if state.flagged[slot, axon]:
+        return 1
+    state.flagged[slot, axon] = True
+    state.due[slot, state.dues[slot]] = axon
+    state.dues[slot] += 1
+    return 0
+
+
+@compiled
+def _inject(events: Any, bin_ticks: Any, tick: Any, slot: Any, wiring: Any, state: Any, fed: Any, working: Any) -> Any:
+    """Events and clocks of this tick; returns the neurons that work, and the merged spikes."""
+    merged = 0
+    for k in range(len(wiring.offsets)):
+        since = tick - wiring.offsets[k]
+        if since < 0 or since % bin_ticks != 0 or since // bin_ticks >= len(events):
+            continue
+        for channel in np.flatnonzero(events[since // bin_ticks]):
+            fed[k, channel] += 1
+            for s in range(wiring.burst_bounds[k, channel], wiring.burst_bounds[k, channel + 1]):
+                n = wiring.burst_neuron[s]
+                state.arrived[n] += wiring.burst_weight[s]
+                if not state.listed[n]:
+                    state.listed[n] = True
+                    state.work[working] = n
+                    working += 1
+            for row in range(wiring.feed_bounds[k, channel], wiring.feed_bounds[k, channel + 1]):
+                merged += _queue(state, slot, wiring.feed_axon[row])
+    for k in range(len(wiring.clocks)):
+        axon, period, phase = wiring.clocks[k]
+        if tick >= phase and (tick - phase) % period == 0:
+            merged += _queue(state, slot, axon)
+    return working, merged
+
+
+@compiled
+def _integrate(slot: Any, wiring: Any, state: Any, axons: Any, working: Any) -> Any:
+    """Visit the crossing points of all axons with a spike; returns the neurons that work."""
+    for k in range(state.dues[slot]):
+        axon = state.due[slot, k]
+        state.flagged[slot, axon] = False
+        axons[axon] += 1
+        for s in range(wiring.axon_synapses[axon], wiring.axon_synapses[axon + 1]):
+            n = wiring.synapse_neuron[s]
+            state.arrived[n] += wiring.synapse_weight[s]
+            if not state.listed[n]:
+                state.listed[n] = True
+                state.work[working] = n
+                working += 1
+    state.dues[slot] = 0
+    return working
+
+
+@compiled
+def _update(n: Any, tick: Any, seed: Any, low: Any, high: Any, sums: Any, wiring: Any, state: Any, tallies: Any) -> Any:
+    """A tick of a neuron that remembers: whether it spiked, and whether it may sleep."""
+    p = wiring.parameters
+    leak, threshold, below = np.int64(p[n, LEAK]), np.int64(p[n, THRESHOLD]), np.int64(p[n, NEGATIVE])
+    random = draw(seed, n, tick, p[n, MASK_BITS]) if p[n, MASK_BITS] else np.int64(0)
+    before, positive, negative = np.int64(state.membrane[n]), sums >> HALF, sums & LOWER
+    summed = min(max(before + positive - negative, low), high)
+    wanted = leaked(summed, leak, p[n, REVERSAL])
+    v = min(max(wanted, low), high)
+    spiked = v >= threshold + random
+    left = after(v, spiked, threshold + random, random, p[n, RESET_MODE], np.int64(p[n, RESET]), below, p[n, SATURATES])
+    v = min(max(left, low), high)
+    state.membrane[n] = v
+    if before + positive > high or before - negative < low or wanted < low or wanted > high or left != v:
+        tallies.overflows[n] += 1
+    sleeps = v == p[n, REST] or (leak == 0 and -below <= v < threshold)
+    return spiked, sleeps and p[n, MASK_BITS] == 0
 
 
 @compiled_and_cached
 def run(
-    events: Any,
-    bin_ticks: int,
-    ticks: int,
-    seed: Any,
-    low: int,
-    high: int,
-    slots: int,
-    offsets: Any,
-    feed_bounds: Any,
-    feed_axon: Any,
-    clocks: Any,
-    axon_synapses: Any,
-    synapse_neuron: Any,
-    synapse_weight: Any,
-    parameters: Any,
-    initial: Any,
-    spike_counts: Any,
-    votes: Any,
-    axon_counts: Any,
-    overflows: Any,
-    spikes: Any,
-    membranes: Any,
+    events: Any, bin_ticks: int, ticks: int, seed: Any, low: int, high: int, slots: int, wiring: Any, tallies: Any
 ) -> int:
-    """Run one recording; fills the counts, and the traces where they are not empty; returns the merged spikes.
+    """Run one recording; fills the tallies and returns the merged spikes.
 
-    `slots` is a power of two above every delay: spikes that are due in a tick wait in the slot of its lowest bits.
+    `events` is (steps, channels); `slots` is a power of two above every delay: spikes that are due in a tick wait in
+    the slot of its lowest bits.
     """
-    neurons, axons, steps = len(initial), len(axon_counts), events.shape[1]
-    membrane = initial.copy()
-    positive, negative = np.zeros(neurons, np.int32), np.zeros(neurons, np.int32)
-    listed = np.zeros(neurons, np.bool_)
-    work, awake = np.empty(neurons, np.int32), np.empty(neurons, np.int32)
-    working = 0
-    for n in range(neurons):
-        if not at_rest(parameters[n], membrane[n]):
-            work[working] = n
-            working += 1
-            listed[n] = True
-    due = np.empty((slots, axons), np.int32)
-    dues = np.zeros(slots, np.int64)
-    flagged = np.zeros((slots, axons), np.bool_)
-    merged = 0
+    neurons, axons, window = len(wiring.initial), len(tallies.axons), len(events) * bin_ticks
+    state = State(
+        wiring.initial.copy(),
+        np.zeros(neurons, np.int64),
+        np.ones(neurons, np.bool_),
+        np.arange(neurons).astype(np.int32),
+        np.empty((slots, axons), np.int32),
+        np.zeros(slots, np.int64),
+        np.zeros((slots, axons), np.bool_),
+    )
+    working, merged = neurons, 0  # all are awake at first
     for tick in range(ticks):
         slot = tick & (slots - 1)
-        # events and clocks of this tick join the spikes that are due
-        for k in range(len(offsets)):
-            since = tick - offsets[k]
-            if since < 0 or since % bin_ticks != 0 or since // bin_ticks >= steps:
-                continue
-            for channel in range(events.shape[0]):
-                if events[channel, since // bin_ticks] == 0:
-                    continue
-                for row in range(feed_bounds[k, channel], feed_bounds[k, channel + 1]):
-                    axon = feed_axon[row]
-                    if flagged[slot, axon]:
-                        merged += 1
-                    else:
-                        flagged[slot, axon] = True
-                        due[slot, dues[slot]] = axon
-                        dues[slot] += 1
-        for k in range(len(clocks)):
-            if tick >= clocks[k, 2] and (tick - clocks[k, 2]) % clocks[k, 1] == 0:
-                axon = clocks[k, 0]
-                if flagged[slot, axon]:
-                    merged += 1
-                else:
-                    flagged[slot, axon] = True
-                    due[slot, dues[slot]] = axon
-                    dues[slot] += 1
-        # integrate
-        for k in range(dues[slot]):
-            axon = due[slot, k]
-            flagged[slot, axon] = False
-            axon_counts[axon] += 1
-            for s in range(axon_synapses[axon], axon_synapses[axon + 1]):
-                n = synapse_neuron[s]
-                weight = synapse_weight[s]
-                if weight > 0:
-                    positive[n] += weight
-                else:
-                    negative[n] -= weight
-                if not listed[n]:
-                    listed[n] = True
-                    work[working] = n
-                    working += 1
-        dues[slot] = 0
-        # the neurons that have something to do
-        waking = 0
+        working, more = _inject(events, bin_ticks, tick, slot, wiring, state, tallies.fed, working)
+        merged += more
+        working = _integrate(slot, wiring, state, tallies.axons, working)
+        awake = 0
         for k in range(working):
-            n = work[k]
-            p = parameters[n]
-            random = np.int64(0)
-            if p[MASK_BITS]:
-                random = draw(seed, n, tick, p[MASK_BITS])
-            v, spiked, left = neuron_tick(p, np.int64(membrane[n]), positive[n], negative[n], random, low, high)
-            membrane[n] = v
-            positive[n] = 0
-            negative[n] = 0
-            if left:
-                overflows[n] += 1
-            if spiked:
-                spike_counts[n] += 1
-                if len(spikes):
-                    spikes[tick, n] = True
-                first = p[VOTES_FROM]
-                if first >= 0 and first <= tick < first + steps * bin_ticks:
-                    votes[n] += 1
-                axon = p[WIRE_AXON]
-                if axon >= 0:
-                    later = (tick + p[WIRE_DELAY]) & (slots - 1)
-                    if flagged[later, axon]:
-                        merged += tick + p[WIRE_DELAY] < ticks
-                    else:
-                        flagged[later, axon] = True
-                        due[later, dues[later]] = axon
-                        dues[later] += 1
-            if at_rest(p, v):
-                listed[n] = False
+            n = state.work[k]
+            sums = state.arrived[n]
+            state.arrived[n] = 0
+            if wiring.instant[n]:
+                spiked, sleeps = (sums >> HALF) - (sums & LOWER) + wiring.instant[n] >= 0, True
             else:
-                awake[waking] = n
-                waking += 1
-        work, awake = awake, work
-        working = waking
-        if len(membranes):
-            membranes[tick] = membrane
+                spiked, sleeps = _update(n, tick, seed, low, high, sums, wiring, state, tallies)
+            if sleeps:
+                state.listed[n] = False
+            else:
+                state.work[awake] = n  # never ahead of k
+                awake += 1
+            if spiked:
+                tallies.spikes[n] += 1
+                if len(tallies.raster):
+                    tallies.raster[tick, n] = True
+                first = wiring.parameters[n, VOTES_FROM]
+                tallies.votes[n] += 0 <= first <= tick < first + window
+                if wiring.parameters[n, WIRE_AXON] >= 0:
+                    later = tick + wiring.parameters[n, WIRE_DELAY]
+                    twice = _queue(state, later & (slots - 1), wiring.parameters[n, WIRE_AXON])
+                    merged += twice * (later < ticks)
+        working = awake
+        if len(tallies.membranes):
+            tallies.membranes[tick] = state.membrane
     return merged

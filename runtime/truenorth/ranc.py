@@ -49,7 +49,8 @@ def unsupported(netlist: CrossbarNetlist) -> list[str]:
 
 def _resets_as_it_saturates(netlist: CrossbarNetlist) -> npt.NDArray[np.bool_]:
     """Neurons whose saturation at the negative threshold is what a reset to its reset value does."""
-    return (netlist.reset_mode == RESET_TO) & (netlist.reset == netlist.negative_threshold)
+    same: npt.NDArray[np.bool_] = (netlist.reset_mode == RESET_TO) & (netlist.reset == netlist.negative_threshold)
+    return same
 
 
 def export(netlist: CrossbarNetlist, events: EventArray | None = None) -> Iterator[str]:
@@ -184,7 +185,7 @@ def _core(netlist: CrossbarNetlist, core: int, x: int, y: int, aims: list[tuple[
 
 
 def read_outputs(text: str, voters: int) -> npt.NDArray[np.bool_]:
-    """Spikes of the voters, (ticks, voters), from the output file of a run of one tick more.
+    r"""Spikes of the voters, (ticks, voters), from the output file of a run of one tick more.
 
     Raises
     ------
@@ -193,7 +194,7 @@ def read_outputs(text: str, voters: int) -> npt.NDArray[np.bool_]:
 
     Examples
     --------
-    >>> read_outputs("0 0 0 \\n1 0 0 \\n0 1 1 \\n", 2).tolist()
+    >>> read_outputs("0 0 0 \n1 0 0 \n0 1 1 \n", 2).tolist()
     [[True, False], [False, True]]
     """
     rows = [[word == "1" for word in line.split()] for line in text.splitlines() if line.strip()]

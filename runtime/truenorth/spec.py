@@ -26,6 +26,7 @@ References
 
 from __future__ import annotations
 
+from collections import defaultdict
 from dataclasses import dataclass
 
 import numpy as np
@@ -130,6 +131,21 @@ def neuron_tick(neuron: Neuron, positive: int, negative: int, random: int, bits:
     return spiked, left or neuron.membrane != v
 
 
+def injected(netlist: CrossbarNetlist, events: EventArray) -> defaultdict[int, list[int]]:
+    """Axons that input events and clocks reach in each tick of a recording (n_inputs, T), once for each of them."""
+    due: defaultdict[int, list[int]] = defaultdict(list)
+    fed = netlist.axons_at(netlist.feed_core, netlist.feed_line).tolist()
+    for channel, axon, offset in zip(netlist.feed_channel.tolist(), fed, netlist.feed_tick.tolist(), strict=True):
+        for step in np.flatnonzero(events[channel]).tolist():
+            due[step * netlist.bin_ticks + offset].append(axon)
+    clocked = netlist.axons_at(netlist.clock_core, netlist.clock_line).tolist()
+    periods, phases = netlist.clock_period.tolist(), netlist.clock_phase.tolist()
+    for axon, period, phase in zip(clocked, periods, phases, strict=True):
+        for tick in range(phase, netlist.ticks(events.shape[1]), period):
+            due[tick].append(axon)
+    return due
+
+
 def simulate(netlist: CrossbarNetlist, events: EventArray, *, seed: int = 0) -> Trace:
     """Run one recording through the cores.
 
@@ -176,21 +192,12 @@ def simulate(netlist: CrossbarNetlist, events: EventArray, *, seed: int = 0) -> 
     for axon, neuron in zip(netlist.axon_of_synapse().tolist(), netlist.neuron_of_synapse().tolist(), strict=True):
         points[axon].append((neuron, int(netlist.weight[neuron, netlist.axon_type[axon]])))
 
-    # what leads to the axons
+    # what leads to the axons: from outside by tick, from neurons by their wires
+    due = injected(netlist, events)
     wired = netlist.axons_at(netlist.cores_at(netlist.wire_x, netlist.wire_y), netlist.wire_line).tolist()
-    fed = netlist.axons_at(netlist.feed_core, netlist.feed_line).tolist()
-    clocked = netlist.axons_at(netlist.clock_core, netlist.clock_line).tolist()
     wires: list[list[tuple[int, int]]] = [[] for _ in neurons]
     for source, axon, delay in zip(netlist.wire_neuron.tolist(), wired, netlist.wire_delay.tolist(), strict=True):
         wires[source].append((axon, delay))
-    due: dict[int, list[int]] = {tick: [] for tick in range(ticks)}
-    for channel, axon, offset in zip(netlist.feed_channel.tolist(), fed, netlist.feed_tick.tolist(), strict=True):
-        for step in np.flatnonzero(events[channel]).tolist():
-            due.setdefault(step * netlist.bin_ticks + offset, []).append(axon)
-    periods, phases = netlist.clock_period.tolist(), netlist.clock_phase.tolist()
-    for axon, period, phase in zip(clocked, periods, phases, strict=True):
-        for tick in range(phase, ticks, period):
-            due[tick].append(axon)
 
     spikes = np.zeros((ticks, len(neurons)), np.bool_)
     membranes = np.zeros((ticks, len(neurons)), np.int32)
@@ -219,7 +226,7 @@ def simulate(netlist: CrossbarNetlist, events: EventArray, *, seed: int = 0) -> 
             if spiked:
                 spikes[tick, n] = True
                 for axon, delay in wires[n]:
-                    due.setdefault(tick + delay, []).append(axon)
+                    due[tick + delay].append(axon)
 
     tick_of = np.arange(ticks)[:, None]
     window = (tick_of >= netlist.readout_first) & (tick_of < netlist.readout_first + steps * netlist.bin_ticks)
