@@ -332,11 +332,6 @@ def test_unreadable_files(refusal, tmp_path, monkeypatch):
             ["net.pt", "--target", "loihi2"],
             "--target loihi2: not modelled; no public per-event energies; allowed: loihi1",
         ),
-        (
-            ["net.pt", "--target", "truenorth"],
-            "--target truenorth: not modelled; its additive leak cannot express a multiplicative decay; "
-            "allowed: loihi1",
-        ),
         (["net.pt", "--target", "../loihi1"], "--target ../loihi1: unknown; allowed: loihi1"),
         *(
             (

@@ -90,7 +90,7 @@ def estimate(netlist: CrossbarNetlist, target: Target, counts: Counts) -> Costs:
     member = np.eye(layers, dtype=np.int64)[netlist.layer]
     sent = counts.spikes[:, netlist.wire_neuron]
     events = counts.axons @ into
-    time_s: FloatArray = counts.ticks * (target.limit("tick.length") * 1e-6)
+    time_s: FloatArray = counts.ticks.astype(np.float64) * (target.limit("tick.length") * 1e-6)
     return Costs(
         ticks=counts.ticks,
         time_s=time_s,
@@ -115,5 +115,5 @@ def price(table: EnergyTable, events: IntArray, time_s: FloatArray) -> Energy:
     [0.0161023]
     """
     floor = table.floor_w
-    joules: FloatArray = events * table.joule("synaptic_event")
+    joules: FloatArray = events.astype(np.float64) * table.joule("synaptic_event")
     return Energy(events_j=joules, floor_j=None if floor is None else floor * time_s)
