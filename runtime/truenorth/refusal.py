@@ -121,8 +121,9 @@ def refusal_text(report: Json) -> str:
     ]
     if report["samples"]:
         lines.append(
-            f"accuracy on {report['samples']} training recordings, {100 * report['accuracy']:.1f} % as trained; each "
-            "way alone, in its layer; cores of the layer; ticks of a decision"
+            f"accuracy on {report['samples']} training recordings (one is {100 / report['samples']:.1f} points), "
+            f"{100 * report['accuracy']:.1f} % as trained; each way alone, in its layer; cores of the layer; "
+            "ticks of a decision"
         )
     else:
         lines.append(

@@ -14,10 +14,11 @@ import numpy as np
 from compiler.frontends.checkpoint import Checkpoint
 from compiler.frontends.systems import GRAPH_SYSTEMS, TACTILESGNET
 from compiler.ir import INPUT, Network, Sparse
-from compiler.passes.expand import expand_first_layer
+from compiler.passes.expand import expand_first_layer, expand_graph_convolution
 from compiler.targets import Target
 from compiler.truenorth.needs import CURRENT, FAN_IN, LEAK, TARGETS, WEIGHTS, Need, targets_of
 from compiler.truenorth.sizes import Split, packed, relays, split
+from models.graphs import NEUTOUCH, build_graph, normalised_adjacency
 from runtime.asked import Asked
 from runtime.truenorth.trials import Change, Levels, Trial, codebook
 
@@ -29,6 +30,9 @@ TERNARY = 2
 
 COPIES = (2, 3, 4)
 """Axons of an input that are tried; beyond four types repeat."""
+
+SPARSEST = "mst:0"
+"""Graph of the built-in sensor with the fewest edges, a tree."""
 
 FEWER_HOPS = 2
 """Hops of a graph convolution that are left, as trained."""
@@ -231,6 +235,7 @@ class Planner:
         checkpoint = self.asked.checkpoint
         if layer == 0 and checkpoint is not None and checkpoint.system == TACTILESGNET:
             yield from self._fewer_hops(checkpoint)
+            yield from self._fewer_neighbours(checkpoint)
         cores, parts = self.layer_cores(layer, TERNARY)
         graph = f" --graph {self.asked.graph}" if checkpoint is not None and checkpoint.edges is None else ""
         command = f"spikeloom finetune {self.path}{graph} --data DATA --weight-bits 2 -o OUT.pt"
@@ -253,6 +258,18 @@ class Planner:
             accuracy=self._measured(0, Change(levels=book)),
             cores=cores,
         )
+
+    def _fewer_neighbours(self, checkpoint: Checkpoint) -> Iterator[Way]:
+        if checkpoint.taxels != len(NEUTOUCH) or self.asked.graph in (None, SPARSEST):
+            return
+        edges = build_graph(SPARSEST).edges
+        weight = expand_graph_convolution(
+            normalised_adjacency(edges, checkpoint.taxels), checkpoint.hops.astype(np.float64)
+        )
+        copies = max((m for m in COPIES if packed(weight, m, self.chip) is not None), default=TERNARY)
+        cores, _ = self.layer_cores(0, copies, weight)
+        name = f"trained on the sparsest graph, {copies} axons an input"
+        yield self._retrained(name, self._train(graph=SPARSEST), cores, 1)
 
     def _targets(self, layer: int) -> Iterator[Way]:
         targets, size = targets_of(self.network, layer, self.chip), self.network.populations[layer].size
@@ -308,13 +325,13 @@ class Planner:
     def _no_decay(self, option: str) -> str:
         return self._train(f"{option} {','.join(f'{p.name}=0' for p in self.network.populations)}")
 
-    def _train(self, options: str = "") -> str:
+    def _train(self, options: str = "", *, graph: str | None = None) -> str:
         """Command that trains a network of this kind anew."""
         checkpoint, words = self.asked.checkpoint, ["spikeloom train --data DATA"]
         if checkpoint is not None and checkpoint.system != TACTILESGNET:
             words.append(f"--system {checkpoint.system}")
         if self.asked.graph and (checkpoint is None or checkpoint.system in GRAPH_SYSTEMS):
-            words.append(f"--graph {self.asked.graph}")
+            words.append(f"--graph {graph or self.asked.graph}")
         return " ".join([*words, *([options] if options else []), "-o OUT.pt"])
 
 
