@@ -151,6 +151,17 @@ def after(v: Any, spiked: Any, threshold: Any, random: Any, mode: Any, reset: An
 
 
 @compiled
+def _reach(state: Any, n: Any, weight: Any, working: Any) -> Any:
+    """Let a weight arrive at a neuron, which works then; returns the neurons that do."""
+    state.arrived[n] += weight
+    if not state.listed[n]:
+        state.listed[n] = True
+        state.work[working] = n
+        return working + 1
+    return working
+
+
+@compiled
 def _queue(state: Any, slot: Any, axon: Any) -> Any:
     """Let an axon have a spike in the tick of a slot; 1 where it has one already."""
     if state.flagged[slot, axon]:
@@ -172,12 +183,7 @@ def _inject(events: Any, bin_ticks: Any, tick: Any, slot: Any, wiring: Any, stat
         for channel in np.flatnonzero(events[since // bin_ticks]):
             fed[k, channel] += 1
             for s in range(wiring.burst_bounds[k, channel], wiring.burst_bounds[k, channel + 1]):
-                n = wiring.burst_neuron[s]
-                state.arrived[n] += wiring.burst_weight[s]
-                if not state.listed[n]:
-                    state.listed[n] = True
-                    state.work[working] = n
-                    working += 1
+                working = _reach(state, wiring.burst_neuron[s], wiring.burst_weight[s], working)
             for row in range(wiring.feed_bounds[k, channel], wiring.feed_bounds[k, channel + 1]):
                 merged += _queue(state, slot, wiring.feed_axon[row])
     for k in range(len(wiring.clocks)):
@@ -195,12 +201,7 @@ def _integrate(slot: Any, wiring: Any, state: Any, axons: Any, working: Any) -> 
         state.flagged[slot, axon] = False
         axons[axon] += 1
         for s in range(wiring.axon_synapses[axon], wiring.axon_synapses[axon + 1]):
-            n = wiring.synapse_neuron[s]
-            state.arrived[n] += wiring.synapse_weight[s]
-            if not state.listed[n]:
-                state.listed[n] = True
-                state.work[working] = n
-                working += 1
+            working = _reach(state, wiring.synapse_neuron[s], wiring.synapse_weight[s], working)
     state.dues[slot] = 0
     return working
 
