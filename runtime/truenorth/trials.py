@@ -79,8 +79,8 @@ def codebook(weight: FloatArray, copies: int) -> Levels:
     Examples
     --------
     >>> found = codebook(np.array([[0.5, -0.4, 0.02]]), 2)
-    >>> found.level.tolist(), found.step.round(3).tolist()
-    ([[1.0, -1.0, 0.0]], [0.45])
+    >>> found.level.tolist(), [f"{step:.2f}" for step in found.step]
+    ([[1.0, -1.0, 0.0]], ['0.45'])
     """
     low, high = (-1, 1) if copies == 2 else (-(1 << (copies - 1)), (1 << (copies - 1)) - 1)
     largest = np.maximum(np.abs(weight).max(axis=1, keepdims=True), 1e-12)
