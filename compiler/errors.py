@@ -93,3 +93,37 @@ class CapacityError(SpikeloomError):
 
     def __reduce__(self) -> tuple[type[CapacityError], tuple[tuple[Violation, ...]]]:
         return type(self), (self.violations,)  # not of its text, as exceptions usually are
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Fault:
+    """One rule of a chip that a network breaks, in words.
+
+    Parameters
+    ----------
+    where : str
+        Who breaks it, for example ``core 3, neuron 17``.
+    found, allowed : str
+        What is there, and what the rule allows.
+    rule : str
+        Its name in the target file, for example ``truenorth.neuron.delay``.
+    remedy : str
+        What would mend it.
+    """
+
+    where: str
+    found: str
+    allowed: str
+    rule: str
+    remedy: str
+
+    def __str__(self) -> str:
+        return f"{self.where}: {self.found}, allowed {self.allowed} ({self.rule}); {self.remedy}"
+
+
+class RuleError(SpikeloomError):
+    """A network breaks rules of its chip; holds every fault, not the first."""
+
+    def __init__(self, faults: tuple[Fault, ...]) -> None:
+        self.faults = faults
+        super().__init__("\n".join(str(fault) for fault in faults))

@@ -18,12 +18,8 @@ Equal netlists give equal bytes: members are stored, not compressed, in a fixed 
 
 from __future__ import annotations
 
-import hashlib
-import io
-import json
 import math
 import os
-import struct
 import zipfile
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -31,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from compiler.atomic import write_atomically
+from compiler.archive import archive_bytes, read_manifest, read_members, require_file, require_whole, write_archive
 from compiler.dynamics import MOST_CLOCKS, MOST_STEPS, NO_CLOCKS, Clocks
 from compiler.errors import FormatError
 from compiler.netlist import Layer, Netlist, frozen, read_only, read_only_float
@@ -44,36 +40,12 @@ VERSIONS = (2, 3)
 LARGE = frozenset({"synapse_target", "synapse_weight"})
 """Arrays that stay in the type that they are stored in."""
 
-SIZE_LIMIT = 2**32
-"""Bytes that a netlist file may have, 4 GiB: some hundred times the synapses of a whole chip."""
-
 FLOATS = frozenset({"scale"})
 """Array members of real numbers."""
 
-_EPOCH = (1980, 1, 1, 0, 0, 0)
-_ZIP_ERRORS = (zipfile.BadZipFile, struct.error, ValueError, EOFError, OverflowError, MemoryError, RuntimeError)
-"""What zipfile and numpy raise on content that is no netlist; a header may announce more than the memory holds."""
 _SCALARS = ("target", "taxels", "polarities", "classes", "layers", "provenance", "clocks")
 ARRAYS = tuple(field.name for field in fields(Netlist) if field.name not in _SCALARS)
 """Array members in file order."""
-
-
-def _narrow(array: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-    if array.dtype.kind == "f":
-        return array.astype("<f8")
-    for dtype in ("<i1", "<i2", "<i4"):
-        info = np.iinfo(dtype)
-        if not array.size or (info.min <= array.min() and array.max() <= info.max):
-            return array.astype(dtype)
-    return array.astype("<i8")
-
-
-def _digest(members: dict[str, np.ndarray[Any, Any]]) -> str:
-    digest = hashlib.sha256()
-    for name, array in members.items():
-        digest.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
-        digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()
 
 
 def netlist_bytes(netlist: Netlist) -> bytes:
@@ -94,16 +66,7 @@ def netlist_bytes(netlist: Netlist) -> bytes:
     else:
         for layer in manifest["layers"]:
             del layer["alpha"]
-    members: dict[str, np.ndarray[Any, Any]] = {"manifest": np.array(json.dumps(manifest, sort_keys=True))}
-    members |= {name: _narrow(getattr(netlist, name)) for name in ARRAYS}
-    members["sha256"] = np.array(_digest(members))
-    file = io.BytesIO()
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
-        for name, array in members.items():
-            content = io.BytesIO()
-            np.lib.format.write_array(content, array, version=(1, 0), allow_pickle=False)
-            archive.writestr(zipfile.ZipInfo(f"{name}.npy", date_time=_EPOCH), content.getvalue())
-    return file.getvalue()
+    return archive_bytes(manifest, {name: getattr(netlist, name) for name in ARRAYS})
 
 
 def write_netlist(netlist: Netlist, path: str | os.PathLike[str]) -> str:
@@ -114,30 +77,7 @@ def write_netlist(netlist: Netlist, path: str | os.PathLike[str]) -> str:
     OSError
         If the file cannot be written; an older file is left as it was.
     """
-    content = netlist_bytes(netlist)
-    with write_atomically(path) as file:
-        file.write(content)
-    return hashlib.sha256(content).hexdigest()
-
-
-def _members(path: Path) -> dict[str, np.ndarray[Any, Any]]:
-    if path.stat().st_size > SIZE_LIMIT:
-        raise FormatError(f"{path}: {path.stat().st_size} bytes, {SIZE_LIMIT} allowed; this is no netlist of one chip")
-    file = io.BytesIO(path.read_bytes())
-    try:
-        with zipfile.ZipFile(file) as archive:
-            infos = archive.infolist()
-            if any(info.compress_type != zipfile.ZIP_STORED for info in infos):
-                raise FormatError(f"{path}: has compressed members, a netlist stores them plainly; compile it again")
-            if sum(info.file_size for info in infos) > len(file.getbuffer()):
-                raise FormatError(f"{path}: declares more bytes than it has; compile it again")
-            found = {}
-            for info in infos:
-                content = io.BytesIO(archive.read(info))
-                found[info.filename.removesuffix(".npy")] = np.lib.format.read_array(content, allow_pickle=False)
-            return found
-    except _ZIP_ERRORS as error:
-        raise FormatError(f"{path}: is truncated or not a netlist ({error}); compile it again") from error
+    return write_archive(netlist_bytes(netlist), path)
 
 
 def read_netlist(path: str | os.PathLike[str]) -> Netlist:
@@ -151,31 +91,10 @@ def read_netlist(path: str | os.PathLike[str]) -> Netlist:
         If it cannot be read.
     """
     path = Path(path)
-    if not path.is_file():
-        found = "is not a file" if path.exists() else "no such file"
-        raise FormatError(f"{path}: {found}; write one with spikeloom compile")
-    members = _members(path)
-    missing = sorted({"manifest", "sha256"} - set(members))
-    if missing:
-        raise FormatError(f"{path}: is not a netlist (no {' and no '.join(missing)}); write one with spikeloom compile")
-    try:
-        manifest = json.loads(str(members["manifest"]))
-    except (ValueError, RecursionError) as error:
-        raise FormatError(f"{path}: has an unreadable manifest; compile it again") from error
-    if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
-        raise FormatError(f"{path}: is not a netlist; write one with spikeloom compile")
-    if manifest.get("version") not in VERSIONS:
-        raise FormatError(
-            f"{path}: has format version {manifest.get('version')}, this program reads "
-            f"{' and '.join(map(str, VERSIONS))}; compile it again or update spikeloom"
-        )
-    stated = str(members.pop("sha256"))
-    names = {"manifest", *ARRAYS}
-    if set(members) != names:
-        odd = ", ".join(sorted(names ^ set(members)))
-        raise FormatError(f"{path}: has missing or unknown members ({odd}); compile it again")
-    if _digest({"manifest": members["manifest"], **{name: members[name] for name in ARRAYS}}) != stated:
-        raise FormatError(f"{path}: its content does not match its hash, so it was altered; compile it again")
+    require_file(path)
+    members = read_members(path)
+    manifest = read_manifest(path, members, FORMAT)
+    require_whole(path, manifest, members, VERSIONS, ARRAYS)
     if manifest["version"] == VERSIONS[0]:
         manifest = _widened(manifest)
     faults = _type_faults(manifest, members)

@@ -26,6 +26,7 @@ from compiler.netlist import Netlist
 from compiler.passes.legalize import measure
 from compiler.serialize import is_netlist, read_netlist
 from compiler.targets import load_target, with_tables
+from compiler.truenorth.serialize import is_crossbars
 from models.evtouch import Recordings
 from models.grasps import SYNTHETIC
 from runtime import (
@@ -70,6 +71,7 @@ from runtime.spent import Account, explained
 from runtime.tables import show
 from runtime.trace import BoolArray
 from runtime.train_command import train
+from runtime.truenorth import commands as truenorth
 from runtime.windows import first_part, window_asked
 
 Arguments = argparse.Namespace
@@ -111,6 +113,8 @@ def _inspect(arguments: Arguments) -> Outcome:
             value = getattr(arguments, name)
             if value is not None and (name, value) != ("run", 0):
                 raise OptionError(f"--{name} {value}: is for checkpoints, {arguments.path} is a netlist; leave it away")
+        if is_crossbars(arguments.path):
+            return truenorth.inspect(arguments.path)
         netlist = read_netlist(arguments.path)
         uses = measure(netlist, load_target(netlist.target))
         return render.netlist_json(netlist, uses, _sha256(arguments.path)), render.netlist_text, 0
@@ -125,6 +129,8 @@ def _run(arguments: Arguments) -> Outcome:
 
     if arguments.spikes is not None:
         require_place(arguments.spikes, "--spikes", arguments)
+    if is_crossbars(arguments.netlist):
+        return truenorth.run(arguments)
     netlist = read_netlist(arguments.netlist)
     data = _recordings(arguments, netlist)
     progress("running")
@@ -198,6 +204,8 @@ def _verify(arguments: Arguments) -> Outcome:
 def _estimate(arguments: Arguments) -> Outcome:
     from runtime.estimates import estimate_text
 
+    if is_crossbars(arguments.netlist):
+        return truenorth.estimate(arguments)
     netlist = read_netlist(arguments.netlist)
     data = _recordings(arguments, netlist)
     account = Account(netlist, data)

@@ -11,10 +11,13 @@ from compiler.atomic import write_atomically
 from compiler.errors import OptionError
 from compiler.serialize import read_netlist
 from compiler.targets import load_target
+from models.events import BIN_S
 from runtime import onnx_float, onnx_graph, sanafe
+from runtime.data_commands import add_bin_option
 from runtime.inputs import asked_checkpoint, asked_graph, propagation, require_place
 from runtime.onnx_nodes import port_words
-from runtime.options import add_model
+from runtime.options import DATA_HELP, add_model
+from runtime.truenorth.commands import export_ranc
 
 Json = dict[str, Any]
 
@@ -22,10 +25,14 @@ SUMMARY = "write a network in the format of another program"
 
 FORMATS = {
     "sanafe": f"network and mapping of a netlist for SANA-FE {sanafe.VERSION}, YAML",
+    "ranc": "TrueNorth cores, and a recording, for RANC's simulator, JSON",
     "onnx": "a netlist as an integer ONNX graph, bit for bit the chip",
     "onnx-float": "the float network of a checkpoint as a static ONNX graph",
 }
 """Values of ``--to``."""
+
+RECORDING: dict[str, object] = {"data": None, "split": None, "recording": None, "bin": BIN_S}
+"""Options that name a recording, and what they are where they are not given."""
 
 MODEL = {
     "graph": None,
@@ -49,6 +56,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--form", choices=onnx_graph.FORMS, help="onnx: one step with its state, or whole recordings (default: scan)"
     )
+    parser.add_argument("--data", metavar="PATH", help=f"ranc: {DATA_HELP}")
+    parser.add_argument("--split", help="ranc: split to read (default: test)")
+    parser.add_argument("--recording", type=int, metavar="N", help="ranc: which of them (default: 0)")
+    add_bin_option(parser)
     add_model(parser)
     parser.add_argument("-o", "--output", required=True, metavar="FILE")
 
@@ -90,6 +101,7 @@ def _ports(arguments: argparse.Namespace, content: bytes) -> Json:
 
 WRITERS: dict[str, Callable[[argparse.Namespace], tuple[Iterable[bytes], Json]]] = {
     "sanafe": _sanafe,
+    "ranc": export_ranc,
     "onnx": _onnx,
     "onnx-float": _onnx_float,
 }
@@ -98,7 +110,13 @@ WRITERS: dict[str, Callable[[argparse.Namespace], tuple[Iterable[bytes], Json]]]
 
 def _require_fit(arguments: argparse.Namespace) -> None:
     """Refuse options that the format would ignore."""
-    if arguments.form is not None and arguments.to == "sanafe":
+    for name, absent in RECORDING.items():
+        given = getattr(arguments, name)
+        if given != absent and arguments.to != "ranc":
+            raise OptionError(f"--{name} {given}: is for ranc; leave it away")
+        if given != absent and arguments.data is None:
+            raise OptionError(f"--{name} {given}: says which recording of --data, which is not given; add it")
+    if arguments.form is not None and arguments.to in ("sanafe", "ranc"):
         raise OptionError(f"--form {arguments.form}: is for onnx and onnx-float; leave it away")
     if arguments.to == "onnx-float":
         return
@@ -135,6 +153,10 @@ def _text(report: Json) -> str:
     if "synapses" in report:
         held += f" and {report['synapses']} synapses"
     first = f"{report['path']}: {held} for {report['format']}, {report['bytes']} bytes"
+    if "ticks" in report:
+        inputs = report["path"], report["path"].removesuffix(".json") + ".out"
+        with_events = "no recording, add packets" if report["ticks"] is None else f"{report['ticks']} ticks"
+        return f"{first}\nrun: ranc_sim {inputs[0]} {inputs[1]} {inputs[0]} TICKS ({with_events})"
     if "groups" in report:
         return (
             f"{first}\ngroups: {', '.join(report['groups'])}\n"
