@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from compiler.errors import OptionError
+from compiler.frontends.nir_neurons import CONVENTIONS
 from compiler.frontends.own import WEIGHTS
 from compiler.frontends.systems import GRAPH_SYSTEMS, SYSTEMS, TACTILESGNET
 from compiler.passes.layout import GOALS
@@ -118,9 +119,9 @@ def add_model(parser: argparse.ArgumentParser, *, graph: bool = True) -> None:
 
 
 def add_network(parser: argparse.ArgumentParser) -> None:
-    """Add the options that say how to read a float network: a checkpoint on its graph, or an ONNX file."""
+    """Add the options that say how to read a float network: a checkpoint on its graph, an ONNX or a NIR file."""
     add_model(parser)
-    parser.add_argument("--polarities", type=int, metavar="N", help="of an ONNX input, where its shape is flat")
+    parser.add_argument("--polarities", type=int, metavar="N", help="of an ONNX or NIR input, where its shape is flat")
     order = parser.add_mutually_exclusive_group()
     for name, first in (("first", True), ("last", False)):
         order.add_argument(
@@ -128,8 +129,19 @@ def add_network(parser: argparse.ArgumentParser) -> None:
             dest="polarities_first",
             action="store_const",
             const=first,
-            help=f"they are the {name} axis, where the shape of an ONNX input does not say",
+            help=f"they are the {name} axis, where the shape of an ONNX or NIR input does not say",
         )
+    add_steps(parser)
+
+
+def add_steps(parser: argparse.ArgumentParser) -> None:
+    """Add the options that say how the time constants of a NIR file become decays."""
+    parser.add_argument("--dt", type=float, metavar="SECONDS", help="time step that a NIR file is read in")
+    parser.add_argument(
+        "--convention",
+        choices=CONVENTIONS,
+        help=f"a step keeps 1 - dt/tau (euler) or exp(-dt/tau) (exponential) of a state (default: {CONVENTIONS[0]})",
+    )
 
 
 def cores_asked(words: str | None) -> dict[str, int] | None:
@@ -160,7 +172,7 @@ def cores_asked(words: str | None) -> dict[str, int] | None:
 
 def add_compile(sub: argparse.ArgumentParser) -> None:
     """Add the options of a compilation."""
-    sub.add_argument("checkpoint", help="checkpoint, or a network as an ONNX file")
+    sub.add_argument("checkpoint", help="checkpoint, or a network as an ONNX, NIR or netx file")
     add_network(sub)
     sub.add_argument("--against", metavar="NET.loom", help="list the weights that differ from another netlist's")
     sub.add_argument("--target", default="loihi1", help="chip (default: loihi1)")
