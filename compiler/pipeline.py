@@ -95,6 +95,80 @@ class Compilation:
         return self.layout.parts.bound
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Placed:
+    """An integer network on cores.
+
+    Parameters
+    ----------
+    netlist : Netlist
+        The result.
+    uses : tuple of LimitUse
+        Use of every limit by every core.
+    layout, usual : Layout
+        Cores and tiles; and those of the layout of fewest cores.
+    silent, unheard : tuple of (neurons,) bool
+        Neurons left out, by population.
+    """
+
+    netlist: Netlist
+    uses: tuple[LimitUse, ...]
+    layout: Layout
+    usual: Layout
+    silent: tuple[npt.NDArray[np.bool_], ...]
+    unheard: tuple[npt.NDArray[np.bool_], ...]
+
+
+def place_integers(
+    integer: IntegerNetwork,
+    *,
+    target: str = "loihi1",
+    keep_all: bool = False,
+    cores_for: Mapping[str, int] | None = None,
+    chips: int = 1,
+    optimize: str = "cores",
+    calibration: Calibration | None = None,
+    provenance: Mapping[str, Any] | None = None,
+) -> Placed:
+    """Put an integer network on the cores of a chip, as it stands.
+
+    Parameters
+    ----------
+    integer : IntegerNetwork
+        Integer stage, verified.
+    target, keep_all, cores_for, chips, optimize, provenance
+        See :func:`compile_network`.
+    calibration : Calibration, optional
+        What layouts are judged by.
+
+    Raises
+    ------
+    OptionError, CapacityError
+        As the passes say.
+    """
+    chip = load_target(target)
+    silent, unheard = (nobody(integer), nobody(integer)) if keep_all else removable(integer)
+    laid, identity = compact(integer, either(silent, unheard))
+    rates: tuple[FloatArray, ...] | None = None
+    if calibration is not None:
+        every = tuple(spikes.mean(axis=(0, 1)) for spikes in calibration.spikes)
+        rates = tuple(rate[ids] for rate, ids in zip(every, identity, strict=True))
+    layout, usual = lay_out(
+        laid,
+        chip,
+        goal=optimize,
+        cores_for=cores_for,
+        chips=chips,
+        rates=rates,
+        calibration=calibration,
+        identity=identity,
+    )
+    origin = Origin(network=integer, identity=identity, unheard=unheard)
+    netlist = emit(laid, layout.parts, layout.placement.tiles, chip, provenance or {}, origin)
+    uses = require_legal(netlist, chip)
+    return Placed(netlist=netlist, uses=uses, layout=layout, usual=usual, silent=silent, unheard=unheard)
+
+
 def compile_network(
     network: Network,
     *,
@@ -164,13 +238,11 @@ def compile_network(
     publish("expand", network)
 
     calibration: Calibration | None = None
-    rates: tuple[FloatArray, ...] | None = None
     if training_events is not None:
         events = channels_last(training_events, network.input.clocks)
         several = any(recipe.planes > 1 for recipe in recipes or ())
         used = events if spike_exact or prune_unused else evenly_spaced(events, MANY if several else FEW)
         calibration = calibrate(network, used)
-        rates = tuple(spikes.mean(axis=(0, 1)) for spikes in calibration.spikes)
     unused = nobody(network)
     if prune_unused:
         if calibration is None or keep_all or forms is not None:
@@ -201,36 +273,29 @@ def compile_network(
     verify(integer)
     publish("quantize", integer)
 
-    silent, unheard = (nobody(network), nobody(network)) if keep_all else removable(integer)
-    laid, identity = compact(integer, either(silent, unheard))
-    if rates is not None:
-        rates = tuple(rate[ids] for rate, ids in zip(rates, identity, strict=True))
-    layout, usual = lay_out(
-        laid,
-        chip,
-        goal=optimize,
+    placed = place_integers(
+        integer,
+        target=target,
+        keep_all=keep_all,
         cores_for=cores_for,
         chips=chips,
-        rates=rates,
+        optimize=optimize,
         calibration=calibration,
-        identity=identity,
+        provenance=provenance,
     )
-    origin = Origin(network=integer, identity=identity, unheard=unheard)
-    netlist = emit(laid, layout.parts, layout.placement.tiles, chip, provenance or {}, origin)
-    uses = require_legal(netlist, chip)
-    publish("place", netlist)
+    publish("place", placed.netlist)
     return Compilation(
         network=whole,
         integer=integer,
-        netlist=netlist,
+        netlist=placed.netlist,
         choices=choices,
         exactness=exactness,
         proofs=prove_ranges(integer),
-        uses=uses,
-        removals=removals(whole, silent, unheard, unused),
+        uses=placed.uses,
+        removals=removals(whole, placed.silent, placed.unheard, unused),
         goal=optimize,
-        layout=layout,
-        usual=usual,
+        layout=placed.layout,
+        usual=placed.usual,
     )
 
 

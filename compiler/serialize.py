@@ -25,6 +25,7 @@ import math
 import os
 import struct
 import zipfile
+from collections.abc import Mapping
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
@@ -76,8 +77,8 @@ def _digest(members: dict[str, np.ndarray[Any, Any]]) -> str:
     return digest.hexdigest()
 
 
-def netlist_bytes(netlist: Netlist) -> bytes:
-    """File content of a netlist; equal netlists give equal bytes."""
+def manifest_of(netlist: Netlist) -> dict[str, Any]:
+    """What a netlist says beside its arrays, as JSON values."""
     timed = bool(netlist.clocks.channels or any(layer.alpha for layer in netlist.layers))
     manifest: dict[str, Any] = {
         "format": FORMAT,
@@ -94,7 +95,13 @@ def netlist_bytes(netlist: Netlist) -> bytes:
     else:
         for layer in manifest["layers"]:
             del layer["alpha"]
-    members: dict[str, np.ndarray[Any, Any]] = {"manifest": np.array(json.dumps(manifest, sort_keys=True))}
+    return manifest
+
+
+def netlist_bytes(netlist: Netlist) -> bytes:
+    """File content of a netlist; equal netlists give equal bytes."""
+    manifest = json.dumps(manifest_of(netlist), sort_keys=True)
+    members: dict[str, np.ndarray[Any, Any]] = {"manifest": np.array(manifest)}
     members |= {name: _narrow(getattr(netlist, name)) for name in ARRAYS}
     members["sha256"] = np.array(_digest(members))
     file = io.BytesIO()
@@ -162,13 +169,7 @@ def read_netlist(path: str | os.PathLike[str]) -> Netlist:
         manifest = json.loads(str(members["manifest"]))
     except (ValueError, RecursionError) as error:
         raise FormatError(f"{path}: has an unreadable manifest; compile it again") from error
-    if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
-        raise FormatError(f"{path}: is not a netlist; write one with spikeloom compile")
-    if manifest.get("version") not in VERSIONS:
-        raise FormatError(
-            f"{path}: has format version {manifest.get('version')}, this program reads "
-            f"{' and '.join(map(str, VERSIONS))}; compile it again or update spikeloom"
-        )
+    _require_manifest(path, manifest)
     stated = str(members.pop("sha256"))
     names = {"manifest", *ARRAYS}
     if set(members) != names:
@@ -176,6 +177,37 @@ def read_netlist(path: str | os.PathLike[str]) -> Netlist:
         raise FormatError(f"{path}: has missing or unknown members ({odd}); compile it again")
     if _digest({"manifest": members["manifest"], **{name: members[name] for name in ARRAYS}}) != stated:
         raise FormatError(f"{path}: its content does not match its hash, so it was altered; compile it again")
+    return netlist_of(path, manifest, members)
+
+
+def _require_manifest(path: Path, manifest: Any) -> None:
+    if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
+        raise FormatError(f"{path}: is not a netlist; write one with spikeloom compile")
+    if manifest.get("version") not in VERSIONS:
+        raise FormatError(
+            f"{path}: has format version {manifest.get('version')}, this program reads "
+            f"{' and '.join(map(str, VERSIONS))}; compile it again or update spikeloom"
+        )
+
+
+def netlist_of(path: Path, manifest: Any, members: Mapping[str, np.ndarray[Any, Any]]) -> Netlist:
+    """Put a netlist together from what a file holds, and check it.
+
+    Parameters
+    ----------
+    path : Path
+        For messages.
+    manifest : JSON value
+        As :func:`manifest_of` gives it.
+    members : mapping of str to array
+        Every one of ``ARRAYS``.
+
+    Raises
+    ------
+    FormatError
+        If it is from another version or inconsistent.
+    """
+    _require_manifest(path, manifest)
     if manifest["version"] == VERSIONS[0]:
         manifest = _widened(manifest)
     faults = _type_faults(manifest, members)
@@ -221,7 +253,7 @@ def is_netlist(path: str | os.PathLike[str]) -> bool:
         return False
 
 
-def _type_faults(manifest: dict[str, Any], members: dict[str, np.ndarray[Any, Any]]) -> list[str]:
+def _type_faults(manifest: dict[str, Any], members: Mapping[str, np.ndarray[Any, Any]]) -> list[str]:
     """Say which entries of the manifest or which arrays are missing or of another kind than :class:`Netlist` asks."""
     layers = manifest.get("layers")
     entries = {

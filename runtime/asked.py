@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
 
 from compiler.errors import OptionError
 from compiler.fixedpoint import FloatArray
 from compiler.frontends.checkpoint import Checkpoint
+from compiler.frontends.netx_file import SUFFIX as NETX
 from compiler.frontends.nir import SUFFIX as NIR
 from compiler.frontends.nir import NirNetwork, read_nir
+from compiler.frontends.nir_neurons import CONVENTIONS
 from compiler.frontends.onnx import SUFFIX as ONNX
 from compiler.frontends.onnx import OnnxNetwork, read_onnx
 from compiler.ir import Network
 from compiler.passes.expand import expand
+from compiler.sidecar import read_said
 from runtime.inputs import asked_checkpoint, asked_graph, progress, propagation
 
 TITLES = {ONNX: "ONNX", NIR: "NIR"}
@@ -37,6 +42,10 @@ class Asked:
         What was read from an ONNX or NIR file and what was assumed.
     sha256 : str
         Of the file.
+    format : str
+        ``checkpoint``, ``onnx`` or ``nir``.
+    read_as : JSON values
+        How it was read, beyond what it says: the time step of a NIR file.
     """
 
     network: Network
@@ -45,6 +54,8 @@ class Asked:
     graph: str | None
     facts: tuple[str, ...]
     sha256: str
+    format: str = "checkpoint"
+    read_as: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def model(self) -> Checkpoint | Network:
@@ -75,18 +86,32 @@ def asked_network(path: str, arguments: argparse.Namespace) -> Asked:
         )
     progress("reading the network")
     layout = {"polarities": arguments.polarities, "polarities_first": arguments.polarities_first}
-    found: OnnxNetwork | NirNetwork
     if suffix == ONNX:
-        found = read_onnx(path, **layout)
-    else:
-        found = read_nir(path, dt=arguments.dt, convention=arguments.convention, **layout)
+        onnx = read_onnx(path, **layout)
+        return _asked(onnx, "onnx", {})
+    said = read_said(path, CONVENTIONS) if arguments.dt is None else None
+    dt = arguments.dt if said is None else said.dt
+    convention = arguments.convention or (CONVENTIONS[0] if said is None else said.convention)
+    return _asked(read_nir(path, dt=dt, convention=convention, **layout), "nir", {"dt": dt, "convention": convention})
+
+
+def _asked(found: OnnxNetwork | NirNetwork, kind: str, read_as: Mapping[str, Any]) -> Asked:
     return Asked(
-        network=found.network, checkpoint=None, adjacency=None, graph=None, facts=found.facts, sha256=found.sha256
+        network=found.network,
+        checkpoint=None,
+        adjacency=None,
+        graph=None,
+        facts=found.facts,
+        sha256=found.sha256,
+        format=kind,
+        read_as=read_as,
     )
 
 
 def _require_fit(path: str, suffix: str | None, arguments: argparse.Namespace) -> None:
-    """Refuse options that are for another kind of file."""
+    """Refuse options that are for another kind of file, and files that hold no float network."""
+    if path.endswith(NETX):
+        raise OptionError(f"{path}: holds integers, no float network to compare with; compile, inspect and run it")
     if suffix is None:
         layout = {"--polarities": arguments.polarities, "--polarities-first or -last": arguments.polarities_first}
         for option, value in layout.items():

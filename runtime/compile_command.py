@@ -1,4 +1,4 @@
-"""The command ``compile``: a checkpoint or an ONNX file becomes a netlist."""
+"""The command ``compile``: a checkpoint or a file of another format becomes a netlist."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from runtime import render
 from runtime.asked import asked_network
 from runtime.inputs import progress, recordings, require_place, version
 from runtime.options import MARGIN, cores_asked
+from runtime.restore import is_whole, take
 
 Json = dict[str, Any]
 
@@ -32,6 +33,8 @@ LISTED = 20
 def compile_netlist(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
     """Run the command: the report, how to print it, and the exit code."""
     require_place(arguments.output, "-o", arguments)
+    if is_whole(arguments):
+        return take(arguments)
     if arguments.margin is not None and arguments.ranges != "observed":
         raise OptionError(
             f"--margin {arguments.margin:g}: only observed ranges have one; add --ranges observed or leave it away"
@@ -78,7 +81,7 @@ def compile_netlist(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json
             "spikeloom": version(),
             "checkpoint_sha256": asked.sha256,
             **(
-                {"format": "onnx"}
+                {"format": asked.format, **asked.read_as}
                 if checkpoint is None
                 else {"run": arguments.run, "weights": checkpoint.weights, "graph": asked.graph}
             ),
@@ -109,7 +112,7 @@ def compile_netlist(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json
 
 
 def _text(report: Json) -> str:
-    """A compilation for people, with what was read from an ONNX file and what differs from another netlist."""
+    """A compilation for people, with what was read from another format and what differs from another netlist."""
     lines = [*report.get("facts", ()), *([""] if "facts" in report else []), render.compilation_text(report)]
     if "against" in report:
         weights, registers = report["against"]["weights"], report["against"]["registers"]

@@ -121,6 +121,9 @@ def _written(graph: Graph) -> float | None:
 
 
 def _hint(graph: Graph) -> str:
+    said = graph.metadata.get("dt")
+    if isinstance(said, np.ndarray) and said.size == 1:
+        return f", but its metadata says dt = {float(said.ravel()[0]):g}"
     written = _written(graph)
     return "" if written is None else f", but its r is tau / {written:g}, as of steps of {written:g} s"
 
@@ -334,7 +337,9 @@ def _drifts(graph: Graph, steps: Steps, sensor: Input) -> list[str]:
     """What files are known to lose or to change."""
     facts = ["v goes to its reset as NIR says; a framework that subtracts the threshold instead means another network"]
     if any(node.type == "CubaLIF" for node in graph.nodes.values()):
-        facts.append("a reset leaves currents as they are, as NIR says; snnTorch's Synaptic with reset 'zero' clears them")
+        facts.append(
+            "a reset leaves currents as they are, as NIR says; snnTorch's Synaptic with reset 'zero' clears them"
+        )
     written = _written(graph)
     if written is not None and not math.isclose(written, steps.dt, rel_tol=1e-4):
         facts.append(
