@@ -4,9 +4,9 @@ One package at a time, in an environment that has it::
 
     python benchmarks/nir_files.py snntorch tests/nir
 
-Each network gets a file ``NAME.nir`` and ``NAME.npz``: ``events`` (steps, inputs), one recording, and the spikes of each
-spiking layer (steps, neurons) that the package makes of them, by the name of its node. Everything is seeded. The tests
-read the files that are there; only this script needs the packages.
+Each network gets a file ``NAME.nir`` and ``NAME.npz``: ``events`` (steps, inputs), one recording, and the spikes of
+each spiking layer (steps, neurons) that the package makes of them, by the name of its node. Everything is seeded. The
+tests read the files that are there; only this script needs the packages.
 """
 
 import argparse

@@ -107,7 +107,7 @@ def read_nir(
             raise OptionError(f"{path}: NIR keeps no time step{_hint(graph)}; give --dt SECONDS")
         steps = Steps(dt=dt, convention=convention or CONVENTIONS[0])
         require_steps(dt)
-        return _network(graph, steps, polarities, polarities_first)
+        return network_of(graph, steps, polarities, polarities_first)
     except ModelError as error:
         raise ModelError(f"{path}: {error}") from error
 
@@ -128,7 +128,10 @@ def _hint(graph: Graph) -> str:
     return "" if written is None else f", but its r is tau / {written:g}, as of steps of {written:g} s"
 
 
-def _network(graph: Graph, steps: Steps, polarities: int | None, polarities_first: bool | None) -> NirNetwork:
+def network_of(
+    graph: Graph, steps: Steps, polarities: int | None = None, polarities_first: bool | None = None
+) -> NirNetwork:
+    """Network of a graph that was read; parameters and errors as of :func:`read_nir`, without the path."""
     entry, end = graph.one("Input"), graph.one("Output")
     shape = entry.whole("shape") if entry.values.get("shape") is not None else ()
     if not shape or len(shape) > AXES or min(shape) < 1 or math.prod(shape) > ELEMENTS:
