@@ -86,18 +86,18 @@ def test_what_snntorch_loses_of_a_synaptic_neuron_is_said():
 
 
 def test_facts_of_a_file():
-    facts = read_nir(FILES / "snntorch_leaky.nir", dt=0.02, convention="exponential").facts
+    facts = read_nir(FILES / "snntorch_leaky.nir", dt=2e-4, convention="exponential").facts
     assert facts == (
-        "NIR 1.0.8, read in steps of 0.02 s (exponential)",
+        "NIR 1.0.8, read in steps of 0.0002 s (exponential)",
         "input input: 6 taxels, 2 polarities, as flat, channel = taxel * polarities + polarity; 2 polarities are "
         "assumed",
-        "layer 1 (LIF): 16 neurons, decay 3.26149e-70 (0.000244141 on the chip), fires at v > 0.5, then v = 0; a step "
-        "adds 1.25 of its input",
-        "layer 3 (LIF): 4 neurons, decay 1.38396e-87 (0.000244141 on the chip), fires at v > 1, then v = 0; a step "
-        "adds 10 of its input",
+        "layer 1 (LIF): 16 neurons, decay 0.201896 (0.201904 on the chip), fires at v > 0.5, then v = 0; a step adds "
+        "0.997629 of its input",
+        "layer 3 (LIF): 4 neurons, decay 0.818731 (0.818848 on the chip), fires at v > 1, then v = 0; a step adds "
+        "1.81269 of its input",
         "v goes to its reset as NIR says; a framework that subtracts the threshold instead means another network",
-        "drift: r is tau / 0.0001 in every neuron, as of a file written in steps of 0.0001 s; in steps of 0.02 s its "
-        "decays and gains are others than there",
+        "drift: r is tau / 0.0001 in every neuron, as of a file written in steps of 0.0001 s; in steps of 0.0002 s "
+        "its decays and gains are others than there",
         "classes: the spikes of 3 in output output",
     )
 

@@ -108,16 +108,10 @@ def _conv(node: Node, value: Value, _steps: Steps) -> Value:
             turned = "; its axes look exchanged" if declared == shape[:0:-1] else ""
             raise node.fail(f"is for inputs of {list(declared)}, it gets {list(shape[1:])}{turned}; export it again")
     stride, dilation = node.whole("stride", axes), node.whole("dilation", axes)
+    padding, groups = _padding(node, kernel, dilation, stride), node.whole("groups", 1)[0]
     matrix, out = _named(
         node,
-        lambda: convolution(
-            shape,
-            weight,
-            stride=stride,
-            padding=_padding(node, kernel, dilation, stride),
-            dilation=dilation,
-            groups=node.whole("groups", 1)[0],
-        ),
+        lambda: convolution(shape, weight, stride=stride, padding=padding, dilation=dilation, groups=groups),
     )
     bias = np.repeat(_each(node, "bias", out[0]), math.prod(out[1:])) if node.has("bias") else None
     result = through(value, matrix, out)
