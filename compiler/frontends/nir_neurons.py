@@ -175,6 +175,8 @@ def _leaky(node: Node, size: int, shape: tuple[int, ...], steps: Steps) -> Neuro
         alpha = one(node, "tau_syn", steps.keeps(node, "tau_syn", size, shape))
         weight = spread(node, "w_in", size, shape) if node.has("w_in") else np.ones(size)
         gain = gain * weight * (1 - alpha)
+    # r = tau / dt, stored in float32, makes a gain of 1 that is not quite one
+    gain = np.where(np.abs(gain - 1) < TOLERANCE, 1.0, gain)
     return Neurons(beta=beta, alpha=alpha, gain=gain, drive=drive, theta=theta, reset=reset)
 
 
