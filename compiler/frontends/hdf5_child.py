@@ -116,7 +116,8 @@ def _decoded(value: Any) -> Any:
     return value.decode("utf-8", "backslashreplace") if isinstance(value, bytes) else str(value)
 
 
-def _limit_resources() -> None:
+def limit_resources() -> None:
+    """Give up on what takes too long or too much memory, where the system can do so."""
     try:
         import resource
     except ImportError:
@@ -127,7 +128,7 @@ def _limit_resources() -> None:
 
 def main() -> None:
     """Answer for the file on standard input."""
-    _limit_resources()
+    limit_resources()
     out = sys.stdout.buffer
     try:
         entries, arrays = take_apart(sys.stdin.buffer.read())

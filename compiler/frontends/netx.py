@@ -139,7 +139,7 @@ def _input_shape(blocks: Sequence[Block]) -> tuple[int, ...]:
         if weight.ndim == 2 and weight.size:
             return (weight.shape[1],)
         return (first.number_of("inFeatures"),)
-    raise first.fail("nothing says what shape its input has, allowed is a layer of type input before it; add one")
+    raise first.fail("the shape of its input is nowhere, wanted is a layer of type input before it; add one")
 
 
 def _synapses(block: Block, shape: tuple[int, ...]) -> tuple[Sparse, tuple[int, ...]]:
