@@ -13,8 +13,8 @@ from __future__ import annotations
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
-import h5py
 import numpy as np
 
 from compiler.errors import ModelError
@@ -169,13 +169,15 @@ def tree_of(network: IntegerNetwork, blocks: Sequence[Block]) -> Tree:
 
 def file_bytes(tree: Tree) -> bytes:
     """HDF5 of a tree; equal trees give equal bytes."""
+    import h5py  # slow to load, so only where it is used
+
     content = io.BytesIO()
     with h5py.File(content, "w") as file:
         _fill(file, tree)
     return content.getvalue()
 
 
-def _fill(group: h5py.Group, tree: Tree) -> None:
+def _fill(group: Any, tree: Tree) -> None:
     for name, value in tree.items():
         if isinstance(value, dict):
             _fill(group.create_group(name), value)

@@ -19,7 +19,6 @@ import io
 import re
 from typing import Any
 
-import h5py
 import numpy as np
 import numpy.typing as npt
 
@@ -148,6 +147,8 @@ def _neurons(population: IntegerPopulation, bias: npt.NDArray[np.float64], dt: f
 
 
 def _file(nodes: dict[str, Params], edges: list[tuple[str, str]], dt: float) -> bytes:
+    import h5py  # slow to load, so only where it is used
+
     content = io.BytesIO()
     words = h5py.string_dtype()
     with h5py.File(content, "w") as file:

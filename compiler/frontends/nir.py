@@ -107,7 +107,8 @@ def read_nir(
             raise OptionError(f"{path}: NIR keeps no time step{_hint(graph)}; give --dt SECONDS")
         steps = Steps(dt=dt, convention=convention or CONVENTIONS[0])
         require_steps(dt)
-        return network_of(graph, steps, polarities, polarities_first)
+        with np.errstate(all="ignore"):  # what is not finite is refused at the end
+            return network_of(graph, steps, polarities, polarities_first)
     except ModelError as error:
         raise ModelError(f"{path}: {error}") from error
 
