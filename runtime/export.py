@@ -98,6 +98,7 @@ def _sanafe(arguments: argparse.Namespace) -> Written:
         "groups": [sanafe.INPUT, *sanafe.group_names(netlist)],
         "cores": list(places[: netlist.n_cores]),
         "input_cores": list(places[netlist.n_cores :]),
+        **({"floating_currents": list(floating)} if (floating := sanafe.floating_layers(netlist)) else {}),
     }
     return Written(chunks=lines, facts=facts)
 
@@ -271,6 +272,11 @@ def _text(report: Json) -> str:
         return (
             f"{first}\ngroups: {', '.join(report['groups'])}\n"
             f"cores (tile.core): {', '.join(report['cores'])}; of the inputs: {', '.join(report['input_cores'])}"
+            + (
+                f"\ncurrents of {', '.join(report['floating_currents'])} are floats there, so spikes may differ"
+                if "floating_currents" in report
+                else ""
+            )
         )
     sides = [f"{side}:\n" + "\n".join(f"  {port}" for port in report[side]) for side in ("inputs", "outputs")]
     return "\n".join([f"{first}, form {report['form']}", *sides])

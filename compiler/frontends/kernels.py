@@ -19,6 +19,8 @@ from compiler.ir import Sparse
 COEFFICIENT_LIMIT = 2**25
 """Products of a kernel's weights with places: more than twice the synapses of a whole chip."""
 
+IMPOSSIBLE = "has a kernel size, stride or dilation below 1 or a padding below 0; export it again"
+
 Padding = Sequence[tuple[int, int]]
 """Zeros before and after each space axis."""
 
@@ -53,7 +55,7 @@ def places(
     numbers = [*kernel, *stride, *dilation]
     pads = [zeros for pair in padding for zeros in pair]
     if min(numbers, default=1) < 1 or min(pads, default=0) < 0:
-        raise ModelError("has a kernel size, stride or dilation below 1 or a padding below 0; export it again")
+        raise ModelError(IMPOSSIBLE)
     found = []
     for size, taps, step, (before, after), apart in zip(space, kernel, stride, padding, dilation, strict=True):
         covered = size + before + after - apart * (taps - 1)
@@ -159,6 +161,8 @@ def pooling(
     >>> shape, matrix.toarray().tolist()
     ((1, 1, 1), [[0.25, 0.25, 0.25, 0.25]])
     """
+    if min(kernel) < 1:
+        raise ModelError(IMPOSSIBLE)
     share = 1 / math.prod(kernel) if mean else 1.0
     return convolution(
         shape,

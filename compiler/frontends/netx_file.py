@@ -21,6 +21,7 @@ import numpy as np
 from compiler.errors import ModelError
 from compiler.fixedpoint import IntArray
 from compiler.frontends.hdf5 import Tree, read_hdf5
+from compiler.frontends.tensors import printable
 
 SUFFIX = ".net"
 
@@ -43,7 +44,7 @@ class Block:
     entries: Tree
 
     def __str__(self) -> str:
-        return f"layer {self.number} ({self.type or 'no type'})"
+        return f"layer {self.number} ({printable(self.type) or 'no type'})"
 
     def fail(self, problem: str) -> ModelError:
         """An error about this layer, to be raised."""
