@@ -324,7 +324,8 @@ def _readout(end: Node, result: Value, spiking: Sequence[_Spiking]) -> tuple[int
 
 def _facts(graph: Graph, steps: Steps, spiking: Sequence[_Spiking], sensor: str, clocked: Input) -> list[str]:
     """What a reader of the file would want to check."""
-    facts = [f"NIR {graph.version or 'of no version'}, read in steps of {steps.dt:g} s ({steps.convention})", sensor]
+    version = printable(graph.version) or "of no version"
+    facts = [f"NIR {version}, read in steps of {steps.dt:g} s ({steps.convention})", sensor]
     for one in spiking:
         n = one.neurons
         decays = " or ".join(decay_words(float(n.beta[rows[0]])) for rows in one.groups[:4])
