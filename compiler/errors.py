@@ -6,7 +6,9 @@ and exits with 2; nothing here carries a traceback to a user.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 
 class SpikeloomError(Exception):
@@ -31,6 +33,25 @@ class FormatError(SpikeloomError):
 
 class NumericRangeError(SpikeloomError):
     """A chip register would overflow: the simulation stops instead of inventing a value."""
+
+
+class UnfinishedError(SpikeloomError):
+    """Work of several parts ended without some of them: nothing is wrong with what the user gave; exit code 1.
+
+    Parameters
+    ----------
+    message : str
+        What is missing and what is kept.
+    results : mapping, optional
+        Of the parts that are there.
+    resume : tuple of str
+        Words to add to the command to go on.
+    """
+
+    def __init__(self, message: str, results: Mapping[str, Any] | None = None, resume: tuple[str, ...] = ()) -> None:
+        self.results = dict(results or {})
+        self.resume = resume
+        super().__init__(message)
 
 
 class VerifyError(Exception):
@@ -69,3 +90,40 @@ class CapacityError(SpikeloomError):
     def __init__(self, violations: tuple[Violation, ...]) -> None:
         self.violations = violations
         super().__init__("\n".join(str(violation) for violation in violations))
+
+    def __reduce__(self) -> tuple[type[CapacityError], tuple[tuple[Violation, ...]]]:
+        return type(self), (self.violations,)  # not of its text, as exceptions usually are
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Fault:
+    """One rule of a chip that a network breaks, in words.
+
+    Parameters
+    ----------
+    where : str
+        Who breaks it, for example ``core 3, neuron 17``.
+    found, allowed : str
+        What is there, and what the rule allows.
+    rule : str
+        Its name in the target file, for example ``truenorth.neuron.delay``.
+    remedy : str
+        What would mend it.
+    """
+
+    where: str
+    found: str
+    allowed: str
+    rule: str
+    remedy: str
+
+    def __str__(self) -> str:
+        return f"{self.where}: {self.found}, allowed {self.allowed} ({self.rule}); {self.remedy}"
+
+
+class RuleError(SpikeloomError):
+    """A network breaks rules of its chip; holds every fault, not the first."""
+
+    def __init__(self, faults: tuple[Fault, ...]) -> None:
+        self.faults = faults
+        super().__init__("\n".join(str(fault) for fault in faults))

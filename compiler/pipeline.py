@@ -18,14 +18,12 @@ from compiler.ir import IntegerNetwork, Network
 from compiler.netlist import Netlist
 from compiler.passes.bounds import RangeProof, prove_ranges
 from compiler.passes.calibrate import FEW, MANY, Calibration, calibrate, evenly_spaced
-from compiler.passes.emit import Origin, emit
 from compiler.passes.exact import Exactness, make_exact
-from compiler.passes.layout import Layout, lay_out, require_goal
-from compiler.passes.legalize import LimitUse, require_legal
+from compiler.passes.layout import Layout, require_goal
+from compiler.passes.legalize import LimitUse
 from compiler.passes.place import Placement
 from compiler.passes.prune import (
     Removal,
-    compact,
     disconnect,
     either,
     never_fired,
@@ -35,11 +33,40 @@ from compiler.passes.prune import (
     removals,
 )
 from compiler.passes.quantize import Choice, Recipe, check_recipes, quantize, round_to_forms
+from compiler.placing import place_integers
 from compiler.targets import Target, load_target
 from compiler.verify import verify
 
 STAGES = ("expand", "quantize", "place")
 """Stages after which the artefact can be dumped: float network, integer network, netlist."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Stored:
+    """A network in the integers of the chip, from which any layout can be made.
+
+    Parameters
+    ----------
+    network : Network
+        Float stage, expanded.
+    integer : IntegerNetwork
+        Integer stage.
+    choices, exactness : tuple of Choice, tuple of Exactness
+        As in :class:`Compilation`.
+    calibration : Calibration or None
+        What the float model did on training recordings, where there are any.
+    silent, unheard, unused : tuple of (neurons,) bool
+        Neurons to leave out, by population, and why: they cannot fire, nobody hears them, they never fired.
+    """
+
+    network: Network
+    integer: IntegerNetwork
+    choices: tuple[Choice, ...]
+    exactness: tuple[Exactness, ...]
+    calibration: Calibration | None
+    silent: tuple[npt.NDArray[np.bool_], ...]
+    unheard: tuple[npt.NDArray[np.bool_], ...]
+    unused: tuple[npt.NDArray[np.bool_], ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -93,80 +120,6 @@ class Compilation:
     def core_bound(self) -> int:
         """No legal partition uses fewer cores."""
         return self.layout.parts.bound
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Placed:
-    """An integer network on cores.
-
-    Parameters
-    ----------
-    netlist : Netlist
-        The result.
-    uses : tuple of LimitUse
-        Use of every limit by every core.
-    layout, usual : Layout
-        Cores and tiles; and those of the layout of fewest cores.
-    silent, unheard : tuple of (neurons,) bool
-        Neurons left out, by population.
-    """
-
-    netlist: Netlist
-    uses: tuple[LimitUse, ...]
-    layout: Layout
-    usual: Layout
-    silent: tuple[npt.NDArray[np.bool_], ...]
-    unheard: tuple[npt.NDArray[np.bool_], ...]
-
-
-def place_integers(
-    integer: IntegerNetwork,
-    *,
-    target: str = "loihi1",
-    keep_all: bool = False,
-    cores_for: Mapping[str, int] | None = None,
-    chips: int = 1,
-    optimize: str = "cores",
-    calibration: Calibration | None = None,
-    provenance: Mapping[str, Any] | None = None,
-) -> Placed:
-    """Put an integer network on the cores of a chip, as it stands.
-
-    Parameters
-    ----------
-    integer : IntegerNetwork
-        Integer stage, verified.
-    target, keep_all, cores_for, chips, optimize, provenance
-        See :func:`compile_network`.
-    calibration : Calibration, optional
-        What layouts are judged by.
-
-    Raises
-    ------
-    OptionError, CapacityError
-        As the passes say.
-    """
-    chip = load_target(target)
-    silent, unheard = (nobody(integer), nobody(integer)) if keep_all else removable(integer)
-    laid, identity = compact(integer, either(silent, unheard))
-    rates: tuple[FloatArray, ...] | None = None
-    if calibration is not None:
-        every = tuple(spikes.mean(axis=(0, 1)) for spikes in calibration.spikes)
-        rates = tuple(rate[ids] for rate, ids in zip(every, identity, strict=True))
-    layout, usual = lay_out(
-        laid,
-        chip,
-        goal=optimize,
-        cores_for=cores_for,
-        chips=chips,
-        rates=rates,
-        calibration=calibration,
-        identity=identity,
-    )
-    origin = Origin(network=integer, identity=identity, unheard=unheard)
-    netlist = emit(laid, layout.parts, layout.placement.tiles, chip, provenance or {}, origin)
-    uses = require_legal(netlist, chip)
-    return Placed(netlist=netlist, uses=uses, layout=layout, usual=usual, silent=silent, unheard=unheard)
 
 
 def compile_network(
@@ -229,9 +182,47 @@ def compile_network(
         As the passes say.
     """
     chip = load_target(target)
+    require_goal(optimize, cores_for, chip, calibrated=training_events is not None, chips=chips)
+    publish = after or (lambda _stage, _artefact: None)
+    stored = store(
+        network,
+        forms=forms,
+        target=target,
+        recipes=recipes,
+        spike_exact=spike_exact,
+        keep_all=keep_all,
+        prune_unused=prune_unused,
+        training_events=training_events,
+        ranges=ranges,
+        margin=margin,
+        after=publish,
+    )
+    made = place(stored, target=target, cores_for=cores_for, chips=chips, optimize=optimize, provenance=provenance)
+    publish("place", made.netlist)
+    return made
+
+
+def store(
+    network: Network,
+    *,
+    forms: Sequence[Form] | None = None,
+    target: str = "loihi1",
+    recipes: Sequence[Recipe] | None = None,
+    spike_exact: bool = False,
+    keep_all: bool = False,
+    prune_unused: bool = False,
+    training_events: npt.NDArray[Any] | None = None,
+    ranges: str = "proven",
+    margin: float = 0.1,
+    after: Callable[[str, Network | IntegerNetwork], object] | None = None,
+) -> Stored:
+    """Round a float network to the integers of the chip: the longest part of a compilation, before any layout.
+
+    Parameters and errors as of :func:`compile_network`.
+    """
+    chip = load_target(target)
     if not 0 <= margin < math.inf:
         raise OptionError(f"--margin {margin:g}: is no share to add to a range; give a number from 0")
-    require_goal(optimize, cores_for, chip, calibrated=training_events is not None, chips=chips)
     publish = after or (lambda _stage, _artefact: None)
 
     verify(network)
@@ -273,26 +264,51 @@ def compile_network(
     verify(integer)
     publish("quantize", integer)
 
+    silent, unheard = (nobody(network), nobody(network)) if keep_all else removable(integer)
+    return Stored(
+        network=whole,
+        integer=integer,
+        choices=choices,
+        exactness=exactness,
+        calibration=calibration,
+        silent=silent,
+        unheard=unheard,
+        unused=unused,
+    )
+
+
+def place(
+    stored: Stored,
+    *,
+    target: str = "loihi1",
+    cores_for: Mapping[str, int] | None = None,
+    chips: int = 1,
+    optimize: str = "cores",
+    provenance: Mapping[str, Any] | None = None,
+) -> Compilation:
+    """Lay out a rounded network: which neuron sits where has no influence on any spike.
+
+    Parameters and errors as of :func:`compile_network`.
+    """
     placed = place_integers(
-        integer,
+        stored.integer,
+        removed=(stored.silent, stored.unheard),
         target=target,
-        keep_all=keep_all,
         cores_for=cores_for,
         chips=chips,
         optimize=optimize,
-        calibration=calibration,
+        calibration=stored.calibration,
         provenance=provenance,
     )
-    publish("place", placed.netlist)
     return Compilation(
-        network=whole,
-        integer=integer,
+        network=stored.network,
+        integer=stored.integer,
         netlist=placed.netlist,
-        choices=choices,
-        exactness=exactness,
-        proofs=prove_ranges(integer),
+        choices=stored.choices,
+        exactness=stored.exactness,
+        proofs=prove_ranges(stored.integer),
         uses=placed.uses,
-        removals=removals(whole, placed.silent, placed.unheard, unused),
+        removals=removals(stored.network, stored.silent, stored.unheard, stored.unused),
         goal=optimize,
         layout=placed.layout,
         usual=placed.usual,
@@ -327,15 +343,14 @@ def without(
     CapacityError
         If a limit cannot be kept.
     """
-    chip, integer = load_target(target), compilation.integer
-    silent, unheard = removable(integer)
-    laid, identity = compact(integer, either(either(silent, unheard), unused))
-    left = None if rates is None else tuple(rate[ids] for rate, ids in zip(rates, identity, strict=True))
-    layout, _ = lay_out(laid, chip, rates=left)
-    origin = Origin(network=integer, identity=identity, unheard=unheard)
-    netlist = emit(laid, layout.parts, layout.placement.tiles, chip, compilation.netlist.provenance, origin)
-    require_legal(netlist, chip)
-    return netlist
+    silent, unheard = removable(compilation.integer)
+    return place_integers(
+        compilation.integer,
+        removed=(either(silent, unused), unheard),
+        target=target,
+        rates=rates,
+        provenance=compilation.netlist.provenance,
+    ).netlist
 
 
 def _require_stored(network: Network, forms: Sequence[Form], chip: Target) -> None:

@@ -18,12 +18,8 @@ Equal netlists give equal bytes: members are stored, not compressed, in a fixed 
 
 from __future__ import annotations
 
-import hashlib
-import io
-import json
 import math
 import os
-import struct
 import zipfile
 from collections.abc import Mapping
 from dataclasses import asdict, fields
@@ -32,7 +28,7 @@ from typing import Any
 
 import numpy as np
 
-from compiler.atomic import write_atomically
+from compiler.archive import Array, archive_bytes, read_archive, write_archive
 from compiler.dynamics import MOST_CLOCKS, MOST_STEPS, NO_CLOCKS, Clocks
 from compiler.errors import FormatError
 from compiler.netlist import Layer, Netlist, frozen, read_only, read_only_float
@@ -45,36 +41,12 @@ VERSIONS = (2, 3)
 LARGE = frozenset({"synapse_target", "synapse_weight"})
 """Arrays that stay in the type that they are stored in."""
 
-SIZE_LIMIT = 2**32
-"""Bytes that a netlist file may have, 4 GiB: some hundred times the synapses of a whole chip."""
-
 FLOATS = frozenset({"scale"})
 """Array members of real numbers."""
 
-_EPOCH = (1980, 1, 1, 0, 0, 0)
-_ZIP_ERRORS = (zipfile.BadZipFile, struct.error, ValueError, EOFError, OverflowError, MemoryError, RuntimeError)
-"""What zipfile and numpy raise on content that is no netlist; a header may announce more than the memory holds."""
 _SCALARS = ("target", "taxels", "polarities", "classes", "layers", "provenance", "clocks")
 ARRAYS = tuple(field.name for field in fields(Netlist) if field.name not in _SCALARS)
 """Array members in file order."""
-
-
-def _narrow(array: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-    if array.dtype.kind == "f":
-        return array.astype("<f8")
-    for dtype in ("<i1", "<i2", "<i4"):
-        info = np.iinfo(dtype)
-        if not array.size or (info.min <= array.min() and array.max() <= info.max):
-            return array.astype(dtype)
-    return array.astype("<i8")
-
-
-def _digest(members: dict[str, np.ndarray[Any, Any]]) -> str:
-    digest = hashlib.sha256()
-    for name, array in members.items():
-        digest.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
-        digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()
 
 
 def manifest_of(netlist: Netlist) -> dict[str, Any]:
@@ -100,17 +72,7 @@ def manifest_of(netlist: Netlist) -> dict[str, Any]:
 
 def netlist_bytes(netlist: Netlist) -> bytes:
     """File content of a netlist; equal netlists give equal bytes."""
-    manifest = json.dumps(manifest_of(netlist), sort_keys=True)
-    members: dict[str, np.ndarray[Any, Any]] = {"manifest": np.array(manifest)}
-    members |= {name: _narrow(getattr(netlist, name)) for name in ARRAYS}
-    members["sha256"] = np.array(_digest(members))
-    file = io.BytesIO()
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
-        for name, array in members.items():
-            content = io.BytesIO()
-            np.lib.format.write_array(content, array, version=(1, 0), allow_pickle=False)
-            archive.writestr(zipfile.ZipInfo(f"{name}.npy", date_time=_EPOCH), content.getvalue())
-    return file.getvalue()
+    return archive_bytes(manifest_of(netlist), {name: getattr(netlist, name) for name in ARRAYS})
 
 
 def write_netlist(netlist: Netlist, path: str | os.PathLike[str]) -> str:
@@ -121,30 +83,7 @@ def write_netlist(netlist: Netlist, path: str | os.PathLike[str]) -> str:
     OSError
         If the file cannot be written; an older file is left as it was.
     """
-    content = netlist_bytes(netlist)
-    with write_atomically(path) as file:
-        file.write(content)
-    return hashlib.sha256(content).hexdigest()
-
-
-def _members(path: Path) -> dict[str, np.ndarray[Any, Any]]:
-    if path.stat().st_size > SIZE_LIMIT:
-        raise FormatError(f"{path}: {path.stat().st_size} bytes, {SIZE_LIMIT} allowed; this is no netlist of one chip")
-    file = io.BytesIO(path.read_bytes())
-    try:
-        with zipfile.ZipFile(file) as archive:
-            infos = archive.infolist()
-            if any(info.compress_type != zipfile.ZIP_STORED for info in infos):
-                raise FormatError(f"{path}: has compressed members, a netlist stores them plainly; compile it again")
-            if sum(info.file_size for info in infos) > len(file.getbuffer()):
-                raise FormatError(f"{path}: declares more bytes than it has; compile it again")
-            found = {}
-            for info in infos:
-                content = io.BytesIO(archive.read(info))
-                found[info.filename.removesuffix(".npy")] = np.lib.format.read_array(content, allow_pickle=False)
-            return found
-    except _ZIP_ERRORS as error:
-        raise FormatError(f"{path}: is truncated or not a netlist ({error}); compile it again") from error
+    return write_archive(netlist_bytes(netlist), path)
 
 
 def read_netlist(path: str | os.PathLike[str]) -> Netlist:
@@ -158,56 +97,26 @@ def read_netlist(path: str | os.PathLike[str]) -> Netlist:
         If it cannot be read.
     """
     path = Path(path)
-    if not path.is_file():
-        found = "is not a file" if path.exists() else "no such file"
-        raise FormatError(f"{path}: {found}; write one with spikeloom compile")
-    members = _members(path)
-    missing = sorted({"manifest", "sha256"} - set(members))
-    if missing:
-        raise FormatError(f"{path}: is not a netlist (no {' and no '.join(missing)}); write one with spikeloom compile")
-    try:
-        manifest = json.loads(str(members["manifest"]))
-    except (ValueError, RecursionError) as error:
-        raise FormatError(f"{path}: has an unreadable manifest; compile it again") from error
-    _require_manifest(path, manifest)
-    stated = str(members.pop("sha256"))
-    names = {"manifest", *ARRAYS}
-    if set(members) != names:
-        odd = ", ".join(sorted(names ^ set(members)))
-        raise FormatError(f"{path}: has missing or unknown members ({odd}); compile it again")
-    if _digest({"manifest": members["manifest"], **{name: members[name] for name in ARRAYS}}) != stated:
-        raise FormatError(f"{path}: its content does not match its hash, so it was altered; compile it again")
-    return netlist_of(path, manifest, members)
+    return netlist_of(path, *read_archive(path, FORMAT, VERSIONS, ARRAYS))
 
 
-def _require_manifest(path: Path, manifest: Any) -> None:
-    if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
-        raise FormatError(f"{path}: is not a netlist; write one with spikeloom compile")
-    if manifest.get("version") not in VERSIONS:
-        raise FormatError(
-            f"{path}: has format version {manifest.get('version')}, this program reads "
-            f"{' and '.join(map(str, VERSIONS))}; compile it again or update spikeloom"
-        )
-
-
-def netlist_of(path: Path, manifest: Any, members: Mapping[str, np.ndarray[Any, Any]]) -> Netlist:
+def netlist_of(path: Path, manifest: dict[str, Any], members: Mapping[str, Array]) -> Netlist:
     """Put a netlist together from what a file holds, and check it.
 
     Parameters
     ----------
     path : Path
         For messages.
-    manifest : JSON value
-        As :func:`manifest_of` gives it.
+    manifest : JSON object
+        As :func:`manifest_of` gives it; format and version are known to be ours.
     members : mapping of str to array
         Every one of ``ARRAYS``.
 
     Raises
     ------
     FormatError
-        If it is from another version or inconsistent.
+        If it is inconsistent.
     """
-    _require_manifest(path, manifest)
     if manifest["version"] == VERSIONS[0]:
         manifest = _widened(manifest)
     faults = _type_faults(manifest, members)
@@ -253,7 +162,7 @@ def is_netlist(path: str | os.PathLike[str]) -> bool:
         return False
 
 
-def _type_faults(manifest: dict[str, Any], members: Mapping[str, np.ndarray[Any, Any]]) -> list[str]:
+def _type_faults(manifest: dict[str, Any], members: Mapping[str, Array]) -> list[str]:
     """Say which entries of the manifest or which arrays are missing or of another kind than :class:`Netlist` asks."""
     layers = manifest.get("layers")
     entries = {
@@ -296,7 +205,7 @@ def _is_layer(entry: Any) -> bool:
     return all(_is(entry[name], kind, 0) for name, kind in wanted.items() if name != "unheard")
 
 
-def _bounds_fault(name: str, bounds: np.ndarray[Any, Any], parts: int, total: int) -> str | None:
+def _bounds_fault(name: str, bounds: Array, parts: int, total: int) -> str | None:
     good = len(bounds) == parts + 1 and bounds[0] == 0 and bounds[-1] == total and np.all(np.diff(bounds) >= 0)
     return None if good else f"{name} does not divide {total} entries in {parts} parts"
 
@@ -320,7 +229,7 @@ def inconsistencies(netlist: Netlist) -> list[str]:
     if any(found):
         return [fault for fault in found if fault]
 
-    def outside(array: np.ndarray[Any, Any], low: int, high: int) -> bool:
+    def outside(array: Array, low: int, high: int) -> bool:
         return bool(array.size and (array.min() < low or array.max() >= high))
 
     ranges = {

@@ -26,9 +26,11 @@ from typing import Any
 
 import numpy as np
 
+from compiler.archive import require_manifest
 from compiler.errors import FormatError
 from compiler.netlist import Netlist
-from compiler.serialize import ARRAYS, FLOATS, manifest_of, netlist_bytes, netlist_of
+from compiler.serialize import ARRAYS, FLOATS, VERSIONS, manifest_of, netlist_bytes, netlist_of
+from compiler.serialize import FORMAT as NETLIST
 
 FORMAT = "spikeloom-nir-sidecar"
 VERSION = 1
@@ -137,7 +139,8 @@ def restore(nir: str | os.PathLike[str], conventions: tuple[str, ...]) -> Netlis
     arrays = values.get("arrays")
     if not isinstance(arrays, dict) or set(arrays) != set(ARRAYS):
         raise FormatError(f"{path}: has missing or unknown arrays; {_REMEDY}")
-    netlist = netlist_of(path, values.get("manifest"), {name: _array(path, name, arrays[name]) for name in ARRAYS})
+    members = {name: _array(path, name, arrays[name]) for name in ARRAYS}
+    netlist = netlist_of(path, require_manifest(path, values.get("manifest"), NETLIST, VERSIONS), members)
     if hashlib.sha256(netlist_bytes(netlist)).hexdigest() != values["loom_sha256"]:
         raise FormatError(f"{path}: its content does not match its hash, so it was altered; {_REMEDY}")
     return netlist

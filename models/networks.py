@@ -221,11 +221,24 @@ class SpikingNet(nn.Module):
         lengths : (samples,) int64, optional
             Steps of each recording, where some were filled up with silence.
         """
-        spikes = self.layers(events)[self.dense[-1]][0]
+        return self.rates(self.layers(events), lengths)
+
+    def rates(self, layers: Mapping[str, tuple[Tensor, Tensor]], lengths: Tensor | None = None) -> Tensor:
+        """Spikes per step of each output neuron, from what `layers` returned."""
+        spikes = layers[self.dense[-1]][0]
         if lengths is None:
             return spikes.mean(0)
         inside = torch.arange(len(spikes), device=spikes.device)[:, None] < lengths
         return torch.sum(spikes * inside[..., None], dim=0) / lengths[:, None]
+
+    def activity(self, layers: Mapping[str, tuple[Tensor, Tensor]]) -> Tensor:
+        """Share of the synapses behind neurons that carry a spike, mean over steps and samples; one number."""
+        used, there = torch.zeros(()), 0
+        for source, layer in zip(layers, self.dense, strict=False):
+            inputs, outputs = self.get_submodule(layer).get_parameter("weight").shape
+            used = used + layers[source][0].mean().cpu() * (inputs * outputs)
+            there += inputs * outputs
+        return used / there
 
     def export_weights(self) -> Weights:
         """Copy of the weights."""

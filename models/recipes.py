@@ -6,6 +6,7 @@ system or the graph, and nothing of how a training is reported (:mod:`models.pro
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -60,6 +61,9 @@ class Recipe:
         first, every layer's is rounded to what the chip holds.
     clocks : int
         Clock channels, see :mod:`compiler.dynamics`.
+    penalty : float
+        Added to the loss for each synapse that carries a spike in every step: this times the share of the synapses
+        behind neurons that do so, mean over steps and recordings.
     """
 
     name: str
@@ -79,11 +83,14 @@ class Recipe:
     betas: Decays = ()
     alphas: Decays = ()
     clocks: int = 0
+    penalty: float = 0.0
 
     def to_json(self) -> dict[str, Any]:
-        """JSON values; without the usual number of epochs, which a training states by itself."""
+        """JSON values; without the usual number of epochs, which a training states by itself, and a penalty of zero."""
         values = asdict(self) | {"betas": dict(self.betas), "alphas": dict(self.alphas)}
         del values["epochs"]
+        if not self.penalty:
+            del values["penalty"]
         return values
 
     def dynamics(self, layers: Iterable[str], beta: float, steps: int) -> Dynamics:
@@ -177,6 +184,8 @@ def check_recipe(recipe: Recipe) -> None:
     for option, value, most in (("features", recipe.features, 1024), ("batch", recipe.batch, 1024)):
         if not 1 <= value <= most:
             raise OptionError(f"--{option} {value}: allowed are 1 to {most}; choose another")
+    if not 0 <= recipe.penalty < math.inf:
+        raise OptionError(f"--spike-penalty {recipe.penalty:g}: allowed are numbers from 0 up; choose another")
     if not 0 <= recipe.clocks <= MOST_CLOCKS:
         raise OptionError(f"--clocks {recipe.clocks}: allowed are 0 to {MOST_CLOCKS}; choose another")
     if recipe.clocks and dict(recipe.alphas).get("conv1"):

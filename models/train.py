@@ -55,7 +55,7 @@ class Epoch:
         While it ran.
     training_loss, test_loss : float
         The recipe's loss, by default the mean squared error of the spike rates against zeros and a one; mean over the
-        recordings.
+        recordings. A penalty on spikes counts in training only.
     correct, tested : int
         Test recordings classified correctly after it, and all of them.
     """
@@ -324,7 +324,7 @@ def _train_epoch(
     *,
     epoch: int,
 ) -> float:
-    total = 0.0
+    total, device = 0.0, network.adjacency.device
     for step, start in enumerate(range(0, len(order), recipe.batch), 1):
         chosen = order[start : start + recipe.batch]
         if course is not None:
@@ -333,7 +333,11 @@ def _train_epoch(
         lengths = np.array([recordings.steps_of(int(index)) for index in chosen])
         events = recordings.events[chosen][..., : lengths.max()]
         filled = lengths if lengths.min() < lengths.max() else None
-        loss = _loss(recipe, _rates(network, events, filled), recordings.labels[chosen])
+        layers = network.layers(_time_first(events).to(device))
+        inside = None if filled is None else torch.tensor(filled, device=device)
+        loss = _loss(recipe, network.rates(layers, inside).cpu(), recordings.labels[chosen])
+        if recipe.penalty:
+            loss = loss + recipe.penalty * network.activity(layers)
         found = float(loss.detach())
         _require_finite(found, epoch, step)
         loss.backward()  # type: ignore[no-untyped-call]
@@ -356,11 +360,9 @@ def rate_loss(rates: Tensor, labels: NDArray[np.int64]) -> Tensor:
     return torch.nn.functional.mse_loss(rates, target)
 
 
-def _rates(network: SpikingNet, events: NDArray[np.uint8], lengths: NDArray[np.int64] | None = None) -> Tensor:
-    """Spike rates on the CPU, computed where the network is; `lengths` where some recordings were filled up."""
-    device = network.adjacency.device
-    inside = None if lengths is None else torch.tensor(lengths, device=device)
-    rates: Tensor = network(_time_first(events).to(device), inside).cpu()
+def _rates(network: SpikingNet, events: NDArray[np.uint8]) -> Tensor:
+    """Spike rates on the CPU, computed where the network is."""
+    rates: Tensor = network(_time_first(events).to(network.adjacency.device)).cpu()
     return rates
 
 

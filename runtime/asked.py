@@ -57,6 +57,12 @@ class Asked:
     format: str = "checkpoint"
     read_as: Mapping[str, Any] = field(default_factory=dict)
 
+    def origin(self, run: int) -> dict[str, Any]:
+        """What a netlist remembers of the file; `run` is which of a released file's runs was asked for."""
+        if self.checkpoint is None:
+            return {"format": self.format, **self.read_as}
+        return {"run": run, "weights": self.checkpoint.weights, "graph": self.graph}
+
     @property
     def model(self) -> Checkpoint | Network:
         """What float spikes are computed from: the checkpoint in its own operator order where there is one."""

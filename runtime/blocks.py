@@ -135,6 +135,17 @@ def lay_out_blocks(netlist: Netlist) -> Blocks | None:
     )
 
 
+def obstacle(netlist: Netlist) -> str | None:
+    """Why there are no blocks of a netlist; None if there are."""
+    if not _is_pipeline(netlist):
+        return "a layer hears others than the one before it"
+    if not _in_range(netlist):
+        return "a sum may leave 16 bits, or a membrane or current its register"
+    if lay_out_blocks(netlist) is None:
+        return "synapses too scattered for rows of 64"
+    return None
+
+
 def charge_rows(netlist: Netlist, blocks: Blocks, charges: Charges | None) -> ChargeRows:
     """Lay charges out for the kernel: padded, by channel and position."""
     if charges is None:
@@ -150,7 +161,7 @@ def charge_rows(netlist: Netlist, blocks: Blocks, charges: Charges | None) -> Ch
     source[channels + seated, :sums] = charges.spikes[blocks.compartment[seated]]
     update[seated, :sums] = charges.updates[blocks.compartment[seated]]
     begins = np.append(0, channels + blocks.stage * LANES)  # of the channels, then of the positions of each stage
-    most = np.add.reduceat(np.abs(source.astype(np.int64)), begins[:-1], axis=0).max(initial=0)
+    most = _sums_between(np.abs(source.astype(np.int64)), begins).max(initial=0)
     kinds, kind = np.unique(update, axis=0, return_inverse=True)
     groups, member = np.unique(np.arange(len(update)) // LANES * len(kinds) + kind.reshape(-1), return_inverse=True)
     words = np.zeros(len(groups), np.uint64)
@@ -160,12 +171,19 @@ def charge_rows(netlist: Netlist, blocks: Blocks, charges: Charges | None) -> Ch
         width=width,
         narrow=bool(most < 2**31),
         source=source.reshape(-1),
-        everyone=np.add.reduceat(update, blocks.stage[:-1] * LANES, axis=0).reshape(-1),
+        everyone=_sums_between(update, blocks.stage * LANES).reshape(-1),
         update=kinds.reshape(-1),
         first=np.searchsorted(block, np.arange(len(blocks.layer) + 1)),
         group=group,
         member=words,
     )
+
+
+def _sums_between(rows: IntArray, bounds: IntArray) -> IntArray:
+    """Sums of the rows from each bound to the next, zero where there are none; ``np.add.reduceat`` has one there."""
+    below = np.concatenate([np.zeros((1, rows.shape[1]), np.int64), np.cumsum(rows, axis=0)])
+    sums: IntArray = below[bounds[1:]] - below[bounds[:-1]]
+    return sums
 
 
 class _Seats(NamedTuple):

@@ -80,7 +80,7 @@ def breakdowns(
     found: list[Breakdown] = []
     for name, ours, theirs, ids in zip(names, reference, chip, neurons, strict=True):
         found += _fallen(name, ours.sum(axis=(0, 1)), theirs.sum(axis=(0, 1)), ids)
-    return (*found, *_decisions(*votes, files), *_empty(votes, events, files, lengths))
+    return (*found, *undecided(*votes, files), *_empty(votes, events, files, lengths))
 
 
 def _fallen(name: str, before: IntArray, after: IntArray, ids: IntArray) -> list[Breakdown]:
@@ -104,8 +104,8 @@ def _fallen(name: str, before: IntArray, after: IntArray, ids: IntArray) -> list
     return found
 
 
-def _decisions(before: IntArray, after: IntArray, files: Sequence[str]) -> list[Breakdown]:
-    """Decisions that say nothing about the recording."""
+def undecided(before: IntArray, after: IntArray, files: Sequence[str]) -> list[Breakdown]:
+    """Decisions that say nothing about the recording; votes (samples, classes) of the reference and of the chip."""
     found = []
     decided, wanted = vote(after), vote(before)
     if len(set(decided)) == 1 and len(set(wanted)) > 1:

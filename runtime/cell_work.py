@@ -5,15 +5,22 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from contextlib import closing
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+from compiler.errors import DataError, UnfinishedError
 from compiler.frontends.systems import GCN, GRID_CNN, MLP, TACTILESGNET
+from models.evtouch import Recordings
 from runtime import paper_table
 from runtime.cells import FORMAT, SAME_PADDING, Row, write_cell
+from runtime.cluster import ClusterLostError
 from runtime.inputs import progress
+from runtime.sweep import Point, left_out, spread
 from runtime.training import Job
+from runtime.workers import ProcessDied, ended_by_signal
 
 Json = dict[str, Any]
 
@@ -39,6 +46,8 @@ class Work:
         Its training.
     place : Path
         Where its figures go.
+    data : str
+        Its recordings, as another process may name them.
     sha256 : str
         Of its recordings.
     """
@@ -47,6 +56,7 @@ class Work:
     seed: int
     job: Job
     place: Path
+    data: str
     sha256: str
 
     @property
@@ -82,8 +92,52 @@ def run_cell(work: Work) -> Json:
     return found
 
 
+def run_cell_elsewhere(work: Work) -> Json:
+    """What `run_cell` does, of a cell that came without its recordings, see `_for_elsewhere`."""
+    training, test = splits_on_worker(work.data, work.sha256)
+    return run_cell(replace(work, job=replace(work.job, training=training, test=test)))
+
+
+@lru_cache(maxsize=2)
+def splits_on_worker(data: str, sha256: str) -> tuple[Recordings, Recordings]:
+    """Recordings as a worker finds them.
+
+    Raises
+    ------
+    DataError
+        If they are not those of everybody else.
+    """
+    from models.events import BIN_S
+    from models.graphs import NEUTOUCH
+    from models.protocols import data_digest
+    from runtime.train_command import both_splits
+
+    training, test = both_splits(data, len(NEUTOUCH), BIN_S)
+    if data_digest(training, test) != sha256:
+        raise DataError(f"{data}: holds other recordings on a worker than here; share the folder, or copy it there")
+    return training, test
+
+
+def _for_elsewhere(work: Work) -> Work:
+    """A cell that fits through a network: paths that hold on every machine of a shared folder, no recordings."""
+    training, test = (
+        replace(each, events=each.events[:0], labels=each.labels[:0], files=(), lengths=None)
+        for each in (work.job.training, work.job.test)
+    )
+    job = replace(work.job, training=training, test=test, output=work.job.output.absolute(), position=0)
+    data = str(Path(work.data).absolute()) if Path(work.data).exists() else work.data
+    return replace(work, job=job, place=work.place.absolute(), data=data)
+
+
 def make(
-    work: Sequence[Work], folder: Path, *, there: int, planned: int, most: int | None, after: Callable[[], object]
+    work: Sequence[Work],
+    folder: Path,
+    *,
+    there: int,
+    planned: int,
+    jobs: int | None,
+    scheduler: str | None,
+    after: Callable[[], object],
 ) -> None:
     """Make cells side by side; a line on stderr tells of each, and how long the rest takes.
 
@@ -95,8 +149,10 @@ def make(
         Where they are kept, for messages.
     there, planned : int
         Cells that are there already, and all.
-    most : int, optional
+    jobs : int, optional
         Processes at a time; 1 stays in this one. As many as there are cores by default.
+    scheduler : str, optional
+        Of a Dask cluster, on whose workers to make them instead.
     after : callable
         Called when a cell is done.
 
@@ -104,34 +160,48 @@ def make(
     ------
     SpikeloomError, OSError, MemoryError
         What ended a cell.
+    UnfinishedError
+        If cells ended their process too often, or the scheduler was lost.
     KeyboardInterrupt
         On an interrupt or a request to end; its text says what is kept.
     """
-    from runtime.seeds import ended_by_signal, finished, side_by_side
+    from runtime.seeds import finished
 
-    costs = [_cost(each, trained=finished(each.job)) for each in work]
-    began, results = time.monotonic(), dict[int, Json]()
+    costs = {each.place.stem: _cost(each, trained=finished(each.job)) for each in work}
+    began, spent, made = time.monotonic(), 0.0, 0
     taken = sum(finished(each.job) for each in work)
     _tell(f"{there} of {planned} cells are there; {taken} more networks to measure, {len(work) - taken} to train")
+    run, prepare = (run_cell, _as_it_is) if scheduler is None else (run_cell_elsewhere, _for_elsewhere)
+    points = [Point(key=each.place.stem, label=each.place.stem, payload=prepare(each)) for each in work]
+    lost = []
 
-    def done(index: int) -> None:
-        after()
-        spent, whole = sum(costs[i] for i in results), sum(costs)
-        left = (time.monotonic() - began) * (whole - spent) / spent
-        line = f"{there + len(results)} of {planned} cells, {duration(left)} left: {work[index].place.stem}"
-        _tell(f"{line} {_figures(results[index])}")
+    def kept() -> str:
+        return f"{there + made} of {planned} cells and the epochs so far are kept in {folder}"
 
     try:
-        with ended_by_signal():
-            if most == 1 or len(work) == 1:
-                for index, each in enumerate(work):
-                    results[index] = run_cell(each)
-                    done(index)
-            else:
-                side_by_side(work, range(len(work)), results, run_cell, most=most, fewer="--jobs", done=done)
+        with ended_by_signal(), closing(spread(points, run, jobs=jobs, scheduler=scheduler)) as cells:
+            for point, found in cells:
+                if isinstance(found, ProcessDied):
+                    lost.append(left_out(point, found))
+                elif isinstance(found, Exception):
+                    raise found
+                else:
+                    made += 1
+                    spent += costs[point.key]
+                    after()
+                    left = (time.monotonic() - began) * (sum(costs.values()) - spent) / spent
+                    line = f"{there + made} of {planned} cells, {duration(left)} left: {point.label}"
+                    _tell(f"{line} {_figures(found)}")
+    except ClusterLostError as error:
+        lost.append(str(error))
     except KeyboardInterrupt as interrupt:
-        kept = f"{there + len(results)} of {planned} cells and the epochs so far are kept in {folder}"
-        raise KeyboardInterrupt(f"{kept}; go on with the same command and --resume") from interrupt
+        raise KeyboardInterrupt(f"{kept()}; go on with the same command and --resume") from interrupt
+    if lost:
+        raise UnfinishedError("\n".join([*lost, kept()]), resume=("--resume",))
+
+
+def _as_it_is(work: Work) -> Work:
+    return work
 
 
 def _tell(line: str) -> None:

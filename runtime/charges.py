@@ -5,6 +5,8 @@ How long a core sweeps, sends and receives is a sum over events; so the events t
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from compiler.errors import DataError
@@ -39,6 +41,15 @@ def charges(clock: Clock) -> Charges:
     channel = np.repeat(np.arange(netlist.n_inputs), np.diff(tables.channel_first))
     np.add.at(channels, (channel, cores + tables.channel_destination), tables.channel_processing)
     return Charges(channels=channels, spikes=spikes, updates=updates)
+
+
+def side_by_side(parts: Sequence[Charges]) -> Charges:
+    """Several charges as one: the sums of each after those before it."""
+    return Charges(
+        channels=np.concatenate([part.channels for part in parts], axis=1),
+        spikes=np.concatenate([part.spikes for part in parts], axis=1),
+        updates=np.concatenate([part.updates for part in parts], axis=1),
+    )
 
 
 def simple_from(clock: Clock, charged: IntArray, steps: IntArray) -> SimpleTimes:

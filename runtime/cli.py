@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import shlex
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
@@ -19,24 +20,29 @@ import numpy as np
 
 from compiler.atomic import write_atomically
 from compiler.dynamics import with_clocks
-from compiler.errors import OptionError, SpikeloomError
+from compiler.errors import OptionError, SpikeloomError, UnfinishedError
 from compiler.fixedpoint import IntArray
 from compiler.netlist import Netlist
 from compiler.passes.legalize import measure
 from compiler.serialize import is_netlist, read_netlist
 from compiler.targets import load_target, with_tables
+from compiler.truenorth.serialize import is_crossbars
 from models.evtouch import Recordings
 from models.grasps import SYNTHETIC
 from runtime import (
+    anytime,
     bits,
+    chart,
     decisions,
     explain,
     export,
     finetune,
     join,
+    lean,
     render,
     report,
     reproduce,
+    stress,
     verdicts,
     watch,
     yardstick_command,
@@ -52,10 +58,21 @@ from runtime.inputs import (
     require_place,
     version,
 )
-from runtime.options import add_compile, add_detail, add_model, add_network, add_recordings, add_training
+from runtime.options import (
+    MIN_AGREEMENT,
+    add_compile,
+    add_detail,
+    add_model,
+    add_recordings,
+    add_training,
+    add_verify,
+)
+from runtime.spent import Account, explained
 from runtime.tables import show
-from runtime.trace import ENGINES
+from runtime.trace import BoolArray
 from runtime.train_command import train
+from runtime.truenorth import commands as truenorth
+from runtime.windows import first_part, window_asked
 
 Arguments = argparse.Namespace
 Report = dict[str, Any]
@@ -69,16 +86,15 @@ DEMO = (
 )
 """The main job on what the package ships; ``demo`` runs these commands in a temporary folder."""
 
-MIN_AGREEMENT = 0.95
-
 
 def _sha256(path: str) -> str:
     return hashlib.sha256(Path(path).read_bytes()).hexdigest()
 
 
 def _recordings(arguments: Arguments, netlist: Netlist, *, labels_for: str | None = None) -> Recordings:
+    percent = window_asked(arguments.window)
     progress("reading the recordings")
-    return recordings(
+    found = recordings(
         arguments.data,
         arguments.split,
         limit=arguments.limit,
@@ -87,6 +103,7 @@ def _recordings(arguments: Arguments, netlist: Netlist, *, labels_for: str | Non
         bin_s=arguments.bin,
         labels_for=labels_for,
     )
+    return first_part(found, percent)
 
 
 def _inspect(arguments: Arguments) -> Outcome:
@@ -96,6 +113,8 @@ def _inspect(arguments: Arguments) -> Outcome:
             value = getattr(arguments, name)
             if value is not None and (name, value) != ("run", 0):
                 raise OptionError(f"--{name} {value}: is for checkpoints, {arguments.path} is a netlist; leave it away")
+        if is_crossbars(arguments.path):
+            return truenorth.inspect(arguments.path)
         netlist = read_netlist(arguments.path)
         uses = measure(netlist, load_target(netlist.target))
         return render.netlist_json(netlist, uses, _sha256(arguments.path)), render.netlist_text, 0
@@ -110,23 +129,32 @@ def _run(arguments: Arguments) -> Outcome:
 
     if arguments.spikes is not None:
         require_place(arguments.spikes, "--spikes", arguments)
+    if is_crossbars(arguments.netlist):
+        return truenorth.run(arguments)
     netlist = read_netlist(arguments.netlist)
     data = _recordings(arguments, netlist)
     progress("running")
     events = with_clocks(data.events, netlist.clocks)
+    account = Account(netlist, data)
     found: Report | None = None
-    if arguments.detail == "spikes" or arguments.spikes is not None:
+    if arguments.detail == "spikes":
+        account.begin("spikes" if arguments.spikes is None else "spikes kept")
         trace = engine.simulate(netlist, events, lengths=data.lengths, spikes=arguments.spikes is not None)
-        spikes = trace.counts.spikes
-        if trace.spikes is not None:
-            layers = {layer.name: aligned(netlist, trace.spikes, i) for i, layer in enumerate(netlist.layers)}
-            with write_atomically(arguments.spikes) as file:
-                np.savez_compressed(file, **layers)  # type: ignore[arg-type]
-    if arguments.detail != "spikes":
-        spikes, found = _costs(arguments, netlist, data)
+        spikes, kept = trace.counts.spikes, trace.spikes
+    else:
+        shape = len(data), data.steps + netlist.max_depth, netlist.n_compartments
+        kept = None if arguments.spikes is None else np.zeros(shape, np.bool_)
+        account.begin(arguments.detail)
+        spikes, found = _costs(arguments, netlist, data, kept)
+    account.begin("no float")
+    if kept is not None:
+        layers = {layer.name: aligned(netlist, kept, i) for i, layer in enumerate(netlist.layers)}
+        with write_atomically(arguments.spikes) as file:
+            np.savez_compressed(file, **layers)  # type: ignore[arg-type]
     decided = predictions(netlist, spikes)
     report = decisions.run_json(data.files, data.labels, class_counts(netlist, spikes), decided)
-    return report | ({} if found is None else {"costs": found}), decisions.run_text, 0
+    report |= {} if found is None else {"costs": found}
+    return report | explained(arguments, account), decisions.run_text, 0
 
 
 def _verify(arguments: Arguments) -> Outcome:
@@ -147,6 +175,7 @@ def _verify(arguments: Arguments) -> Outcome:
     asked = asked_network(arguments.checkpoint, arguments)
     original = None if arguments.original is None else asked_network(arguments.original, arguments)
     data = _recordings(arguments, netlist, labels_for="verify")
+    account = Account(netlist, data, checked=arguments.spec_samples)
     verdict = verify(
         netlist,
         asked.model,
@@ -159,8 +188,9 @@ def _verify(arguments: Arguments) -> Outcome:
         spec_samples=arguments.spec_samples,
         engine_name=arguments.engine,
         lengths=data.lengths,
-        progress=progress,
+        progress=account.begin,
     )
+    told = explained(arguments, account)
     compiled_for = netlist.provenance.get("graph", asked.graph)
     if asked.graph not in (None, compiled_for):
         sys.stderr.write(
@@ -168,19 +198,27 @@ def _verify(arguments: Arguments) -> Outcome:
         )
     levels = levels_of(verdict)
     missed = unmet(levels, required)
-    return verdicts.verify_json(verdict, levels, missed), verdicts.verify_text, 1 if missed else 0
+    return verdicts.verify_json(verdict, levels, missed) | told, verdicts.verify_text, 1 if missed else 0
 
 
 def _estimate(arguments: Arguments) -> Outcome:
     from runtime.estimates import estimate_text
 
+    if is_crossbars(arguments.netlist):
+        return truenorth.estimate(arguments)
     netlist = read_netlist(arguments.netlist)
-    _, report = _costs(arguments, netlist, _recordings(arguments, netlist))
-    return report, estimate_text, 0
+    data = _recordings(arguments, netlist)
+    account = Account(netlist, data)
+    account.begin(arguments.detail)
+    _, report = _costs(arguments, netlist, data)
+    account.begin("no float")
+    return report | explained(arguments, account), estimate_text, 0
 
 
-def _costs(arguments: Arguments, netlist: Netlist, data: Recordings) -> tuple[IntArray, Report]:
-    """Spikes of each compartment, and what the recordings cost at the detail that was asked for."""
+def _costs(
+    arguments: Arguments, netlist: Netlist, data: Recordings, spikes: BoolArray | None = None
+) -> tuple[IntArray, Report]:
+    """Spikes of each compartment, and what the recordings cost at the detail that was asked for; fills `spikes`."""
     from runtime.estimate import estimate
     from runtime.estimates import estimate_json
 
@@ -193,6 +231,7 @@ def _costs(arguments: Arguments, netlist: Netlist, data: Recordings) -> tuple[In
         with_clocks(data.events, netlist.clocks),
         lengths=data.lengths,
         detail=arguments.detail,
+        spikes=spikes,
         progress=lambda done: progress(f"running: {done} of {len(data)}"),
     )
     return counts.spikes, estimate_json(netlist, target, found, bin_s=arguments.bin)
@@ -246,53 +285,31 @@ def build_parser() -> argparse.ArgumentParser:
 
     sub = command("run", _run, "run a netlist exactly as the chip would")
     sub.add_argument("netlist")
-    add_recordings(sub)
+    add_recordings(sub, window=True)
     add_detail(sub, ("spikes", "counts", "cycle"), "spikes")
     sub.add_argument("--spikes", metavar="OUT.npz", help="write the spikes of every layer, aligned with the data")
 
     sub = command("verify", _verify, "compare chip and float model, spike for spike")
-    sub.add_argument("netlist")
-    sub.add_argument("--checkpoint", required=True, metavar="CKPT|NET.onnx")
-    add_network(sub)
-    add_recordings(sub)
-    sub.add_argument(
-        "--original", metavar="CKPT", help="float model for E2 and E3 (default: the weights of --checkpoint)"
-    )
-    sub.add_argument(
-        "--spec-samples", type=int, default=3, metavar="N", help="recordings for spec = engine (default: 3)"
-    )
-    sub.add_argument(
-        "--engine",
-        choices=ENGINES,
-        default=ENGINES[0],
-        help=f"onnx: onnxruntime runs the integer graph beside our engine (default: {ENGINES[0]})",
-    )
-    sub.add_argument(
-        "--min-agreement",
-        type=float,
-        metavar="X",
-        help=f"share of equal decisions to pass (default: {MIN_AGREEMENT:g})",
-    )
-    sub.add_argument(
-        "--require",
-        metavar="E0,E2=X,E3=X",
-        help="levels to pass instead: E0 specification = engine, E2 share of spikes in every layer, E3 of decisions",
-    )
+    add_verify(sub)
 
     sub = command("estimate", _estimate, "synaptic operations, energy and time of an inference")
     sub.add_argument("netlist")
-    add_recordings(sub)
+    add_recordings(sub, window=True)
     add_detail(sub, ("counts", "cycle"), "counts")
 
     sub = command("train", train, "train a network by the released protocol, reported by the paper's and a clean one")
     add_training(sub)
+    anytime.add_arguments(command("anytime", anytime.anytime, anytime.SUMMARY))
     bits.add_arguments(command("bits", bits.bits, bits.SUMMARY))
+    chart.add_arguments(command("chart", chart.chart, chart.SUMMARY))
     explain.add_arguments(command("explain", explain.explain, explain.SUMMARY))
     export.add_arguments(command("export", export.export, export.SUMMARY))
     finetune.add_arguments(command("finetune", finetune.finetune, finetune.SUMMARY))
     join.add_arguments(command("join", join.join, join.SUMMARY))
+    lean.add_arguments(command("lean", lean.lean, lean.SUMMARY))
     report.add_arguments(command("report", report.report, report.SUMMARY))
     reproduce.add_arguments(command("reproduce", reproduce.reproduce, reproduce.SUMMARY))
+    stress.add_arguments(command("stress", stress.stress, stress.SUMMARY))
     watch.add_arguments(command("watch", watch.watch, watch.SUMMARY))
     yardstick_command.add_arguments(command("yardsticks", yardstick_command.measure, yardstick_command.SUMMARY))
     add_data_commands(commands)
@@ -310,6 +327,17 @@ def _mistake(error: Exception) -> str:
     return " ".join([str(error), *(f"({note})" for note in getattr(error, "__notes__", ()))])
 
 
+def _go_on(words: Sequence[str], more: Sequence[str]) -> str:
+    """Command that goes on where one has left off.
+
+    Examples
+    --------
+    >>> _go_on(["chart", "a b.pt", "--fresh"], ()), _go_on(["reproduce", "--resume"], ["--resume"])
+    ("spikeloom chart 'a b.pt'", 'spikeloom reproduce --resume')
+    """
+    return shlex.join(["spikeloom", *(w for w in words if w != "--fresh"), *(w for w in more if w not in words)])
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; return its exit code."""
     words = sys.argv[1:] if argv is None else argv
@@ -324,6 +352,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         if "--debug" in words:
             raise
         sys.stderr.writelines(f"spikeloom: {line}\n" for line in _mistake(error).splitlines())
+        if isinstance(error, UnfinishedError):
+            sys.stderr.write(f"spikeloom: go on with: {_go_on(words, error.resume)}\n")
+            return 1
         return 2
     except KeyboardInterrupt as interrupt:
         progress("")

@@ -16,13 +16,14 @@ from compiler.passes.layout import require_goal
 from compiler.passes.quantize import Recipe
 from compiler.pipeline import compile_network
 from compiler.serialize import read_netlist, write_netlist
-from compiler.targets import load_target
+from compiler.targets import CROSSBARS, known_targets, load_target
 from compiler.text import text
 from runtime import render
-from runtime.asked import asked_network
+from runtime.asked import Asked, asked_network
 from runtime.inputs import progress, recordings, require_place, version
 from runtime.options import MARGIN, cores_asked
 from runtime.restore import is_whole, take
+from runtime.truenorth.refusal import refuse
 
 Json = dict[str, Any]
 
@@ -35,13 +36,14 @@ def compile_netlist(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json
     require_place(arguments.output, "-o", arguments)
     if is_whole(arguments):
         return take(arguments)
+    if arguments.target in known_targets(CROSSBARS):
+        return refuse(arguments)
     if arguments.margin is not None and arguments.ranges != "observed":
         raise OptionError(
             f"--margin {arguments.margin:g}: only observed ranges have one; add --ranges observed or leave it away"
         )
-    margin = MARGIN if arguments.margin is None else arguments.margin
     chip = load_target(arguments.target)
-    recipes = _recipes(arguments)
+    recipes = recipes_asked(arguments)
     cores_for = cores_asked(arguments.cores_for)
     require_goal(arguments.optimize, cores_for, chip, calibrated=arguments.calibrate is not None, chips=arguments.chips)
     other = None if arguments.against is None else lift(read_netlist(arguments.against))
@@ -73,30 +75,11 @@ def compile_netlist(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json
         prune_unused=arguments.prune_unused,
         training_events=training,
         ranges=arguments.ranges,
-        margin=margin,
+        margin=_margin(arguments),
         cores_for=cores_for,
         chips=arguments.chips,
         optimize=arguments.optimize,
-        provenance={
-            "spikeloom": version(),
-            "checkpoint_sha256": asked.sha256,
-            **(
-                {"format": asked.format, **asked.read_as}
-                if checkpoint is None
-                else {"run": arguments.run, "weights": checkpoint.weights, "graph": asked.graph}
-            ),
-            **({"towers": checkpoint.towers} if checkpoint is not None and checkpoint.towers > 1 else {}),
-            **_storage(recipes, checkpoint),
-            "spike_exact": arguments.spike_exact,
-            "keep_all": arguments.keep_all,
-            "prune_unused": arguments.prune_unused,
-            "ranges": arguments.ranges,
-            "margin": margin,
-            "calibrated": training is not None,
-            **({"cores_for": cores_for} if cores_for else {}),
-            **({"chips": arguments.chips} if arguments.chips != 1 else {}),
-            **({"optimize": arguments.optimize} if arguments.optimize != "cores" else {}),
-        },
+        provenance=provenance(arguments, asked, calibrated=training is not None),
         after=dump,
     )
     report = render.compilation_json(compilation, write_netlist(compilation.netlist, arguments.output))
@@ -109,6 +92,41 @@ def compile_netlist(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json
             "registers": list(found.registers),
         }
     return report, _text, 0
+
+
+def provenance(arguments: argparse.Namespace, asked: Asked, *, calibrated: bool) -> Json:
+    """What a netlist remembers of its compilation.
+
+    Parameters
+    ----------
+    arguments : Namespace
+        Options of ``compile``.
+    asked : Asked
+        The network.
+    calibrated : bool
+        Whether recordings chose its scales.
+    """
+    checkpoint, cores_for = asked.checkpoint, cores_asked(arguments.cores_for)
+    return {
+        "spikeloom": version(),
+        "checkpoint_sha256": asked.sha256,
+        **asked.origin(arguments.run),
+        **({"towers": checkpoint.towers} if checkpoint is not None and checkpoint.towers > 1 else {}),
+        **storage(recipes_asked(arguments), checkpoint),
+        "spike_exact": arguments.spike_exact,
+        "keep_all": arguments.keep_all,
+        "prune_unused": arguments.prune_unused,
+        "ranges": arguments.ranges,
+        "margin": _margin(arguments),
+        "calibrated": calibrated,
+        **({"cores_for": cores_for} if cores_for else {}),
+        **({"chips": arguments.chips} if arguments.chips != 1 else {}),
+        **({"optimize": arguments.optimize} if arguments.optimize != "cores" else {}),
+    }
+
+
+def _margin(arguments: argparse.Namespace) -> float:
+    return float(MARGIN if arguments.margin is None else arguments.margin)
 
 
 def _text(report: Json) -> str:
@@ -130,8 +148,14 @@ def _numbers(text: str, option: str) -> list[int]:
         raise OptionError(f"{option} {text}: not a number; give one, or one for each layer as in 8,4,4,8") from None
 
 
-def _recipes(arguments: argparse.Namespace) -> tuple[Recipe, ...] | None:
-    """Storage that the options ask for, or None where they do not."""
+def recipes_asked(arguments: argparse.Namespace) -> tuple[Recipe, ...] | None:
+    """Storage that the options of ``compile`` ask for, or None where they do not.
+
+    Raises
+    ------
+    OptionError
+        If they are no numbers, or disagree about the number of layers.
+    """
     if not (arguments.weight_bits or arguments.planes or arguments.scale_groups):
         return None
     asked = {
@@ -147,7 +171,7 @@ def _recipes(arguments: argparse.Namespace) -> tuple[Recipe, ...] | None:
     return tuple(Recipe(bits=b, planes=p, groups=g) for b, p, g in zip(*columns, strict=True))
 
 
-def _storage(recipes: tuple[Recipe, ...] | None, checkpoint: Checkpoint | None) -> Json:
+def storage(recipes: tuple[Recipe, ...] | None, checkpoint: Checkpoint | None) -> Json:
     """The same for the provenance of a netlist."""
     if checkpoint is not None and checkpoint.forms is not None:
         return {"weight_bits": _one_or_list([form.bits for form in checkpoint.forms]), "fine_tuned": True}

@@ -23,7 +23,7 @@ from compiler.targets import Target
 from runtime import charges, cost, energy, engine, timing
 from runtime.cost import Costs
 from runtime.timing import DetailedTimes, SimpleTimes
-from runtime.trace import Charges, Counts
+from runtime.trace import BoolArray, Counts
 
 DETAILS = ("spikes", "counts", "cycle")
 
@@ -65,6 +65,7 @@ def estimate(
     *,
     lengths: IntArray | None = None,
     detail: str = "counts",
+    spikes: BoolArray | None = None,
     progress: Callable[[int], object] | None = None,
 ) -> tuple[Counts, Estimate]:
     """Run recordings and say what they cost.
@@ -81,6 +82,8 @@ def estimate(
         Data steps of each where some are shorter than T.
     detail : {"counts", "cycle"}
         How deep.
+    spikes : (samples, chip steps, compartments) bool, optional
+        Array to fill, see :class:`runtime.trace.Trace`.
     progress : callable, optional
         Told the number of recordings that are done.
 
@@ -101,20 +104,25 @@ def estimate(
     clocks = {times.name: timing.prepare(netlist, target, times) for times in timed}
     prepared = _charged(netlist, clocks)
     steps = np.full(len(events), events.shape[2]) if lengths is None else np.asarray(lengths, np.int64)
-    trace = engine.simulate(prepared, events, lengths=steps)
-    counts, simple = trace.counts, {}
-    if trace.charged is not None:
-        sums = np.split(trace.charged, len(clocks), axis=2)
+    detailed: dict[str, DetailedTimes] = {}
+    if detail == "cycle":
+        counts, charged, detailed, updates = _deep(prepared, clocks, events, steps, spikes, progress)
+    else:
+        trace = engine.simulate(prepared, events, lengths=steps, spikes=spikes is not None)
+        counts, charged = trace.counts, trace.charged
+        if spikes is not None:
+            spikes[:] = trace.spikes
+    simple = {}
+    if charged is not None:
+        sums = np.split(charged, len(clocks), axis=2)
         simple = {
             name: charges.simple_from(clock, own, steps + prepared.drain)
             for (name, clock), own in zip(clocks.items(), sums, strict=True)
         }
     costs = cost.estimate(cost.prepare(netlist, target), counts, steps)
     parts = {prices.name: energy.by_part(prices, costs.events) for prices in target.energy}
-    detailed: dict[str, DetailedTimes] = {}
     cores: dict[str, FloatArray] = {}
     if detail == "cycle":
-        detailed, updates = _deep(prepared, clocks, events, steps, progress)
         by_core = energy.count_by_core(netlist, target, counts, updates, steps + netlist.max_depth)
         for prices in target.energy:
             found = cost.price(prices, by_core)
@@ -134,12 +142,7 @@ def _charged(netlist: Netlist, clocks: Mapping[str, timing.Clock]) -> engine.Eng
     """An engine that adds up the times of the simple model, one table's after the other's."""
     if not clocks:
         return engine.prepare(netlist)
-    each = [charges.charges(clock) for clock in clocks.values()]
-    wanted = Charges(
-        channels=np.concatenate([found.channels for found in each], axis=1),
-        spikes=np.concatenate([found.spikes for found in each], axis=1),
-        updates=np.concatenate([found.updates for found in each], axis=1),
-    )
+    wanted = charges.side_by_side([charges.charges(clock) for clock in clocks.values()])
     return engine.prepare(netlist, charges=wanted)
 
 
@@ -148,21 +151,26 @@ def _deep(
     clocks: Mapping[str, timing.Clock],
     events: engine.EventArray,
     steps: IntArray,
+    spikes: BoolArray | None,
     progress: Callable[[int], object] | None,
-) -> tuple[dict[str, DetailedTimes], IntArray]:
-    """Detailed times, and updates of each core; some recordings at a time, as their spikes have to be kept."""
+) -> tuple[Counts, IntArray | None, dict[str, DetailedTimes], IntArray]:
+    """Counts, charges, detailed times and updates of each core; some recordings at a time, as their spikes are kept."""
     found: dict[str, list[DetailedTimes]] = {name: [] for name in clocks}
-    updates = []
+    counts, charged, updates = [], [], []
     for first in range(0, len(events), PART):
         part = slice(first, first + PART)
         trace = engine.simulate(prepared, events[part], lengths=steps[part], spikes=True, updated=True)
         assert trace.spikes is not None, "spikes were asked for"
         assert trace.updated is not None, "updates were asked for"
+        counts.append(trace.counts)
+        charged += [] if trace.charged is None else [trace.charged]
         updates.append(energy.updates_by_core(prepared.netlist, trace.updated))
         own = steps[part] + prepared.drain
         heard = events[part] * (np.arange(events.shape[2]) < steps[part, None, None])  # nothing after a recording's end
         for name, clock in clocks.items():
             found[name].append(timing.detailed(clock, trace.spikes, trace.updated, heard, steps=own))
+        if spikes is not None:
+            spikes[part] = trace.spikes
         if progress is not None:
             progress(min(first + PART, len(events)))
     joined = {
@@ -171,4 +179,5 @@ def _deep(
         )
         for name, times in found.items()
     }
-    return joined, np.concatenate(updates)
+    whole = Counts(**{f.name: np.concatenate([getattr(c, f.name) for c in counts]) for f in fields(Counts)})
+    return whole, np.concatenate(charged) if charged else None, joined, np.concatenate(updates)

@@ -21,7 +21,8 @@ from runtime import netx_export, nir_export, onnx_float, onnx_graph, sanafe
 from runtime.data_commands import add_bin_option
 from runtime.inputs import asked_checkpoint, asked_graph, propagation, recordings, require_place
 from runtime.onnx_nodes import port_words
-from runtime.options import add_model
+from runtime.options import DATA_HELP, MODEL, add_model
+from runtime.truenorth.commands import export_ranc
 
 Json = dict[str, Any]
 
@@ -29,6 +30,7 @@ SUMMARY = "write a network in the format of another program"
 
 FORMATS = {
     "sanafe": f"network and mapping of a netlist for SANA-FE {sanafe.VERSION}, YAML",
+    "ranc": "TrueNorth cores, and a recording, for RANC's simulator, JSON",
     "onnx": "a netlist as an integer ONNX graph, bit for bit the chip",
     "onnx-float": "the float network of a checkpoint as a static ONNX graph",
     "nir": "a netlist as a NIR file in weight units, with a side-car FILE.json that holds all of it",
@@ -36,17 +38,17 @@ FORMATS = {
 }
 """Values of ``--to``."""
 
-MODEL = {
-    "graph": None,
-    "taxels": None,
-    "edges": None,
-    "directed": False,
-    "run": 0,
-    "weights": None,
-    "beta": None,
-    "theta": None,
+RECORDING: dict[str, tuple[object, tuple[str, ...]]] = {
+    "data": (None, ("ranc", "netx")),
+    "split": (None, ("ranc", "netx")),
+    "bin": (BIN_S, ("ranc", "netx")),
+    "recording": (None, ("ranc",)),
+    "limit": (None, ("netx",)),
 }
-"""Options of checkpoints, and what they are where they are not given."""
+"""Options that name recordings: what they are where they are not given, and the formats that they are for."""
+
+OWN = {"dt": (None, "nir"), "strict": (False, "netx")}
+"""Other options of one format, likewise."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -58,13 +60,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--form", choices=onnx_graph.FORMS, help="onnx: one step with its state, or whole recordings (default: scan)"
     )
+    parser.add_argument(
+        "--data",
+        metavar="PATH",
+        help=f"ranc: a recording to add; netx: those on which spikes that move are counted; {DATA_HELP}",
+    )
+    parser.add_argument("--split", help="ranc, netx: split to read (default: test)")
+    parser.add_argument("--recording", type=int, metavar="N", help="ranc: which of them (default: 0)")
+    parser.add_argument("--limit", type=int, metavar="N", help="netx: first N of them only")
+    add_bin_option(parser)
     add_model(parser)
     parser.add_argument("--dt", type=float, metavar="SECONDS", help=f"nir: length of a step (default: {BIN_S:g})")
     parser.add_argument("--strict", action="store_true", help="netx: write nothing that had to be rounded")
-    parser.add_argument("--data", metavar="PATH", help="netx: recordings on which spikes that move are counted")
-    parser.add_argument("--split", default="test", help="split of them (default: test)")
-    parser.add_argument("--limit", type=int, metavar="N", help="first N of them only")
-    add_bin_option(parser)
     parser.add_argument("-o", "--output", required=True, metavar="FILE")
 
 
@@ -100,6 +107,11 @@ def _sanafe(arguments: argparse.Namespace) -> Written:
         "input_cores": list(places[netlist.n_cores :]),
         **({"floating_currents": list(floating)} if (floating := sanafe.floating_layers(netlist)) else {}),
     }
+    return Written(chunks=lines, facts=facts)
+
+
+def _ranc(arguments: argparse.Namespace) -> Written:
+    lines, facts = export_ranc(arguments)
     return Written(chunks=lines, facts=facts)
 
 
@@ -161,7 +173,7 @@ def _netx(arguments: argparse.Namespace) -> Written:
     if arguments.data is not None:
         data = recordings(
             arguments.data,
-            arguments.split,
+            arguments.split or "test",
             limit=arguments.limit,
             classes=netlist.classes,
             taxels=netlist.taxels,
@@ -199,6 +211,7 @@ def _rounding(layers: list[Json]) -> list[str]:
 
 WRITERS: dict[str, Callable[[argparse.Namespace], Written]] = {
     "sanafe": _sanafe,
+    "ranc": _ranc,
     "onnx": _onnx,
     "onnx-float": _onnx_float,
     "nir": _nir,
@@ -206,19 +219,15 @@ WRITERS: dict[str, Callable[[argparse.Namespace], Written]] = {
 }
 """What writes each format."""
 
-OWN = {
-    "dt": (None, "nir"),
-    "strict": (False, "netx"),
-    "data": (None, "netx"),
-    "split": ("test", "netx"),
-    "limit": (None, "netx"),
-    "bin": (BIN_S, "netx"),
-}
-"""Options of one format: what they are where they are not given, and the format."""
-
 
 def _require_fit(arguments: argparse.Namespace) -> None:
     """Refuse options that the format would ignore."""
+    for name, (absent, formats) in RECORDING.items():
+        given = getattr(arguments, name)
+        if given != absent and arguments.to not in formats:
+            raise OptionError(f"--{name} {given}: is for {' and '.join(formats)}; leave it away")
+        if given != absent and arguments.data is None:
+            raise OptionError(f"--{name} {given}: says which recording of --data, which is not given; add it")
     for name, (absent, only) in OWN.items():
         if getattr(arguments, name) != absent and arguments.to != only:
             raise OptionError(f"--{name}: is for {only}, --to says {arguments.to}; leave it away")
@@ -268,6 +277,10 @@ def _text(report: Json) -> str:
         )
     if "layers" in report:
         return "\n".join([first, *_netx_lines(report)])
+    if "ticks" in report:
+        inputs = report["path"], report["path"].removesuffix(".json") + ".out"
+        with_events = "no recording, add packets" if report["ticks"] is None else f"{report['ticks']} ticks"
+        return f"{first}\nrun: ranc_sim {inputs[0]} {inputs[1]} {inputs[0]} TICKS ({with_events})"
     if "groups" in report:
         return (
             f"{first}\ngroups: {', '.join(report['groups'])}\n"

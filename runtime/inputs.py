@@ -155,7 +155,7 @@ def propagation(checkpoint: Checkpoint, asked: Graph | None, where: str) -> tupl
     return asked.name, found
 
 
-INPUTS = ("checkpoint", "original", "against", "netlist", "data", "calibrate", "source", "taxels", "edges")
+INPUTS = ("checkpoint", "original", "against", "netlist", "data", "calibrate", "source", "taxels", "edges", "stress")
 """Arguments that may name a file to read."""
 
 

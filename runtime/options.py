@@ -16,8 +16,41 @@ from models.recipes import RECIPES, RELEASED
 from models.schedule import DECAY_EPOCHS
 from models.systems import PADDINGS
 from runtime.data_commands import add_bin_option
+from runtime.trace import ENGINES
 
 MARGIN = 0.1
+
+MIN_AGREEMENT = 0.95
+"""Share of equal decisions that ``verify`` wants."""
+
+MODEL: dict[str, object] = {
+    "system": None,
+    "graph": None,
+    "taxels": None,
+    "edges": None,
+    "directed": False,
+    "weights": None,
+    "beta": None,
+    "theta": None,
+    "run": 0,
+}
+"""Options of :func:`add_model`, and what they are where they are not given."""
+
+ROUNDING: dict[str, object] = {
+    "weight_bits": None,
+    "planes": None,
+    "scale_groups": None,
+    "spike_exact": False,
+    "prune_unused": False,
+    "ranges": "proven",
+    "margin": None,
+    "against": None,
+    "dump_after": [],
+}
+"""Options of ``compile`` that say how a float network is stored on Loihi, likewise."""
+
+PLACING: dict[str, object] = {"keep_all": False, "cores_for": None, "chips": 1, "optimize": "cores"}
+"""Options of ``compile`` that say where integers go, likewise."""
 
 DATA_HELP = "recordings: released layout, event files (csv, npz), one recording, 'synthetic', 'objects' or 'containers'"
 
@@ -35,12 +68,19 @@ def add_system(parser: argparse.ArgumentParser, default: str) -> None:
     parser.add_argument("--system", choices=SYSTEMS, help=f"{', '.join(SYSTEMS)} ({default})")
 
 
-def add_recordings(parser: argparse.ArgumentParser) -> None:
-    """Add the options that name recordings to run."""
+def add_recordings(parser: argparse.ArgumentParser, *, window: bool = False) -> None:
+    """Add the options that name recordings to run; with `window` also the one that names a part of each."""
     parser.add_argument("--data", required=True, metavar="PATH", help=DATA_HELP)
     add_bin_option(parser)
     parser.add_argument("--split", default="test", help="split to read (default: test)")
     parser.add_argument("--limit", type=int, metavar="N", help="first N recordings only")
+    if window:
+        parser.add_argument(
+            "--window",
+            default="100%",
+            metavar="PERCENT",
+            help="first part of every recording, as in 50%% (default: 100%%)",
+        )
 
 
 def add_detail(parser: argparse.ArgumentParser, choices: tuple[str, ...], default: str) -> None:
@@ -53,6 +93,46 @@ def add_detail(parser: argparse.ArgumentParser, choices: tuple[str, ...], defaul
     told = "; ".join(f"{choice}: {what[choice]}" for choice in choices)
     parser.add_argument("--detail", choices=choices, default=default, help=f"{told} (default: {default})")
     parser.add_argument("--table", metavar="NAME|FILE.toml", help="price and time by this table only, or by your own")
+    add_explain_cost(parser)
+
+
+def add_explain_cost(parser: argparse.ArgumentParser) -> None:
+    """Add the option that tells what was simulated."""
+    parser.add_argument(
+        "--explain-cost", action="store_true", help="say on stderr (and in --json) what was simulated, and why"
+    )
+
+
+def add_verify(parser: argparse.ArgumentParser) -> None:
+    """Add the options of ``verify``."""
+    parser.add_argument("netlist")
+    parser.add_argument("--checkpoint", required=True, metavar="CKPT|NET.onnx")
+    add_network(parser)
+    add_recordings(parser, window=True)
+    parser.add_argument(
+        "--original", metavar="CKPT", help="float model for E2 and E3 (default: the weights of --checkpoint)"
+    )
+    parser.add_argument(
+        "--spec-samples", type=int, default=3, metavar="N", help="recordings for spec = engine (default: 3)"
+    )
+    parser.add_argument(
+        "--engine",
+        choices=ENGINES,
+        default=ENGINES[0],
+        help=f"onnx: onnxruntime runs the integer graph beside our engine (default: {ENGINES[0]})",
+    )
+    parser.add_argument(
+        "--min-agreement",
+        type=float,
+        metavar="X",
+        help=f"share of equal decisions to pass (default: {MIN_AGREEMENT:g})",
+    )
+    parser.add_argument(
+        "--require",
+        metavar="E0,E2=X,E3=X",
+        help="levels to pass instead: E0 specification = engine, E2 share of spikes in every layer, E3 of decisions",
+    )
+    add_explain_cost(parser)
 
 
 def add_training(parser: argparse.ArgumentParser) -> None:
@@ -82,6 +162,9 @@ def add_training(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--clocks", type=int, metavar="K", help="inputs that tell which K-th of the recording it is")
     parser.add_argument("--features", type=int, metavar="N", help="of the first layer, per place")
     parser.add_argument("--batch", type=int, metavar="N", help="recordings to a step of the optimizer")
+    parser.add_argument(
+        "--spike-penalty", type=float, metavar="X", help="loss of a spike on every synapse in every step: fewer spikes"
+    )
     parser.add_argument("--epochs", type=int, metavar="N", help=f"default: {defaults}")
     parser.add_argument(
         "--decay-epochs",
@@ -175,7 +258,7 @@ def add_compile(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("checkpoint", help="checkpoint, or a network as an ONNX, NIR or netx file")
     add_network(sub)
     sub.add_argument("--against", metavar="NET.loom", help="list the weights that differ from another netlist's")
-    sub.add_argument("--target", default="loihi1", help="chip (default: loihi1)")
+    sub.add_argument("--target", default="loihi1", help="chip: loihi1 (default), or truenorth, to hear why not")
     sub.add_argument(
         "--weight-bits",
         metavar="N[,N]",

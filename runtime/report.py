@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import hashlib
 from collections.abc import Callable
 from difflib import get_close_matches
+from pathlib import Path
 from typing import Any
 
 from compiler.atomic import write_atomically
@@ -16,11 +18,13 @@ from compiler.serialize import read_netlist
 from compiler.targets import load_target
 from models.evtouch import Recordings
 from runtime.asked import Asked, asked_network
+from runtime.chart_file import read_chart
 from runtime.inputs import progress, recordings, require_place
 from runtime.levels import levels_of, unmet
-from runtime.options import add_network, add_recordings
+from runtime.options import add_explain_cost, add_network, add_recordings
 from runtime.render import netlist_json
 from runtime.report_text import report_text
+from runtime.spent import Account, explained
 from runtime.trace import check_channels
 from runtime.verdicts import verify_json
 
@@ -46,7 +50,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--spec-samples", type=int, default=3, metavar="N", help="recordings for spec = engine (default: 3)"
     )
+    parser.add_argument("--stress", metavar="STRESS.json", help="show what stress -o wrote about this netlist")
+    parser.add_argument("--chart", metavar="FOLDER", help="show what spikeloom chart found of this network, too")
     parser.add_argument("-o", "--output", required=True, metavar="OUT.html")
+    add_explain_cost(parser)
     parser.epilog = NOTES
 
 
@@ -62,8 +69,15 @@ def report(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], 
 
     require_place(arguments.output, "-o", arguments)
     netlist = read_netlist(arguments.netlist)
+    stability: Json = {}
+    if arguments.stress is not None:
+        from runtime.report_stress import read_stress
+
+        sha256 = hashlib.sha256(Path(arguments.netlist).read_bytes()).hexdigest()
+        stability = {"stress": read_stress(arguments.stress, arguments.netlist, sha256)}
     asked = asked_network(arguments.checkpoint, arguments)
     _require_origin(arguments, netlist, asked)
+    chart = None if arguments.chart is None else read_chart(arguments.chart, asked.sha256, arguments.checkpoint)
     progress("reading the recordings")
     data = recordings(
         arguments.data,
@@ -77,6 +91,8 @@ def report(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], 
     check_channels(netlist, data.events.shape[1] * data.events.shape[2] + netlist.clocks.channels)
     chosen = None if arguments.recording is None else find_recording(data, arguments.recording)
     found, code = _facts(arguments, netlist, asked, data, chosen)
+    found |= stability
+    found |= {} if chart is None else {"chart": chart}
     with write_atomically(arguments.output) as file:
         file.write(page(found).encode())
     return found | {"output": arguments.output}, report_text, code
@@ -138,6 +154,7 @@ def _facts(
     from runtime.estimates import estimate_json
     from runtime.report_recording import recording_json
 
+    account = Account(netlist, data, checked=arguments.spec_samples)
     target = load_target(netlist.target)
     verdict = verify(
         netlist,
@@ -149,14 +166,14 @@ def _facts(
         sha256=asked.sha256,
         spec_samples=arguments.spec_samples,
         lengths=data.lengths,
-        progress=progress,
+        progress=account.begin,
     )
     levels = levels_of(verdict)
     if chosen is None:
         chosen = 0 if verdict.first_divergence is None else data.files.index(verdict.first_divergence.file)
-    progress("costs")
+    account.begin("costs")
     counts, costs = estimate(netlist, target, with_clocks(data.events, netlist.clocks), lengths=data.lengths)
-    progress("the recording")
+    account.begin("the recording")
     provenance = report_facts.provenance_json(arguments, netlist, target, asked, data, data.files[chosen])
     found = {
         "verify": verify_json(verdict, levels, unmet(levels, {"E0": 1.0})),
@@ -168,4 +185,4 @@ def _facts(
         "costs": estimate_json(netlist, target, costs, bin_s=arguments.bin),
         "provenance": provenance,
     }
-    return found, 1 if found["verify"]["missed"] else 0
+    return found | explained(arguments, account), 1 if found["verify"]["missed"] else 0

@@ -8,7 +8,8 @@ from html import escape
 from importlib import resources
 from typing import Any
 
-from runtime import report_costs, report_sections
+from runtime import report_costs, report_sections, report_stress
+from runtime.chart_page import chart_section
 from runtime.markup import paragraph, section, table
 
 Json = dict[str, Any]
@@ -24,10 +25,14 @@ def page(report: Json) -> str:
     """
     made = report["provenance"]
     title = f"{made['netlist']['file']} on {made['data']['name']}"
-    body = "".join(section(name, heading, content(report)) for name, (heading, content) in SECTIONS.items())
-    links = "".join(f'<li><a href="#{name}">{escape(heading)}</a></li>' for name, (heading, _) in SECTIONS.items())
+    made_of = {name: (heading, content(report)) for name, (heading, content) in SECTIONS.items()}
+    shown = {name: found for name, found in made_of.items() if found[1]}
+    body = "".join(section(name, heading, content) for name, (heading, content) in shown.items())
+    links = "".join(f'<li><a href="#{name}">{escape(heading)}</a></li>' for name, (heading, _) in shown.items())
     files = resources.files("runtime")
-    style, script = (files.joinpath(name).read_text("utf-8") for name in ("report.css", "report.js"))
+    sheets = ("report.css", "chart.css") if "chart" in report else ("report.css",)
+    style = "".join(files.joinpath(name).read_text("utf-8") for name in sheets)
+    script = files.joinpath("report.js").read_text("utf-8")
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
@@ -49,6 +54,16 @@ def _about(report: Json) -> str:
         f"A {system}{graph}: {net['neurons']:,} neurons and {net['synapses']:,} synapses on {net['cores']} cores of "
         f"{net['target']}, held against its float model on {made['data']['samples']} recordings."
     )
+
+
+def _configurations(report: Json) -> list[str]:
+    """What a chart of this network and others found; nothing where none was given."""
+    return chart_section(report["chart"]) if "chart" in report else []
+
+
+def _stability(report: Json) -> list[str]:
+    """What a stress battery found of this netlist; nothing where none was given."""
+    return report_stress.stability(report) if "stress" in report else []
 
 
 def _provenance(report: Json) -> list[str]:
@@ -89,6 +104,8 @@ SECTIONS: dict[str, tuple[str, Callable[[Json], list[str]]]] = {
     "taxels-section": ("Taxels", report_sections.taxels),
     "recording": ("One recording", report_sections.recording),
     "costs": ("Energy and time", report_costs.costs),
+    "stress": ("Stability", _stability),
+    "configurations": ("Configurations", _configurations),
     "provenance": ("Provenance", _provenance),
 }
-"""Sections in their order: id, heading, and what makes the content; a further chart is a further entry."""
+"""Sections in their order: id, heading, and what makes the content; one without content is left out."""

@@ -6,8 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from runtime.chart_text import recommended_text
 from runtime.estimates import estimate_text
 from runtime.render import netlist_text
+from runtime.stress_text import stress_text
 from runtime.tables import si, table
 from runtime.verdicts import verify_text
 
@@ -26,6 +28,8 @@ def report_text(report: Json) -> str:
         "Taxels": _taxels(report["taxels"]),
         "One recording": _recording(report["recording"]),
         "Energy and time": estimate_text(report["costs"]),
+        **({"Stability": stress_text(report["stress"])} if "stress" in report else {}),
+        **({"Configurations": recommended_text(report["chart"])} if "chart" in report else {}),
         "Provenance": _provenance(report["provenance"]),
     }
     parts = [f"{title}\n{'-' * len(title)}\n{text}" for title, text in sections.items()]

@@ -32,6 +32,7 @@ from runtime.cells import (
     read_cells,
 )
 from runtime.options import DATA_HELP
+from runtime.sweep import add_place_arguments, require_place_to_work
 
 Json = dict[str, Any]
 
@@ -85,7 +86,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--no-train", action="store_true", help="measure networks that are finished and rebuild the tables, no more"
     )
-    parser.add_argument("--jobs", type=int, metavar="N", help="processes at a time (default: one a core)")
+    add_place_arguments(parser, "; they read --data and write to -o by the same paths, so share both folders")
     parser.add_argument("--device", default="cpu", help="to train on: cpu or cuda (default: cpu)")
     parser.add_argument("-o", "--output", required=True, metavar="FOLDER")
 
@@ -126,7 +127,8 @@ def reproduce(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str
         folder,
         there=known_already,
         planned=len(cells),
-        most=arguments.jobs,
+        jobs=arguments.jobs,
+        scheduler=arguments.scheduler,
         after=lambda: write_tables(folder, shown, pictures=False),
     )
     report = write_tables(folder, shown, pictures=True) | _completeness(folder, parts)
@@ -151,11 +153,12 @@ def _check(arguments: argparse.Namespace) -> tuple[str, ...]:
     from models.train import require_device
 
     require_device(arguments.device)
-    for option in ("seeds", "epochs", "jobs"):
+    require_place_to_work(arguments.jobs, arguments.scheduler)
+    for option in ("seeds", "epochs"):
         value = getattr(arguments, option)
         if value is not None and value < 1:
             raise OptionError(f"--{option} {value}: allowed are 1 or more; choose another")
-        if value is not None and arguments.full and option != "jobs":
+        if value is not None and arguments.full:
             raise OptionError(f"--{option} {value}: --full says how many; leave one of them away")
     if arguments.table is not None and arguments.table not in TABLES:
         raise OptionError(f"--table {arguments.table}: unknown; choose from {', '.join(TABLES)}")
@@ -214,7 +217,7 @@ def _work(
         (job,) = planned(parser.parse_args(words), data.training, data.test)
         job = replace(job, position=len(found) % (arguments.jobs or os.cpu_count() or 1))  # of its progress bar
         place = cell_file(folder, name)
-        found.append(Work(row=row, seed=seed, job=job, place=place, sha256=data.sha256))
+        found.append(Work(row=row, seed=seed, job=job, place=place, data=data.path, sha256=data.sha256))
     return found
 
 

@@ -13,51 +13,24 @@ from compiler.frontends.nir import SUFFIX as NIR
 from compiler.frontends.nir_neurons import CONVENTIONS
 from compiler.netlist import Netlist
 from compiler.passes.legalize import measure
-from compiler.pipeline import place_integers
+from compiler.passes.prune import nobody
+from compiler.placing import place_integers
 from compiler.serialize import write_netlist
 from compiler.sidecar import restore, sidecar_of
 from compiler.targets import load_target
 from compiler.verify import verify
 from runtime import render
 from runtime.inputs import progress, version
-from runtime.options import cores_asked
+from runtime.options import MODEL, PLACING, ROUNDING, cores_asked
 
 Json = dict[str, Any]
 Outcome = tuple[Json, Callable[[Json], str], int]
 
-PLACING = {"target": "loihi1", "keep_all": False, "cores_for": None, "chips": 1, "optimize": "cores"}
-"""Options that say where integers go, and what they are where they are not given."""
+READING: Json = {"polarities": None, "polarities_first": None}
+"""Options that say how inputs are laid out, and what they are where they are not given."""
 
-READING = {"polarities": None, "polarities_first": None}
-
-ROUNDING: Json = {
-    "dt": None,
-    "convention": None,
-    "weight_bits": None,
-    "planes": None,
-    "scale_groups": None,
-    "spike_exact": False,
-    "prune_unused": False,
-    "calibrate": None,
-    "ranges": "proven",
-    "margin": None,
-    "against": None,
-    "dump_after": [],
-}
-"""Options that say how a float network is rounded, likewise."""
-
-MODEL = {
-    "system": None,
-    "graph": None,
-    "taxels": None,
-    "edges": None,
-    "directed": False,
-    "weights": None,
-    "beta": None,
-    "theta": None,
-    "run": 0,
-}
-"""Options of checkpoints, likewise."""
+FLOATS: Json = {"dt": None, "convention": None, **ROUNDING, "calibrate": None}
+"""Options that say how a float network is read and rounded, likewise."""
 
 
 def is_whole(arguments: argparse.Namespace) -> bool:
@@ -87,14 +60,14 @@ def _refuse(arguments: argparse.Namespace, options: Json, why: str) -> None:
 def _restored(arguments: argparse.Namespace) -> tuple[Netlist, list[str]]:
     beside = sidecar_of(arguments.checkpoint)
     why = f"{beside} restores the netlist as it was; leave it away, or add --dt SECONDS to compile the network anew"
-    _refuse(arguments, PLACING | READING | ROUNDING | MODEL, why)
+    _refuse(arguments, {"target": "loihi1"} | PLACING | READING | FLOATS | MODEL, why)
     progress("reading the netlist")
     return restore(arguments.checkpoint, CONVENTIONS), [f"restored from {beside}: the netlist as it was"]
 
 
 def _from_netx(arguments: argparse.Namespace) -> tuple[Netlist, list[str]]:
     path = arguments.checkpoint
-    _refuse(arguments, ROUNDING, f"is for float networks, {path} holds integers; leave it away")
+    _refuse(arguments, FLOATS, f"is for float networks, {path} holds integers; leave it away")
     _refuse(arguments, MODEL, f"is for checkpoints, the netx file {path} holds all it needs; leave it away")
     progress("reading the network")
     found = read_netx(path, polarities=arguments.polarities, polarities_first=arguments.polarities_first)
@@ -103,8 +76,8 @@ def _from_netx(arguments: argparse.Namespace) -> tuple[Netlist, list[str]]:
     cores_for = cores_asked(arguments.cores_for)
     placed = place_integers(
         found.network,
+        removed=(nobody(found.network), nobody(found.network)) if arguments.keep_all else None,
         target=arguments.target,
-        keep_all=arguments.keep_all,
         cores_for=cores_for,
         chips=arguments.chips,
         optimize=arguments.optimize,

@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-import os
-import signal
 import sys
-import threading
-import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from multiprocessing import get_context, parent_process
-from multiprocessing.connection import Connection, wait
-from multiprocessing.context import SpawnProcess
+from collections.abc import Callable, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 from compiler.atomic import remove_leftovers
-from compiler.errors import OptionError, SpikeloomError
+from compiler.errors import OptionError
 from compiler.fixedpoint import IntArray
 from runtime.training import Job, recall, run_job, state_of
+from runtime.workers import ProcessDied, cores, ended_by_signal, run_side_by_side
 
 Result = tuple[dict[str, Any], IntArray | None]
 
@@ -33,12 +27,6 @@ class Writes(Protocol):
 
 AJob = TypeVar("AJob", bound=Writes)
 AResult = TypeVar("AResult")
-
-PATIENCE_S = 5.0
-"""How long a process that was told to end may take for it."""
-
-STOPPED = 143
-"""Exit code of a process that a signal ended, as a shell gives it."""
 
 
 def train_seeds(jobs: Sequence[Job], *, resume: bool) -> list[Result]:
@@ -129,28 +117,11 @@ def _kept(done: Sequence[Job], jobs: Sequence[Job]) -> str:
     return f"{' and '.join(parts)}; go on with the same command and --resume" if parts else ""
 
 
-@contextmanager
-def ended_by_signal() -> Iterator[None]:
-    """A request to end (SIGTERM) interrupts as Ctrl-C does, so that everything is left tidy."""
-    if threading.current_thread() is not threading.main_thread():
-        yield  # only the main thread may say what a signal does
-        return
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
-
-
 def side_by_side(
     jobs: Sequence[AJob],
     waiting: Sequence[int],
     results: dict[int, AResult],
     run: Callable[[AJob], AResult],
-    *,
-    most: int | None = None,
-    fewer: str = "--seeds",
-    done: Callable[[int], object] | None = None,
 ) -> None:
     """Run jobs in processes of their own; whatever ends this ends them all.
 
@@ -164,77 +135,21 @@ def side_by_side(
         Takes the result of each job by its place among `jobs`.
     run : callable
         Does the work; a function of a module, since it crosses process borders.
-    most : int, optional
-        Processes at a time; as many as there are cores by default.
-    fewer : str
-        Option that makes them fewer, for the message of a lack of memory.
-    done : callable, optional
-        Told the place of each job whose result has come.
 
     Raises
     ------
     SpikeloomError, OSError, MemoryError
         What ended a job.
     """
-    # spawned, not forked: torch and its thread pools do not survive a fork
-    context = get_context("spawn")
-    queue = list(waiting)
-    running: dict[Connection, tuple[int, SpawnProcess]] = {}
-    try:
-        while queue or running:
-            while queue and len(running) < (most or os.cpu_count() or 1):
-                index = queue.pop(0)
-                receiver, sender = context.Pipe(duplex=False)
-                process = context.Process(target=_work, args=(run, jobs[index], sender))
-                process.start()
-                sender.close()
-                running[receiver] = index, process
-            for ready in wait(list(running)):
-                receiver = next(known for known in running if known is ready)
-                index, process = running[receiver]
-                try:
-                    found = receiver.recv()
-                except EOFError:
-                    process.join()
-                    raise OptionError(
-                        f"{jobs[index].output}: its process ended early (exit code {process.exitcode}), perhaps for "
-                        f"lack of memory; go on with --resume, and with fewer {fewer}"
-                    ) from None
-                if isinstance(found, BaseException):
-                    raise found
-                results[index] = found
-                process.join()
-                del running[receiver]
-                if done is not None:
-                    done(index)
-    finally:
-        for _, process in running.values():
-            process.terminate()
-        for _, process in running.values():
-            process.join(PATIENCE_S)
-            process.kill()
-            process.join()
-
-
-def _work(run: Callable[[AJob], AResult], job: AJob, sender: Connection) -> None:
-    """One job in its own process, which outlives neither a request to end nor its parent."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent gets it too, and ends us
-    signal.signal(signal.SIGTERM, _stop)
-    threading.Thread(target=_follow_parent, daemon=True).start()
-    try:
-        sender.send(run(job))
-    except (SpikeloomError, OSError, MemoryError) as error:
-        sender.send(error)
-
-
-def _stop(_signal: int, _frame: object) -> None:
-    raise SystemExit(STOPPED)
-
-
-def _follow_parent() -> None:
-    parent = parent_process()
-    if parent is not None:
-        parent.join()
-        os.kill(os.getpid(), signal.SIGTERM)
-        time.sleep(PATIENCE_S)
-        os._exit(STOPPED)
+    work = [jobs[index] for index in waiting]
+    with closing(run_side_by_side(work, run, processes=cores())) as at_work:
+        for place, found in at_work:
+            index = waiting[place]
+            if isinstance(found, ProcessDied):
+                raise OptionError(
+                    f"{jobs[index].output}: {found}, perhaps for lack of memory; go on with --resume, and with fewer "
+                    "--seeds"
+                )
+            if isinstance(found, Exception):
+                raise found
+            results[index] = found

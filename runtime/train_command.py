@@ -107,7 +107,7 @@ def _jobs(
     ]
 
 
-OVERRIDES = ("current_decay", "membrane_decay", "clocks", "features", "batch", "decay_epochs")
+OVERRIDES = ("current_decay", "membrane_decay", "clocks", "features", "batch", "decay_epochs", "spike_penalty")
 """Options that change single values of a recipe."""
 
 
@@ -121,6 +121,8 @@ def _recipe(arguments: argparse.Namespace) -> Recipe:
             f"--decay-epochs {arguments.decay_epochs}: the recipe {recipe.name} lowers its learning rate all along; "
             "leave it away"
         )
+    if arguments.spike_penalty is not None:
+        recipe = replace(recipe, penalty=arguments.spike_penalty)
     if arguments.current_decay is not None:
         recipe = replace(recipe, alphas=decays_asked(arguments.current_decay, "--current-decay", LAYERS))
     if arguments.membrane_decay is not None:

@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import io
 import json
+import math
 import sys
 import time
 from collections.abc import Callable
@@ -27,6 +28,7 @@ from compiler.errors import DataError, ModelError, OptionError
 from runtime.eventlines import Event, EventLines, Mark
 
 if TYPE_CHECKING:
+    from compiler.fixedpoint import IntArray
     from runtime.stream import Step, Stream
 
 SUMMARY = "read event lines (time_s,taxel,polarity) and print the running decision"
@@ -81,16 +83,17 @@ class Display:
             sys.stderr.flush()
             self._drawn = time.monotonic()
 
-    def grasp(self, grasp: int, bins: int, last: Step) -> None:
-        """Show what a grasp came to."""
+    def grasp(self, grasp: int, bins: int, last: Step, *, early: bool | None = None) -> None:
+        """Show what a grasp came to; and whether it ended before its length, where it may."""
         self._shown = None
         if self._json:
-            self._write(self._result("grasp", grasp, bins, last))
+            self._write(self._result("grasp", grasp, bins, last, {} if early is None else {"early": early}))
         else:
             seconds = f"{self._bin_s * bins:f}"
-            self._write(f"grasp {grasp}: {_standing(last)}, after {_number(bins, 'bin')} ({seconds} s)")
+            told = ", sure" if early else ""
+            self._write(f"grasp {grasp}: {_standing(last)}{told}, after {_number(bins, 'bin')} ({seconds} s)")
 
-    def _result(self, kind: str, grasp: int, bins: int, step: Step) -> str:
+    def _result(self, kind: str, grasp: int, bins: int, step: Step, more: dict[str, bool] | None = None) -> str:
         return json.dumps(
             {
                 "kind": kind,
@@ -100,6 +103,7 @@ class Display:
                 "decision": step.decision,
                 "margin": step.margin,
                 "counts": step.counts.tolist(),
+                **(more or {}),
             }
         )
 
@@ -132,6 +136,8 @@ class Watch:
         Begin the bins of a grasp at its first event instead of at time 0.
     real : bool
         Keep to the wall clock.
+    may_end : callable, optional
+        Says from a chip step and the votes after it whether the grasp is decided, see :func:`runtime.exits.live`.
     """
 
     def __init__(
@@ -145,6 +151,7 @@ class Watch:
         bins: int | None,
         from_first: bool,
         real: bool,
+        may_end: Callable[[int, IntArray], bool] | None = None,
     ) -> None:
         self._stream = stream
         self._lines = lines
@@ -154,11 +161,12 @@ class Watch:
         self._bins = bins
         self._from_first = from_first
         self._real = real
+        self._may_end = may_end
         self._origin: Decimal | None = None  # of the grasp; None between two grasps
         self._epoch = 0.0  # wall clock at the origin
         self._decided = False
         self._last: tuple[Step, ...] = ()
-        self.grasps = self.bins = self.events = self.repeated = self.late = 0
+        self.grasps = self.bins = self.events = self.repeated = self.late = self.early = 0
         self.step_s: list[float] = []
 
     def run(self) -> bool:
@@ -224,6 +232,8 @@ class Watch:
         self._display.bin(self.grasps + 1, step)
         if step.index + 1 == self._bins:
             self._decide()
+        elif self._may_end is not None and self._may_end(step.index, step.counts):
+            self._decide(early=True)
 
     def _end_grasp(self) -> None:
         """Step the bins that are left, decide, and get ready for the next grasp."""
@@ -234,14 +244,15 @@ class Watch:
         self._stream.reset()
         self._origin, self._decided = None, False
 
-    def _decide(self) -> None:
-        """Run the steps by which the read-out lags, and show the decision."""
+    def _decide(self, *, early: bool = False) -> None:
+        """Run the steps by which the read-out lags, unless they change nothing, and show the decision."""
         bins = self._stream.index
         self._decided = True
-        last = (*self._last, *self._stream.finish())[-1]
+        last = self._last[-1] if early else (*self._last, *self._stream.finish())[-1]
         self.grasps += 1
         self.bins += bins
-        self._display.grasp(self.grasps, bins, last)
+        self.early += early
+        self._display.grasp(self.grasps, bins, last, early=None if self._may_end is None else early)
 
 
 def watch(arguments: argparse.Namespace) -> tuple[dict[str, Any], Callable[[dict[str, Any]], str], int]:
@@ -252,11 +263,20 @@ def watch(arguments: argparse.Namespace) -> tuple[dict[str, Any], Callable[[dict
     SpikeloomError
         If an option, the netlist or a line cannot be used.
     """
+    from runtime import exits
     from runtime.stream import load
 
     bin_s = _duration(arguments.bin)
     if arguments.bins is not None and arguments.bins < 1:
         raise OptionError(f"--bins {arguments.bins}: not a length; give 1 or more, or leave it out")
+    factor = arguments.until_sure
+    if factor is not None and arguments.bins is None:
+        raise OptionError("--until-sure: what can still come is not known; give the length of a grasp with --bins")
+    if factor is not None and not factor >= 0:
+        raise OptionError(
+            f"--until-sure {factor:g}: no votes per root of a bin; give a number from 0, as spikeloom anytime prints "
+            "it, or none for the proof alone"
+        )
     live = load(arguments.netlist)
     netlist = live.netlist
     if netlist.polarities != 2:
@@ -277,6 +297,7 @@ def watch(arguments: argparse.Namespace) -> tuple[dict[str, Any], Callable[[dict
             bins=arguments.bins,
             from_first=arguments.origin == "first",
             real=arguments.speed == "real",
+            may_end=None if factor is None else exits.live(netlist, arguments.bins, factor),
         )
         interrupted = session.run()
     if not session.events and not interrupted:
@@ -290,6 +311,8 @@ def watch(arguments: argparse.Namespace) -> tuple[dict[str, Any], Callable[[dict
         "late": session.late,
         "interrupted": interrupted,
     }
+    if factor is not None:
+        report["early"] = session.early
     if arguments.timing:
         report["step"] = _timing(session.step_s, float(bin_s))
     return report, _summary, 0
@@ -314,6 +337,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=("real", "full"),
         default="full",
         help="keep to the wall clock, or go on as soon as events allow it (default: full)",
+    )
+    parser.add_argument(
+        "--until-sure",
+        nargs="?",
+        type=float,
+        const=math.inf,
+        metavar="A",
+        help="end a grasp of --bins once nothing can change the vote, or it leads by A*sqrt(bins left) (see anytime)",
     )
     parser.add_argument("--timing", action="store_true", help="add the time that steps took to the summary")
     parser.epilog = NOTES
@@ -360,7 +391,8 @@ def _timing(step_s: list[float], bin_s: float) -> dict[str, float]:
 
 def _summary(report: dict[str, Any]) -> str:
     parts = [_number(report["grasps"], "grasp"), _number(report["bins"], "bin"), _number(report["events"], "event")]
-    text = ", ".join([*parts, f"{report['repeated']} repeated within a bin", f"{report['late']} late"])
+    parts += [f"{report['repeated']} repeated within a bin", f"{report['late']} late"]
+    text = ", ".join([*parts, *([f"{report['early']} ended early"] if "early" in report else [])])
     if "step" in report:
         step = report["step"]
         share = f"{100 * step['p99_share_of_bin']:.2g} % of a bin"

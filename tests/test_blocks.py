@@ -268,3 +268,22 @@ def test_the_released_network(released_checkpoint, objects_zip, recipe):
     expected = engine.simulate(engine.prepare(netlist, stepwise=True), events, **KEPT)
     assert_equal(found, expected)
     assert found.counts.spikes.sum() > 0
+
+
+@pytest.mark.parametrize("layer", [0, 1, 2])
+def test_layers_without_neurons_are_charged_nothing(layer):
+    netlist = build(
+        [Neuron(layer=layer, bias=10), Neuron(layer=layer)],
+        [Axon(source=0, targets=((0, 50),))] if layer == 0 else [],
+        n_inputs=1,
+        depths=[0, 1, 2],
+    )
+    charges = Charges(channels=np.array([[1]]), spikes=np.array([[10], [20]]), updates=np.array([[300], [400]]))
+    events = np.ones((1, 1, 6), np.uint8)
+    traces = [
+        engine.simulate(engine.prepare(netlist, stepwise=stepwise, charges=charges), events, threads=1)
+        for stepwise in (False, True)
+    ]
+    assert lay_out_blocks(netlist) is not None
+    assert traces[1].charged.sum() == 6 + 10 * traces[1].counts.spikes[0, 0] + 6 * 300
+    np.testing.assert_array_equal(traces[0].charged, traces[1].charged)

@@ -28,7 +28,7 @@ from models.train import evaluate, train
 from runtime.cli import main
 
 ADJACENCY = normalised_adjacency(GRAPH.edges, 39)
-SMOOTH = Surrogate(shape=FAST_SIGMOID, width=0.25, reset=False)
+SIGMOID = Surrogate(shape=FAST_SIGMOID, width=0.25, reset=False)
 
 
 def surrogate_spike(surrogate):
@@ -85,7 +85,9 @@ def test_the_reset_leaves_the_current_as_it_is():
     assert membranes[:, 0].tolist() == [2.0, 1.0, 0.5, pytest.approx(0.7)]
 
 
-@pytest.mark.parametrize("surrogate", [RECTANGLE, SMOOTH, replace(SMOOTH, reset=True), replace(RECTANGLE, reset=False)])
+@pytest.mark.parametrize(
+    "surrogate", [RECTANGLE, SIGMOID, replace(SIGMOID, reset=True), replace(RECTANGLE, reset=False)]
+)
 @given(seed=st.integers(0, 2**31), steps=st.integers(1, 30), alpha=st.sampled_from([0.0, 0.5, 0.95]))
 @settings(max_examples=25, deadline=None)
 def test_gradients_equal_plain_autograd(surrogate, seed, steps, alpha):
@@ -117,7 +119,7 @@ def test_gradients_equal_plain_autograd(surrogate, seed, steps, alpha):
 
 def test_the_surrogate_of_a_fast_sigmoid():
     current = torch.tensor([[0.5, 0.75, 0.0]], dtype=torch.float64, requires_grad=True)
-    lif(current, 0.2, 0.5, SMOOTH)[0].sum().backward()
+    lif(current, 0.2, 0.5, SIGMOID)[0].sum().backward()
     assert_allclose(current.grad, [[1.0, 1 / 4, 1 / 9]], rtol=1e-12)
 
 
@@ -192,7 +194,7 @@ def network_step_by_step(network, events, surrogate):
     return spikes
 
 
-@pytest.mark.parametrize("surrogate", [RECTANGLE, SMOOTH])
+@pytest.mark.parametrize("surrogate", [RECTANGLE, SIGMOID])
 @pytest.mark.parametrize("dynamics", [TIMING, replace(TIMING, alphas=()), Dynamics(alphas=(0.6, 0.0, 0.0, 0.9)), PLAIN])
 def test_gradients_of_a_whole_network_equal_plain_autograd(surrogate, dynamics):
     sizes = replace(SMALL, dynamics=dynamics)
@@ -342,6 +344,7 @@ def test_decays_that_are_none_are_refused(words, message):
     ("values", "message"),
     [
         ({"features": 0}, "--features 0: allowed are 1 to 1024; choose another"),
+        ({"penalty": -1.0}, "--spike-penalty -1: allowed are numbers from 0 up; choose another"),
         ({"batch": 0}, "--batch 0: allowed are 1 to 1024; choose another"),
         ({"clocks": 65}, "--clocks 65: allowed are 0 to 64; choose another"),
         (
@@ -424,6 +427,36 @@ def test_the_loss_is_the_cross_entropy_of_the_scaled_rates():
     assert evaluate(network, training, recipe)[0] == pytest.approx(expected, rel=1e-5)
 
 
+def test_activity_is_the_share_of_synapses_that_carry_a_spike():
+    training = grasps(1)
+    recipe, sizes = small_timed(training)
+    network = SpikingNet(sizes, ADJACENCY, seed=2)
+    layers = network.layers(torch.from_numpy(training.events.transpose(3, 0, 1, 2).astype(np.float32)))
+    fan_out = {"conv1": 8, "fc1": 6, "fc2": sizes.classes}
+    carried = sum(layers[name][0].detach().numpy().mean((0, 1)).sum() * synapses for name, synapses in fan_out.items())
+    synapses = (39 * 4 + recipe.clocks) * 8 + 8 * 6 + 6 * sizes.classes
+    assert float(network.activity(layers).detach()) == pytest.approx(carried / synapses, rel=1e-5)
+
+
+def test_a_penalty_on_spikes_makes_them_fewer():
+    training = grasps(1)
+    _, sizes = small_timed(training)
+    time_first = torch.from_numpy(training.events.transpose(3, 0, 1, 2).astype(np.float32))
+    shares = []
+    for penalty in (0.0, 50.0):
+        recipe, _ = small_timed(training, penalty=penalty, learning_rate=0.02)
+        trained = train(training, training, ADJACENCY, sizes, epochs=5, seed=0, recipe=recipe)
+        network = SpikingNet(sizes, ADJACENCY)
+        network.load_weights(trained.last)
+        shares.append(float(network.activity(network.layers(time_first)).detach()))
+    assert shares[1] < 0.8 * shares[0]
+
+
+def test_a_recipe_tells_of_a_penalty_only_where_there_is_one():
+    assert "penalty" not in TIMED.to_json()
+    assert replace(TIMED, penalty=2.0).to_json() == TIMED.to_json() | {"penalty": 2.0}
+
+
 @pytest.fixture
 def data(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -434,12 +467,12 @@ def data(tmp_path, monkeypatch):
 
 def test_train_writes_what_the_recipe_asks_for(data, capsys):
     words = "train --data data --graph manual --recipe timed --current-decay fc1=0.5 --membrane-decay fc3=0.75"
-    words = f"{words} --clocks 4 --features 6 --batch 3 --epochs 1"
+    words = f"{words} --clocks 4 --features 6 --batch 3 --spike-penalty 0.5 --epochs 1"
     assert main([*words.split(), "-o", "x.pt", "--picture", "x.png", "--json"]) == 0
     (run,) = json.loads(capsys.readouterr().out)["runs"]
     assert run["command"] == (
         "spikeloom train --data data --graph manual --recipe timed --current-decay fc1=0.5 --membrane-decay fc3=0.75 "
-        "--clocks 4 --features 6 --batch 3 --epochs 1 --seed 0"
+        "--clocks 4 --features 6 --batch 3 --spike-penalty 0.5 --epochs 1 --seed 0"
     )
     assert run["recipe"]["alphas"] == {"fc1": 0.5}
     assert "epochs" not in run["recipe"]

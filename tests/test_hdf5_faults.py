@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fuzzed_hdf5 import changed_bytes, content_outcome, sources
+from fuzzed_bytes import changed_bytes
+from fuzzed_hdf5 import content_outcome, sources
 from random_networks import chain
 
 from compiler.errors import FormatError, ModelError

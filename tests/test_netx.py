@@ -24,7 +24,8 @@ from compiler.frontends.sensor_layout import sensor_layout
 from compiler.interpret import run_integer
 from compiler.lift import lift
 from compiler.passes.quantize import Recipe
-from compiler.pipeline import compile_network, place_integers
+from compiler.pipeline import compile_network
+from compiler.placing import place_integers
 from compiler.serialize import read_netlist
 from compiler.verify import verify
 from runtime import engine, netx_export
@@ -454,7 +455,6 @@ def test_options_of_other_formats(tmp_path, capsys):
     for words, name, only in (
         (["--dt", "1"], "dt", "nir"),
         (["--strict"], "strict", "netx"),
-        (["--data", "synthetic"], "data", "netx"),
     ):
         code, _, said = run(capsys, "export", "x.loom", "--to", "sanafe", *words, "-o", tmp_path / "x")
         assert (code, said) == (2, f"spikeloom: --{name}: is for {only}, --to says sanafe; leave it away\n")

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from random_networks import LOIHI, integer_chain, integer_networks
 
-from compiler import serialize
+from compiler import archive
 from compiler.errors import CapacityError, FormatError
 from compiler.netlist import Netlist
 from compiler.passes.emit import emit
@@ -263,7 +263,7 @@ def test_more_bytes_declared_than_there_are(path, monkeypatch):
 
 def test_a_file_too_large_to_read(path, monkeypatch):
     size = path.stat().st_size
-    monkeypatch.setattr(serialize, "SIZE_LIMIT", size - 1)
+    monkeypatch.setattr(archive, "SIZE_LIMIT", size - 1)
     assert refused(path) == f"{size} bytes, {size - 1} allowed; this is no netlist of one chip"
 
 

@@ -6,7 +6,7 @@ import pytest
 from compiler import targets
 from compiler.errors import OptionError
 from compiler.passes.legalize import REMEDIES
-from compiler.targets import known_targets, load_target, read_target, with_tables
+from compiler.targets import CROSSBARS, known_targets, load_target, read_target, with_tables
 
 LIMITS = {
     "core.compartments": 1024,
@@ -139,17 +139,14 @@ def test_every_limit_of_a_core_has_a_remedy():
 
 def test_known_targets_are_the_files():
     assert known_targets() == ("loihi1",)
+    assert known_targets(CROSSBARS) == ("truenorth",)
 
 
 @pytest.mark.parametrize(
     ("name", "message"),
     [
         ("loihi2", "--target loihi2: not modelled; no public per-event energies; allowed: loihi1"),
-        (
-            "truenorth",
-            "--target truenorth: not modelled; its additive leak cannot express a multiplicative decay; "
-            "allowed: loihi1",
-        ),
+        ("truenorth", "--target truenorth: its cores are crossbars, this is for compartments; allowed: loihi1"),
         ("loihi", "--target loihi: unknown; allowed: loihi1"),
         ("../loihi1", "--target ../loihi1: unknown; allowed: loihi1"),
         ("", "--target : unknown; allowed: loihi1"),
@@ -305,3 +302,63 @@ def test_static_power_has_its_unit(tmp_path):
         "static.frady2020: unit is 'W', allowed is 'mW'"
     ]
     assert load_target("loihi1").static["frady2020"].value == 104.4
+
+
+# -- crossbars ---------------------------------------------------------------------------------------------------------
+
+TRUENORTH = {
+    "core.axons": 256,
+    "core.neurons": 256,
+    "core.axon_types": 4,
+    "chip.cores": 4096,
+    "mesh.width": 64,
+    "mesh.height": 64,
+    "mesh.reach": 255,
+    "neuron.weight_bits": 9,
+    "neuron.leak_bits": 9,
+    "neuron.threshold_bits": 18,
+    "neuron.mask_bits": 18,
+    "neuron.reset_bits": 9,
+    "neuron.membrane_bits": 20,
+    "neuron.targets": 1,
+    "neuron.delay": 15,
+    "tick.length": 1000,
+}
+UNVERIFIED = {"neuron.leak_bits", "neuron.threshold_bits", "neuron.mask_bits", "neuron.reset_bits"}
+
+
+def test_truenorth_limits_with_source_and_confidence():
+    target = load_target("truenorth", CROSSBARS)
+    assert {rule: target.limit(rule) for rule in target.limits} == TRUENORTH
+    assert all(entry.source and entry.confidence for entry in target.limits.values())
+    assert {rule for rule, entry in target.limits.items() if entry.confidence == "unverified"} == UNVERIFIED
+    assert not target.choices
+    assert not target.time
+
+
+def test_truenorth_energy_has_two_readings_and_only_one_has_a_floor():
+    target = load_target("truenorth", CROSSBARS)
+    read = {table.name: (table.joule("synaptic_event"), table.floor_w) for table in target.energy}
+    assert read == {
+        "all_in": (pytest.approx(26e-12), None),
+        "marginal": (pytest.approx(2.3e-12), pytest.approx(0.0644)),
+    }
+    assert {name: power.value for name, power in target.static.items()} == {"idle_0v70": 42.0, "typical_0v75": 65.0}
+
+
+def test_a_crossbar_file_that_is_wrong(tmp_path):
+    text = (resources.files("compiler.targets") / "truenorth.toml").read_text("utf-8")
+    for old, new in (
+        ('confidence = "unverified" }', 'confidence = "rumour" }'),
+        ("core.axon_types =", "core.kinds ="),
+        ('floor = { value = 64.4, unit = "mW"', 'floor = { value = 64.4, unit = "pJ"'),
+    ):
+        assert old in text
+        text = text.replace(old, new, 1)
+    assert faults(tmp_path / "x.toml", text) == [
+        "limits.core.axon_types: is missing",
+        f"limits.core.kinds: unknown, allowed are {', '.join(TRUENORTH)}",
+        "limits.neuron.leak_bits: confidence is 'rumour', allowed are agreed, read, secondary, derived, unverified",
+        "energy.marginal.floor: unit is 'pJ', allowed is 'mW'",
+    ]
+    assert faults(tmp_path / "y.toml", text.replace('"crossbars"', '"neurons"', 1))[:1] == ["choices: is missing"]

@@ -25,7 +25,7 @@ from compiler.serialize import write_netlist
 from models.events import load_data
 from models.evtouch import load_recordings
 from models.graphs import build_graph, normalised_adjacency
-from runtime import engine, watch
+from runtime import course, engine, exits, watch
 from runtime.votes import class_counts
 
 HEADER = "time_s,taxel,polarity"
@@ -480,3 +480,47 @@ def test_standard_input_and_interruption(pair_file, end):
             "grasp 1: class 1, 2 votes, 1 ahead, after 3 bins (0.06 s)\n"
             "1 grasp, 3 bins, 4 events, 0 repeated within a bin, 0 late\ninterrupted\n"
         )
+
+
+@pytest.mark.parametrize("factor", [None, 1.5, 0.0])
+def test_a_grasp_ends_as_soon_as_it_is_sure(lively, lively_file, lines, objects, factor):
+    ended = 0
+    for seed in range(3):
+        events = random_events(seed)
+        given = () if factor is None else (factor,)
+        words = (lively_file, "--input", lines(as_lines(events, seed)), "--bins", 40, "--until-sure", *given)
+        found = objects(*words)
+        votes = course.votes_of(lively, events.reshape(1, 20, 40), np.array([40]))
+        at = exits.standing(votes, np.array([40]))
+        sure = exits.proven(votes, at, exits.most_votes(lively, 40))
+        end = int(exits.exits(sure, at, np.inf if factor is None else factor)[0])
+        early = end + 3 < 39  # the read-out lags three steps
+        bins = end + 4 if early else 40
+        (grasp,) = found["grasp"]
+        assert (grasp["bins"], grasp["early"], len(found["bin"])) == (bins, early, bins)
+        assert grasp["decision"] == at.leader[0, end if early else -1]
+        assert found["end"][0]["early"] == early
+        assert found["end"][0]["late"] == events[..., bins + 1 :].sum() + (events[..., bins].sum() if early else 0)
+        ended += early
+    assert ended or factor is None
+
+
+def test_a_sure_grasp_in_words(pair_file, lines, capsys):
+    _, text = command(pair_file, "--input", lines("0,0,1\n0.02,0,1\n0.04,0,1\n0.06,0,0\n"), "--bins", 5, "--until-sure")
+    out = capsys.readouterr().out.splitlines()
+    assert out[-1] == "grasp 1: class 1, 3 votes, 3 ahead, sure, after 3 bins (0.06 s)"
+    assert text == "1 grasp, 3 bins, 4 events, 0 repeated within a bin, 1 late, 1 ended early"
+
+
+def test_sure_of_what(pair_file, lines):
+    with pytest.raises(OptionError) as error:
+        command(pair_file, "--input", lines("0,0,1\n"), "--until-sure")
+    assert str(error.value) == (
+        "--until-sure: what can still come is not known; give the length of a grasp with --bins"
+    )
+    with pytest.raises(OptionError) as error:
+        command(pair_file, "--input", lines("0,0,1\n"), "--bins", 5, "--until-sure", "-1")
+    assert str(error.value) == (
+        "--until-sure -1: no votes per root of a bin; give a number from 0, as spikeloom anytime prints it, or none "
+        "for the proof alone"
+    )

@@ -163,6 +163,21 @@ def _cannot_reach(population: IntegerPopulation, inflow: npt.NDArray[np.float64]
     return below
 
 
+def deaf_to(network: IntegerNetwork, channels: Mask) -> IntegerNetwork:
+    """Set the weights from some input channels, (channels,) bool, to zero; the structure stays."""
+    if not channels.any():
+        return network
+    return replace(
+        network,
+        projections=tuple(
+            replace(p, weight=_zeroed(p.weight, np.zeros(p.weight.shape[0], np.bool_), channels))
+            if p.pre == INPUT
+            else p
+            for p in network.projections
+        ),
+    )
+
+
 def compact(network: IntegerNetwork, gone: tuple[Mask, ...]) -> tuple[IntegerNetwork, tuple[IntArray, ...]]:
     """Take neurons out.
 

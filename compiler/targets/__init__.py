@@ -13,17 +13,54 @@ from pathlib import Path
 from typing import Any
 
 from compiler.errors import OptionError
+from compiler.targets.tables import (
+    BARRIER,
+    CROSSBAR_EVENTS,
+    EVENTS,
+    FLOOR,
+    LATENCIES,
+    LINK_BUFFER,
+    PICOSECONDS,
+    POWER_UNIT,
+    PRICE_UNIT,
+    TIME_UNIT,
+    EnergyTable,
+    Quantity,
+    TimeTable,
+)
 
-_NOT_MODELLED = {
-    "loihi2": "not modelled; no public per-event energies",
-    "truenorth": "not modelled; its additive leak cannot express a multiplicative decay",
-}
+__all__ = [
+    "BARRIER",
+    "CHOICES",
+    "COMPARTMENTS",
+    "CROSSBARS",
+    "CROSSBAR_EVENTS",
+    "CROSSBAR_LIMITS",
+    "EVENTS",
+    "LATENCIES",
+    "LIMITS",
+    "LINK_BUFFER",
+    "PICOSECONDS",
+    "POWER_UNIT",
+    "PRICE_UNIT",
+    "TIME_UNIT",
+    "EnergyTable",
+    "Quantity",
+    "Target",
+    "TimeTable",
+    "known_targets",
+    "load_target",
+    "read_target",
+    "with_tables",
+]
 
-PRICE_UNIT = "pJ"
-POWER_UNIT = "mW"
-TIME_UNIT = "ns"
-PICOSECONDS = 1000
-"""In a TIME_UNIT; finer latencies are refused."""
+_NOT_MODELLED = {"loihi2": "not modelled; no public per-event energies"}
+
+COMPARTMENTS, CROSSBARS = "compartments", "crossbars"
+"""What cores are made of: lists of weighted synapses onto compartments (Loihi), or a binary crossbar (TrueNorth)."""
+
+CONFIDENCE = ("agreed", "read", "secondary", "derived", "unverified")
+"""How sure a number is, where its entry says so: sources agree, one primary source, notes on one, arithmetic, none."""
 
 LIMITS = (
     *(f"core.{what}" for what in ("compartments", "axons_in", "axons_out", "synapse_words", "threshold_slots")),
@@ -31,90 +68,25 @@ LIMITS = (
     *("synapse.block", "synapse.block_header_bits", "synapse.word_bits"),
     *("mesh.tile_cores", "mesh.width", "mesh.height"),
 )
-"""What a target must limit."""
+"""What a target of compartments must limit."""
+
+CROSSBAR_LIMITS = (
+    *("core.axons", "core.neurons", "core.axon_types", "chip.cores", "mesh.width", "mesh.height", "mesh.reach"),
+    *(f"neuron.{what}_bits" for what in ("weight", "leak", "threshold", "mask", "reset", "membrane")),
+    *("neuron.targets", "neuron.delay", "tick.length"),
+)
+"""What a target of crossbars must limit."""
 
 CHOICES = ("synapse.weight_bits", "synapse.index_bits", "synapse.exponent")
 """Of what a target must list the permitted values."""
 
-EVENTS = (
-    *("synaptic_operation", "synaptic_operation_dense", "synaptic_operation_sparse", "neuron_idle", "neuron_active"),
-    *("spike", "packet", "hop_east_west", "hop_north_south"),
-)
-"""What an energy table may price."""
-
-LINK_BUFFER = "link_buffer"
-BARRIER = "barrier."
-
-LATENCIES = (
-    *("neuron_access", "neuron_update", "spike", "axon_out", "axon_in"),
-    *("synaptic_operation_dense", "synaptic_operation_sparse", "hop_east_west", "hop_north_south"),
-)
-"""What a time table must give in nanoseconds, beside ``link_buffer`` and ``barrier.N``, the barrier from N used tiles
-on."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Quantity:
-    """One number of a target, with its unit and where it was read."""
-
-    value: float
-    unit: str
-    source: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class EnergyTable:
-    """Prices per event in joules; an event without an entry is unknown to this table."""
-
-    name: str
-    title: str
-    prices: Mapping[str, Quantity]
-
-    def joule(self, event: str) -> float:
-        """Price of one `event` in joules; KeyError if the table does not know it."""
-        return self.prices[event].value * 1e-12  # PRICE_UNIT
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TimeTable:
-    """Latencies per event; all are whole picoseconds, so that sums of them are exact.
-
-    Parameters
-    ----------
-    name, title : str
-        For humans.
-    latencies : mapping
-        Of each of ``LATENCIES``.
-    barriers : mapping of int to Quantity
-        Length of the barrier that ends a step, by the least number of used tiles that it holds for.
-    link_buffer : Quantity
-        Messages that a link of the mesh holds.
-    """
-
-    name: str
-    title: str
-    latencies: Mapping[str, Quantity]
-    barriers: Mapping[int, Quantity]
-    link_buffer: Quantity
-
-    def picoseconds(self, event: str) -> int:
-        """Latency of one `event`."""
-        return round(self.latencies[event].value * PICOSECONDS)
-
-    def barrier(self, tiles: int) -> int:
-        """Picoseconds of the barrier among so many used tiles, at least one.
-
-        Examples
-        --------
-        >>> [load_target("loihi1").time[0].barrier(tiles) for tiles in (1, 3, 4, 32)]
-        [600000, 1000000, 1400000, 1800000]
-        """
-        return round(self.barriers[max(least for least in self.barriers if least <= tiles)].value * PICOSECONDS)
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Target:
-    """A chip: integer limits, permitted values, named energy and time tables, static power by source (of a chip)."""
+    """A chip: integer limits, permitted values, named energy and time tables, static power by source (of a chip).
+
+    `cores` is ``COMPARTMENTS`` or ``CROSSBARS``; only the first have choices and time tables.
+    """
 
     name: str
     title: str
@@ -123,6 +95,7 @@ class Target:
     energy: tuple[EnergyTable, ...]
     time: tuple[TimeTable, ...]
     static: Mapping[str, Quantity]
+    cores: str = COMPARTMENTS
 
     def limit(self, rule: str) -> int:
         """Largest amount that `rule`, for example ``core.axons_in``, allows."""
@@ -152,7 +125,10 @@ def _check_entry(name: str, entry: Mapping[str, Any], leaf: str, faults: list[st
     missing = [key for key in keys if key not in entry]
     if missing:
         faults.append(f"{name}: lacks {' and '.join(missing)}; give {', '.join(keys)}")
-    faults += [f"{name}: unknown key {key!r}, allowed are {', '.join(keys)}" for key in entry if key not in keys]
+    odd = [key for key in entry if key not in (*keys, "confidence")]
+    faults += [f"{name}: unknown key {key!r}, allowed are {', '.join(keys)}" for key in odd]
+    if entry.get("confidence", CONFIDENCE[0]) not in CONFIDENCE:
+        faults.append(f"{name}: confidence is {entry['confidence']!r}, allowed are {', '.join(CONFIDENCE)}")
     for key in ("unit", "source"):
         if key in entry and not (isinstance(entry[key], str) and entry[key].strip()):
             faults.append(f"{name}: {key} is {entry[key]!r}, a text is needed")
@@ -174,9 +150,10 @@ def read_target(path: str | os.PathLike[str]) -> Target:
     """
     raw = _read(path, "a target file")
     faults = _head_faults(raw)
-    limits = _rules(raw, "limits", "value", LIMITS, faults)
-    choices = _rules(raw, "choices", "values", CHOICES, faults)
-    energy, time = _cost_tables(raw, faults)
+    crossbars = raw.get("cores") == CROSSBARS
+    limits = _rules(raw, "limits", "value", CROSSBAR_LIMITS if crossbars else LIMITS, faults)
+    choices = {} if crossbars else _rules(raw, "choices", "values", CHOICES, faults)
+    energy, time = _cost_tables(raw, faults, CROSSBAR_EVENTS if crossbars else EVENTS)
     static = _entries(raw.get("static", {}), "value", "", faults)
     for name, entry in static.items():
         _check_entry(f"static.{name}", entry, "value", faults)
@@ -191,6 +168,7 @@ def read_target(path: str | os.PathLike[str]) -> Target:
         energy=energy,
         time=time,
         static={name: Quantity(**entry) for name, entry in static.items()},
+        cores=raw.get("cores", COMPARTMENTS),
     )
 
 
@@ -217,10 +195,13 @@ def with_tables(target: Target, name: str) -> Target:
         if not name.endswith(".toml"):
             raise OptionError(f"--table {name}: unknown; allowed: {', '.join(names)}, or a file that ends in .toml")
         raw = _read(name, "a file of tables")
-        faults = [f"unknown key {key!r}, allowed are energy, time" for key in raw if key not in ("energy", "time")]
-        if not {"energy", "time"} & raw.keys():
-            faults.append("holds no table; give [energy.NAME] or [time.NAME] with title and entries")
-        energy, time = _cost_tables(raw, faults)
+        crossbars = target.cores == CROSSBARS
+        kinds = ("energy",) if crossbars else ("energy", "time")
+        faults = [f"unknown key {key!r}, allowed are {', '.join(kinds)}" for key in raw if key not in kinds]
+        if not set(kinds) & raw.keys():
+            sections = " or ".join(f"[{kind}.NAME]" for kind in kinds)
+            faults.append(f"holds no table; give {sections} with title and entries")
+        energy, time = _cost_tables(raw, faults, CROSSBAR_EVENTS if crossbars else EVENTS)
         if faults:
             raise OptionError("\n".join(f"{name}: {fault}" for fault in faults))
     return replace(target, energy=energy or target.energy, time=time or target.time)
@@ -235,11 +216,13 @@ def _read(path: str | os.PathLike[str], what: str) -> dict[str, Any]:
         raise OptionError(f"{path}: is not TOML ({error}); mend it") from error
 
 
-def _cost_tables(raw: Mapping[str, Any], faults: list[str]) -> tuple[tuple[EnergyTable, ...], tuple[TimeTable, ...]]:
-    """Energy and time tables; none of a kind that has a fault."""
+def _cost_tables(
+    raw: Mapping[str, Any], faults: list[str], events: tuple[str, ...]
+) -> tuple[tuple[EnergyTable, ...], tuple[TimeTable, ...]]:
+    """Energy tables of these events and time tables; none of a kind that has a fault."""
     energy, time = raw.get("energy", {}), raw.get("time", {})
     before = len(faults)
-    prices, latencies = _prices(energy, faults), _latencies(time, faults)
+    prices, latencies = _prices(energy, events, faults), _latencies(time, faults)
     if len(faults) > before:
         return (), ()
     return tuple(
@@ -262,9 +245,13 @@ def _cost_tables(raw: Mapping[str, Any], faults: list[str]) -> tuple[tuple[Energ
 
 
 def _head_faults(raw: Mapping[str, Any]) -> list[str]:
-    known = ("name", "title", "limits", "choices", "energy", "time")
+    known: tuple[str, ...] = ("name", "title", "limits", "energy")
+    if raw.get("cores") != CROSSBARS:
+        known = ("name", "title", "limits", "choices", "energy", "time")
     faults = [f"{key}: is missing" for key in known if key not in raw]
-    allowed = (*known, "static")
+    if raw.get("cores", COMPARTMENTS) not in (COMPARTMENTS, CROSSBARS):
+        faults.append(f"cores: is {raw['cores']!r}, allowed are {COMPARTMENTS}, {CROSSBARS}")
+    allowed = (*known, "static", *(["cores"] if "cores" in raw else []))
     faults += [f"unknown key {key!r}, allowed are {', '.join(allowed)}" for key in raw if key not in allowed]
     texts = [key for key in ("name", "title") if not isinstance(raw.get(key, ""), str)]
     return faults + [f"{key}: is {raw[key]!r}, a text is needed" for key in texts]
@@ -299,16 +286,18 @@ def _tables(raw: Any, kind: str, contents: str, faults: list[str]) -> dict[str, 
     return tables
 
 
-def _prices(energy: Any, faults: list[str]) -> dict[str, dict[str, dict[str, Any]]]:
+def _prices(energy: Any, events: tuple[str, ...], faults: list[str]) -> dict[str, dict[str, dict[str, Any]]]:
     """Prices by table and event."""
     prices = _tables(energy, "energy", "prices", faults)
     for key, found in prices.items():
+        if events is CROSSBAR_EVENTS and events[0] not in found:
+            faults.append(f"energy.{key}: has no price of {events[0]}; give it")
         for event, price in found.items():
             where = f"energy.{key}.{event}"
             _check_entry(where, price, "value", faults)
-            if event not in EVENTS:
-                faults.append(f"{where}: unknown event, allowed are {', '.join(EVENTS)}")
-            _check_unit(where, price, PRICE_UNIT, faults)
+            if event not in events:
+                faults.append(f"{where}: unknown event, allowed are {', '.join(events)}")
+            _check_unit(where, price, POWER_UNIT if event == FLOOR else PRICE_UNIT, faults)
     return prices
 
 
@@ -346,28 +335,39 @@ def _check_unit(where: str, entry: Mapping[str, Any], unit: str, faults: list[st
         faults.append(f"{where}: unit is {entry['unit']!r}, allowed is {unit!r}")
 
 
-def known_targets() -> tuple[str, ...]:
-    """Names that :func:`load_target` accepts, sorted."""
-    files = resources.files(__name__).iterdir()
-    return tuple(sorted(file.name.removesuffix(".toml") for file in files if file.name.endswith(".toml")))
-
-
 @cache
-def load_target(name: str) -> Target:
-    """Read a target by name.
+def _targets() -> Mapping[str, Target]:
+    """Every target that is shipped."""
+    found = {}
+    for file in resources.files(__name__).iterdir():
+        if file.name.endswith(".toml"):
+            with resources.as_file(file) as path:
+                found[file.name.removesuffix(".toml")] = read_target(path)
+    return found
+
+
+def known_targets(cores: str = COMPARTMENTS) -> tuple[str, ...]:
+    """Names that :func:`load_target` accepts, sorted."""
+    return tuple(sorted(name for name, target in _targets().items() if target.cores == cores))
+
+
+def load_target(name: str, cores: str = COMPARTMENTS) -> Target:
+    """Read a target by name; its cores must be of the kind that the caller can handle.
 
     Raises
     ------
     OptionError
-        If there is no such target.
+        If there is no such target, or its cores are of the other kind.
 
     Examples
     --------
-    >>> load_target("loihi1").limit("core.synapse_words")
-    16384
+    >>> load_target("loihi1").limit("core.synapse_words"), load_target("truenorth", CROSSBARS).limit("core.axons")
+    (16384, 256)
     """
-    if name not in known_targets():
-        why = _NOT_MODELLED.get(name, "unknown")
-        raise OptionError(f"--target {name}: {why}; allowed: {', '.join(known_targets())}")
-    with resources.as_file(resources.files(__name__) / f"{name}.toml") as file:
-        return read_target(file)
+    found = _targets().get(name)
+    if found is None or found.cores != cores:
+        why = (
+            _NOT_MODELLED.get(name, "unknown") if found is None else f"its cores are {found.cores}, this is for {cores}"
+        )
+        raise OptionError(f"--target {name}: {why}; allowed: {', '.join(known_targets(cores))}")
+    return found

@@ -1,0 +1,99 @@
+"""How right networks of one training recipe are alone and joined, as float model and on the chip.
+
+    python benchmarks/joined.py DATA OUT.json --towers 5 s0.pt s1.pt …
+
+Members are taken in the order given, so many at a time, each once: joined networks share no member. Scales are chosen
+on training recordings; test recordings are only reported, except that the epoch *best* was chosen on them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from compiler.dynamics import with_clocks
+from compiler.frontends.checkpoint import Checkpoint, read_checkpoint
+from compiler.frontends.towers import join
+from compiler.passes.expand import expand
+from compiler.pipeline import compile_network
+from compiler.targets import load_target
+from models.evtouch import Recordings, load_recordings
+from runtime.estimate import estimate
+from runtime.inputs import propagation
+from runtime.intervals import of_mean
+from runtime.measured import float_decisions
+from runtime.votes import predictions
+
+Json = dict[str, Any]
+
+WEIGHTS = ("last", "clean", "best")
+
+
+def main() -> None:
+    """Measure and write."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("recordings")
+    parser.add_argument("output", type=Path)
+    parser.add_argument("members", nargs="+")
+    parser.add_argument("--towers", type=int, action="append", help="members of a joined network (default: 5)")
+    parser.add_argument("--float-only", action="store_true", help="leave the chip away")
+    arguments = parser.parse_args()
+    training, test = (load_recordings(arguments.recordings, split) for split in ("train", "test"))
+    found: Json = {"data": Path(arguments.recordings).name, "test_samples": len(test)}
+    for weights in WEIGHTS:
+        members = [read_checkpoint(path, weights=weights) for path in arguments.members]
+        of_weights: Json = {"1": _summary([_decided(member, test) for member in members])}
+        for towers in arguments.towers or [5]:
+            groups = [members[i : i + towers] for i in range(0, len(members) - towers + 1, towers)]
+            joined = [join(group, arguments.members[:towers]) for group in groups]
+            of_weights[str(towers)] = _summary([_measured(one, training, test, arguments.float_only) for one in joined])
+            print(weights, towers, json.dumps(of_weights[str(towers)]["mean"]), file=sys.stderr)
+        found[weights] = of_weights
+        arguments.output.write_text(json.dumps(found, indent=1) + "\n")
+
+
+def _decided(network: Checkpoint, test: Recordings) -> Json:
+    """Recordings that the float model has right."""
+    _, adjacency = propagation(network, None, "member")
+    return {"float": int(np.sum(float_decisions(network, adjacency, test) == test.labels))}
+
+
+def _measured(network: Checkpoint, training: Recordings, test: Recordings, float_only: bool) -> Json:
+    """Float model and chip at 8 bits."""
+    if float_only:
+        return _decided(network, test)
+    _, adjacency = propagation(network, None, "joined")
+    decided = float_decisions(network, adjacency, test)
+    netlist = compile_network(expand(network, adjacency), training_events=training.events).netlist
+    events = with_clocks(test.events, netlist.clocks)
+    counts, costs = estimate(netlist, load_target("loihi1"), events, lengths=test.lengths)
+    chip = predictions(netlist, counts.spikes)
+    return {
+        "float": int(np.sum(decided == test.labels)),
+        "chip": int(np.sum(chip == test.labels)),
+        "equal": int(np.sum(chip == decided)),
+        "cores": netlist.n_cores,
+        "synaptic_operations": float(costs.costs.synaptic_operations.sum(axis=1).mean()),
+        "energy_j": {name: float(each.sum(axis=1).mean()) for name, each in costs.costs.energy.items()},
+    }
+
+
+def _summary(networks: list[Json]) -> Json:
+    """All networks, and mean, deviation and Student's 95 % interval of what they have right."""
+    mean: Json = {}
+    for key in ("float", "chip"):
+        right = [network[key] for network in networks if key in network]
+        if len(right) > 1:
+            low, high = of_mean(right)
+            mean[key] = {"mean": statistics.mean(right), "std": statistics.stdev(right), "interval": [low, high]}
+    return {"networks": networks, "mean": mean}
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,299 @@
+"""The command ``chart``: accuracy against energy, time and size, for every configuration of a grid."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import math
+import shlex
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from compiler.atomic import write_atomically
+from compiler.errors import OptionError
+from compiler.targets import load_target
+from models.events import BIN_S
+from runtime import chart_networks, chart_plan, chart_points, sweep
+from runtime.chart_budget import Budget, parse_budgets, pick
+from runtime.chart_grid import Grid, parse_grid
+from runtime.chart_networks import Given
+from runtime.chart_plan import Facts, Stored
+from runtime.chart_tasks import FORMAT, SPLITS, Data
+from runtime.chart_text import chart_text, csv_text
+from runtime.data_commands import add_bin_option
+from runtime.inputs import progress, version
+from runtime.options import DATA_HELP, add_model
+
+Json = dict[str, Any]
+
+TARGET = "loihi1"
+KIND = "chart"
+STORE = "points.jsonl"
+
+SUMMARY = "accuracy against energy, time and size for a grid of configurations: fronts, and which one to deploy"
+NOTES = """\
+Axes of the grid: bits (2-6, 8, or one a layer as in 8+4+4+8), planes (1-3), groups (1-8), prune (0, 1), cores (cores,
+energy, latency, or LAYER:N as in fc1:6+conv1:4), window (per cent of each recording, 25-100% is every quarter,
+25-100%:5 every twentieth), graph (that a network was trained on: of those given, or shipped ones beside them). Choices
+are made on the training split, the test split is reported. A chart that was interrupted goes on with the same command;
+netlists and figures are kept in FOLDER. The exit code is 1 if no point fits a budget.
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Describe the options of the command."""
+    parser.add_argument("checkpoints", nargs="+", metavar="CKPT", help="trained networks of one data set")
+    add_model(parser)
+    parser.add_argument("--data", required=True, metavar="PATH", help=DATA_HELP)
+    add_bin_option(parser)
+    parser.add_argument(
+        "--grid",
+        metavar="AXIS=V,V,…",
+        help="configurations, as in bits=2-6,8,planes=1-2,window=25-100%% (default: bits=2-6,8,window=25-100%%)",
+    )
+    parser.add_argument(
+        "--budget",
+        action="append",
+        default=[],
+        metavar="WHAT=LIMIT",
+        help="pick a point: energy=0.1mJ, latency=5ms or accuracy=88; may be repeated, all of them hold",
+    )
+    parser.add_argument("--table", metavar="NAME", help="energy table to choose and draw by (default: the first)")
+    sweep.add_sweep_arguments(parser)
+    parser.add_argument("-o", "--output", required=True, metavar="FOLDER")
+    parser.epilog = NOTES
+
+
+def chart(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
+    """Run the command; exit code 1 if no point fits a budget.
+
+    Raises
+    ------
+    SpikeloomError
+        If an option, a checkpoint, the recordings or the folder's store cannot be used.
+    KeyboardInterrupt
+        On an interrupt; its text says what is kept.
+    """
+    from models.protocols import data_digest  # torch, and the engine: no other command waits for them
+    from runtime.chart_work import both_splits
+
+    target = load_target(TARGET)
+    grid = Grid() if arguments.grid is None else parse_grid(arguments.grid, target)
+    budgets = parse_budgets(arguments.budget)
+    tables = [table.name for table in target.energy]
+    energy = tables[0] if arguments.table is None else arguments.table
+    if energy not in tables:
+        raise OptionError(f"--table {energy}: {target.title} has no such energy table; give {' or '.join(tables)}")
+    folder = _folder(arguments.output)
+    networks = chart_networks.given_networks(arguments, grid)
+    data = Data(path=arguments.data, bin_s=arguments.bin)
+    checkpoint = networks[0].checkpoint
+    progress("reading the recordings")
+    splits = both_splits(data, checkpoint.taxels, checkpoint.classes)
+    digest = data_digest(splits["train"], splits["test"])
+    chart_networks.require_suited(networks, splits, digest)
+    chart_networks.require_grid(networks, grid, target)
+    facts = Facts(data=data, data_sha256=digest, target=target, folder=folder)
+    folder.mkdir(exist_ok=True)
+    points, refused, decided, rates = _measured(arguments, networks, grid, facts)
+    labels = {split: splits[split].labels.tolist() for split in SPLITS}
+    report = _report(networks, grid, facts, decided, labels, energy)
+    report["command"] = _command(arguments)
+    report["data"] |= {split: len(splits[split]) for split in SPLITS} | {"steps": splits["test"].steps}
+    _conclude(report, points, refused, budgets, decided, labels)
+    report["digest"] = hashlib.sha256(json.dumps(report, sort_keys=True).encode()).hexdigest()
+    report["measured"] = {"recordings_per_s": rates}
+    write_chart(folder, report)
+    return report, lambda found: chart_text(found, str(folder)), _code(report)
+
+
+def _code(report: Json) -> int:
+    return 1 if report["budget"] is not None and not report["budget"]["fits"] else 0
+
+
+def _command(arguments: argparse.Namespace) -> str:
+    """The words that ask for the same chart."""
+    words = ["spikeloom", "chart", *arguments.checkpoints, "--data", arguments.data]
+    names = ("graph", "taxels", "edges", "system", "weights", "beta", "theta", "grid", "table")
+    words += [
+        word for name in names if (value := getattr(arguments, name)) is not None for word in (f"--{name}", str(value))
+    ]
+    words += ["--directed"] if arguments.directed else []
+    words += ["--run", str(arguments.run)] if arguments.run else []
+    words += [] if math.isclose(arguments.bin, BIN_S) else ["--bin", f"{arguments.bin:g}"]
+    words += [word for budget in arguments.budget for word in ("--budget", budget)]
+    return shlex.join([*words, "-o", arguments.output])
+
+
+def _folder(words: str) -> Path:
+    """Folder of the chart.
+
+    Raises
+    ------
+    OptionError
+        If there cannot be one.
+    """
+    folder = Path(words)
+    if folder.exists() and not folder.is_dir():
+        raise OptionError(f"-o {words}: is not a folder; give the name of one")
+    if not folder.absolute().parent.is_dir():
+        raise OptionError(f"-o {words}: the folder that it shall be in does not exist; make it first")
+    return folder
+
+
+Measured = tuple[list[Json], list[Json], dict[str, Json], dict[str, float]]
+
+
+def _measured(arguments: argparse.Namespace, networks: Sequence[Given], grid: Grid, facts: Facts) -> Measured:
+    """Points, configurations that the chip refuses, float decisions by network, and simulated recordings a second."""
+    stored = chart_plan.stored_networks(networks, grid, facts)
+    floats = {network.name: chart_plan.decisions(network, grid, facts) for network in networks}
+    first = _sweep(arguments, facts, [*floats.values(), *(each.point() for each in stored)], "compiling")
+    planned: list[tuple[Stored, str, Json, int, sweep.Point]] = []
+    refused = []
+    for each in stored:
+        for layout, found in first[each.key].items():
+            if "refused" in found:
+                refused.append(_named(each, layout) | {"why": found["refused"]})
+                continue
+            runs = chart_plan.runs(each, layout, found["sha256"], grid, facts)
+            planned += [(each, layout, found, window, point) for window, point in runs.items()]
+    if not planned:
+        raise OptionError(
+            f"--grid: the chip refuses all {len(refused)} configurations; the first: {refused[0]['why'][0]}"
+        )
+    second = _sweep(arguments, facts, [point for *_, point in planned], "measuring")
+    points, rates = [], {}
+    for number, (each, layout, found, window, point) in enumerate(planned, 1):
+        ran = second[point.key]
+        points.append(
+            {"number": number}
+            | _named(each, layout)
+            | {"window": window, "n_cores": found["cores"], "neurons": found["neurons"], "synapses": found["synapses"]}
+            | {"netlist": f"netlists/{each.build.files[layout].name}", "netlist_sha256": found["sha256"]}
+            | {split: ran[split] for split in SPLITS}
+            | {"commands": chart_plan.commands(each, layout, window, facts)}
+        )
+        rates[str(number)] = ran["recordings_per_s"]
+    return points, refused, {name: first[point.key] for name, point in floats.items()}, rates
+
+
+def _sweep(arguments: argparse.Namespace, facts: Facts, points: Sequence[sweep.Point], label: str) -> dict[str, Json]:
+    from runtime import chart_work
+
+    return sweep.sweep(
+        points,
+        chart_work.measure,
+        facts.folder / STORE,
+        kind=KIND,
+        version=FORMAT,
+        jobs=arguments.jobs,
+        scheduler=arguments.scheduler,
+        fresh=arguments.fresh
+        and label == "compiling",  # what the first half found is not to be forgotten by the second
+        label=label,
+    )
+
+
+def _named(each: Stored, layout: str) -> Json:
+    """What a configuration is, by the axes of the grid."""
+    storage = each.storage
+    return {
+        "network": each.network.name,
+        "graph": each.network.graph,
+        "bits": list(storage.bits),
+        "planes": storage.planes,
+        "groups": storage.groups,
+        "prune": storage.prune,
+        "fine_tuned": storage.own,
+        "storage": storage.label(),
+        "cores": layout,
+    }
+
+
+def _report(
+    networks: Sequence[Given],
+    grid: Grid,
+    facts: Facts,
+    decided: Mapping[str, Json],
+    labels: Mapping[str, list[int]],
+    energy: str,
+) -> Json:
+    """All but the points and what follows from them."""
+    target = facts.target
+    described = []
+    for network in networks:
+        windows = {
+            window: {split: _right(decided[network.name][split][window], labels[split]) for split in SPLITS}
+            for window in decided[network.name]["test"]
+        }
+        described.append(chart_networks.network_json(network) | {"float": windows})
+    return {
+        "format": FORMAT,
+        "spikeloom": version(),
+        "target": target.name,
+        "data": {"path": facts.data.path, "bin_s": facts.data.bin_s, "sha256": facts.data_sha256},
+        "tables": {
+            "energy": {table.name: table.title for table in target.energy},
+            "time": {table.name: table.title for table in target.time},
+        },
+        "chosen_by": {"energy": energy, "time": target.time[0].name if target.time else None},
+        "grid": {name: list(getattr(grid, name)) for name in Grid.__slots__},
+        "networks": described,
+    }
+
+
+def _right(decisions: Sequence[int], labels: Sequence[int]) -> Json:
+    return chart_points.share(sum(a == b for a, b in zip(decisions, labels, strict=True)), len(labels))
+
+
+def _conclude(
+    report: Json,
+    points: list[Json],
+    refused: list[Json],
+    budgets: Sequence[Budget],
+    decided: Mapping[str, Json],
+    labels: Mapping[str, list[int]],
+) -> None:
+    """Figures of the points, fronts and choices; into the report."""
+    energy, time = report["chosen_by"]["energy"], report["chosen_by"]["time"]
+    for point in points:
+        model = decided[point["network"]]
+        for split in SPLITS:
+            point[split] = chart_points.figures(point[split], model[split][str(point["window"])], labels[split])
+    for network in report["networks"]:
+        network["float_training"] = _whole(decided[network["name"]], labels)
+    report["expected"] = chart_points.with_expectations(points, report["networks"])
+    chart_points.with_fronts(points, energy, time)
+    bin_s = report["data"]["bin_s"]
+    report |= {
+        "points": points,
+        "refused": refused,
+        "recommended": chart_points.recommended(points, report["networks"], energy=energy, time=time, bin_s=bin_s),
+        "saving": chart_points.saving(points, energy),
+        "budget": pick(points, budgets, energy=energy, time=time),
+    }
+
+
+def _whole(decided: Json, labels: Mapping[str, list[int]]) -> float:
+    """Share of training recordings that a float model decides right when all of each has passed."""
+    longest = max(decided["train"], key=int)
+    return float(_right(decided["train"][longest], labels["train"])["accuracy"])
+
+
+def write_chart(folder: Path, report: Json) -> None:
+    """Write the files of a chart: data, pictures and page."""
+    from runtime.chart_page import chart_page
+    from runtime.chart_picture import pictures
+
+    files = {
+        "chart.json": (json.dumps(report, indent=1, allow_nan=False) + "\n").encode(),
+        "chart.csv": csv_text(report).encode(),
+        "chart.html": chart_page(report).encode(),
+        **pictures(report),
+    }
+    for name, content in files.items():
+        with write_atomically(folder / name) as file:
+            file.write(content)

@@ -1,0 +1,242 @@
+"""From a grid to work: which networks are compiled how, on what they run, and the commands that do the same."""
+
+from __future__ import annotations
+
+import math
+import shlex
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from compiler.targets import Target
+from models.events import BIN_S
+from runtime.chart_grid import Grid
+from runtime.chart_networks import Given
+from runtime.chart_tasks import FORMAT, Build, Data, Decide, Run
+from runtime.inputs import version
+from runtime.sweep import Point, content_key
+from runtime.windows import WHOLE
+
+Json = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Storage:
+    """How a network is stored on the chip.
+
+    Parameters
+    ----------
+    bits : tuple of int
+        Width of all layers, or of each.
+    planes, groups : int
+        Times that a synapse is stored, scales in a layer.
+    prune : bool
+        Whether neurons that never fired on training recordings are left out.
+    own : bool
+        Whether the network was fine-tuned for it.
+    """
+
+    bits: tuple[int, ...]
+    planes: int
+    groups: int
+    prune: bool
+    own: bool = False
+
+    def words(self) -> list[str]:
+        """Options of ``compile`` that ask for it."""
+        if self.own:
+            return []
+        words = [] if self.bits == (8,) else ["--weight-bits", ",".join(map(str, self.bits))]
+        words += [] if self.planes == 1 else ["--planes", str(self.planes)]
+        words += [] if self.groups == 1 else ["--scale-groups", str(self.groups)]
+        return [*words, *(["--prune-unused"] if self.prune else [])]
+
+    def label(self) -> str:
+        """Short name: ``4b``, ``8-4-4-8b 2p 3g pruned``."""
+        words = [f"{'-'.join(map(str, self.bits))}b"]
+        words += [] if self.planes == 1 else [f"{self.planes}p"]
+        words += [] if self.groups == 1 else [f"{self.groups}g"]
+        return " ".join([*words, *(["pruned"] if self.prune else [])])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Stored:
+    """A network in one storage, in all layouts of the grid.
+
+    Parameters
+    ----------
+    network : Given
+    storage : Storage
+    build : Build
+        What makes its netlists.
+    key : str
+        Of that work.
+    """
+
+    network: Given
+    storage: Storage
+    build: Build
+    key: str
+
+    def point(self) -> Point:
+        """It as a point of a sweep."""
+        label = f"{self.network.name} {self.storage.label()}"
+        return Point(key=self.key, label=label, payload=self.build)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Facts:
+    """What decides every result, beside what a single one is about.
+
+    Parameters
+    ----------
+    data : Data
+    data_sha256 : str
+        Of both splits.
+    target : Target
+        Chip, with its tables.
+    folder : Path
+        Of the chart.
+    """
+
+    data: Data
+    data_sha256: str
+    target: Target
+    folder: Path
+
+    def key(self, **facts: Any) -> str:
+        """Content key of a piece of work."""
+        shared = {"format": FORMAT, "spikeloom": version(), "data": self.data_sha256, "target": repr(self.target)}
+        return content_key(shared | {"bin_s": self.data.bin_s} | facts)
+
+
+def identity(network: Given) -> Json:
+    """What tells a float network from others."""
+    checkpoint = network.checkpoint
+    return {
+        "checkpoint": checkpoint.sha256,
+        "weights": checkpoint.weights,
+        "sees": network.sees,
+        "options": list(network.words[2:]),  # all but the name of the file
+    }
+
+
+def decisions(network: Given, grid: Grid, facts: Facts) -> Point:
+    """Work that finds the decisions of a float network."""
+    words = from_anywhere([*network.words, "-o", "x.loom"])
+    work = Decide(words=words, sha256=network.checkpoint.sha256, data=_data(facts), windows=tuple(sorted(grid.window)))
+    key = facts.key(what="float", **identity(network), windows=list(work.windows))
+    return Point(key=key, label=f"{network.name} float", payload=work)
+
+
+def storages(network: Given, grid: Grid) -> Iterator[Storage]:
+    """Every storage that a grid asks for; of a fine-tuned network its own and no other."""
+    forms = network.checkpoint.forms
+    if forms is not None:
+        bits = tuple(form.bits for form in forms)
+        yield Storage(
+            bits=bits[:1] if len(set(bits)) == 1 else bits,
+            planes=max(len(form.exponents) for form in forms),
+            groups=max(len(set(form.threshold.tolist())) for form in forms),
+            prune=False,
+            own=True,
+        )
+        return
+    for bits, planes, groups, prune in product(grid.bits, grid.planes, grid.groups, grid.prune):
+        yield Storage(bits=bits, planes=planes, groups=groups, prune=bool(prune))
+
+
+def stored_networks(networks: Sequence[Given], grid: Grid, facts: Facts) -> list[Stored]:
+    """Every network in every storage, with the work that compiles it."""
+    found = []
+    for network in networks:
+        for storage in storages(network, grid):
+            layouts, files = {}, {}
+            for layout in grid.cores:
+                layouts[layout] = from_anywhere(compile_words(network, storage, layout, facts))
+                key = facts.key(what="netlist", **identity(network), storage=storage.words(), layout=layout)
+                files[layout] = facts.folder.resolve() / "netlists" / f"{key}.loom"
+            work = Build(layouts=layouts, sha256=network.checkpoint.sha256, files=files, data=_data(facts))
+            key = facts.key(what="build", **identity(network), storage=storage.words(), layouts=list(grid.cores))
+            found.append(Stored(network=network, storage=storage, build=work, key=key))
+    return found
+
+
+def runs(stored: Stored, layout: str, sha256: str, grid: Grid, facts: Facts) -> dict[int, Point]:
+    """Work that runs a netlist, by window."""
+    return {
+        window: Point(
+            key=facts.key(what="run", netlist=sha256, window=window),
+            label=f"{stored.network.name} {stored.storage.label()} {layout} {window}%",
+            payload=Run(build=stored.build, layout=layout, sha256=sha256, window=window),
+        )
+        for window in grid.window
+    }
+
+
+# -- commands ----------------------------------------------------------------------------------------------------------
+
+
+def compile_words(network: Given, storage: Storage, layout: str, facts: Facts) -> list[str]:
+    """What to type after ``spikeloom`` to get a netlist."""
+    words = [*network.words, *storage.words(), "--calibrate", facts.data.path, *_bin_words(facts)]
+    return [*words, *layout_words(layout), "-o", file_name(network, storage, layout)]
+
+
+READ = ("--calibrate", "--taxels", "--edges")
+"""Options of ``compile`` that may name what is read."""
+
+
+def from_anywhere(words: Sequence[str]) -> tuple[str, ...]:
+    """The same words for a process that works in another folder: what they read is named by its whole path.
+
+    Examples
+    --------
+    >>> from_anywhere(["compile", "pretrained:grasps", "--calibrate", "synthetic", "-o", "x.loom"])
+    ('compile', 'pretrained:grasps', '--calibrate', 'synthetic', '-o', 'x.loom')
+    """
+    reads = {1, *(at + 1 for at, word in enumerate(words) if word in READ)}
+    return tuple(_whole(word) if at in reads else word for at, word in enumerate(words))
+
+
+def _whole(path: str) -> str:
+    return str(Path(path).resolve()) if Path(path).exists() else path
+
+
+def _data(facts: Facts) -> Data:
+    return Data(path=_whole(facts.data.path), bin_s=facts.data.bin_s, sha256=facts.data_sha256)
+
+
+def layout_words(layout: str) -> list[str]:
+    """Options of ``compile`` that ask for a layout.
+
+    Examples
+    --------
+    >>> layout_words("latency"), layout_words("fc1:6+conv1:4"), layout_words("cores")
+    (['--optimize', 'latency'], ['--cores-for', 'fc1=6,conv1=4'], [])
+    """
+    if layout == "cores":
+        return []
+    if ":" in layout:
+        return ["--cores-for", layout.replace(":", "=").replace("+", ",")]
+    return ["--optimize", layout]
+
+
+def file_name(network: Given, storage: Storage, layout: str) -> str:
+    """What a netlist is called in commands."""
+    words = [network.name, *storage.label().split(), *([] if layout == "cores" else [layout])]
+    return "-".join(words).replace(":", "").replace("+", "-") + ".loom"
+
+
+def commands(stored: Stored, layout: str, window: int, facts: Facts) -> list[str]:
+    """What to type to get a point: its netlist, then its figures."""
+    compiled = compile_words(stored.network, stored.storage, layout, facts)
+    words = ["run", compiled[-1], "--data", facts.data.path, *_bin_words(facts), "--detail", "counts"]
+    words += [] if window == WHOLE else ["--window", f"{window}%"]
+    return [shlex.join(["spikeloom", *each]) for each in (compiled, words)]
+
+
+def _bin_words(facts: Facts) -> list[str]:
+    return [] if math.isclose(facts.data.bin_s, BIN_S) else ["--bin", f"{facts.data.bin_s:g}"]

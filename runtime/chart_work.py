@@ -1,0 +1,258 @@
+"""What a chart measures, in steps that can be kept: float decisions, netlists, and netlists on recordings.
+
+A network is rounded once for any number of layouts, a netlist is compiled once for any number of windows. Everything
+here is a function of files and of the words of ``spikeloom compile``, so that a netlist is the file, byte for byte,
+that the command would write.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import time
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from compiler.dynamics import with_clocks
+from compiler.errors import CapacityError, DataError, FormatError, ModelError
+from compiler.fixedpoint import FloatArray, IntArray
+from compiler.interpret import cut, vote
+from compiler.netlist import Netlist
+from compiler.pipeline import place, store
+from compiler.serialize import read_netlist, write_netlist
+from compiler.targets import load_target
+from models.evtouch import Recordings
+from runtime import engine
+from runtime.asked import Asked, asked_network
+from runtime.chart_tasks import SPLITS, Build, Data, Decide, Run
+from runtime.compile_command import provenance, recipes_asked
+from runtime.estimate import estimate
+from runtime.inputs import recordings
+from runtime.options import cores_asked
+from runtime.votes import predictions, readout_counts
+from runtime.windows import first_part, steps_of
+
+Json = dict[str, Any]
+
+PART = 16
+"""Recordings whose float spikes are held at a time."""
+
+SUMS = 1 << 24
+"""Sums of the time model that are held at a time: 128 MiB."""
+
+
+def measure(work: Decide | Build | Run) -> Json:
+    """Do one piece of a chart's work; JSON values.
+
+    Raises
+    ------
+    SpikeloomError
+        If a file cannot be used.
+    """
+    if isinstance(work, Decide):
+        return _decide(work)
+    return _build(work) if isinstance(work, Build) else _run(work)
+
+
+# -- what is kept from one piece to the next ---------------------------------------------------------------------------
+
+
+@lru_cache(maxsize=1)
+def both_splits(data: Data, taxels: int, classes: int) -> dict[str, Recordings]:
+    """Training and test recordings by split.
+
+    Raises
+    ------
+    DataError, OptionError
+        If they cannot be used, do not suit the network, or are others than those of who asks for the work.
+    """
+    from models.protocols import data_digest
+
+    shared: dict[str, Any] = {"classes": classes, "taxels": taxels, "bin_s": data.bin_s, "labels_for": "chart"}
+    found = {split: recordings(data.path, split, **shared) for split in SPLITS}
+    if data.sha256 not in (None, data_digest(found["train"], found["test"])):
+        raise DataError(f"{data.path}: holds other recordings than where the chart was asked for; copy those here")
+    return found
+
+
+@lru_cache(maxsize=2)
+def _network(words: tuple[str, ...], sha256: str) -> Asked:
+    arguments = parsed(words)
+    found = asked_network(arguments.checkpoint, arguments)
+    if found.sha256 != sha256:
+        raise ModelError(f"{arguments.checkpoint}: is another file than where the chart was asked for; copy that here")
+    return found
+
+
+def parsed(words: tuple[str, ...]) -> argparse.Namespace:
+    """Options of a command, as they would be typed."""
+    from runtime.cli import build_parser
+
+    return build_parser().parse_args(list(words))
+
+
+@lru_cache(maxsize=1)
+def _read(path: Path, sha256: str) -> Netlist | None:
+    """A netlist that is kept; None if it is gone, damaged or another one."""
+    if not path.is_file() or hashlib.sha256(path.read_bytes()).hexdigest() != sha256:
+        return None
+    try:
+        return read_netlist(path)
+    except FormatError:
+        return None
+
+
+# -- float model -------------------------------------------------------------------------------------------------------
+
+
+def _decide(work: Decide) -> Json:
+    """Decisions of the float32 model by split and window; one run each, since what comes later changes nothing."""
+    from models.reference import float_spikes  # torch, so only here
+
+    asked = _network(work.words, work.sha256)
+    checkpoint, adjacency = asked.checkpoint, asked.adjacency
+    assert checkpoint is not None, "a chart takes checkpoints"
+    assert adjacency is not None, "and these have a first layer that sees something"
+    found: Json = {}
+    for split, data in both_splits(work.data, checkpoint.taxels, checkpoint.classes).items():
+        counts: dict[int, list[IntArray]] = {window: [] for window in work.windows}
+        own = np.full(len(data), data.steps) if data.lengths is None else data.lengths
+        for first in range(0, len(data), PART):
+            part = slice(first, first + PART)
+            *_, spikes = float_spikes(checkpoint, adjacency, data.events[part]).values()
+            for window in work.windows:
+                heard = cut(spikes, steps_of(own[part], window))
+                counts[window].append(readout_counts(checkpoint.readout, checkpoint.classes, heard))
+        found[split] = {str(window): vote(np.concatenate(each)).tolist() for window, each in counts.items()}
+    return found
+
+
+# -- netlists ----------------------------------------------------------------------------------------------------------
+
+
+def _build(work: Build) -> Json:
+    """Compile what is not there; by layout the netlist's size and hash, or the limits that it breaks."""
+    arguments = {layout: parsed(words) for layout, words in work.layouts.items()}
+    some = next(iter(arguments.values()))
+    asked = _network(model_words(next(iter(work.layouts.values()))), work.sha256)
+    training = both_splits(work.data, asked.network.input.taxels, asked.network.classes)["train"]
+    try:
+        stored = store(
+            asked.network,
+            forms=None if asked.checkpoint is None else asked.checkpoint.forms,
+            target=some.target,
+            recipes=recipes_asked(some),
+            prune_unused=some.prune_unused,
+            training_events=training.events,
+        )
+    except (CapacityError, ModelError) as error:
+        return {layout: {"refused": str(error).splitlines()} for layout in work.layouts}
+    found: Json = {}
+    for layout, own in arguments.items():
+        try:
+            netlist = place(
+                stored,
+                target=own.target,
+                cores_for=cores_asked(own.cores_for),
+                optimize=own.optimize,
+                provenance=provenance(own, asked, calibrated=True),
+            ).netlist
+        except CapacityError as error:
+            found[layout] = {"refused": str(error).splitlines()}
+            continue
+        work.files[layout].parent.mkdir(parents=True, exist_ok=True)
+        found[layout] = {
+            "sha256": write_netlist(netlist, work.files[layout]),
+            "cores": netlist.n_cores,
+            "neurons": netlist.n_compartments,
+            "synapses": netlist.n_synapses,
+        }
+    return found
+
+
+STORAGE = ("--weight-bits", "--planes", "--scale-groups", "--optimize", "--cores-for", "-o")
+"""Options of ``compile`` that say nothing of the float network, each with a value; ``--prune-unused`` has none."""
+
+
+def model_words(words: tuple[str, ...]) -> tuple[str, ...]:
+    """The words of a ``compile`` command that name the float network.
+
+    Examples
+    --------
+    >>> model_words(("compile", "a.pt", "--weight-bits", "4", "--prune-unused", "-o", "x.loom"))
+    ('compile', 'a.pt', '-o', 'x.loom')
+    """
+    kept, skip = [], False
+    for word in words:
+        if skip:
+            skip = False
+        elif word in STORAGE:
+            skip = True
+        elif word != "--prune-unused":
+            kept.append(word)
+    return (*kept, "-o", "x.loom")
+
+
+# -- netlists on recordings --------------------------------------------------------------------------------------------
+
+
+def _run(work: Run) -> Json:
+    """What a netlist decides on both splits, what that costs, and how fast the simulator is."""
+    path = work.build.files[work.layout]
+    netlist = _read(path, work.sha256)
+    if netlist is None:
+        _read.cache_clear()
+        _build(work.build)
+        netlist = _read(path, work.sha256)
+    if netlist is None:
+        raise FormatError(f"{path}: is not the netlist that was measured before; begin anew with --fresh")
+    splits = both_splits(work.build.data, netlist.taxels, netlist.classes)
+    found: Json = {split: _costs(netlist, first_part(data, work.window)) for split, data in splits.items()}
+    found["recordings_per_s"] = _throughput(netlist, first_part(splits["test"], work.window))
+    return found
+
+
+def _costs(netlist: Netlist, data: Recordings) -> Json:
+    """Decisions, and the mean inference: operations, energy by table, time by table, the longest step."""
+    target = load_target(netlist.target)
+    events = with_clocks(data.events, netlist.clocks)
+    own = np.full(len(data), data.steps) if data.lengths is None else data.lengths
+    size = max(1, SUMS // ((data.steps + netlist.max_depth) * 2 * netlist.n_cores * max(1, len(target.time))))
+    decided: list[int] = []
+    operations: list[FloatArray] = []
+    energy: dict[str, list[FloatArray]] = {}
+    seconds: dict[str, list[FloatArray]] = {}
+    longest: dict[str, float] = {}
+    for first in range(0, len(data), size):
+        part = slice(first, first + size)
+        counts, costs = estimate(netlist, target, events[part], lengths=own[part])
+        decided += predictions(netlist, counts.spikes).tolist()
+        operations.append(costs.costs.synaptic_operations.sum(axis=1))
+        for name, joule in costs.costs.energy.items():
+            energy.setdefault(name, []).append(joule.sum(axis=1))
+        for name, times in costs.simple.items():
+            seconds.setdefault(name, []).append(times.duration_ns.sum(axis=1) * 1e-9)
+            longest[name] = max(longest.get(name, 0.0), float(times.duration_ns.max() * 1e-9))
+    return {
+        "decisions": decided,
+        "synaptic_operations": float(np.concatenate(operations).mean()),
+        "energy_j": {name: float(np.concatenate(each).mean()) for name, each in energy.items()},
+        "time_s": {name: float(np.concatenate(each).mean()) for name, each in seconds.items()},
+        "step_s": longest,
+        "steps": float(own.mean()),
+    }
+
+
+def _throughput(netlist: Netlist, data: Recordings) -> float:
+    """Recordings a second on one thread, decisions only; the better of two rounds."""
+    prepared = engine.prepare(netlist)
+    events = with_clocks(data.events, netlist.clocks)
+    rounds = []
+    for _ in range(2):
+        began = time.perf_counter()
+        engine.simulate(prepared, events, lengths=data.lengths, threads=1)
+        rounds.append(time.perf_counter() - began)
+    return len(data) / min(rounds)

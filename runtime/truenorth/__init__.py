@@ -1,0 +1,1 @@
+"""IBM TrueNorth, tick by tick."""

@@ -1,0 +1,227 @@
+"""The fast twin of :mod:`runtime.truenorth.spec`: crossbar cores by events, bit for bit the same."""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from compiler.errors import NumericRangeError
+from compiler.fixedpoint import IntArray
+from compiler.targets import CROSSBARS, load_target
+from compiler.truenorth.netlist import RESET_TO, CrossbarNetlist
+from compiler.truenorth.rules import signed_range
+from runtime.truenorth import kernel
+from runtime.truenorth.spec import Neuron, neuron_tick
+from runtime.truenorth.trace import Counts, EventArray, Trace, check_channels
+
+SETTLING = 64
+"""Ticks within which a neuron without input must come to rest to be let sleep."""
+
+MOST_TICKS = 2**31
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Engine:
+    """A network as the kernel takes it.
+
+    Parameters
+    ----------
+    netlist : CrossbarNetlist
+    low, high : int
+        Range of the membrane register.
+    slots : int
+        Power of two above every delay.
+    wiring : Wiring
+    burst_axon : (burst axons, 3) int64
+        Row of the offset, channel and axon of each that nothing else reaches.
+    """
+
+    netlist: CrossbarNetlist
+    low: int
+    high: int
+    slots: int
+    wiring: kernel.Wiring
+    burst_axon: IntArray
+
+
+def prepare(netlist: CrossbarNetlist) -> Engine:
+    """Arrange a network that breaks no rule of its chip for the kernel."""
+    bits = load_target(netlist.target, CROSSBARS).limit("neuron.membrane_bits")
+    low, high = signed_range(bits)
+    neuron, axon = netlist.neuron_of_synapse(), netlist.axon_of_synapse()
+    weight = netlist.weight[neuron, netlist.axon_type[axon]]
+    halves = np.where(weight > 0, weight << kernel.HALF, -weight)
+    wired = netlist.axons_at(netlist.cores_at(netlist.wire_x, netlist.wire_y), netlist.wire_line)
+    clocked = netlist.axons_at(netlist.clock_core, netlist.clock_line)
+    fed = netlist.axons_at(netlist.feed_core, netlist.feed_line)
+
+    # channels that are alone on their axons reach the neurons behind them at once
+    offsets, offset = np.unique(netlist.feed_tick, return_inverse=True)
+    key = offset.reshape(-1) * netlist.n_inputs + netlist.feed_channel
+    alone = np.bincount(np.concatenate([wired, clocked, fed]), minlength=netlist.n_axons)[fed] == 1
+    owner = np.full(netlist.n_axons, -1)
+    owner[fed[alone]] = key[alone]
+    bursts = np.flatnonzero(owner[axon] >= 0)
+    pairs, pair = np.unique(np.stack([owner[axon[bursts]], neuron[bursts]]), axis=1, return_inverse=True)
+    burst_weight = np.zeros(pairs.shape[1], np.int64)
+    np.add.at(burst_weight, pair.reshape(-1), halves[bursts])
+    rest = np.argsort(key[~alone], kind="stable")
+
+    def bounds(keys: IntArray) -> IntArray:
+        ends = np.searchsorted(keys, np.arange(len(offsets) * netlist.n_inputs + 1))
+        starts = np.arange(len(offsets))[:, None] * netlist.n_inputs + np.arange(netlist.n_inputs + 1)
+        found: IntArray = ends[starts].astype(np.int64)
+        return found
+
+    wiring = kernel.Wiring(
+        offsets=offsets.astype(np.int64),
+        feed_bounds=bounds(key[~alone][rest]),
+        feed_axon=fed[~alone][rest].astype(np.int32),
+        burst_bounds=bounds(pairs[0]),
+        burst_neuron=pairs[1].astype(np.int32),
+        burst_weight=burst_weight,
+        clocks=np.stack([clocked, netlist.clock_period, netlist.clock_phase], axis=1),
+        axon_synapses=np.array(netlist.axon_synapses),
+        synapse_neuron=neuron.astype(np.int32),
+        synapse_weight=halves,
+        parameters=_parameters(netlist, wired, bits),
+        instant=_instant(netlist, neuron, weight, high),
+        initial=netlist.initial.astype(np.int32),
+    )
+    return Engine(
+        netlist=netlist,
+        low=low,
+        high=high,
+        slots=1 << int(netlist.wire_delay.max(initial=1)).bit_length(),
+        wiring=wiring,
+        burst_axon=np.stack([*np.divmod(key[alone], netlist.n_inputs), fed[alone]], axis=1),
+    )
+
+
+def _parameters(netlist: CrossbarNetlist, wired: IntArray, bits: int) -> kernel.Int32:
+    """Columns of the kernel."""
+    target, delay = np.full(netlist.n_neurons, -1), np.zeros(netlist.n_neurons, np.int64)
+    target[netlist.wire_neuron], delay[netlist.wire_neuron] = wired, netlist.wire_delay
+    columns = {
+        kernel.LEAK: netlist.leak,
+        kernel.REVERSAL: netlist.leak_reversal,
+        kernel.THRESHOLD: netlist.threshold,
+        kernel.MASK_BITS: netlist.mask_bits,
+        kernel.RESET_MODE: netlist.reset_mode,
+        kernel.RESET: netlist.reset,
+        kernel.NEGATIVE: netlist.negative_threshold,
+        kernel.SATURATES: netlist.negative_saturates,
+        kernel.REST: _rests(netlist, bits),
+        kernel.WIRE_AXON: target,
+        kernel.WIRE_DELAY: delay,
+        kernel.VOTES_FROM: np.where(netlist.readout_class >= 0, netlist.readout_first, -1),
+    }
+    return np.stack([columns[i] for i in range(len(columns))], axis=1).astype(np.int32)
+
+
+def _rests(netlist: CrossbarNetlist, bits: int) -> IntArray:
+    """Membrane at which each neuron without arrivals stays, silent, or ``NO_REST`` where it does not come to one."""
+    names = [name for name in Neuron.__dataclass_fields__ if name != "membrane"]
+    columns = np.stack([*(getattr(netlist, name) for name in names), netlist.initial], axis=1)
+    distinct, which = np.unique(columns, axis=0, return_inverse=True)
+    found = np.full(len(distinct), kernel.NO_REST)
+    for row, values in enumerate(distinct.tolist()):
+        neuron = Neuron(*values)
+        for _ in range(SETTLING):
+            before = neuron.membrane
+            spiked, left = neuron_tick(neuron, 0, 0, 0, bits)
+            if not spiked and not left and neuron.membrane == before and not neuron.mask_bits:
+                found[row] = before
+                break
+    return found[which.reshape(-1)]
+
+
+def _instant(netlist: CrossbarNetlist, neuron: IntArray, weight: IntArray, high: int) -> kernel.Int32:
+    """Leak of the neurons that :func:`compiler.truenorth.draft.history_free` describes; 0 for all others."""
+    sums = [np.bincount(neuron, np.maximum(sign * weight, 0), netlist.n_neurons) for sign in (1, -1)]
+    plain = (netlist.leak < 0) & (netlist.reset_mode == RESET_TO) & (np.maximum(*sums) - netlist.leak <= high)
+    for name in ("leak_reversal", "threshold", "mask_bits", "reset", "negative_threshold", "initial"):
+        plain &= getattr(netlist, name) == 0
+    return np.where(plain, netlist.leak, 0).astype(np.int32)
+
+
+def simulate(
+    network: CrossbarNetlist | Engine,
+    events: EventArray,
+    *,
+    lengths: IntArray | None = None,
+    seed: int = 0,
+    spikes: bool = False,
+    membranes: bool = False,
+) -> Trace:
+    """Run recordings through the cores, as :func:`runtime.truenorth.spec.simulate` does each.
+
+    Parameters
+    ----------
+    network : CrossbarNetlist or Engine
+        A network that breaks no rule of its chip, or what :func:`prepare` made of it.
+    events : (samples, n_inputs, T) uint8 or bool
+        Input events; any value but zero is an event.
+    lengths : (samples,) int64, optional
+        Data steps of each recording where some are shorter than T; what comes after them is not heard.
+    seed : int
+        Of the random numbers; the same for all recordings, so that none depends on its neighbours.
+    spikes, membranes : bool
+        Keep them, at one and four bytes a neuron and tick.
+
+    Raises
+    ------
+    DataError
+        If the recordings have another number of input channels than the network.
+    NumericRangeError
+        If they would take more ticks than a run can count.
+    """
+    engine = network if isinstance(network, Engine) else prepare(network)
+    netlist = engine.netlist
+    check_channels(netlist, events.shape[1])
+    samples, channels, whole = events.shape
+    steps = np.full(samples, whole) if lengths is None else np.asarray(lengths, np.int64)
+    most = netlist.ticks(whole)
+    if most >= MOST_TICKS:
+        raise NumericRangeError(f"recordings of {whole} data steps take {most} ticks, {MOST_TICKS - 1} can be counted")
+    neurons = netlist.n_neurons
+    fed = np.zeros((samples, len(engine.wiring.offsets), channels), np.int64)
+    axons = np.zeros((samples, netlist.n_axons), np.int64)
+    spiked, votes, overflows = np.zeros((3, samples, neurons), np.int64)
+    raster = np.zeros((samples, most if spikes else 0, neurons), np.bool_)
+    held = np.zeros((samples, most if membranes else 0, neurons), np.int32)
+    inputs, merged = np.zeros((samples, channels), np.int64), np.zeros(samples, np.int64)
+
+    def one(sample: int) -> None:
+        heard = np.ascontiguousarray(events[sample, :, : steps[sample]].T).astype(np.uint8)
+        inputs[sample] = np.count_nonzero(heard, axis=0)
+        arrays = (fed, axons, spiked, votes, overflows, raster, held)
+        merged[sample] = kernel.run(
+            heard,
+            netlist.bin_ticks,
+            netlist.ticks(int(steps[sample])),
+            np.uint64(seed),
+            engine.low,
+            engine.high,
+            engine.slots,
+            engine.wiring,
+            kernel.Tallies(*(array[sample] for array in arrays)),
+        )
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        list(pool.map(one, range(samples)))
+    offset, channel, axon = engine.burst_axon.T
+    axons[:, axon] = fed[:, offset, channel]
+    counts = Counts(
+        ticks=steps * netlist.bin_ticks + netlist.drain,
+        inputs=inputs,
+        spikes=spiked,
+        votes=votes,
+        axons=axons,
+        merged=merged,
+        overflows=overflows,
+    )
+    return Trace(counts=counts, spikes=raster if spikes else None, membranes=held if membranes else None)

@@ -1,0 +1,204 @@
+"""The command ``anytime``: figures of a stopped chip are those of a chip that stopped, and what cannot be asked."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from made_files import CLASSES, events, own_file, recordings_folder, weights
+from numpy.testing import assert_allclose, assert_array_equal
+from timed_networks import written
+
+from compiler.dynamics import with_clocks
+from compiler.serialize import read_netlist, write_netlist
+from compiler.targets import load_target
+from models.events import load_data
+from runtime import cli, cost, course, engine, estimate, exits
+from runtime.trace import Counts
+from runtime.votes import class_counts, predictions
+
+STEPS = 60
+
+WORDS = ("anytime", "net.loom", "--data", "data")
+ALL = (*WORDS, "--checkpoint", "net.pt", "--calibrate", "data")
+
+
+def _recordings(seed, samples):
+    return events(seed, samples=samples, steps=STEPS, rate=0.3)
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """A folder with recordings, a checkpoint and its netlist."""
+    folder = tmp_path_factory.mktemp("anytime")
+    recordings_folder(folder / "data", train=_recordings(1, 40), test=_recordings(2, 12))
+    own_file(folder / "net.pt", last=weights(3, gain=2.5))
+    own_file(folder / "wide.pt", last=weights(sizes=(10, 8, CLASSES)))
+    assert cli.main(["compile", str(folder / "net.pt"), "-o", str(folder / "net.loom"), "--json"]) == 0
+    return folder
+
+
+@pytest.fixture
+def spikeloom(capsys, place, monkeypatch):
+    """Run a command in that folder; returns exit code, standard output and standard error."""
+    monkeypatch.chdir(place)
+
+    def command(*words):
+        capsys.readouterr()
+        code = cli.main([str(word) for word in words])
+        return code, *capsys.readouterr()
+
+    return command
+
+
+def test_text(spikeloom, golden):
+    code, out, err = spikeloom(*ALL)
+    assert (code, err) == (0, "")
+    golden("anytime.txt", out)
+
+
+def test_without_labels_checkpoint_and_calibration(spikeloom, tmp_path):
+    grasp = tmp_path / "grasp.npy"
+    np.save(grasp, events(5, samples=1)[0].astype(np.float32))
+    code, out, _ = spikeloom("anytime", "net.loom", "--data", grasp)
+    assert code == 0
+    lines = out.splitlines()
+    assert lines[0].split() == [
+        *("stop", "when", "votes", "ahead", "steps", "operations", "davies2018", "sanafe", "time,", "sanafe", "differ"),
+        "right",
+    ]
+    assert [line.split()[0] for line in lines if line] == ["stop", "all", "proven", "all", "live:"]
+
+
+def test_all_figures_of_a_stopped_chip(spikeloom, place):
+    code, out, _ = spikeloom(*ALL, "--differ", "0.25", "--json")
+    assert code == 0
+    report = json.loads(out)
+    netlist, data = read_netlist("net.loom"), load_data("data", "test")[0]
+    target, flat = load_target("loihi1"), with_clocks(data.events, netlist.clocks)
+    stepped, meter = engine.prepare(netlist, stepwise=True), cost.prepare(netlist, target)
+    assert [rule["allowed"] for rule in report["rules"]] == [None, 0.0, 0.005, 0.01, 0.02, 0.05, 0.25]
+    assert report["chosen"] == 6
+    full, whole = engine.simulate(netlist, flat), estimate.estimate(netlist, target, flat)[1]
+    joule = {name: each.sum(axis=1) for name, each in whole.costs.energy.items()}
+    second = {name: each.duration_ns.sum(axis=1) * 1e-9 for name, each in whole.simple.items()}
+    assert report["decisions"] == predictions(netlist, full.counts.spikes).tolist()
+    for rule in (report["rules"][0], report["rules"][6]):
+        for i, ends in enumerate(rule["samples"]["chip_steps"]):
+            state = engine.start(stepped)
+            engine.advance(stepped, state, flat[i], length=STEPS, steps=ends)
+            counts = Counts(
+                **{name: getattr(state, name)[None] for name in ("inputs", "spikes", "updates", "saturations")}
+            )
+            assert rule["samples"]["decisions"][i] == predictions(netlist, counts.spikes)[0]
+            found = cost.estimate(meter, counts, ends - netlist.max_depth)
+            left = whole.costs.synaptic_operations[i].sum() - found.synaptic_operations.sum()
+            assert rule["samples"]["saved_operations"][i] == left
+            for name, each in found.energy.items():
+                assert_allclose(rule["samples"]["saved_energy_j"][name][i], joule[name][i] - each.sum(), atol=1e-18)
+            spent = whole.simple["sanafe"].duration_ns[i, :ends].sum() * 1e-9
+            assert_allclose(rule["samples"]["saved_time_s"]["sanafe"][i], second["sanafe"][i] - spent, atol=1e-15)
+    proof = report["rules"][0]
+    assert proof["differ"] == proof["gained"] == proof["lost"] == 0
+    assert proof["samples"]["decisions"] == report["decisions"]
+    assert_allclose(
+        proof["mean"]["energy_j"]["sanafe"], (1 - proof["saved"]["energy_j"]["sanafe"]) * joule["sanafe"].mean()
+    )
+    assert report["rules"][report["savings"]["identical"]]["differ"] == 0
+    assert report["rules"][report["savings"]["one_lost"]]["correct"] >= report["full"]["correct"] - 1
+
+
+def test_windows_are_those_of_shortened_recordings(spikeloom):
+    report = json.loads(spikeloom(*ALL, "--json")[1])
+    netlist, data = read_netlist("net.loom"), load_data("data", "test")[0]
+    assert [window["percent"] for window in report["windows"]] == list(range(5, 101, 5))
+    for window in report["windows"]:
+        steps = max(STEPS * window["percent"] // 100, 1)
+        assert window["bins"] == steps
+        flat = with_clocks(data.events[..., :steps], netlist.clocks)
+        decided = predictions(netlist, engine.simulate(netlist, flat).counts.spikes)
+        assert window["chip"]["correct"] == np.count_nonzero(decided == data.labels)
+    recordings_folder(Path("short"), test=_recordings(2, 12)[..., : STEPS // 2])
+    cut = json.loads(spikeloom("verify", "net.loom", "--checkpoint", "net.pt", "--data", "short", "--json")[1])
+    assert report["windows"][9]["float"]["correct"] == round(cut["accuracy"]["float"] * len(data))
+    assert report["windows"][9]["chip"]["correct"] == round(cut["accuracy"]["chip"] * len(data))
+
+
+def test_recordings_of_different_length_end_on_their_own(place, monkeypatch):
+    monkeypatch.chdir(place)
+    netlist, data = read_netlist("net.loom"), load_data("data", "test")[0]
+    lengths = np.array([60, 1, 7, 24, 33, 2, 50, 59, 60, 60, 3, 40])
+    ran = course.run(netlist, load_target("loihi1"), with_clocks(data.events, netlist.clocks), lengths)
+    at = exits.standing(ran.votes, lengths)
+    sure = exits.proven(ran.votes, at, exits.most_votes(netlist, STEPS))
+    ends = exits.exits(sure, at)
+    assert np.all(ends < lengths)
+    for i, length in enumerate(lengths):
+        flat = with_clocks(data.events[i : i + 1, ..., :length], netlist.clocks)
+        counts, alone = estimate.estimate(netlist, load_target("loihi1"), flat)
+        assert_array_equal(ran.votes[i, -1], class_counts(netlist, counts.spikes)[0])
+        assert at.leader[i, ends[i]] == predictions(netlist, counts.spikes)[0]
+        assert ran.operations[i, -1] == alone.costs.synaptic_operations.sum()
+        for name, each in alone.costs.energy.items():
+            assert_allclose(ran.energy[name][i, -1], each.sum())
+        assert_allclose(ran.time["sanafe"][i, -1], alone.simple["sanafe"].duration_ns.sum() * 1e-9)
+
+
+def test_clocks_and_lasting_currents(spikeloom, tmp_path):
+    checkpoint, data = tmp_path / "x.pt", tmp_path / "data"
+    written(checkpoint)
+    made = (np.random.default_rng(3).random((6, 39, 2, 20)) < 0.15).astype(np.uint8)
+    recordings_folder(data, train=made[:3], test=made[3:])
+    net = tmp_path / "x.loom"
+    assert spikeloom("compile", checkpoint, "--keep-all", "-o", net)[0] == 0
+    code, out, _ = spikeloom("anytime", net, "--checkpoint", checkpoint, "--data", data, "--calibrate", data, "--json")
+    assert code == 0
+    assert json.loads(out)["rules"][0]["differ"] == 0
+
+
+def test_files(spikeloom, tmp_path):
+    code, out, _ = spikeloom(*ALL, "-o", tmp_path / "out.json", "--picture", tmp_path / "out.png", "--json")
+    assert code == 0
+    assert json.loads((tmp_path / "out.json").read_text()) == json.loads(out)
+    assert (tmp_path / "out.png").read_bytes().startswith(b"\x89PNG")
+    assert spikeloom(*WORDS, "--picture", tmp_path / "proof.png")[0] == 0
+
+
+def test_several_chips_have_no_times(spikeloom, tmp_path):
+    netlist = read_netlist("net.loom")
+    far = replace(netlist, core_tile=netlist.core_tile + np.arange(netlist.n_cores) * 32)
+    if netlist.n_cores > 1:
+        write_netlist(far, tmp_path / "far.loom")
+        report = json.loads(spikeloom("anytime", tmp_path / "far.loom", "--data", "data", "--json")[1])
+        assert report["full"]["time_s"] == {}
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ((*WORDS, "--differ", "0.1"), "--differ 0.1: nothing to calibrate on; add --calibrate or leave it away"),
+        (
+            (*WORDS, "--calibrate", "data", "--differ", "1"),
+            "--differ 1: not a share; give a number from 0 to below 1",
+        ),
+        (
+            (*WORDS, "--graph", "manual"),
+            "--graph: is for --checkpoint, which is not given; add it or leave this away",
+        ),
+        ((*WORDS, "-o", "net.loom"), "-o net.loom: is an input of this command (net.loom); give another name"),
+        (
+            (*WORDS, "--picture", "none/x.png"),
+            "--picture none/x.png: the folder does not exist; make it first",
+        ),
+        (
+            (*WORDS, "--checkpoint", "wide.pt"),
+            "netlist and checkpoint disagree: the netlist has taxels 6, channels 2, conv1 30, fc1 9, fc2 8, fc3 4, the "
+            "checkpoint taxels 6, channels 2, conv1 30, fc1 10, fc2 8, fc3 4; give the checkpoint that the netlist was "
+            "compiled from",
+        ),
+    ],
+)
+def test_mistakes(spikeloom, words, message):
+    code, out, err = spikeloom(*words)
+    assert (code, out, err) == (2, "", f"spikeloom: {message}\n")

@@ -1,0 +1,503 @@
+"""The command ``chart`` on small networks: what it writes, that its commands give its figures, resuming, refusals."""
+
+import csv
+import hashlib
+import json
+import os
+import shlex
+import signal
+import subprocess
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from commands import RUNTIME
+from made_files import CLASSES, events, own_file, recordings_folder, ring, weights
+
+from compiler.errors import CapacityError, OptionError, SpikeloomError, Violation
+from compiler.serialize import netlist_bytes, read_netlist
+from models.evtouch import load_recordings
+from models.graphs import Graph
+from models.protocols import data_digest
+from runtime import chart_tasks, chart_work, cli
+from runtime.chart_text import chart_text
+
+ROOT = Path(__file__).resolve().parents[1]
+
+GRID = "bits=4,8,window=50-100%:50,cores=cores/fc1:2"
+VIOLATION = Violation(owner="core 0", rule="loihi1.core.axons_in", used=5, allowed=4, remedy="use fewer inputs")
+
+CHART = ("chart", "ring.pt", "--data", "data", "--grid", GRID, "--jobs", "1")
+
+
+def chain():
+    pairs = [(i, i + 1) for i in range(5)]
+    return Graph(name="knn:1", coordinates=np.arange(6.0)[:, None], edges=np.array(pairs + [(b, a) for a, b in pairs]))
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """A folder with recordings and checkpoints of two graphs."""
+    folder = tmp_path_factory.mktemp("chart")
+    train = np.concatenate([events(1, samples=12), events(3, samples=4, rate=0.05)])
+    recordings_folder(folder / "data", train=train, test=events(2, samples=8))
+    recordings_folder(folder / "other", test=events(5, samples=8))
+    digest = data_digest(load_recordings(folder / "data", "train"), load_recordings(folder / "data", "test"))
+    known = {"data_sha256": digest, "validation": {"correct": 3, "samples": 4}, "command": "spikeloom train …"}
+    own_file(folder / "ring.pt", training=known)
+    own_file(folder / "chain.pt", last=weights(3), graph=chain(), training=known)
+    own_file(folder / "unknown.pt", last=weights(4))
+    own_file(folder / "elsewhere.pt", training={"data_sha256": "0" * 64, "data": "Grasps.zip"})
+    own_file(folder / "small.pt", last=weights(taxels=4), graph=ring(4))
+    (folder / "file").write_text("")
+    return folder
+
+
+@pytest.fixture
+def spikeloom(capsys, place, monkeypatch):
+    """Run a command in that folder; returns exit code, standard output and standard error."""
+    monkeypatch.chdir(place)
+    chart_work.both_splits.cache_clear()
+    chart_work._network.cache_clear()
+
+    def command(*words):
+        capsys.readouterr()
+        code = cli.main([str(word) for word in words])
+        return code, *capsys.readouterr()
+
+    return command
+
+
+@pytest.fixture
+def made(spikeloom, place):
+    """A chart of one network, made once."""
+    if not (place / "out" / "chart.json").exists():
+        code, out, err = spikeloom(*CHART, "-o", "out", "--json")
+        assert (code, err) == (0, "")
+        assert json.loads(out) == json.loads((place / "out" / "chart.json").read_text())
+    return json.loads((place / "out" / "chart.json").read_text())
+
+
+def without_rates(report):
+    """A chart as text, without what is measured on this machine."""
+    return {key: value for key, value in report.items() if key != "measured"}
+
+
+# -- points ------------------------------------------------------------------------------------------------------------
+
+
+def test_every_point_of_the_grid_is_there(made):
+    found = [(p["bits"], p["cores"], p["window"]) for p in made["points"]]
+    assert found == [(b, c, w) for b in ([4], [8]) for c in ("cores", "fc1:2") for w in (50, 100)]
+    assert [point["number"] for point in made["points"]] == list(range(1, 9))
+    assert made["refused"] == []
+    assert (made["data"]["train"], made["data"]["test"], made["data"]["steps"]) == (16, 8, 24)
+
+
+def test_the_commands_of_a_point_give_its_netlist_and_its_figures(made, spikeloom, place):
+    for point in made["points"]:
+        compiled, ran = (shlex.split(command) for command in point["commands"])
+        assert spikeloom(*compiled[1:])[0] == 0
+        netlist = (place / compiled[-1]).read_bytes()
+        assert netlist == (place / "out" / point["netlist"]).read_bytes()
+        assert hashlib.sha256(netlist).hexdigest() == point["netlist_sha256"]
+        code, out, _ = spikeloom(*ran[1:], "--json")
+        assert code == 0
+        found = json.loads(out)
+        assert found["accuracy"] == point["test"]["accuracy"]
+        mean = found["costs"]["per_inference"]
+        assert mean["energy_j"] == pytest.approx(point["test"]["energy_j"], rel=1e-12)
+        assert mean["synaptic_operations"] == point["test"]["synaptic_operations"]
+        (clock,) = found["costs"]["time"]
+        assert {clock["table"]: clock["inference_s"]["mean"]} == pytest.approx(point["test"]["time_s"], rel=1e-12)
+        assert found["costs"]["chip_steps"] == point["test"]["steps"] + read_netlist(place / compiled[-1]).max_depth
+
+
+def test_decisions_are_held_against_the_float_model_on_the_same_part_of_a_recording(made, spikeloom):
+    for point in made["points"]:
+        name = shlex.split(point["commands"][0])[-1]
+        words = ("verify", name, "--checkpoint", "ring.pt", "--data", "data", "--window", f"{point['window']}%")
+        _, out, _ = spikeloom(*words, "--spec-samples", "1", "--json")
+        found = json.loads(out)
+        assert found["accuracy"]["float"] == point["test"]["float"]["accuracy"]
+        assert found["decision_agreement"] == point["test"]["equal"] / 8
+
+
+def test_layouts_of_one_network_decide_alike(made):
+    decided = {}
+    for point in made["points"]:
+        figures = [point[split][key] for split in ("train", "test") for key in ("correct", "equal")]
+        assert decided.setdefault((str(point["bits"]), point["window"]), figures) == figures
+    assert len({point["n_cores"] for point in made["points"]}) > 1
+
+
+def test_numbers_follow_from_the_figures(made):
+    (network,) = made["networks"]
+    assert network["validation"] == network["expected"] == 0.75
+    for point in made["points"]:
+        kept = point["train"]["accuracy"] / network["float_training"]
+        assert point["expected"] == pytest.approx(0.75 * kept)
+        assert point["test"]["low"] <= point["test"]["accuracy"] <= point["test"]["high"]
+    assert any(point["front"]["energy"] for point in made["points"])
+    assert made["measured"]["recordings_per_s"].keys() == {str(point["number"]) for point in made["points"]}
+    assert min(made["measured"]["recordings_per_s"].values()) > 0
+
+
+def test_the_digest_is_over_all_but_what_is_measured(made):
+    content = {key: value for key, value in made.items() if key not in ("measured", "digest")}
+    assert hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest() == made["digest"]
+
+
+def test_the_table_of_points(made, place):
+    with (place / "out" / "chart.csv").open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == len(made["points"])
+    for row, point in zip(rows, made["points"], strict=True):
+        assert row["bits"] == str(point["bits"][0])
+        assert float(row["test_energy_j_davies2018"]) == point["test"]["energy_j"]["davies2018"]
+        assert float(row["train_time_s_sanafe"]) == point["train"]["time_s"]["sanafe"]
+        assert [row["compile"], row["run"]] == point["commands"]
+        assert float(row["measured_recordings_per_s"]) >= 0
+
+
+def test_what_the_terminal_shows(made):
+    told = chart_text(made, "out").splitlines()
+    assert told[0] == "8 points of 1 network on 8 test and 16 training recordings"
+    assert told[-1] == "written: out/chart.html, .svg, .png, .csv, .json; netlists in out/netlists"
+
+
+def test_pictures_and_page_are_written(made, place):
+    assert (place / "out" / "chart.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+    assert (place / "out" / "chart.svg").read_text("utf-8").startswith("<?xml")
+    assert (place / "out" / "chart.html").read_text("utf-8").startswith("<!DOCTYPE html>")
+
+
+# -- again, resumed, side by side --------------------------------------------------------------------------------------
+
+
+def test_asked_again_nothing_is_measured_and_every_byte_is_the_same(made, spikeloom, place, monkeypatch):
+    before = {file.name: file.read_bytes() for file in (place / "out").glob("chart.*")}
+
+    def never(_work):
+        raise AssertionError("measured again")
+
+    monkeypatch.setattr("runtime.chart_work.measure", never)
+    assert spikeloom(*CHART, "-o", "out", "--json")[0] == 0
+    assert {file.name: file.read_bytes() for file in (place / "out").glob("chart.*")} == before
+
+
+def test_one_more_window_compiles_nothing(made, spikeloom, monkeypatch):
+    worked, measure = [], chart_work.measure
+
+    def watched(work):
+        worked.append(work)
+        return measure(work)
+
+    monkeypatch.setattr("runtime.chart_work.measure", watched)
+    words = [word if word != GRID else GRID.replace("50-100%:50", "25%,50%,100%") for word in CHART]
+    assert spikeloom(*words, "-o", "out", "--json")[0] == 0
+    runs = [work for work in worked if isinstance(work, chart_tasks.Run)]
+    assert [work.window for work in runs] == [25] * 4
+    assert [type(work) for work in worked if work not in runs] == [chart_tasks.Decide]
+    spikeloom(*CHART, "-o", "out", "--json")
+
+
+def test_a_netlist_that_is_gone_or_damaged_is_made_again(made, spikeloom, place):
+    gone, damaged = (place / "out" / made["points"][at]["netlist"] for at in (0, -1))
+    kept = gone.read_bytes(), damaged.read_bytes()
+    gone.unlink()
+    damaged.write_bytes(kept[1][:100])
+    words = [word if word != GRID else GRID.replace("50-100%:50", "10%") for word in CHART]
+    assert spikeloom(*words, "-o", "out", "--json")[0] == 0
+    assert (gone.read_bytes(), damaged.read_bytes()) == kept
+    spikeloom(*CHART, "-o", "out", "--json")
+
+
+@pytest.mark.slow
+def test_two_processes_find_the_same(made, spikeloom, place):
+    words = [*CHART[:-1], "2", "-o", "two", "--json"]
+    code, out, _ = spikeloom(*words)
+    assert code == 0
+    other = without_rates(json.loads(out))
+    mine = without_rates(made)
+    for found in (other, mine):
+        found.pop("digest"), found.pop("command")
+    assert other == mine
+    pictures = ("chart.svg", "chart.png")
+    assert [(place / "two" / name).read_bytes() for name in pictures] == [
+        (place / "out" / name).read_bytes() for name in pictures
+    ]
+
+
+def test_after_a_kill_the_same_command_goes_on(made, spikeloom, place):
+    started = subprocess.Popen(
+        [*RUNTIME, *CHART, "-o", "killed"], cwd=place, env=os.environ | {"PYTHONPATH": str(ROOT)}
+    )
+    store = place / "killed" / "points.jsonl"
+    end = time.monotonic() + 120
+    while time.monotonic() < end and (not store.exists() or store.read_bytes().count(b"\n") < 3):
+        time.sleep(0.01)
+    started.send_signal(signal.SIGKILL)
+    started.wait()
+    kept = store.read_bytes()
+    assert kept.count(b"\n") >= 3
+    code, out, _ = spikeloom(*CHART, "-o", "killed", "--json")
+    assert code == 0
+    assert store.read_bytes().startswith(kept[: kept.rindex(b"\n") + 1])
+    keys = [json.loads(line)["key"] for line in store.read_text().splitlines()[1:]]
+    assert len(keys) == len(set(keys)) == 1 + 2 + 8
+    found = without_rates(json.loads(out))
+    for name in ("points", "networks", "recommended", "saving"):
+        assert found[name] == made[name]
+
+
+# -- choices -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_budget_picks_a_point_and_gives_its_commands(made, spikeloom):
+    most = sorted(point["train"]["energy_j"]["davies2018"] for point in made["points"])[3]
+    code, out, err = spikeloom(*CHART, "-o", "out", "--budget", f"energy={most * 1e9 * 1.001:.3f}nJ")
+    assert (code, err) == (0, "")
+    assert "4 of 8 points fit; take #" in out
+    chosen = int(out.split("points fit; take #")[1].split()[0])
+    (point,) = (each for each in made["points"] if each["number"] == chosen)
+    assert all(f"  {command}" in out for command in point["commands"])
+    assert "beside the best, #" in out or "it is the best of all points" in out
+
+
+def test_a_budget_that_nothing_fits(made, spikeloom):
+    code, out, _ = spikeloom(*CHART, "-o", "out", "--budget", "energy=1pJ", "--budget", "accuracy=100")
+    assert code == 1
+    assert "energy=1pJ and accuracy=100: no point fits; the nearest is #" in out
+    assert "misses energy: it takes " in out
+    spikeloom(*CHART, "-o", "out", "--json")
+
+
+def test_the_graph_of_the_grid_chooses_among_the_networks(spikeloom):
+    both = ("chart", "ring.pt", "chain.pt", "--data", "data", "--jobs", "1", "-o", "graphs", "--json", "--grid")
+    code, out, _ = spikeloom(*both, "bits=8,window=100%,graph=knn:1")
+    assert code == 0
+    assert [net["name"] for net in json.loads(out)["networks"]] == ["chain"]
+    code, out, _ = spikeloom(*both, "bits=8,window=100%")
+    assert [(net["name"], net["graph"]) for net in json.loads(out)["networks"]] == [
+        ("ring", "ring"),
+        ("chain", "knn:1"),
+    ]
+    assert [point["network"] for point in json.loads(out)["points"]] == ["ring", "chain"]
+
+
+def test_a_shipped_checkpoint_stands_in_for_a_graph_that_is_asked_for(spikeloom, monkeypatch):
+    files = {"pretrained:rings": "ring.pt", "pretrained:rings-knn1": "chain.pt"}
+
+    def shipped(path):
+        if path not in files:
+            raise OptionError(f"{path}: no such shipped checkpoint")
+        return files[path]
+
+    monkeypatch.setattr("runtime.chart_networks.shipped", shipped)
+    monkeypatch.setattr("runtime.inputs.shipped", shipped)
+    words = ("chart", "pretrained:rings", "--data", "data", "--jobs", "1", "-o", "shipped", "--json", "--grid")
+    code, out, _ = spikeloom(*words, "bits=8,window=100%,graph=ring/knn:1")
+    assert code == 0
+    found = json.loads(out)
+    assert [(net["name"], net["graph"]) for net in found["networks"]] == [("rings", "ring"), ("rings-knn1", "knn:1")]
+    assert found["points"][1]["commands"][0].startswith("spikeloom compile pretrained:rings-knn1 --calibrate data ")
+    code, _, err = spikeloom(*words, "graph=knn:4")
+    assert code == 2
+    assert err.startswith(
+        "spikeloom: --grid graph=knn:4: no checkpoint was trained on that graph, those given on ring;"
+    )
+
+
+def test_where_validation_is_not_known_the_text_says_what_chose(spikeloom):
+    words = ("chart", "unknown.pt", "--data", "data", "--jobs", "1", "-o", "unknown", "--grid", "bits=8,window=100%")
+    code, out, _ = spikeloom(*words)
+    assert code == 0
+    assert "by what is expected: accuracy on the training split (not every checkpoint knows" in out
+
+
+@pytest.fixture
+def refusing(monkeypatch):
+    """A chip on which widths in a set do not fit."""
+    refused, store = set(), chart_work.store
+
+    def picky(network, *, recipes, **options):
+        if recipes is not None and recipes[0].bits in refused:
+            raise CapacityError((VIOLATION,))
+        return store(network, recipes=recipes, **options)
+
+    monkeypatch.setattr("runtime.chart_work.store", picky)
+    return refused
+
+
+def test_what_the_chip_refuses_is_listed(spikeloom, refusing, place):
+    refusing.add(4)
+    words = ("chart", "ring.pt", "--data", "data", "--jobs", "1", "-o", "refused", "--grid", "bits=4,3,window=100%")
+    code, out, _ = spikeloom(*words)
+    assert code == 0
+    assert out.startswith("1 point of 1 network on 8 test and 16 training recordings, 1 more configuration refused\n")
+    assert f"does not fit: ring 4b, cores: {VIOLATION}\n" in out
+    found = json.loads((place / "refused" / "chart.json").read_text())
+    assert [(each["bits"], each["why"]) for each in found["refused"]] == [([4], [str(VIOLATION)])]
+
+
+def test_where_nothing_fits_there_is_no_chart(spikeloom, refusing, place):
+    refusing |= {5, 6}
+    words = ("chart", "ring.pt", "--data", "data", "--jobs", "1", "-o", "nothing", "--grid", "bits=5-6,window=100%")
+    code, out, err = spikeloom(*words)
+    assert (code, out) == (2, "")
+    assert err == f"spikeloom: --grid: the chip refuses all 2 configurations; the first: {VIOLATION}\n"
+    assert not (place / "nothing" / "chart.json").exists()
+
+
+def test_a_fine_tuned_network_keeps_its_storage(spikeloom, place):
+    tuned = ("finetune", "ring.pt", "--data", "data", "--weight-bits", "3", "--epochs", "1", "-o", "tuned.pt")
+    assert spikeloom(*tuned)[0] == 0
+    words = ("chart", "tuned.pt", "--data", "data", "--jobs", "1", "-o", "tuned", "--json", "--grid")
+    code, out, _ = spikeloom(*words, "bits=2-6,8,window=50%,100%")
+    assert code == 0
+    points = json.loads(out)["points"]
+    found = [(point["bits"], point["fine_tuned"], point["window"]) for point in points]
+    assert found == [([3], True, 50), ([3], True, 100)]
+    assert "--weight-bits" not in points[0]["commands"][0]
+
+
+# -- bad input ---------------------------------------------------------------------------------------------------------
+
+OUT = ("-o", "bad")
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (
+            ("ring.pt", "--data", "data", "--grid", "bits=2-6,9", *OUT),
+            "--grid, character 10: 9 is not a width that the chip stores; allowed: 2, 3, 4, 5, 6, 8\n"
+            "spikeloom:   bits=2-6,9\n"
+            "spikeloom:            ^",
+        ),
+        (
+            ("ring.pt", "--data", "data", "--grid", "", *OUT),
+            "--grid: is empty; name an axis as in bits=2-6,8, or leave --grid away",
+        ),
+        (
+            ("ring.pt", "--data", "data", "--grid", "graph=mst:3", *OUT),
+            "--grid graph=mst:3: no checkpoint was trained on that graph, those given on ring; train one and name it: "
+            "spikeloom train --data data --graph mst:3 --epochs 30 -o mst3.pt",
+        ),
+        (
+            ("ring.pt", "--data", "data", "--grid", "bits=8+4", *OUT),
+            "--grid bits=8+4: 2 widths, ring.pt has 4 layers (conv1, fc1, fc2, fc3); give one width, or one for each "
+            "layer",
+        ),
+        (
+            ("ring.pt", "--data", "data", "--grid", "cores=fc9:2", *OUT),
+            "--grid cores=fc9:2: ring.pt has no layer fc9; it has conv1, fc1, fc2, fc3",
+        ),
+        (
+            ("ring.pt", "ring.pt", "--data", "data", *OUT),
+            "ring.pt: is given twice; give each checkpoint once",
+        ),
+        (
+            ("elsewhere.pt", "--data", "data", *OUT),
+            "elsewhere.pt: was trained on other recordings (Grasps.zip) than data; give those, or a checkpoint that "
+            "was trained on these",
+        ),
+        (
+            ("unknown.pt", "small.pt", "--data", "data", *OUT),
+            f"small.pt: has 4 taxels and {CLASSES} classes, unknown.pt has 6 and {CLASSES}; chart networks of one data "
+            "set at a time",
+        ),
+        (
+            ("net.onnx", "--data", "data", *OUT),
+            "net.onnx: is an ONNX file, a chart takes checkpoints; give the checkpoint that it was made of",
+        ),
+        (
+            ("ring.pt", "--data", "data", "--budget", "energy=1", *OUT),
+            "--budget energy=1: 1 is no energy; write it as in 0.1mJ (J, mJ, uJ, nJ, pJ)",
+        ),
+        (
+            ("ring.pt", "--data", "data", "--table", "mine", *OUT),
+            "--table mine: Intel Loihi 1 has no such energy table; give davies2018 or sanafe",
+        ),
+        (("ring.pt", "--data", "data", "-o", "file"), "-o file: is not a folder; give the name of one"),
+        (
+            ("ring.pt", "--data", "data", "-o", "no/where"),
+            "-o no/where: the folder that it shall be in does not exist; make it first",
+        ),
+    ],
+)
+def test_mistakes_are_told_in_a_line(spikeloom, place, words, told):
+    code, out, err = spikeloom("chart", *words)
+    assert (code, out, err) == (2, "", f"spikeloom: {told}\n")
+    assert not (place / "bad").exists()
+
+
+def test_a_netlist_is_no_checkpoint(made, spikeloom, place):
+    code, _, err = spikeloom("chart", place / "out" / made["points"][0]["netlist"], "--data", "data", *OUT)
+    assert code == 2
+    assert err.endswith(".loom: is a netlist, a chart compiles its own; give the checkpoint that it was made from\n")
+
+
+def test_a_store_of_another_version(made, spikeloom, place, monkeypatch):
+    monkeypatch.setattr("runtime.chart.FORMAT", chart_tasks.FORMAT + 1)
+    code, out, err = spikeloom(*CHART, "-o", "out")
+    assert (code, out) == (2, "")
+    assert err.startswith(f"spikeloom: {Path('out') / 'points.jsonl'}: ")
+    assert len(err.splitlines()) == 1
+
+
+def test_a_window_that_is_none(made, spikeloom):
+    name = shlex.split(made["points"][0]["commands"][0])[-1]
+    spikeloom(*shlex.split(made["points"][0]["commands"][0])[1:])
+    code, _, err = spikeloom("run", name, "--data", "data", "--window", "0%")
+    assert (code, err) == (
+        2,
+        "spikeloom: --window 0%: not a part of a recording; give whole per cent from 1% to 100%\n",
+    )
+
+
+def test_the_netlists_are_read_back_whole(made, place):
+    for point in made["points"]:
+        file = place / "out" / point["netlist"]
+        assert netlist_bytes(read_netlist(file)) == file.read_bytes()
+
+
+@pytest.mark.slow
+def test_workers_of_a_scheduler_in_another_folder_find_the_same(made, spikeloom):
+    pytest.importorskip("distributed", reason="distributed is not installed (extra 'cluster')")
+    from test_cluster import Cluster
+
+    cluster = Cluster()
+    try:
+        cluster.worker()
+        cluster.reachable(1)
+        code, out, _ = spikeloom(*CHART[:-2], "--scheduler", cluster.address, "-o", "cluster", "--json")
+    finally:
+        cluster.end()
+    assert code == 0
+    assert json.loads(out)["points"] == made["points"]
+
+
+@pytest.mark.parametrize("what", ["data", "network"])
+def test_a_worker_that_has_other_files_says_so(made, spikeloom, place, monkeypatch, what):
+    handed, measure = [], chart_work.measure
+    monkeypatch.setattr("runtime.chart_work.measure", lambda work: handed.append(work) or measure(work))
+    spikeloom(*[word if word != GRID else "bits=6,window=100%" for word in CHART], "-o", f"files-{what}")
+    work = next(each for each in handed if isinstance(each, chart_tasks.Build))
+    chart_work.both_splits.cache_clear()
+    if what == "data":
+        other = place / "other"
+        changed = replace(work, data=replace(work.data, path=str(other)))
+        told = f"{other}: holds other recordings than where the chart was asked for; copy those here"
+    else:
+        other = place / "unknown.pt"
+        changed = replace(
+            work, layouts={key: (words[0], str(other), *words[2:]) for key, words in work.layouts.items()}
+        )
+        told = f"{other}: is another file than where the chart was asked for; copy that here"
+    with pytest.raises(SpikeloomError) as caught:
+        measure(changed)
+    assert str(caught.value) == told

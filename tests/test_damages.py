@@ -1,0 +1,312 @@
+"""Damage done to netlist and float network alike: what changes, what does not, and that both change by as much."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from made_files import ring
+from numpy.testing import assert_allclose, assert_array_equal
+from random_networks import chain, compiled, integer_chain, random_checkpoint
+from timed_networks import written
+
+from compiler.errors import OptionError
+from compiler.forms import decay_registers
+from compiler.frontends.checkpoint import read_checkpoint
+from compiler.lift import lift
+from compiler.passes.expand import expand
+from compiler.passes.quantize import Recipe
+from compiler.pipeline import compile_network
+from models.graphs import normalised_adjacency
+from runtime import damages, engine, float_engine, other_networks, spec
+from runtime.blocks import lay_out_blocks
+from runtime.damages import Pair
+
+
+def made(seed=0, recipe=None, taxels=6):
+    """A pair of a small TactileSGNet."""
+    checkpoint = random_checkpoint(taxels=taxels, features=4, sizes=(9, 8, 4), seed=seed)
+    network = expand(checkpoint, normalised_adjacency(ring(taxels).edges, taxels))
+    return Pair(netlist=compile_network(network, recipes=recipe).netlist, network=network)
+
+
+def drawn(seed=0):
+    return np.random.default_rng(seed)
+
+
+def inputs(pair, seed=0, samples=5, steps=24):
+    return (drawn(seed).random((samples, pair.netlist.n_inputs, steps)) < 0.3).astype(np.uint8)
+
+
+def weights(stage):
+    return [projection.weight.toarray() for projection in stage.projections]
+
+
+def in_model_units(netlist):
+    """Weights that the chip has, in the float model's units, by layer."""
+    found = []
+    integer = lift(netlist)
+    for post, population in enumerate(integer.populations):
+        whole = sum(p.effective().toarray() for p in integer.projections if p.post == post)
+        found.append(whole / population.scale[:, None])
+    return found
+
+
+def moved(before, after):
+    """How far weights of both sides moved; they must have moved alike."""
+    ours = [b - a for a, b in zip(weights(before.network), weights(after.network), strict=True)]
+    theirs = [b - a for a, b in zip(in_model_units(before.netlist), in_model_units(after.netlist), strict=True)]
+    for one, other in zip(ours, theirs, strict=True):
+        assert_allclose(one, other, atol=1e-9)
+    return ours
+
+
+# -- weights -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("recipe", [None, (Recipe(bits=4),), (Recipe(planes=2),)])
+def test_float_weights_move_as_the_stored_ones_do(recipe):
+    pair = made(recipe=recipe)
+    after = damages.flip_bits(pair, 0.02, drawn(1))
+    assert any(m.any() for m in moved(pair, after))
+    for old, new in zip(pair.network.projections, after.network.projections, strict=True):
+        same = old.weight.toarray() == new.weight.toarray()
+        assert same.mean() > 0.5
+
+
+def test_flipped_bits_are_as_many_as_asked_and_two_flips_undo_each_other():
+    pair = made()
+    bits = 8 * pair.netlist.n_synapses
+    after = damages.flip_bits(pair, 0.1, drawn(2))
+    codes = [(p.netlist.synapse_weight.astype(int) // 2) & 255 for p in (pair, after)]
+    flipped = sum(int(x).bit_count() for x in codes[0] ^ codes[1])
+    assert abs(flipped - 0.1 * bits) < 5 * np.sqrt(0.09 * bits)
+    assert np.all(after.netlist.synapse_weight % 2 == 0)
+    assert after.netlist.synapse_weight.min() >= -256
+    assert after.netlist.synapse_weight.max() <= 254
+    back = damages.flip_bits(after, 0.1, drawn(2))
+    assert_array_equal(back.netlist.synapse_weight, pair.netlist.synapse_weight)
+
+
+def test_every_bit_flips_at_a_probability_of_one_half_at_last():
+    pair = made(recipe=(Recipe(bits=3),))
+    seen = np.zeros(pair.netlist.n_synapses, int)
+    for seed in range(40):
+        after = damages.flip_bits(pair, 0.5, drawn(seed)).netlist.synapse_weight.astype(int) // 64
+        seen |= (after & 7) ^ ((pair.netlist.synapse_weight.astype(int) // 64) & 7)
+    assert np.all(seen == 7)
+
+
+def test_fewer_bits_round_to_a_coarser_grid_and_hold_the_rest():
+    pair = made()
+    code = pair.netlist.synapse_weight.astype(int) // 2
+    for width in (7, 5, 3, 2):
+        after = damages.fewer_bits(pair, width)
+        kept = after.netlist.synapse_weight.astype(int) // 2
+        step = 2 ** (8 - width)
+        assert np.all(kept % step == 0)
+        assert np.abs(kept // step).max() <= 2 ** (width - 1) - 1
+        inside = np.abs(code) < step * (2 ** (width - 1) - 1)
+        assert np.abs(kept - code)[inside].max() <= step // 2
+        moved(pair, after)
+    assert_array_equal(damages.fewer_bits(pair, 8).netlist.synapse_weight, pair.netlist.synapse_weight)
+
+
+def test_nothing_moves_where_no_bit_flips():
+    pair = made()
+    after = damages.flip_bits(pair, 0.0, drawn())
+    assert_array_equal(after.netlist.synapse_weight, pair.netlist.synapse_weight)
+    assert all(a is b for a, b in zip(_weights_of(after), _weights_of(pair), strict=True))
+
+
+def _weights_of(pair):
+    return [projection.weight for projection in pair.network.projections]
+
+
+# -- neurons -----------------------------------------------------------------------------------------------------------
+
+
+def both_spikes(pair, events):
+    """Whether each neuron of each side fires in each step: of the chip, and of the float network by layer."""
+    trace = engine.simulate(pair.netlist, events, spikes=True)
+    return trace.spikes, float_engine.run(float_engine.prepare(pair.network, pair.netlist), events)
+
+
+@pytest.mark.parametrize("firing", [False, True])
+def test_stuck_neurons_fire_in_every_step_or_never_on_both_sides(firing):
+    pair = made()
+    after = damages.stick_neurons(pair, 0.4, drawn(3), firing=firing)
+    stuck = np.flatnonzero(after.netlist.threshold == 0) if firing else _silenced(pair, after)
+    assert len(stuck) == round(0.4 * len(damages.hidden(pair)))
+    assert np.all(after.netlist.readout_class[stuck] < 0)
+    events = inputs(pair)
+    spikes, model = both_spikes(after, events)
+    flags = np.unpackbits(model.packed.view(np.uint8), axis=-1, bitorder="little")[..., : after.netlist.n_compartments]
+    for compartment in stuck.tolist():
+        depth = after.netlist.layers[after.netlist.layer[compartment]].depth
+        window = slice(depth, depth + events.shape[2])
+        assert np.all(spikes[:, window, compartment] == firing)
+        assert np.all(flags[:, window, compartment] == firing)
+
+
+def _silenced(before, after):
+    """Compartments whose bias and weights are all zero now."""
+    target = after.netlist.synapse_compartment()
+    heard = np.bincount(target, np.abs(after.netlist.synapse_weight), after.netlist.n_compartments)
+    was = np.bincount(target, np.abs(before.netlist.synapse_weight), after.netlist.n_compartments)
+    return np.flatnonzero((heard == 0) & (was > 0) & (after.netlist.bias_mantissa == 0))
+
+
+def test_voters_and_relays_are_spared(tmp_path):
+    _, seen = written(tmp_path / "net.pt")
+    network = expand(read_checkpoint(tmp_path / "net.pt"), seen)
+    pair = Pair(netlist=compile_network(network).netlist, network=network)
+    netlist = pair.netlist
+    relays = (netlist.layer == 0) & (netlist.neuron >= network.populations[0].size - 3)
+    assert relays.sum() == 3
+    hidden = damages.hidden(pair)
+    assert not relays[hidden].any()
+    assert np.all(netlist.readout_class[hidden] < 0)
+    assert len(hidden) == netlist.n_compartments - 3 - np.count_nonzero(netlist.readout_class >= 0)
+    after = damages.scale_thresholds(pair, 3.0)
+    assert_array_equal(after.netlist.threshold[relays], netlist.threshold[relays])
+    assert_array_equal(after.netlist.threshold[~relays], 3 * netlist.threshold[~relays])
+
+
+def test_thresholds_change_on_both_sides_by_the_same_factor():
+    pair = made()
+    after = damages.scale_thresholds(pair, 1.5)
+    assert_array_equal(after.netlist.threshold, np.rint(1.5 * pair.netlist.threshold))
+    for post, (old, new) in enumerate(zip(pair.network.populations, after.network.populations, strict=True)):
+        ids = pair.netlist.compartments_of(post)
+        held = pair.netlist.neuron[ids]
+        factor = pair.netlist.threshold[ids] / after.netlist.threshold[ids]
+        assert_allclose(new.bias[held], old.bias[held] * factor)
+        rows = [p.weight.toarray()[held] for p in (pair.network.projections[post], after.network.projections[post])]
+        assert_allclose(rows[1], rows[0] * factor[:, None])
+
+
+def test_a_tie_does_not_fire_and_does_with_the_threshold_one_unit_lower():
+    netlist = compiled(integer_chain([[2]], thresholds=[2]))
+    network = chain([[0.5]])
+    pair = Pair(netlist=netlist, network=network)
+    events = np.ones((1, 1, 1), np.uint8)
+    lower = damages.with_thresholds(pair, netlist.threshold - 1)
+    for one, fires in ((pair, False), (lower, True)):
+        spikes, model = both_spikes(one, events)
+        assert spikes.any() == fires
+        assert model.packed.any() == fires
+
+
+def test_spread_thresholds_are_spread_and_positive():
+    pair = made(taxels=12)
+    factor = damages.spread_thresholds(pair, 0.2, drawn(4)).netlist.threshold / pair.netlist.threshold
+    assert 0.1 < factor.std() < 0.3
+    assert damages.spread_thresholds(pair, 50.0, drawn(4)).netlist.threshold.min() >= 1
+
+
+def test_shorter_decay_on_both_sides(tmp_path):
+    _, seen = written(tmp_path / "net.pt")
+    network = expand(read_checkpoint(tmp_path / "net.pt"), seen)
+    pair = Pair(netlist=compile_network(network).netlist, network=network)
+    after = damages.shorten_decay(pair, 0.5)
+    for post, (old, new) in enumerate(zip(network.populations, after.network.populations, strict=True)):
+        u, v = decay_registers(0.5 * old.beta, 0.5 * old.alpha)
+        ids = pair.netlist.compartments_of(post)
+        assert set(after.netlist.decay_u[ids].tolist()) == {u}
+        assert set(after.netlist.decay_v[ids].tolist()) == {v}
+        assert (new.alpha, new.beta) == ((4095 - u) / 4096, (4096 - v) / 4096)
+        assert_allclose([new.alpha, new.beta], [0.5 * old.alpha, 0.5 * old.beta], atol=1e-3)
+
+
+def test_windows_that_open_late_are_those_of_the_specification():
+    pair = damages.open_late(made(), 2)
+    assert [layer.depth for layer in pair.netlist.layers] == [0, 3, 4, 5]
+    assert lay_out_blocks(pair.netlist) is None
+    events = inputs(pair, samples=1)
+    fast, slow = engine.simulate(pair.netlist, events, spikes=True), spec.simulate(pair.netlist, events[0])
+    assert_array_equal(fast.spikes[0], slow.spikes)
+
+
+# -- other networks ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("recipe", [None, (Recipe(planes=2),), (Recipe(bits=4),)])
+def test_an_unplaced_netlist_spikes_as_the_placed_one(recipe):
+    pair = made(recipe=recipe)
+    flat = other_networks.unplaced(lift(pair.netlist), pair.netlist)
+    events = inputs(pair)
+    placed, unplaced = (engine.simulate(netlist, events) for netlist in (pair.netlist, flat))
+    for post in range(len(flat.layers)):
+        ids, others = pair.netlist.compartments_of(post), flat.compartments_of(post)
+        ours = placed.counts.spikes[:, ids]
+        assert_array_equal(ours, unplaced.counts.spikes[:, others][:, pair.netlist.neuron[ids]])
+        assert ours.any()
+    assert_array_equal(engine.simulate(flat, events[:1], spikes=True).spikes[0], spec.simulate(flat, events[0]).spikes)
+
+
+def test_the_same_network_is_stored_alike_and_none_can_overflow():
+    pair = made()
+    alike = other_networks.stored_alike(pair, pair.network)
+    integer = lift(alike.netlist)
+    for ours, theirs, population, projection in zip(
+        in_model_units(alike.netlist), weights(pair.network), integer.populations, integer.projections, strict=True
+    ):
+        half_a_step = 2.0**projection.exponent / population.scale.min()
+        assert np.abs(ours - theirs).max() <= half_a_step * (1 + 1e-9)
+    assert lay_out_blocks(alike.netlist) is not None
+
+
+def test_scales_shrink_where_weights_that_are_larger_could_overflow():
+    pair = made()
+    larger = replace(
+        pair.network,
+        projections=tuple(replace(p, weight=p.weight * 40) for p in pair.network.projections),
+    )
+    alike = other_networks.stored_alike(pair, larger)
+    assert lay_out_blocks(alike.netlist) is not None
+
+
+def test_outliers_leave_the_float_network_but_for_one_weight_a_layer_and_coarsen_the_chip():
+    pair = made()
+    after = other_networks.add_outliers(pair, 8, drawn(5))
+    for old, new in zip(weights(pair.network), weights(after.network), strict=True):
+        place = np.argwhere(old != new)
+        assert len(place) == 1
+        assert_allclose(np.abs(new).max(), 8 * np.abs(old).max())
+    for post in range(4):
+        before = np.median(pair.netlist.threshold[pair.netlist.compartments_of(post)])
+        assert after.netlist.threshold[after.netlist.compartments_of(post)].max() <= before / 8 + 1
+
+
+def test_rewired_edges():
+    edges = ring(8).edges
+    some, more = (other_networks.rewire(edges, 8, share, drawn(6)) for share in (0.25, 0.5))
+    for found, count in ((some, 2), (more, 4)):
+        pairs = set(map(tuple, found.tolist()))
+        assert len(pairs) == len(found) == len(edges)
+        assert {(b, a) for a, b in pairs} == pairs
+        assert len(set(map(tuple, edges.tolist())) - pairs) == 2 * count
+        assert all(a != b for a, b in pairs)
+    one_way = np.array([[0, 1], [1, 2], [2, 3]])
+    found = other_networks.rewire(one_way, 4, 1.0, drawn(6))
+    assert len(found) == 3
+    assert not set(map(tuple, one_way.tolist())) & set(map(tuple, found.tolist()))
+
+
+def test_doubled_edges_change_the_propagation_and_no_reach():
+    edges = ring(8).edges
+    twice = other_networks.double(edges, 0.5, drawn(7))
+    assert len(twice) == 1.5 * len(edges)
+    before, after = normalised_adjacency(edges, 8), normalised_adjacency(twice, 8)
+    assert_array_equal(before != 0, after != 0)
+    assert not np.allclose(before, after)
+    assert_allclose(normalised_adjacency(other_networks.double(edges, 1.0, drawn(7)), 8), before)
+
+
+def test_a_bias_that_no_register_holds_is_said(monkeypatch):
+    pair = made()
+    populations = tuple(replace(p, bias=p.bias + 1e9) for p in pair.network.populations)
+    with pytest.raises(OptionError) as caught:
+        other_networks.stored_alike(pair, replace(pair.network, populations=populations))
+    assert str(caught.value).startswith("conv1: ")
+    assert str(caught.value).endswith("; leave this perturbation away")

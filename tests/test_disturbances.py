@@ -1,0 +1,186 @@
+"""What happens to recordings: each function keeps what it promises, for any recordings."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_array_equal
+
+from runtime import disturbances as d
+
+REPEATABLE = settings(max_examples=40, deadline=None, derandomize=True)
+
+
+@st.composite
+def recordings(draw, *, least=1):
+    """Recordings (samples, taxels, 2, steps)."""
+    shape = [draw(st.integers(1, 3)), draw(st.integers(2, 7)), 2, draw(st.integers(least, 30))]
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    return (rng.random(shape) < draw(st.sampled_from([0.0, 0.1, 0.5, 1.0]))).astype(np.uint8)
+
+
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def drawn(seed):
+    return np.random.default_rng(seed)
+
+
+@REPEATABLE
+@given(recordings(), SEEDS, st.integers(0, 7))
+def test_dead_and_stuck_taxels_and_no_others(events, seed, count):
+    taxels = d.chosen(events.shape[1], count, drawn(seed))
+    others = np.setdiff1d(np.arange(events.shape[1]), taxels)
+    assert len(set(taxels.tolist())) == min(count, events.shape[1])
+    dead, stuck = d.silence(events, taxels), d.stick(events, taxels)
+    assert not dead[:, taxels].any()
+    assert stuck[:, taxels].all()
+    for found in (dead, stuck):
+        assert_array_equal(found[:, others], events[:, others])
+
+
+@REPEATABLE
+@given(st.integers(2, 9), SEEDS)
+def test_harsher_choices_contain_milder_ones(taxels, seed):
+    places = np.random.default_rng(seed).random((taxels, 2))
+    distance = np.linalg.norm(places[:, None] - places, axis=2)
+    for count in range(1, taxels):
+        fewer, more = (set(d.chosen(taxels, n, drawn(seed)).tolist()) for n in (count, count + 1))
+        assert fewer < more
+        near, nearer = (d.neighbours(distance, n, drawn(seed)).tolist() for n in (count + 1, count))
+        assert near[:count] == nearer
+
+
+def test_neighbours_are_the_nearest_ones_the_lower_number_first():
+    line = np.abs(np.arange(5.0)[:, None] - np.arange(5.0))
+    centres = {d.neighbours(line, 3, drawn(seed))[0]: d.neighbours(line, 3, drawn(seed)).tolist() for seed in range(40)}
+    assert centres == {0: [0, 1, 2], 1: [1, 0, 2], 2: [2, 1, 3], 3: [3, 2, 4], 4: [4, 3, 2]}
+
+
+@REPEATABLE
+@given(recordings(), SEEDS, st.floats(0, 1), st.floats(0, 1))
+def test_lost_events_were_there_and_are_lost_again_at_a_higher_rate(events, seed, share, other):
+    low, high = sorted((share, other))
+    some, more = (d.lose(events, rate, drawn(seed)) for rate in (low, high))
+    assert np.all(some <= events)
+    assert np.all(more <= some)
+    assert some.dtype == np.uint8
+    assert not d.lose(events, 1.0, drawn(seed)).any()
+    assert_array_equal(d.lose(events, 0.0, drawn(seed)), events)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
+def test_rates_are_those_that_were_asked_for(share):
+    full, none = np.ones((4, 39, 2, 250), np.uint8), np.zeros((4, 39, 2, 250), np.uint8)
+    spread = 5 * np.sqrt(share * (1 - share) * full.size)  # five standard deviations of a binomial number
+    assert abs(full.sum() - d.lose(full, share, drawn(1)).sum(dtype=int) - share * full.size) < spread
+    assert abs(d.invent(none, share, drawn(1)).sum(dtype=int) - share * full.size) < spread
+
+
+@REPEATABLE
+@given(recordings(), SEEDS, st.floats(0, 1), st.floats(0, 1))
+def test_invented_events_are_added_to_those_that_were_there(events, seed, share, other):
+    low, high = sorted((share, other))
+    some, more = (d.invent(events, rate, drawn(seed)) for rate in (low, high))
+    assert np.all(some >= events)
+    assert np.all(more >= some)
+    assert d.invent(events, 1.0, drawn(seed)).all()
+    assert_array_equal(d.invent(events, 0.0, drawn(seed)), events)
+
+
+@REPEATABLE
+@given(recordings(), SEEDS, st.floats(0, 8))
+def test_jitter_moves_events_along_their_channel_and_makes_none(events, seed, sigma):
+    found = d.jitter(events, sigma, drawn(seed))
+    before, after = events.sum(axis=3, dtype=int), found.sum(axis=3, dtype=int)
+    assert np.all(after <= before)  # less by what meets
+    assert_array_equal(after > 0, before > 0)
+    assert found.max(initial=0) <= 1
+    assert_array_equal(d.jitter(events, 0.0, drawn(seed)), events)
+
+
+def test_jitter_keeps_the_number_of_events_that_do_not_meet():
+    events = np.zeros((1, 200, 2, 101), np.uint8)
+    events[..., 50] = 1
+    found = d.jitter(events, 5.0, drawn(3))
+    assert_array_equal(found.sum(axis=3), events.sum(axis=3))
+    moved = np.nonzero(found)[3] - 50
+    assert abs(moved.mean()) < 1.5
+    assert 4.0 < moved.std() < 6.0
+
+
+@REPEATABLE
+@given(recordings(), st.integers(0, 40))
+def test_a_late_start_and_an_early_one_undo_each_other_but_for_the_ends(events, steps):
+    late, early = d.start_late(events, steps), d.start_early(events, steps)
+    length = events.shape[3]
+    assert not late[..., :steps].any()
+    assert_array_equal(late[..., steps:], events[..., : max(length - steps, 0)])
+    assert not early[..., max(length - steps, 0) :].any()
+    assert_array_equal(d.start_early(late, steps)[..., : max(length - steps, 0)], events[..., : max(length - steps, 0)])
+
+
+def test_playing_faster_and_slower():
+    events = np.zeros((1, 1, 2, 8), np.uint8)
+    events[0, 0, 0] = [1, 0, 1, 1, 0, 0, 1, 1]
+    assert d.play(events, 2.0)[0, 0, 0].tolist() == [1, 1, 0, 1, 0, 0, 0, 0]
+    assert d.play(events, 0.5)[0, 0, 0].tolist() == [1, 0, 0, 0, 1, 0, 1, 0]
+
+
+@REPEATABLE
+@given(recordings(), st.floats(0.1, 10))
+def test_playing_makes_no_events(events, speed):
+    found = d.play(events, speed)
+    assert np.all(found.sum(axis=3, dtype=int) <= events.sum(axis=3, dtype=int))
+    assert_array_equal(d.play(events, 1.0), events)
+
+
+@REPEATABLE
+@given(recordings(), SEEDS, st.integers(0, 7))
+def test_swapped_polarity_is_undone_by_doing_it_again(events, seed, count):
+    taxels = d.chosen(events.shape[1], count, drawn(seed))
+    once = d.swap_polarity(events, taxels)
+    assert_array_equal(once.sum(axis=2), events.sum(axis=2))
+    assert_array_equal(once[:, taxels, 0], events[:, taxels, 1])
+    assert_array_equal(d.swap_polarity(once, taxels), events)
+
+
+@REPEATABLE
+@given(recordings(), SEEDS, st.floats(0, 1), st.floats(0, 1))
+def test_densities_are_reached_from_their_side_alone(events, seed, density, other):
+    room = events[0].size
+    thin, full = d.thin(events, density, drawn(seed)), d.fill(events, density, drawn(seed))
+    assert np.all(thin <= events)
+    assert np.all(full >= events)
+    for i, own in enumerate(events.sum(axis=(1, 2, 3), dtype=int).tolist()):
+        assert thin[i].sum(dtype=int) == min(own, int(np.floor(density * room)))
+        assert full[i].sum(dtype=int) == max(own, int(np.ceil(density * room)))
+    low, high = sorted((density, other))
+    assert np.all(d.thin(events, low, drawn(seed)) <= d.thin(events, high, drawn(seed)))
+    assert np.all(d.fill(events, low, drawn(seed)) <= d.fill(events, high, drawn(seed)))
+    assert d.fill(events, 1.0, drawn(seed)).all()
+    assert not d.thin(events, 0.0, drawn(seed)).any()
+
+
+@REPEATABLE
+@given(recordings(), SEEDS)
+def test_recordings_that_were_given_stay_as_they_are(events, seed):
+    before = events.copy()
+    taxels = np.array([0])
+    for change in (
+        lambda: d.silence(events, taxels),
+        lambda: d.stick(events, taxels),
+        lambda: d.lose(events, 0.5, drawn(seed)),
+        lambda: d.invent(events, 0.5, drawn(seed)),
+        lambda: d.jitter(events, 1.0, drawn(seed)),
+        lambda: d.start_late(events, 1),
+        lambda: d.start_early(events, 1),
+        lambda: d.play(events, 1.5),
+        lambda: d.swap_polarity(events, taxels),
+        lambda: d.thin(events, 0.1, drawn(seed)),
+        lambda: d.fill(events, 0.6, drawn(seed)),
+    ):
+        found = change()
+        assert (found.shape, found.dtype) == (events.shape, np.uint8)
+        assert_array_equal(found, change())  # the same seed, the same events
+        assert_array_equal(events, before)

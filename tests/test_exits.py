@@ -1,0 +1,236 @@
+"""When a vote is decided: the proof never changes a decision and is never late, calibration keeps its word."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_array_equal
+from random_netlists import Axon, Neuron, build, large_netlist, netlists, recordings
+
+from compiler.dynamics import with_clocks
+from compiler.errors import NumericRangeError
+from compiler.frontends.checkpoint import read_checkpoint
+from compiler.interpret import vote
+from compiler.lift import lift
+from compiler.netlist import read_only
+from compiler.passes.expand import expand
+from compiler.pipeline import compile_network
+from models.evtouch import load_recordings
+from models.graphs import normalised_adjacency
+from runtime import course, engine, exits
+from runtime.inputs import shipped
+from runtime.votes import predictions
+
+
+@st.composite
+def gains(draw):
+    """Votes of each step: (samples, steps, classes) 0 or 1, and the steps of each recording."""
+    samples, steps, classes = draw(st.integers(1, 4)), draw(st.integers(1, 12)), draw(st.integers(1, 4))
+    bits = draw(st.lists(st.booleans(), min_size=samples * steps * classes, max_size=samples * steps * classes))
+    found = np.array(bits, np.int64).reshape(samples, steps, classes)
+    lengths = np.array(draw(st.lists(st.integers(1, steps), min_size=samples, max_size=samples)))
+    return found * (np.arange(steps) < lengths[:, None])[:, :, None], lengths
+
+
+def settled(votes, lengths, most=None):
+    at = exits.standing(votes, lengths)
+    steps = votes.shape[1]
+    one_each = np.broadcast_to(np.arange(steps + 1), (votes.shape[2], steps + 1))
+    return at, exits.proven(votes, at, one_each if most is None else most)
+
+
+@given(gains())
+def test_the_proof_changes_no_decision_and_comes_as_early_as_one_can(drawn):
+    gained, lengths = drawn
+    votes = np.cumsum(gained, axis=1)
+    at, sure = settled(votes, lengths)
+    ends = exits.exits(sure, at)
+    assert np.all(ends < lengths)
+    for i, end in enumerate(ends):
+        assert at.leader[i, end] == vote(votes[i, -1:])[0] == at.decision[i]
+        for step in range(lengths[i]):
+            left = lengths[i] - 1 - step
+            rivals = votes[i, step] + left * (1 - np.eye(votes.shape[2], dtype=int))[at.leader[i, step]]
+            # what may follow at worst: every rival gets a vote in every step, the leader none
+            assert sure[i, step] == (np.argmax(rivals) == at.leader[i, step])
+
+
+@given(gains(), st.floats(0, 5))
+def test_an_infinite_factor_is_the_proof_alone_and_smaller_ones_end_earlier(drawn, factor):
+    gained, lengths = drawn
+    votes = np.cumsum(gained, axis=1)
+    at, sure = settled(votes, lengths)
+    assert np.all(exits.exits(sure, at, factor) <= exits.exits(sure, at))
+    assert np.all(exits.exits(sure, at, factor) <= exits.exits(sure, at, factor + 0.5))
+
+
+@given(gains())
+def test_no_factor_from_the_turning_point_on_changes_a_decision(drawn):
+    gained, lengths = drawn
+    at = exits.standing(np.cumsum(gained, axis=1), lengths)
+    never = np.zeros(at.leader.shape, bool)
+    never[:, -1] = True
+    points = exits.turning_points(at)
+    for i, point in enumerate(points):
+        for factor in (point, point * 1.5 + 0.01):
+            end = exits.exits(never, at, factor)[i]
+            assert at.leader[i, end] == at.decision[i]
+        if point > 0:
+            end = exits.exits(never, at, np.nextafter(point, 0))[i]
+            assert at.leader[i, end] != at.decision[i]
+
+
+def test_a_small_vote_step_by_step():
+    gained = np.array([[[0, 1], [0, 1], [0, 1], [0, 0], [1, 0]], [[1, 0], [0, 0], [0, 1], [0, 0], [0, 0]]])
+    at, sure = settled(np.cumsum(gained, axis=1), np.array([5, 4]))
+    assert at.leader.tolist() == [[1, 1, 1, 1, 1], [0, 0, 0, 0, 0]]
+    assert at.lead.tolist() == [[1, 2, 3, 3, 2], [1, 1, 0, 0, 0]]
+    assert at.left.tolist() == [[4, 3, 2, 1, 0], [3, 2, 1, 0, 0]]
+    # class 1 needs more than can come; class 0 wins ties
+    assert sure.tolist() == [[False, False, True, True, True], [False, False, False, True, True]]
+    assert exits.exits(sure, at).tolist() == [2, 3]
+    assert exits.exits(sure, at, 0.7).tolist() == [1, 1]
+    assert at.confidence[0].round(3).tolist() == [0.5, 1.155, 2.121, 3.0, np.inf]
+
+
+def test_races_are_for_second_place():
+    gained = np.array([[[1, 0, 1], [1, 1, 0], [1, 1, 0]]])
+    at = exits.races(np.cumsum(gained, axis=1), np.array([3]))
+    assert at.leader.tolist() == [[2, 1, 1]]
+    assert exits.turning_points(at).tolist() == [pytest.approx(1 / np.sqrt(2))]
+    two = exits.races(np.cumsum(gained[..., :2], axis=1), np.array([3]))
+    assert two.leader.tolist() == [[0, 0, 0]]
+    assert exits.turning_points(two).tolist() == [0]
+
+
+def test_calibration_allows_what_it_says():
+    points = np.concatenate([np.zeros(90), np.arange(1.0, 11)])
+    for allowed, factor, differ in ((0.0, 10.0, 0), (0.01, 9.0, 1), (0.05, 5.0, 5), (0.1, 0.0, 10)):
+        found = exits.calibrate(points, allowed)
+        assert (found.factor, found.differ, found.races) == (factor, differ, 100)
+        assert np.count_nonzero(points > found.factor) <= allowed * 100
+    # 1 - 0.05 ** (1 / 100): no failure among a hundred
+    assert exits.calibrate(points, 0.0).bound == round(1 - 0.05**0.01, 4)
+
+
+def two_classes(*neurons):
+    """Output neurons of classes 0, 1, …; input 0 excites all of them by 100."""
+    netlist = build(
+        list(neurons),
+        [Axon(source=0, targets=tuple((i, 100) for i in range(len(neurons))))],
+        n_inputs=1,
+        depths=[0],
+    )
+    return replace(netlist, classes=len(neurons), readout_class=read_only(range(len(neurons))))
+
+
+def test_how_often_an_output_neuron_can_spike():
+    netlist = two_classes(
+        Neuron(threshold=99),
+        Neuron(threshold=100),
+        Neuron(threshold=110, decay_v=3277),
+        Neuron(threshold=124, decay_v=3277),  # 100 + 19.99 + … stays below 125
+        Neuron(threshold=125, decay_v=3277),
+        Neuron(threshold=250, decay_v=0),
+        Neuron(threshold=150, decay_u=2047),  # the current adds up to twice the weight
+        Neuron(threshold=1, bias=-101, bias_exponent=6),
+    )
+    assert exits.least_interval(netlist).tolist() == [1, 2, 2, 4, 0, 3, 1, 0]
+    most = exits.most_votes(netlist, 5)
+    assert most[0].tolist() == [0, 1, 2, 3, 4, 5]
+    assert most[1].tolist() == [0, 1, 1, 2, 2, 3]
+    assert most[3].tolist() == [0, 1, 1, 1, 1, 2]
+    assert most[4].tolist() == [0] * 6
+
+
+def test_slow_neurons_are_looked_at_only_so_far():
+    netlist = two_classes(Neuron(threshold=2**17 - 1, decay_v=0), Neuron(threshold=1))
+    quiet = replace(netlist, bias_mantissa=read_only([0, 0]), synapse_weight=read_only([2, 2]))
+    assert exits.least_interval(quiet).tolist() == [exits.LONGEST, 1]
+
+
+@settings(deadline=None)
+@given(st.data())
+def test_no_output_neuron_spikes_more_often(data):
+    netlist = data.draw(netlists())
+    votes = np.arange(netlist.n_compartments) % 4 - (netlist.n_compartments > 1)
+    netlist = replace(netlist, classes=4, readout_class=read_only(votes))
+    events = data.draw(recordings(netlist, max_length=12))
+    try:
+        spikes = engine.simulate(netlist, events[None], spikes=True, threads=1).spikes[0]
+    except NumericRangeError:
+        return
+    voters = np.flatnonzero(netlist.readout_class >= 0)
+    for voter, interval in zip(voters, exits.least_interval(netlist), strict=True):
+        times = np.flatnonzero(spikes[:, voter])
+        assert interval or not len(times)
+        assert np.all(np.diff(times) >= interval)
+    length = events.shape[1]
+    if length:
+        counted = course.votes_of(netlist, events[None], np.array([length]))
+        at = exits.standing(counted, np.array([length]))
+        sure = exits.proven(counted, at, exits.most_votes(netlist, length))
+        assert np.all(at.leader[sure] == at.decision[0])
+
+
+def test_live_and_recorded_votes_end_alike():
+    netlist = large_netlist(10, proved=True)
+    netlist = replace(netlist, classes=3, readout_class=read_only(np.arange(netlist.n_compartments) % 4 - 1))
+    events = (np.random.default_rng(1).random((6, netlist.n_inputs, 40)) < 0.3).astype(np.uint8)
+    lengths = np.full(6, 40)
+    votes = course.votes_of(netlist, events, lengths)
+    at = exits.standing(votes, lengths)
+    sure = exits.proven(votes, at, exits.most_votes(netlist, 40))
+    depth = exits.read_out_depth(netlist)
+    assert depth == 3
+    for factor in (np.inf, 2.0, 0.0):
+        may_end = exits.live(netlist, 40, factor)
+        assert not may_end(depth - 1, votes[0, 0])
+        for i, end in enumerate(exits.exits(sure, at, factor)):
+            told = [may_end(step + depth, votes[i, step]) for step in range(40)]
+            assert told.index(True) == end
+
+
+@pytest.mark.recordings
+@pytest.mark.parametrize("split", ["train", "test"])
+@pytest.mark.parametrize("which", ["objects", "containers"])
+def test_no_recording_is_decided_otherwise_by_proof(which, split, shipped_netlists, request):
+    netlist = shipped_netlists[which]
+    data = load_recordings(request.getfixturevalue(f"{which}_zip"), split)
+    lengths = np.full(len(data), data.steps)
+    votes = course.votes_of(netlist, with_clocks(data.events, netlist.clocks), lengths)
+    at = exits.standing(votes, lengths)
+    sure = exits.proven(votes, at, exits.most_votes(netlist, data.steps))
+    ends = exits.exits(sure, at)
+    assert_array_equal(at.leader[np.arange(len(data)), ends], at.decision)
+    counts = engine.simulate(netlist, with_clocks(data.events, netlist.clocks)).counts.spikes
+    assert_array_equal(at.decision, predictions(netlist, counts))
+    assert ends.mean() < 0.95 * data.steps
+
+
+@pytest.mark.parametrize(("which", "classes"), [("objects", 36), ("containers", 20)])
+def test_the_last_layer_alone_allows_no_earlier_proof(which, classes, shipped_netlists):
+    network = lift(shipped_netlists[which])
+    weight = sum(p.effective().toarray() for p in network.projections if p.post == 3)
+    last = network.populations[3]
+    bias, overturned = last.bias / 64, 0
+    for leader in range(classes):
+        for rival in set(range(classes)) - {leader}:
+            spikes = (weight[rival] > 0) & (weight[leader] <= 0)
+            always = weight[rival, spikes].sum() + bias[rival] > last.threshold[rival]
+            never = weight[leader, spikes].sum() + bias[leader] <= 0
+            overturned += bool(always and never)
+    assert overturned == classes * (classes - 1)
+
+
+@pytest.fixture(scope="module")
+def shipped_netlists():
+    """Netlists of the shipped checkpoints, scales from their weights."""
+    found = {}
+    for name in ("objects", "containers"):
+        checkpoint = read_checkpoint(shipped(f"pretrained:{name}"))
+        adjacency = normalised_adjacency(checkpoint.edges, checkpoint.taxels)
+        found[name] = compile_network(expand(checkpoint, adjacency)).netlist
+    return found

@@ -1,0 +1,297 @@
+"""The command ``lean``: what is silenced is as if it were gone, budgets hold, and what cannot be asked."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from made_files import CLASSES, TAXELS, events, own_file, recordings_folder, small_checkpoint, weights
+from numpy.testing import assert_array_equal
+from random_netlists import Axon, Neuron, build
+from timed_networks import written
+
+from compiler.ir import INPUT
+from compiler.lift import lift
+from compiler.netlist import read_only
+from compiler.passes.expand import expand
+from compiler.passes.prune import deaf_to
+from compiler.pipeline import compile_network
+from compiler.serialize import read_netlist
+from models.events import load_data
+from runtime import cli, engine, leaner
+from runtime.votes import predictions
+
+WORDS = ("lean", "net.pt", "--data", "data")
+STEPS = 40
+
+
+def _recordings(seed, samples):
+    made = events(seed, samples=samples, steps=STEPS, rate=0.3)
+    made[:, 3] = 0  # a taxel that nothing touches
+    return made
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """A folder with recordings and checkpoints."""
+    folder = tmp_path_factory.mktemp("lean")
+    recordings_folder(folder / "data", train=_recordings(1, 24), test=_recordings(2, 12))
+    own_file(folder / "net.pt", last=weights(3, gain=2.5))
+    own_file(folder / "thin.pt", last=weights(3, gain=2.5, features=4))
+    own_file(folder / "more.pt", last=weights(3, sizes=(9, 8, CLASSES + 1)))
+    return folder
+
+
+@pytest.fixture
+def spikeloom(capsys, place, monkeypatch):
+    """Run a command in that folder; returns exit code, standard output and standard error."""
+    monkeypatch.chdir(place)
+
+    def command(*words):
+        capsys.readouterr()
+        code = cli.main([str(word) for word in words])
+        return code, *capsys.readouterr()
+
+    return command
+
+
+@pytest.fixture(scope="module")
+def compiled(tmp_path_factory):
+    """A small network, what it was compiled to, and training recordings."""
+    checkpoint, adjacency = small_checkpoint(tmp_path_factory.mktemp("small"), last=weights(3, gain=2.5))
+    compilation = compile_network(expand(checkpoint, adjacency), training_events=_recordings(1, 24))
+    flat = _recordings(1, 24).reshape(24, -1, STEPS)
+    seen = leaner.Scene(flat=flat, labels=np.arange(24) % CLASSES, lengths=None)
+    return checkpoint, adjacency, compilation, seen
+
+
+def trial(compilation, seen, allowed):
+    return leaner.Trial(
+        compilation=compilation,
+        integer=compilation.integer,
+        training=seen,
+        wanted=leaner.decisions(compilation.netlist, seen),
+        allowed=allowed,
+    )
+
+
+def counts(netlist, seen):
+    return engine.simulate(netlist, seen.flat).counts.spikes
+
+
+def test_text(spikeloom, golden):
+    code, out, err = spikeloom(*WORDS, "--differ", "0.1", "-o", "lean.loom")
+    assert (code, err) == (0, "")
+    golden("lean.txt", out)
+
+
+def test_what_is_written_decides_and_costs_as_reported(spikeloom):
+    code, out, _ = spikeloom(*WORDS, "--differ", "0.1", "-o", "lean.loom", "--report", "lean.json", "--json")
+    assert code == 0
+    report = json.loads(out)
+    assert json.loads(Path("lean.json").read_text("utf-8")) == report
+    row = report["rows"][report["taken"]]
+    assert row["training"]["differ"] <= 2
+    netlist = read_netlist("lean.loom")
+    assert netlist.provenance["lean"] == {"differ": 0.1} | row["removed"]
+    assert spikeloom("compile", "net.pt", "--calibrate", "data", "-o", "whole.loom")[0] == 0
+    whole = read_netlist("whole.loom")
+    for split, key in (("train", "training"), ("test", "test")):
+        data = load_data("data", split)[0]
+        flat = data.events.reshape(len(data), -1, STEPS)
+        before, after = (predictions(each, engine.simulate(each, flat).counts.spikes) for each in (whole, netlist))
+        assert row[key]["differ"] == np.count_nonzero(before != after)
+        assert row[key]["right"] == np.count_nonzero(after == data.labels)
+        lost = np.count_nonzero((before == data.labels) & (after != data.labels))
+        assert row["test"]["lost"] == lost or split == "train"
+    costs = json.loads(spikeloom("estimate", "lean.loom", "--data", "data", "--json")[1])["per_inference"]
+    assert costs["synaptic_operations"] == pytest.approx(row["operations"])
+    assert costs["energy_j"] == pytest.approx(row["energy_j"])
+    first = report["rows"][0]
+    assert (first["training"]["differ"], first["test"]["differ"]) == (0, 0)
+    for other in report["rows"]:
+        if "no training decision changed" in other["name"]:
+            assert other["training"]["differ"] == 0
+
+
+def test_rows_and_facts(spikeloom):
+    report = json.loads(spikeloom(*WORDS, "--differ", "0", "--json")[1])
+    names = [row["name"] for row in report["rows"]]
+    hops = ["hop 0", "hop 1", "hop 2", "hop 3", "hops 1 to 3", "hops 2 to 3"]
+    strict = "no training decision changed"
+    bins = [f"{n} bins joined, {how}" for n in (2, 4) for how in ("decays as they are", "decays of as many steps")]
+    assert names == [
+        "everything",
+        "neurons that never fired in training",
+        *(f"{part}, {strict}" for part in ("neurons", "taxels")),
+        *hops,
+        *bins,
+        f"together, {strict}",
+    ]
+    data = load_data("data", "train")[0]
+    assert [taxel["events"] for taxel in report["taxels"]] == data.events.sum(axis=(0, 2, 3), dtype=int).tolist()
+    assert report["taxels"][3] == {"events": 0, "training_differ": 0, "test_differ": 0}
+    assert 3 in report["rows"][3]["removed"]["taxels"]
+    assert [layer["neurons"] for layer in report["layers"]] == [30, 9, 8, CLASSES]
+
+
+def test_the_cheapest_of_several_networks_within_a_recording_of_the_best(spikeloom):
+    report = json.loads(spikeloom("lean", "net.pt", "thin.pt", "--data", "data", "--json")[1])
+    right = [entry["training_right"] for entry in report["candidates"]]
+    fitting = [entry for entry in report["candidates"] if entry["training_right"] >= max(right) - 1]
+    assert report["chosen"] == min(fitting, key=lambda entry: entry["training_operations"])["name"]
+    code, out, _ = spikeloom("lean", "net.pt", "thin.pt", "--data", "data")
+    assert code == 0
+    assert f"taken: {report['chosen']}" in out.splitlines()
+
+
+def test_silenced_is_as_if_it_were_gone(compiled):
+    _, _, compilation, seen = compiled
+    netlist, whole = compilation.netlist, trial(compilation, seen, 0)
+    taxels = np.array([1, 4])
+    silent = leaner.silenced(netlist, leaner.sources_of(netlist, taxels))
+    quiet = seen.flat.copy()
+    quiet[:, [2, 3, 8, 9]] = 0
+    assert_array_equal(counts(silent, seen), engine.simulate(netlist, quiet).counts.spikes)
+    deaf = replace(whole, integer=leaner.without_taxels(compilation.integer, netlist, taxels)).built()
+    assert_array_equal(leaner.decisions(deaf, seen), leaner.decisions(silent, seen))
+    for layer in range(4):
+        kept = deaf.neuron[deaf.compartments_of(layer)]
+        before = counts(silent, seen)[:, netlist.compartments_of(layer)]
+        index = np.searchsorted(netlist.neuron[netlist.compartments_of(layer)], kept)
+        assert_array_equal(counts(deaf, seen)[:, deaf.compartments_of(layer)], before[:, index])
+    gone = np.flatnonzero((netlist.layer == 1) & (netlist.neuron % 3 == 0))
+    sources = np.zeros(netlist.n_inputs + netlist.n_compartments, bool)
+    sources[netlist.n_inputs + gone] = True
+    assert_array_equal(
+        leaner.decisions(whole.built(gone, netlist), seen),
+        leaner.decisions(leaner.silenced(netlist, sources), seen),
+    )
+
+
+@pytest.mark.parametrize("allowed", [0, 2, 6])
+def test_budgets_hold_and_more_is_spared_with_more(compiled, allowed):
+    _, _, compilation, seen = compiled
+    netlist, asked = compilation.netlist, trial(compilation, seen, allowed)
+    spikes = counts(netlist, seen).sum(axis=0)
+    gone = asked.spare_neurons(netlist, spikes)
+    assert asked.differ(asked.built(gone, netlist)) <= allowed
+    assert set(np.flatnonzero((spikes == 0) & (netlist.readout_class < 0))) <= set(gone)
+    assert np.all(netlist.readout_class[gone] < 0)
+    changed = leaner.alone(netlist, seen, asked.wanted)
+    assert changed[3] == 0
+    taxels = asked.spare_taxels(netlist, changed)
+    assert 3 in taxels
+    built = replace(asked, integer=leaner.without_taxels(asked.integer, netlist, taxels)).built()
+    assert asked.differ(built) <= allowed
+
+
+def test_a_layer_keeps_a_neuron(compiled):
+    _, _, compilation, seen = compiled
+    netlist = compilation.netlist
+    built = trial(compilation, seen, 0).built(np.flatnonzero(netlist.layer == 1), netlist)
+    assert np.count_nonzero(built.layer == 1) == 1
+
+
+def test_without_hops(compiled):
+    checkpoint, adjacency, compilation, _ = compiled
+    same = leaner.without_hops(compilation, checkpoint, adjacency, ())
+    gone = leaner.without_hops(compilation, checkpoint, adjacency, (1, 2, 3))
+    first = [next(p for p in network.projections if p.post == 0) for network in (compilation.integer, same, gone)]
+    held = compilation.netlist.neuron[compilation.netlist.compartments_of(0)]
+    before, again, lean = (p.effective().toarray()[held] for p in first)
+    assert_array_equal(before, again)
+    # hop 0 is the taxel itself
+    features = np.arange(TAXELS * checkpoint.hops.shape[1])[held] // checkpoint.hops.shape[1]
+    own = np.arange(2 * TAXELS) // 2 == features[:, None]
+    assert not lean[~own].any()
+    assert lean[own].any()
+    louder = replace(checkpoint, hops=checkpoint.hops * 1e4)
+    assert leaner.without_hops(compilation, louder, adjacency, (1,)) is None
+    assert gone.projections[1:] == tuple(p for p in compilation.integer.projections if p.post)
+
+
+def test_deaf_to_nothing_is_the_same(compiled):
+    integer = compiled[2].integer
+    assert deaf_to(integer, np.zeros(integer.input.size, bool)) is integer
+    deaf = deaf_to(integer, np.ones(integer.input.size, bool))
+    assert not any(p.weight.data.any() for p in deaf.projections if p.pre == INPUT)
+    assert lift(compiled[2].netlist).input.size == integer.input.size
+
+
+def chain():
+    """An input to a neuron, that to another which votes."""
+    neurons = [Neuron(layer=0, threshold=10), Neuron(layer=0, threshold=10), Neuron(layer=1, threshold=20)]
+    axons = [
+        Axon(source=0, targets=((0, 40), (1, 60))),
+        Axon(source=2, targets=((2, 30),)),
+        Axon(source=3, targets=((2, -10),)),
+    ]
+    netlist = build(neurons, axons, n_inputs=2, depths=[0, 1])
+    return replace(netlist, readout_class=read_only([-1, -1, 0]))
+
+
+def test_effects_are_shares_of_what_a_layer_sends():
+    found = leaner.effects(chain(), np.array([3, 1, 5]))
+    assert found.tolist() == [0.9, 0.1, np.inf]
+    assert leaner.effects(chain(), np.array([0, 0, 0])).tolist() == [0, 0, np.inf]
+
+
+def test_bisection_finds_the_longest_beginning():
+    order, asked = np.arange(10, 30), []
+
+    def fits(parts):
+        asked.append(len(parts))
+        return len(parts) <= 13
+
+    assert leaner.most_spared(order, 4, fits).tolist() == list(range(10, 23))
+    assert min(asked) > 4
+    assert len(asked) <= 5
+    assert leaner.most_spared(order, 4, lambda _: False).tolist() == [10, 11, 12, 13]
+
+
+def test_joined_bins():
+    netlist = chain()
+    seen = leaner.Scene(
+        flat=np.array([[[1, 0, 0, 0, 1], [0, 1, 1, 0, 0]]], np.uint8), labels=np.array([0]), lengths=np.array([5])
+    )
+    joined = leaner.coarser(seen, netlist, 2)
+    assert joined.flat.tolist() == [[[1, 0, 1], [1, 1, 0]]]
+    assert joined.lengths.tolist() == [3]
+    assert leaner.coarser(seen, netlist, 4).flat.tolist() == [[[1, 1], [1, 0]]]
+    slow = leaner.coarse_netlist(netlist, 2, adapted=True)
+    assert slow.decay_v.tolist() == [round(4096 * (1 - (819 / 4096) ** 2))] * 3
+    assert slow.decay_u.tolist() == [4095] * 3
+    lasting = replace(netlist, decay_u=read_only([204, 204, 4095]))
+    keep = 4096 - 1 - leaner.coarse_netlist(lasting, 2, adapted=True).decay_u
+    assert keep.tolist() == [round(3891**2 / 4096), round(3891**2 / 4096), 0]
+    assert leaner.coarse_netlist(netlist, 2, adapted=False).decay_v.tolist() == netlist.decay_v.tolist()
+
+
+def test_clocks_and_lasting_currents(spikeloom, tmp_path):
+    checkpoint, data = tmp_path / "x.pt", tmp_path / "data"
+    written(checkpoint)
+    made = (np.random.default_rng(3).random((6, 39, 2, 20)) < 0.15).astype(np.uint8)
+    recordings_folder(data, train=made[:3], test=made[3:])
+    code, out, _ = spikeloom("lean", checkpoint, "--data", data, "--json")
+    assert code == 0
+    assert json.loads(out)["rows"][0]["test"]["differ"] == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ((*WORDS, "--differ", "1.5"), "--differ 1.5: not a share; give a number from 0 to below 1"),
+        (
+            ("lean", "net.pt", "more.pt", "--data", "data"),
+            "more.pt: 6 taxels, 2 polarities and 5 classes, net.pt has 6, 2 and 4; give networks for the same "
+            "recordings",
+        ),
+        ((*WORDS, "-o", "none/x.loom"), "-o none/x.loom: the folder does not exist; make it first"),
+        ((*WORDS, "-o", "net.pt"), "-o net.pt: is an input of this command (net.pt); give another name"),
+    ],
+)
+def test_mistakes(spikeloom, words, message):
+    code, out, err = spikeloom(*words)
+    assert (code, out, err) == (2, "", f"spikeloom: {message}\n")

@@ -1,0 +1,667 @@
+"""The command ``stress``: runs, rules, tables, and everything that is refused."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from made_files import CLASSES, STEPS, TAXELS, events, own_file, recordings_folder, small_checkpoint
+from numpy.testing import assert_array_equal
+from timed_networks import events_of, written
+
+from compiler.dynamics import with_clocks
+from compiler.frontends.checkpoint import read_checkpoint
+from compiler.frontends.towers import join
+from compiler.interpret import vote
+from compiler.passes.expand import expand
+from compiler.passes.quantize import Recipe
+from compiler.pipeline import compile_network
+from compiler.serialize import write_netlist
+from models.graphs import NEUTOUCH
+from models.reference import float_spikes
+from runtime import cli, engine, spec
+from runtime.battery import BATTERY, NAMES, levels_of
+from runtime.damages import Pair
+from runtime.intervals import wilson
+from runtime.perturbation import Sensor
+from runtime.side_by_side import evaluate, ready
+from runtime.stress_bench import distances
+from runtime.stress_runs import Bench, after_others, by_length, clean, generator, going_round, measure, whole
+from runtime.stress_text import stress_text
+from runtime.stress_verdicts import curve, parse_requirement, reasons, spread, unmet
+from runtime.trace import unpack
+from runtime.votes import class_counts, readout_counts
+
+NAMES_LISTED = ", ".join(NAMES)
+REPORT = ("report", "net.loom", "--checkpoint", "net.pt", "--data", "data")
+FEW = ("--seeds", "2", "--only", "taxels_dead,events_lost,warm_state,longer,weight_bit_flips,other_graph,fewer_bits")
+
+
+def bench_of(network, netlist, recordings, labels=None, *, checkpoint=None, edges=None, lengths=None, places=None):
+    taxels = recordings.shape[1]
+    pair = Pair(netlist=netlist, network=network)
+    return Bench(
+        pair=pair,
+        ready=ready(pair),
+        sensor=Sensor(distance=distances(taxels, places, edges), places=places, edges=edges, checkpoint=checkpoint),
+        events=recordings,
+        labels=np.arange(len(recordings)) % netlist.classes if labels is None else labels,
+        files=tuple(f"r{i}" for i in range(len(recordings))),
+        lengths=np.full(len(recordings), recordings.shape[3]) if lengths is None else lengths,
+    )
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory):
+    """A small TactileSGNet, labelled as its float model decides."""
+    checkpoint, adjacency = small_checkpoint(tmp_path_factory.mktemp("small"))
+    network = expand(checkpoint, adjacency)
+    recordings = events(2, samples=8)
+    made = bench_of(
+        network,
+        compile_network(network).netlist,
+        recordings,
+        checkpoint=checkpoint,
+        edges=checkpoint.edges,
+        places=np.arange(float(TAXELS))[:, None],
+    )
+    found, _ = clean(made)
+    return replace(made, labels=found.decisions("float"))
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """A folder with recordings, a checkpoint and its netlist."""
+    folder = tmp_path_factory.mktemp("stress")
+    recordings_folder(folder / "data")
+    own_file(folder / "net.pt")
+    words = ["compile", folder / "net.pt", "-o", folder / "net.loom", "--json"]
+    assert cli.main([str(word) for word in words]) == 0
+    return folder
+
+
+@pytest.fixture
+def spikeloom(capsys, place, monkeypatch):
+    """Run ``stress`` in that folder; returns exit code, standard output and standard error."""
+    monkeypatch.chdir(place)
+
+    def command(*words, netlist="net.loom"):
+        capsys.readouterr()
+        base = ("stress", netlist, "--checkpoint", "net.pt", "--data", "data")
+        code = cli.main([str(word) for word in (*base, *words)])
+        return code, *capsys.readouterr()
+
+    return command
+
+
+# -- both sides --------------------------------------------------------------------------------------------------------
+
+
+def test_clean_recordings_are_what_reference_and_engine_say(bench):
+    found, counted = clean(bench)
+    flat = with_clocks(bench.events, bench.pair.netlist.clocks)
+    trace = engine.simulate(bench.pair.netlist, flat)
+    assert_array_equal(found.votes["chip"], class_counts(bench.pair.netlist, trace.counts.spikes))
+    layers = float_spikes(bench.sensor.checkpoint, _adjacency(bench), bench.events)
+    counts = readout_counts(bench.pair.network.readout, CLASSES, layers["fc3"])
+    assert_array_equal(found.votes["float"], counts)
+    for layer, (name, spikes) in enumerate(layers.items()):
+        assert counted["layers"][name][0] == spikes.sum()
+        ids = bench.pair.netlist.compartments_of(layer)
+        assert counted["layers"][name][1] == trace.counts.spikes[:, ids].sum()
+        assert counted["layers"][name][3] == len(ids) * 8 * STEPS
+    equal = np.count_nonzero(vote(found.votes["chip"]) == vote(counts))
+    assert counted["equal"] == equal
+    assert counted["right"] == {"float": 8, "chip": equal}
+
+
+def _adjacency(bench):
+    from models.graphs import normalised_adjacency
+
+    return normalised_adjacency(bench.sensor.checkpoint.edges, TAXELS)
+
+
+def test_different_spikes_are_those_of_verify(bench):
+    from runtime.equivalence import verify
+
+    verdict = verify(
+        bench.pair.netlist, bench.sensor.checkpoint, _adjacency(bench), bench.events, bench.labels, bench.files
+    )
+    _, counted = clean(bench)
+    for name, spikes in verdict.spikes.items():
+        assert counted["layers"][name][:3] == [spikes.float, spikes.chip, spikes.different]
+
+
+def test_recordings_after_others_without_a_reset_are_one_long_run_of_the_specification(bench):
+    inputs = after_others(bench, 2, generator("warm_state", 0))
+    found = evaluate(bench.ready, inputs)
+    for i in range(3):
+        slow = spec.simulate(bench.pair.netlist, inputs.events[i, :, : inputs.lengths[i]])
+        layer = bench.pair.netlist.layers[-1]
+        window = slow.spikes[inputs.begin[i] + layer.depth : inputs.lengths[i] + layer.depth]
+        assert_array_equal(found.votes["chip"][i], class_counts(bench.pair.netlist, window.sum(axis=0)[None])[0])
+        assert_array_equal(inputs.events[i, :, 2 * STEPS :], with_clocks(bench.events, bench.pair.netlist.clocks)[i])
+
+
+def test_cold_recordings_are_those_of_the_specification_each_from_rest(bench):
+    inputs = whole(bench.events, bench.pair.netlist, bench.lengths)
+    found = evaluate(bench.ready, inputs)
+    for i in range(3):
+        slow = spec.simulate(bench.pair.netlist, inputs.events[i])
+        assert_array_equal(found.votes["chip"][i], class_counts(bench.pair.netlist, slow.counts.spikes[None])[0])
+
+
+def test_state_that_is_left_over_matters_where_membranes_last(tmp_path):
+    """With lasting currents the recordings before are to be seen; it is the specification that says how."""
+    _, seen = written(tmp_path / "net.pt")
+    network = expand(read_checkpoint(tmp_path / "net.pt"), seen)
+    made = bench_of(network, compile_network(network).netlist, events_of(3))
+    warm = evaluate(made.ready, after_others(made, 1, generator("warm_state", 1)))
+    cold, _ = clean(made)
+    for side in (0, 1):
+        assert not np.array_equal(warm.spikes[:, 1, side], cold.spikes[:, 1, side])
+        assert_array_equal(warm.spikes[:, 0, side] > 0, cold.spikes[:, 0, side] > 0)
+
+
+def test_ten_times_as_long_is_ten_recordings_of_which_the_last_counts(bench):
+    inputs = going_round(bench, 10)
+    assert inputs.events.shape[2] == 10 * STEPS
+    assert set(inputs.begin.tolist()) == {9 * STEPS}
+    found = evaluate(bench.ready, inputs)
+    trace = engine.simulate(bench.pair.netlist, inputs.events, packed=True)
+    flags = unpack(trace.packed, bench.pair.netlist.n_compartments)
+    depth = bench.pair.netlist.layers[-1].depth
+    counts = flags[:, 9 * STEPS + depth : 10 * STEPS + depth].sum(axis=1)
+    assert_array_equal(found.votes["chip"], class_counts(bench.pair.netlist, counts))
+
+
+def test_clocks_are_no_taxels(tmp_path):
+    """Whatever happens to taxels, clocks tick: again with each recording, and to their end in a longer one."""
+    _, seen = written(tmp_path / "net.pt")
+    network = expand(read_checkpoint(tmp_path / "net.pt"), seen)
+    netlist = compile_network(network).netlist
+    made = bench_of(network, netlist, events_of(3))
+    ticks = netlist.clocks.events(15)
+    sensor = netlist.taxels * netlist.polarities
+    silent = NAMES["taxels_dead"].disturb(made.events, 39, made.sensor, generator("taxels_dead", 0))
+    heard = whole(silent, netlist, made.lengths).events
+    assert not heard[:, :sensor].any()
+    assert_array_equal(heard[0, sensor:], ticks)
+    warm = after_others(made, 1, generator("warm_state", 0)).events
+    assert_array_equal(warm[0, sensor:], np.tile(ticks, 2))
+    longer = going_round(made, 10).events
+    assert_array_equal(longer[0, sensor:, :15], ticks)
+    assert not longer[0, sensor:, 15:].any()
+
+
+def test_recordings_of_different_length_are_disturbed_within_their_own(bench):
+    lengths = np.array([24, 10, 24, 7, 10, 24, 24, 3])
+    cut = bench.events.copy()
+    for i, length in enumerate(lengths):
+        cut[i, ..., length:] = 0
+    found = by_length(cut, lengths, np.ones_like)
+    for i, length in enumerate(lengths):
+        assert found[i, ..., :length].all()
+        assert not found[i, ..., length:].any()
+    shorter = replace(bench, events=cut, lengths=lengths)
+    reference, _ = clean(shorter)
+    for name in ("saturated", "warm_state", "longer"):
+        (run,) = measure(shorter, name, 1, [0], reference)
+        assert sum(run["right"].values()) <= 16
+    alone = engine.simulate(bench.pair.netlist, with_clocks(cut[1:2, ..., :10], bench.pair.netlist.clocks))
+    assert_array_equal(reference.votes["chip"][1], class_counts(bench.pair.netlist, alone.counts.spikes)[0])
+
+
+def test_an_overflow_stops_its_recording_and_no_other(bench):
+    netlist = bench.pair.netlist
+    target = netlist.synapse_compartment()
+    first = netlist.compartments_of(0)[0]
+    heavy = replace(netlist, format_exponent=np.full_like(netlist.format_exponent, 7))
+    assert np.any(target == first)
+    recordings = bench.events.copy()
+    recordings[1:] = 0
+    recordings[0] = 1
+    made = bench_of(bench.pair.network, heavy, recordings)
+    found, counted = clean(made)
+    if not found.stopped.any():  # not enough weight in this small network: make it more
+        heavier = replace(heavy, format_exponent=np.full_like(netlist.format_exponent, 12))
+        found, counted = clean(bench_of(bench.pair.network, heavier, recordings))
+    assert found.stopped.tolist() == [True] + [False] * 7
+    assert counted["stopped"] == 1
+    assert found.decisions("chip")[0] == -1
+    assert not found.votes["chip"][0].any()
+
+
+# -- every perturbation ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_perturbation_runs_at_its_mildest_and_harshest_the_same_for_a_seed(bench, name):
+    reference, undisturbed = clean(bench)
+    levels = levels_of(name, TAXELS, full=False)
+    for level in {levels[0], levels[-1]}:
+        seeds = [0, 1] if NAMES[name].seeded else [0]
+        runs = measure(bench, name, level, seeds, reference)
+        again = measure(bench, name, level, seeds[::-1], reference)[::-1]
+        assert runs == again
+        assert [run["seed"] for run in runs] == seeds
+        for run in runs:
+            assert run["layers"].keys() == undisturbed["layers"].keys()
+            assert run["equal"] <= 8
+            assert json.loads(json.dumps(run)) == run
+
+
+def test_levels_are_in_order_and_make_sense():
+    for known in BATTERY:
+        for levels in (known.levels, known.full):
+            numbers = [level for level in levels if not isinstance(level, str)]
+            assert numbers in (sorted(numbers), sorted(numbers, reverse=True))
+            assert all(known.least <= level <= known.most for level in numbers)
+            assert len(set(levels)) == len(levels)
+        assert (known.disturb is None) or (known.damage is None)
+        assert len(known.full) >= len(known.levels)
+
+
+def test_a_harsher_run_of_a_seed_goes_on_from_the_milder_one(bench):
+    dead = [
+        NAMES["taxels_dead"].disturb(bench.events, count, bench.sensor, generator("taxels_dead", 4)) for count in (1, 3)
+    ]
+    assert np.all(dead[1] <= dead[0])
+    assert dead[0].any(axis=(0, 2, 3)).sum() == TAXELS - 1
+
+
+@pytest.mark.parametrize("system", ["tactilesgnet", "gcn", "mlp", "grid-cnn"])
+def test_all_systems_timed_and_joined(tmp_path, system):
+    """Each system runs the whole battery but what needs a graph; so do networks with clocks, and joined ones."""
+    members = []
+    for seed in (1, 2):
+        _, seen = written(tmp_path / f"{seed}.pt", system, seed=seed)
+        members.append(read_checkpoint(tmp_path / f"{seed}.pt"))
+    joined = join(members, ["1.pt", "2.pt"])
+    recordings = events_of(3, samples=2)
+    for checkpoint in (members[0], joined):
+        network = expand(checkpoint, seen)
+        edges = checkpoint.edges if system in ("tactilesgnet", "gcn") else None
+        made = bench_of(
+            network,
+            compile_network(network).netlist,
+            recordings,
+            checkpoint=checkpoint,
+            edges=edges,
+            places=NEUTOUCH,
+        )
+        reference, _ = clean(made)
+        spikes = list(float_spikes(checkpoint, seen, recordings).values())[-1]
+        assert_array_equal(reference.votes["float"], readout_counts(network.readout, network.classes, spikes))
+        from runtime.battery import why_not
+
+        skipped = {name: why_not(name, made.pair, made.sensor) for name in NAMES}
+        if system in ("mlp", "grid-cnn"):
+            title = "an MLP" if system == "mlp" else "a grid-based CNN"
+            assert {name: why for name, why in skipped.items() if why} == dict.fromkeys(
+                ("other_graph", "edges_rewired", "edges_doubled"), f"{title} has no taxel graph"
+            )
+        else:
+            assert not any(skipped.values())
+        for name, why in skipped.items():
+            if why is None:
+                (run,) = measure(made, name, levels_of(name, 39, full=False)[0], [0], reference)
+                assert run["stopped"] in range(3)
+
+
+# -- rules -------------------------------------------------------------------------------------------------------------
+
+
+def run_of(right, *, equal=100, spikes=(1000, 1000, 100, 10000), signs=None, most=10, stopped=0, seed=0):
+    right = (right, right) if isinstance(right, int) else right
+    signs = signs or {}
+    return {
+        "seed": seed,
+        "right": {"float": right[0], "chip": right[1]},
+        "equal": equal,
+        "layers": {"fc": list(spikes)},
+        "signs": {"float": {}, "chip": signs},
+        "most": {"float": [0, most], "chip": [0, most]},
+        "stopped": stopped,
+        "saturated": 0,
+    }
+
+
+CLEAN = run_of(90)
+
+
+@pytest.mark.parametrize(
+    ("chip", "verdict", "leaves", "chance"),
+    [
+        ((90, 85, 84), "robust", None, None),  # Wilson's interval of 90 in 100 begins at 82.6
+        ((90, 82, 84), "degrades", 2, None),
+        ((90, 60, 50), "degrades", 2, None),
+        ((90, 60, 15), "breaks", 2, 3),  # that of 15 in 100 begins at 9.3, chance is 10
+        ((90, 60, 16), "degrades", 2, None),  # that of 16 in 100 at 10.1
+        ((10, 90, 90), "breaks", 1, 1),
+    ],
+)
+def test_verdicts(chip, verdict, leaves, chance):
+    assert wilson(90, 100)[0] == pytest.approx(0.8256, abs=1e-4)
+    runs = [(level, [run_of((90, right))]) for level, right in enumerate(chip, 1)]
+    found = curve(runs, CLEAN, 100, 10)
+    assert (found["verdict"], found["breaks"]["chip"]) == (verdict, {"leaves": leaves, "chance": chance})
+    assert found["breaks"]["float"] == {"leaves": None, "chance": None}
+    apart = leaves is not None and chip[leaves - 1] < 82  # else intervals of both sides overlap there
+    assert found["same_place"] != apart
+
+
+def test_it_is_the_mean_over_seeds_that_leaves():
+    seeds = [run_of(right, seed=i) for i, right in enumerate((95, 70, 84))]
+    found = curve([(1, seeds)], CLEAN, 100, 10)
+    assert found["levels"][0]["chip"]["mean"] == pytest.approx(0.83)
+    assert found["verdict"] == "robust"
+
+
+def test_the_same_place_is_one_where_intervals_overlap():
+    def both(float_right, chip_right):
+        return [(level, [run_of(pair)]) for level, pair in enumerate(zip(float_right, chip_right, strict=True), 1)]
+
+    # Wilson's interval of 82 in 100 ends at 88.3, that of 90 begins at 82.6, that of 60 ends at 69.1
+    assert curve(both((90, 90), (82, 60)), CLEAN, 100, 10)["same_place"]
+    assert not curve(both((90, 90), (60, 60)), CLEAN, 100, 10)["same_place"]
+    assert not curve(both((60, 60), (90, 90)), CLEAN, 100, 10)["same_place"]
+    assert curve(both((90, 60), (90, 60)), CLEAN, 100, 10)["same_place"]
+    assert curve(both((90, 90), (90, 90)), CLEAN, 100, 10)["same_place"]
+
+
+def test_intervals_of_one_run_and_of_several():
+    assert spread([90], 100) == {
+        "mean": 0.9,
+        "low": wilson(90, 100)[0],
+        "high": wilson(90, 100)[1],
+        "values": [0.9],
+    }
+    several = spread([80, 90, 100], 100)
+    assert several["mean"] == pytest.approx(0.9)
+    assert several["low"] == pytest.approx(0.9 - 4.302653 * 0.1 / 3**0.5)  # Student's, two degrees of freedom
+    assert several["high"] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("run", "told"),
+    [
+        (run_of(50), []),
+        (run_of(50, spikes=(1000, 0, 1000, 10000)), ["fc is silent"]),
+        (run_of(50, spikes=(1000, 6000, 100, 10000)), ["fc is saturated: fires in 60 % of all steps"]),
+        (run_of(50, spikes=(1000, 300, 100, 10000)), ["fc fires 0.3 times as often"]),
+        (run_of(50, spikes=(1000, 3000, 100, 10000)), ["fc fires 3 times as often"]),
+        (run_of(50, spikes=(1000, 1900, 100, 10000)), []),
+        (run_of(50, signs={"no vote": 20}), ["no vote in 20 of 100"]),
+        (run_of(50, signs={"no vote": 19}), []),
+        (run_of(50, signs={"one class": 100}, most=100), ["one class for every recording"]),
+        (run_of(50, most=80), ["one class in 80 % of the decisions"]),
+        (run_of(50, most=79), []),
+        (run_of(50, stopped=20), ["a register overflows in 20 of 100 recordings"]),
+        (
+            run_of(0, spikes=(1000, 0, 1000, 10000), signs={"no vote": 100, "one class": 100}, most=100),
+            ["fc is silent", "no vote in 100 of 100"],
+        ),
+    ],
+)
+def test_reasons(run, told):
+    assert reasons("chip", [run], run["layers"], CLEAN, 100) == told
+
+
+def test_what_the_float_network_does_is_its_own():
+    run = run_of(50, spikes=(0, 1000, 1000, 10000), signs={"no vote": 100}, stopped=100, most=10)
+    assert reasons("float", [run], run["layers"], CLEAN, 100) == ["fc is silent"]
+
+
+def test_spikes_in_common_are_counted_as_verify_does():
+    found = curve([(1, [run_of(90, spikes=(60, 40, 20, 1000))])], CLEAN, 100, 10)
+    assert found["levels"][0]["common"] == {"fc": 0.8}
+    found = curve([(1, [run_of(90, spikes=(0, 0, 0, 1000))])], CLEAN, 100, 10)
+    assert found["levels"][0]["common"] == {"fc": 1.0}
+
+
+def test_requirements_hold_at_the_share_itself():
+    found = {"taxels_dead": curve([(3, [run_of((90, 85))])], CLEAN, 100, 10)}
+    kept, missed = (parse_requirement(f"taxels_dead:3>={share}") for share in ("0.85", "0.86"))
+    assert unmet([kept, missed], found) == ["taxels_dead:3>=0.86: 0.8500 reached"]
+
+
+# -- the command -------------------------------------------------------------------------------------------------------
+
+
+def test_text(golden):
+    """Tables of a made report: a verdict of each kind, several seeds and one, what does not apply, requirements."""
+
+    def several(*right):
+        return [run_of(r, seed=i, equal=100 - i) for i, r in enumerate(right)]
+
+    curves = {
+        "taxels_dead": [(1, several(90, 90)), (10, several(70, 64)), (20, several((40, 35), 30))],
+        "threshold_raised": [
+            (1.5, [run_of(88)]),
+            (2, [run_of((8, 7), spikes=(1000, 0, 1000, 10000), signs={"no vote": 93})]),
+        ],
+        "other_graph": [("knn:1", [run_of((90, 60), equal=61)]), ("mst:0", [run_of(88)])],
+        "start_late": [(steps, [run_of(90)]) for steps in range(1, 13)],
+    }
+    report = {
+        "recordings": 100,
+        "classes": 10,
+        "clean": CLEAN,
+        "perturbations": {
+            name: {"what": NAMES[name].what, "unit": NAMES[name].unit} | curve(runs, CLEAN, 100, 10)
+            for name, runs in curves.items()
+        },
+        "not_applicable": {"edges_doubled": "an MLP has no taxel graph"},
+        "required": ["taxels_dead:1>=0.85", "taxels_dead:20>=0.5"],
+        "missed": ["taxels_dead:20>=0.5: 0.3250 reached"],
+    }
+    golden("stress.txt", stress_text(report) + "\n")
+
+
+def test_the_same_command_says_the_same_in_threads_and_in_processes(spikeloom, place):
+    code, one, err = spikeloom(*FEW, "-o", "one.json")
+    assert (code, err) == (0, "")
+    assert spikeloom(*FEW, "-o", "two.json")[1] == one
+    assert spikeloom(*FEW, "--jobs", "1", "-o", "three.json")[1] == one
+    first, second, third = ((place / f"{name}.json").read_bytes() for name in ("one", "two", "three"))
+    assert first == second == third
+    report = json.loads(first)
+    wanted = set(FEW[3].split(",")) - {"other_graph"}  # the positions of its taxels are not known
+    assert list(report["perturbations"]) == [name for name in NAMES if name in wanted]
+    assert list(report["not_applicable"]) == ["other_graph"]
+    assert [point["level"] for point in report["perturbations"]["taxels_dead"]["levels"]] == [1, 3, 5]
+    assert report["provenance"]["netlist"] == "net.loom"
+    assert report["perturbations"]["taxels_dead"]["levels"][0]["seeds"] == [0, 1]
+    assert report["perturbations"]["longer"]["levels"][0]["seeds"] == [0]
+
+
+def test_a_sweep_goes_on_from_what_is_there(spikeloom, place, monkeypatch):
+    words = ("--only", "events_lost,longer", "--seeds", "2", "--jobs", "1", "-o", "kept.json")
+    code, once, _ = spikeloom(*words)
+    assert code == 0
+    monkeypatch.setattr("runtime.stress.measure_point", None)  # everything is known: nothing may be measured
+    assert spikeloom(*words)[:2] == (0, once)
+    assert (place / "kept.json.points").exists()
+
+
+def test_full_has_all_levels(spikeloom):
+    code, out, _ = spikeloom("--full", "--jobs", "1", "--only", "fewer_bits,edges_doubled", "--seeds", "1", "--json")
+    assert code == 0
+    found = json.loads(out)["perturbations"]
+    assert [point["level"] for point in found["fewer_bits"]["levels"]] == list(NAMES["fewer_bits"].full)
+    assert [point["level"] for point in found["edges_doubled"]["levels"]] == list(NAMES["edges_doubled"].full)
+
+
+def test_requirements_decide_about_the_exit_code(spikeloom):
+    words = ("--only", "taxels_dead", "--seeds", "2", "--json")
+    code, out, _ = spikeloom(*words, "--require", "taxels_dead:2>=0")
+    report = json.loads(out)
+    assert (code, report["missed"], report["required"]) == (0, [], ["taxels_dead:2>=0"])
+    assert [point["level"] for point in report["perturbations"]["taxels_dead"]["levels"]] == [1, 2, 3, 5]
+    reached = report["perturbations"]["taxels_dead"]["levels"][1]["chip"]["mean"]
+    code, out, err = spikeloom(*words[:-1], "--require", "taxels_dead:2>=1")
+    assert (code, err) == (1, "")
+    assert out.endswith(f"\nrequired taxels_dead:2>=1: {reached:.4f} reached\n")
+
+
+def test_requirements_that_are_kept_are_said_too(spikeloom):
+    _, out, _ = spikeloom("--only", "taxels_dead", "--seeds", "1", "--require", "taxels_dead:1>=0")
+    assert out.endswith("\nrequired taxels_dead:1>=0: kept\n")
+
+
+def test_picture_and_page(spikeloom, place, capsys):
+    assert spikeloom(*FEW, "-o", "page.json", "--picture", "curves.png")[0] == 0
+    assert (place / "curves.png").read_bytes().startswith(b"\x89PNG")
+    words = [
+        "report",
+        "net.loom",
+        "--checkpoint",
+        "net.pt",
+        "--data",
+        "data",
+        "--stress",
+        "page.json",
+        "-o",
+        "page.html",
+    ]
+    assert cli.main(words) == 0
+    out = capsys.readouterr().out
+    assert "Stability\n---------\nfloat accuracy, clean: " in out
+    page = (place / "page.html").read_text("utf-8")
+    assert '<h2 id="stress-h">Stability</h2>' in page
+    assert page.count('<circle class="k-float v"') >= sum(
+        len(one["levels"]) for one in json.loads((place / "page.json").read_bytes())["perturbations"].values()
+    )
+    assert cli.main([*REPORT, "-o", "plain.html"]) == 0
+    assert "Stability" not in (place / "plain.html").read_text("utf-8")
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("--only", "taxels_ded"), f"--only taxels_ded: no such perturbation; choose from {NAMES_LISTED}"),
+        (
+            ("--require", "taxels_ded:3>=0.5"),
+            f"--require taxels_ded:3>=0.5: 'taxels_ded' is no perturbation; choose from {NAMES_LISTED}",
+        ),
+        (
+            ("--require", "taxels_dead>=0.5"),
+            "--require taxels_dead>=0.5: is not NAME:LEVEL>=SHARE; write for example taxels_dead:3>=0.85",
+        ),
+        (
+            ("--require", "taxels_dead:3=0.5"),
+            "--require taxels_dead:3=0.5: is not NAME:LEVEL>=SHARE; write for example taxels_dead:3>=0.85",
+        ),
+        (
+            ("--require", "taxels_dead:3>=85"),
+            "--require taxels_dead:3>=85: '85' is no share; give a number from 0 to 1",
+        ),
+        (
+            ("--require", "taxels_dead:3>=much"),
+            "--require taxels_dead:3>=much: 'much' is no share; give a number from 0 to 1",
+        ),
+        (
+            ("--require", "taxels_dead:2.5>=0.5"),
+            "taxels_dead:2.5: '2.5' is no level of it; give a whole number from 0 (taxels)",
+        ),
+        (
+            ("--require", "events_lost:1.5>=0.5"),
+            "events_lost:1.5: '1.5' is no level of it; give a number from 0 to 1 (probability)",
+        ),
+        (
+            ("--require", "events_lost:many>=0.5"),
+            "events_lost:many: 'many' is no level of it; give a number from 0 to 1 (probability)",
+        ),
+        (
+            ("--require", "taxels_dead:7>=0.5"),
+            "--require taxels_dead:7>=0.5: the sensor has 6 taxels; give a smaller level",
+        ),
+        (
+            ("--only", "events_lost", "--require", "taxels_dead:3>=0.5"),
+            "--require taxels_dead:3>=0.5: --only leaves taxels_dead out; add it there",
+        ),
+        (
+            ("--require", "other_graph:knn:1>=0.5"),
+            "--require other_graph:knn:1>=0.5: does not apply, positions of the taxels are not known, no graph can be "
+            "built on them; leave it away",
+        ),
+        (("--seeds", "0"), "--seeds 0: allowed are 1 or more; choose another"),
+        (("--jobs", "0"), "--jobs 0: allowed are 1 or more; choose another"),
+        (("-o", "net.loom"), "-o net.loom: is an input of this command (net.loom); give another name"),
+        (("--picture", "no/curves.png"), "--picture no/curves.png: the folder does not exist; make it first"),
+    ],
+)
+def test_what_is_refused(spikeloom, words, told):
+    assert spikeloom(*words) == (2, "", f"spikeloom: {told}\n")
+
+
+def test_an_unknown_graph_is_refused(spikeloom):
+    code, out, err = spikeloom("--require", "other_graph:knn:0>=0.5")
+    assert (code, out) == (2, "")
+    assert err.startswith("spikeloom: graph 'knn:0': K is '0'")
+
+
+def test_a_netlist_of_another_architecture_is_refused(spikeloom, place, tmp_path):
+    _, seen = written(tmp_path / "other.pt")
+    network = expand(read_checkpoint(tmp_path / "other.pt"), seen)
+    write_netlist(compile_network(network).netlist, tmp_path / "other.loom")
+    code, out, err = spikeloom(netlist=str(tmp_path / "other.loom"))
+    assert (code, out) == (2, "")
+    assert err.startswith("spikeloom: netlist and checkpoint disagree: the netlist has taxels 39, channels 2, clocks 3")
+
+
+def test_planes_have_no_fewer_bits(bench):
+    from runtime.battery import why_not
+
+    netlist = compile_network(bench.pair.network, recipes=(Recipe(planes=2),)).netlist
+    pair = Pair(netlist=netlist, network=bench.pair.network)
+    assert why_not("fewer_bits", pair, bench.sensor) == "weights are stored in several planes"
+    onnx = Sensor(distance=bench.sensor.distance, places=None, edges=None, checkpoint=None)
+    told = "a network from an ONNX file has no taxel graph that is known"
+    assert why_not("edges_rewired", pair, onnx) == told
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        (None, "--stress s.json: no such file; write it with spikeloom stress -o"),
+        ("{", "--stress s.json: is not what spikeloom stress -o writes; give such a file"),
+        ("[]", "--stress s.json: is not what spikeloom stress -o writes; give such a file"),
+        ('{"recordings": 3}', "--stress s.json: is not what spikeloom stress -o writes; give such a file"),
+    ],
+)
+def test_a_page_refuses_what_is_no_result_of_stress(place, monkeypatch, capsys, content, told):
+    monkeypatch.chdir(place)
+    (place / "s.json").unlink(missing_ok=True)
+    if content is not None:
+        (place / "s.json").write_text(content)
+    words = [*REPORT, "--stress", "s.json", "-o", "x.html"]
+    capsys.readouterr()
+    assert cli.main(words) == 2
+    assert capsys.readouterr().err == f"spikeloom: {told}\n"
+
+
+def test_a_page_refuses_the_stress_of_another_netlist(spikeloom, place, capsys):
+    assert spikeloom("--only", "longer", "-o", "own.json")[0] == 0
+    found = json.loads((place / "own.json").read_bytes())
+    own = found["provenance"]["netlist_sha256"]
+    found["provenance"]["netlist_sha256"] = "0" * 64
+    (place / "foreign.json").write_text(json.dumps(found))
+    words = [
+        "report",
+        "net.loom",
+        "--checkpoint",
+        "net.pt",
+        "--data",
+        "data",
+        "--stress",
+        "foreign.json",
+        "-o",
+        "x.html",
+    ]
+    assert cli.main(words) == 2
+    assert capsys.readouterr().err == (
+        f"spikeloom: --stress foreign.json: is about a netlist of sha256 000000000000…, net.loom has {own[:12]}…; "
+        "stress that one, or report the other\n"
+    )

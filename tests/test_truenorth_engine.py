@@ -1,0 +1,251 @@
+"""Crossbar cores: the specification against values worked out by hand, and the engine against the specification."""
+
+from dataclasses import fields
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from random_crossbars import assert_same, crossbars, events
+
+from compiler.errors import DataError, NumericRangeError
+from compiler.targets import CROSSBARS, load_target
+from compiler.truenorth.draft import Draft, Neuron, history_free
+from compiler.truenorth.netlist import RESET_LINEAR, RESET_NONE, RESET_TO
+from compiler.truenorth.rules import faults
+from runtime.truenorth import engine, spec
+from runtime.truenorth.trace import Counts, Trace
+
+CHIP = load_target("truenorth", CROSSBARS)
+
+
+def one(batch: Trace, sample: int = 0) -> Trace:
+    """One recording of a batch, cut to its own ticks."""
+    counts = Counts(**{field.name: getattr(batch.counts, field.name)[sample] for field in fields(Counts)})
+    ticks = int(counts.ticks)
+    return Trace(counts=counts, spikes=batch.spikes[sample, :ticks], membranes=batch.membranes[sample, :ticks])
+
+
+# -- one neuron --------------------------------------------------------------------------------------------------------
+
+
+def lives(neuron: Neuron, arrivals: list[int]) -> tuple[list[int], list[int]]:
+    """Membranes at the ends of ticks and ticks with spikes of a neuron to which weights of type 0 arrive."""
+    state = spec.Neuron(
+        neuron.leak,
+        neuron.leak_reversal,
+        neuron.threshold,
+        neuron.mask_bits,
+        neuron.reset_mode,
+        neuron.reset,
+        neuron.negative_threshold,
+        neuron.negative_saturates,
+        neuron.initial,
+    )
+    held, spikes = [], []
+    for tick, arrived in enumerate(arrivals):
+        spiked, _ = spec.neuron_tick(state, max(arrived, 0), max(-arrived, 0), 0, 20)
+        held.append(state.membrane)
+        spikes += [tick] * spiked
+    return held, spikes
+
+
+@pytest.mark.parametrize(
+    ("neuron", "arrivals", "held", "spikes"),
+    [
+        # at least the threshold, not above it; leak comes before the comparison
+        (Neuron(threshold=3), [2, 1, 5], [2, 0, 0], [1, 2]),
+        (Neuron(threshold=3, leak=1), [2, 0, 1], [0, 1, 0], [0, 2]),
+        # three resets
+        (Neuron(threshold=3, reset_mode=RESET_TO, reset=2), [7, 0, 0], [2, 2, 2], [0]),
+        (Neuron(threshold=3, reset_mode=RESET_LINEAR), [7, 0, 0], [4, 1, 1], [0, 1]),
+        (Neuron(threshold=3, reset_mode=RESET_NONE), [7, 0, -5], [7, 7, 2], [0, 1]),
+        # below the negative threshold: the same resets with the other sign, or saturation; at it nothing happens
+        (Neuron(threshold=9, negative_threshold=4, reset=2), [-4, -1], [-4, -2], []),
+        (Neuron(threshold=9, negative_threshold=4, reset_mode=RESET_LINEAR), [-7, 0], [-3, -3], []),
+        (Neuron(threshold=9, negative_threshold=4, reset_mode=RESET_NONE), [-7, 0], [-7, -7], []),
+        (Neuron(threshold=9, negative_threshold=4, negative_saturates=True), [-7, 1], [-4, -3], []),
+        # leak: one direction, or by the sign of the membrane, which it does not change
+        (Neuron(threshold=9, leak=-2, negative_threshold=99), [3, 0, 0], [1, -1, -3], []),
+        (Neuron(threshold=9, leak=-2, leak_reversal=True, negative_threshold=99), [3, 0, 0], [1, 0, 0], []),
+        (Neuron(threshold=9, leak=-2, leak_reversal=True, negative_threshold=99), [-5, 0, 0], [-3, -1, 0], []),
+        (Neuron(threshold=9, leak=2, leak_reversal=True, negative_threshold=99), [-1, 0, 0], [-3, -5, -7], []),
+        (Neuron(threshold=9, leak=2, leak_reversal=True, negative_threshold=99), [0, 0], [0, 0], []),
+        # history-free: the threshold is the leak
+        (history_free((1, 0, 0, 0), 3), [2, 2, 3, 0, -9, 4], [0] * 6, [2, 5]),
+        (history_free((1, 0, 0, 0), 3, bias=1), [2, 1, 0], [0] * 3, [0]),
+        # the register saturates at both ends
+        (Neuron(threshold=2**18 - 1, reset_mode=RESET_NONE, initial=2**19 - 1), [5, -3], [524287, 524284], [0, 1]),
+        (
+            Neuron(threshold=9, negative_threshold=2**18 - 1, reset_mode=RESET_NONE, initial=-(2**19)),
+            [-5],
+            [-524288],
+            [],
+        ),
+    ],
+)
+def test_a_neuron_by_hand(neuron, arrivals, held, spikes):
+    assert lives(neuron, arrivals) == (held, spikes)
+
+
+def test_a_register_that_some_order_would_leave_is_counted():
+    neuron = spec.Neuron(0, False, 2**18 - 1, 0, RESET_NONE, 0, 0, True, 524_280)
+    assert spec.neuron_tick(neuron, 10, 10, 0, 20) == (True, True)
+    assert neuron.membrane == 524_280
+    assert spec.neuron_tick(neuron, 7, 10, 0, 20) == (True, False)
+
+
+# -- ticks, delays, clocks ---------------------------------------------------------------------------------------------
+
+
+def chain(delay: int, *, bin_ticks: int = 1, tick: int = 0, first: int = 0):
+    """An input, a relay, and a voter that hears it `delay` ticks later."""
+    draft = Draft()
+    for x in (0, 1):
+        draft.core(x, 0)
+        draft.axon(x)
+        draft.neuron(x, Neuron(), layer=f"layer{x}")
+        draft.connect(x, 0, [0])
+    draft.feed(0, 0, 0, tick=tick)
+    draft.wire((0, 0), 1, 0, delay)
+    draft.vote((1, 0), 0, first=first)
+    return draft.netlist(taxels=1, polarities=1, classes=1, bin_ticks=bin_ticks)
+
+
+@pytest.mark.parametrize("delay", [1, 2, 15])
+@pytest.mark.parametrize("run", ["spec", "engine"])
+def test_when_spikes_arrive(delay, run):
+    netlist, recording = chain(delay, bin_ticks=3, tick=2, first=20), np.array([[1, 0, 1]], np.uint8)
+    trace = (
+        spec.simulate(netlist, recording)
+        if run == "spec"
+        else one(engine.simulate(netlist, recording[None], spikes=True, membranes=True))
+    )
+    assert int(trace.counts.ticks) == 3 * 3 + 20
+    assert [np.flatnonzero(row).tolist() for row in trace.spikes.T] == [[2, 8], [2 + delay, 8 + delay]]
+
+
+def test_votes_count_in_their_window_only():
+    recording = np.array([[1, 0, 1, 1]], np.uint8)
+    for first, votes in ((0, 2), (1, 3), (2, 2), (3, 2), (4, 1), (5, 0)):
+        found = spec.simulate(chain(1, first=first), recording).counts.votes
+        assert found.tolist() == [0, votes], first
+
+
+def test_spikes_that_meet_on_an_axon_are_one():
+    draft = Draft()
+    draft.core(0, 0)
+    draft.axon(0)
+    draft.neuron(0, Neuron(threshold=2), layer="layer0")
+    draft.connect(0, 0, [0])
+    draft.feed(0, 0, 0)
+    draft.feed(1, 0, 0)
+    draft.clock(0, 0, period=2, phase=1)
+    netlist = draft.netlist(taxels=2, polarities=1, classes=1)
+    trace = spec.simulate(netlist, np.array([[1, 1, 0, 0], [1, 0, 0, 0]], np.uint8))
+    assert trace.counts.axons.tolist() == [3]
+    assert int(trace.counts.merged) == 2
+    assert np.flatnonzero(trace.spikes[:, 0]).tolist() == [1]
+    assert trace.membranes[:, 0].tolist() == [1, 0, 0, 1]
+
+
+def test_a_splitter_costs_one_tick():
+    draft = Draft()
+    for x in range(4):
+        draft.core(x, 0)
+    for x in (0, 1, 2):
+        draft.axon(x)
+        draft.neuron(x, Neuron(), layer=f"layer{min(x, 1)}", number=x)
+        draft.connect(x, 0, [0])
+    draft.feed(0, 0, 0)
+    draft.split((0, 0), [(1, 0), (2, 0)], 3)
+    for x in (1, 2):
+        draft.vote((x, 0), 0, first=2)
+    netlist = draft.netlist(taxels=1, polarities=1, classes=1)
+    assert faults(netlist, CHIP) == ()
+    trace = spec.simulate(netlist, np.array([[1, 0]], np.uint8))
+    assert [np.flatnonzero(row).tolist() for row in trace.spikes.T] == [[0], [2], [2], [1], [1]]
+
+
+# -- engine = specification --------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=120, deadline=None)
+@given(crossbars(), st.integers(0, 2**31))
+def test_engine_equals_specification(netlist, seed):
+    assert faults(netlist, CHIP) == ()
+    recording = events(seed, 3, 20)
+    expected = spec.simulate(netlist, recording, seed=seed)
+    assert_same(expected, one(engine.simulate(netlist, recording[None], seed=seed, spikes=True, membranes=True)))
+
+
+@settings(max_examples=15, deadline=None)
+@given(crossbars(), st.integers(0, 2**31))
+def test_recordings_of_a_batch_do_not_depend_on_each_other(netlist, seed):
+    recordings, lengths = events(seed, 3, 12, samples=3), np.array([12, 7, 1])
+    batch = engine.simulate(netlist, recordings, lengths=lengths, spikes=True, membranes=True)
+    for sample, steps in enumerate(lengths):
+        assert_same(spec.simulate(netlist, recordings[sample, :, :steps]), one(batch, sample))
+
+
+def large():
+    """Ten full cores of history-free neurons that feed each other: 2,500 neurons, every line in use."""
+    rng, draft = np.random.default_rng(7), Draft()
+    for core in range(10):
+        draft.core(core, 0)
+        for _ in range(256):
+            draft.axon(core, int(rng.integers(4)))
+        for number in range(250):
+            neuron = Neuron(leak=-1, leak_reversal=True, threshold=9, reset_mode=RESET_LINEAR, negative_threshold=50)
+            weights = tuple(int(weight) for weight in rng.integers(-3, 5, 4))
+            draft.neuron(core, history_free(weights, 6) if core % 2 else neuron, layer="layer0", number=number)
+        for line in range(256):
+            draft.connect(core, line, rng.choice(250, 60, replace=False).tolist())
+        for line in range(78):
+            draft.feed(line, core, line)
+    for core in range(10):
+        for number in range(250):
+            if number % 50 == 0:
+                draft.vote((core, number), core % 3)
+            else:
+                draft.wire((core, number), int(rng.integers(10)), 78 + number % 178, 1 + number % 15)
+    return draft.netlist(taxels=39, polarities=2, classes=3)
+
+
+def test_full_cores_and_many_ticks():
+    netlist, recording = large(), (np.random.default_rng(1).random((78, 60)) < 0.05).astype(np.uint8)
+    assert faults(netlist, CHIP) == ()
+    expected = spec.simulate(netlist, recording)
+    assert 1000 < expected.counts.spikes.sum() < 2500 * 60
+    assert_same(expected, one(engine.simulate(netlist, recording[None], spikes=True, membranes=True)))
+
+
+def test_random_thresholds_depend_on_the_seed_alone():
+    draft = Draft()
+    draft.core(0, 0)
+    draft.neuron(0, Neuron(threshold=0, leak=3, mask_bits=3, reset_mode=RESET_TO), layer="layer0")
+    netlist = draft.netlist(taxels=1, polarities=1, classes=1)
+    silence = np.zeros((1, 1, 400), np.uint8)
+    runs = [engine.simulate(netlist, silence, seed=seed).counts.spikes.item() for seed in (0, 0, 1)]
+    assert runs[0] == runs[1] != runs[2]
+    # eta is uniform in 0 … 7: of the resting values 3, 6, 9 … the first reached spikes with 4/8, the second 7/8
+    assert 200 < runs[0] < 330
+
+
+def test_a_network_at_rest_does_nothing_and_loses_nothing():
+    netlist = large()
+    trace = engine.simulate(netlist, np.zeros((1, 78, 40), np.uint8), membranes=True)
+    assert trace.counts.spikes.sum() == 0
+    assert not trace.membranes.any()
+
+
+def test_recordings_of_another_sensor_or_too_long():
+    with pytest.raises(DataError) as caught:
+        engine.simulate(chain(1), np.zeros((1, 2, 3), np.uint8))
+    expected = "recordings have 2 input channels, the network has 1; use recordings of its sensor"
+    assert str(caught.value) == expected
+    with pytest.raises(DataError, match=f"^{expected}$"):
+        spec.simulate(chain(1), np.zeros((2, 3), np.uint8))
+    with pytest.raises(NumericRangeError) as much:
+        engine.simulate(chain(1, bin_ticks=2**20), np.zeros((1, 1, 2**11), np.uint8))
+    assert str(much.value) == "recordings of 2048 data steps take 2147483648 ticks, 2147483647 can be counted"

@@ -1,0 +1,297 @@
+"""Files of crossbar cores: round trip, what is refused, and the commands that take them."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from random_crossbars import crossbars
+
+from compiler import archive
+from compiler.errors import FormatError
+from compiler.netlist import read_only
+from compiler.serialize import is_netlist, read_netlist
+from compiler.targets import CROSSBARS, load_target
+from compiler.truenorth.draft import Draft, Neuron, history_free
+from compiler.truenorth.netlist import CrossbarNetlist
+from compiler.truenorth.rules import faults
+from compiler.truenorth.serialize import (
+    ARRAYS,
+    FORMAT,
+    crossbar_bytes,
+    inconsistencies,
+    is_crossbars,
+    read_crossbars,
+    write_crossbars,
+)
+from runtime import cli
+from runtime.truenorth import engine
+
+
+def network() -> CrossbarNetlist:
+    """Two of three taxels, each heard by a neuron that votes for its own class."""
+    draft = Draft()
+    core = draft.core(3, 4)
+    for taxel in range(2):
+        draft.axon(core, taxel)
+        draft.neuron(core, history_free((1, 1, 0, 0), 1), layer="out", number=taxel)
+        draft.connect(core, taxel, [taxel])
+        for polarity in range(2):
+            draft.feed(2 * taxel + polarity, core, taxel)
+        draft.vote((core, taxel), taxel)
+    return draft.netlist(taxels=3, polarities=2, classes=2, provenance={"made": "by hand"})
+
+
+@pytest.fixture
+def path(tmp_path):
+    write_crossbars(network(), tmp_path / "net.loom")
+    return tmp_path / "net.loom"
+
+
+@settings(max_examples=30, deadline=None)
+@given(crossbars())
+def test_round_trip(tmp_path_factory, netlist):
+    path = tmp_path_factory.mktemp("crossbars") / "x.loom"
+    write_crossbars(netlist, path)
+    again = read_crossbars(path)
+    assert crossbar_bytes(again) == crossbar_bytes(netlist) == path.read_bytes()
+    for name in ARRAYS:
+        np.testing.assert_array_equal(getattr(again, name), getattr(netlist, name), name)
+    assert inconsistencies(again) == []
+
+
+def test_numpy_alone_reads_it(path):
+    with np.load(path) as members:
+        manifest = json.loads(str(members["manifest"]))
+        assert manifest["format"] == FORMAT
+        assert manifest["provenance"] == {"made": "by hand"}
+        assert members["weight"].tolist() == [[1, 1, 0, 0]] * 2
+
+
+def test_each_reader_names_the_other_kind(path, tmp_path):
+    assert is_crossbars(path)
+    assert is_netlist(path)
+    assert not is_crossbars(tmp_path / "nothing.loom")
+    with pytest.raises(FormatError) as caught:
+        read_netlist(path)
+    assert str(caught.value) == (
+        f"{path}: holds crossbar cores (TrueNorth), this is for cores of compartments (Loihi); give such a file"
+    )
+
+
+def change(path, **arrays):
+    """Write the file again with other arrays and a fitting hash."""
+    members = archive.read_members(path)
+    manifest = json.loads(str(members["manifest"]))
+    manifest |= arrays.pop("manifest", {})
+    held = {name: arrays.get(name, members[name]) for name in ARRAYS}
+    path.write_bytes(archive.archive_bytes(manifest, held))
+    with pytest.raises(FormatError) as caught:
+        read_crossbars(path)
+    return str(caught.value).removeprefix(f"{path}: ")
+
+
+@pytest.mark.parametrize(
+    ("changes", "line"),
+    [
+        ({"threshold": np.zeros(3, np.int8)}, "threshold has 3 entries, 2 are needed"),
+        ({"weight": np.zeros((2, 3), np.int8)}, "weight is 2 by 3, not 2 by 4"),
+        ({"weight": np.zeros(8, np.int8)}, "weight is no table of integers"),
+        ({"leak": np.zeros(2)}, "leak is no list of integers"),
+        ({"wire_x": np.zeros(1, np.int8)}, "wire_x has 1 entries, 0 are needed"),
+        ({"synapse_neuron": np.array([0, 2], np.int8)}, "synapse_neuron points beyond its core"),
+        ({"core_axons": np.array([0, 1], np.int8)}, "core_axons does not divide 2 entries in 1 parts"),
+        ({"feed_channel": np.array([0, 1, 2, 6], np.int8)}, "feed_channel has values outside 0 … 5"),
+        ({"readout_class": np.array([0, 2], np.int8)}, "readout_class has values outside -1 … 1"),
+        ({"layer": np.array([0, 1], np.int8)}, "layer has values outside 0 … 0"),
+        ({"manifest": {"bin_ticks": 0}}, "the manifest has no usable bin_ticks"),
+        ({"manifest": {"clocks": {"channels": 0}}}, "the manifest has no usable clocks"),
+        ({"manifest": {"layers": [1]}}, "the manifest has no usable layers"),
+        ({"manifest": {"target": "loihi1"}}, "it is for 'loihi1', known are truenorth"),
+        (
+            {"manifest": {"version": 2}},
+            "has format version 2, this program reads 1; compile it again or update spikeloom",
+        ),
+    ],
+)
+def test_files_that_mean_nothing(path, changes, line):
+    assert change(path, **changes) in (line, f"{line}; compile it again")
+
+
+def test_crossing_points_out_of_order(path):
+    ends = np.array([0, 2, 2], np.int8)
+    line = change(path, axon_synapses=ends, synapse_neuron=np.array([1, 1], np.int8))
+    assert line == "synapse_neuron does not rise along an axon; compile it again"
+
+
+def test_altered_and_missing_files(path, tmp_path):
+    content = bytearray(path.read_bytes())
+    content[content.index("by hand".encode("utf-32-le"))] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(FormatError, match="is truncated or not a netlist"):  # the archive's own check sum
+        read_crossbars(path)
+    with pytest.raises(FormatError) as caught:
+        read_crossbars(tmp_path / "no.loom")
+    assert str(caught.value) == f"{tmp_path / 'no.loom'}: no such file; write one with spikeloom compile"
+
+
+@settings(max_examples=150, deadline=None)
+@given(crossbars(), st.sampled_from(ARRAYS), st.randoms(use_true_random=False))
+def test_any_numbers_are_refused_or_told_or_run(tmp_path_factory, netlist, name, random):
+    array = np.array(getattr(netlist, name))
+    if array.size:
+        array.flat[random.randrange(array.size)] = random.choice(
+            [-(2**31), -300, -2, -1, 0, 1, 2, 5, 20, 300, 2**31 - 1]
+        )
+    path = tmp_path_factory.mktemp("any") / "x.loom"
+    write_crossbars(replace(netlist, **{name: array}), path)
+    try:
+        found = read_crossbars(path)
+    except FormatError:
+        return
+    if not faults(found, load_target("truenorth", CROSSBARS)):
+        assert found.drain < 2**20
+        engine.simulate(replace(found, readout_first=np.minimum(found.readout_first, 9)), np.ones((1, 3, 4), np.uint8))
+
+
+# -- commands ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def place(path, tmp_path):
+    """A folder with the network and four recordings of its sensor: touches of taxel 0, 1, 1 and 2."""
+    recordings = np.zeros((4, 3, 2, 6), np.uint8)
+    for sample, (taxel, touches) in enumerate([(0, 2), (1, 3), (1, 1), (2, 4)]):
+        recordings[sample, taxel, 0, :touches] = 1
+        recordings[sample, taxel, 1, 0] = 1  # the same axon in the same tick
+    for split in ("train", "test"):
+        (tmp_path / "data" / split).mkdir(parents=True)
+        for sample, label in enumerate([0, 1, 0, 1]):
+            np.save(tmp_path / "data" / split / f"sample_{sample}_label_{label}.npy", recordings[sample])
+    return tmp_path
+
+
+def asked(capsys, *words: str, code: int = 0):
+    assert cli.main(words) == code
+    return capsys.readouterr()
+
+
+def test_run(place, capsys):
+    words = ("run", f"{place}/net.loom", "--data", f"{place}/data", "--spikes", f"{place}/s.npz", "--json")
+    report = json.loads(asked(capsys, *words).out)
+    assert report["predictions"] == [0, 1, 1, 0]
+    assert report["counts"] == [[2, 0], [0, 3], [0, 1], [0, 0]]
+    assert report["accuracy"] == 0.5
+    with np.load(place / "s.npz") as spikes:
+        assert spikes["out"].shape == (4, 6, 2)
+        assert spikes["out"].sum(axis=1).tolist() == report["counts"]
+
+
+def test_estimate(place, capsys):
+    words = ("estimate", f"{place}/net.loom", "--data", f"{place}/data")
+    report = json.loads(asked(capsys, *words, "--json").out)
+    # every arrival meets one crossing point: 2, 3, 1 and 0 of them, and one of two polarities is merged in each
+    assert report["per_inference"]["synaptic_events"] == 1.5
+    assert report["per_inference"]["spikes"] == 1.5
+    assert report["per_inference"]["merged_spikes"] == 0.75
+    assert report["per_inference"]["ticks"] == 6
+    assert report["per_inference"]["time_s"] == pytest.approx(6e-3)
+    all_in, marginal = report["energy"]
+    assert (all_in["table"], all_in["floor_j"]) == ("all_in", None)
+    assert all_in["total_j"] == pytest.approx(1.5 * 26e-12)
+    assert marginal["floor_j"] == pytest.approx(0.0644 * 6e-3)
+    assert marginal["floor_of_used_cores_j"] == pytest.approx(0.0644 * 6e-3 / 4096)
+    assert marginal["total_j"] == pytest.approx(0.0644 * 6e-3 + 1.5 * 2.3e-12)
+    assert report["pace"]["real_time"] is True
+    lines = asked(capsys, *words).out.splitlines()
+    assert lines[0] == "per inference on 1 of 4,096 cores, over 4 recordings:"
+    assert "two readings of one measurement: take one, never their sum" in lines
+    assert "a data step takes 1 ms: keeps the sensor's pace of 20 ms a step" in lines
+
+
+def test_estimate_by_one_table_or_ones_own(place, capsys):
+    words = ("estimate", f"{place}/net.loom", "--data", f"{place}/data", "--json", "--table")
+    assert [e["table"] for e in json.loads(asked(capsys, *words, "all_in").out)["energy"]] == ["all_in"]
+    mine = place / "mine.toml"
+    mine.write_text(
+        '[energy.mine]\ntitle = "mine"\nsynaptic_event = { value = 2, unit = "pJ", source = "me" }\n', "utf-8"
+    )
+    report = json.loads(asked(capsys, *words, str(mine)).out)
+    assert report["per_inference"]["energy_j"] == {"mine": pytest.approx(3e-12)}
+    mine.write_text("other = 1\n", "utf-8")
+    lines = asked(capsys, *words, str(mine), code=2).err.splitlines()
+    assert lines == [
+        f"spikeloom: {mine}: unknown key 'other', allowed are energy",
+        f"spikeloom: {mine}: holds no table; give [energy.NAME] with title and entries",
+    ]
+    mine.write_text('[energy.mine]\ntitle = "mine"\n', "utf-8")
+    found = asked(capsys, *words, str(mine), code=2).err
+    assert found == f"spikeloom: {mine}: energy.mine: has no price of synaptic_event; give it\n"
+
+
+def test_run_with_costs(place, capsys):
+    words = ("run", f"{place}/net.loom", "--data", f"{place}/data", "--detail", "counts")
+    report = json.loads(asked(capsys, *words, "--json").out)
+    assert report["costs"]["per_inference"]["spikes"] == 1.5
+    out = asked(capsys, *words).out
+    assert out.startswith("chip accuracy: 50.00 % (2 of 4;")
+    assert "per inference on 1 of 4,096 cores" in out
+
+
+def test_inspect(place, capsys):
+    report = json.loads(asked(capsys, "inspect", f"{place}/net.loom", "--json").out)
+    assert report["layers"] == [{"name": "out", "neurons": 2, "distinct": 2, "max_fan_in": 1, "cores": 1}]
+    assert asked(capsys, "inspect", f"{place}/net.loom").out.splitlines()[0] == (
+        "truenorth: 2 neurons, 2 axons, 2 crossing points, 1 cores; 1 tick a data step, 0 more to drain"
+    )
+
+
+def test_every_broken_rule_is_told(place, capsys):
+    broken = replace(network(), leak=read_only([300, 0]), clock_core=read_only([0]), clock_line=read_only([0]))
+    broken = replace(broken, clock_period=read_only([0]), clock_phase=read_only([0]))
+    write_crossbars(broken, place / "broken.loom")
+    for words in (["inspect"], ["run", "--data", f"{place}/data"], ["estimate", "--data", f"{place}/data"]):
+        found = asked(capsys, words[0], f"{place}/broken.loom", *words[1:], code=2)
+        assert found.err.splitlines() == [
+            "spikeloom: core 0, neuron 0: leak 300, allowed -256 … 255 (truenorth.neuron.leak_bits); a smaller scale",
+            "spikeloom: clock 0: a period of 0 ticks, allowed 1 or more (truenorth.clock); "
+            "say every how many ticks it spikes",
+        ]
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (
+            ["run", "--detail", "cycle"],
+            "--detail cycle: a tick of TrueNorth has one length, whatever happens in it; use counts",
+        ),
+        (
+            ["estimate", "--table", "sanafe"],
+            "--table sanafe: unknown; allowed: all_in, marginal, or a file that ends in .toml",
+        ),
+    ],
+)
+def test_options_that_do_not_fit(place, capsys, words, line):
+    found = asked(capsys, words[0], f"{place}/net.loom", "--data", f"{place}/data", *words[1:], code=2)
+    assert found.err == f"spikeloom: {line}\n"
+
+
+def test_other_commands_say_what_the_file_is(place, capsys):
+    found = asked(capsys, "export", f"{place}/net.loom", "--to", "sanafe", "-o", f"{place}/x", code=2)
+    assert found.err == (
+        f"spikeloom: {place}/net.loom: holds crossbar cores (TrueNorth), this is for cores of compartments (Loihi); "
+        "give such a file\n"
+    )
+
+
+def test_a_neuron_with_leak_only(place, capsys):
+    draft = Draft()
+    draft.core(0, 0)
+    draft.neuron(0, Neuron(threshold=3, leak=1), layer="out")
+    draft.vote((0, 0), 0)
+    write_crossbars(draft.netlist(taxels=3, polarities=2, classes=2), place / "leak.loom")
+    report = json.loads(asked(capsys, "run", f"{place}/leak.loom", "--data", f"{place}/data", "--json").out)
+    assert report["counts"] == [[2, 0]] * 4

@@ -1,0 +1,205 @@
+"""Files for RANC's simulator: their schema, and equal spikes where its binary is named by ``RANC_SIM``."""
+
+import json
+import os
+import subprocess
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from random_crossbars import WEIGHTS, crossbars, events
+
+from compiler.errors import ModelError
+from compiler.truenorth.draft import Draft, Neuron
+from compiler.truenorth.netlist import RESET_LINEAR, RESET_NONE
+from compiler.truenorth.serialize import write_crossbars
+from runtime import cli
+from runtime.truenorth import ranc, spec
+
+SHARED_WITH_RANC = st.builds(
+    Neuron,
+    weights=st.tuples(WEIGHTS, WEIGHTS, WEIGHTS, WEIGHTS),
+    leak=st.integers(-5, 5),
+    threshold=st.integers(0, 20),
+    reset_mode=st.integers(0, 1),
+    reset=st.integers(-4, 4),
+    negative_threshold=st.integers(0, 20),
+    initial=st.integers(-9, 9),
+)
+
+
+def small(**changes):
+    """Two cores with a corner of the mesh at (5, 2); the second neuron votes, the third has no target."""
+    draft = Draft()
+    draft.core(5, 2)
+    draft.core(6, 3)
+    draft.axon(0, 1)
+    draft.axon(1, 3, line=2)
+    draft.neuron(0, Neuron(weights=(0, 4, 0, 0), threshold=3, negative_threshold=2, **changes), layer="layer0")
+    for number in range(2):
+        draft.neuron(1, Neuron(weights=(0, 0, 0, 1), reset_mode=RESET_LINEAR), layer="layer1", number=number)
+    draft.connect(0, 0, [0])
+    draft.connect(1, 2, [0, 1])
+    draft.feed(0, 0, 0, tick=1)
+    draft.clock(1, 2, period=3, phase=1)
+    draft.wire((0, 0), 1, 2, 15)
+    draft.vote((1, 0), 0, first=1)
+    return draft.netlist(taxels=1, polarities=1, classes=1, bin_ticks=2)
+
+
+def test_schema():
+    written = json.loads("\n".join(ranc.export(small(), np.array([[1, 0]], np.uint8))))
+    assert {key: value for key, value in written.items() if key.startswith(("num", "max", "neuron_r"))} == {
+        "num_neurons": 256,
+        "num_axons": 256,
+        "num_weights": 4,
+        "num_cores_x": 2,
+        "num_cores_y": 3,
+        "max_tick_offset": 16,
+        "neuron_reset_type": 0,
+    }
+    assert written["output_bus"] == {"coordinates": [0, 2], "num_outputs": 2}
+    packet = {"destination_core": [1, 1], "destination_axon": 2, "destination_tick": 0}
+    fed = {"destination_core": [0, 0], "destination_axon": 0, "destination_tick": 0}
+    assert written["packets"] == [[], [fed, packet], [], [], [packet]]
+    first, second = written["cores"]
+    assert first == {
+        "axons": [1],
+        "connections": [[1]],
+        "coordinates": [0, 0],
+        "neurons": [
+            {
+                "weights": [0, 4, 0, 0],
+                "leak": 0,
+                "positive_threshold": 3,
+                "negative_threshold": -2,
+                "reset_potential": 0,
+                "reset_mode": 0,
+                "current_potential": 0,
+                "destination_core_offset": [1, 1],
+                "destination_axon": 2,
+                "destination_tick": 14,
+            }
+        ],
+    }
+    assert second["axons"] == [0, 0, 3]
+    assert second["connections"] == [[0, 0, 1], [0, 0, 1]]
+    voter, lost = second["neurons"]
+    assert (voter["destination_core_offset"], voter["destination_axon"], voter["destination_tick"]) == ([-1, 1], 0, 0)
+    assert (lost["destination_core_offset"], lost["destination_axon"]) == ([-1, 1], 1)
+
+
+@pytest.mark.parametrize(
+    ("changes", "what"),
+    [
+        ({"leak": -1, "leak_reversal": True}, "a leak with reversal (1 neurons)"),
+        ({"mask_bits": 1}, "a random threshold (1 neurons)"),
+        ({"reset_mode": RESET_NONE}, "a reset that does nothing (1 neurons)"),
+        ({"negative_saturates": True}, "a negative threshold that saturates (1 neurons)"),
+    ],
+)
+def test_what_ranc_has_not(changes, what):
+    with pytest.raises(ModelError) as caught:
+        list(ranc.export(small(**changes)))
+    assert str(caught.value) == f"--to ranc: RANC has no {what}; leave them out of the network"
+
+
+def test_saturation_that_is_a_reset_is_written():
+    assert ranc.unsupported(small(negative_saturates=True, reset=2)) == []
+
+
+def test_the_command(tmp_path, capsys):
+    write_crossbars(small(), tmp_path / "net.loom")
+    np.savez(tmp_path / "one.npz", np.zeros(1))
+    words = ["export", f"{tmp_path}/net.loom", "--to", "ranc", "-o", f"{tmp_path}/net.json"]
+    assert cli.main(words) == 0
+    assert json.loads((tmp_path / "net.json").read_text("utf-8"))["packets"] == [[]]
+    assert capsys.readouterr().out.splitlines() == [
+        f"{tmp_path}/net.json: 3 neurons and 3 synapses for ranc, {(tmp_path / 'net.json').stat().st_size} bytes",
+        f"run: ranc_sim {tmp_path}/net.json {tmp_path}/net.out {tmp_path}/net.json TICKS (no recording, add packets)",
+    ]
+
+
+def test_the_command_with_a_recording(tmp_path, capsys):
+    draft = Draft()
+    draft.core(0, 0)
+    draft.axon(0)
+    draft.neuron(0, Neuron(), layer="layer0")
+    draft.connect(0, 0, [0])
+    draft.feed(3, 0, 0)
+    draft.vote((0, 0), 0, first=2)
+    write_crossbars(draft.netlist(taxels=2, polarities=2, classes=1), tmp_path / "net.loom")
+    (tmp_path / "data" / "test").mkdir(parents=True)
+    (tmp_path / "data" / "train").mkdir()
+    for sample in range(2):
+        recording = np.zeros((2, 2, 5), np.float32)
+        recording[1, 1, [sample, 4]] = 1
+        np.save(tmp_path / "data" / "test" / f"sample_{sample}_label_0.npy", recording)
+        np.save(tmp_path / "data" / "train" / f"sample_{sample}_label_0.npy", recording)
+    words = [
+        "export",
+        f"{tmp_path}/net.loom",
+        "--to",
+        "ranc",
+        "-o",
+        f"{tmp_path}/net.json",
+        "--data",
+        f"{tmp_path}/data",
+    ]
+    assert cli.main([*words, "--recording", "1", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["ticks"] == 5 + 2 + 1
+    packets = json.loads((tmp_path / "net.json").read_text("utf-8"))["packets"]
+    assert [len(tick) for tick in packets] == [0, 1, 0, 0, 1, 0, 0]
+    assert cli.main([*words, "--recording", "2"]) == 2
+    assert capsys.readouterr().err == f"spikeloom: --recording 2: {tmp_path}/data has recordings 0 to 1\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["--to", "sanafe", "--data", "x"], "--data x: is for ranc and netx; leave it away"),
+        (["--to", "onnx", "--recording", "0"], "--recording 0: is for ranc; leave it away"),
+        (["--to", "sanafe", "--bin", "0.1"], "--bin 0.1: is for ranc and netx; leave it away"),
+        (["--to", "nir", "--split", "train"], "--split train: is for ranc and netx; leave it away"),
+        (["--to", "netx", "--recording", "0", "--data", "x"], "--recording 0: is for ranc; leave it away"),
+        (["--to", "ranc", "--limit", "1", "--data", "x"], "--limit 1: is for netx; leave it away"),
+        (
+            ["--to", "ranc", "--recording", "3"],
+            "--recording 3: says which recording of --data, which is not given; add it",
+        ),
+        (
+            ["--to", "netx", "--split", "train"],
+            "--split train: says which recording of --data, which is not given; add it",
+        ),
+        (["--to", "netx", "--limit", "2"], "--limit 2: says which recording of --data, which is not given; add it"),
+        (["--to", "nir", "--form", "step"], "--form step: is for onnx and onnx-float; leave it away"),
+        (["--to", "ranc", "--form", "step"], "--form step: is for onnx and onnx-float; leave it away"),
+    ],
+)
+def test_options_that_would_be_ignored(tmp_path, capsys, words, line):
+    write_crossbars(small(), tmp_path / "net.loom")
+    assert cli.main(["export", f"{tmp_path}/net.loom", *words, "-o", f"{tmp_path}/net.json"]) == 2
+    assert capsys.readouterr().err == f"spikeloom: {line}\n"
+
+
+@pytest.fixture(scope="module")
+def simulator():
+    path = os.environ.get("RANC_SIM")
+    if not path:
+        pytest.skip("RANC's simulator is not named by RANC_SIM")
+    return path
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(crossbars(SHARED_WITH_RANC), st.integers(0, 2**31))
+def test_ranc_spikes_the_same(simulator, tmp_path, netlist, seed):
+    recording = events(seed, 3, 20)
+    expected = spec.simulate(netlist, recording)
+    voters = np.flatnonzero(netlist.readout_class >= 0)
+    source, result = tmp_path / "in.json", tmp_path / "out.txt"
+    source.write_text("\n".join(ranc.export(netlist, recording)), "utf-8")
+    ticks = str(int(expected.counts.ticks) + 1)
+    done = subprocess.run([simulator, source, result, source, ticks], capture_output=True, text=True, check=True)
+    assert "ERROR" not in done.stdout
+    np.testing.assert_array_equal(ranc.read_outputs(result.read_text("utf-8"), len(voters)), expected.spikes[:, voters])
