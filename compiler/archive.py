@@ -133,13 +133,13 @@ def stated_format(path: Path) -> str | None:
     return stated if isinstance(stated, str) else None
 
 
-def read_manifest(path: Path, members: Mapping[str, Array], wanted: str) -> dict[str, Any]:
-    """Manifest of an archive that claims to be of a format, one of ``FORMATS``.
+def read_manifest(path: Path, members: Mapping[str, Array], wanted: str, versions: tuple[int, ...]) -> dict[str, Any]:
+    """Manifest of an archive, as :func:`require_manifest` wants it.
 
     Raises
     ------
     FormatError
-        If it does not.
+        If there is none, or it is of another format or version.
     """
     missing = sorted({"manifest", "sha256"} - set(members))
     if missing:
@@ -148,22 +148,51 @@ def read_manifest(path: Path, members: Mapping[str, Array], wanted: str) -> dict
         manifest = json.loads(str(members["manifest"]))
     except (ValueError, RecursionError) as error:
         raise FormatError(f"{path}: has an unreadable manifest; compile it again") from error
+    return require_manifest(path, manifest, wanted, versions)
+
+
+def require_manifest(path: Path, manifest: Any, wanted: str, versions: tuple[int, ...]) -> dict[str, Any]:
+    """Refuse a JSON value that is no manifest of a format, one of ``FORMATS``, in a version that is read.
+
+    Raises
+    ------
+    FormatError
+        What is wrong first.
+    """
     stated = manifest.get("format") if isinstance(manifest, dict) else None
     if isinstance(stated, str) and stated in FORMATS and stated != wanted:
         raise FormatError(f"{path}: holds {FORMATS[stated]}, this is for {FORMATS[wanted]}; give such a file")
     if stated != wanted:
         raise FormatError(f"{path}: is not a netlist; write one with spikeloom compile")
+    if manifest.get("version") not in versions:
+        raise FormatError(
+            f"{path}: has format version {manifest.get('version')}, this program reads "
+            f"{' and '.join(map(str, versions))}; compile it again or update spikeloom"
+        )
     return dict(manifest)
 
 
-def require_whole(
-    path: Path,
-    manifest: Mapping[str, Any],
-    members: dict[str, Array],
-    versions: tuple[int, ...],
-    arrays: tuple[str, ...],
-) -> None:
-    """Refuse an archive of another version, with other members, or that does not match its hash.
+def read_archive(
+    path: Path, wanted: str, versions: tuple[int, ...], arrays: tuple[str, ...]
+) -> tuple[dict[str, Any], dict[str, Array]]:
+    """Manifest and members of a file of a format, one of ``FORMATS``, that matches its hash.
+
+    Raises
+    ------
+    FormatError
+        If it is missing, truncated, altered, or of another format or version.
+    OSError
+        If it cannot be read.
+    """
+    require_file(path)
+    members = read_members(path)
+    manifest = read_manifest(path, members, wanted, versions)
+    require_whole(path, members, arrays)
+    return manifest, members
+
+
+def require_whole(path: Path, members: dict[str, Array], arrays: tuple[str, ...]) -> None:
+    """Refuse an archive with other members, or that does not match its hash.
 
     The hash is taken out of the members.
 
@@ -172,11 +201,6 @@ def require_whole(
     FormatError
         What is wrong first.
     """
-    if manifest.get("version") not in versions:
-        raise FormatError(
-            f"{path}: has format version {manifest.get('version')}, this program reads "
-            f"{' and '.join(map(str, versions))}; compile it again or update spikeloom"
-        )
     stated = str(members.pop("sha256"))
     names = {"manifest", *arrays}
     if set(members) != names:

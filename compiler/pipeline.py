@@ -18,14 +18,12 @@ from compiler.ir import IntegerNetwork, Network
 from compiler.netlist import Netlist
 from compiler.passes.bounds import RangeProof, prove_ranges
 from compiler.passes.calibrate import FEW, MANY, Calibration, calibrate, evenly_spaced
-from compiler.passes.emit import Origin, emit
 from compiler.passes.exact import Exactness, make_exact
-from compiler.passes.layout import Layout, lay_out, require_goal
-from compiler.passes.legalize import LimitUse, require_legal
+from compiler.passes.layout import Layout, require_goal
+from compiler.passes.legalize import LimitUse
 from compiler.passes.place import Placement
 from compiler.passes.prune import (
     Removal,
-    compact,
     disconnect,
     either,
     never_fired,
@@ -35,6 +33,7 @@ from compiler.passes.prune import (
     removals,
 )
 from compiler.passes.quantize import Choice, Recipe, check_recipes, quantize, round_to_forms
+from compiler.placing import place_integers
 from compiler.targets import Target, load_target
 from compiler.verify import verify
 
@@ -264,6 +263,7 @@ def store(
         )
     verify(integer)
     publish("quantize", integer)
+
     silent, unheard = (nobody(network), nobody(network)) if keep_all else removable(integer)
     return Stored(
         network=whole,
@@ -290,37 +290,28 @@ def place(
 
     Parameters and errors as of :func:`compile_network`.
     """
-    chip, integer, calibration = load_target(target), stored.integer, stored.calibration
-    require_goal(optimize, cores_for, chip, calibrated=calibration is not None, chips=chips)
-    laid, identity = compact(integer, either(stored.silent, stored.unheard))
-    rates: tuple[FloatArray, ...] | None = None
-    if calibration is not None:
-        each = (spikes.mean(axis=(0, 1)) for spikes in calibration.spikes)
-        rates = tuple(rate[ids] for rate, ids in zip(each, identity, strict=True))
-    layout, usual = lay_out(
-        laid,
-        chip,
-        goal=optimize,
+    placed = place_integers(
+        stored.integer,
+        removed=(stored.silent, stored.unheard),
+        target=target,
         cores_for=cores_for,
         chips=chips,
-        rates=rates,
-        calibration=calibration,
-        identity=identity,
+        optimize=optimize,
+        calibration=stored.calibration,
+        provenance=provenance,
     )
-    origin = Origin(network=integer, identity=identity, unheard=stored.unheard)
-    netlist = emit(laid, layout.parts, layout.placement.tiles, chip, provenance or {}, origin)
     return Compilation(
         network=stored.network,
-        integer=integer,
-        netlist=netlist,
+        integer=stored.integer,
+        netlist=placed.netlist,
         choices=stored.choices,
         exactness=stored.exactness,
-        proofs=prove_ranges(integer),
-        uses=require_legal(netlist, chip),
+        proofs=prove_ranges(stored.integer),
+        uses=placed.uses,
         removals=removals(stored.network, stored.silent, stored.unheard, stored.unused),
         goal=optimize,
-        layout=layout,
-        usual=usual,
+        layout=placed.layout,
+        usual=placed.usual,
     )
 
 
@@ -352,15 +343,14 @@ def without(
     CapacityError
         If a limit cannot be kept.
     """
-    chip, integer = load_target(target), compilation.integer
-    silent, unheard = removable(integer)
-    laid, identity = compact(integer, either(either(silent, unheard), unused))
-    left = None if rates is None else tuple(rate[ids] for rate, ids in zip(rates, identity, strict=True))
-    layout, _ = lay_out(laid, chip, rates=left)
-    origin = Origin(network=integer, identity=identity, unheard=unheard)
-    netlist = emit(laid, layout.parts, layout.placement.tiles, chip, compilation.netlist.provenance, origin)
-    require_legal(netlist, chip)
-    return netlist
+    silent, unheard = removable(compilation.integer)
+    return place_integers(
+        compilation.integer,
+        removed=(either(silent, unused), unheard),
+        target=target,
+        rates=rates,
+        provenance=compilation.netlist.provenance,
+    ).netlist
 
 
 def _require_stored(network: Network, forms: Sequence[Form], chip: Target) -> None:

@@ -21,13 +21,14 @@ from __future__ import annotations
 import math
 import os
 import zipfile
+from collections.abc import Mapping
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from compiler.archive import archive_bytes, read_manifest, read_members, require_file, require_whole, write_archive
+from compiler.archive import Array, archive_bytes, read_archive, write_archive
 from compiler.dynamics import MOST_CLOCKS, MOST_STEPS, NO_CLOCKS, Clocks
 from compiler.errors import FormatError
 from compiler.netlist import Layer, Netlist, frozen, read_only, read_only_float
@@ -48,8 +49,8 @@ ARRAYS = tuple(field.name for field in fields(Netlist) if field.name not in _SCA
 """Array members in file order."""
 
 
-def netlist_bytes(netlist: Netlist) -> bytes:
-    """File content of a netlist; equal netlists give equal bytes."""
+def manifest_of(netlist: Netlist) -> dict[str, Any]:
+    """What a netlist says beside its arrays, as JSON values."""
     timed = bool(netlist.clocks.channels or any(layer.alpha for layer in netlist.layers))
     manifest: dict[str, Any] = {
         "format": FORMAT,
@@ -66,7 +67,12 @@ def netlist_bytes(netlist: Netlist) -> bytes:
     else:
         for layer in manifest["layers"]:
             del layer["alpha"]
-    return archive_bytes(manifest, {name: getattr(netlist, name) for name in ARRAYS})
+    return manifest
+
+
+def netlist_bytes(netlist: Netlist) -> bytes:
+    """File content of a netlist; equal netlists give equal bytes."""
+    return archive_bytes(manifest_of(netlist), {name: getattr(netlist, name) for name in ARRAYS})
 
 
 def write_netlist(netlist: Netlist, path: str | os.PathLike[str]) -> str:
@@ -91,10 +97,26 @@ def read_netlist(path: str | os.PathLike[str]) -> Netlist:
         If it cannot be read.
     """
     path = Path(path)
-    require_file(path)
-    members = read_members(path)
-    manifest = read_manifest(path, members, FORMAT)
-    require_whole(path, manifest, members, VERSIONS, ARRAYS)
+    return netlist_of(path, *read_archive(path, FORMAT, VERSIONS, ARRAYS))
+
+
+def netlist_of(path: Path, manifest: dict[str, Any], members: Mapping[str, Array]) -> Netlist:
+    """Put a netlist together from what a file holds, and check it.
+
+    Parameters
+    ----------
+    path : Path
+        For messages.
+    manifest : JSON object
+        As :func:`manifest_of` gives it; format and version are known to be ours.
+    members : mapping of str to array
+        Every one of ``ARRAYS``.
+
+    Raises
+    ------
+    FormatError
+        If it is inconsistent.
+    """
     if manifest["version"] == VERSIONS[0]:
         manifest = _widened(manifest)
     faults = _type_faults(manifest, members)
@@ -140,7 +162,7 @@ def is_netlist(path: str | os.PathLike[str]) -> bool:
         return False
 
 
-def _type_faults(manifest: dict[str, Any], members: dict[str, np.ndarray[Any, Any]]) -> list[str]:
+def _type_faults(manifest: dict[str, Any], members: Mapping[str, Array]) -> list[str]:
     """Say which entries of the manifest or which arrays are missing or of another kind than :class:`Netlist` asks."""
     layers = manifest.get("layers")
     entries = {
@@ -183,7 +205,7 @@ def _is_layer(entry: Any) -> bool:
     return all(_is(entry[name], kind, 0) for name, kind in wanted.items() if name != "unheard")
 
 
-def _bounds_fault(name: str, bounds: np.ndarray[Any, Any], parts: int, total: int) -> str | None:
+def _bounds_fault(name: str, bounds: Array, parts: int, total: int) -> str | None:
     good = len(bounds) == parts + 1 and bounds[0] == 0 and bounds[-1] == total and np.all(np.diff(bounds) >= 0)
     return None if good else f"{name} does not divide {total} entries in {parts} parts"
 
@@ -207,7 +229,7 @@ def inconsistencies(netlist: Netlist) -> list[str]:
     if any(found):
         return [fault for fault in found if fault]
 
-    def outside(array: np.ndarray[Any, Any], low: int, high: int) -> bool:
+    def outside(array: Array, low: int, high: int) -> bool:
         return bool(array.size and (array.min() < low or array.max() >= high))
 
     ranges = {

@@ -45,6 +45,9 @@ DIFFER = 0.0
 WINDOWS = tuple(range(5, 101, 5))
 """Percent of each recording that is observed."""
 
+BESIDE = ("graph", "taxels", "edges", "system", "weights", "dt", "convention")
+"""Options that say how a checkpoint is read, and are nothing without one."""
+
 PART = 16
 """Recordings whose float spikes are held at a time."""
 
@@ -144,7 +147,7 @@ def _races(arguments: argparse.Namespace, netlist: Netlist) -> FloatArray | None
 def _float_votes(arguments: argparse.Namespace, netlist: Netlist, data: Recordings) -> IntArray | None:
     """Votes of the float model so far after each step, (samples, steps, classes), if a checkpoint was given."""
     if arguments.checkpoint is None:
-        given = [name for name in ("graph", "taxels", "edges", "system", "weights") if getattr(arguments, name)]
+        given = [name for name in BESIDE if getattr(arguments, name) is not None]
         if given:
             raise OptionError(f"--{given[0]}: is for --checkpoint, which is not given; add it or leave this away")
         return None

@@ -1,17 +1,27 @@
-"""The float network that a command is given: a checkpoint on its graph, or an ONNX file that holds everything."""
+"""The float network that a command is given: a checkpoint on its graph, or an ONNX or NIR file that holds all."""
 
 from __future__ import annotations
 
 import argparse
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
 
 from compiler.errors import OptionError
 from compiler.fixedpoint import FloatArray
 from compiler.frontends.checkpoint import Checkpoint
-from compiler.frontends.onnx import SUFFIX, read_onnx
+from compiler.frontends.netx_file import SUFFIX as NETX
+from compiler.frontends.nir import SUFFIX as NIR
+from compiler.frontends.nir import NirNetwork, read_nir
+from compiler.frontends.nir_neurons import CONVENTIONS
+from compiler.frontends.onnx import SUFFIX as ONNX
+from compiler.frontends.onnx import OnnxNetwork, read_onnx
 from compiler.ir import Network
 from compiler.passes.expand import expand
+from compiler.sidecar import read_said
 from runtime.inputs import asked_checkpoint, asked_graph, progress, propagation
+
+TITLES = {ONNX: "ONNX", NIR: "NIR"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -29,9 +39,13 @@ class Asked:
     graph : str or None
         Its name, likewise.
     facts : tuple of str
-        What was read from an ONNX file and what was assumed.
+        What was read from an ONNX or NIR file and what was assumed.
     sha256 : str
         Of the file.
+    format : str
+        ``checkpoint``, ``onnx`` or ``nir``.
+    read_as : JSON values
+        How it was read, beyond what it says: the time step of a NIR file.
     """
 
     network: Network
@@ -40,6 +54,14 @@ class Asked:
     graph: str | None
     facts: tuple[str, ...]
     sha256: str
+    format: str = "checkpoint"
+    read_as: Mapping[str, Any] = field(default_factory=dict)
+
+    def origin(self, run: int) -> dict[str, Any]:
+        """What a netlist remembers of the file; `run` is which of a released file's runs was asked for."""
+        if self.checkpoint is None:
+            return {"format": self.format, **self.read_as}
+        return {"run": run, "weights": self.checkpoint.weights, "graph": self.graph}
 
     @property
     def model(self) -> Checkpoint | Network:
@@ -55,11 +77,9 @@ def asked_network(path: str, arguments: argparse.Namespace) -> Asked:
     OptionError, ModelError
         If it is not there, not as the options say, or an option is for the other kind of file.
     """
-    onnx_only = {"--polarities": arguments.polarities, "--polarities-first or -last": arguments.polarities_first}
-    if not path.endswith(SUFFIX):
-        for option, value in onnx_only.items():
-            if value is not None:
-                raise OptionError(f"{option}: is for ONNX files, {path} is none; leave it away")
+    suffix = next((suffix for suffix in (ONNX, NIR) if path.endswith(suffix)), None)
+    _require_fit(path, suffix, arguments)
+    if suffix is None:
         checkpoint = asked_checkpoint(path, arguments)
         graph, adjacency = propagation(checkpoint, asked_graph(arguments, checkpoint.system), path)
         return Asked(
@@ -70,11 +90,46 @@ def asked_network(path: str, arguments: argparse.Namespace) -> Asked:
             facts=(),
             sha256=checkpoint.sha256,
         )
-    for name in ("system", "graph", "taxels", "edges", "directed", "weights", "beta", "theta", "run"):
-        if getattr(arguments, name) not in (None, False, 0):
-            raise OptionError(f"--{name}: is for checkpoints, the ONNX file {path} holds all it needs; leave it away")
     progress("reading the network")
-    found = read_onnx(path, polarities=arguments.polarities, polarities_first=arguments.polarities_first)
+    layout = {"polarities": arguments.polarities, "polarities_first": arguments.polarities_first}
+    if suffix == ONNX:
+        onnx = read_onnx(path, **layout)
+        return _asked(onnx, "onnx", {})
+    said = read_said(path, CONVENTIONS) if arguments.dt is None else None
+    dt = arguments.dt if said is None else said.dt
+    convention = arguments.convention or (CONVENTIONS[0] if said is None else said.convention)
+    return _asked(read_nir(path, dt=dt, convention=convention, **layout), "nir", {"dt": dt, "convention": convention})
+
+
+def _asked(found: OnnxNetwork | NirNetwork, kind: str, read_as: Mapping[str, Any]) -> Asked:
     return Asked(
-        network=found.network, checkpoint=None, adjacency=None, graph=None, facts=found.facts, sha256=found.sha256
+        network=found.network,
+        checkpoint=None,
+        adjacency=None,
+        graph=None,
+        facts=found.facts,
+        sha256=found.sha256,
+        format=kind,
+        read_as=read_as,
     )
+
+
+def _require_fit(path: str, suffix: str | None, arguments: argparse.Namespace) -> None:
+    """Refuse options that are for another kind of file, and files that hold no float network."""
+    if path.endswith(NETX):
+        raise OptionError(f"{path}: holds integers, no float network to compare with; compile, inspect and run it")
+    if suffix is None:
+        layout = {"--polarities": arguments.polarities, "--polarities-first or -last": arguments.polarities_first}
+        for option, value in layout.items():
+            if value is not None:
+                raise OptionError(f"{option}: is for ONNX and NIR files, {path} is none; leave it away")
+    else:
+        for name in ("system", "graph", "taxels", "edges", "directed", "weights", "beta", "theta", "run"):
+            if getattr(arguments, name) not in (None, False, 0):
+                raise OptionError(
+                    f"--{name}: is for checkpoints, the {TITLES[suffix]} file {path} holds all it needs; leave it away"
+                )
+    if suffix != NIR:
+        for name in ("dt", "convention"):
+            if getattr(arguments, name) is not None:
+                raise OptionError(f"--{name}: is for NIR files, {path} is none; leave it away")

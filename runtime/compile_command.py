@@ -1,4 +1,4 @@
-"""The command ``compile``: a checkpoint or an ONNX file becomes a netlist."""
+"""The command ``compile``: a checkpoint or a file of another format becomes a netlist."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from runtime import render
 from runtime.asked import Asked, asked_network
 from runtime.inputs import progress, recordings, require_place, version
 from runtime.options import MARGIN, cores_asked
+from runtime.restore import is_whole, take
 from runtime.truenorth.refusal import refuse
 
 Json = dict[str, Any]
@@ -33,6 +34,8 @@ LISTED = 20
 def compile_netlist(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
     """Run the command: the report, how to print it, and the exit code."""
     require_place(arguments.output, "-o", arguments)
+    if is_whole(arguments):
+        return take(arguments)
     if arguments.target in known_targets(CROSSBARS):
         return refuse(arguments)
     if arguments.margin is not None and arguments.ranges != "observed":
@@ -104,14 +107,10 @@ def provenance(arguments: argparse.Namespace, asked: Asked, *, calibrated: bool)
         Whether recordings chose its scales.
     """
     checkpoint, cores_for = asked.checkpoint, cores_asked(arguments.cores_for)
-    if checkpoint is None:
-        origin: Json = {"format": "onnx"}
-    else:
-        origin = {"run": arguments.run, "weights": checkpoint.weights, "graph": asked.graph}
     return {
         "spikeloom": version(),
         "checkpoint_sha256": asked.sha256,
-        **origin,
+        **asked.origin(arguments.run),
         **({"towers": checkpoint.towers} if checkpoint is not None and checkpoint.towers > 1 else {}),
         **storage(recipes_asked(arguments), checkpoint),
         "spike_exact": arguments.spike_exact,
@@ -131,7 +130,7 @@ def _margin(arguments: argparse.Namespace) -> float:
 
 
 def _text(report: Json) -> str:
-    """A compilation for people, with what was read from an ONNX file and what differs from another netlist."""
+    """A compilation for people, with what was read from another format and what differs from another netlist."""
     lines = [*report.get("facts", ()), *([""] if "facts" in report else []), render.compilation_text(report)]
     if "against" in report:
         weights, registers = report["against"]["weights"], report["against"]["registers"]

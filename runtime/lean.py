@@ -139,10 +139,8 @@ def _read(arguments: argparse.Namespace, split: str, limit: int | None, asked: A
 
 
 def _provenance(arguments: argparse.Namespace, asked: Asked) -> Json:
-    of = asked.checkpoint
-    known = {"format": "onnx"} if of is None else {"run": arguments.run, "weights": of.weights, "graph": asked.graph}
-    made = {"spikeloom": version(), "checkpoint_sha256": asked.sha256, **known}
-    made |= storage(None, of)
+    made = {"spikeloom": version(), "checkpoint_sha256": asked.sha256, **asked.origin(arguments.run)}
+    made |= storage(None, asked.checkpoint)
     return made | {"keep_all": False, "prune_unused": True, "ranges": "proven", "calibrated": True}
 
 

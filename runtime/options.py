@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from compiler.errors import OptionError
+from compiler.frontends.nir_neurons import CONVENTIONS
 from compiler.frontends.own import WEIGHTS
 from compiler.frontends.systems import GRAPH_SYSTEMS, SYSTEMS, TACTILESGNET
 from compiler.passes.layout import GOALS
@@ -21,6 +22,35 @@ MARGIN = 0.1
 
 MIN_AGREEMENT = 0.95
 """Share of equal decisions that ``verify`` wants."""
+
+MODEL: dict[str, object] = {
+    "system": None,
+    "graph": None,
+    "taxels": None,
+    "edges": None,
+    "directed": False,
+    "weights": None,
+    "beta": None,
+    "theta": None,
+    "run": 0,
+}
+"""Options of :func:`add_model`, and what they are where they are not given."""
+
+ROUNDING: dict[str, object] = {
+    "weight_bits": None,
+    "planes": None,
+    "scale_groups": None,
+    "spike_exact": False,
+    "prune_unused": False,
+    "ranges": "proven",
+    "margin": None,
+    "against": None,
+    "dump_after": [],
+}
+"""Options of ``compile`` that say how a float network is stored on Loihi, likewise."""
+
+PLACING: dict[str, object] = {"keep_all": False, "cores_for": None, "chips": 1, "optimize": "cores"}
+"""Options of ``compile`` that say where integers go, likewise."""
 
 DATA_HELP = "recordings: released layout, event files (csv, npz), one recording, 'synthetic', 'objects' or 'containers'"
 
@@ -172,9 +202,9 @@ def add_model(parser: argparse.ArgumentParser, *, graph: bool = True) -> None:
 
 
 def add_network(parser: argparse.ArgumentParser) -> None:
-    """Add the options that say how to read a float network: a checkpoint on its graph, or an ONNX file."""
+    """Add the options that say how to read a float network: a checkpoint on its graph, an ONNX or a NIR file."""
     add_model(parser)
-    parser.add_argument("--polarities", type=int, metavar="N", help="of an ONNX input, where its shape is flat")
+    parser.add_argument("--polarities", type=int, metavar="N", help="of an ONNX or NIR input, where its shape is flat")
     order = parser.add_mutually_exclusive_group()
     for name, first in (("first", True), ("last", False)):
         order.add_argument(
@@ -182,8 +212,19 @@ def add_network(parser: argparse.ArgumentParser) -> None:
             dest="polarities_first",
             action="store_const",
             const=first,
-            help=f"they are the {name} axis, where the shape of an ONNX input does not say",
+            help=f"they are the {name} axis, where the shape of an ONNX or NIR input does not say",
         )
+    add_steps(parser)
+
+
+def add_steps(parser: argparse.ArgumentParser) -> None:
+    """Add the options that say how the time constants of a NIR file become decays."""
+    parser.add_argument("--dt", type=float, metavar="SECONDS", help="time step that a NIR file is read in")
+    parser.add_argument(
+        "--convention",
+        choices=CONVENTIONS,
+        help=f"a step keeps 1 - dt/tau (euler) or exp(-dt/tau) (exponential) of a state (default: {CONVENTIONS[0]})",
+    )
 
 
 def cores_asked(words: str | None) -> dict[str, int] | None:
@@ -214,7 +255,7 @@ def cores_asked(words: str | None) -> dict[str, int] | None:
 
 def add_compile(sub: argparse.ArgumentParser) -> None:
     """Add the options of a compilation."""
-    sub.add_argument("checkpoint", help="checkpoint, or a network as an ONNX file")
+    sub.add_argument("checkpoint", help="checkpoint, or a network as an ONNX, NIR or netx file")
     add_network(sub)
     sub.add_argument("--against", metavar="NET.loom", help="list the weights that differ from another netlist's")
     sub.add_argument("--target", default="loihi1", help="chip: loihi1 (default), or truenorth, to hear why not")

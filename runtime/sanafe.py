@@ -10,6 +10,8 @@ What the file says and what the chip does differ in a few points:
   more of its synapses; :func:`dense_synapses` tells our models the same.
 * A neuron sends one message to a core, however many lists there listen to it.
 * A current that the step before left is no work to a neuron; :func:`updates` counts without it.
+* A current that outlasts its step is a float there, cut to nothing; the chip cuts it to a whole 64th of a weight unit
+  in every step. Spikes of such layers may differ, and of no others: :func:`floating_layers` names them.
 * Registers have no ends. No register of a compiled netlist reaches its own.
 
 Groups are called ``input`` and by the layers; neuron ``k`` of a group is the channel or the layer's ``k``-th
@@ -29,7 +31,6 @@ from itertools import pairwise
 import numpy as np
 from scipy.sparse import csr_array
 
-from compiler.errors import ModelError
 from compiler.fixedpoint import DECAY_BITS, MEMBRANE_SHIFT, IntArray
 from compiler.netlist import Netlist
 from compiler.passes.chips import require_one_chip
@@ -48,6 +49,12 @@ def group_names(netlist: Netlist) -> tuple[str, ...]:
     """Names of the layers' groups; dots, which separate names from numbers, and the like become underscores."""
     names = [re.sub(r"\W", "_", layer.name, flags=re.ASCII) for layer in netlist.layers]
     return tuple(name if names.count(name) == 1 and name != INPUT else f"{name}_{i}" for i, name in enumerate(names))
+
+
+def floating_layers(netlist: Netlist) -> tuple[str, ...]:
+    """Names of the groups whose currents outlast their step."""
+    lasting = np.unique(netlist.layer[netlist.decay_u != 2**DECAY_BITS - 1])
+    return tuple(group_names(netlist)[layer] for layer in lasting)
 
 
 def members(netlist: Netlist) -> IntArray:
@@ -132,24 +139,17 @@ def export(netlist: Netlist, target: Target) -> Iterator[str]:
 
     Raises
     ------
-    ModelError
-        If SANA-FE cannot say what the netlist does.
     OptionError
         If the netlist takes several chips.
     """
-    remembering = np.flatnonzero(netlist.decay_u != 2**DECAY_BITS - 1)
-    if len(remembering):
-        layer = netlist.layers[netlist.layer[remembering[0]]].name
-        raise ModelError(
-            f"{layer}: a current that outlasts its step found (decay_u {netlist.decay_u[remembering[0]]}), "
-            f"SANA-FE keeps currents as floats, not as the chip does; export networks without currents"
-        )
     room = target.limit("core.compartments")
     names, number, places = group_names(netlist), members(netlist), cores(netlist, target)
     yield f"# spikeloom netlist for SANA-FE {VERSION} and its loihi.yaml; give the neurons of group {INPUT} 'spikes'"
     if netlist.clocks.channels:
         length, first = netlist.clocks.steps, netlist.n_inputs - netlist.clocks.channels
         yield f"# from neuron {first} on they are clocks: each spikes in {length} steps, one after the other"
+    if floating := floating_layers(netlist):
+        yield f"# currents of {', '.join(floating)} outlast a step: floats here, whole 64ths on the chip"
     yield "network:"
     yield "  name: spikeloom"
     yield "  groups:"
@@ -181,14 +181,16 @@ def _groups(netlist: Netlist, names: tuple[str, ...]) -> Iterator[str]:
     dense = _dense_neurons(netlist)
     bias = netlist.bias_mantissa * 2.0**netlist.bias_exponent / 2**MEMBRANE_SHIFT
     leak = (2**DECAY_BITS - netlist.decay_v) / 2**DECAY_BITS
+    kept = (2**DECAY_BITS - 1 - netlist.decay_u) / 2**DECAY_BITS
     for layer, name in enumerate(names):
         yield f"    - name: {name}"
         yield "      attributes: {soma_hw_name: loihi_lif, reset: 0.0, input_decay: 0.0, log_spikes: true}"
         yield "      neurons:"
         for k, c in enumerate(netlist.compartments_of(layer).tolist()):
             unit = UNITS[bool(dense[c])]
+            lasts = f"input_decay: {float(kept[c])!r}, " if kept[c] else ""
             yield (
-                f"        - {k}: {{threshold: {netlist.threshold[c]}.0, leak_decay: {float(leak[c])!r}, "
+                f"        - {k}: {{threshold: {netlist.threshold[c]}.0, leak_decay: {float(leak[c])!r}, {lasts}"
                 f"bias: {float(bias[c])!r}, synapse_hw_name: {unit}}}"
             )
 

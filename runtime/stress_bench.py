@@ -104,6 +104,7 @@ def facts_of(arguments: argparse.Namespace, asked: Asked, data: str) -> Json:
         "spikeloom": version(),
         "netlist_sha256": hashlib.sha256(Path(arguments.netlist).read_bytes()).hexdigest(),
         "checkpoint_sha256": asked.sha256,
+        **asked.read_as,
         "graph": asked.graph,
         "data_sha256": data,
         "netlist": Path(arguments.netlist).name,

@@ -3,6 +3,7 @@
 import random
 from functools import cache
 
+from fuzzed_bytes import changed_bytes
 from made_modules import NETS, example_of, one_step
 from made_onnx import looped, scanned, two_layers
 from onnx import AttributeProto, ModelProto
@@ -80,28 +81,6 @@ def sources():
     made = [two_layers(spelling) for spelling in ("product", "where", "truth", "after")]
     made += [one_step(NETS[name](), example_of(name)) for name in ("mlp", "tag", "grid", "gcn")]
     return (*made, scanned(), looped())
-
-
-def changed_bytes(content, rng):
-    """A few bytes cut, changed, doubled or moved."""
-    data = bytearray(content)
-    for _ in range(rng.choice((1, 1, 2, 5))):
-        place = rng.randrange(len(data)) if data else 0
-        length = rng.choice((1, 1, 2, 8, 100))
-        match rng.randrange(6):
-            case 0:
-                del data[place:]
-            case 1:
-                del data[place : place + length]
-            case 2:
-                data[place : place + length] = rng.randbytes(length)
-            case 3:
-                data[place:place] = data[place : place + length]
-            case 4:
-                data[place:place] = rng.randbytes(length)
-            case 5 if data:
-                data[place] ^= 1 << rng.randrange(8)
-    return bytes(data)
 
 
 def _graphs(graph):

@@ -5,12 +5,11 @@ import hashlib
 import re
 from dataclasses import replace
 
-import numpy as np
 import pytest
 from random_netlists import Axon, Neuron, build
 from test_timing import LOIHI, six_steps
 
-from compiler.errors import ModelError, OptionError
+from compiler.errors import OptionError
 from compiler.netlist import read_only
 from compiler.serialize import write_netlist
 from runtime import export, sanafe
@@ -138,17 +137,17 @@ def test_channels_fill_cores_of_their_own():
     assert "- input.0..1023: {core: '1.1'}\n  - input.1024..1029: {core: '1.2'}" in text
 
 
-def test_a_current_that_lasts_cannot_be_said(tmp_path):
+def test_a_current_that_lasts_is_a_float_there_and_that_is_said(tmp_path):
     netlist, _, _ = six_steps()
-    decays = np.array([4095, 4095, 2048])
-    write_netlist(replace(netlist, decay_u=read_only(decays)), tmp_path / "net.loom")
-    with pytest.raises(ModelError) as caught:
-        run(tmp_path / "net.loom", "--to", "sanafe", "-o", tmp_path / "net.yaml")
-    assert str(caught.value) == (
-        "layer1: a current that outlasts its step found (decay_u 2048), SANA-FE keeps currents as floats, "
-        "not as the chip does; export networks without currents"
-    )
-    assert [path.name for path in tmp_path.iterdir()] == ["net.loom"]
+    netlist = replace(netlist, decay_u=read_only([4095, 4095, 2047]))
+    write_netlist(netlist, tmp_path / "net.loom")
+    report, text = run(tmp_path / "net.loom", "--to", "sanafe", "-o", tmp_path / "net.yaml")
+    assert report["floating_currents"] == ["layer1"]
+    assert text.splitlines()[-1] == "currents of layer1 are floats there, so spikes may differ"
+    written = (tmp_path / "net.yaml").read_text("utf-8")
+    assert written.count("input_decay: 0.5, ") == 1
+    told = "# currents of layer1 outlast a step: floats here, whole 64ths on the chip\n"
+    assert written.replace("input_decay: 0.5, ", "").replace(told, "") == SIX_STEPS
 
 
 def test_a_place_that_cannot_be_written(tmp_path):

@@ -363,7 +363,7 @@ def test_options(refusal, words, line):
 
 
 def test_options_of_the_other_kind(refusal):
-    line = "--polarities: is for ONNX files, pretrained:grasps is none; leave it away"
+    line = "--polarities: is for ONNX and NIR files, pretrained:grasps is none; leave it away"
     assert refusal(None, "--polarities", "2", name="pretrained:grasps") == line
 
 

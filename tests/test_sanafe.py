@@ -15,7 +15,9 @@ import numpy as np
 import pytest
 from random_netlists import large_netlist
 from test_timing import DETAILED, ENERGY_PJ, LOIHI, SANAFE, SIMPLE, six_steps
+from timed_networks import events_of, written
 
+from compiler.dynamics import with_clocks
 from compiler.frontends.checkpoint import read_checkpoint
 from compiler.netlist import Netlist, read_only
 from compiler.passes.expand import expand
@@ -155,6 +157,18 @@ def test_a_network_of_any_wiring(interpreter, tmp_path):
         np.testing.assert_allclose(run.ours_simple, run.simple, rtol=1e-9)
         assert run.ours_detailed.sum() == pytest.approx(run.detailed.sum(), rel=0.02)
         assert run.ours_energy == pytest.approx(run.energy, rel=1e-9)
+
+
+def test_currents_that_last(interpreter, tmp_path):
+    written(tmp_path / "net.pt")
+    checkpoint = read_checkpoint(tmp_path / "net.pt")
+    graph = build_graph("manual")
+    netlist = compile_network(expand(checkpoint, normalised_adjacency(graph.edges, graph.n_taxels))).netlist
+    assert sanafe.floating_layers(netlist) == ("fc1", "fc2")
+    events = with_clocks(events_of(3, steps=60), netlist.clocks)
+    for run in compare(interpreter, netlist, events, tmp_path):
+        assert run.expected_spikes.sum() > 1000
+        assert (run.spikes != run.expected_spikes).sum() <= 0.01 * run.expected_spikes.sum()
 
 
 def without_second_lists(netlist: Netlist, kept: np.ndarray) -> Netlist:

@@ -158,13 +158,22 @@ def test_the_command_with_a_recording(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        (["--to", "sanafe", "--data", "x"], "--data x: is for ranc; leave it away"),
+        (["--to", "sanafe", "--data", "x"], "--data x: is for ranc and netx; leave it away"),
         (["--to", "onnx", "--recording", "0"], "--recording 0: is for ranc; leave it away"),
-        (["--to", "sanafe", "--bin", "0.1"], "--bin 0.1: is for ranc; leave it away"),
+        (["--to", "sanafe", "--bin", "0.1"], "--bin 0.1: is for ranc and netx; leave it away"),
+        (["--to", "nir", "--split", "train"], "--split train: is for ranc and netx; leave it away"),
+        (["--to", "netx", "--recording", "0", "--data", "x"], "--recording 0: is for ranc; leave it away"),
+        (["--to", "ranc", "--limit", "1", "--data", "x"], "--limit 1: is for netx; leave it away"),
         (
             ["--to", "ranc", "--recording", "3"],
             "--recording 3: says which recording of --data, which is not given; add it",
         ),
+        (
+            ["--to", "netx", "--split", "train"],
+            "--split train: says which recording of --data, which is not given; add it",
+        ),
+        (["--to", "netx", "--limit", "2"], "--limit 2: says which recording of --data, which is not given; add it"),
+        (["--to", "nir", "--form", "step"], "--form step: is for onnx and onnx-float; leave it away"),
         (["--to", "ranc", "--form", "step"], "--form step: is for onnx and onnx-float; leave it away"),
     ],
 )

@@ -30,6 +30,10 @@ class Layer:
     bias : (neurons,) float64
     sources : mapping of int to csr_array (neurons, neurons of the source)
         Stages from other layers by their place in the sequence, or from ``INPUT``.
+    alpha : float
+        Share of the synaptic current that a step keeps.
+    relays : int
+        How many of the last neurons relay a channel that always has an event, see :mod:`compiler.dynamics`.
     """
 
     name: str
@@ -37,6 +41,8 @@ class Layer:
     theta: float
     bias: FloatArray
     sources: Mapping[int, Sparse]
+    alpha: float = 0.0
+    relays: int = 0
 
 
 def class_of_each(counts: Sparse) -> IntArray | None:
@@ -128,7 +134,16 @@ def assemble(layers: Sequence[Layer], sensor: Input, voters: int, label: IntArra
     for layer in (layers[index] for index in order):
         _require_neuron(layer)
         post = len(populations)
-        populations.append(Population(name=layer.name, beta=layer.beta, theta=layer.theta, bias=layer.bias))
+        populations.append(
+            Population(
+                name=layer.name,
+                beta=layer.beta,
+                theta=layer.theta,
+                bias=layer.bias,
+                alpha=layer.alpha,
+                relays=layer.relays,
+            )
+        )
         for source, weight in sorted(layer.sources.items(), key=lambda entry: place[entry[0]]):
             projections.append(Projection(pre=place[source], post=post, weight=weight))
     network = Network(
@@ -146,6 +161,10 @@ def _require_neuron(layer: Layer) -> None:
     where = f"layer {printable(layer.name)}"
     if not 0 <= layer.beta <= 1:
         raise ModelError(f"{where}: keeps {layer.beta:g} of its membrane in a step, allowed are 0 to 1; train it again")
+    if not 0 <= layer.alpha < 1:
+        raise ModelError(
+            f"{where}: keeps {layer.alpha:g} of its current in a step, allowed is less than 1; train again"
+        )
     if not 0 < layer.theta < np.inf:
         raise ModelError(f"{where}: has the threshold {layer.theta:g}, allowed are numbers above 0; train it again")
     if not all(np.all(np.isfinite(values)) for values in (layer.bias, *(w.data for w in layer.sources.values()))):

@@ -85,7 +85,7 @@ def never_fired(network: Network, calibration: Calibration) -> tuple[Mask, ...]:
     return _without_voters(network, tuple(~mask for mask in fired))
 
 
-def nobody(network: Network) -> tuple[Mask, ...]:
+def nobody(network: Network | IntegerNetwork) -> tuple[Mask, ...]:
     """No neuron of any population."""
     return tuple(np.zeros(population.size, np.bool_) for population in network.populations)
 

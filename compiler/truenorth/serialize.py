@@ -15,16 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from compiler.archive import (
-    Array,
-    archive_bytes,
-    read_manifest,
-    read_members,
-    require_file,
-    require_whole,
-    stated_format,
-    write_archive,
-)
+from compiler.archive import Array, archive_bytes, read_archive, stated_format, write_archive
 from compiler.dynamics import MOST_CLOCKS, MOST_STEPS, Clocks
 from compiler.errors import FormatError
 from compiler.netlist import read_only
@@ -89,10 +80,7 @@ def read_crossbars(path: str | os.PathLike[str]) -> CrossbarNetlist:
         If it cannot be read.
     """
     path = Path(path)
-    require_file(path)
-    members = read_members(path)
-    manifest = read_manifest(path, members, FORMAT)
-    require_whole(path, manifest, members, VERSIONS, ARRAYS)
+    manifest, members = read_archive(path, FORMAT, VERSIONS, ARRAYS)
     wrong = _kind_faults(manifest, members)
     if not wrong and manifest["target"] not in known_targets(CROSSBARS):
         wrong = [f"it is for {manifest['target']!r}, known are {', '.join(known_targets(CROSSBARS))}"]

@@ -17,6 +17,7 @@ from compiler.truenorth.needs import needs
 from models.evtouch import Recordings
 from runtime.asked import Asked, asked_network
 from runtime.inputs import progress, recordings
+from runtime.options import PLACING, ROUNDING
 from runtime.tables import table
 from runtime.truenorth.trials import Trial
 from runtime.truenorth.ways import COPIES, Planner, Way
@@ -25,23 +26,6 @@ Json = dict[str, Any]
 
 TRIED = 72
 """Training recordings that ways out are measured on, evenly spaced."""
-
-LOIHI_ONLY: dict[str, Any] = {
-    "weight_bits": None,
-    "planes": None,
-    "scale_groups": None,
-    "spike_exact": False,
-    "keep_all": False,
-    "prune_unused": False,
-    "ranges": "proven",
-    "margin": None,
-    "cores_for": None,
-    "chips": 1,
-    "optimize": "cores",
-    "against": None,
-    "dump_after": [],
-}
-"""Options that say how a network is stored on Loihi, and what they are where they are not given."""
 
 
 def refuse(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
@@ -52,7 +36,7 @@ def refuse(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], 
     OptionError, ModelError, DataError
         If the options, the network or the recordings cannot be used.
     """
-    for name, absent in LOIHI_ONLY.items():
+    for name, absent in (ROUNDING | PLACING).items():
         if getattr(arguments, name) != absent:
             raise OptionError(f"--{name.replace('_', '-')}: is for loihi1, not for truenorth; leave it away")
     chip = load_target(arguments.target, CROSSBARS)

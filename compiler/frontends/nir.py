@@ -1,0 +1,376 @@
+"""Read a spiking network from a NIR file: affine stages become weights, in float64, spiking nodes become layers."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from scipy import sparse
+
+from compiler.dynamics import MOST_STEPS, RELAY_WEIGHT, Clocks
+from compiler.errors import ModelError, OptionError
+from compiler.fixedpoint import FloatArray, IntArray
+from compiler.frontends.assemble import Layer, assemble, class_of_each, in_order, unique_names
+from compiler.frontends.nir_file import Graph, Node, read_graph
+from compiler.frontends.nir_file import in_order as nodes_in_order
+from compiler.frontends.nir_neurons import (
+    CONVENTIONS,
+    SPIKING,
+    TOLERANCE,
+    Neurons,
+    Steps,
+    decay_words,
+    neurons_of,
+    require_steps,
+    written_for,
+)
+from compiler.frontends.nir_nodes import KNOWN, STAGES
+from compiler.frontends.nir_values import Value, added, filtered, scaled, spikes_of
+from compiler.frontends.sensor_layout import sensor_layout
+from compiler.frontends.tensors import printable
+from compiler.ir import INPUT, Input, Network, Sparse
+
+SUFFIX = ".nir"
+
+MOST_DECAYS = 16
+"""Membrane decays within a node; each becomes a layer of its own. A core holds 32."""
+
+AXES, ELEMENTS = 8, 2**20
+"""Of an input."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class NirNetwork:
+    """A network, and what was found about the file that it is from.
+
+    Parameters
+    ----------
+    network : Network
+        Float stage, in float64.
+    facts : tuple of str
+        What was read and what was assumed, for people.
+    sha256 : str
+        Of the file.
+    """
+
+    network: Network
+    facts: tuple[str, ...]
+    sha256: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Spiking:
+    """A spiking node: what it gets, scaled to its membrane, and its neurons by their decays."""
+
+    node: Node
+    value: Value
+    neurons: Neurons
+    groups: list[IntArray]
+
+
+def read_nir(
+    path: str | os.PathLike[str],
+    *,
+    dt: float | None,
+    convention: str | None = None,
+    polarities: int | None = None,
+    polarities_first: bool | None = None,
+) -> NirNetwork:
+    """Read a network.
+
+    Parameters
+    ----------
+    path : path
+        File.
+    dt : float
+        Seconds of a time step. None is refused, with what the file tells about it.
+    convention : {"euler", "exponential"}, optional
+        How time constants become decays, see :mod:`compiler.frontends.nir_neurons`; by default ``euler``.
+    polarities, polarities_first : optional
+        See :func:`compiler.frontends.sensor_layout.sensor_layout`.
+
+    Raises
+    ------
+    ModelError
+        If the file cannot be read, or holds something else than a feed-forward network that spikes; the message names
+        the node.
+    OptionError
+        If there is no time step, or an option has no such value.
+    """
+    try:
+        graph = read_graph(Path(path))
+        if dt is None:
+            raise OptionError(f"{path}: NIR keeps no time step{_hint(graph)}; give --dt SECONDS")
+        steps = Steps(dt=dt, convention=convention or CONVENTIONS[0])
+        require_steps(dt)
+        with np.errstate(all="ignore"):  # what is not finite is refused at the end
+            return network_of(graph, steps, polarities, polarities_first)
+    except ModelError as error:
+        raise ModelError(f"{path}: {error}") from error
+
+
+def _written(graph: Graph) -> float | None:
+    """Step that the file was written in, as far as all of its neurons say the same."""
+    found = [written_for(node) for node in graph.nodes.values() if node.type in SPIKING and node.type != "Threshold"]
+    if not found or found[0] is None or any(step is None for step in found):
+        return None
+    return found[0] if all(math.isclose(step, found[0], rel_tol=1e-4) for step in found if step) else None
+
+
+def _hint(graph: Graph) -> str:
+    said = graph.metadata.get("dt")
+    if isinstance(said, np.ndarray) and said.size == 1:
+        return f", but its metadata says dt = {float(said.ravel()[0]):g}"
+    written = _written(graph)
+    return "" if written is None else f", but its r is tau / {written:g}, as of steps of {written:g} s"
+
+
+def network_of(
+    graph: Graph, steps: Steps, polarities: int | None = None, polarities_first: bool | None = None
+) -> NirNetwork:
+    """Network of a graph that was read; parameters and errors as of :func:`read_nir`, without the path."""
+    entry, end = graph.one("Input"), graph.one("Output")
+    shape = entry.whole("shape") if entry.values.get("shape") is not None else ()
+    if not shape or len(shape) > AXES or min(shape) < 1 or math.prod(shape) > ELEMENTS:
+        raise entry.fail(f"has the shape {list(shape[:AXES])}, allowed are up to {ELEMENTS} values; export it again")
+    sensor, positions, words = sensor_layout(shape, polarities=polarities, polarities_first=polarities_first)
+    spiking, result = _walk(graph, steps, shape)
+    if not spiking:
+        raise ModelError("has no spiking neurons, so nothing can be counted; export a spiking network")
+    voters, label = _readout(end, result, spiking)
+    layers, held = _layers(spiking, positions)
+    place = sum(len(other.groups) for other in spiking[:voters])
+    layers, sensor = _with_held(layers, held, sensor)
+    network = assemble(layers, sensor, place, label)
+    facts = _facts(graph, steps, spiking, f"input {printable(entry.name)}: {words}", sensor)
+    facts.append(f"classes: the spikes of {printable(spiking[voters].node.name)} in output {printable(end.name)}")
+    return NirNetwork(network=network, facts=tuple(facts), sha256=graph.sha256)
+
+
+def _walk(graph: Graph, steps: Steps, shape: tuple[int, ...]) -> tuple[list[_Spiking], Value]:
+    """All spiking nodes in order, and what the output gets."""
+    heard: dict[str, list[str]] = {name: [] for name in graph.nodes}
+    for source, target in graph.edges:
+        heard[target].append(source)
+    values: dict[str, Value] = {}
+    spiking: list[_Spiking] = []
+    result: Value | None = None
+    for name in nodes_in_order(graph):
+        node = graph.nodes[name]
+        if node.type == "Input":
+            if heard[name]:
+                raise node.fail("gets values from other nodes; leave these edges away")
+            values[name] = spikes_of(INPUT, shape)
+            continue
+        try:
+            value = added([values[source] for source in heard[name]])
+        except ModelError as error:
+            raise node.fail(str(error)) from error
+        if node.type in SPIKING:
+            values[name] = spikes_of(len(spiking), value.shape)
+            spiking.append(_spiking(node, value, steps))
+        elif node.type in STAGES:
+            values[name] = STAGES[node.type](node, value, steps)
+        else:
+            known = ", ".join(sorted([*SPIKING, *STAGES]))
+            raise node.fail(KNOWN.get(node.type, f"is of a type that is not known here, known are {known}; replace it"))
+        if node.type == "Output":
+            result = values[name]
+    assert result is not None, "there is one output"
+    return spiking, result
+
+
+def _spiking(node: Node, value: Value, steps: Steps) -> _Spiking:
+    if not value.size:
+        raise node.fail("has no neurons; export it again")
+    neurons = neurons_of(node, value.size, value.shape, steps)
+    try:
+        own = (
+            filtered(value, neurons.alpha, neurons.gain, np.zeros(value.size))
+            if neurons.alpha
+            else scaled(value, neurons.gain)
+        )
+    except ModelError as error:
+        raise node.fail(str(error)) from error
+    decays = np.round(neurons.beta / TOLERANCE).astype(np.int64)
+    different = np.unique(decays)
+    if len(different) > MOST_DECAYS:
+        raise node.fail(
+            f"has {len(different)} different membrane time constants, {MOST_DECAYS} are allowed in a node; train with "
+            "fewer"
+        )
+    groups = [np.flatnonzero(decays == decay) for decay in different]
+    return _Spiking(node=node, value=own, neurons=neurons, groups=groups)
+
+
+def _layers(spiking: Sequence[_Spiking], positions: IntArray) -> tuple[list[Layer], list[FloatArray]]:
+    """A layer for each decay of each node, and what flows into the currents of its neurons in every step."""
+    first = np.cumsum([0, *(len(one.groups) for one in spiking)]).tolist()
+    named = unique_names([one.node.name for one in spiking])
+    layers, held = [], []
+    for one, name in zip(spiking, named, strict=True):
+        for number, rows in enumerate(one.groups, 1):
+            # Neurons of other thresholds are those of one, with their weights and biases in its units.
+            theta = float(one.neurons.theta[rows[0]])
+            units = theta / one.neurons.theta[rows]
+            sources: dict[int, Sparse] = {}
+            for source, weight in one.value.terms.items():
+                own = _rows_scaled(weight[rows], units)
+                if source == INPUT:
+                    sources[INPUT] = own[:, positions]
+                    continue
+                for group, columns in enumerate(spiking[source].groups):
+                    sources[first[source] + group] = own[:, columns]
+            reached = {source: weight for source, weight in sources.items() if weight.nnz} or sources
+            for weight in reached.values():
+                weight.sort_indices()
+            layers.append(
+                Layer(
+                    name=name if len(one.groups) == 1 else f"{name}_{number}",
+                    beta=float(one.neurons.beta[rows[0]]),
+                    theta=theta,
+                    bias=(one.value.bias + one.neurons.drive)[rows] * units,
+                    sources=reached,
+                    alpha=one.value.alpha,
+                )
+            )
+            held.append(one.value.held[rows] * units)
+    return layers, held
+
+
+def _rows_scaled(weight: Sparse, factor: FloatArray) -> Sparse:
+    scaled_rows = weight.copy()
+    scaled_rows.data = scaled_rows.data * np.repeat(factor, np.diff(weight.indptr))
+    scaled_rows.eliminate_zeros()
+    return scaled_rows
+
+
+def _with_held(layers: list[Layer], held: list[FloatArray], sensor: Input) -> tuple[list[Layer], Input]:
+    """Let a channel that always has an event bring biases that go through a synaptic filter.
+
+    The chip adds a bias past the current, where it acts in full from the first step on.
+    """
+    lasting = [index for index, values in enumerate(held) if np.any(values)]
+    if not lasting:
+        return layers, sensor
+    depth: dict[int, int] = {INPUT: -1}
+    for index in in_order(layers):
+        depth[index] = max((depth[source] + 1 for source in layers[index].sources), default=0)
+    clocked = replace(sensor, clocks=Clocks(channels=1, steps=MOST_STEPS))
+    found = []
+    relays = range(max(depth[index] for index in lasting))  # one a depth, on the way to the deepest
+    for index, layer in enumerate(layers):
+        sources = dict(layer.sources)
+        own = held[index] if index in lasting else np.zeros(len(layer.bias))
+        column = _column(own)
+        if INPUT in sources:
+            sources[INPUT] = _beside(sources[INPUT], _column(own if not depth[index] else 0 * own))
+        elif not depth[index]:
+            sources[INPUT] = _beside(_column(np.zeros(len(own)), sensor.size), column)
+        if depth[index] and index in lasting:
+            sources[len(layers) + depth[index] - 1] = column
+        found.append(replace(layer, sources=sources))
+    for step in relays:
+        weight = _column(np.array([RELAY_WEIGHT]))
+        if not step:
+            weight = _beside(_column(np.zeros(1), sensor.size), weight)
+        found.append(
+            Layer(
+                name=f"always{step + 1}",
+                beta=0.0,
+                theta=1.0,
+                bias=np.zeros(1),
+                sources={INPUT if not step else len(layers) + step - 1: weight},
+                relays=1,
+            )
+        )
+    return found, clocked
+
+
+def _column(values: FloatArray, width: int = 1) -> Sparse:
+    """csr_array whose first column is given, the others empty."""
+    rows = np.flatnonzero(values)
+    return sparse.csr_array((values[rows], (rows, np.zeros(len(rows), np.int64))), shape=(len(values), width))
+
+
+def _beside(left: Sparse, right: Sparse) -> Sparse:
+    both = sparse.csr_array(sparse.hstack([left, right], format="csr"))
+    both.sort_indices()
+    return both
+
+
+def _readout(end: Node, result: Value, spiking: Sequence[_Spiking]) -> tuple[int, IntArray]:
+    """The spiking node whose spikes are counted, and the class of each of its neurons."""
+    remedy = "end the network with a spiking layer, one neuron or one group of neurons a class"
+    if result.alpha:
+        raise end.fail(f"gets the membranes of a leaky integrator, a chip counts spikes; {remedy}")
+    if len(result.terms) != 1 or INPUT in result.terms:
+        raise end.fail(f"gets no count of the spikes of one layer; {remedy}")
+    ((source, counts),) = result.terms.items()
+    label = class_of_each(counts)
+    if label is None or (result.bias.size and np.ptp(result.bias) > 0):
+        raise end.fail(f"gets weighted spikes of {printable(spiking[source].node.name)}, a vote counts them; {remedy}")
+    node = spiking[source].node
+    if len(spiking[source].groups) > 1:
+        raise node.fail(
+            f"votes, and has {len(spiking[source].groups)} membrane time constants; give the last layer one"
+        )
+    return source, label
+
+
+def _facts(graph: Graph, steps: Steps, spiking: Sequence[_Spiking], sensor: str, clocked: Input) -> list[str]:
+    """What a reader of the file would want to check."""
+    version = printable(graph.version) or "of no version"
+    facts = [f"NIR {version}, read in steps of {steps.dt:g} s ({steps.convention})", sensor]
+    for one in spiking:
+        n = one.neurons
+        decays = " or ".join(decay_words(float(n.beta[rows[0]])) for rows in one.groups[:4])
+        told = f"layer {printable(one.node.name)} ({one.node.type}): {len(n.beta)} neurons, {decays}"
+        told += f", current {one.value.alpha:.6g}" if one.value.alpha else ""
+        told += f", fires at v > {_span(n.theta + n.reset)}, then v = {_span(n.reset)}"
+        if np.any(np.abs(n.gain - 1) > 1e-4):
+            told += f"; a step adds {_span(n.gain)} of its input"
+        facts.append(told)
+    return facts + _drifts(graph, steps, clocked)
+
+
+def _drifts(graph: Graph, steps: Steps, sensor: Input) -> list[str]:
+    """What files are known to lose or to change."""
+    facts = ["v goes to its reset as NIR says; a framework that subtracts the threshold instead means another network"]
+    if any(node.type == "CubaLIF" for node in graph.nodes.values()):
+        facts.append(
+            "a reset leaves currents as they are, as NIR says; snnTorch's Synaptic with reset 'zero' clears them"
+        )
+    written = _written(graph)
+    if written is not None and not math.isclose(written, steps.dt, rel_tol=1e-4):
+        facts.append(
+            f"drift: r is tau / {written:g} in every neuron, as of a file written in steps of {written:g} s; in steps "
+            f"of {steps.dt:g} s its decays and gains are others than there"
+        )
+    rounded = [
+        f"{printable(name)}.{key} ({np.dtype(node.stored(key)).name})"
+        for name, node in graph.nodes.items()
+        for key in ("weight", "bias", "tau", "tau_mem", "tau_syn", "v_threshold")
+        if node.has(key) and (np.dtype(node.stored(key)).kind != "f" or np.dtype(node.stored(key)).itemsize < 4)
+    ]
+    if rounded:
+        facts.append(f"drift: rounded before the file was written: {', '.join(rounded[:6])}; read as they stand")
+    square = [
+        printable(name)
+        for name, node in graph.nodes.items()
+        if node.type in ("Affine", "Linear") and len(set(node.numbers("weight").shape)) == 1
+    ]
+    if square:
+        facts.append(f"square matrices are read as (to, from): {', '.join(square[:6])}")
+    if sensor.clocks.channels:
+        facts.append("biases that go through a synaptic current come from a channel that always has an event")
+    return facts
+
+
+def _span(values: FloatArray) -> str:
+    low, high = float(values.min()), float(values.max())
+    return f"{low:.6g}" if math.isclose(low, high, rel_tol=1e-6, abs_tol=1e-12) else f"{low:.6g} … {high:.6g}"

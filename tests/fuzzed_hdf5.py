@@ -1,0 +1,195 @@
+"""NIR and netx files with faults: bytes and content of good ones changed at random, the same for the same seed.
+
+As a program, ``fuzzed_hdf5.py FIRST COUNT`` takes files with changed bytes apart in one process, as the reader does in
+one of its own, and reads what comes out; it names each seed before, so that whoever started it knows where it died.
+"""
+
+import copy
+import random
+import signal
+import sys
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from fuzzed_bytes import changed_bytes
+
+from compiler.errors import SpikeloomError
+from compiler.frontends import hdf5_child
+from compiler.frontends.hdf5 import assembled
+from compiler.frontends.netx import integers_of
+from compiler.frontends.netx_file import blocks_of
+from compiler.frontends.nir import network_of
+from compiler.frontends.nir_file import graph_of
+from compiler.frontends.nir_neurons import Steps
+from compiler.verify import verify
+
+FILES = Path(__file__).parent / "nir"
+
+TYPES = ("Affine", "AvgPool2d", "Conv1d", "Conv2d", "CubaLIF", "Delay", "Flatten", "I", "IF", "Identity", "Input", "LI")
+TYPES += ("LIF", "Linear", "NIRGraph", "Output", "Scale", "SumPool2d", "Threshold", "conv", "dense", "flatten", "input")
+NUMBERS = (-(2**63), -(2**31), -100, -1, 0, 1, 2, 3, 7, 100, 2**20, 2**31, 2**62, 1e-300, 1e300, np.nan, np.inf, 0.5)
+SECONDS = 4
+
+
+@cache
+def sources():
+    """Good files."""
+    return (*tuple(path.read_bytes() for path in sorted(FILES.glob("*.ni[r]"))), netx_bytes())
+
+
+@cache
+def netx_bytes():
+    """A good netx file."""
+    from runtime.netx_export import file_bytes
+
+    rng = np.random.default_rng(0)
+
+    def neuron():
+        kinds = {"iDecay": 4096, "vDecay": 1024, "vThMant": 25, "refDelay": 1, "gradedSpike": 0}
+        return {"type": "CUBA"} | {key: np.array(value) for key, value in kinds.items()}
+
+    def block(kind, shape, weight, **more):
+        bias = 2 * rng.integers(-9, 9, len(weight))
+        return {"type": kind, "shape": np.array(shape), "weight": weight, "bias": bias, "neuron": neuron()} | more
+
+    pairs = {key: np.array([1, 1]) for key in ("stride", "dilation")} | {"padding": np.array([0, 0])}
+    layers = [
+        {"type": "input", "shape": np.array([2, 4, 4])},
+        block("conv", [3, 3, 3], 2 * rng.integers(-9, 9, (3, 2, 2, 2)), groups=np.array(1), **pairs),
+        {"type": "flatten", "shape": np.array([27])},
+        block("dense", [4], 2 * rng.integers(-60, 60, (4, 27))),
+    ]
+    return file_bytes({"layer": {str(number): layer for number, layer in enumerate(layers)}})
+
+
+@cache
+def trees():
+    """What is in them."""
+    return tuple(assembled_of(content) for content in sources())
+
+
+def assembled_of(content):
+    entries, arrays = hdf5_child.take_apart(content)
+    return assembled(entries, b"".join(array.tobytes() for array in arrays))
+
+
+def read(tree):
+    """Read a content as both formats do; whatever may be raised is raised."""
+    if "layer" in tree:
+        network, facts = integers_of(blocks_of(tree), tree)
+    else:
+        found = network_of(graph_of(tree, ""), Steps(dt=1e-4, convention="euler"))
+        network, facts = found.network, found.facts
+    verify(network)
+    assert all("\n" not in fact for fact in facts)
+
+
+def outcome(tree):
+    """How reading ends: fine, or with one clear line."""
+    said = None
+    try:
+        with np.errstate(all="ignore"):
+            read(tree)
+    except SpikeloomError as error:
+        said = str(error)
+    if said is None:
+        return "read"
+    assert "\n" not in said, said
+    assert len(said) < 600, said
+    return "refused"
+
+
+def groups_of(tree):
+    """All groups of a content."""
+    found = [tree]
+    for group in found:
+        found += [entry for entry in group.values() if isinstance(entry, dict)]
+    return found
+
+
+def strange(rng, entry):  # noqa: PLR0911 one return a kind of fault
+    """An entry that is something else."""
+    match rng.randrange(9):
+        case 0:
+            return None
+        case 1:
+            return rng.choice((*TYPES, "", "a\nb", "ä" * 200, "same", "subtract"))
+        case 2:
+            return {}
+        case 3:
+            return [["a", "b"], ["b"]]
+        case 4 if isinstance(entry, np.ndarray) and entry.size:
+            changed = entry.astype(np.float64).ravel()
+            changed[rng.randrange(changed.size)] = rng.choice(NUMBERS)
+            return changed.reshape(entry.shape)
+        case 5 if isinstance(entry, np.ndarray) and entry.size > 1:
+            return entry.ravel()[: rng.randrange(entry.size)]
+        case 6 if isinstance(entry, np.ndarray):
+            return entry[None] if rng.random() < 0.5 else entry.T
+        case 7 if isinstance(entry, np.ndarray):
+            return np.abs(np.nan_to_num(entry.astype(np.float64))).astype(np.uint8)
+    return np.array(rng.choice(NUMBERS))
+
+
+def changed_content(tree, rng):
+    """A few faults in the content of a file."""
+    tree = copy.deepcopy(tree)
+    for _ in range(rng.choice((1, 1, 2, 4))):
+        group = rng.choice(groups_of(tree))
+        if not group:
+            continue
+        key = rng.choice(sorted(group))
+        match rng.randrange(6):
+            case 0:
+                del group[key]
+            case 1:
+                group[rng.choice(("x", "1", "weight", "type", "delay", "metadata"))] = group[key]
+            case 2 if isinstance(group.get("edges"), list) and group["edges"]:
+                edges = group["edges"]
+                names = [name for pair in edges for name in pair]
+                edges.append([rng.choice(names), rng.choice([*names, "nothing"])])
+            case 3 if isinstance(group.get("type"), str):
+                group["type"] = rng.choice(TYPES)
+            case _:
+                group[key] = strange(rng, group[key])
+    return tree
+
+
+def content_outcome(seed):
+    """How a content for a seed is read."""
+    rng = random.Random(seed)
+    with np.errstate(all="ignore"):  # the faults themselves
+        tree = changed_content(rng.choice(trees()), rng)
+    return outcome(tree)
+
+
+def bytes_outcome(seed):
+    """How bytes for a seed are read."""
+    rng = random.Random(seed)
+    content = changed_bytes(rng.choice(sources()), rng)
+    try:
+        tree = assembled_of(content)
+    except hdf5_child.RefusedError:
+        return "refused"
+    except Exception:  # as the process of its own tells it
+        return "damaged"
+    return outcome(tree)
+
+
+def main():
+    """See the module."""
+    first, count = int(sys.argv[1]), int(sys.argv[2])
+    hdf5_child.limit_resources()
+    for seed in range(first, first + count):
+        sys.stdout.write(f"{seed}\n")
+        sys.stdout.flush()
+        signal.alarm(SECONDS)
+        ending = bytes_outcome(seed)
+        signal.alarm(0)
+        sys.stdout.write(f"{ending}\n")
+    sys.stdout.write("done\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,256 @@
+"""NIR files: written by their own packages and held to what these run, and node by node."""
+
+import itertools
+from pathlib import Path
+
+import nir
+import numpy as np
+import pytest
+from made_nir import affine, chain, cuba, graph_with, lif, lowered, simulate
+from numpy.testing import assert_array_equal
+
+from compiler.dynamics import with_clocks
+from compiler.frontends.nir import read_nir
+from compiler.interpret import run_float, run_integer
+from compiler.pipeline import compile_network
+from runtime import engine, spec
+
+FILES = Path(__file__).parent / "nir"
+
+READ = {
+    "snntorch_leaky": (1e-4, "euler"),
+    "snntorch_conv": (1e-4, "euler"),
+    "norse_lif": (1e-6, "euler"),  # the square of its dt, which it multiplies into tau
+    "norse_iaf": (1.0, "euler"),
+    "sinabs_lif": (1.0, "exponential"),
+    "sinabs_iaf": (1.0, "exponential"),
+    "spikingjelly_lif": (0.02, "euler"),
+    "spikingjelly_if": (0.02, "euler"),
+    "spikingjelly_cuba": (0.02, "euler"),
+}
+"""Time step and convention that each package means."""
+
+
+def recording(network, events, image=False):
+    """Events of a file's input as a recording (1, taxels, polarities, steps)."""
+    sensor = network.input
+    if image:  # [polarities, height, width] in the file
+        return events.reshape(len(events), sensor.polarities, sensor.taxels).transpose(2, 1, 0)[None].astype(np.uint8)
+    return events.reshape(len(events), sensor.taxels, sensor.polarities).transpose(1, 2, 0)[None].astype(np.uint8)
+
+
+def float_spikes(network, events, image=False):
+    given = with_clocks(recording(network, events, image), network.input.clocks)
+    found = run_float(network, np.ascontiguousarray(given.transpose(0, 2, 1)).astype(bool)).spikes
+    return {population.name: spikes[0] for population, spikes in zip(network.populations, found, strict=True)}
+
+
+@pytest.mark.parametrize("name", READ)
+def test_every_spike_is_that_of_the_package_that_wrote_the_file(name):
+    dt, convention = READ[name]
+    found = read_nir(FILES / f"{name}.nir", dt=dt, convention=convention)
+    run = np.load(FILES / f"{name}.npz")
+    spikes = float_spikes(found.network, run["events"], image=run["events"].shape[1] == 50)
+    for node in set(run.files) - {"events"}:
+        layer = node if node in spikes else f"_{node}"  # as SpikingJelly calls it
+        assert run[node].sum() > 4
+        assert_array_equal(spikes[layer], run[node])
+
+
+@pytest.mark.parametrize("name", ["snntorch_leaky", "norse_lif", "sinabs_iaf", "spikingjelly_cuba"])
+def test_one_of_each_package_on_the_chip(name):
+    dt, convention = READ[name]
+    network = read_nir(FILES / f"{name}.nir", dt=dt, convention=convention).network
+    compiled = compile_network(network)
+    events = recording(network, np.load(FILES / f"{name}.npz")["events"], image="iaf" in name)
+    given = with_clocks(events, network.input.clocks)
+    fast = engine.simulate(compiled.netlist, given, spikes=True, membranes=True)
+    slow = spec.simulate(compiled.netlist, given[0])
+    assert_array_equal(fast.spikes[0], slow.spikes)
+    assert_array_equal(fast.membranes[0], slow.membranes)
+    inputs = np.ascontiguousarray(given.transpose(0, 2, 1)).astype(bool)
+    wanted, chip = (run(net, inputs).spikes for run, net in ((run_float, network), (run_integer, compiled.integer)))
+    moved = sum(int((a != b).sum()) for a, b in zip(wanted, chip, strict=True))
+    assert moved <= 0.1 * sum(int(spikes.sum()) for spikes in wanted)
+
+
+def test_what_snntorch_loses_of_a_synaptic_neuron_is_said():
+    found = read_nir(FILES / "snntorch_synaptic.nir", dt=1e-4)
+    said = "a reset leaves currents as they are, as NIR says; snnTorch's Synaptic with reset 'zero' clears them"
+    assert said in found.facts
+    run = np.load(FILES / "snntorch_synaptic.npz")
+    spikes = float_spikes(found.network, run["events"])["1"]
+    first = int(np.argmax(run["1"].any(axis=1)))  # up to the first reset both are alike
+    assert_array_equal(spikes[: first + 1], run["1"][: first + 1])
+    assert not np.array_equal(spikes, run["1"])
+
+
+def test_facts_of_a_file():
+    facts = read_nir(FILES / "snntorch_leaky.nir", dt=2e-4, convention="exponential").facts
+    assert facts == (
+        "NIR 1.0.8, read in steps of 0.0002 s (exponential)",
+        "input input: 6 taxels, 2 polarities, as flat, channel = taxel * polarities + polarity; 2 polarities are "
+        "assumed",
+        "layer 1 (LIF): 16 neurons, decay 0.201896 (0.201904 on the chip), fires at v > 0.5, then v = 0; a step adds "
+        "0.997629 of its input",
+        "layer 3 (LIF): 4 neurons, decay 0.818731 (0.818848 on the chip), fires at v > 1, then v = 0; a step adds "
+        "1.81269 of its input",
+        "v goes to its reset as NIR says; a framework that subtracts the threshold instead means another network",
+        "drift: r is tau / 0.0001 in every neuron, as of a file written in steps of 0.0001 s; in steps of 0.0002 s "
+        "its decays and gains are others than there",
+        "classes: the spikes of 3 in output output",
+    )
+
+
+def given(seed, size, steps=60, share=0.3):
+    return np.random.default_rng(seed).random((steps, size)) < share
+
+
+def compare(graph, size, *, dt=0.02, convention="euler", image=False, least=10):
+    """Every spiking node against the second reading."""
+    events = given(1, size)
+    network = lowered(graph, dt, convention).network
+    ours, theirs = float_spikes(network, events, image), simulate(graph, events, dt, convention)
+    for name, spikes in theirs.items():
+        assert spikes.sum() >= least
+        assert_array_equal(ours[name], spikes)
+    return network
+
+
+@pytest.mark.parametrize("convention", ["euler", "exponential"])
+@pytest.mark.parametrize("seed", range(4))
+def test_leaky_neurons_with_every_parameter(seed, convention):
+    rng = np.random.default_rng(seed)
+    first = lif(9, tau=0.07, r=rng.uniform(1, 3, 9), threshold=rng.uniform(0.3, 0.8, 9), leak=0.2, reset=-0.3)
+    last = lif(4, tau=0.04, r=2.0, leak=rng.uniform(-0.1, 0.1, 4), reset=0.1)
+    compare(chain(affine(rng, 9, 6, 1.5), first, affine(rng, 4, 9, 1.5), last), 6, convention=convention)
+
+
+@pytest.mark.parametrize("convention", ["euler", "exponential"])
+def test_currents_and_the_biases_that_go_through_them(convention):
+    rng = np.random.default_rng(3)
+    nodes = [
+        affine(rng, 9, 6),
+        cuba(9, r=2.0, weight=rng.uniform(1, 2, 9), leak=0.1),
+        affine(rng, 7, 9),
+        lif(7, r=2.0),
+        affine(rng, 4, 7),
+        cuba(4, tau_syn=0.08, r=2.5, weight=2.0),
+    ]
+    network = compare(chain(*nodes), 6, convention=convention)
+    assert network.input.clocks.channels == 1
+    assert [population.name for population in network.populations] == ["n1", "always1", "n3", "always2", "n5"]
+
+
+def test_a_leaky_integrator_is_the_filter_of_what_follows():
+    rng = np.random.default_rng(5)
+    filter_ = nir.LI(tau=np.full(9, 0.06), r=np.full(9, 3.0), v_leak=np.full(9, 0.1))
+    nodes = [affine(rng, 9, 6), filter_, affine(rng, 8, 9), lif(8, r=2.0), affine(rng, 4, 8, 2.0), lif(4, r=2.0)]
+    network = compare(chain(*nodes), 6)
+    assert network.populations[0].alpha == pytest.approx(1 - 0.02 / 0.06)
+
+
+def test_a_node_of_several_decays_is_several_layers():
+    rng = np.random.default_rng(6)
+    mixed = lif(9, tau=np.array([0.05, 0.2, 0.05] * 3), r=2.5)
+    graph = chain(affine(rng, 9, 6, 1.5), mixed, affine(rng, 4, 9, 1.5), lif(4, r=2.0))
+    network = lowered(graph).network
+    assert [(p.name, p.size) for p in network.populations] == [("n1_1", 6), ("n1_2", 3), ("n3", 4)]
+    events = given(1, 6)
+    ours, theirs = float_spikes(network, events), simulate(graph, events, 0.02)
+    assert_array_equal(ours["n3"], theirs["n3"])
+    assert_array_equal(ours["n1_2"], theirs["n1"][:, 1::3])
+
+
+def image(rng, **more):
+    return nir.Conv2d(
+        input_shape=(5, 6), weight=rng.normal(size=(4, 2, 3, 2)), bias=rng.normal(size=4) * 0.1, groups=1,
+        **{"stride": (2, 1), "padding": (1, 0), "dilation": (1, 2)} | more,
+    )  # fmt: skip
+
+
+def test_images_of_every_kind_of_stage():
+    rng = np.random.default_rng(7)
+    pools = {"n2": nir.SumPool2d, "n4": nir.AvgPool2d}
+    nodes = {
+        "n0": image(rng),
+        "n1": nir.IF(r=np.full((4, 3, 4), 40.0), v_threshold=np.ones((4, 3, 4))),
+        "n2": pools["n2"](kernel_size=np.array([2, 2]), stride=np.array([1, 1]), padding=np.array([0, 0])),
+        "n3": nir.Threshold(np.full((4, 2, 3), 1.5)),
+        "n4": pools["n4"](kernel_size=np.array([2, 3]), stride=np.array([2, 3]), padding=np.array([0, 0])),
+        "n5": nir.Flatten(np.array([4, 1, 1]), 0, -1),
+        "n6": affine(rng, 3, 4, 2.0),
+        "n7": nir.Scale(np.array([1.0, 2.0, 0.5])),
+        "n8": lif(3, r=2.0, threshold=0.2),
+    }
+    names = list(nodes)
+    compare(graph_with(nodes, [*itertools.pairwise(names)], (2, 5, 6), (3,)), 60, image=True, least=5)
+
+
+@pytest.mark.parametrize(
+    "more", [{"padding": "same", "stride": 1}, {"padding": "valid"}, {"stride": 2, "padding": 1, "dilation": 1}]
+)
+def test_padding_in_words_and_numbers_for_all_axes(more):
+    rng = np.random.default_rng(8)
+    conv = nir.Conv2d(
+        input_shape=(5, 6),
+        weight=rng.normal(size=(4, 2, 3, 3)),
+        bias=np.zeros(4),
+        groups=1,
+        **{"stride": 1, "dilation": 1} | more,
+    )
+    shape = simulate_shape(conv)
+    size = int(np.prod(shape))
+    nodes = {"a": conv, "b": nir.Flatten(np.array(shape), 0, -1), "c": nir.Threshold(np.full(size, 0.5))}
+    compare(graph_with(nodes, [("a", "b"), ("b", "c")], (2, 5, 6), (size,)), 60, image=True)
+
+
+def simulate_shape(conv):
+    from made_nir import _step
+
+    return _step(conv, np.zeros((2, 5, 6)), {}, 1.0, "euler").shape
+
+
+def test_one_axis_and_groups():
+    rng = np.random.default_rng(9)
+    conv = nir.Conv1d(
+        input_shape=7, weight=rng.normal(size=(4, 1, 3)), stride=2, padding=1, dilation=1, groups=2,
+        bias=rng.normal(size=4) * 0.2,
+    )  # fmt: skip
+    nodes = {"a": conv, "b": nir.Flatten(np.array([4, 4]), 0, -1), "c": lif(16, r=3.0)}
+    graph = graph_with(nodes, [("a", "b"), ("b", "c")], (2, 7), (16,))
+    events = given(1, 14)
+    ours = float_spikes(lowered(graph).network, events.reshape(60, 2, 7).transpose(0, 2, 1).reshape(60, 14))
+    assert_array_equal(ours["c"], simulate(graph, events, 0.02)["c"])
+
+
+def test_branches_and_nested_graphs():
+    rng = np.random.default_rng(10)
+    inner = chain(affine(rng, 8, 6, 2.0), lif(8, r=2.0))
+    parts = {"a": affine(rng, 8, 6, 2.0), "b": lif(8, r=2.0), "c": affine(rng, 4, 8), "d": affine(rng, 4, 8)}
+    nodes = {**parts, "deep": inner, "e": lif(4, r=2.0)}
+    edges = [("a", "b"), ("b", "c"), ("deep", "d"), ("c", "e"), ("d", "e"), ("input", "deep")]
+    nested = lowered(graph_with(nodes, edges, (6,), (4,))).network
+    flat = {**parts, "deep.n0": inner.nodes["n0"], "deep.n1": inner.nodes["n1"], "e": nodes["e"]}
+    pairs = [("a", "b"), ("b", "c"), ("input", "deep.n0"), ("deep.n0", "deep.n1"), ("deep.n1", "d")]
+    graph = graph_with(flat, [*pairs, ("c", "e"), ("d", "e")], (6,), (4,))
+    events = given(1, 6)
+    ours, theirs = float_spikes(nested, events), simulate(graph, events, 0.02)
+    for name, spikes in theirs.items():
+        assert spikes.sum() > 10
+        assert_array_equal(ours[name], spikes)
+
+
+def test_groups_of_neurons_vote_for_a_class():
+    rng = np.random.default_rng(11)
+    votes = np.zeros((2, 6))
+    votes[[0, 1, 1, 0, 0, 1], np.arange(6)] = 0.5
+    network = lowered(chain(affine(rng, 6, 4), lif(6), nir.Linear(votes))).network
+    assert network.classes == 2
+    assert network.readout.label.tolist() == [0, 1, 1, 0, 0, 1]
+
+
+def test_the_same_file_gives_the_same_netlist():
+    one, two = (compile_network(read_nir(FILES / "norse_lif.nir", dt=1e-6).network).netlist for _ in range(2))
+    assert_array_equal(one.synapse_weight, two.synapse_weight)
+    assert_array_equal(one.threshold, two.threshold)
