@@ -292,8 +292,12 @@ def test_choices_within_a_checkpoint(refusal, words, line, monkeypatch):
 
 
 def test_unreadable_files(refusal, tmp_path, monkeypatch):
-    def denied(*_words, **_options):
-        raise PermissionError(errno.EACCES, "Permission denied", "secret")
+    as_ever = Path.open
+
+    def denied(path, *words, **options):
+        if path.stem == "net":
+            raise PermissionError(errno.EACCES, "Permission denied", "secret")
+        return as_ever(path, *words, **options)
 
     monkeypatch.setattr(Path, "open", denied)
     assert refusal("inspect", "net.pt") == "net.pt: cannot be read (Permission denied); check its permissions"
