@@ -1,0 +1,1 @@
+"""Networks that are trained for TrueNorth: everything that the chip rounds or limits is rounded and limited in training."""
