@@ -16,12 +16,13 @@ from compiler.passes.layout import require_goal
 from compiler.passes.quantize import Recipe
 from compiler.pipeline import compile_network
 from compiler.serialize import read_netlist, write_netlist
-from compiler.targets import load_target
+from compiler.targets import CROSSBARS, known_targets, load_target
 from compiler.text import text
 from runtime import render
 from runtime.asked import asked_network
 from runtime.inputs import progress, recordings, require_place, version
 from runtime.options import MARGIN, cores_asked
+from runtime.truenorth.refusal import refuse
 
 Json = dict[str, Any]
 
@@ -32,6 +33,8 @@ LISTED = 20
 def compile_netlist(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
     """Run the command: the report, how to print it, and the exit code."""
     require_place(arguments.output, "-o", arguments)
+    if arguments.target in known_targets(CROSSBARS):
+        return refuse(arguments)
     if arguments.margin is not None and arguments.ranges != "observed":
         raise OptionError(
             f"--margin {arguments.margin:g}: only observed ranges have one; add --ranges observed or leave it away"

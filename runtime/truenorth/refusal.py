@@ -1,0 +1,166 @@
+"""``compile --target truenorth`` of a network that does not fit: every reason, and what each way out would cost."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from compiler.errors import ModelError, OptionError
+from compiler.interpret import channels_last
+from compiler.passes.calibrate import evenly_spaced
+from compiler.targets import CROSSBARS, Target, load_target
+from compiler.truenorth.needs import needs
+from models.evtouch import Recordings
+from runtime.asked import Asked, asked_network
+from runtime.inputs import progress, recordings
+from runtime.tables import table
+from runtime.truenorth.trials import Trial
+from runtime.truenorth.ways import COPIES, Planner, Way
+
+Json = dict[str, Any]
+
+TRIED = 72
+"""Training recordings that ways out are measured on, evenly spaced."""
+
+LOIHI_ONLY = {
+    "weight_bits": None,
+    "planes": None,
+    "scale_groups": None,
+    "spike_exact": False,
+    "keep_all": False,
+    "prune_unused": False,
+    "ranges": "proven",
+    "margin": None,
+    "cores_for": None,
+    "chips": 1,
+    "optimize": "cores",
+    "against": None,
+    "dump_after": [],
+}
+"""Options that say how a network is stored on Loihi, and what they are where they are not given."""
+
+
+def refuse(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
+    """Say why a network does not fit: the report, how to print it, and exit code 2.
+
+    Raises
+    ------
+    OptionError, ModelError, DataError
+        If the options, the network or the recordings cannot be used.
+    """
+    for name, absent in LOIHI_ONLY.items():
+        if getattr(arguments, name) != absent:
+            raise OptionError(f"--{name.replace('_', '-')}: is for loihi1, not for truenorth; leave it away")
+    chip = load_target(arguments.target, CROSSBARS)
+    asked = asked_network(arguments.checkpoint, arguments)
+    if asked.network.input.clocks.channels:
+        raise ModelError(f"{arguments.checkpoint}: has clocks, ways out of them are not known; give one without")
+    trial, steps = None, None
+    if arguments.calibrate is not None:
+        progress("reading the recordings")
+        data = recordings(
+            arguments.calibrate,
+            "train",
+            classes=asked.network.classes,
+            taxels=asked.network.input.taxels,
+            bin_s=arguments.bin,
+            labels_for="compile --target truenorth",
+        )
+        trial, steps = _trial(asked, data), data.events.shape[3]
+    return _report(arguments.checkpoint, asked, chip, trial, steps), refusal_text, 2
+
+
+def _trial(asked: Asked, data: Recordings) -> Trial:
+    events = evenly_spaced(channels_last(data.events), TRIED)
+    labels = evenly_spaced(data.labels, TRIED)
+    return Trial(asked.network, events, labels)
+
+
+def _report(path: str, asked: Asked, chip: Target, trial: Trial | None, steps: int | None) -> Json:
+    network, planner = asked.network, Planner(asked, chip, trial, path)
+    found = needs(network, chip)
+    if not found:
+        raise ModelError(
+            f"{path}: breaks none of the rules that are known before lowering, but is not lowered; use loihi1"
+        )
+    violations = []
+    for number, need in enumerate(found):
+        progress(f"pricing ways out: {number} of {len(found)}")
+        ways = [_way_json(way, network, steps) for way in planner.ways(need)]
+        name = network.populations[need.layer].name
+        violations.append({"layer": name, "kind": need.kind, **asdict(need.fault), "ways": ways})
+    together = [_way_json(planner.together(copies), network, steps) for copies in COPIES]
+    return {
+        "network": Path(path).name,
+        "target": chip.name,
+        "title": chip.title,
+        "accuracy": None if trial is None else trial.accuracy({}),
+        "samples": 0 if trial is None else len(trial.labels),
+        "steps": steps,
+        "cores_of_chip": chip.limit("chip.cores"),
+        "violations": violations,
+        "together": together,
+    }
+
+
+def _way_json(way: Way, network: Any, steps: int | None) -> Json:
+    """A way with the ticks of a decision, where the length of a recording is known."""
+    depth = len(network.populations) - 1
+    ticks = None if steps is None or way.cores is None else steps * way.bin_ticks + depth + way.more_ticks
+    return asdict(way) | {"ticks": ticks}
+
+
+def refusal_text(report: Json) -> str:
+    """The same for people."""
+    violations = report["violations"]
+    lines = [
+        f"{report['network']} does not fit {report['title']}: {len(violations)} violations, nothing was written",
+    ]
+    if report["samples"]:
+        lines.append(
+            f"accuracy on {report['samples']} training recordings, as trained {100 * report['accuracy']:.1f} %; each way "
+            "alone, in its layer; cores of the layer"
+        )
+    else:
+        lines.append(
+            "cores of the layer, ticks of a data step; --calibrate DATA measures what the ways do to decisions"
+        )
+    for violation in violations:
+        lines += [
+            "",
+            f"{violation['where']}: {violation['found']}, allowed {violation['allowed']} ({violation['rule']})",
+            _ways_table(violation["ways"]),
+        ]
+    lines += ["", "all of it at once, without training:", _ways_table(report["together"])]
+    commands = {
+        way["command"]: way["name"]
+        for violation in violations
+        for way in violation["ways"]
+        if way["command"] is not None
+    }
+    lines += ["", "after retraining:", *(f"  {name}: {command}" for command, name in commands.items())]
+    return "\n".join(lines)
+
+
+def _ways_table(ways: list[Json]) -> str:
+    rows = [
+        [
+            way["name"] + (f" ({way['note']})" if way["note"] and way["command"] is None else ""),
+            _accuracy(way),
+            "does not fit" if way["cores"] is None else f"{way['cores']:,}",
+            f"{way['bin_ticks']} a step" if way["ticks"] is None else f"{way['ticks']:,}",
+        ]
+        for way in ways
+    ]
+    return table(["way out", "accuracy", "cores", "ticks"], rows)
+
+
+def _accuracy(way: Json) -> str:
+    if way["command"] is not None:
+        return "after retraining"
+    if way["accuracy"] is None:
+        return "as it is" if way["exact"] else "not measured"
+    return f"{100 * way['accuracy']:.1f} %" + (", no spike changes" if way["exact"] else "")

@@ -1,0 +1,211 @@
+"""What it does to the decisions when a layer of the float model is changed into something that crossbar cores can do.
+
+One forward pass, in float32, with the layers before the first change taken from the pass of the network as it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from compiler.fixedpoint import FloatArray, IntArray
+from compiler.interpret import BoolArray, Floating, float_recurrence, lasting_currents, product, vote
+from compiler.ir import INPUT, Network, Population, Sparse
+from runtime.votes import readout_counts
+
+SEARCHED = np.linspace(0.1, 1.0, 19)
+"""Shares of the largest weight that are tried as the largest level of a codebook."""
+
+LEAKS = (0.2, 0.4, 0.6, 0.8, 1.0)
+"""Constant leaks that are tried, in thresholds."""
+
+FEW = 16
+"""Recordings on which a leak is chosen."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Levels:
+    """Weights as whole multiples of a step of each neuron.
+
+    Parameters
+    ----------
+    level : (neurons, inputs) float32
+        Whole numbers.
+    step : (neurons,) float32
+    """
+
+    level: npt.NDArray[np.float32]
+    step: npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Change:
+    """What is done to a layer; what is None stays as it is.
+
+    Parameters
+    ----------
+    beta, alpha : float, optional
+        Decay of membrane and current.
+    leak : float, optional
+        Constant leak toward zero, in membrane units, in place of the decay.
+    echoes : bool
+        Inputs come again one and two steps later, with weights times the decay and its square, to a membrane that
+        forgets.
+    weight : csr_array, optional
+        Other weights for the first projection.
+    levels : Levels, optional
+        The same, as levels.
+    inputs, most : int, optional
+        With levels: the sum is made of parts of so many inputs, each of which counts `most` steps at the most, above
+        zero and below.
+    """
+
+    beta: float | None = None
+    alpha: float | None = None
+    leak: float | None = None
+    echoes: bool = False
+    weight: Sparse | None = None
+    levels: Levels | None = None
+    inputs: int | None = None
+    most: int | None = None
+
+
+def codebook(weight: FloatArray, copies: int) -> Levels:
+    """Weights (neurons, inputs) in the levels that so many axons an input give: for 2, 3, 4 copies -1…1, -4…3, -8…7.
+
+    The weights of the types are 1 and -1; 1, 2 and -4; 1, 2, 4 and -8, times a step that each neuron has of its own:
+    of those tried, the one of least squared error.
+
+    Examples
+    --------
+    >>> found = codebook(np.array([[0.5, -0.4, 0.02]]), 2)
+    >>> found.level.tolist(), found.step.round(3).tolist()
+    ([[1.0, -1.0, 0.0]], [0.45])
+    """
+    low, high = (-1, 1) if copies == 2 else (-(1 << (copies - 1)), (1 << (copies - 1)) - 1)
+    largest = np.maximum(np.abs(weight).max(axis=1, keepdims=True), 1e-12)
+    best = np.full(len(weight), np.inf)
+    step, level = np.ones(len(weight)), np.zeros(weight.shape)
+    for share in SEARCHED:
+        tried = share * largest / -low
+        rounded = np.clip(np.rint(weight / tried), low, high)
+        error = ((rounded * tried - weight) ** 2).sum(axis=1)
+        better = error < best
+        best[better], step[better], level[better] = error[better], tried[better, 0], rounded[better]
+    return Levels(level=level.astype(np.float32), step=step.astype(np.float32))
+
+
+class Trial:
+    """A network on recordings, and its accuracy with layers changed.
+
+    Parameters
+    ----------
+    network : Network
+    events : (samples, steps, channels) bool
+    labels : (samples,) int64
+    """
+
+    def __init__(self, network: Network, events: BoolArray, labels: IntArray) -> None:
+        self.network = network
+        self.events = events
+        self.labels = labels
+        self.spikes: list[BoolArray] = []
+        self.saturated = 0.0
+        self.spikes = self._run({})
+
+    def accuracy(self, changes: Mapping[int, Change]) -> float:
+        """Share of recordings that are decided rightly with these layers changed."""
+        spikes = self._run(changes) if changes else self.spikes
+        readout = self.network.readout
+        decided = vote(readout_counts(readout, self.network.classes, spikes[readout.population]))
+        return float(np.mean(decided == self.labels))
+
+    def leak_for(self, layer: int) -> float:
+        """Constant leak that moves the fewest spikes of a layer that has its own inputs."""
+        population = self.network.populations[layer]
+        sums = self._sums(layer, self.spikes, None)[:FEW]
+        expected = self.spikes[layer][:FEW]
+        leaks = [share * population.theta for share in LEAKS]
+        moved = [np.count_nonzero(leaking(population, sums.copy(), leak) != expected) for leak in leaks]
+        return leaks[int(np.argmin(moved))]
+
+    def _run(self, changes: Mapping[int, Change]) -> list[BoolArray]:
+        spikes: list[BoolArray] = []
+        fresh = not self.spikes
+        other: set[int] = set()
+        for layer, population in enumerate(self.network.populations):
+            pres = {projection.pre for projection in self.network.projections if projection.post == layer}
+            if not fresh and layer not in changes and not pres & other:
+                spikes.append(self.spikes[layer])
+                continue
+            other.add(layer)
+            change = changes.get(layer, Change())
+            spikes.append(_neurons(population, self._sums(layer, spikes, change), change))
+        return spikes
+
+    def _sums(self, layer: int, spikes: list[BoolArray], change: Change | None) -> Floating:
+        """Synaptic sums of a layer, (samples, steps, neurons) float32."""
+        total: Floating | None = None
+        for projection in self.network.projections:
+            if projection.post != layer:
+                continue
+            heard = self.events if projection.pre == INPUT else spikes[projection.pre]
+            if total is None and change is not None and change.levels is not None:
+                total = self._in_levels(change.levels, heard, change.inputs, change.most)
+                continue
+            weight = projection.weight
+            if total is None and change is not None and change.weight is not None:
+                weight = change.weight
+            more = product(weight, heard, np.float32)
+            total = more if total is None else total + more
+        assert total is not None, "verify: every population is reached"
+        return total
+
+    def _in_levels(self, levels: Levels, heard: BoolArray, inputs: int | None, most: int | None) -> Floating:
+        """Sums of weights in levels; with `most`, of saturated parts, whose share goes to ``saturated``."""
+        samples, steps, channels = heard.shape
+        flat = heard.reshape(samples * steps, channels).astype(np.float32)
+        width = channels if inputs is None else inputs
+        total = np.zeros((len(flat), len(levels.level)), np.float32)
+        clipped = parts = 0
+        for first in range(0, channels, width):
+            part = flat[:, first : first + width] @ levels.level[:, first : first + width].T
+            if most is not None:
+                clipped += int(np.count_nonzero(np.abs(part) > most))
+                parts += part.size
+                np.clip(part, -most, most, out=part)
+            total += part
+        if parts:
+            self.saturated = clipped / parts
+        return (total * levels.step).reshape(samples, steps, -1)
+
+
+def leaking(population: Population, sums: Floating, leak: float) -> BoolArray:
+    """Spikes of neurons that lose a constant of their membrane a step, toward zero; `sums` is overwritten."""
+    spikes = np.empty(sums.shape, np.bool_)
+    sums += population.bias.astype(sums.dtype)
+    u = np.zeros_like(sums[:, 0])
+    for step in range(sums.shape[1]):
+        u = np.sign(u) * np.maximum(np.abs(u) - sums.dtype.type(leak), 0)
+        u += sums[:, step]
+        fired = np.greater(u, population.theta, out=spikes[:, step])
+        u *= ~fired
+    return spikes
+
+
+def _neurons(population: Population, sums: Floating, change: Change) -> BoolArray:
+    if change.leak is not None:
+        alpha = population.alpha if change.alpha is None else change.alpha
+        return leaking(population, lasting_currents(sums, alpha) if alpha else sums, change.leak)
+    beta = population.beta if change.beta is None else change.beta
+    if change.echoes:
+        sums = sums + population.bias.astype(sums.dtype)
+        heard = sums.copy()
+        for lag in (1, 2):
+            heard[:, lag:] += sums.dtype.type(population.beta**lag) * sums[:, :-lag]
+        return float_recurrence(replace(population, beta=0.0, bias=np.zeros(population.size)), heard)[0]
+    changed = replace(population, beta=beta, alpha=population.alpha if change.alpha is None else change.alpha)
+    return float_recurrence(changed, sums)[0]

@@ -1,0 +1,310 @@
+"""Ways out of what crossbar cores do not have: what each costs in cores and ticks, and in decisions.
+
+Ways that need no training are tried on the float network, each alone, in the layer that needs it; ways that lead spikes
+elsewhere change none and cost cores. Ways that need training name the command; what they reach is not known before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from compiler.frontends.checkpoint import Checkpoint
+from compiler.frontends.systems import GRAPH_SYSTEMS, TACTILESGNET
+from compiler.ir import INPUT, Network, Sparse
+from compiler.passes.expand import expand_first_layer
+from compiler.targets import Target
+from compiler.truenorth.needs import CURRENT, FAN_IN, LEAK, TARGETS, WEIGHTS, Need, targets_of
+from compiler.truenorth.sizes import Split, packed, relays, split
+from runtime.asked import Asked
+from runtime.truenorth.trials import Change, Levels, Trial, codebook
+
+BIN_TICKS = 20
+"""Ticks of a data step whose partial sums travel as numbers of spikes: one millisecond each of the sensor's 20."""
+
+TERNARY = 2
+"""Axons of an input that weights of -1, 0 and 1 steps take."""
+
+COPIES = (2, 3, 4)
+"""Axons of an input that are tried; beyond four types repeat."""
+
+FEWER_HOPS = 2
+"""Hops of a graph convolution that are left, as trained."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Way:
+    """A way out.
+
+    Parameters
+    ----------
+    name : str
+    accuracy : float or None
+        Share of the calibration recordings that are decided rightly; None where nothing was measured.
+    exact : bool
+        Whether no spike changes.
+    cores : int or None
+        Of the layer, with what leads to it; None where it does not fit.
+    bin_ticks : int
+        Ticks of a data step.
+    more_ticks : int
+        Ticks that every decision takes more.
+    command : str or None
+        What trains it.
+    note : str
+        What else was found.
+    """
+
+    name: str
+    accuracy: float | None = None
+    exact: bool = False
+    cores: int | None = None
+    bin_ticks: int = 1
+    more_ticks: int = 0
+    command: str | None = None
+    note: str = ""
+
+
+class Planner:
+    """Finds and prices the ways out of the needs of a network.
+
+    Parameters
+    ----------
+    asked : Asked
+        The network, and the checkpoint that it is from.
+    chip : Target
+    trial : Trial or None
+        On calibration recordings, where there are some.
+    path : str
+        Of the checkpoint as it was typed.
+    """
+
+    def __init__(self, asked: Asked, chip: Target, trial: Trial | None, path: str) -> None:
+        self.network: Network = asked.network
+        self.asked = asked
+        self.chip = chip
+        self.trial = trial
+        self.path = path
+        self.books: dict[tuple[int, int], Levels] = {}
+
+    def ways(self, need: Need) -> list[Way]:
+        """Ways out of a need, at least two."""
+        finders = {
+            LEAK: self._leak,
+            CURRENT: self._current,
+            FAN_IN: self._fan_in,
+            WEIGHTS: self._weights,
+            TARGETS: self._targets,
+        }
+        return list(finders[need.kind](need.layer))
+
+    # -- sizes ---------------------------------------------------------------------------------------------------------
+
+    def weight(self, layer: int) -> Sparse:
+        """Weights of the first projection onto a layer."""
+        return next(p.weight for p in self.network.projections if p.post == layer)
+
+    def layer_cores(self, layer: int, copies: int, weight: Sparse | None = None) -> tuple[int | None, Split | None]:
+        """Cores of a layer with so many axons an input: packed where it fits, else split in time."""
+        weight = self.weight(layer) if weight is None else weight
+        fit = packed(weight, copies, self.chip)
+        if fit is not None:
+            return fit, None
+        parts = split(weight.shape[1], weight.shape[0], copies, self.chip)
+        return (None if parts is None else parts.cores), parts
+
+    def lead_cores(self, layer: int, targets: int) -> int | None:
+        """Cores that lead each spike of a layer to so many axons: of relays, or of copies, whichever are fewer."""
+        if targets < 2:
+            return 0
+        population, fed = self.network.populations[layer], self._hears_inputs(layer)
+        by_relay = relays(population.size, targets, self.chip)
+        cores, _ = self.layer_cores(layer, TERNARY)
+        by_copy = None if cores is None or not fed else cores * (targets - 1)
+        return min((found for found in (by_relay, by_copy) if found is not None), default=None)
+
+    def _hears_inputs(self, layer: int) -> bool:
+        return all(p.pre == INPUT for p in self.network.projections if p.post == layer)
+
+    # -- ways ----------------------------------------------------------------------------------------------------------
+
+    def _measured(self, layer: int, change: Change) -> float | None:
+        return None if self.trial is None else self.trial.accuracy({layer: change})
+
+    def _book(self, layer: int, copies: int) -> Levels:
+        if (layer, copies) not in self.books:
+            self.books[layer, copies] = codebook(self.weight(layer).toarray(), copies)
+        return self.books[layer, copies]
+
+    def _leak(self, layer: int) -> Iterator[Way]:
+        cores, parts = self.layer_cores(layer, TERNARY)
+        ticks = 1 if parts is None else BIN_TICKS
+        yield Way(
+            name="history-free as it is: the membrane forgets within a step",
+            accuracy=self._measured(layer, Change(beta=0.0)),
+            cores=cores,
+            bin_ticks=ticks,
+        )
+        chosen = None if self.trial is None else self.trial.leak_for(layer)
+        theta = self.network.populations[layer].theta
+        yield Way(
+            name="a constant leak toward zero",
+            accuracy=None if chosen is None else self._measured(layer, Change(leak=chosen)),
+            cores=cores,
+            bin_ticks=ticks,
+            note="" if chosen is None else f"leak {chosen / theta:.1f} θ a step",
+        )
+        echoed, echo_parts = self.layer_cores(layer, 3 * TERNARY)
+        yield Way(
+            name="history-free, each input again after one and two steps",
+            accuracy=self._measured(layer, Change(echoes=True)),
+            cores=echoed,
+            bin_ticks=1 if echo_parts is None else BIN_TICKS,
+        )
+        yield self._retrained("trained history-free", self._no_decay("--membrane-decay"), cores, ticks)
+
+    def _current(self, layer: int) -> Iterator[Way]:
+        cores, parts = self.layer_cores(layer, TERNARY)
+        ticks = 1 if parts is None else BIN_TICKS
+        accuracy = self._measured(layer, Change(alpha=0.0))
+        yield Way(name="without the current, as it is", accuracy=accuracy, cores=cores, bin_ticks=ticks)
+        yield self._retrained("trained without lasting currents", self._train(), cores, ticks)
+
+    def _fan_in(self, layer: int) -> Iterator[Way]:
+        inputs, neurons = self.weight(layer).shape[1], self.network.populations[layer].size
+        for copies in COPIES:
+            parts = split(inputs, neurons, copies, self.chip)
+            if parts is not None:
+                yield self._in_time(layer, copies, parts)
+        before = {p.pre for p in self.network.projections if p.post == layer}
+        checkpoint = self.asked.checkpoint
+        if before == {0} and checkpoint is not None:
+            most = self.chip.limit("core.axons") // TERNARY // checkpoint.places
+            if most:
+                options = f"--features {most}"
+                heard = checkpoint.places * most
+                cores = packed(_full(heard, neurons), TERNARY, self.chip)
+                yield self._retrained(f"trained with {most} features, {heard} inputs", self._train(options), cores, 1)
+
+    def _in_time(self, layer: int, copies: int, parts: Split) -> Way:
+        change = Change(levels=self._book(layer, copies), inputs=parts.inputs, most=BIN_TICKS)
+        accuracy = self._measured(layer, change)
+        note = "" if self.trial is None else f"{100 * self.trial.saturated:.2g} % of the partial sums saturate"
+        return Way(
+            name=f"split in time: {parts.groups} groups of {parts.inputs}, {copies} axons an input",
+            accuracy=accuracy,
+            cores=parts.cores,
+            bin_ticks=BIN_TICKS,
+            more_ticks=BIN_TICKS,
+            note=note,
+        )
+
+    def _weights(self, layer: int) -> Iterator[Way]:
+        for copies in COPIES:
+            cores, parts = self.layer_cores(layer, copies)
+            if parts is not None:
+                yield self._in_time(layer, copies, parts)
+            elif cores is not None:
+                named = "-1, 0, 1" if copies == TERNARY else f"{2**copies} levels"
+                yield Way(
+                    name=f"{copies} axons an input, {named} times a step for each neuron",
+                    accuracy=self._measured(layer, Change(levels=self._book(layer, copies))),
+                    cores=cores,
+                )
+        checkpoint = self.asked.checkpoint
+        if layer == 0 and checkpoint is not None and checkpoint.system == TACTILESGNET:
+            yield from self._fewer_hops(checkpoint)
+        cores, parts = self.layer_cores(layer, TERNARY)
+        bits = ",".join("2" if at == layer else "8" for at in range(len(self.network.populations)))
+        command = f"spikeloom finetune {self.path} --data DATA --weight-bits {bits} -o OUT.pt"
+        ticks = 1 if parts is None else BIN_TICKS
+        if checkpoint is not None:
+            yield self._retrained("fine-tuned to -1, 0, 1 times a step", command, cores, ticks)
+
+    def _fewer_hops(self, checkpoint: Checkpoint) -> Iterator[Way]:
+        if len(checkpoint.hops) <= FEWER_HOPS or self.asked.adjacency is None:
+            return
+        short = replace(checkpoint, hops=checkpoint.hops[:FEWER_HOPS])
+        weight, _ = expand_first_layer(short, self.asked.adjacency)
+        if weight.shape != self.weight(0).shape:  # clocks are relayed by neurons of the layer
+            return
+        copies = max((m for m in COPIES if packed(weight, m, self.chip) is not None), default=TERNARY)
+        cores, _ = self.layer_cores(0, copies, weight)
+        book = codebook(weight.toarray(), copies)
+        yield Way(
+            name=f"the first {FEWER_HOPS} of {len(checkpoint.hops)} hops as they are, {copies} axons an input",
+            accuracy=self._measured(0, Change(levels=book)),
+            cores=cores,
+        )
+
+    def _targets(self, layer: int) -> Iterator[Way]:
+        targets, size = targets_of(self.network, layer, self.chip), self.network.populations[layer].size
+        accuracy = None if self.trial is None else self.trial.accuracy({})
+        yield Way(
+            name=f"{targets} relays for each neuron",
+            accuracy=accuracy,
+            exact=True,
+            cores=relays(size, targets, self.chip),
+            more_ticks=1,
+        )
+        cores, parts = self.layer_cores(layer, TERNARY)
+        ticks = 1 if parts is None else BIN_TICKS
+        note = "" if self._hears_inputs(layer) else "and as many more targets for the layer before"
+        copied = None if cores is None else cores * targets
+        yield Way(
+            name=f"{targets} copies of each neuron",
+            accuracy=accuracy,
+            exact=True,
+            cores=copied,
+            bin_ticks=ticks,
+            note=note,
+        )
+
+    # -- all of it -----------------------------------------------------------------------------------------------------
+
+    def together(self, copies: int) -> Way:
+        """All of it without training: history-free, weights in levels, split in time where needed, spikes led on."""
+        changes, total, groups = {}, 0, 0
+        for layer in range(len(self.network.populations)):
+            cores, parts = self.layer_cores(layer, copies)
+            targets = targets_of(self.network, layer, self.chip) * copies // TERNARY
+            leading = self.lead_cores(layer, targets)
+            if cores is None or leading is None:
+                return Way(name=f"{copies} axons an input: does not fit")
+            total, groups = total + cores + leading, groups + (parts is not None)
+            change = Change(beta=0.0, alpha=0.0, levels=self._book(layer, copies))
+            if parts is not None:
+                change = replace(change, inputs=parts.inputs, most=BIN_TICKS)
+            changes[layer] = change
+        return Way(
+            name=f"history-free, {copies} axons an input, split in time, spikes led on",
+            accuracy=None if self.trial is None else self.trial.accuracy(changes),
+            cores=total,
+            bin_ticks=BIN_TICKS if groups else 1,
+            more_ticks=groups * BIN_TICKS + 2 * len(changes),
+        )
+
+    # -- commands ------------------------------------------------------------------------------------------------------
+
+    def _retrained(self, name: str, command: str | None, cores: int | None, bin_ticks: int) -> Way:
+        return Way(name=name, cores=cores, bin_ticks=bin_ticks, command=command, note="after retraining")
+
+    def _no_decay(self, option: str) -> str:
+        return self._train(f"{option} {','.join(f'{p.name}=0' for p in self.network.populations)}")
+
+    def _train(self, options: str = "") -> str:
+        """Command that trains a network of this kind anew."""
+        checkpoint, words = self.asked.checkpoint, ["spikeloom train --data DATA"]
+        if checkpoint is not None and checkpoint.system != TACTILESGNET:
+            words.append(f"--system {checkpoint.system}")
+        if self.asked.graph and (checkpoint is None or checkpoint.system in GRAPH_SYSTEMS):
+            words.append(f"--graph {self.asked.graph}")
+        return " ".join([*words, *([options] if options else []), "-o OUT.pt"])
+
+
+def _full(inputs: int, neurons: int) -> Sparse:
+    from scipy import sparse
+
+    return sparse.csr_array(np.ones((neurons, inputs)))
