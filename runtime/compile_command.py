@@ -22,6 +22,7 @@ from runtime import render
 from runtime.asked import asked_network
 from runtime.inputs import progress, recordings, require_place, version
 from runtime.options import MARGIN, cores_asked
+from runtime.truenorth import native
 from runtime.truenorth.refusal import refuse
 
 Json = dict[str, Any]
@@ -33,6 +34,8 @@ LISTED = 20
 def compile_netlist(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
     """Run the command: the report, how to print it, and the exit code."""
     require_place(arguments.output, "-o", arguments)
+    if native.is_named(arguments.checkpoint):
+        return native.compile_network(arguments)
     if arguments.target in known_targets(CROSSBARS):
         return refuse(arguments)
     if arguments.margin is not None and arguments.ranges != "observed":

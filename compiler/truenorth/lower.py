@@ -128,9 +128,7 @@ class _Placing:
             on_core = np.array([n for n, _ in part]) - own[0]
             self.axons(stage.inputs[block], points[:, on_core], depth, core, before)
 
-    def axons(
-        self, inputs: IntArray, points: IntArray, depth: int, core: int, before: list[list[Place]]
-    ) -> None:
+    def axons(self, inputs: IntArray, points: IntArray, depth: int, core: int, before: list[list[Place]]) -> None:
         """Add the axons of a core: copies of each input and clock; from outside only those that join something."""
         first_clock = self.network.taxels * self.network.polarities
         for row in range(len(points)):

@@ -24,11 +24,16 @@ import numpy as np
 from compiler.dynamics import NO_CLOCKS, Clocks
 from compiler.fixedpoint import IntArray
 
+SYSTEM = "tactilesgnet-truenorth"
+"""What such a network is called among the systems."""
+
 UNIT = 32
 """Weight of level 1; ``7 * UNIT`` is the largest weight, and fits 9 bits with sign."""
 
 BASES = {2: (-1, 1), 3: (-3, 1, 2), 4: (-7, 1, 2, 4)}
 """Weights of the axon types by number of copies, in units."""
+
+USUAL_COPIES = 3
 
 LEAK_MOST = 255
 """Magnitude of a leak, 9 bits with sign."""

@@ -21,17 +21,21 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from compiler.dynamics import NO_CLOCKS, Clocks
+from compiler.errors import OptionError
+from compiler.targets import CROSSBARS, load_target
 from compiler.truenorth.native import (
     LEAK_MOST,
     THRESHOLD_MOST,
     UNIT,
     NativeNetwork,
     Stage,
-    Tower,
     highest_level,
 )
+from models.evtouch import Recordings
 from models.surrogate import RECTANGLE, Surrogate
 from models.truenorth.neurons import block_sums, integrate
+
+CHIP = "truenorth"
 
 CONV = "conv1"
 
@@ -110,6 +114,46 @@ class NativeArchitecture:
     def network(self, propagation: NDArray[np.float64], *, seed: int = 0, surrogate: Surrogate) -> NativeNet:
         """An untrained network."""
         return NativeNet(self, propagation, seed=seed, surrogate=surrogate)
+
+
+def sized(
+    *, taxels: int, classes: int, hops: int, features: int, copies: int, clocks: Clocks, channels: int = 2
+) -> NativeArchitecture:
+    """The architecture whose groups fill the axons of a core best: as few groups as can be.
+
+    Raises
+    ------
+    OptionError
+        If the sensor is too large, or the features cannot be dealt to groups that fit.
+    """
+    axons = load_target(CHIP, CROSSBARS).limit("core.axons")
+    room = axons // copies
+    if taxels * channels > room:
+        raise OptionError(
+            f"--copies {copies}: {taxels * channels} input channels with {copies} axons each, a core of TrueNorth has "
+            f"{axons}; give fewer copies, or a smaller sensor"
+        )
+    fitting = [
+        g for g in range(1, features + 1) if not features % g and taxels * features // g <= room - clocks.channels
+    ]
+    if not fitting or room - clocks.channels < fitting[0]:
+        raise OptionError(
+            f"--features {features}: no number of groups deals {features} features of {taxels} taxels and "
+            f"{clocks.channels} clocks to cores of {room} inputs; give other --features, or fewer --clocks or --copies"
+        )
+    groups = fitting[0]
+    size = (room - clocks.channels) // groups * groups
+    return NativeArchitecture(
+        taxels=taxels,
+        classes=classes,
+        channels=channels,
+        hops=hops,
+        features=features,
+        groups=groups,
+        hidden=(size, size),
+        copies=copies,
+        clocks=clocks,
+    )
 
 
 class NativeNet(nn.Module):
@@ -262,11 +306,11 @@ def _spikes(layer: Rounded, sums: Tensor, surrogate: Surrogate) -> Tensor:
     return integrate(sums + layer.leak, layer.threshold, layer.floor, surrogate)
 
 
-def tower_of(architecture: NativeArchitecture, arrays: Mapping[str, NDArray[np.float32]]) -> Tower:
-    """Tower from what `NativeNet.export_weights` returned."""
+def native_network(architecture: NativeArchitecture, arrays: Mapping[str, NDArray[np.float32]]) -> NativeNetwork:
+    """Network of one tower from what `NativeNet.export_weights` returned."""
     channels = np.arange(architecture.taxels * architecture.channels)[None]
     heard = [channels, *architecture.inputs()]
-    return tuple(
+    tower = tuple(
         Stage(
             name=name,
             inputs=inputs,
@@ -274,6 +318,25 @@ def tower_of(architecture: NativeArchitecture, arrays: Mapping[str, NDArray[np.f
         )
         for name, inputs in zip(architecture.layers, heard, strict=True)
     )
+    return NativeNetwork(
+        taxels=architecture.taxels,
+        polarities=architecture.channels,
+        classes=architecture.classes,
+        copies=architecture.copies,
+        clocks=architecture.clocks,
+        towers=(tower,),
+    )
+
+
+def predict(network: NativeNetwork, recordings: Recordings) -> NDArray[np.int64]:
+    """Class of each recording by the added votes of all towers; equal ones count for the lowest class."""
+    found = []
+    for index in range(len(recordings)):
+        events = recordings.events[index : index + 1, ..., : recordings.steps_of(index)]
+        last = network.towers[0][-1].name
+        votes = run_network(network, events)[last].sum(axis=1)
+        found.append(votes.reshape(-1, network.classes).sum(axis=0).argmax())
+    return np.array(found, np.int64)
 
 
 def run_network(network: NativeNetwork, events: NDArray[np.uint8]) -> dict[str, NDArray[np.bool_]]:
@@ -296,7 +359,10 @@ def run_network(network: NativeNetwork, events: NDArray[np.uint8]) -> dict[str, 
             layers = [
                 Rounded(
                     weight=torch.from_numpy((stage.level * UNIT).astype(np.float32)),
-                    **{n: torch.from_numpy(getattr(stage, n).astype(np.float32)) for n in ("threshold", "floor", "leak")},
+                    **{
+                        n: torch.from_numpy(getattr(stage, n).astype(np.float32))
+                        for n in ("threshold", "floor", "leak")
+                    },
                 )
                 for stage in tower
             ]

@@ -99,9 +99,7 @@ def _differentiate_step(
 
 
 @numba.njit(cache=True)
-def _differentiate(
-    above: Any, membrane: Any, threshold: Any, floor: Any, width: Any, smooth: bool, out: Any
-) -> None:
+def _differentiate(above: Any, membrane: Any, threshold: Any, floor: Any, width: Any, smooth: bool, out: Any) -> None:
     steps, samples, neurons = membrane.shape
     nothing = np.zeros(neurons, np.float32)
     for t in range(steps - 1, -1, -1):
