@@ -293,7 +293,7 @@ def run_layers(
     found = [spikes]
     for layer, heard in zip(layers[1:], inputs, strict=True):
         width = heard.shape[1]
-        sums = block_sums(spikes.index_select(2, torch.from_numpy(heard.reshape(-1))), layer.weight[:, :width])
+        sums = block_sums(spikes.index_select(2, torch.tensor(heard.reshape(-1))), layer.weight[:, :width])
         if layer.weight.shape[1] > width:
             timed = torch.matmul(ticks, layer.weight[:, width:])
             sums = sums + timed.transpose(0, 1).reshape(steps, 1, -1)
@@ -360,7 +360,7 @@ def run_network(network: NativeNetwork, events: NDArray[np.uint8]) -> dict[str, 
                 Rounded(
                     weight=torch.from_numpy((stage.level * UNIT).astype(np.float32)),
                     **{
-                        n: torch.from_numpy(getattr(stage, n).astype(np.float32))
+                        n: torch.tensor(getattr(stage, n), dtype=torch.float32)
                         for n in ("threshold", "floor", "leak")
                     },
                 )
