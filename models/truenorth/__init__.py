@@ -1,1 +1,1 @@
-"""Networks that are trained for TrueNorth: everything that the chip rounds or limits is rounded and limited in training."""
+"""Networks trained for TrueNorth: whatever the chip rounds or limits is rounded and limited in training."""

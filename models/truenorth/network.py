@@ -39,8 +39,9 @@ CHIP = "truenorth"
 
 CONV = "conv1"
 
-GAIN = 2.7
-"""Initial weights of a dense layer lie within this over the root of its inputs, thresholds being 1."""
+CONV_GAIN, GAIN = 4.0, 2.7
+"""Initial weights lie within this over the root of a neuron's inputs (of one taxel's channels in the convolution),
+thresholds being 1: membranes that only add reach them every ten to twenty steps."""
 
 LEAST_THRESHOLD = 8
 """In a threshold of fewer whole numbers no weight and no drift has room."""
@@ -186,7 +187,7 @@ class NativeNet(nn.Module):
         self.adjacency: Tensor
         self.register_buffer("adjacency", torch.tensor(powers, dtype=torch.float32), persistent=False)
         shape = (architecture.hops + 1, architecture.features, architecture.channels)
-        self.hops = nn.Parameter(_uniform(shape, 1 / math.sqrt(architecture.channels), generator))
+        self.hops = nn.Parameter(_uniform(shape, CONV_GAIN / math.sqrt(architecture.channels), generator))
         self.bias = nn.Parameter(torch.zeros(architecture.features))
         self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
         clocks = architecture.clocks.channels

@@ -16,6 +16,7 @@ from compiler.truenorth.rules import signed_range
 from runtime.truenorth import kernel
 from runtime.truenorth.spec import Neuron, neuron_tick
 from runtime.truenorth.trace import Counts, EventArray, Trace, check_channels
+from runtime.truenorth.twins import Twins, find_twins
 
 SETTLING = 64
 """Ticks within which a neuron without input must come to rest to be let sleep."""
@@ -30,16 +31,19 @@ class Engine:
     Parameters
     ----------
     netlist : CrossbarNetlist
+    twins : Twins
+        Neurons and axons that are alike; the kernel runs one of each kind.
     low, high : int
         Range of the membrane register.
     slots : int
         Power of two above every delay.
     wiring : Wiring
     burst_axon : (burst axons, 3) int64
-        Row of the offset, channel and axon of each that nothing else reaches.
+        Row of the offset, channel and kind of axon of each that nothing else reaches.
     """
 
     netlist: CrossbarNetlist
+    twins: Twins
     low: int
     high: int
     slots: int
@@ -51,18 +55,19 @@ def prepare(netlist: CrossbarNetlist) -> Engine:
     """Arrange a network that breaks no rule of its chip for the kernel."""
     bits = load_target(netlist.target, CROSSBARS).limit("neuron.membrane_bits")
     low, high = signed_range(bits)
-    neuron, axon = netlist.neuron_of_synapse(), netlist.axon_of_synapse()
-    weight = netlist.weight[neuron, netlist.axon_type[axon]]
-    halves = np.where(weight > 0, weight << kernel.HALF, -weight)
-    wired = netlist.axons_at(netlist.cores_at(netlist.wire_x, netlist.wire_y), netlist.wire_line)
-    clocked = netlist.axons_at(netlist.clock_core, netlist.clock_line)
-    fed = netlist.axons_at(netlist.feed_core, netlist.feed_line)
+    twins = find_twins(netlist, kernel.HALF)
+    neuron, axon, halves = twins.synapse_neuron, twins.synapse_axon, twins.synapse_halves
+    axons, first = len(twins.first_axon), twins.first_neuron
+    wired = twins.axon[netlist.axons_at(netlist.cores_at(netlist.wire_x, netlist.wire_y), netlist.wire_line)]
+    ticking, clocked = _held(twins, netlist.axons_at(netlist.clock_core, netlist.clock_line))
+    rows, fed = _held(twins, netlist.axons_at(netlist.feed_core, netlist.feed_line))
+    channel, late = netlist.feed_channel[rows], netlist.feed_tick[rows]
 
     # channels that are alone on their axons reach the neurons behind them at once
-    offsets, offset = np.unique(netlist.feed_tick, return_inverse=True)
-    key = offset.reshape(-1) * netlist.n_inputs + netlist.feed_channel
-    alone = np.bincount(np.concatenate([wired, clocked, fed]), minlength=netlist.n_axons)[fed] == 1
-    owner = np.full(netlist.n_axons, -1)
+    offsets, offset = np.unique(late, return_inverse=True)
+    key = offset.reshape(-1) * netlist.n_inputs + channel
+    alone = np.bincount(np.concatenate([wired, clocked, fed]), minlength=axons)[fed] == 1
+    owner = np.full(axons, -1)
     owner[fed[alone]] = key[alone]
     bursts = np.flatnonzero(owner[axon] >= 0)
     pairs, pair = np.unique(np.stack([owner[axon[bursts]], neuron[bursts]]), axis=1, return_inverse=True)
@@ -83,16 +88,17 @@ def prepare(netlist: CrossbarNetlist) -> Engine:
         burst_bounds=bounds(pairs[0]),
         burst_neuron=pairs[1].astype(np.int32),
         burst_weight=burst_weight,
-        clocks=np.stack([clocked, netlist.clock_period, netlist.clock_phase], axis=1),
-        axon_synapses=np.array(netlist.axon_synapses),
+        clocks=np.stack([clocked, netlist.clock_period[ticking], netlist.clock_phase[ticking]], axis=1),
+        axon_synapses=np.searchsorted(axon, np.arange(axons + 1)).astype(np.int64),
         synapse_neuron=neuron.astype(np.int32),
         synapse_weight=halves,
-        parameters=_parameters(netlist, wired, bits),
-        instant=_instant(netlist, neuron, weight, high),
-        initial=netlist.initial.astype(np.int32),
+        parameters=_parameters(netlist, wired, bits)[first],
+        instant=_instant(netlist, high)[first],
+        initial=netlist.initial[first].astype(np.int32),
     )
     return Engine(
         netlist=netlist,
+        twins=twins,
         low=low,
         high=high,
         slots=1 << int(netlist.wire_delay.max(initial=1)).bit_length(),
@@ -139,8 +145,16 @@ def _rests(netlist: CrossbarNetlist, bits: int) -> IntArray:
     return found[which.reshape(-1)]
 
 
-def _instant(netlist: CrossbarNetlist, neuron: IntArray, weight: IntArray, high: int) -> kernel.Int32:
+def _held(twins: Twins, aims: IntArray) -> tuple[IntArray, IntArray]:
+    """Rows of a table that lead to the first axon of a kind, and that kind; those of its twins say the same."""
+    rows = np.flatnonzero(twins.first_axon[twins.axon[aims]] == aims)
+    return rows, twins.axon[aims[rows]]
+
+
+def _instant(netlist: CrossbarNetlist, high: int) -> kernel.Int32:
     """Leak of the neurons that :func:`compiler.truenorth.draft.history_free` describes; 0 for all others."""
+    neuron, axon = netlist.neuron_of_synapse(), netlist.axon_of_synapse()
+    weight = netlist.weight[neuron, netlist.axon_type[axon]]
     sums = [np.bincount(neuron, np.maximum(sign * weight, 0), netlist.n_neurons) for sign in (1, -1)]
     plain = (netlist.leak < 0) & (netlist.reset_mode == RESET_TO) & (np.maximum(*sums) - netlist.leak <= high)
     for name in ("leak_reversal", "threshold", "mask_bits", "reset", "negative_threshold", "initial"):
@@ -187,9 +201,10 @@ def simulate(
     most = netlist.ticks(whole)
     if most >= MOST_TICKS:
         raise NumericRangeError(f"recordings of {whole} data steps take {most} ticks, {MOST_TICKS - 1} can be counted")
-    neurons = netlist.n_neurons
+    twins = engine.twins
+    neurons = len(twins.first_neuron)
     fed = np.zeros((samples, len(engine.wiring.offsets), channels), np.int64)
-    axons = np.zeros((samples, netlist.n_axons), np.int64)
+    axons = np.zeros((samples, len(twins.first_axon)), np.int64)
     spiked, votes, overflows = np.zeros((3, samples, neurons), np.int64)
     raster = np.zeros((samples, most if spikes else 0, neurons), np.bool_)
     held = np.zeros((samples, most if membranes else 0, neurons), np.int32)
@@ -218,10 +233,14 @@ def simulate(
     counts = Counts(
         ticks=steps * netlist.bin_ticks + netlist.drain,
         inputs=inputs,
-        spikes=spiked,
-        votes=votes,
-        axons=axons,
+        spikes=spiked[:, twins.neuron],
+        votes=votes[:, twins.neuron],
+        axons=axons[:, twins.axon],
         merged=merged,
-        overflows=overflows,
+        overflows=overflows[:, twins.neuron],
     )
-    return Trace(counts=counts, spikes=raster if spikes else None, membranes=held if membranes else None)
+    return Trace(
+        counts=counts,
+        spikes=raster[:, :, twins.neuron] if spikes else None,
+        membranes=held[:, :, twins.neuron] if membranes else None,
+    )
