@@ -360,10 +360,7 @@ def run_network(network: NativeNetwork, events: NDArray[np.uint8]) -> dict[str, 
             layers = [
                 Rounded(
                     weight=torch.from_numpy((stage.level * UNIT).astype(np.float32)),
-                    **{
-                        n: torch.tensor(getattr(stage, n), dtype=torch.float32)
-                        for n in ("threshold", "floor", "leak")
-                    },
+                    **{n: torch.tensor(getattr(stage, n), dtype=torch.float32) for n in ("threshold", "floor", "leak")},
                 )
                 for stage in tower
             ]

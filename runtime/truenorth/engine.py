@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,6 +20,9 @@ from runtime.truenorth.twins import Twins, find_twins
 
 SETTLING = 64
 """Ticks within which a neuron without input must come to rest to be let sleep."""
+
+LONGEST_GAP = 8
+"""Steady neurons that an axon may skip within a row of weights; so many zeros are added as fast as one number."""
 
 MOST_TICKS = 2**31
 
@@ -38,8 +41,6 @@ class Engine:
     slots : int
         Power of two above every delay.
     wiring : Wiring
-    burst_axon : (burst axons, 3) int64
-        Row of the offset, channel and kind of axon of each that nothing else reaches.
     """
 
     netlist: CrossbarNetlist
@@ -48,50 +49,40 @@ class Engine:
     high: int
     slots: int
     wiring: kernel.Wiring
-    burst_axon: IntArray
 
 
 def prepare(netlist: CrossbarNetlist) -> Engine:
     """Arrange a network that breaks no rule of its chip for the kernel."""
     bits = load_target(netlist.target, CROSSBARS).limit("neuron.membrane_bits")
     low, high = signed_range(bits)
-    twins = find_twins(netlist, kernel.HALF)
-    neuron, axon, halves = twins.synapse_neuron, twins.synapse_axon, twins.synapse_halves
-    axons, first = len(twins.first_axon), twins.first_neuron
+    twins, steady = _steady_first(netlist, find_twins(netlist, kernel.HALF), low, high)
+    first, axons = twins.first_neuron, len(twins.first_axon)
     wired = twins.axon[netlist.axons_at(netlist.cores_at(netlist.wire_x, netlist.wire_y), netlist.wire_line)]
     ticking, clocked = _held(twins, netlist.axons_at(netlist.clock_core, netlist.clock_line))
     rows, fed = _held(twins, netlist.axons_at(netlist.feed_core, netlist.feed_line))
-    channel, late = netlist.feed_channel[rows], netlist.feed_tick[rows]
+    offsets, offset = np.unique(netlist.feed_tick[rows], return_inverse=True)
+    key = offset.reshape(-1) * netlist.n_inputs + netlist.feed_channel[rows]
+    order = np.argsort(key, kind="stable")
+    ends = np.searchsorted(key[order], np.arange(len(offsets) * netlist.n_inputs + 1))
+    starts = np.arange(len(offsets))[:, None] * netlist.n_inputs + np.arange(netlist.n_inputs + 1)
 
-    # channels that are alone on their axons reach the neurons behind them at once
-    offsets, offset = np.unique(late, return_inverse=True)
-    key = offset.reshape(-1) * netlist.n_inputs + channel
-    alone = np.bincount(np.concatenate([wired, clocked, fed]), minlength=axons)[fed] == 1
-    owner = np.full(axons, -1)
-    owner[fed[alone]] = key[alone]
-    bursts = np.flatnonzero(owner[axon] >= 0)
-    pairs, pair = np.unique(np.stack([owner[axon[bursts]], neuron[bursts]]), axis=1, return_inverse=True)
-    burst_weight = np.zeros(pairs.shape[1], np.int64)
-    np.add.at(burst_weight, pair.reshape(-1), halves[bursts])
-    rest = np.argsort(key[~alone], kind="stable")
-
-    def bounds(keys: IntArray) -> IntArray:
-        ends = np.searchsorted(keys, np.arange(len(offsets) * netlist.n_inputs + 1))
-        starts = np.arange(len(offsets))[:, None] * netlist.n_inputs + np.arange(netlist.n_inputs + 1)
-        found: IntArray = ends[starts].astype(np.int64)
-        return found
-
+    near = twins.synapse_neuron < steady
+    bounds, segments, row = _segments(*(column[near] for column in _synapses(twins)), axons)
+    axon, neuron, halves = (column[~near] for column in _synapses(twins))
+    registers = (netlist.leak, netlist.threshold, netlist.reset, -netlist.negative_threshold)
     wiring = kernel.Wiring(
         offsets=offsets.astype(np.int64),
-        feed_bounds=bounds(key[~alone][rest]),
-        feed_axon=fed[~alone][rest].astype(np.int32),
-        burst_bounds=bounds(pairs[0]),
-        burst_neuron=pairs[1].astype(np.int32),
-        burst_weight=burst_weight,
+        feed_bounds=ends[starts].astype(np.int64),
+        feed_axon=fed[order].astype(np.int32),
         clocks=np.stack([clocked, netlist.clock_period[ticking], netlist.clock_phase[ticking]], axis=1),
+        segment_bounds=bounds,
+        segments=segments,
+        row=row,
+        steady=np.stack([register[first[:steady]] for register in registers]).astype(np.int32),
         axon_synapses=np.searchsorted(axon, np.arange(axons + 1)).astype(np.int64),
         synapse_neuron=neuron.astype(np.int32),
         synapse_weight=halves,
+        number=first.astype(np.int64),
         parameters=_parameters(netlist, wired, bits)[first],
         instant=_instant(netlist, high)[first],
         initial=netlist.initial[first].astype(np.int32),
@@ -103,8 +94,61 @@ def prepare(netlist: CrossbarNetlist) -> Engine:
         high=high,
         slots=1 << int(netlist.wire_delay.max(initial=1)).bit_length(),
         wiring=wiring,
-        burst_axon=np.stack([*np.divmod(key[alone], netlist.n_inputs), fed[alone]], axis=1),
     )
+
+
+def _synapses(twins: Twins) -> tuple[IntArray, IntArray, IntArray]:
+    return twins.synapse_axon, twins.synapse_neuron, twins.synapse_halves
+
+
+def _steady_first(netlist: CrossbarNetlist, twins: Twins, low: int, high: int) -> tuple[Twins, int]:
+    """The same kinds with steady neurons first, and how many of them there are.
+
+    Steady are those without random numbers and reversal that are reset to a value and held at their negative
+    threshold, if their registers and all that can reach them in a tick leave the membrane within its range.
+    """
+    first = twins.first_neuron
+    positive, negative = (
+        np.bincount(twins.synapse_neuron, part, len(first))
+        for part in (twins.synapse_halves >> kernel.HALF, twins.synapse_halves & kernel.LOWER)
+    )
+    plain = (netlist.mask_bits == 0) & (netlist.leak_reversal == 0) & (netlist.reset_mode == RESET_TO)
+    ends = netlist.reset, netlist.initial
+    most = np.maximum.reduce([netlist.threshold - 1, *ends])[first] + positive + np.maximum(netlist.leak, 0)[first]
+    least = np.minimum.reduce([-netlist.negative_threshold, *ends])[first] - negative
+    least += np.minimum(netlist.leak, 0)[first]
+    steady = (plain & (netlist.negative_saturates == 1))[first] & (most <= high) & (least >= low)
+    order = np.argsort(~steady, kind="stable")
+    rank = np.argsort(order)
+    ends_at = rank[twins.synapse_neuron]
+    by_axon = np.lexsort((ends_at, twins.synapse_axon))
+    ordered = replace(
+        twins,
+        neuron=rank[twins.neuron],
+        first_neuron=first[order],
+        synapse_axon=twins.synapse_axon[by_axon],
+        synapse_neuron=ends_at[by_axon],
+        synapse_halves=twins.synapse_halves[by_axon],
+    )
+    return ordered, int(np.count_nonzero(steady))
+
+
+def _segments(
+    axon: IntArray, neuron: IntArray, halves: IntArray, axons: int
+) -> tuple[IntArray, IntArray, kernel.Int32]:
+    """Synapses (by axon, then neuron) as rows of neighbours; bounds by axon, (segments, 3), and the weights."""
+    weight = (halves >> kernel.HALF) - (halves & kernel.LOWER)
+    starts = np.ones(len(axon), np.bool_)
+    starts[1:] = (np.diff(axon) != 0) | (np.diff(neuron) > LONGEST_GAP)
+    begins = np.flatnonzero(starts)
+    last = np.append(begins[1:], len(axon))[: len(begins)] - 1
+    lengths = neuron[last] + 1 - neuron[begins]
+    at = np.cumsum(lengths) - lengths
+    row = np.zeros(int(lengths.sum()), np.int32)
+    segment = np.cumsum(starts) - 1
+    row[at[segment] + neuron - neuron[begins][segment]] = weight
+    bounds = np.searchsorted(axon[begins], np.arange(axons + 1)).astype(np.int64)
+    return bounds, np.stack([neuron[begins], neuron[last] + 1, at], axis=1).astype(np.int64), row
 
 
 def _parameters(netlist: CrossbarNetlist, wired: IntArray, bits: int) -> kernel.Int32:
@@ -203,7 +247,6 @@ def simulate(
         raise NumericRangeError(f"recordings of {whole} data steps take {most} ticks, {MOST_TICKS - 1} can be counted")
     twins = engine.twins
     neurons = len(twins.first_neuron)
-    fed = np.zeros((samples, len(engine.wiring.offsets), channels), np.int64)
     axons = np.zeros((samples, len(twins.first_axon)), np.int64)
     spiked, votes, overflows = np.zeros((3, samples, neurons), np.int64)
     raster = np.zeros((samples, most if spikes else 0, neurons), np.bool_)
@@ -213,7 +256,7 @@ def simulate(
     def one(sample: int) -> None:
         heard = np.ascontiguousarray(events[sample, :, : steps[sample]].T).astype(np.uint8)
         inputs[sample] = np.count_nonzero(heard, axis=0)
-        arrays = (fed, axons, spiked, votes, overflows, raster, held)
+        arrays = (axons, spiked, votes, overflows, raster, held)
         merged[sample] = kernel.run(
             heard,
             netlist.bin_ticks,
@@ -228,8 +271,6 @@ def simulate(
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         list(pool.map(one, range(samples)))
-    offset, channel, axon = engine.burst_axon.T
-    axons[:, axon] = fed[:, offset, channel]
     counts = Counts(
         ticks=steps * netlist.bin_ticks + netlist.drain,
         inputs=inputs,

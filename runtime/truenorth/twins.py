@@ -48,7 +48,7 @@ class Twins:
 
 
 def find_twins(netlist: CrossbarNetlist, half: int) -> Twins:
-    """Kinds of a network that breaks no rule; each is alone where neurons draw random numbers, which are their own.
+    """Kinds of a network that breaks no rule; a neuron that draws random numbers, which are its own, is alone.
 
     Parameters
     ----------
@@ -61,12 +61,9 @@ def find_twins(netlist: CrossbarNetlist, half: int) -> Twins:
     sources, single = _sources(netlist)
     registers = _registers(netlist, single)
     kind = np.arange(netlist.n_neurons)
-    merges = not np.any(netlist.mask_bits)
     while True:
-        axon_kind = _axon_kinds(sources, kind) if merges else np.arange(netlist.n_axons)
+        axon_kind = _axon_kinds(sources, kind)
         pairs, weights = _pairs(axon_kind, neuron, axon, halves)
-        if not merges:
-            break
         found = _neuron_kinds(registers, pairs, weights)
         if found.max(initial=-1) == kind.max(initial=-1):
             break
@@ -117,7 +114,8 @@ def _registers(netlist: CrossbarNetlist, single: BoolArray) -> IntArray:
     # to an axon of its own with a delay; or to one that others reach, too, where two spikes of a tick merge
     leads[netlist.wire_neuron, 0] = np.where(single[aim], -2, netlist.wire_neuron)
     leads[netlist.wire_neuron, 1] = netlist.wire_delay
-    columns = [*(getattr(netlist, name) for name in _REGISTERS), netlist.readout_class >= 0, *leads.T]
+    draws = np.where(netlist.mask_bits > 0, np.arange(netlist.n_neurons), -1)
+    columns = [*(getattr(netlist, name) for name in _REGISTERS), netlist.readout_class >= 0, *leads.T, draws]
     rows = np.stack(columns, axis=1).astype(np.int64).reshape(netlist.n_neurons, -1)
     found: IntArray = np.unique(rows, axis=0, return_inverse=True)[1].reshape(-1)
     return found
