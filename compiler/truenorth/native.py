@@ -16,8 +16,8 @@ seven, with ``(-7, 1, 2, 4)`` fifteen, each times ``UNIT``, which makes threshol
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -190,3 +190,22 @@ def _stage_faults(network: NativeNetwork, stage: Stage, depth: int, heard: int) 
         yield f"thresholds and floors outside 1 <= threshold <= floor <= {THRESHOLD_MOST}"
     elif np.any(np.abs(stage.leak) > steepest_leak(stage.threshold, depth)):
         yield "leaks that the ticks before the first data cannot undo"
+
+
+def joined(networks: Sequence[NativeNetwork]) -> NativeNetwork:
+    """One network with the towers of all; their votes add up.
+
+    Raises
+    ------
+    ValueError
+        Naming in what they differ.
+    """
+    one = networks[0]
+    for what in ("taxels", "polarities", "classes", "copies", "clocks"):
+        found = {str(getattr(network, what)) for network in networks}
+        if len(found) > 1:
+            raise ValueError(f"differ in {what}: {', '.join(sorted(found))}")
+    layers = {", ".join(stage.name for stage in tower) for network in networks for tower in network.towers}
+    if len(layers) > 1:
+        raise ValueError(f"differ in their layers: {' and '.join(sorted(layers))}")
+    return replace(one, towers=tuple(tower for network in networks for tower in network.towers))

@@ -131,9 +131,10 @@ class _BlockSums(torch.autograd.Function):
         blocks, width, size = weight.shape
         steps, samples, _ = spikes.shape
         rows = spikes.detach().reshape(steps * samples, blocks * width).contiguous()
-        ctx.events = events_of(rows.numpy())
+        source, bounds = events_of(rows.numpy())
         out = torch.zeros((steps * samples, blocks * size))
-        _gather(*ctx.events, width, weight.detach().contiguous().view(-1, size).numpy(), out.numpy())
+        _gather(source, bounds, width, weight.detach().contiguous().view(-1, size).numpy(), out.numpy())
+        ctx.events = source, bounds
         ctx.save_for_backward(weight)
         return out.view(steps, samples, blocks * size)
 
@@ -144,7 +145,8 @@ class _BlockSums(torch.autograd.Function):
         above = gradients[0].contiguous()
         rows = above.view(-1, blocks * size)
         out = torch.zeros_like(weight)
-        _scatter(*ctx.events, width, rows.numpy(), rows_of(out.view(-1, size)))
+        source, bounds = ctx.events
+        _scatter(source, bounds, width, rows.numpy(), rows_of(out.view(-1, size)))
         if not ctx.needs_input_grad[0]:
             return None, out
         below = torch.bmm(rows.view(-1, blocks, size).transpose(0, 1), weight.transpose(1, 2))

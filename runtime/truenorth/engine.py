@@ -67,7 +67,8 @@ def prepare(netlist: CrossbarNetlist) -> Engine:
     starts = np.arange(len(offsets))[:, None] * netlist.n_inputs + np.arange(netlist.n_inputs + 1)
 
     near = twins.synapse_neuron < steady
-    bounds, segments, row = _segments(*(column[near] for column in _synapses(twins)), axons)
+    axon, neuron, halves = (column[near] for column in _synapses(twins))
+    bounds, segments, row = _segments(axon, neuron, halves, axons)
     axon, neuron, halves = (column[~near] for column in _synapses(twins))
     registers = (netlist.leak, netlist.threshold, netlist.reset, -netlist.negative_threshold)
     wiring = kernel.Wiring(
