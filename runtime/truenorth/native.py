@@ -14,7 +14,7 @@ from compiler.dynamics import with_clocks
 from compiler.errors import OptionError
 from compiler.fixedpoint import IntArray
 from compiler.interpret import vote
-from compiler.targets import CROSSBARS, Target, load_target
+from compiler.targets import CROSSBARS, Target, known_targets, load_target
 from compiler.truenorth.lower import lower
 from compiler.truenorth.native import BASES, SYSTEM, highest_level
 from compiler.truenorth.netlist import CrossbarNetlist
@@ -28,6 +28,7 @@ from runtime.tables import table
 from runtime.trace import ENGINES
 from runtime.truenorth import engine, render, spec
 from runtime.truenorth.commands import class_counts, legal
+from runtime.truenorth.refusal import require_crossbar_options
 
 Json = dict[str, Any]
 Outcome = tuple[Json, Callable[[Json], str], int]
@@ -58,6 +59,13 @@ def read(path: str, arguments: argparse.Namespace) -> Trained:
 
 def compile_network(arguments: argparse.Namespace) -> Outcome:
     """Place a network on cores and write them."""
+    if arguments.target not in known_targets(CROSSBARS):
+        raise OptionError(
+            f"--target {arguments.target}: {arguments.checkpoint} was trained for TrueNorth; give --target truenorth"
+        )
+    require_crossbar_options(arguments)
+    if arguments.calibrate is not None:
+        raise OptionError(f"--calibrate: {arguments.checkpoint} is whole numbers already; leave it away")
     chip = load_target(arguments.target, CROSSBARS)
     trained = read(arguments.checkpoint, arguments)
     progress("compiling")
