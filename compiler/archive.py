@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import os
 import struct
 import zipfile
 from collections.abc import Mapping
@@ -17,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from compiler.atomic import write_atomically
 from compiler.errors import FormatError
 
 Array = np.ndarray[Any, Any]
@@ -68,6 +70,31 @@ def archive_bytes(manifest: Mapping[str, Any], arrays: Mapping[str, Array]) -> b
             np.lib.format.write_array(content, array, version=(1, 0), allow_pickle=False)
             archive.writestr(zipfile.ZipInfo(f"{name}.npy", date_time=_EPOCH), content.getvalue())
     return file.getvalue()
+
+
+def write_archive(content: bytes, path: str | os.PathLike[str]) -> str:
+    """Write a file, whole or not at all; return its sha256.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written; an older file is left as it was.
+    """
+    with write_atomically(path) as file:
+        file.write(content)
+    return hashlib.sha256(content).hexdigest()
+
+
+def require_file(path: Path) -> None:
+    """Refuse a path that is no file.
+
+    Raises
+    ------
+    FormatError
+    """
+    if not path.is_file():
+        found = "is not a file" if path.exists() else "no such file"
+        raise FormatError(f"{path}: {found}; write one with spikeloom compile")
 
 
 def read_members(path: Path) -> dict[str, Array]:

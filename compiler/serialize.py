@@ -18,7 +18,6 @@ Equal netlists give equal bytes: members are stored, not compressed, in a fixed 
 
 from __future__ import annotations
 
-import hashlib
 import math
 import os
 import zipfile
@@ -28,8 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from compiler.archive import archive_bytes, read_manifest, read_members, require_whole
-from compiler.atomic import write_atomically
+from compiler.archive import archive_bytes, read_manifest, read_members, require_file, require_whole, write_archive
 from compiler.dynamics import MOST_CLOCKS, MOST_STEPS, NO_CLOCKS, Clocks
 from compiler.errors import FormatError
 from compiler.netlist import Layer, Netlist, frozen, read_only, read_only_float
@@ -79,10 +77,7 @@ def write_netlist(netlist: Netlist, path: str | os.PathLike[str]) -> str:
     OSError
         If the file cannot be written; an older file is left as it was.
     """
-    content = netlist_bytes(netlist)
-    with write_atomically(path) as file:
-        file.write(content)
-    return hashlib.sha256(content).hexdigest()
+    return write_archive(netlist_bytes(netlist), path)
 
 
 def read_netlist(path: str | os.PathLike[str]) -> Netlist:
@@ -96,9 +91,7 @@ def read_netlist(path: str | os.PathLike[str]) -> Netlist:
         If it cannot be read.
     """
     path = Path(path)
-    if not path.is_file():
-        found = "is not a file" if path.exists() else "no such file"
-        raise FormatError(f"{path}: {found}; write one with spikeloom compile")
+    require_file(path)
     members = read_members(path)
     manifest = read_manifest(path, members, FORMAT)
     require_whole(path, manifest, members, VERSIONS, ARRAYS)

@@ -11,6 +11,7 @@ from compiler.atomic import write_atomically
 from compiler.errors import OptionError
 from compiler.serialize import read_netlist
 from compiler.targets import load_target
+from models.events import BIN_S
 from runtime import onnx_float, onnx_graph, sanafe
 from runtime.data_commands import add_bin_option
 from runtime.inputs import asked_checkpoint, asked_graph, propagation, require_place
@@ -29,6 +30,9 @@ FORMATS = {
     "onnx-float": "the float network of a checkpoint as a static ONNX graph",
 }
 """Values of ``--to``."""
+
+RECORDING: dict[str, object] = {"data": None, "split": None, "recording": None, "bin": BIN_S}
+"""Options that name a recording, and what they are where they are not given."""
 
 MODEL = {
     "graph": None,
@@ -53,8 +57,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--form", choices=onnx_graph.FORMS, help="onnx: one step with its state, or whole recordings (default: scan)"
     )
     parser.add_argument("--data", metavar="PATH", help=f"ranc: {DATA_HELP}")
-    parser.add_argument("--split", default="test", help="ranc: split to read (default: test)")
-    parser.add_argument("--recording", type=int, default=0, metavar="N", help="ranc: which of them (default: 0)")
+    parser.add_argument("--split", help="ranc: split to read (default: test)")
+    parser.add_argument("--recording", type=int, metavar="N", help="ranc: which of them (default: 0)")
     add_bin_option(parser)
     add_model(parser)
     parser.add_argument("-o", "--output", required=True, metavar="FILE")
@@ -106,8 +110,12 @@ WRITERS: dict[str, Callable[[argparse.Namespace], tuple[Iterable[bytes], Json]]]
 
 def _require_fit(arguments: argparse.Namespace) -> None:
     """Refuse options that the format would ignore."""
-    if arguments.data is not None and arguments.to != "ranc":
-        raise OptionError(f"--data {arguments.data}: is for ranc; leave it away")
+    for name, absent in RECORDING.items():
+        given = getattr(arguments, name)
+        if given != absent and arguments.to != "ranc":
+            raise OptionError(f"--{name} {given}: is for ranc; leave it away")
+        if given != absent and arguments.data is None:
+            raise OptionError(f"--{name} {given}: says which recording of --data, which is not given; add it")
     if arguments.form is not None and arguments.to in ("sanafe", "ranc"):
         raise OptionError(f"--form {arguments.form}: is for onnx and onnx-float; leave it away")
     if arguments.to == "onnx-float":

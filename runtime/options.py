@@ -169,7 +169,7 @@ def add_compile(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("checkpoint", help="checkpoint, or a network as an ONNX file")
     add_network(sub)
     sub.add_argument("--against", metavar="NET.loom", help="list the weights that differ from another netlist's")
-    sub.add_argument("--target", default="loihi1", help="chip (default: loihi1)")
+    sub.add_argument("--target", default="loihi1", help="chip: loihi1 (default), or truenorth, to hear why not")
     sub.add_argument(
         "--weight-bits",
         metavar="N[,N]",

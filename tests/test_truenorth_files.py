@@ -6,14 +6,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from hypothesis import given, settings
+from hypothesis import strategies as st
 from random_crossbars import crossbars
 
 from compiler import archive
 from compiler.errors import FormatError
 from compiler.netlist import read_only
 from compiler.serialize import is_netlist, read_netlist
+from compiler.targets import CROSSBARS, load_target
 from compiler.truenorth.draft import Draft, Neuron, history_free
 from compiler.truenorth.netlist import CrossbarNetlist
+from compiler.truenorth.rules import faults
 from compiler.truenorth.serialize import (
     ARRAYS,
     FORMAT,
@@ -24,6 +27,7 @@ from compiler.truenorth.serialize import (
     write_crossbars,
 )
 from runtime import cli
+from runtime.truenorth import engine
 
 
 def network() -> CrossbarNetlist:
@@ -131,6 +135,25 @@ def test_altered_and_missing_files(path, tmp_path):
     with pytest.raises(FormatError) as caught:
         read_crossbars(tmp_path / "no.loom")
     assert str(caught.value) == f"{tmp_path / 'no.loom'}: no such file; write one with spikeloom compile"
+
+
+@settings(max_examples=150, deadline=None)
+@given(crossbars(), st.sampled_from(ARRAYS), st.randoms(use_true_random=False))
+def test_any_numbers_are_refused_or_told_or_run(tmp_path_factory, netlist, name, random):
+    array = np.array(getattr(netlist, name))
+    if array.size:
+        array.flat[random.randrange(array.size)] = random.choice(
+            [-(2**31), -300, -2, -1, 0, 1, 2, 5, 20, 300, 2**31 - 1]
+        )
+    path = tmp_path_factory.mktemp("any") / "x.loom"
+    write_crossbars(replace(netlist, **{name: array}), path)
+    try:
+        found = read_crossbars(path)
+    except FormatError:
+        return
+    if not faults(found, load_target("truenorth", CROSSBARS)):
+        assert found.drain < 2**20
+        engine.simulate(replace(found, readout_first=np.minimum(found.readout_first, 9)), np.ones((1, 3, 4), np.uint8))
 
 
 # -- commands ----------------------------------------------------------------------------------------------------------

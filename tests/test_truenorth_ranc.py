@@ -119,8 +119,59 @@ def test_the_command(tmp_path, capsys):
         f"{tmp_path}/net.json: 3 neurons and 3 synapses for ranc, {(tmp_path / 'net.json').stat().st_size} bytes",
         f"run: ranc_sim {tmp_path}/net.json {tmp_path}/net.out {tmp_path}/net.json TICKS (no recording, add packets)",
     ]
-    assert cli.main([*words[:3], "sanafe", "--data", "x", *words[4:]]) == 2
-    assert capsys.readouterr().err == "spikeloom: --data x: is for ranc; leave it away\n"
+
+
+def test_the_command_with_a_recording(tmp_path, capsys):
+    draft = Draft()
+    draft.core(0, 0)
+    draft.axon(0)
+    draft.neuron(0, Neuron(), layer="layer0")
+    draft.connect(0, 0, [0])
+    draft.feed(3, 0, 0)
+    draft.vote((0, 0), 0, first=2)
+    write_crossbars(draft.netlist(taxels=2, polarities=2, classes=1), tmp_path / "net.loom")
+    (tmp_path / "data" / "test").mkdir(parents=True)
+    (tmp_path / "data" / "train").mkdir()
+    for sample in range(2):
+        recording = np.zeros((2, 2, 5), np.float32)
+        recording[1, 1, [sample, 4]] = 1
+        np.save(tmp_path / "data" / "test" / f"sample_{sample}_label_0.npy", recording)
+        np.save(tmp_path / "data" / "train" / f"sample_{sample}_label_0.npy", recording)
+    words = [
+        "export",
+        f"{tmp_path}/net.loom",
+        "--to",
+        "ranc",
+        "-o",
+        f"{tmp_path}/net.json",
+        "--data",
+        f"{tmp_path}/data",
+    ]
+    assert cli.main([*words, "--recording", "1", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["ticks"] == 5 + 2 + 1
+    packets = json.loads((tmp_path / "net.json").read_text("utf-8"))["packets"]
+    assert [len(tick) for tick in packets] == [0, 1, 0, 0, 1, 0, 0]
+    assert cli.main([*words, "--recording", "2"]) == 2
+    assert capsys.readouterr().err == f"spikeloom: --recording 2: {tmp_path}/data has recordings 0 to 1\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["--to", "sanafe", "--data", "x"], "--data x: is for ranc; leave it away"),
+        (["--to", "onnx", "--recording", "0"], "--recording 0: is for ranc; leave it away"),
+        (["--to", "sanafe", "--bin", "0.1"], "--bin 0.1: is for ranc; leave it away"),
+        (
+            ["--to", "ranc", "--recording", "3"],
+            "--recording 3: says which recording of --data, which is not given; add it",
+        ),
+        (["--to", "ranc", "--form", "step"], "--form step: is for onnx and onnx-float; leave it away"),
+    ],
+)
+def test_options_that_would_be_ignored(tmp_path, capsys, words, line):
+    write_crossbars(small(), tmp_path / "net.loom")
+    assert cli.main(["export", f"{tmp_path}/net.loom", *words, "-o", f"{tmp_path}/net.json"]) == 2
+    assert capsys.readouterr().err == f"spikeloom: {line}\n"
 
 
 @pytest.fixture(scope="module")

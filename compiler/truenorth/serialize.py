@@ -8,7 +8,6 @@ of its chip, which :mod:`compiler.truenorth.rules` lists; what is refused here i
 
 from __future__ import annotations
 
-import hashlib
 import os
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -16,8 +15,16 @@ from typing import Any
 
 import numpy as np
 
-from compiler.archive import Array, archive_bytes, read_manifest, read_members, require_whole, stated_format
-from compiler.atomic import write_atomically
+from compiler.archive import (
+    Array,
+    archive_bytes,
+    read_manifest,
+    read_members,
+    require_file,
+    require_whole,
+    stated_format,
+    write_archive,
+)
 from compiler.dynamics import MOST_CLOCKS, MOST_STEPS, Clocks
 from compiler.errors import FormatError
 from compiler.netlist import read_only
@@ -63,10 +70,7 @@ def write_crossbars(netlist: CrossbarNetlist, path: str | os.PathLike[str]) -> s
     OSError
         If the file cannot be written; an older file is left as it was.
     """
-    content = crossbar_bytes(netlist)
-    with write_atomically(path) as file:
-        file.write(content)
-    return hashlib.sha256(content).hexdigest()
+    return write_archive(crossbar_bytes(netlist), path)
 
 
 def is_crossbars(path: str | os.PathLike[str]) -> bool:
@@ -85,9 +89,7 @@ def read_crossbars(path: str | os.PathLike[str]) -> CrossbarNetlist:
         If it cannot be read.
     """
     path = Path(path)
-    if not path.is_file():
-        found = "is not a file" if path.exists() else "no such file"
-        raise FormatError(f"{path}: {found}; write one with spikeloom compile")
+    require_file(path)
     members = read_members(path)
     manifest = read_manifest(path, members, FORMAT)
     require_whole(path, manifest, members, VERSIONS, ARRAYS)

@@ -51,10 +51,10 @@ def class_counts(netlist: CrossbarNetlist, votes: IntArray) -> IntArray:
     return counts
 
 
-def _data(arguments: argparse.Namespace, netlist: CrossbarNetlist, limit: int | None) -> Recordings:
+def _data(arguments: argparse.Namespace, netlist: CrossbarNetlist, split: str, limit: int | None) -> Recordings:
     progress("reading the recordings")
     classes, taxels = netlist.classes, netlist.taxels
-    return recordings(arguments.data, arguments.split, limit=limit, classes=classes, taxels=taxels, bin_s=arguments.bin)
+    return recordings(arguments.data, split, limit=limit, classes=classes, taxels=taxels, bin_s=arguments.bin)
 
 
 def _costs(arguments: argparse.Namespace, netlist: CrossbarNetlist, chip: Target, trace: Trace) -> Json:
@@ -78,7 +78,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     """Decisions of the recordings, and their costs where they are asked for."""
     _require_detail(arguments)
     netlist, chip = legal(arguments.netlist)
-    data = _data(arguments, netlist, arguments.limit)
+    data = _data(arguments, netlist, arguments.split, arguments.limit)
     progress("running")
     prepared, events = engine.prepare(netlist), with_clocks(data.events, netlist.clocks)
     trace = engine.simulate(prepared, events, lengths=data.lengths, spikes=arguments.spikes is not None)
@@ -103,7 +103,7 @@ def estimate(arguments: argparse.Namespace) -> Outcome:
     """Costs of the recordings."""
     _require_detail(arguments)
     netlist, chip = legal(arguments.netlist)
-    data = _data(arguments, netlist, arguments.limit)
+    data = _data(arguments, netlist, arguments.split, arguments.limit)
     progress("running")
     trace = engine.simulate(netlist, with_clocks(data.events, netlist.clocks), lengths=data.lengths)
     return _costs(arguments, netlist, chip, trace), render.costs_text, 0
@@ -114,7 +114,7 @@ def export_ranc(arguments: argparse.Namespace) -> tuple[list[bytes], Json]:
     netlist, _ = legal(arguments.source)
     events = None
     if arguments.data is not None:
-        data, number = _data(arguments, netlist, None), arguments.recording
+        data, number = _data(arguments, netlist, arguments.split or "test", None), arguments.recording or 0
         if not 0 <= number < len(data.files):
             raise OptionError(f"--recording {number}: {arguments.data} has recordings 0 to {len(data.files) - 1}")
         steps = None if data.lengths is None else int(data.lengths[number])

@@ -159,6 +159,17 @@ def after(v: Any, spiked: Any, threshold: Any, random: Any, mode: Any, reset: An
 
 
 @compiled
+def _reach(state: Any, n: Any, weight: Any, working: Any) -> Any:
+    """Let a weight arrive at a neuron, which works then; returns the neurons that do."""
+    state.arrived[n] += weight
+    if not state.listed[n]:
+        state.listed[n] = True
+        state.work[working] = n
+        return working + 1
+    return working
+
+
+@compiled
 def _queue(state: Any, slot: Any, axon: Any) -> Any:
     """Let an axon have a spike in the tick of a slot; 1 where it has one already."""
     if state.flagged[slot, axon]:
@@ -204,12 +215,7 @@ def _integrate(slot: Any, wiring: Any, state: Any, axons: Any, working: Any) -> 
             first, end, at = wiring.segments[s, 0], wiring.segments[s, 1], wiring.segments[s, 2]
             _add(state.steady_sum[first:end], wiring.row[at : at + end - first])
         for s in range(wiring.axon_synapses[axon], wiring.axon_synapses[axon + 1]):
-            n = wiring.synapse_neuron[s]
-            state.arrived[n] += wiring.synapse_weight[s]
-            if not state.listed[n]:
-                state.listed[n] = True
-                state.work[working] = n
-                working += 1
+            working = _reach(state, wiring.synapse_neuron[s], wiring.synapse_weight[s], working)
     state.dues[slot] = 0
     return working
 

@@ -8,9 +8,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from compiler.errors import ModelError, OptionError
 from compiler.interpret import channels_last
-from compiler.passes.calibrate import evenly_spaced
 from compiler.targets import CROSSBARS, Target, load_target
 from compiler.truenorth.needs import needs
 from models.evtouch import Recordings
@@ -25,7 +26,7 @@ Json = dict[str, Any]
 TRIED = 72
 """Training recordings that ways out are measured on, evenly spaced."""
 
-LOIHI_ONLY = {
+LOIHI_ONLY: dict[str, Any] = {
     "weight_bits": None,
     "planes": None,
     "scale_groups": None,
@@ -74,9 +75,8 @@ def refuse(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], 
 
 
 def _trial(asked: Asked, data: Recordings) -> Trial:
-    events = evenly_spaced(channels_last(data.events), TRIED)
-    labels = evenly_spaced(data.labels, TRIED)
-    return Trial(asked.network, events, labels)
+    kept = np.linspace(0, len(data.labels) - 1, min(TRIED, len(data.labels))).round().astype(np.int64)
+    return Trial(asked.network, channels_last(data.events[kept]), data.labels[kept])
 
 
 def _report(path: str, asked: Asked, chip: Target, trial: Trial | None, steps: int | None) -> Json:
@@ -121,8 +121,9 @@ def refusal_text(report: Json) -> str:
     ]
     if report["samples"]:
         lines.append(
-            f"accuracy on {report['samples']} training recordings, as trained {100 * report['accuracy']:.1f} %; each way "
-            "alone, in its layer; cores of the layer"
+            f"accuracy on {report['samples']} training recordings (one is {100 / report['samples']:.1f} points), "
+            f"{100 * report['accuracy']:.1f} % as trained; each way alone, in its layer; cores of the layer; "
+            "ticks of a decision"
         )
     else:
         lines.append(

@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from compiler.fixedpoint import FloatArray, IntArray
-from compiler.interpret import BoolArray, Floating, float_recurrence, lasting_currents, product, vote
-from compiler.ir import INPUT, Network, Population, Sparse
+from compiler.interpret import BATCH, BoolArray, Floating, float_recurrence, lasting_currents, product, vote
+from compiler.ir import INPUT, Network, Population
 from runtime.votes import readout_counts
 
 SEARCHED = np.linspace(0.1, 1.0, 19)
@@ -22,8 +22,8 @@ SEARCHED = np.linspace(0.1, 1.0, 19)
 LEAKS = (0.2, 0.4, 0.6, 0.8, 1.0)
 """Constant leaks that are tried, in thresholds."""
 
-FEW = 16
-"""Recordings on which a leak is chosen."""
+FEW = 2
+"""Batches of recordings on which a leak is chosen."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -54,10 +54,8 @@ class Change:
     echoes : bool
         Inputs come again one and two steps later, with weights times the decay and its square, to a membrane that
         forgets.
-    weight : csr_array, optional
-        Other weights for the first projection.
     levels : Levels, optional
-        The same, as levels.
+        Other weights for the first projection.
     inputs, most : int, optional
         With levels: the sum is made of parts of so many inputs, each of which counts `most` steps at the most, above
         zero and below.
@@ -67,7 +65,6 @@ class Change:
     alpha: float | None = None
     leak: float | None = None
     echoes: bool = False
-    weight: Sparse | None = None
     levels: Levels | None = None
     inputs: int | None = None
     most: int | None = None
@@ -82,8 +79,8 @@ def codebook(weight: FloatArray, copies: int) -> Levels:
     Examples
     --------
     >>> found = codebook(np.array([[0.5, -0.4, 0.02]]), 2)
-    >>> found.level.tolist(), found.step.round(3).tolist()
-    ([[1.0, -1.0, 0.0]], [0.45])
+    >>> found.level.tolist(), [f"{step:.2f}" for step in found.step]
+    ([[1.0, -1.0, 0.0]], ['0.45'])
     """
     low, high = (-1, 1) if copies == 2 else (-(1 << (copies - 1)), (1 << (copies - 1)) - 1)
     largest = np.maximum(np.abs(weight).max(axis=1, keepdims=True), 1e-12)
@@ -110,76 +107,78 @@ class Trial:
 
     def __init__(self, network: Network, events: BoolArray, labels: IntArray) -> None:
         self.network = network
-        self.events = events
         self.labels = labels
-        self.spikes: list[BoolArray] = []
+        self.parts = [events[first : first + BATCH] for first in range(0, len(events), BATCH)]
         self.saturated = 0.0
-        self.spikes = self._run({})
+        self._clipped = self._partial = 0
+        self.spikes = [self._run(part, {}, None) for part in self.parts]
 
     def accuracy(self, changes: Mapping[int, Change]) -> float:
-        """Share of recordings that are decided rightly with these layers changed."""
-        spikes = self._run(changes) if changes else self.spikes
-        readout = self.network.readout
-        decided = vote(readout_counts(readout, self.network.classes, spikes[readout.population]))
-        return float(np.mean(decided == self.labels))
+        """Share of recordings that are decided rightly with these layers changed.
+
+        The share of partial sums that saturate, in the last layer that has such, is kept in ``saturated``.
+        """
+        readout, decided = self.network.readout, []
+        clipped = parts = 0
+        for events, spikes in zip(self.parts, self.spikes, strict=True):
+            self._clipped = self._partial = 0
+            found = self._run(events, changes, spikes)
+            decided.append(vote(readout_counts(readout, self.network.classes, found[readout.population])))
+            clipped, parts = clipped + self._clipped, parts + self._partial
+        self.saturated = clipped / max(parts, 1)
+        return float(np.mean(np.concatenate(decided) == self.labels))
 
     def leak_for(self, layer: int) -> float:
-        """Constant leak that moves the fewest spikes of a layer that has its own inputs."""
+        """Constant leak that moves the fewest spikes of a layer, its inputs as they are."""
         population = self.network.populations[layer]
-        sums = self._sums(layer, self.spikes, None)[:FEW]
-        expected = self.spikes[layer][:FEW]
         leaks = [share * population.theta for share in LEAKS]
-        moved = [np.count_nonzero(leaking(population, sums.copy(), leak) != expected) for leak in leaks]
+        moved = np.zeros(len(leaks), np.int64)
+        for events, spikes in zip(self.parts[:FEW], self.spikes, strict=False):
+            sums = self._sums(layer, events, spikes, Change())
+            moved += [np.count_nonzero(leaking(population, sums.copy(), leak) != spikes[layer]) for leak in leaks]
         return leaks[int(np.argmin(moved))]
 
-    def _run(self, changes: Mapping[int, Change]) -> list[BoolArray]:
+    def _run(self, events: BoolArray, changes: Mapping[int, Change], before: list[BoolArray] | None) -> list[BoolArray]:
+        """Spikes of all layers; those that no change reaches are taken from `before`."""
         spikes: list[BoolArray] = []
-        fresh = not self.spikes
         other: set[int] = set()
         for layer, population in enumerate(self.network.populations):
-            pres = {projection.pre for projection in self.network.projections if projection.post == layer}
-            if not fresh and layer not in changes and not pres & other:
-                spikes.append(self.spikes[layer])
+            heard = {projection.pre for projection in self.network.projections if projection.post == layer}
+            if before is not None and layer not in changes and not heard & other:
+                spikes.append(before[layer])
                 continue
             other.add(layer)
             change = changes.get(layer, Change())
-            spikes.append(_neurons(population, self._sums(layer, spikes, change), change))
+            spikes.append(_neurons(population, self._sums(layer, events, spikes, change), change))
         return spikes
 
-    def _sums(self, layer: int, spikes: list[BoolArray], change: Change | None) -> Floating:
-        """Synaptic sums of a layer, (samples, steps, neurons) float32."""
+    def _sums(self, layer: int, events: BoolArray, spikes: list[BoolArray], change: Change) -> Floating:
+        """Synaptic sums of a layer, (samples, steps, neurons) float32; a change of weights is of the first of them."""
         total: Floating | None = None
         for projection in self.network.projections:
-            if projection.post != layer:
-                continue
-            heard = self.events if projection.pre == INPUT else spikes[projection.pre]
-            if total is None and change is not None and change.levels is not None:
-                total = self._in_levels(change.levels, heard, change.inputs, change.most)
-                continue
-            weight = projection.weight
-            if total is None and change is not None and change.weight is not None:
-                weight = change.weight
-            more = product(weight, heard, np.float32)
-            total = more if total is None else total + more
+            if projection.post == layer:
+                heard = events if projection.pre == INPUT else spikes[projection.pre]
+                if total is None and change.levels is not None:
+                    total = self._in_levels(change.levels, heard, change.inputs, change.most)
+                else:
+                    more = product(projection.weight, heard, np.float32)
+                    total = more if total is None else total + more
         assert total is not None, "verify: every population is reached"
         return total
 
     def _in_levels(self, levels: Levels, heard: BoolArray, inputs: int | None, most: int | None) -> Floating:
-        """Sums of weights in levels; with `most`, of saturated parts, whose share goes to ``saturated``."""
+        """Sums of weights in levels; with `most`, of parts that saturate there."""
         samples, steps, channels = heard.shape
         flat = heard.reshape(samples * steps, channels).astype(np.float32)
         width = channels if inputs is None else inputs
         total = np.zeros((len(flat), len(levels.level)), np.float32)
-        clipped = parts = 0
         for first in range(0, channels, width):
             part = flat[:, first : first + width] @ levels.level[:, first : first + width].T
             if most is not None:
-                clipped += int(np.count_nonzero(np.abs(part) > most))
-                parts += part.size
+                self._clipped += int(np.count_nonzero(np.abs(part) > most))
+                self._partial += part.size
                 np.clip(part, -most, most, out=part)
             total += part
-        if parts:
-            self.saturated = clipped / parts
         return (total * levels.step).reshape(samples, steps, -1)
 
 

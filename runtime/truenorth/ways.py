@@ -14,10 +14,11 @@ import numpy as np
 from compiler.frontends.checkpoint import Checkpoint
 from compiler.frontends.systems import GRAPH_SYSTEMS, TACTILESGNET
 from compiler.ir import INPUT, Network, Sparse
-from compiler.passes.expand import expand_first_layer
+from compiler.passes.expand import expand_first_layer, expand_graph_convolution
 from compiler.targets import Target
 from compiler.truenorth.needs import CURRENT, FAN_IN, LEAK, TARGETS, WEIGHTS, Need, targets_of
 from compiler.truenorth.sizes import Split, packed, relays, split
+from models.graphs import NEUTOUCH, build_graph, normalised_adjacency
 from runtime.asked import Asked
 from runtime.truenorth.trials import Change, Levels, Trial, codebook
 
@@ -29,6 +30,9 @@ TERNARY = 2
 
 COPIES = (2, 3, 4)
 """Axons of an input that are tried; beyond four types repeat."""
+
+SPARSEST = "mst:0"
+"""Graph of the built-in sensor with the fewest edges, a tree."""
 
 FEWER_HOPS = 2
 """Hops of a graph convolution that are left, as trained."""
@@ -88,6 +92,7 @@ class Planner:
         self.trial = trial
         self.path = path
         self.books: dict[tuple[int, int], Levels] = {}
+        self.in_time: dict[tuple[int, int], tuple[float | None, str]] = {}
 
     def ways(self, need: Need) -> list[Way]:
         """Ways out of a need, at least two."""
@@ -115,13 +120,24 @@ class Planner:
         parts = split(weight.shape[1], weight.shape[0], copies, self.chip)
         return (None if parts is None else parts.cores), parts
 
-    def lead_cores(self, layer: int, targets: int) -> int | None:
-        """Cores that lead each spike of a layer to so many axons: of relays, or of copies, whichever are fewer."""
+    def reach(self, layer: int, copies: int) -> int:
+        """Axons that each spike of a layer must reach, with so many an input on every core that hears it."""
+        held, total = self.chip.limit("core.neurons"), 0
+        for projection in self.network.projections:
+            if projection.pre == layer:
+                cores, parts = self.layer_cores(projection.post, copies)
+                size = self.network.populations[projection.post].size
+                total += copies * (-(-2 * size // held) if parts is not None else cores or 1)
+        return total
+
+    def lead_cores(self, layer: int, copies: int) -> int | None:
+        """Cores that lead each spike of a layer where it must go: of relays, or of copies, whichever are fewer."""
+        targets = self.reach(layer, copies)
         if targets < 2:
             return 0
         population, fed = self.network.populations[layer], self._hears_inputs(layer)
         by_relay = relays(population.size, targets, self.chip)
-        cores, _ = self.layer_cores(layer, TERNARY)
+        cores, _ = self.layer_cores(layer, copies)
         by_copy = None if cores is None or not fed else cores * (targets - 1)
         return min((found for found in (by_relay, by_copy) if found is not None), default=None)
 
@@ -189,9 +205,12 @@ class Planner:
                 yield self._retrained(f"trained with {most} features, {heard} inputs", self._train(options), cores, 1)
 
     def _in_time(self, layer: int, copies: int, parts: Split) -> Way:
-        change = Change(levels=self._book(layer, copies), inputs=parts.inputs, most=BIN_TICKS)
-        accuracy = self._measured(layer, change)
-        note = "" if self.trial is None else f"{100 * self.trial.saturated:.2g} % of the partial sums saturate"
+        if (layer, copies) not in self.in_time:
+            change = Change(levels=self._book(layer, copies), inputs=parts.inputs, most=BIN_TICKS)
+            accuracy = self._measured(layer, change)
+            note = "" if self.trial is None else f"{100 * self.trial.saturated:.2g} % of the partial sums saturate"
+            self.in_time[layer, copies] = accuracy, note
+        accuracy, note = self.in_time[layer, copies]
         return Way(
             name=f"split in time: {parts.groups} groups of {parts.inputs}, {copies} axons an input",
             accuracy=accuracy,
@@ -216,9 +235,10 @@ class Planner:
         checkpoint = self.asked.checkpoint
         if layer == 0 and checkpoint is not None and checkpoint.system == TACTILESGNET:
             yield from self._fewer_hops(checkpoint)
+            yield from self._fewer_neighbours(checkpoint)
         cores, parts = self.layer_cores(layer, TERNARY)
-        bits = ",".join("2" if at == layer else "8" for at in range(len(self.network.populations)))
-        command = f"spikeloom finetune {self.path} --data DATA --weight-bits {bits} -o OUT.pt"
+        graph = f" --graph {self.asked.graph}" if checkpoint is not None and checkpoint.edges is None else ""
+        command = f"spikeloom finetune {self.path}{graph} --data DATA --weight-bits 2 -o OUT.pt"
         ticks = 1 if parts is None else BIN_TICKS
         if checkpoint is not None:
             yield self._retrained("fine-tuned to -1, 0, 1 times a step", command, cores, ticks)
@@ -238,6 +258,18 @@ class Planner:
             accuracy=self._measured(0, Change(levels=book)),
             cores=cores,
         )
+
+    def _fewer_neighbours(self, checkpoint: Checkpoint) -> Iterator[Way]:
+        if checkpoint.taxels != len(NEUTOUCH) or self.asked.graph in (None, SPARSEST):
+            return
+        edges = build_graph(SPARSEST).edges
+        weight = expand_graph_convolution(
+            normalised_adjacency(edges, checkpoint.taxels), checkpoint.hops.astype(np.float64)
+        )
+        copies = max((m for m in COPIES if packed(weight, m, self.chip) is not None), default=TERNARY)
+        cores, _ = self.layer_cores(0, copies, weight)
+        name = f"trained on the sparsest graph, {copies} axons an input"
+        yield self._retrained(name, self._train(graph=SPARSEST), cores, 1)
 
     def _targets(self, layer: int) -> Iterator[Way]:
         targets, size = targets_of(self.network, layer, self.chip), self.network.populations[layer].size
@@ -269,8 +301,7 @@ class Planner:
         changes, total, groups = {}, 0, 0
         for layer in range(len(self.network.populations)):
             cores, parts = self.layer_cores(layer, copies)
-            targets = targets_of(self.network, layer, self.chip) * copies // TERNARY
-            leading = self.lead_cores(layer, targets)
+            leading = self.lead_cores(layer, copies)
             if cores is None or leading is None:
                 return Way(name=f"{copies} axons an input: does not fit")
             total, groups = total + cores + leading, groups + (parts is not None)
@@ -294,13 +325,13 @@ class Planner:
     def _no_decay(self, option: str) -> str:
         return self._train(f"{option} {','.join(f'{p.name}=0' for p in self.network.populations)}")
 
-    def _train(self, options: str = "") -> str:
+    def _train(self, options: str = "", *, graph: str | None = None) -> str:
         """Command that trains a network of this kind anew."""
         checkpoint, words = self.asked.checkpoint, ["spikeloom train --data DATA"]
         if checkpoint is not None and checkpoint.system != TACTILESGNET:
             words.append(f"--system {checkpoint.system}")
         if self.asked.graph and (checkpoint is None or checkpoint.system in GRAPH_SYSTEMS):
-            words.append(f"--graph {self.asked.graph}")
+            words.append(f"--graph {graph or self.asked.graph}")
         return " ".join([*words, *([options] if options else []), "-o OUT.pt"])
 
 
