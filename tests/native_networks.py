@@ -51,7 +51,7 @@ def random_events(seed, network, *, samples=2, steps=12):
 
 
 def defined_spikes(network, events) -> dict[str, np.ndarray]:
-    """Spikes (steps, neurons) of each layer of one recording (taxels, polarities, steps), as the module defines them."""
+    """Spikes (steps, neurons) of each layer for one recording (taxels, polarities, steps), as they are defined."""
     steps = events.shape[-1]
     found = {}
     for tower in network.towers:

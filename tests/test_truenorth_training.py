@@ -6,18 +6,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from native_networks import random_events, random_network
+from native_networks import random_network
 
 from compiler.dynamics import clocks_over
 from compiler.errors import ModelError, OptionError
 from compiler.truenorth.native import faults
+from compiler.truenorth.serialize import read_crossbars, write_crossbars
 from compiler.truenorth.trained import PARTS, is_trained, read_trained, write_trained
 from models.grasps import synthetic_grasps
 from models.recipes import CROSSBARS
 from models.release import write_released
 from models.surrogate import FAST_SIGMOID, Surrogate
 from models.systems import propagation_of
-from models.train import one_thread
 from models.truenorth.network import NativeArchitecture, native_network, predict, run_network, sized
 from models.truenorth.neurons import block_sums, integrate
 from runtime.cli import main
@@ -68,7 +68,9 @@ def test_sums_of_blocks_and_their_gradient():
     expected = torch.einsum("tsbi,bio->tsbo", spikes.view(5, 2, 3, 4), weight).reshape(5, 2, 15)
     torch.testing.assert_close(found, expected, rtol=0, atol=0)
     above = torch.tensor(rng.normal(size=found.shape), dtype=torch.float32)
-    for one, other in zip(*(torch.autograd.grad((x * above).sum(), (spikes, weight)) for x in (found, expected)), strict=True):
+    for one, other in zip(
+        *(torch.autograd.grad((x * above).sum(), (spikes, weight)) for x in (found, expected)), strict=True
+    ):
         torch.testing.assert_close(one, other)
 
 
@@ -161,14 +163,28 @@ def test_files_that_are_refused(tmp_path):
     assert refused(path) == "no such file; make one with spikeloom train"
     assert refused(tmp_path) == "is not a file; make one with spikeloom train"
     written(path)
-    assert refused(path, weights="clean") == (
-        "--weights clean: the file holds last, best; choose one that it holds"
-    )
+    assert refused(path, weights="clean") == ("--weights clean: the file holds last, best; choose one that it holds")
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
     assert refused(path).startswith("damaged, altered or of another version (is truncated or not a network (")
-    path.write_bytes(whole.replace(b"spikeloom train", b"spikeloom drain"[:15]) if b"spikeloom train" in whole else whole)
-    assert refused(path).startswith("damaged, altered or of another version (")
+    path.write_bytes(whole)
+    with np.load(path) as file:
+        members = {name: file[name] for name in file.files}
+    leak = "last/0/conv1/leak"
+    np.savez(tmp_path / "x.npz", **members | {leak: members[leak] + 1})
+    assert refused(tmp_path / "x.npz") == (
+        "damaged, altered or of another version (its content does not match its hash, so it was altered); copy or "
+        "train it again"
+    )
+    manifest = json.loads(str(members["manifest"]))
+    np.savez(tmp_path / "x.npz", **members | {"manifest": np.array(json.dumps(manifest | {"version": 2}))})
+    assert refused(tmp_path / "x.npz") == (
+        "damaged, altered or of another version (has format version 2, this program reads 1); copy or train it again"
+    )
+    np.savez(tmp_path / "x.npz", **members | {"manifest": np.array(json.dumps(manifest | {"towers": 0, "graph": 1}))})
+    assert refused(tmp_path / "x.npz") == (
+        "the manifest has no usable graph; the manifest has no usable towers; copy or train it again"
+    )
     first, *rest = random_network(0).towers[0]
     broken = replace(random_network(0), towers=((replace(first, level=first.level * 4), *rest),))
     written(path, networks={"last": broken})
@@ -192,7 +208,18 @@ def data(tmp_path, monkeypatch):
     return tmp_path
 
 
-SMALL = ("--system", "tactilesgnet-truenorth", "--data", "data", "--graph", "manual", "--features", "2", "--epochs", "1")
+SMALL = (
+    "--system",
+    "tactilesgnet-truenorth",
+    "--data",
+    "data",
+    "--graph",
+    "manual",
+    "--features",
+    "2",
+    "--epochs",
+    "1",
+)
 
 
 def as_json(capsys, *words):
@@ -221,8 +248,8 @@ def test_from_recordings_to_the_chip(data, capsys):
     assert found["E1"]["differences"] == 0
     assert found["correct"] == run["last"]["correct"]
     decided = as_json(capsys, "run", "x.loom", "--data", "data")
-    assert decided["correct"] == run["last"]["correct"]
-    assert as_json(capsys, "estimate", "x.loom", "--data", "data")["mean"]["ticks"] == 12 + 3
+    assert decided["accuracy"] == run["last"]["accuracy"]
+    assert as_json(capsys, "estimate", "x.loom", "--data", "data")["per_inference"]["ticks"] == 12 + 3
     # what was finished is not trained again
     (again,) = as_json(capsys, "train", *SMALL, "-o", "x.pt", "--resume")["runs"]
     assert again == run
@@ -279,8 +306,6 @@ def test_mistakes_are_told_in_one_line(data, capsys):
 def test_a_spike_that_differs_fails(data, capsys):
     as_json(capsys, "train", *SMALL, "-o", "x.pt")
     as_json(capsys, "compile", "x.pt", "--target", "truenorth", "-o", "x.loom")
-    from compiler.truenorth.serialize import read_crossbars, write_crossbars
-
     netlist = read_crossbars("x.loom")
     write_crossbars(replace(netlist, threshold=netlist.threshold + 9), "x.loom")
     assert main(["verify", "x.loom", "--checkpoint", "x.pt", "--data", "data", "--spec-samples", "0", "--json"]) == 1

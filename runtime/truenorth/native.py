@@ -302,8 +302,8 @@ def verdict_text(report: Json) -> str:
     rows = [[layer["name"], f"{layer['spikes']:,}", f"{layer['differences']:,}"] for layer in model_part["layers"]]
     return "\n".join(
         [
-            f"E0 specification = engine: {_told(spec_part['differences'])} on {spec_part['samples']} recordings",
-            f"E1 model = chip: {_told(model_part['differences'])} on {samples} recordings, every copy of every neuron",
+            f"E0 specification = engine: {_told(spec_part)}, membranes and counts too",
+            f"E1 model = chip: {_told(model_part | {'samples': samples})}, every copy of every neuron",
             table(["layer", "spikes of the model", "different"], rows),
             f"membranes that left their register: {report['membranes_saturated']:,}",
             f"accuracy of the chip: {correct} of {samples}, {100 * correct / samples:.2f} % "
@@ -314,8 +314,9 @@ def verdict_text(report: Json) -> str:
     )
 
 
-def _told(differences: int) -> str:
-    return "equal in every spike and membrane" if not differences else f"{differences:,} differences"
+def _told(level: Json) -> str:
+    on = f"on {level['samples']} recording{'s' * (level['samples'] != 1)}"
+    return f"{level['differences']:,} differences {on}" if level["differences"] else f"equal in every spike {on}"
 
 
 def is_named(path: str) -> bool:
