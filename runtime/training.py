@@ -15,12 +15,12 @@ import numpy as np
 from compiler.dynamics import clocks_over
 from compiler.errors import OptionError
 from compiler.fixedpoint import FloatArray, IntArray
-from compiler.frontends.checkpoint import read_checkpoint
+from compiler.frontends.checkpoint import Checkpoint, read_checkpoint
 from compiler.frontends.own import WEIGHTS
 from compiler.frontends.systems import TACTILESGNET, Grid
 from compiler.truenorth.native import SYSTEM as NATIVE
 from compiler.truenorth.native import USUAL_COPIES
-from compiler.truenorth.trained import read_trained, write_trained
+from compiler.truenorth.trained import Trained, read_trained, write_trained
 from models.evtouch import Recordings
 from models.graphs import Graph
 from models.recipes import MSE, RELEASED, Recipe
@@ -212,35 +212,25 @@ def recall(job: Job) -> tuple[dict[str, Any], IntArray | None]:
     OptionError
         If it holds another training, or lacks the epoch that a picture needs.
     """
-    if job.system == NATIVE:
-        return _recall_native(job)
-    found = read_checkpoint(job.output)
+    found: Checkpoint | Trained = read_trained(job.output) if job.system == NATIVE else read_checkpoint(job.output)
     record = dict(found.training or {})
     differing = _differing(job, record, found.graph)
-    ours, theirs = (None if grid is None else grid.to_json() for grid in (job.grid, found.grid))
-    if found.system != job.system or ours != theirs:
-        differing.append("system")
+    if isinstance(found, Trained):
+        differing += ["copies"] if found.network.copies != job.copies else []
+    else:
+        ours, theirs = (None if grid is None else grid.to_json() for grid in (job.grid, found.grid))
+        differing += ["system"] if found.system != job.system or ours != theirs else []
     _require_same(job, differing, found.weights)
     if not job.draws:
         return _with_file(job, record), None
+    if isinstance(found, Trained):
+        from models.truenorth.network import predict
+
+        return _with_file(job, record), predict(found.network, job.test)
     weights = {"conv1.hops": found.hops, "conv1.bias": found.conv_bias}
     weights |= {f"{dense.name}.weight": dense.weight for dense in found.dense}
     weights |= {f"{dense.name}.bias": dense.bias for dense in found.dense}
     return _with_file(job, record), _predictions(job, weights)
-
-
-def _recall_native(job: Job) -> tuple[dict[str, Any], IntArray | None]:
-    """The same of a network for TrueNorth."""
-    found = read_trained(job.output)
-    record = dict(found.training)
-    differing = _differing(job, record, found.graph)
-    differing += ["copies"] if found.network.copies != job.copies else []
-    _require_same(job, differing, found.weights)
-    if not job.draws:
-        return _with_file(job, record), None
-    from models.truenorth.network import predict
-
-    return _with_file(job, record), predict(found.network, job.test)
 
 
 def _differing(job: Job, record: Mapping[str, Any], graph: str | None) -> list[str]:

@@ -291,6 +291,9 @@ def test_mistakes_are_told_in_one_line(data, capsys):
     assert mistake(capsys, "inspect", "x.pt", "--beta", "0.3") == (
         "--beta 0.3: x.pt is a network for TrueNorth and says that itself; leave it away"
     )
+    assert mistake(capsys, "export", "x.pt", "--to", "onnx-float", "-o", "x.onnx") == (
+        "x.pt: is a network for TrueNorth, which compile, verify, inspect and join take; this is for others"
+    )
     words = ("verify", "x.loom", "--data", "data", "--checkpoint")
     assert mistake(capsys, *words, "x.pt", "--require", "E3=1") == (
         "--require E3=1: a network for TrueNorth has one model, whose every spike must be the chip's; leave it away"
