@@ -23,7 +23,11 @@ from compiler.errors import FormatError
 
 Array = np.ndarray[Any, Any]
 
-FORMATS = {"spikeloom-netlist": "cores of compartments (Loihi)", "spikeloom-crossbars": "crossbar cores (TrueNorth)"}
+FORMATS = {
+    "spikeloom-netlist": "cores of compartments (Loihi)",
+    "spikeloom-crossbars": "crossbar cores (TrueNorth)",
+    "spikeloom-native": "a network trained for TrueNorth, not yet compiled",
+}
 """What a manifest may say that an archive is."""
 
 SIZE_LIMIT = 2**32

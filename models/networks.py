@@ -64,6 +64,10 @@ class Architecture:
     system: str = TACTILESGNET
     dynamics: Dynamics = PLAIN
 
+    def network(self, propagation: NDArray[np.float64], *, seed: int = 0, surrogate: Surrogate) -> SpikingNet:
+        """An untrained network."""
+        return SpikingNet(self, propagation, seed=seed, surrogate=surrogate)
+
 
 class TagConvolution(nn.Module):
     """K-hop graph convolution with filters (K + 1, features, channels).

@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from compiler.errors import DataError
 from compiler.frontends.own import arrays_digest
 from models.evtouch import Recordings
-from models.networks import Architecture
 from models.recipes import RELEASED, Recipe
-from models.train import Trained, train
+from models.train import Sizes, Trained, train
 
 VALIDATION_SHARE = 0.2
 """Share of each class that the first training leaves out."""
@@ -94,7 +93,7 @@ def train_both(
     training: Recordings,
     test: Recordings,
     propagation: NDArray[np.float64],
-    architecture: Architecture,
+    architecture: Sizes,
     *,
     epochs: int,
     seed: int,

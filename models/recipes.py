@@ -126,6 +126,22 @@ TIMED = Recipe(
 )
 """For recordings that differ in when their events come: currents that last 20 steps, and clocks."""
 
+CROSSBARS = Recipe(
+    name="truenorth",
+    epochs=30,
+    batch=4,
+    loss=CROSS_ENTROPY,
+    gain=60.0,
+    surrogate=Surrogate(shape=FAST_SIGMOID, width=0.5, reset=False),
+    optimizer=ADAMW,
+    weight_decay=0.01,
+    learning_rate=3e-3,
+    schedule=COSINE,
+    features=16,
+    clocks=5,
+)
+"""For networks that TrueNorth holds, which have no other."""
+
 RECIPES = {recipe.name: recipe for recipe in (RELEASED, TIMED)}
 
 

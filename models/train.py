@@ -37,6 +37,10 @@ from models.optimizers import course_of, optimizer_of, set_rate
 from models.recipes import CROSS_ENTROPY, RELEASED, Recipe
 from models.resume import TrainingState, pack, read_state, unpack, write_state
 from models.schedule import EPOCHS
+from models.truenorth.network import NativeArchitecture, NativeNet
+
+Sizes = Architecture | NativeArchitecture
+Network = SpikingNet | NativeNet
 
 DEVICES = ("cpu", "cuda")
 
@@ -79,7 +83,7 @@ class Trained:
 
     Parameters
     ----------
-    architecture : Architecture
+    architecture : Architecture or NativeArchitecture
         Of the network.
     last, best : dict of arrays
         Weights after the last epoch, and after the epoch with the most correct test recordings (the first such):
@@ -92,7 +96,7 @@ class Trained:
         All epochs.
     """
 
-    architecture: Architecture
+    architecture: Sizes
     last: Weights
     best: Weights
     best_epoch: int
@@ -104,7 +108,7 @@ def train(
     training: Recordings,
     test: Recordings,
     propagation: NDArray[np.float64],
-    architecture: Architecture,
+    architecture: Sizes,
     *,
     epochs: int = EPOCHS,
     seed: int = 0,
@@ -117,7 +121,7 @@ def train(
     position: int = 0,
     after_epoch: Callable[[Epoch], None] | None = None,
 ) -> Trained:
-    """Train a `SpikingNet` from scratch, or go on with an interrupted training.
+    """Train a network from scratch, or go on with an interrupted training.
 
     Parameters
     ----------
@@ -125,7 +129,7 @@ def train(
         Both splits; `test` is only looked at.
     propagation : (taxels, taxels) or (filters, places, taxels) float64
         What the first layer sees, see :func:`models.systems.propagation_of`.
-    architecture : Architecture
+    architecture : Architecture or NativeArchitecture
         Sizes.
     epochs : int
         Passes over the training recordings.
@@ -172,7 +176,7 @@ def train(
     history: list[Epoch] = []
     weights: dict[str, Weights] = {}
     with one_thread():
-        network = SpikingNet(architecture, propagation, seed=seed, surrogate=recipe.surrogate).to(device)
+        network = architecture.network(propagation, seed=seed, surrogate=recipe.surrogate).to(device)
         optimizer = optimizer_of(recipe, network, device)
         if resume and state is not None and state.exists():
             found = read_state(state, options)
@@ -251,7 +255,7 @@ def _require_finite(loss: float, epoch: int, step: int) -> None:
 
 
 def _restore(
-    found: TrainingState, network: SpikingNet, optimizer: torch.optim.Optimizer, order: np.random.Generator
+    found: TrainingState, network: Network, optimizer: torch.optim.Optimizer, order: np.random.Generator
 ) -> tuple[list[Epoch], dict[str, Weights]]:
     """Put a state back; return its history and the weights that it kept."""
     unpack(found.arrays, network, optimizer, found.progress["rate"])
@@ -266,7 +270,7 @@ def _restore(
 
 def _state(
     options: Mapping[str, Any],
-    network: SpikingNet,
+    network: Network,
     optimizer: torch.optim.Optimizer,
     order: np.random.Generator,
     history: list[Epoch],
@@ -282,7 +286,7 @@ def _state(
     return TrainingState(options=options, progress=progress, arrays=arrays)
 
 
-def evaluate(network: SpikingNet, recordings: Recordings, recipe: Recipe = RELEASED) -> tuple[float, int]:
+def evaluate(network: Network, recordings: Recordings, recipe: Recipe = RELEASED) -> tuple[float, int]:
     """Mean loss, and how many recordings are classified correctly; equal top rates count for the lowest class."""
     loss, correct = 0.0, 0
     with torch.no_grad():
@@ -294,7 +298,7 @@ def evaluate(network: SpikingNet, recordings: Recordings, recipe: Recipe = RELEA
     return loss / len(recordings), correct
 
 
-def predict(network: SpikingNet, recordings: Recordings) -> NDArray[np.int64]:
+def predict(network: Network, recordings: Recordings) -> NDArray[np.int64]:
     """Class of each recording; equal top rates count for the lowest one."""
     found = []
     with torch.no_grad(), one_thread():
@@ -315,7 +319,7 @@ def _batches(recordings: Recordings) -> Iterator[tuple[slice, NDArray[np.uint8]]
 
 
 def _train_epoch(
-    network: SpikingNet,
+    network: Network,
     optimizer: torch.optim.Optimizer,
     recordings: Recordings,
     order: NDArray[np.int64],
@@ -333,11 +337,14 @@ def _train_epoch(
         lengths = np.array([recordings.steps_of(int(index)) for index in chosen])
         events = recordings.events[chosen][..., : lengths.max()]
         filled = lengths if lengths.min() < lengths.max() else None
-        layers = network.layers(_time_first(events).to(device))
         inside = None if filled is None else torch.tensor(filled, device=device)
-        loss = _loss(recipe, network.rates(layers, inside).cpu(), recordings.labels[chosen])
-        if recipe.penalty:
+        shown = _time_first(events).to(device)
+        if isinstance(network, SpikingNet) and recipe.penalty:
+            layers = network.layers(shown)
+            loss = _loss(recipe, network.rates(layers, inside).cpu(), recordings.labels[chosen])
             loss = loss + recipe.penalty * network.activity(layers)
+        else:
+            loss = _loss(recipe, network(shown, inside).cpu(), recordings.labels[chosen])
         found = float(loss.detach())
         _require_finite(found, epoch, step)
         loss.backward()  # type: ignore[no-untyped-call]
@@ -360,7 +367,7 @@ def rate_loss(rates: Tensor, labels: NDArray[np.int64]) -> Tensor:
     return torch.nn.functional.mse_loss(rates, target)
 
 
-def _rates(network: SpikingNet, events: NDArray[np.uint8]) -> Tensor:
+def _rates(network: Network, events: NDArray[np.uint8]) -> Tensor:
     """Spike rates on the CPU, computed where the network is."""
     rates: Tensor = network(_time_first(events).to(network.adjacency.device)).cpu()
     return rates
@@ -371,7 +378,7 @@ def _time_first(events: NDArray[np.uint8]) -> Tensor:
     return torch.from_numpy(events.transpose(3, 0, 1, 2).astype(np.float32, order="C"))
 
 
-def _check(recordings: Recordings, architecture: Architecture) -> None:
+def _check(recordings: Recordings, architecture: Sizes) -> None:
     where = f"{recordings.source}: split {recordings.split!r}"
     found, wanted = recordings.events.shape[1:3], (architecture.taxels, architecture.channels)
     if found != wanted:

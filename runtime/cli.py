@@ -72,6 +72,7 @@ from runtime.tables import show
 from runtime.trace import BoolArray
 from runtime.train_command import train
 from runtime.truenorth import commands as truenorth
+from runtime.truenorth import native
 from runtime.windows import first_part, window_asked
 
 Arguments = argparse.Namespace
@@ -108,6 +109,8 @@ def _recordings(arguments: Arguments, netlist: Netlist, *, labels_for: str | Non
 
 def _inspect(arguments: Arguments) -> Outcome:
     require_inspectable(arguments.path)
+    if native.is_named(arguments.path):
+        return native.inspect(arguments)
     if is_netlist(arguments.path):
         for name in ("beta", "theta", "weights", "run", "system"):
             value = getattr(arguments, name)
@@ -161,6 +164,8 @@ def _verify(arguments: Arguments) -> Outcome:
     from runtime.equivalence import verify
     from runtime.levels import levels_of, parse_requirements, unmet
 
+    if is_crossbars(arguments.netlist):
+        return native.verify(arguments)
     agreement = MIN_AGREEMENT if arguments.min_agreement is None else arguments.min_agreement
     if not 0 <= agreement <= 1:
         raise OptionError(f"--min-agreement {agreement}: not a share; give a number from 0 to 1")

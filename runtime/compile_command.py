@@ -23,6 +23,7 @@ from runtime.asked import Asked, asked_network
 from runtime.inputs import progress, recordings, require_place, version
 from runtime.options import MARGIN, cores_asked
 from runtime.restore import is_whole, take
+from runtime.truenorth import native
 from runtime.truenorth.refusal import refuse
 
 Json = dict[str, Any]
@@ -36,6 +37,8 @@ def compile_netlist(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json
     require_place(arguments.output, "-o", arguments)
     if is_whole(arguments):
         return take(arguments)
+    if native.is_named(arguments.checkpoint):
+        return native.compile_network(arguments)
     if arguments.target in known_targets(CROSSBARS):
         return refuse(arguments)
     if arguments.margin is not None and arguments.ranges != "observed":

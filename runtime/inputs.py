@@ -14,6 +14,7 @@ from compiler.errors import DataError, ModelError, OptionError
 from compiler.fixedpoint import FloatArray, IntArray
 from compiler.frontends.checkpoint import Checkpoint, read_checkpoint
 from compiler.frontends.systems import GRAPH_SYSTEMS, TACTILESGNET, TITLES
+from compiler.truenorth.trained import is_trained
 from models.events import BIN_S, load_data, need_labels, require_events
 from models.evtouch import Recordings
 from models.graphs import CHOICES, NEUTOUCH, Graph
@@ -231,6 +232,10 @@ def asked_checkpoint(path: str, arguments: argparse.Namespace) -> Checkpoint:
         If it is not there, or not as they say.
     """
     progress("reading the checkpoint")
+    if is_trained(shipped(path)):
+        raise ModelError(
+            f"{path}: is a network for TrueNorth, which compile, verify, inspect and join take; this is for others"
+        )
     places = asked_places(getattr(arguments, "taxels", None))
     return read_checkpoint(
         shipped(path),

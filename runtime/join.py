@@ -19,6 +19,7 @@ from compiler.serialize import is_netlist
 from runtime.finetune import stored_graph
 from runtime.inputs import require_place, shipped
 from runtime.render import tower_line
+from runtime.truenorth import joining, native
 
 SUMMARY = "put several trained networks side by side in one, whose votes add up"
 
@@ -45,6 +46,8 @@ def join(arguments: Namespace) -> tuple[Report, Callable[[Report], str], int]:
     SpikeloomError
         If a network cannot be used, or they do not fit together.
     """
+    if any(native.is_named(name) for name in arguments.checkpoints):
+        return joining.join(arguments, join_text)
     for name in arguments.checkpoints:
         require_place(arguments.output, "-o", Namespace(checkpoint=name))
     found = [_network(name, arguments.weights) for name in arguments.checkpoints]

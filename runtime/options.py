@@ -11,6 +11,8 @@ from compiler.frontends.systems import GRAPH_SYSTEMS, SYSTEMS, TACTILESGNET
 from compiler.passes.layout import GOALS
 from compiler.passes.quantize import RANGES
 from compiler.pipeline import STAGES
+from compiler.truenorth.native import BASES, USUAL_COPIES
+from compiler.truenorth.native import SYSTEM as NATIVE
 from models.graphs import CHOICES
 from models.recipes import RECIPES, RELEASED
 from models.schedule import DECAY_EPOCHS
@@ -63,9 +65,9 @@ def add_graph_options(parser: argparse.ArgumentParser, purpose: str) -> None:
     parser.add_argument("--directed", action="store_true", help="take --edges as they are, one way")
 
 
-def add_system(parser: argparse.ArgumentParser, default: str) -> None:
-    """Add the option that names a system."""
-    parser.add_argument("--system", choices=SYSTEMS, help=f"{', '.join(SYSTEMS)} ({default})")
+def add_system(parser: argparse.ArgumentParser, default: str, *more: str) -> None:
+    """Add the option that names a system: one of the usual ones, or of `more`."""
+    parser.add_argument("--system", choices=(*SYSTEMS, *more), help=f"{', '.join((*SYSTEMS, *more))} ({default})")
 
 
 def add_recordings(parser: argparse.ArgumentParser, *, window: bool = False) -> None:
@@ -139,7 +141,8 @@ def add_training(parser: argparse.ArgumentParser) -> None:
     """Add the options of a training."""
     parser.add_argument("--data", required=True, metavar="PATH", help=DATA_HELP)
     add_bin_option(parser)
-    add_system(parser, f"default: {TACTILESGNET}; {' and '.join(GRAPH_SYSTEMS)} need a graph")
+    needing = ", ".join((*GRAPH_SYSTEMS, NATIVE))
+    add_system(parser, f"default: {TACTILESGNET}; {needing} need a graph", NATIVE)
     parser.add_argument(
         "--padding",
         choices=PADDINGS,
@@ -161,6 +164,9 @@ def add_training(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--clocks", type=int, metavar="K", help="inputs that tell which K-th of the recording it is")
     parser.add_argument("--features", type=int, metavar="N", help="of the first layer, per place")
+    parser.add_argument(
+        "--copies", type=int, choices=tuple(BASES), help=f"axons of an input on TrueNorth (default: {USUAL_COPIES})"
+    )
     parser.add_argument("--batch", type=int, metavar="N", help="recordings to a step of the optimizer")
     parser.add_argument(
         "--spike-penalty", type=float, metavar="X", help="loss of a spike on every synapse in every step: fewer spikes"

@@ -11,10 +11,12 @@ from typing import Any
 from compiler.errors import OptionError
 from compiler.frontends.own import WEIGHTS
 from compiler.frontends.systems import GRAPH_SYSTEMS, GRID_CNN, TACTILESGNET, TITLES, Grid
+from compiler.truenorth.native import SYSTEM as NATIVE
+from compiler.truenorth.native import USUAL_COPIES
 from models.evtouch import Recordings
 from models.graphs import CHOICES, Graph
 from models.grasps import SYNTHETIC
-from models.recipes import RECIPES, RELEASED, STEPS, Recipe, check_recipe, decays_asked
+from models.recipes import CROSSBARS, RECIPES, RELEASED, STEPS, Recipe, check_recipe, decays_asked
 from models.systems import PADDINGS, sensor_grid, taxels_alone
 from runtime.inputs import asked_graph, asked_places, graph_words, progress, recordings, require_place, version
 from runtime.training import LAYERS, PICTURES, Job, check_seeds, draw_training, output_of, summary, training_text
@@ -102,6 +104,7 @@ def _jobs(
             system=system,
             grid=grid,
             recipe=recipe,
+            copies=arguments.copies or USUAL_COPIES,
         )
         for position, seed in enumerate(range(arguments.seed, arguments.seed + arguments.seeds))
     ]
@@ -113,7 +116,7 @@ OVERRIDES = ("current_decay", "membrane_decay", "clocks", "features", "batch", "
 
 def _recipe(arguments: argparse.Namespace) -> Recipe:
     """The recipe that was named, with the values that were given beside it."""
-    recipe = RECIPES[arguments.recipe]
+    recipe = _named_recipe(arguments)
     whole = {name: getattr(arguments, name) for name in ("clocks", "features", "batch", "decay_epochs")}
     recipe = replace(recipe, **{name: value for name, value in whole.items() if value is not None})
     if arguments.decay_epochs is not None and recipe.schedule != STEPS:
@@ -131,11 +134,30 @@ def _recipe(arguments: argparse.Namespace) -> Recipe:
     return recipe
 
 
+def _named_recipe(arguments: argparse.Namespace) -> Recipe:
+    """What was named, or the only one that a network for TrueNorth has."""
+    if arguments.system != NATIVE:
+        if arguments.copies is not None:
+            raise OptionError(f"--copies {arguments.copies}: is for --system {NATIVE}; leave it away")
+        return RECIPES[arguments.recipe]
+    for name, usual in (("recipe", RELEASED.name), ("current_decay", None), ("membrane_decay", None)):
+        if getattr(arguments, name) != usual:
+            raise OptionError(
+                f"--{name.replace('_', '-')} {getattr(arguments, name)}: a network for TrueNorth has a recipe of its "
+                "own, and nothing in it decays; leave it away"
+            )
+    if arguments.device != "cpu":
+        raise OptionError(f"--device {arguments.device}: {NATIVE} is trained on the CPU; leave it away")
+    if arguments.spike_penalty is not None:
+        raise OptionError(f"--spike-penalty {arguments.spike_penalty:g}: {NATIVE} is trained without; leave it away")
+    return CROSSBARS
+
+
 def _recipe_words(arguments: argparse.Namespace) -> str:
     """Options that name the recipe, as they would be typed; none for the released one."""
     words = [] if arguments.recipe == RELEASED.name else [f"--recipe {arguments.recipe}"]
     given = {name: getattr(arguments, name) for name in OVERRIDES}
-    usual = RECIPES[arguments.recipe]
+    usual = _named_recipe(arguments)
     words += [
         f"--{name.replace('_', '-')} {value}"
         for name, value in given.items()
@@ -147,6 +169,8 @@ def _recipe_words(arguments: argparse.Namespace) -> str:
 def _sensor(arguments: argparse.Namespace) -> tuple[Graph, Grid | None]:
     """Taxels, their graph, and the grid over them, as far as the system has these."""
     system = arguments.system or TACTILESGNET
+    if system == NATIVE:
+        system = TACTILESGNET  # and the same graphs
     if arguments.padding is not None and system != GRID_CNN:
         raise OptionError(f"--padding: is for grid-cnn, {TITLES[system]} has no window; leave it away")
     graph = asked_graph(arguments, system)
@@ -162,4 +186,6 @@ def _sensor(arguments: argparse.Namespace) -> tuple[Graph, Grid | None]:
 def _system_words(arguments: argparse.Namespace, system: str) -> str:
     """Options that name the system, as they would be typed; none for the usual one."""
     words = [] if system == TACTILESGNET else [f"--system {system}"]
-    return " ".join([*words, *([f"--padding {arguments.padding}"] if arguments.padding else [])])
+    words += [f"--padding {arguments.padding}"] if arguments.padding else []
+    words += [f"--copies {arguments.copies}"] if arguments.copies not in (None, USUAL_COPIES) else []
+    return " ".join(words)

@@ -12,11 +12,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from compiler.dynamics import clocks_over
 from compiler.errors import OptionError
 from compiler.fixedpoint import FloatArray, IntArray
-from compiler.frontends.checkpoint import read_checkpoint
+from compiler.frontends.checkpoint import Checkpoint, read_checkpoint
 from compiler.frontends.own import WEIGHTS
 from compiler.frontends.systems import TACTILESGNET, Grid
+from compiler.truenorth.native import SYSTEM as NATIVE
+from compiler.truenorth.native import USUAL_COPIES
+from compiler.truenorth.trained import Trained, read_trained, write_trained
 from models.evtouch import Recordings
 from models.graphs import Graph
 from models.recipes import MSE, RELEASED, Recipe
@@ -25,7 +29,7 @@ from runtime.intervals import wilson
 from runtime.tables import table
 
 if TYPE_CHECKING:
-    from models.networks import Architecture
+    from models.train import Sizes
 
 LAYERS = ("conv1", "fc1", "fc2", "fc3")
 """Layers of the networks that are trained."""
@@ -60,11 +64,13 @@ class Job:
     position : int
         Row of the progress bar.
     system : str
-        One of :data:`compiler.frontends.systems.SYSTEMS`.
+        One of :data:`compiler.frontends.systems.SYSTEMS`, or the one for TrueNorth.
     grid : Grid, optional
         Of a grid-based CNN.
     recipe : Recipe
         How it is trained.
+    copies : int
+        Of an input, for TrueNorth.
     """
 
     training: Recordings
@@ -83,14 +89,17 @@ class Job:
     system: str = TACTILESGNET
     grid: Grid | None = None
     recipe: Recipe = RELEASED
+    copies: int = USUAL_COPIES
 
     def propagation(self) -> FloatArray:
         """What the first layer sees."""
-        taxels = self.graph.n_taxels
-        return propagation_of(self.system, self.graph.edges, taxels, self.grid, filters_of(self.system, taxels, HOPS))
+        taxels, system = self.graph.n_taxels, TACTILESGNET if self.system == NATIVE else self.system
+        return propagation_of(system, self.graph.edges, taxels, self.grid, filters_of(system, taxels, HOPS))
 
-    def architecture(self) -> Architecture:
+    def architecture(self) -> Sizes:
         """Sizes and dynamics of the network, which the recordings decide, too."""
+        if self.system == NATIVE:
+            return self._native()
         from models.networks import Architecture
 
         plain = Architecture(
@@ -101,6 +110,18 @@ class Job:
             hops=self.recipe.hops,
         )
         return replace(plain, dynamics=self.recipe.dynamics(LAYERS, plain.beta, self.training.steps))
+
+    def _native(self) -> Sizes:
+        from models.truenorth.network import sized
+
+        return sized(
+            taxels=self.graph.n_taxels,
+            classes=int(self.training.labels.max()) + 1,
+            hops=self.recipe.hops,
+            features=self.recipe.features,
+            copies=self.copies,
+            clocks=clocks_over(self.recipe.clocks, self.training.steps),
+        )
 
 
 def output_of(output: str, seed: int, seeds: int) -> Path:
@@ -138,6 +159,7 @@ def run_job(job: Job) -> tuple[dict[str, Any], IntArray | None]:
     """
     from models.checkpoint import save_checkpoint, training_record
     from models.protocols import train_both
+    from models.truenorth.network import NativeArchitecture, native_network
 
     architecture = job.architecture()
     reported = train_both(
@@ -159,17 +181,22 @@ def run_job(job: Job) -> tuple[dict[str, Any], IntArray | None]:
     trained = reported.trained
     assert trained.kept is not None, "the clean epoch is one of the epochs"
     held = {"last": trained.last, "best": trained.best, "clean": trained.kept}
-    save_checkpoint(
-        job.output,
-        {which: held[which] for which in WEIGHTS if which in job.keep},
-        job.graph,
-        beta=architecture.beta,
-        theta=architecture.theta,
-        training=record,
-        system=job.system,
-        grid=job.grid,
-        dynamics=architecture.dynamics,
-    )
+    kept = {which: held[which] for which in WEIGHTS if which in job.keep}
+    if isinstance(architecture, NativeArchitecture):
+        networks = {which: native_network(architecture, arrays) for which, arrays in kept.items()}
+        write_trained(job.output, networks, graph=job.graph.name, edges=job.graph.edges, training=record)
+    else:
+        save_checkpoint(
+            job.output,
+            kept,
+            job.graph,
+            beta=architecture.beta,
+            theta=architecture.theta,
+            training=record,
+            system=job.system,
+            grid=job.grid,
+            dynamics=architecture.dynamics,
+        )
     for file in state_of(job):
         file.unlink(missing_ok=True)
     return _with_file(job, record), _predictions(job, trained.last) if job.draws else None
@@ -185,10 +212,31 @@ def recall(job: Job) -> tuple[dict[str, Any], IntArray | None]:
     OptionError
         If it holds another training, or lacks the epoch that a picture needs.
     """
+    found: Checkpoint | Trained = read_trained(job.output) if job.system == NATIVE else read_checkpoint(job.output)
+    record = dict(found.training or {})
+    differing = _differing(job, record, found.graph)
+    if isinstance(found, Trained):
+        differing += ["copies"] if found.network.copies != job.copies else []
+    else:
+        ours, theirs = (None if grid is None else grid.to_json() for grid in (job.grid, found.grid))
+        differing += ["system"] if found.system != job.system or ours != theirs else []
+    _require_same(job, differing, found.weights)
+    if not job.draws:
+        return _with_file(job, record), None
+    if isinstance(found, Trained):
+        from models.truenorth.network import predict
+
+        return _with_file(job, record), predict(found.network, job.test)
+    weights = {"conv1.hops": found.hops, "conv1.bias": found.conv_bias}
+    weights |= {f"{dense.name}.weight": dense.weight for dense in found.dense}
+    weights |= {f"{dense.name}.bias": dense.bias for dense in found.dense}
+    return _with_file(job, record), _predictions(job, weights)
+
+
+def _differing(job: Job, record: Mapping[str, Any], graph: str | None) -> list[str]:
+    """In what a finished training is another one."""
     from models.protocols import data_digest
 
-    found = read_checkpoint(job.output)
-    record = dict(found.training or {})
     wanted = {
         "epochs": job.epochs,
         "seed": job.seed,
@@ -196,27 +244,23 @@ def recall(job: Job) -> tuple[dict[str, Any], IntArray | None]:
         "device": job.device,
     }
     differing = [name.removesuffix("_sha256") for name, value in wanted.items() if record.get(name) != value]
-    if found.graph != job.graph.name:
+    if graph != job.graph.name:
         differing.append("graph")
     if record.get("recipe", RELEASED.to_json()) != job.recipe.to_json():
         differing.append("recipe")
-    ours, theirs = (None if grid is None else grid.to_json() for grid in (job.grid, found.grid))
-    if found.system != job.system or ours != theirs:
-        differing.append("system")
+    return differing
+
+
+def _require_same(job: Job, differing: list[str], weights: str) -> None:
+    """Refuse another training, and one without the epoch that a picture needs."""
     if differing:
         raise OptionError(
             f"{job.output}: holds another training (other {', '.join(differing)}); give its options, or another -o"
         )
-    if not job.draws:
-        return _with_file(job, record), None
-    if found.weights != "last":
+    if job.draws and weights != "last":
         raise OptionError(
             f"{job.output}: was written without its last epoch, which --picture draws; leave --picture away"
         )
-    weights = {"conv1.hops": found.hops, "conv1.bias": found.conv_bias}
-    weights |= {f"{dense.name}.weight": dense.weight for dense in found.dense}
-    weights |= {f"{dense.name}.bias": dense.bias for dense in found.dense}
-    return _with_file(job, record), _predictions(job, weights)
 
 
 def _with_file(job: Job, record: Mapping[str, Any]) -> dict[str, Any]:
@@ -225,10 +269,15 @@ def _with_file(job: Job, record: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _predictions(job: Job, weights: Mapping[str, Any]) -> IntArray:
-    from models.networks import SpikingNet
+    from models.networks import Architecture, SpikingNet
     from models.train import predict
+    from models.truenorth.network import native_network
+    from models.truenorth.network import predict as predict_native
 
-    network = SpikingNet(job.architecture(), job.propagation())
+    architecture = job.architecture()
+    if not isinstance(architecture, Architecture):
+        return predict_native(native_network(architecture, weights), job.test)
+    network = SpikingNet(architecture, job.propagation())
     network.load_weights(weights)
     return predict(network, job.test)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,9 +16,13 @@ from compiler.truenorth.rules import signed_range
 from runtime.truenorth import kernel
 from runtime.truenorth.spec import Neuron, neuron_tick
 from runtime.truenorth.trace import Counts, EventArray, Trace, check_channels
+from runtime.truenorth.twins import Twins, find_twins
 
 SETTLING = 64
 """Ticks within which a neuron without input must come to rest to be let sleep."""
+
+LONGEST_GAP = 8
+"""Steady neurons that an axon may skip within a row of weights; so many zeros are added as fast as one number."""
 
 MOST_TICKS = 2**31
 
@@ -30,75 +34,122 @@ class Engine:
     Parameters
     ----------
     netlist : CrossbarNetlist
+    twins : Twins
+        Neurons and axons that are alike; the kernel runs one of each kind.
     low, high : int
         Range of the membrane register.
     slots : int
         Power of two above every delay.
     wiring : Wiring
-    burst_axon : (burst axons, 3) int64
-        Row of the offset, channel and axon of each that nothing else reaches.
     """
 
     netlist: CrossbarNetlist
+    twins: Twins
     low: int
     high: int
     slots: int
     wiring: kernel.Wiring
-    burst_axon: IntArray
 
 
 def prepare(netlist: CrossbarNetlist) -> Engine:
     """Arrange a network that breaks no rule of its chip for the kernel."""
     bits = load_target(netlist.target, CROSSBARS).limit("neuron.membrane_bits")
     low, high = signed_range(bits)
-    neuron, axon = netlist.neuron_of_synapse(), netlist.axon_of_synapse()
-    weight = netlist.weight[neuron, netlist.axon_type[axon]]
-    halves = np.where(weight > 0, weight << kernel.HALF, -weight)
-    wired = netlist.axons_at(netlist.cores_at(netlist.wire_x, netlist.wire_y), netlist.wire_line)
-    clocked = netlist.axons_at(netlist.clock_core, netlist.clock_line)
-    fed = netlist.axons_at(netlist.feed_core, netlist.feed_line)
+    twins, steady = _steady_first(netlist, find_twins(netlist, kernel.HALF), low, high)
+    first, axons = twins.first_neuron, len(twins.first_axon)
+    wired = twins.axon[netlist.axons_at(netlist.cores_at(netlist.wire_x, netlist.wire_y), netlist.wire_line)]
+    ticking, clocked = _held(twins, netlist.axons_at(netlist.clock_core, netlist.clock_line))
+    rows, fed = _held(twins, netlist.axons_at(netlist.feed_core, netlist.feed_line))
+    offsets, offset = np.unique(netlist.feed_tick[rows], return_inverse=True)
+    key = offset.reshape(-1) * netlist.n_inputs + netlist.feed_channel[rows]
+    order = np.argsort(key, kind="stable")
+    ends = np.searchsorted(key[order], np.arange(len(offsets) * netlist.n_inputs + 1))
+    starts = np.arange(len(offsets))[:, None] * netlist.n_inputs + np.arange(netlist.n_inputs + 1)
 
-    # channels that are alone on their axons reach the neurons behind them at once
-    offsets, offset = np.unique(netlist.feed_tick, return_inverse=True)
-    key = offset.reshape(-1) * netlist.n_inputs + netlist.feed_channel
-    alone = np.bincount(np.concatenate([wired, clocked, fed]), minlength=netlist.n_axons)[fed] == 1
-    owner = np.full(netlist.n_axons, -1)
-    owner[fed[alone]] = key[alone]
-    bursts = np.flatnonzero(owner[axon] >= 0)
-    pairs, pair = np.unique(np.stack([owner[axon[bursts]], neuron[bursts]]), axis=1, return_inverse=True)
-    burst_weight = np.zeros(pairs.shape[1], np.int64)
-    np.add.at(burst_weight, pair.reshape(-1), halves[bursts])
-    rest = np.argsort(key[~alone], kind="stable")
-
-    def bounds(keys: IntArray) -> IntArray:
-        ends = np.searchsorted(keys, np.arange(len(offsets) * netlist.n_inputs + 1))
-        starts = np.arange(len(offsets))[:, None] * netlist.n_inputs + np.arange(netlist.n_inputs + 1)
-        found: IntArray = ends[starts].astype(np.int64)
-        return found
-
+    near = twins.synapse_neuron < steady
+    axon, neuron, halves = (column[near] for column in _synapses(twins))
+    bounds, segments, row = _segments(axon, neuron, halves, axons)
+    axon, neuron, halves = (column[~near] for column in _synapses(twins))
+    registers = (netlist.leak, netlist.threshold, netlist.reset, -netlist.negative_threshold)
     wiring = kernel.Wiring(
         offsets=offsets.astype(np.int64),
-        feed_bounds=bounds(key[~alone][rest]),
-        feed_axon=fed[~alone][rest].astype(np.int32),
-        burst_bounds=bounds(pairs[0]),
-        burst_neuron=pairs[1].astype(np.int32),
-        burst_weight=burst_weight,
-        clocks=np.stack([clocked, netlist.clock_period, netlist.clock_phase], axis=1),
-        axon_synapses=np.array(netlist.axon_synapses),
+        feed_bounds=ends[starts].astype(np.int64),
+        feed_axon=fed[order].astype(np.int32),
+        clocks=np.stack([clocked, netlist.clock_period[ticking], netlist.clock_phase[ticking]], axis=1),
+        segment_bounds=bounds,
+        segments=segments,
+        row=row,
+        steady=np.stack([register[first[:steady]] for register in registers]).astype(np.int32),
+        axon_synapses=np.searchsorted(axon, np.arange(axons + 1)).astype(np.int64),
         synapse_neuron=neuron.astype(np.int32),
         synapse_weight=halves,
-        parameters=_parameters(netlist, wired, bits),
-        instant=_instant(netlist, neuron, weight, high),
-        initial=netlist.initial.astype(np.int32),
+        number=first.astype(np.int64),
+        parameters=_parameters(netlist, wired, bits)[first],
+        instant=_instant(netlist, high)[first],
+        initial=netlist.initial[first].astype(np.int32),
     )
     return Engine(
         netlist=netlist,
+        twins=twins,
         low=low,
         high=high,
         slots=1 << int(netlist.wire_delay.max(initial=1)).bit_length(),
         wiring=wiring,
-        burst_axon=np.stack([*np.divmod(key[alone], netlist.n_inputs), fed[alone]], axis=1),
     )
+
+
+def _synapses(twins: Twins) -> tuple[IntArray, IntArray, IntArray]:
+    return twins.synapse_axon, twins.synapse_neuron, twins.synapse_halves
+
+
+def _steady_first(netlist: CrossbarNetlist, twins: Twins, low: int, high: int) -> tuple[Twins, int]:
+    """The same kinds with steady neurons first, and how many of them there are.
+
+    Steady are those without random numbers and reversal that are reset to a value and held at their negative
+    threshold, if their registers and all that can reach them in a tick leave the membrane within its range.
+    """
+    first = twins.first_neuron
+    positive, negative = (
+        np.bincount(twins.synapse_neuron, part, len(first))
+        for part in (twins.synapse_halves >> kernel.HALF, twins.synapse_halves & kernel.LOWER)
+    )
+    plain = (netlist.mask_bits == 0) & (netlist.leak_reversal == 0) & (netlist.reset_mode == RESET_TO)
+    ends = netlist.reset, netlist.initial
+    most = np.maximum.reduce([netlist.threshold - 1, *ends])[first] + positive + np.maximum(netlist.leak, 0)[first]
+    least = np.minimum.reduce([-netlist.negative_threshold, *ends])[first] - negative
+    least += np.minimum(netlist.leak, 0)[first]
+    steady = (plain & (netlist.negative_saturates == 1))[first] & (most <= high) & (least >= low)
+    order = np.argsort(~steady, kind="stable")
+    rank = np.argsort(order)
+    ends_at = rank[twins.synapse_neuron]
+    by_axon = np.lexsort((ends_at, twins.synapse_axon))
+    ordered = replace(
+        twins,
+        neuron=rank[twins.neuron],
+        first_neuron=first[order],
+        synapse_axon=twins.synapse_axon[by_axon],
+        synapse_neuron=ends_at[by_axon],
+        synapse_halves=twins.synapse_halves[by_axon],
+    )
+    return ordered, int(np.count_nonzero(steady))
+
+
+def _segments(
+    axon: IntArray, neuron: IntArray, halves: IntArray, axons: int
+) -> tuple[IntArray, IntArray, kernel.Int32]:
+    """Synapses (by axon, then neuron) as rows of neighbours; bounds by axon, (segments, 3), and the weights."""
+    weight = (halves >> kernel.HALF) - (halves & kernel.LOWER)
+    starts = np.ones(len(axon), np.bool_)
+    starts[1:] = (np.diff(axon) != 0) | (np.diff(neuron) > LONGEST_GAP)
+    begins = np.flatnonzero(starts)
+    last = np.append(begins[1:], len(axon))[: len(begins)] - 1
+    lengths = neuron[last] + 1 - neuron[begins]
+    at = np.cumsum(lengths) - lengths
+    row = np.zeros(int(lengths.sum()), np.int32)
+    segment = np.cumsum(starts) - 1
+    row[at[segment] + neuron - neuron[begins][segment]] = weight
+    bounds = np.searchsorted(axon[begins], np.arange(axons + 1)).astype(np.int64)
+    return bounds, np.stack([neuron[begins], neuron[last] + 1, at], axis=1).astype(np.int64), row
 
 
 def _parameters(netlist: CrossbarNetlist, wired: IntArray, bits: int) -> kernel.Int32:
@@ -139,8 +190,16 @@ def _rests(netlist: CrossbarNetlist, bits: int) -> IntArray:
     return found[which.reshape(-1)]
 
 
-def _instant(netlist: CrossbarNetlist, neuron: IntArray, weight: IntArray, high: int) -> kernel.Int32:
+def _held(twins: Twins, aims: IntArray) -> tuple[IntArray, IntArray]:
+    """Rows of a table that lead to the first axon of a kind, and that kind; those of its twins say the same."""
+    rows = np.flatnonzero(twins.first_axon[twins.axon[aims]] == aims)
+    return rows, twins.axon[aims[rows]]
+
+
+def _instant(netlist: CrossbarNetlist, high: int) -> kernel.Int32:
     """Leak of the neurons that :func:`compiler.truenorth.draft.history_free` describes; 0 for all others."""
+    neuron, axon = netlist.neuron_of_synapse(), netlist.axon_of_synapse()
+    weight = netlist.weight[neuron, netlist.axon_type[axon]]
     sums = [np.bincount(neuron, np.maximum(sign * weight, 0), netlist.n_neurons) for sign in (1, -1)]
     plain = (netlist.leak < 0) & (netlist.reset_mode == RESET_TO) & (np.maximum(*sums) - netlist.leak <= high)
     for name in ("leak_reversal", "threshold", "mask_bits", "reset", "negative_threshold", "initial"):
@@ -187,9 +246,9 @@ def simulate(
     most = netlist.ticks(whole)
     if most >= MOST_TICKS:
         raise NumericRangeError(f"recordings of {whole} data steps take {most} ticks, {MOST_TICKS - 1} can be counted")
-    neurons = netlist.n_neurons
-    fed = np.zeros((samples, len(engine.wiring.offsets), channels), np.int64)
-    axons = np.zeros((samples, netlist.n_axons), np.int64)
+    twins = engine.twins
+    neurons = len(twins.first_neuron)
+    axons = np.zeros((samples, len(twins.first_axon)), np.int64)
     spiked, votes, overflows = np.zeros((3, samples, neurons), np.int64)
     raster = np.zeros((samples, most if spikes else 0, neurons), np.bool_)
     held = np.zeros((samples, most if membranes else 0, neurons), np.int32)
@@ -198,7 +257,7 @@ def simulate(
     def one(sample: int) -> None:
         heard = np.ascontiguousarray(events[sample, :, : steps[sample]].T).astype(np.uint8)
         inputs[sample] = np.count_nonzero(heard, axis=0)
-        arrays = (fed, axons, spiked, votes, overflows, raster, held)
+        arrays = (axons, spiked, votes, overflows, raster, held)
         merged[sample] = kernel.run(
             heard,
             netlist.bin_ticks,
@@ -213,15 +272,17 @@ def simulate(
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         list(pool.map(one, range(samples)))
-    offset, channel, axon = engine.burst_axon.T
-    axons[:, axon] = fed[:, offset, channel]
     counts = Counts(
         ticks=steps * netlist.bin_ticks + netlist.drain,
         inputs=inputs,
-        spikes=spiked,
-        votes=votes,
-        axons=axons,
+        spikes=spiked[:, twins.neuron],
+        votes=votes[:, twins.neuron],
+        axons=axons[:, twins.axon],
         merged=merged,
-        overflows=overflows,
+        overflows=overflows[:, twins.neuron],
     )
-    return Trace(counts=counts, spikes=raster if spikes else None, membranes=held if membranes else None)
+    return Trace(
+        counts=counts,
+        spikes=raster[:, :, twins.neuron] if spikes else None,
+        membranes=held[:, :, twins.neuron] if membranes else None,
+    )

@@ -1,7 +1,9 @@
 """Machine code of the engine: one recording, all its ticks; :mod:`runtime.truenorth.engine` makes the arrays.
 
 Work follows events: a tick visits the axons that have a spike and the neurons that are reached or awake. A neuron
-sleeps while a tick without arrivals would change nothing about it.
+sleeps while a tick without arrivals would change nothing about it. *Steady* neurons, the first ones, do the plainest
+thing and provably never leave their register: they live through every tick, all at once, and what an axon brings them
+is added in rows of neighbours.
 """
 
 from __future__ import annotations
@@ -55,20 +57,23 @@ class Wiring(NamedTuple):
     feed_bounds : (offsets, channels + 1) int64
         Rows of `feed_axon` that a channel feeds at an offset.
     feed_axon : (feeds,) int32
-        Axons that are fed and that something else may reach, too.
-    burst_bounds : (offsets, channels + 1) int64
-        Rows of the next two, likewise.
-    burst_neuron : (bursts,) int32
-        Neurons that a channel reaches through axons that nothing else reaches.
-    burst_weight : (bursts,) int64
-        What that adds, in halves.
     clocks : (clocks, 3) int64
         Axon, period, phase.
+    segment_bounds : (axons + 1,) int64
+        Segments of each axon.
+    segments : (segments, 3) int64
+        First steady neuron, the one after the last, and where in `row` the weights for them begin.
+    row : (…) int32
+        Weights of segments, zero where nothing is joined.
+    steady : (4, steady) int32
+        Leak, threshold, reset and the negative threshold below zero.
     axon_synapses : (axons + 1,) int64
+        Crossing points with all other neurons.
     synapse_neuron : (synapses,) int32
-        Neuron id of each crossing point.
     synapse_weight : (synapses,) int64
         In halves.
+    number : (neurons,) int64
+        Which neuron of the network it is, whose random numbers it draws.
     parameters : (neurons, 12) int32
     instant : (neurons,) int32
         The leak, below zero, of neurons that start each tick at zero and spike where they do not end it below zero;
@@ -79,13 +84,15 @@ class Wiring(NamedTuple):
     offsets: IntArray
     feed_bounds: IntArray
     feed_axon: Int32
-    burst_bounds: IntArray
-    burst_neuron: Int32
-    burst_weight: IntArray
     clocks: IntArray
+    segment_bounds: IntArray
+    segments: IntArray
+    row: Int32
+    steady: Int32
     axon_synapses: IntArray
     synapse_neuron: Int32
     synapse_weight: IntArray
+    number: IntArray
     parameters: Int32
     instant: Int32
     initial: Int32
@@ -95,6 +102,8 @@ class State(NamedTuple):
     """What changes: membranes, arrivals, who works this tick, and spikes on their way by the slot of their tick."""
 
     membrane: Int32
+    steady_sum: Int32
+    steady_spike: npt.NDArray[np.uint8]
     arrived: IntArray
     listed: npt.NDArray[np.bool_]
     work: Int32
@@ -106,7 +115,6 @@ class State(NamedTuple):
 class Tallies(NamedTuple):
     """Counts of a recording, and its traces, empty where they are not wanted."""
 
-    fed: IntArray
     axons: IntArray
     spikes: IntArray
     votes: IntArray
@@ -173,24 +181,27 @@ def _queue(state: Any, slot: Any, axon: Any) -> Any:
 
 
 @compiled
-def _inject(events: Any, bin_ticks: Any, tick: Any, slot: Any, wiring: Any, state: Any, fed: Any, working: Any) -> Any:
-    """Events and clocks of this tick; returns the neurons that work, and the merged spikes."""
+def _inject(events: Any, bin_ticks: Any, tick: Any, slot: Any, wiring: Any, state: Any) -> Any:
+    """Events and clocks of this tick; returns the merged spikes."""
     merged = 0
     for k in range(len(wiring.offsets)):
         since = tick - wiring.offsets[k]
         if since < 0 or since % bin_ticks != 0 or since // bin_ticks >= len(events):
             continue
         for channel in np.flatnonzero(events[since // bin_ticks]):
-            fed[k, channel] += 1
-            for s in range(wiring.burst_bounds[k, channel], wiring.burst_bounds[k, channel + 1]):
-                working = _reach(state, wiring.burst_neuron[s], wiring.burst_weight[s], working)
             for row in range(wiring.feed_bounds[k, channel], wiring.feed_bounds[k, channel + 1]):
                 merged += _queue(state, slot, wiring.feed_axon[row])
     for k in range(len(wiring.clocks)):
         axon, period, phase = wiring.clocks[k]
         if tick >= phase and (tick - phase) % period == 0:
             merged += _queue(state, slot, axon)
-    return working, merged
+    return merged
+
+
+@compiled
+def _add(total: Any, term: Any) -> None:
+    for i in range(len(total)):
+        total[i] += term[i]
 
 
 @compiled
@@ -200,6 +211,9 @@ def _integrate(slot: Any, wiring: Any, state: Any, axons: Any, working: Any) -> 
         axon = state.due[slot, k]
         state.flagged[slot, axon] = False
         axons[axon] += 1
+        for s in range(wiring.segment_bounds[axon], wiring.segment_bounds[axon + 1]):
+            first, end, at = wiring.segments[s, 0], wiring.segments[s, 1], wiring.segments[s, 2]
+            _add(state.steady_sum[first:end], wiring.row[at : at + end - first])
         for s in range(wiring.axon_synapses[axon], wiring.axon_synapses[axon + 1]):
             working = _reach(state, wiring.synapse_neuron[s], wiring.synapse_weight[s], working)
     state.dues[slot] = 0
@@ -211,7 +225,7 @@ def _update(n: Any, tick: Any, seed: Any, low: Any, high: Any, sums: Any, wiring
     """A tick of a neuron that remembers: whether it spiked, and whether it may sleep."""
     p = wiring.parameters
     leak, threshold, below = np.int64(p[n, LEAK]), np.int64(p[n, THRESHOLD]), np.int64(p[n, NEGATIVE])
-    random = draw(seed, n, tick, p[n, MASK_BITS]) if p[n, MASK_BITS] else np.int64(0)
+    random = draw(seed, wiring.number[n], tick, p[n, MASK_BITS]) if p[n, MASK_BITS] else np.int64(0)
     before, positive, negative = np.int64(state.membrane[n]), sums >> HALF, sums & LOWER
     summed = min(max(before + positive - negative, low), high)
     wanted = leaked(summed, leak, p[n, REVERSAL])
@@ -226,6 +240,32 @@ def _update(n: Any, tick: Any, seed: Any, low: Any, high: Any, sums: Any, wiring
     return spiked, sleeps and p[n, MASK_BITS] == 0
 
 
+@compiled
+def _update_steady(membrane: Any, sums: Any, leak: Any, threshold: Any, reset: Any, lowest: Any, spikes: Any) -> None:
+    """A tick of all steady neurons; one-dimensional arrays, so that the compiler vectorises the loop."""
+    for n in range(len(sums)):
+        v = np.int32(membrane[n] + sums[n] + leak[n])
+        sums[n] = 0
+        spiked = v >= threshold[n]
+        spikes[n] = spiked
+        membrane[n] = reset[n] if spiked else max(v, lowest[n])
+
+
+@compiled
+def _send(n: Any, tick: Any, ticks: Any, window: Any, slots: Any, wiring: Any, state: Any, tallies: Any) -> Any:
+    """Count a spike and lead it on; 1 where it merges with another before the last tick."""
+    tallies.spikes[n] += 1
+    if len(tallies.raster):
+        tallies.raster[tick, n] = True
+    first = wiring.parameters[n, VOTES_FROM]
+    tallies.votes[n] += 0 <= first <= tick < first + window
+    if wiring.parameters[n, WIRE_AXON] < 0:
+        return 0
+    later = tick + wiring.parameters[n, WIRE_DELAY]
+    twice = _queue(state, later & (slots - 1), wiring.parameters[n, WIRE_AXON])
+    return twice * (later < ticks)
+
+
 @compiled_and_cached
 def run(
     events: Any, bin_ticks: int, ticks: int, seed: Any, low: int, high: int, slots: int, wiring: Any, tallies: Any
@@ -236,21 +276,31 @@ def run(
     the slot of its lowest bits.
     """
     neurons, axons, window = len(wiring.initial), len(tallies.axons), len(events) * bin_ticks
+    leak, threshold, reset, lowest = wiring.steady[0], wiring.steady[1], wiring.steady[2], wiring.steady[3]
+    steady = len(leak)
     state = State(
         wiring.initial.copy(),
+        np.zeros(steady, np.int32),
+        np.zeros(steady, np.uint8),
         np.zeros(neurons, np.int64),
         np.ones(neurons, np.bool_),
-        np.arange(neurons).astype(np.int32),
+        np.empty(neurons, np.int32),
         np.empty((slots, axons), np.int32),
         np.zeros(slots, np.int64),
         np.zeros((slots, axons), np.bool_),
     )
-    working, merged = neurons, 0  # all are awake at first
+    working, merged = neurons - steady, 0  # all are awake at first
+    for k in range(working):
+        state.work[k] = steady + k
     for tick in range(ticks):
         slot = tick & (slots - 1)
-        working, more = _inject(events, bin_ticks, tick, slot, wiring, state, tallies.fed, working)
-        merged += more
+        merged += _inject(events, bin_ticks, tick, slot, wiring, state)
         working = _integrate(slot, wiring, state, tallies.axons, working)
+        held = state.membrane[:steady]
+        _update_steady(held, state.steady_sum, leak, threshold, reset, lowest, state.steady_spike)
+        for n in range(steady):
+            if state.steady_spike[n]:
+                merged += _send(n, tick, ticks, window, slots, wiring, state, tallies)
         awake = 0
         for k in range(working):
             n = state.work[k]
@@ -266,15 +316,7 @@ def run(
                 state.work[awake] = n  # never ahead of k
                 awake += 1
             if spiked:
-                tallies.spikes[n] += 1
-                if len(tallies.raster):
-                    tallies.raster[tick, n] = True
-                first = wiring.parameters[n, VOTES_FROM]
-                tallies.votes[n] += 0 <= first <= tick < first + window
-                if wiring.parameters[n, WIRE_AXON] >= 0:
-                    later = tick + wiring.parameters[n, WIRE_DELAY]
-                    twice = _queue(state, later & (slots - 1), wiring.parameters[n, WIRE_AXON])
-                    merged += twice * (later < ticks)
+                merged += _send(n, tick, ticks, window, slots, wiring, state, tallies)
         working = awake
         if len(tallies.membranes):
             tallies.membranes[tick] = state.membrane

@@ -28,6 +28,19 @@ TRIED = 72
 """Training recordings that ways out are measured on, evenly spaced."""
 
 
+def require_crossbar_options(arguments: argparse.Namespace) -> None:
+    """Refuse options that only Loihi has.
+
+    Raises
+    ------
+    OptionError
+        Naming the first.
+    """
+    for name, absent in (ROUNDING | PLACING).items():
+        if getattr(arguments, name) != absent:
+            raise OptionError(f"--{name.replace('_', '-')}: is for loihi1, not for truenorth; leave it away")
+
+
 def refuse(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
     """Say why a network does not fit: the report, how to print it, and exit code 2.
 
@@ -36,9 +49,7 @@ def refuse(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], 
     OptionError, ModelError, DataError
         If the options, the network or the recordings cannot be used.
     """
-    for name, absent in (ROUNDING | PLACING).items():
-        if getattr(arguments, name) != absent:
-            raise OptionError(f"--{name.replace('_', '-')}: is for loihi1, not for truenorth; leave it away")
+    require_crossbar_options(arguments)
     chip = load_target(arguments.target, CROSSBARS)
     asked = asked_network(arguments.checkpoint, arguments)
     if asked.network.input.clocks.channels:

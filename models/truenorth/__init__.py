@@ -1,0 +1,1 @@
+"""Networks trained for TrueNorth: whatever the chip rounds or limits is rounded and limited in training."""

@@ -1,0 +1,383 @@
+"""A TactileSGNet that TrueNorth holds: whole weights of few levels, blocks of few inputs, neurons that only add.
+
+The graph convolution hears the sensor as ever: its filters are shared by all taxels, and expanded to a weight for each
+channel and neuron. Its features are dealt to groups, so that every group of the first dense layer sees the whole skin
+in a few of them; each group of the second hears a share of every group of the first; the output neurons vote, several
+for each class in every group. The dense layers hear the clocks, which the chip gives them from outside.
+
+What the chip rounds is rounded in every pass, and the gradient goes past the rounding as if it were not there: what is
+trained is what the chip computes, :class:`compiler.truenorth.native.NativeNetwork`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from compiler.dynamics import NO_CLOCKS, Clocks
+from compiler.errors import OptionError
+from compiler.targets import CROSSBARS, load_target
+from compiler.truenorth.native import (
+    LEAK_MOST,
+    THRESHOLD_MOST,
+    UNIT,
+    NativeNetwork,
+    Stage,
+    highest_level,
+)
+from models.evtouch import Recordings
+from models.surrogate import RECTANGLE, Surrogate
+from models.truenorth.neurons import block_sums, integrate
+
+CHIP = "truenorth"
+
+CONV = "conv1"
+
+CONV_GAIN, GAIN = 4.0, 2.7
+"""Initial weights lie within this over the root of a neuron's inputs (of one taxel's channels in the convolution),
+thresholds being 1: membranes that only add reach them every ten to twenty steps."""
+
+LEAST_THRESHOLD = 8
+"""In a threshold of fewer whole numbers no weight and no drift has room."""
+
+SPREADS = {2: 1.53, 3: 0.8, 4: 0.42}
+"""Distance of two levels, in mean magnitudes of a neuron's weights, which rounds a normal distribution best [1]_.
+
+References
+----------
+.. [1] J. Max, "Quantizing for Minimum Distortion", IRE Transactions on Information Theory 6(1), 1960: uniform
+   quantisers with 3, 7 and 15 levels.
+"""
+
+Arrays = dict[str, NDArray[np.float32]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NativeArchitecture:
+    """Sizes of a `NativeNet`.
+
+    Parameters
+    ----------
+    taxels, classes : int
+        Sensor points and classes.
+    channels : int
+        Inputs per taxel (polarities).
+    hops : int
+        K of the graph convolution.
+    features : int
+        Of the convolution, per taxel; a multiple of `groups`.
+    groups : int
+        Blocks of each dense layer.
+    hidden : tuple of int
+        Neurons of each group before the last layer; multiples of `groups`.
+    voters : int
+        Output neurons of a class in each group.
+    copies : int
+        Axons of an input, see :mod:`compiler.truenorth.native`.
+    clocks : Clocks
+        That the dense layers hear.
+    floor : float
+        Lowest membrane, in thresholds below zero, at least 1.
+    """
+
+    taxels: int
+    classes: int
+    channels: int = 2
+    hops: int = 3
+    features: int = 16
+    groups: int = 8
+    hidden: tuple[int, ...] = (80, 80)
+    voters: int = 2
+    copies: int = 3
+    clocks: Clocks = NO_CLOCKS
+    floor: float = 1.0
+
+    @property
+    def layers(self) -> tuple[str, ...]:
+        """Names of the layers."""
+        return (CONV, *(f"fc{i}" for i in range(1, len(self.hidden) + 2)))
+
+    def inputs(self) -> list[NDArray[np.int64]]:
+        """Neurons that each group of the dense layers hears, (groups, inputs of a group) for each layer."""
+        widths = (self.taxels * self.features, *(self.groups * size for size in self.hidden))
+        rows = (self.taxels, *[self.groups] * len(self.hidden))
+        return [
+            np.arange(width).reshape(row, self.groups, -1).swapaxes(0, 1).reshape(self.groups, -1)
+            for width, row in zip(widths, rows, strict=True)
+        ]
+
+    def network(self, propagation: NDArray[np.float64], *, seed: int = 0, surrogate: Surrogate) -> NativeNet:
+        """An untrained network."""
+        return NativeNet(self, propagation, seed=seed, surrogate=surrogate)
+
+
+def sized(
+    *, taxels: int, classes: int, hops: int, features: int, copies: int, clocks: Clocks, channels: int = 2
+) -> NativeArchitecture:
+    """The architecture whose groups fill the axons of a core best: as few groups as can be.
+
+    Raises
+    ------
+    OptionError
+        If the sensor is too large, or the features cannot be dealt to groups that fit.
+    """
+    axons = load_target(CHIP, CROSSBARS).limit("core.axons")
+    room = axons // copies
+    if taxels * channels > room:
+        raise OptionError(
+            f"--copies {copies}: {taxels * channels} input channels with {copies} axons each, a core of TrueNorth has "
+            f"{axons}; give fewer copies, or a smaller sensor"
+        )
+    fitting = [
+        g for g in range(1, features + 1) if not features % g and taxels * features // g <= room - clocks.channels
+    ]
+    if not fitting or room - clocks.channels < fitting[0]:
+        raise OptionError(
+            f"--features {features}: no number of groups deals {features} features of {taxels} taxels and "
+            f"{clocks.channels} clocks to cores of {room} inputs; give other --features, or fewer --clocks or --copies"
+        )
+    groups = fitting[0]
+    size = (room - clocks.channels) // groups * groups
+    return NativeArchitecture(
+        taxels=taxels,
+        classes=classes,
+        channels=channels,
+        hops=hops,
+        features=features,
+        groups=groups,
+        hidden=(size, size),
+        copies=copies,
+        clocks=clocks,
+    )
+
+
+class NativeNet(nn.Module):
+    """See the module docstring; neurons of the convolution lie taxel by taxel, of the others group by group.
+
+    Parameters
+    ----------
+    architecture : NativeArchitecture
+        Sizes.
+    propagation : (taxels, taxels) float64
+        Normalised adjacency.
+    seed : int
+        Of the initial weights. The global random state is neither used nor moved.
+    surrogate : Surrogate
+        Derivative of a spike, its width in thresholds.
+    """
+
+    def __init__(
+        self,
+        architecture: NativeArchitecture,
+        propagation: NDArray[np.float64],
+        *,
+        seed: int = 0,
+        surrogate: Surrogate = RECTANGLE,
+    ) -> None:
+        super().__init__()
+        self.architecture, self.surrogate = architecture, surrogate
+        generator = torch.Generator().manual_seed(seed)
+        powers = np.stack([np.linalg.matrix_power(propagation, k) for k in range(architecture.hops + 1)])
+        self.adjacency: Tensor
+        self.register_buffer("adjacency", torch.tensor(powers, dtype=torch.float32), persistent=False)
+        shape = (architecture.hops + 1, architecture.features, architecture.channels)
+        self.hops = nn.Parameter(_uniform(shape, CONV_GAIN / math.sqrt(architecture.channels), generator))
+        self.bias = nn.Parameter(torch.zeros(architecture.features))
+        self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
+        clocks = architecture.clocks.channels
+        sizes = (*architecture.hidden, architecture.voters * architecture.classes)
+        self.inputs = architecture.inputs()
+        for inputs, size in zip(self.inputs, sizes, strict=True):
+            groups, width = inputs.shape
+            weight = _uniform((groups, width + clocks, size), GAIN / math.sqrt(width), generator)
+            self.weights.append(nn.Parameter(weight))
+            self.biases.append(nn.Parameter(torch.zeros(groups, size)))
+
+    def rounded(self) -> list[Rounded]:
+        """Every layer as the chip holds it."""
+        architecture = self.architecture
+        dense = torch.einsum("kqp,kfc->pcqf", self.adjacency, self.hops)
+        dense = dense.reshape(1, architecture.taxels * architecture.channels, -1)
+        most = highest_level(architecture.copies)
+        # the weights of a filter over the graph differ by orders of magnitude: the largest decides
+        found = [self._round(dense, self.bias.repeat(architecture.taxels), 0, _peaks(dense) / (most + 0.5))]
+        for depth, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True), 1):
+            step = SPREADS[architecture.copies] * weight.detach().abs().mean(1, keepdim=True)
+            found.append(self._round(weight, bias.reshape(-1), depth, step))
+        return found
+
+    def _round(self, weight: Tensor, bias: Tensor, depth: int, step: Tensor) -> Rounded:
+        """Whole numbers for weights (blocks, inputs, size), whose levels shall be a `step` (blocks, 1, size) apart."""
+        with torch.no_grad():
+            threshold = torch.clamp(torch.round(UNIT / step), LEAST_THRESHOLD, THRESHOLD_MOST / self.architecture.floor)
+            most = highest_level(self.architecture.copies)
+            level = torch.clamp(torch.round(weight * (threshold / UNIT)), -most, most)
+            flat = threshold.reshape(-1)
+            reach = torch.clamp(torch.floor((flat - 1) / max(1, depth - 1)), max=LEAK_MOST)
+            leak = torch.maximum(torch.minimum(torch.round(bias * flat), reach), -reach)
+        return Rounded(
+            weight=_past(weight * threshold, level * UNIT),
+            leak=_past(bias * flat, leak),
+            threshold=flat,
+            floor=torch.round(flat * self.architecture.floor),
+        )
+
+    def forward(self, events: Tensor, lengths: Tensor | None = None) -> Tensor:
+        """Votes per step and output neuron for each class, (samples, classes), for (steps, samples, taxels, channels).
+
+        Parameters
+        ----------
+        lengths : (samples,) int64, optional
+            Steps of each recording, where some were filled up with silence.
+        """
+        architecture = self.architecture
+        *_, spikes = run_layers(self.rounded(), self.inputs, architecture.clocks, events, self.surrogate)
+        steps, samples, _ = spikes.shape
+        votes = spikes.view(steps, samples, -1, architecture.classes).mean(2)
+        if lengths is None:
+            return votes.mean(0)
+        inside = torch.arange(steps)[:, None] < lengths
+        return torch.sum(votes * inside[..., None], dim=0) / lengths[:, None]
+
+    def export_weights(self) -> Arrays:
+        """Whole numbers of every layer: ``level``, ``threshold``, ``floor`` and ``leak`` after the layer's name."""
+        found: Arrays = {}
+        with torch.no_grad():
+            for name, layer in zip(self.architecture.layers, self.rounded(), strict=True):
+                whole = {"level": layer.weight / UNIT} | {n: getattr(layer, n) for n in ("threshold", "floor", "leak")}
+                found |= {f"{name}.{what}": np.round(values.numpy()) for what, values in whole.items()}
+        return found
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Rounded:
+    """A layer as the chip holds it, in float32 that holds whole numbers.
+
+    Parameters
+    ----------
+    weight : (blocks, inputs, size)
+        Multiples of ``UNIT``.
+    leak, threshold, floor : (blocks * size,)
+    """
+
+    weight: Tensor
+    leak: Tensor
+    threshold: Tensor
+    floor: Tensor
+
+
+def run_layers(
+    layers: Sequence[Rounded],
+    inputs: Sequence[NDArray[np.int64]],
+    clocks: Clocks,
+    events: Tensor,
+    surrogate: Surrogate = RECTANGLE,
+) -> list[Tensor]:
+    """Spikes of every layer of a tower, each (steps, samples, neurons), for (steps, samples, taxels, channels).
+
+    Parameters
+    ----------
+    layers : sequence of Rounded
+        The first hears the sensor in one block.
+    inputs : sequence of (blocks, width) int64
+        What each block of the others hears of the layer before.
+    """
+    steps, samples = events.shape[:2]
+    ticks = torch.from_numpy(clocks.events(steps).T.astype(np.float32))
+    spikes = _spikes(layers[0], block_sums(events.reshape(steps, samples, -1), layers[0].weight), surrogate)
+    found = [spikes]
+    for layer, heard in zip(layers[1:], inputs, strict=True):
+        width = heard.shape[1]
+        sums = block_sums(spikes.index_select(2, torch.tensor(heard.reshape(-1))), layer.weight[:, :width])
+        if layer.weight.shape[1] > width:
+            timed = torch.matmul(ticks, layer.weight[:, width:])
+            sums = sums + timed.transpose(0, 1).reshape(steps, 1, -1)
+        spikes = _spikes(layer, sums, surrogate)
+        found.append(spikes)
+    return found
+
+
+def _spikes(layer: Rounded, sums: Tensor, surrogate: Surrogate) -> Tensor:
+    return integrate(sums + layer.leak, layer.threshold, layer.floor, surrogate)
+
+
+def native_network(architecture: NativeArchitecture, arrays: Mapping[str, NDArray[np.float32]]) -> NativeNetwork:
+    """Network of one tower from what `NativeNet.export_weights` returned."""
+    channels = np.arange(architecture.taxels * architecture.channels)[None]
+    heard = [channels, *architecture.inputs()]
+    tower = tuple(
+        Stage(
+            name=name,
+            inputs=inputs,
+            **{what: arrays[f"{name}.{what}"].astype(np.int64) for what in ("level", "threshold", "floor", "leak")},
+        )
+        for name, inputs in zip(architecture.layers, heard, strict=True)
+    )
+    return NativeNetwork(
+        taxels=architecture.taxels,
+        polarities=architecture.channels,
+        classes=architecture.classes,
+        copies=architecture.copies,
+        clocks=architecture.clocks,
+        towers=(tower,),
+    )
+
+
+def predict(network: NativeNetwork, recordings: Recordings) -> NDArray[np.int64]:
+    """Class of each recording by the added votes of all towers; equal ones count for the lowest class."""
+    found = []
+    for index in range(len(recordings)):
+        events = recordings.events[index : index + 1, ..., : recordings.steps_of(index)]
+        last = network.towers[0][-1].name
+        votes = run_network(network, events)[last].sum(axis=1)
+        found.append(votes.reshape(-1, network.classes).sum(axis=0).argmax())
+    return np.array(found, np.int64)
+
+
+def run_network(network: NativeNetwork, events: NDArray[np.uint8]) -> dict[str, NDArray[np.bool_]]:
+    """Spikes of every layer, towers side by side, as the model computes them in training.
+
+    Parameters
+    ----------
+    network : NativeNetwork
+        As read from a file.
+    events : (samples, taxels, polarities, steps) uint8
+
+    Returns
+    -------
+    mapping of layer to (samples, steps, neurons) bool
+    """
+    given = torch.from_numpy(events.transpose(3, 0, 1, 2).astype(np.float32, order="C"))
+    parts: dict[str, list[NDArray[np.bool_]]] = {}
+    with torch.no_grad():
+        for tower in network.towers:
+            layers = [
+                Rounded(
+                    weight=torch.from_numpy((stage.level * UNIT).astype(np.float32)),
+                    **{n: torch.tensor(getattr(stage, n), dtype=torch.float32) for n in ("threshold", "floor", "leak")},
+                )
+                for stage in tower
+            ]
+            spikes = run_layers(layers, [stage.inputs for stage in tower[1:]], network.clocks, given)
+            for stage, found in zip(tower, spikes, strict=True):
+                parts.setdefault(stage.name, []).append(found.numpy().astype(np.bool_).swapaxes(0, 1))
+    return {name: np.concatenate(found, axis=2) for name, found in parts.items()}
+
+
+def _past(real: Tensor, whole: Tensor) -> Tensor:
+    """The whole numbers, to the bit, with the gradient of the real ones."""
+    return whole.detach() + (real - real.detach())
+
+
+def _peaks(weight: Tensor) -> Tensor:
+    return weight.detach().abs().amax(1, keepdim=True)
+
+
+def _uniform(shape: tuple[int, ...], bound: float, generator: torch.Generator) -> Tensor:
+    return torch.empty(shape).uniform_(-bound, bound, generator=generator)

@@ -1,0 +1,332 @@
+"""Training for TrueNorth: neurons and gradients, whole numbers in every pass, and the commands from end to end."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from native_networks import random_network
+
+from compiler.dynamics import clocks_over
+from compiler.errors import ModelError, OptionError
+from compiler.truenorth.native import faults
+from compiler.truenorth.serialize import read_crossbars, write_crossbars
+from compiler.truenorth.trained import PARTS, is_trained, read_trained, write_trained
+from models.grasps import synthetic_grasps
+from models.recipes import CROSSBARS
+from models.release import write_released
+from models.surrogate import FAST_SIGMOID, Surrogate
+from models.systems import propagation_of
+from models.truenorth.network import NativeArchitecture, native_network, predict, run_network, sized
+from models.truenorth.neurons import block_sums, integrate
+from runtime.cli import main
+
+SMOOTH = Surrogate(shape=FAST_SIGMOID, width=0.5, reset=False)
+SIZES = NativeArchitecture(taxels=6, classes=3, features=4, groups=2, hidden=(6, 4), clocks=clocks_over(2, 9))
+EDGES = np.array([[0, 1], [1, 0], [1, 2], [2, 1], [3, 4], [4, 3]])
+
+
+def slow_integrate(current, threshold, floor, surrogate):
+    """The same in torch operations, step by step, so that torch finds the gradient."""
+    held, found = torch.zeros_like(current[0]), []
+    for step in current:
+        m = held + step
+        far = m / threshold - 1
+        if surrogate.shape == FAST_SIGMOID:
+            slope = 1 / (1 + far.abs() / surrogate.width) ** 2
+        else:
+            slope = (far.abs() < surrogate.width).float()
+        fires = (m >= threshold).float()
+        found.append(fires + slope.detach() * (m - m.detach()) / threshold)
+        keeps = ((m >= -floor) & (m < threshold)).float()
+        held = torch.where(fires > 0, 0.0, torch.maximum(m, -floor)).detach() + keeps * (m - m.detach())
+    return torch.stack(found)
+
+
+@pytest.mark.parametrize("surrogate", [SMOOTH, Surrogate(width=0.4)], ids=lambda s: s.shape)
+def test_neurons_and_their_gradient(surrogate):
+    rng = np.random.default_rng(0)
+    current = torch.tensor(rng.integers(-40, 50, (30, 3, 7)), dtype=torch.float32)
+    threshold = torch.tensor(rng.integers(8, 60, 7), dtype=torch.float32)
+    floor = threshold * torch.tensor(rng.integers(1, 3, 7))
+    weights = torch.tensor(rng.normal(size=current.shape), dtype=torch.float32)
+    one, other = current.clone().requires_grad_(), current.clone().requires_grad_()
+    spikes, expected = integrate(one, threshold, floor, surrogate), slow_integrate(other, threshold, floor, surrogate)
+    torch.testing.assert_close(spikes, expected, rtol=0, atol=0)
+    assert 0.1 < spikes.detach().mean() < 0.9
+    (spikes * weights).sum().backward()
+    (expected * weights).sum().backward()
+    torch.testing.assert_close(one.grad, other.grad, rtol=1e-5, atol=1e-6)
+
+
+def test_sums_of_blocks_and_their_gradient():
+    rng = np.random.default_rng(1)
+    spikes = torch.tensor(rng.random((5, 2, 12)) < 0.4, dtype=torch.float32, requires_grad=True)
+    weight = torch.tensor(rng.integers(-90, 90, (3, 4, 5)), dtype=torch.float32, requires_grad=True)
+    found = block_sums(spikes, weight)
+    expected = torch.einsum("tsbi,bio->tsbo", spikes.view(5, 2, 3, 4), weight).reshape(5, 2, 15)
+    torch.testing.assert_close(found, expected, rtol=0, atol=0)
+    above = torch.tensor(rng.normal(size=found.shape), dtype=torch.float32)
+    for one, other in zip(
+        *(torch.autograd.grad((x * above).sum(), (spikes, weight)) for x in (found, expected)), strict=True
+    ):
+        torch.testing.assert_close(one, other)
+
+
+def network(seed=0, sizes=SIZES):
+    return sizes.network(propagation_of("tactilesgnet", EDGES, sizes.taxels, None, 4), seed=seed, surrogate=SMOOTH)
+
+
+def test_what_is_trained_is_what_is_exported():
+    net, events = network(), (np.random.default_rng(2).random((3, 6, 2, 9)) < 0.3).astype(np.uint8)
+    with torch.no_grad():
+        net.biases[1] += 0.3
+        net.hops *= 2
+    found = native_network(SIZES, net.export_weights())
+    assert faults(found) == []
+    votes = run_network(found, events)["fc3"].sum(axis=1).reshape(3, -1, 3).mean(axis=1) / 9
+    rates = net(torch.from_numpy(events.transpose(3, 0, 1, 2).astype(np.float32)))
+    np.testing.assert_allclose(rates.detach().numpy(), votes, rtol=1e-6)
+    for layer in net.rounded():
+        for whole in (layer.weight / 32, layer.leak, layer.threshold, layer.floor):
+            np.testing.assert_array_equal(whole.detach().numpy(), np.round(whole.detach().numpy()))
+    rates.sum().backward()
+    assert all(parameter.grad is not None and parameter.grad.abs().sum() > 0 for parameter in net.parameters())
+
+
+def test_shorter_recordings_count_their_own_steps():
+    net = network()
+    events = torch.from_numpy((np.random.default_rng(3).random((9, 2, 6, 2)) < 0.5).astype(np.float32))
+    both = net(events, torch.tensor([9, 5]))
+    torch.testing.assert_close(both[0], net(events[:, :1])[0])
+    torch.testing.assert_close(both[1], net(events[:5, 1:])[0])
+
+
+def test_a_seed_gives_the_same_weights():
+    one, same, other = (network(seed).export_weights() for seed in (0, 0, 1))
+    assert all(np.array_equal(one[name], same[name]) for name in one)
+    assert not np.array_equal(one["fc1.level"], other["fc1.level"])
+
+
+def test_groups_fill_the_axons_of_a_core():
+    found = sized(taxels=39, classes=20, hops=3, features=16, copies=3, clocks=clocks_over(5, 325))
+    assert (found.groups, found.hidden) == (8, (80, 80))
+    found = sized(taxels=39, classes=20, hops=3, features=15, copies=2, clocks=clocks_over(8, 325))
+    assert (found.groups, found.hidden) == (5, (120, 120))
+    with pytest.raises(OptionError) as caught:
+        sized(taxels=39, classes=20, hops=3, features=16, copies=4, clocks=clocks_over(5, 325))
+    assert str(caught.value) == (
+        "--copies 4: 78 input channels with 4 axons each, a core of TrueNorth has 256; give fewer copies, or a smaller "
+        "sensor"
+    )
+    with pytest.raises(OptionError) as caught:
+        sized(taxels=39, classes=20, hops=3, features=16, copies=3, clocks=clocks_over(60, 325))
+    assert str(caught.value) == (
+        "--features 16: no number of groups deals 16 features of 39 taxels and 60 clocks to cores of 85 inputs; give "
+        "other --features, or fewer --clocks or --copies"
+    )
+
+
+# -- files -------------------------------------------------------------------------------------------------------------
+
+
+def written(path, **changes):
+    networks = changes.pop("networks", {"last": random_network(0), "best": random_network(1)})
+    record = {"command": "spikeloom train", "seed": 0}
+    return write_trained(path, networks, graph="ring", edges=np.array([[0, 1], [1, 0]]), training=record)
+
+
+def test_round_trip(tmp_path):
+    path = tmp_path / "x.pt"
+    sha256 = written(path)
+    first = path.read_bytes()
+    assert is_trained(path)
+    assert (written(path), path.read_bytes()) == (sha256, first)
+    for which, seed in (("last", 0), ("best", 1)):
+        found, made = read_trained(path, weights=which), random_network(seed)
+        assert (found.weights, found.sets, found.graph, found.sha256) == (which, ("last", "best"), "ring", sha256)
+        for one, other in zip(found.network.towers[0], made.towers[0], strict=True):
+            for part in PARTS:
+                np.testing.assert_array_equal(getattr(one, part), getattr(other, part))
+    assert read_trained(path).weights == "last"
+
+
+def refused(path, **options):
+    with pytest.raises(ModelError) as caught:
+        read_trained(path, **options)
+    return str(caught.value).removeprefix(f"{path}: ")
+
+
+def test_files_that_are_refused(tmp_path):
+    path = tmp_path / "x.pt"
+    assert refused(path) == "no such file; make one with spikeloom train"
+    assert refused(tmp_path) == "is not a file; make one with spikeloom train"
+    written(path)
+    assert refused(path, weights="clean") == ("--weights clean: the file holds last, best; choose one that it holds")
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    assert refused(path).startswith("damaged, altered or of another version (is truncated or not a network (")
+    path.write_bytes(whole)
+    with np.load(path) as file:
+        members = {name: file[name] for name in file.files}
+    leak = "last/0/conv1/leak"
+    np.savez(tmp_path / "x.npz", **members | {leak: members[leak] + 1})
+    assert refused(tmp_path / "x.npz") == (
+        "damaged, altered or of another version (its content does not match its hash, so it was altered); copy or "
+        "train it again"
+    )
+    manifest = json.loads(str(members["manifest"]))
+    np.savez(tmp_path / "x.npz", **members | {"manifest": np.array(json.dumps(manifest | {"version": 2}))})
+    assert refused(tmp_path / "x.npz") == (
+        "damaged, altered or of another version (has format version 2, this program reads 1); copy or train it again"
+    )
+    np.savez(tmp_path / "x.npz", **members | {"manifest": np.array(json.dumps(manifest | {"towers": 0, "graph": 1}))})
+    assert refused(tmp_path / "x.npz") == (
+        "the manifest has no usable graph; the manifest has no usable towers; copy or train it again"
+    )
+    first, *rest = random_network(0).towers[0]
+    broken = replace(random_network(0), towers=((replace(first, level=first.level * 4), *rest),))
+    written(path, networks={"last": broken})
+    assert refused(path) == "tower 0, conv1: levels beyond 3, the most of 3 copies; copy or train it again"
+    broken = replace(random_network(0), towers=((replace(first, leak=first.leak[None]), *rest),))
+    written(path, networks={"last": broken})
+    assert refused(path) == "conv1: leak is no array of 1 axes of whole numbers; copy or train it again"
+
+
+# -- commands ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def data(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    splits = [
+        replace(synthetic_grasps(per_class=3, steps=12, seed=seed), split=split)
+        for split, seed in (("train", 1), ("test", 2))
+    ]
+    write_released(tmp_path / "data", splits)
+    return tmp_path
+
+
+SMALL = (
+    "--system",
+    "tactilesgnet-truenorth",
+    "--data",
+    "data",
+    "--graph",
+    "manual",
+    "--features",
+    "2",
+    "--epochs",
+    "1",
+)
+
+
+def as_json(capsys, *words):
+    assert main([*words, "--json"]) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def mistake(capsys, *words):
+    assert main(list(words)) == 2
+    return capsys.readouterr().err.removeprefix("spikeloom: ").rstrip("\n")
+
+
+def test_from_recordings_to_the_chip(data, capsys):
+    (run,) = as_json(capsys, "train", *SMALL, "-o", "x.pt")["runs"]
+    assert run["command"] == (
+        "spikeloom train --data data --system tactilesgnet-truenorth --graph manual --features 2 --epochs 1 --seed 0"
+    )
+    assert run["recipe"] == CROSSBARS.to_json() | {"features": 2}
+    shown = as_json(capsys, "inspect", "x.pt")
+    assert (shown["copies"], shown["levels"], shown["towers"], shown["sets"]) == (3, 7, 1, ["last", "best", "clean"])
+    made = as_json(capsys, "compile", "x.pt", "--target", "truenorth", "-o", "x.loom")
+    assert made["provenance"]["checkpoint_sha256"] == shown["sha256"] == run["sha256"]
+    found = as_json(capsys, "verify", "x.loom", "--checkpoint", "x.pt", "--data", "data", "--spec-samples", "1")
+    assert found["exact"]
+    assert found["E0"] == {"samples": 1, "differences": 0}
+    assert found["E1"]["differences"] == 0
+    assert found["correct"] == run["last"]["correct"]
+    decided = as_json(capsys, "run", "x.loom", "--data", "data")
+    assert decided["accuracy"] == run["last"]["accuracy"]
+    assert as_json(capsys, "estimate", "x.loom", "--data", "data")["per_inference"]["ticks"] == 12 + 3
+    # what was finished is not trained again
+    (again,) = as_json(capsys, "train", *SMALL, "-o", "x.pt", "--resume")["runs"]
+    assert again == run
+
+
+def test_joined_towers_vote_together(data, capsys):
+    for seed in ("0", "1"):
+        as_json(capsys, "train", *SMALL, "--seed", seed, "-o", f"{seed}.pt")
+    report = as_json(capsys, "join", "0.pt", "1.pt", "-o", "both.pt")
+    assert report["command"] == "spikeloom join 0.pt 1.pt"
+    assert [tower["seed"] for tower in report["towers"]] == [0, 1]
+    as_json(capsys, "compile", "both.pt", "--target", "truenorth", "-o", "both.loom")
+    found = as_json(capsys, "verify", "both.loom", "--checkpoint", "both.pt", "--data", "data", "--spec-samples", "1")
+    assert found["exact"]
+    both, parts = read_trained("both.pt").network, [read_trained(f"{seed}.pt").network for seed in (0, 1)]
+    events = synthetic_grasps(per_class=1, steps=12, seed=3)
+    votes = [run_network(part, events.events)["fc3"].sum(axis=1).reshape(6, -1, 6).sum(axis=1) for part in parts]
+    np.testing.assert_array_equal(predict(both, events), sum(votes).argmax(axis=1))
+
+
+def test_mistakes_are_told_in_one_line(data, capsys):
+    as_json(capsys, "train", *SMALL, "-o", "x.pt")
+    as_json(capsys, "compile", "x.pt", "--target", "truenorth", "-o", "x.loom")
+    assert mistake(capsys, "train", *SMALL, "--recipe", "timed", "-o", "y.pt") == (
+        "--recipe timed: a network for TrueNorth has a recipe of its own, and nothing in it decays; leave it away"
+    )
+    assert mistake(capsys, "train", "--data", "data", "--graph", "manual", "--copies", "2", "-o", "y.pt") == (
+        "--copies 2: is for --system tactilesgnet-truenorth; leave it away"
+    )
+    assert mistake(capsys, "train", *SMALL, "--seed", "1", "--resume", "-o", "x.pt") == (
+        "x.pt: holds another training (other seed); give its options, or another -o"
+    )
+    assert mistake(capsys, "compile", "x.pt", "-o", "y.loom") == (
+        "--target loihi1: x.pt was trained for TrueNorth; give --target truenorth"
+    )
+    assert mistake(capsys, "compile", "x.pt", "--target", "truenorth", "--planes", "2", "-o", "y.loom") == (
+        "--planes: is for loihi1, not for truenorth; leave it away"
+    )
+    assert mistake(capsys, "inspect", "x.pt", "--beta", "0.3") == (
+        "--beta 0.3: x.pt is a network for TrueNorth and says that itself; leave it away"
+    )
+    assert mistake(capsys, "export", "x.pt", "--to", "onnx-float", "-o", "x.onnx") == (
+        "x.pt: is a network for TrueNorth, which compile, verify, inspect and join take; this is for others"
+    )
+    words = ("verify", "x.loom", "--data", "data", "--checkpoint")
+    assert mistake(capsys, *words, "x.pt", "--require", "E3=1") == (
+        "--require E3=1: a network for TrueNorth has one model, whose every spike must be the chip's; leave it away"
+    )
+    assert mistake(capsys, *words, "x.pt", "--weights", "best") == (
+        "--weights best: x.loom was compiled from last; give the same"
+    )
+    as_json(capsys, "train", *SMALL, "--seed", "1", "-o", "y.pt")
+    assert mistake(capsys, *words, "y.pt") == "--checkpoint y.pt: x.loom was compiled from another file; give that one"
+    assert mistake(capsys, "join", "x.pt", "-o", "z.pt") == "join: x.pt is one network already; give two or more"
+
+
+def test_a_spike_that_differs_fails(data, capsys):
+    as_json(capsys, "train", *SMALL, "-o", "x.pt")
+    as_json(capsys, "compile", "x.pt", "--target", "truenorth", "-o", "x.loom")
+    netlist = read_crossbars("x.loom")
+    write_crossbars(replace(netlist, threshold=netlist.threshold + 9), "x.loom")
+    assert main(["verify", "x.loom", "--checkpoint", "x.pt", "--data", "data", "--spec-samples", "0", "--json"]) == 1
+    report = json.loads(capsys.readouterr().out)
+    assert report["E1"]["differences"] > 0
+    assert not report["exact"]
+
+
+def test_what_is_printed(data, capsys, golden):
+    networks = {"last": random_network(4, taxels=39, features=2, classes=6, blocks=2, hidden=(8,), steps=12)}
+    record = {"command": "by hand", "test_samples": 18, "last": {"epoch": 1, "correct": 3, "accuracy": 1 / 6}}
+    write_trained("made.pt", networks, graph="none", edges=np.zeros((0, 2), np.int64), training=record)
+    told = []
+    for words in (
+        ("inspect", "made.pt"),
+        ("compile", "made.pt", "--target", "truenorth", "-o", "made.loom"),
+        ("verify", "made.loom", "--checkpoint", "made.pt", "--data", "data", "--spec-samples", "1"),
+    ):
+        assert main(list(words)) == 0
+        told.append(f"$ spikeloom {' '.join(words)}\n{capsys.readouterr().out}")
+    golden("truenorth_native.txt", "\n".join(told))
