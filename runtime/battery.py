@@ -29,7 +29,7 @@ def why_not(name: str, pair: Pair, sensor: Sensor) -> str | None:
     netlist = pair.netlist
     if name in GRAPH_ONLY:
         if sensor.checkpoint is None:
-            return "a network from an ONNX file has no taxel graph that is known"
+            return "a network from an ONNX or NIR file has no taxel graph that is known"
         if sensor.checkpoint.system not in GRAPH_SYSTEMS:
             return f"{TITLES[sensor.checkpoint.system]} has no taxel graph"
         if name == "other_graph" and sensor.places is None:

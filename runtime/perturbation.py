@@ -28,7 +28,7 @@ class Sensor:
     edges : (edges, 2) int64, or None
         Graph that the network was trained on.
     checkpoint : Checkpoint or None
-        What the network was made from; None for an ONNX file.
+        What the network was made from; None for an ONNX or NIR file.
     """
 
     distance: FloatArray

@@ -186,6 +186,7 @@ def test_several_chips_have_no_times(spikeloom, tmp_path):
             (*WORDS, "--graph", "manual"),
             "--graph: is for --checkpoint, which is not given; add it or leave this away",
         ),
+        ((*WORDS, "--dt", "0.02"), "--dt: is for --checkpoint, which is not given; add it or leave this away"),
         ((*WORDS, "-o", "net.loom"), "-o net.loom: is an input of this command (net.loom); give another name"),
         (
             (*WORDS, "--picture", "none/x.png"),

@@ -279,6 +279,20 @@ def test_clocks_and_lasting_currents(spikeloom, tmp_path):
     assert json.loads(out)["rows"][0]["test"]["differ"] == 0
 
 
+def test_a_network_from_nir_remembers_how_it_was_read(spikeloom):
+    assert spikeloom("compile", "net.pt", "-o", "nir.loom")[0] == 0
+    assert spikeloom("export", "nir.loom", "--to", "nir", "--dt", "0.01", "-o", "net.nir")[0] == 0
+    assert spikeloom("lean", "net.nir", "--data", "data", "-o", "lean_nir.loom")[0] == 0
+    assert spikeloom("compile", "net.nir", "--dt", "0.01", "-o", "again.loom")[0] == 0
+    for path in ("lean_nir.loom", "again.loom"):
+        remembered = read_netlist(path).provenance
+        assert {name: remembered[name] for name in ("format", "dt", "convention")} == {
+            "format": "nir",
+            "dt": 0.01,
+            "convention": "euler",
+        }
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [

@@ -618,7 +618,7 @@ def test_planes_have_no_fewer_bits(bench):
     pair = Pair(netlist=netlist, network=bench.pair.network)
     assert why_not("fewer_bits", pair, bench.sensor) == "weights are stored in several planes"
     onnx = Sensor(distance=bench.sensor.distance, places=None, edges=None, checkpoint=None)
-    told = "a network from an ONNX file has no taxel graph that is known"
+    told = "a network from an ONNX or NIR file has no taxel graph that is known"
     assert why_not("edges_rewired", pair, onnx) == told
 
 
