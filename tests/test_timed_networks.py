@@ -539,10 +539,6 @@ def test_what_does_not_know_such_networks_says_so(data, capsys):
         "spikeloom: --to onnx-float: the network has clocks, or decays of single layers, which this form does not say; "
         "compile it and export the netlist with --to onnx\n"
     )
-    assert refusal(capsys, f"export {data}/x.loom --to sanafe -o {data}/y.yaml") == (
-        "spikeloom: fc2: a current that outlasts its step found (decay_u 204), SANA-FE keeps currents as floats, "
-        "not as the chip does; export networks without currents\n"
-    )
 
 
 def test_text_shows_clocks_and_current_decay(data, capsys):

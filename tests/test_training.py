@@ -321,10 +321,11 @@ def test_no_worker_outlives_the_command(data, capsys, sent):
     assert gone(workers)
     if sent != signal.SIGKILL:
         assert process.returncode == 2
-        assert err.splitlines()[-1] == (
+        # behind it Python may complain of a worker that had to be killed, on a busy machine
+        assert (
             "spikeloom: interrupted; the epochs so far are kept in x-seed0.pt.state.validation, "
             "x-seed1.pt.state.validation; go on with the same command and --resume"
-        )
+        ) in err.splitlines()
     assert not list(data.glob(".*")), "half-written files are left"
 
 
