@@ -52,8 +52,8 @@ from runtime.compile_command import compile_netlist
 from runtime.data_commands import add_data_commands
 from runtime.inputs import (
     asked_checkpoint,
+    asked_recordings,
     progress,
-    recordings,
     require_inspectable,
     require_place,
     version,
@@ -94,16 +94,7 @@ def _sha256(path: str) -> str:
 
 def _recordings(arguments: Arguments, netlist: Netlist, *, labels_for: str | None = None) -> Recordings:
     percent = window_asked(arguments.window)
-    progress("reading the recordings")
-    found = recordings(
-        arguments.data,
-        arguments.split,
-        limit=arguments.limit,
-        classes=netlist.classes,
-        taxels=netlist.taxels,
-        bin_s=arguments.bin,
-        labels_for=labels_for,
-    )
+    found = asked_recordings(arguments, netlist, labels_for=labels_for)
     return first_part(found, percent)
 
 

@@ -14,6 +14,8 @@ from compiler.errors import DataError, ModelError, OptionError
 from compiler.fixedpoint import FloatArray, IntArray
 from compiler.frontends.checkpoint import Checkpoint, read_checkpoint
 from compiler.frontends.systems import GRAPH_SYSTEMS, TACTILESGNET, TITLES
+from compiler.netlist import Netlist
+from compiler.truenorth.netlist import CrossbarNetlist
 from compiler.truenorth.trained import is_trained
 from models.events import BIN_S, load_data, need_labels, require_events
 from models.evtouch import Recordings
@@ -83,6 +85,22 @@ def recordings(
             "use the network that was trained on these objects"
         )
     return grasps
+
+
+def asked_recordings(
+    arguments: argparse.Namespace, netlist: Netlist | CrossbarNetlist, *, labels_for: str | None = None
+) -> Recordings:
+    """Recordings that the options of a command name, held against a netlist; as `recordings` otherwise."""
+    progress("reading the recordings")
+    return recordings(
+        arguments.data,
+        arguments.split,
+        limit=arguments.limit,
+        classes=netlist.classes,
+        taxels=netlist.taxels,
+        bin_s=arguments.bin,
+        labels_for=labels_for,
+    )
 
 
 def asked_graph(arguments: argparse.Namespace, system: str = TACTILESGNET) -> Graph | None:

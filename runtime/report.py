@@ -19,7 +19,7 @@ from compiler.targets import load_target
 from models.evtouch import Recordings
 from runtime.asked import Asked, asked_network
 from runtime.chart_file import read_chart
-from runtime.inputs import progress, recordings, require_place
+from runtime.inputs import asked_recordings, require_place
 from runtime.levels import levels_of, unmet
 from runtime.options import add_explain_cost, add_network, add_recordings
 from runtime.render import netlist_json
@@ -78,16 +78,7 @@ def report(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], 
     asked = asked_network(arguments.checkpoint, arguments)
     _require_origin(arguments, netlist, asked)
     chart = None if arguments.chart is None else read_chart(arguments.chart, asked.sha256, arguments.checkpoint)
-    progress("reading the recordings")
-    data = recordings(
-        arguments.data,
-        arguments.split,
-        limit=arguments.limit,
-        classes=netlist.classes,
-        taxels=netlist.taxels,
-        bin_s=arguments.bin,
-        labels_for="report",
-    )
+    data = asked_recordings(arguments, netlist, labels_for="report")
     check_channels(netlist, data.events.shape[1] * data.events.shape[2] + netlist.clocks.channels)
     chosen = None if arguments.recording is None else find_recording(data, arguments.recording)
     found, code = _facts(arguments, netlist, asked, data, chosen)

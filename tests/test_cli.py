@@ -567,7 +567,7 @@ def shipped_grasps(monkeypatch, tmp_path):
     last = made_weights(taxels=39, sizes=(6, 5, 6))
     path = str(own_file(tmp_path / "grasps.pt", last=last, graph=build_graph("manual")))
     monkeypatch.setattr(inputs, "shipped", lambda name: path if name == "pretrained:grasps" else name)
-    for module in (cli, compile_command):
+    for module in (inputs, compile_command):
         few = {"limit": 6}
         monkeypatch.setattr(
             module, "recordings", lambda *words, few=few, **options: recordings(*words, **options | few)

@@ -22,7 +22,7 @@ from compiler.truenorth.rules import require_legal
 from compiler.truenorth.serialize import write_crossbars
 from compiler.truenorth.trained import Trained, is_trained, read_trained
 from models.evtouch import Recordings
-from runtime.inputs import progress, recordings, shipped, version
+from runtime.inputs import asked_recordings, progress, shipped, version
 from runtime.intervals import wilson
 from runtime.tables import table
 from runtime.trace import ENGINES
@@ -258,16 +258,7 @@ def verify(arguments: argparse.Namespace) -> Outcome:
             f"--weights {trained.weights}: {arguments.netlist} was compiled from {netlist.provenance.get('weights')}; "
             "give the same"
         )
-    progress("reading the recordings")
-    data = recordings(
-        arguments.data,
-        arguments.split,
-        limit=arguments.limit,
-        classes=netlist.classes,
-        taxels=netlist.taxels,
-        bin_s=arguments.bin,
-        labels_for="verify",
-    )
+    data = asked_recordings(arguments, netlist, labels_for="verify")
     verdict = compare(netlist, trained, data, spec_samples=arguments.spec_samples)
     report = verdict_json(verdict, data, chip)
     return report, verdict_text, 0 if report["exact"] else 1
