@@ -126,6 +126,7 @@ def _handed_out(
                 found = future.result()
             except (OSError, CancelledError):  # it came to its end, but not to us
                 raise ClusterLostError(scheduler) from None
+            future.release()  # or it is measured again where the worker that keeps it is lost
             yield index, found
         elif future.status == "error":
             error = future.exception()

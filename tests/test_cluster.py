@@ -77,6 +77,13 @@ class Cluster:
 
         until(answers)
 
+    def lets_go(self) -> None:
+        """Wait until it keeps no result: what is kept in a worker that is lost would be measured again."""
+        from distributed import Client
+
+        with Client(self.address, set_as_default=False) as client:
+            until(lambda: "memory" not in client.run_on_scheduler(states))
+
     def end(self) -> None:
         for process in self.processes:
             process.kill()
@@ -112,6 +119,10 @@ def kept(store: Path) -> int:
     return len(store.read_text().splitlines()) - 1
 
 
+def states(dask_scheduler) -> set[str]:
+    return {task.state for task in dask_scheduler.tasks.values()}
+
+
 def meanwhile(what: Callable[[], object]) -> threading.Thread:
     thread = threading.Thread(target=what)
     thread.start()
@@ -133,6 +144,7 @@ def test_a_worker_that_is_killed_costs_its_unfinished_points(made, tmp_path, cap
     def kill() -> None:
         # both are at work, neither ends before one is dead, and whatever came before is kept
         until(lambda: {4, 5} <= set(begun(log)) and kept(tmp_path / "x.store") == len(begun(log)) - 2)
+        cluster.lets_go()
         first.kill()
         first.wait()
         held.unlink()
