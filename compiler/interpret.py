@@ -1,7 +1,9 @@
 """The meaning of the intermediate representation: layer by layer over all time steps.
 
-One matrix product per projection, then the recurrence. The integer stage is exact: products run in floating point
-only where every partial sum is an integer that the type holds (below 2**24 in float32, 2**53 in float64).
+One matrix product per projection, then the recurrence. A population that hears itself takes a further product in each
+step: what it fired in the step before arrives together with what others send. The integer stage is exact: products run
+in floating point only where every partial sum is an integer that the type holds (below 2**24 in float32, 2**53 in
+float64).
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ import numpy.typing as npt
 
 from compiler.dynamics import NO_CLOCKS, Clocks, with_clocks
 from compiler.fixedpoint import MEMBRANE_MAX, MEMBRANE_SHIFT, IntArray
-from compiler.ir import INPUT, IntegerNetwork, IntegerPopulation, Network, Population, Sparse
+from compiler.ir import INPUT, IntegerNetwork, IntegerPopulation, IntegerProjection, Network, Population, Sparse
 
 BoolArray = npt.NDArray[np.bool_]
 Floating = npt.NDArray[np.floating[Any]]
@@ -88,20 +90,43 @@ def lasting_currents(sums: Floating, alpha: float) -> Floating:
     return current
 
 
+def step_late(spikes: BoolArray) -> BoolArray:
+    """Spikes (samples, steps, neurons) as their own population hears them: each in the step after.
+
+    Examples
+    --------
+    >>> step_late(np.array([[[True], [False], [True]]])).ravel().tolist()
+    [False, True, False]
+    """
+    late = np.zeros_like(spikes)
+    late[:, 1:] = spikes[:, :-1]
+    return late
+
+
 def float_recurrence(
-    population: Population, sums: Floating, *, membranes: bool = False
+    population: Population, sums: Floating, *, own: Floating | None = None, membranes: bool = False
 ) -> tuple[BoolArray, Floating | None]:
     """LIF of the definition in :class:`compiler.ir.Population` on given synaptic sums, in their type.
 
-    `sums` is overwritten.
+    `sums` is overwritten. `own` (neurons, neurons), of the same type, is from each neuron (row) of a population that
+    hears itself to each.
     """
-    current = sums if not population.alpha else lasting_currents(sums, population.alpha)
-    current += population.bias.astype(current.dtype)
+    bias = population.bias.astype(sums.dtype)
+    current = lasting_currents(sums, population.alpha) if population.alpha and own is None else sums
+    if own is None:
+        current += bias
+    held = np.zeros_like(current[:, 0])
     spikes = np.empty(current.shape, np.bool_)
     kept = np.empty_like(current) if membranes else None
     u = np.zeros_like(current[:, 0])
-    beta, theta = current.dtype.type(population.beta), current.dtype.type(population.theta)
+    alpha, beta, theta = (current.dtype.type(value) for value in (population.alpha, population.beta, population.theta))
     for step in range(current.shape[1]):
+        if own is not None:
+            held *= alpha
+            held += current[:, step]
+            if step:
+                held += spikes[:, step - 1].astype(held.dtype) @ own
+            np.add(held, bias, out=current[:, step])
         u *= beta
         u += current[:, step]
         fired = np.greater(u, theta, out=spikes[:, step])
@@ -111,17 +136,24 @@ def float_recurrence(
         if step % 16 == 15:
             # A decaying membrane ends in denormals, which cost a hundred times a normal operation.
             u[np.abs(u) < DENORMAL] = 0
+            if own is not None:
+                held[np.abs(held) < DENORMAL] = 0
     return spikes, kept
 
 
 def integer_recurrence(
-    population: IntegerPopulation, sums: Floating, *, membranes: bool = False, saturates: bool = True
+    population: IntegerPopulation,
+    sums: Floating,
+    *,
+    own: Floating | None = None,
+    membranes: bool = False,
+    saturates: bool = True,
 ) -> tuple[BoolArray, IntArray | None]:
     """Loihi's compartment on given synaptic sums (in weight units); :mod:`runtime.spec` holds the definition.
 
     Runs in float64, exactly: registers times a 12-bit factor stay below 2**36, a product with 2**-12 only moves the
     point, and truncation is the chip's rounding toward zero. With `saturates` off the membrane has no limits, which
-    tells what saturation does.
+    tells what saturation does. `own` as in :func:`float_recurrence`, in weight units.
     """
     spikes = np.empty(sums.shape, np.bool_)
     kept = np.empty(sums.shape, np.int64) if membranes else None
@@ -132,7 +164,10 @@ def integer_recurrence(
     v = np.zeros_like(u)
     inflow = np.empty_like(u)
     for step in range(sums.shape[1]):
-        np.multiply(sums[:, step], 1 << MEMBRANE_SHIFT, out=inflow)
+        arrived = sums[:, step]
+        if own is not None and step:
+            arrived = arrived + spikes[:, step - 1].astype(own.dtype) @ own
+        np.multiply(arrived, 1 << MEMBRANE_SHIFT, out=inflow)
         if keep_u:
             u *= keep_u
             np.trunc(u, out=u)
@@ -169,10 +204,11 @@ def run_float(
         Keep the membranes too (8 bytes a neuron and step).
     """
 
-    def layer(post: int, sums: Floating) -> tuple[BoolArray, Floating | None]:
-        return float_recurrence(network.populations[post], sums, membranes=membranes)
+    def layer(post: int, sums: Floating, own: Floating | None) -> tuple[BoolArray, Floating | None]:
+        return float_recurrence(network.populations[post], sums, own=own, membranes=membranes)
 
-    return _run(network, events, lambda p, spikes: product(p.weight, spikes, dtype), layer)
+    own = _own_weights(network, lambda p: p.weight, dtype)
+    return _run(network, events, lambda p, spikes: product(p.weight, spikes, dtype), layer, own)
 
 
 def run_integer(
@@ -180,17 +216,31 @@ def run_integer(
 ) -> Activity:
     """Run the integer stage, aligned with the data; parameters as :func:`run_float`, membranes in register values."""
 
-    def layer(post: int, sums: Floating) -> tuple[BoolArray, IntArray | None]:
-        return integer_recurrence(network.populations[post], sums, membranes=membranes, saturates=saturates)
+    def layer(post: int, sums: Floating, own: Floating | None) -> tuple[BoolArray, IntArray | None]:
+        return integer_recurrence(network.populations[post], sums, own=own, membranes=membranes, saturates=saturates)
 
-    return _run(network, events, lambda p, spikes: integer_sums(p.effective(), spikes), layer)
+    own = _own_weights(network, IntegerProjection.effective, np.float64)
+    return _run(network, events, lambda p, spikes: integer_sums(p.effective(), spikes), layer, own)
+
+
+def _own_weights(
+    network: Network | IntegerNetwork, weight_of: Callable[[Any], Sparse], dtype: npt.DTypeLike
+) -> list[Floating | None]:
+    """Weights of each population to itself, (from, to), all planes together; None if it does not hear itself."""
+    found: list[Floating | None] = [None] * len(network.populations)
+    for p in network.projections:
+        if p.pre == p.post:
+            weight, before = np.ascontiguousarray(weight_of(p).toarray().astype(dtype).T), found[p.post]
+            found[p.post] = weight if before is None else before + weight
+    return found
 
 
 def _run(
     network: Network | IntegerNetwork,
     events: BoolArray,
     sums_of: Callable[[Any, BoolArray], Floating],
-    layer: Callable[[int, Floating], tuple[BoolArray, npt.NDArray[Any] | None]],
+    layer: Callable[[int, Floating, Floating | None], tuple[BoolArray, npt.NDArray[Any] | None]],
+    own: list[Floating | None],
 ) -> Activity:
     """Run batch by batch on all cores, population by population."""
 
@@ -199,12 +249,12 @@ def _run(
         for post in range(len(network.populations)):
             sums: Floating | None = None
             for projection in network.projections:
-                if projection.post == post:
+                if projection.post == post != projection.pre:
                     source = part if projection.pre == INPUT else done[projection.pre][0]
                     more = sums_of(projection, source)
                     sums = more if sums is None else sums + more
             assert sums is not None, "verify: every population is reached"
-            done.append(layer(post, sums))
+            done.append(layer(post, sums, own[post]))
         return done
 
     parts = [events[i : i + BATCH] for i in range(0, len(events), BATCH)]

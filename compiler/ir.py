@@ -1,8 +1,9 @@
 """The intermediate representation: populations, projections, input and read-out, in a float and an integer stage.
 
 Populations are numbered by their place in the tuple; ``INPUT`` (-1) stands for the input wherever a projection names
-its source. Weights are sparse matrices whose *stored* entries are the structural synapses: a stored zero is a synapse
-of weight zero. What one object can know is checked on construction, everything else in :mod:`compiler.verify`.
+its source. A projection from a population to itself is recurrent: it brings the spikes of the step before. Weights are
+sparse matrices whose *stored* entries are the structural synapses: a stored zero is a synapse of weight zero. What one
+object can know is checked on construction, everything else in :mod:`compiler.verify`.
 """
 
 from __future__ import annotations
@@ -97,12 +98,12 @@ class Population:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Projection:
-    """Synapses from one population to another.
+    """Synapses from one population to another, or to itself.
 
     Parameters
     ----------
     pre, post : int
-        Population indices; `pre` may be ``INPUT``.
+        Population indices; `pre` may be ``INPUT``. If they are equal, spikes of a step arrive in the next one.
     weight : csr_array (neurons of post, neurons of pre) float64
         ``weight[i, j]`` is from neuron j of `pre` to neuron i of `post`.
     """
@@ -225,13 +226,19 @@ def depths(network: Network | IntegerNetwork) -> tuple[int, ...]:
 
     Examples
     --------
-    A population that listens to the input has depth 0, its listeners depth 1.
+    A population that listens to the input has depth 0, its listeners depth 1; what it hears of itself does not count.
     """
     found = [0] * len(network.populations)
     for post in range(len(network.populations)):
         sources = [projection.pre for projection in network.projections if projection.post == post]
-        found[post] = max((found[pre] + 1 for pre in sources if pre != INPUT), default=0)
+        found[post] = max((found[pre] + 1 for pre in sources if pre not in (INPUT, post)), default=0)
     return tuple(found)
+
+
+def recurrent(network: Network | IntegerNetwork) -> tuple[str, ...]:
+    """Names of the populations that hear themselves."""
+    hears = {projection.post for projection in network.projections if projection.pre == projection.post}
+    return tuple(network.populations[post].name for post in sorted(hears))
 
 
 def to_networkx(network: Network | IntegerNetwork) -> nx.MultiDiGraph:

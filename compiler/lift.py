@@ -85,7 +85,7 @@ def lift(netlist: Netlist) -> IntegerNetwork:
                 pre=int(kind[1]), post=int(kind[0]), weight=weight, exponent=int(kind[2]), bits=int(kind[3])
             )
         )
-    reached = {projection.post for projection in projections}
+    reached = {projection.post for projection in projections if projection.pre != projection.post}
     for index, layer in enumerate(netlist.layers):
         if index not in reached:
             before = next((i for i, other in enumerate(netlist.layers) if other.depth == layer.depth - 1), INPUT)

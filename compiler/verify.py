@@ -55,10 +55,10 @@ def _populations_exist(network: Network | IntegerNetwork) -> bool:
     return all(INPUT <= p.pre < count and 0 <= p.post < count for p in network.projections)
 
 
-def _is_feed_forward(network: Network | IntegerNetwork) -> Faults:
+def _runs_forward(network: Network | IntegerNetwork) -> Faults:
     projections: tuple[Projection | IntegerProjection, ...] = network.projections
     for i, projection in enumerate(projections):
-        if projection.pre >= projection.post:
+        if projection.pre > projection.post:
             yield f"projection {i} runs from population {projection.pre} to {projection.post}, not forward"
 
 
@@ -68,6 +68,8 @@ def _no_layer_is_skipped(network: Network | IntegerNetwork) -> Faults:
     depth = {INPUT: -1} | dict(enumerate(depths(network)))
     projections: tuple[Projection | IntegerProjection, ...] = network.projections
     for i, projection in enumerate(projections):
+        if projection.pre == projection.post:
+            continue  # what a step fires arrives in the next, on the chip and here
         early = depth[projection.post] - depth[projection.pre] - 1
         if early > 0:
             yield f"projection {i} skips a layer: a spike takes one step on the chip, so it would arrive {early} early"
@@ -130,7 +132,7 @@ def _mantissas_hold(network: IntegerNetwork) -> Faults:
 _SHARED: tuple[Callable[[Network | IntegerNetwork], Faults], ...] = (
     _names_are_unique,
     _projections_fit,
-    _is_feed_forward,
+    _runs_forward,
     _no_layer_is_skipped,
     _everything_is_reached,
     _readout_fits,

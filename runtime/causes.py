@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from compiler.fixedpoint import MEMBRANE_SHIFT, FloatArray, IntArray
-from compiler.interpret import Activity, BoolArray, run_float
+from compiler.interpret import Activity, BoolArray, run_float, step_late
 from compiler.ir import INPUT, IntegerNetwork, Network, depths
 from runtime.netlist_faults import Convolution, LayerCheck, check_layer, sources_into
 from runtime.replay import run_variants, variants_of
@@ -178,11 +178,11 @@ def explain(
             convolution=None if post else convolution,
             may_compensate=may_compensate,
         )
-        inputs = [
+        inputs = []
+        for pre in sources_into(network, integer, post):
             # what the chip does not hold, it has no weights from: the float model's spikes tell what it lacks
-            events if pre == INPUT else np.where(absent[pre], truth[pre], observed.spikes[pre])
-            for pre in sources_into(network, integer, post)
-        ]
+            sent = events if pre == INPUT else np.where(absent[pre], truth[pre], observed.spikes[pre])
+            inputs.append(step_late(sent[None])[0] if pre == post else sent)
         arrived = np.concatenate(inputs, axis=1).astype(np.float64)
         seen = observed.spikes[post], np.asarray(observed.membranes[post], np.int64)
         sums = arrived @ check.stored.weight.T / (1 << MEMBRANE_SHIFT)

@@ -1,7 +1,8 @@
 """The float network driven by its events: as fast as the chip's engine, for runs by the thousand.
 
 What :func:`compiler.interpret.run_float` means, in float32, without a dense product: a spike adds the weights that it
-has to others, source by source, and the bias comes last. Sums are taken in another order than in the released code, so
+has to others, source by source, those of the layer itself after all others, and the bias comes last. Sums are taken in
+another order than in the released code, so
 that a spike decided by the last bit of a sum may differ from :mod:`models.reference`; ``verify`` counts such spikes as
 ill-posed, and the released network has none on the released recordings.
 
@@ -15,7 +16,7 @@ import os
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -34,6 +35,29 @@ NOWHERE = -1
 """Seat of a neuron that the chip does not hold."""
 
 
+class Runs(NamedTuple):
+    """Weights by source, as stretches of neighbouring targets.
+
+    Parameters
+    ----------
+    run : (sources + 1,) int64
+        Bounds of each source's runs; a run is a stretch of neighbouring targets.
+    target, offset : (runs,) int64, (runs + 1,) int64
+        First target of each run, and where its weights begin; a run is as long as its weights.
+    weight : (synapses,) float32
+    """
+
+    run: IntArray
+    target: IntArray
+    offset: IntArray
+    weight: Floats
+
+
+_NONE = np.zeros(0, np.int64)
+NO_RUNS = Runs(_NONE, _NONE, _NONE, _NONE.astype(np.float32))
+"""Of no source."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Layer:
     """One population, prepared.
@@ -41,12 +65,9 @@ class Layer:
     Parameters
     ----------
     pres : tuple of int
-        Populations that it hears, ``INPUT`` for the input; their neurons are numbered one after the other.
-    run : (sources + 1,) int64
-        Bounds of each source's runs; a run is a stretch of neighbouring targets.
-    target, offset : (runs,) int64
-        First target of each run, and where its weights begin; a run is as long as its weights.
-    weight : (synapses,) float32
+        Other populations that it hears, ``INPUT`` for the input; their neurons are numbered one after the other.
+    runs, own : Runs
+        Weights from these, and from itself; the latter without a source if it does not hear itself.
     bias : (neurons,) float32
     beta, theta, alpha : float
     depth, late : int
@@ -59,10 +80,8 @@ class Layer:
     """
 
     pres: tuple[int, ...]
-    run: IntArray
-    target: IntArray
-    offset: IntArray
-    weight: Floats
+    runs: Runs
+    own: Runs
     bias: Floats
     beta: float
     theta: float
@@ -110,10 +129,10 @@ def prepare(network: Network, netlist: Netlist) -> FloatEngine:
     depth = [layer.depth for layer in netlist.layers]
     layers = []
     for post, population in enumerate(network.populations):
-        into = [projection for projection in network.projections if projection.post == post]
+        into = [p for p in network.projections if p.post == post != p.pre]
+        itself = [p for p in network.projections if p.post == post == p.pre]
         pres = tuple(dict.fromkeys(projection.pre for projection in into))
         sizes = {pre: network.input.size if pre == INPUT else network.populations[pre].size for pre in pres}
-        run, target, offset, weight = _runs(into, sizes)
         seat, heard = np.full(population.size, NOWHERE), np.ones(population.size, np.bool_)
         ids = netlist.compartments_of(post)
         seat[netlist.neuron[ids]] = ids
@@ -122,10 +141,8 @@ def prepare(network: Network, netlist: Netlist) -> FloatEngine:
         layers.append(
             Layer(
                 pres=pres,
-                run=run,
-                target=target,
-                offset=offset,
-                weight=weight,
+                runs=_runs(into, sizes),
+                own=_runs(itself, {post: population.size}) if itself else NO_RUNS,
                 bias=population.bias.astype(np.float32),
                 beta=population.beta,
                 theta=population.theta,
@@ -147,8 +164,8 @@ def prepare(network: Network, netlist: Netlist) -> FloatEngine:
     )
 
 
-def _runs(into: list[Projection], sizes: dict[int, int]) -> tuple[IntArray, IntArray, IntArray, Floats]:
-    """Weights of all projections by source, as stretches of neighbouring targets."""
+def _runs(into: list[Projection], sizes: dict[int, int]) -> Runs:
+    """Weights of all projections by source."""
     first = dict(zip(sizes, np.cumsum([0, *sizes.values()]).tolist(), strict=False))
     row = np.concatenate([np.repeat(np.arange(p.weight.shape[0]), np.diff(p.weight.indptr)) for p in into])
     column = np.concatenate([p.weight.indices + first[p.pre] for p in into])
@@ -160,7 +177,7 @@ def _runs(into: list[Projection], sizes: dict[int, int]) -> tuple[IntArray, IntA
     begins[1:] = (np.diff(column) != 0) | (np.diff(row) != 1)
     offset = np.flatnonzero(begins)
     run = np.searchsorted(column[offset], np.arange(sum(sizes.values()) + 1))
-    return run, row[offset].astype(np.int64), np.append(offset, len(row)), data
+    return Runs(run, row[offset].astype(np.int64), np.append(offset, len(row)), data)
 
 
 def run(
@@ -219,10 +236,8 @@ def _one(engine: FloatEngine, inputs: npt.NDArray[np.uint8], begin: int, found: 
             source,
             bounds,
             layer.late,
-            layer.run,
-            layer.target,
-            layer.offset,
-            layer.weight,
+            layer.runs,
+            layer.own,
             layer.bias,
             np.float32(layer.beta),
             np.float32(layer.theta),
@@ -282,6 +297,13 @@ def _add(total: Any, first: Any, weight: Any, begin: Any, length: Any) -> None:
 
 
 @numba.njit(cache=True, nogil=True)
+def _arrive(total: Any, runs: Any, source: Any, begin: Any, end: Any) -> None:
+    for event in range(begin, end):
+        for r in range(runs.run[source[event]], runs.run[source[event] + 1]):
+            _add(total, runs.target[r], runs.weight, runs.offset[r], runs.offset[r + 1] - runs.offset[r])
+
+
+@numba.njit(cache=True, nogil=True)
 def _keep(current: Any, alpha: Any) -> None:
     for i in range(len(current)):
         current[i] *= alpha
@@ -308,10 +330,8 @@ def _integrate_layer(
     source: Any,
     bounds: Any,
     late: Any,
-    run: Any,
-    target: Any,
-    offset: Any,
-    weight: Any,
+    runs: Any,
+    own: Any,
     bias: Any,
     beta: Any,
     theta: Any,
@@ -334,9 +354,9 @@ def _integrate_layer(
         else:
             current[:] = 0
         if t + late < steps:
-            for event in range(bounds[t + late], bounds[t + late + 1]):
-                for r in range(run[source[event]], run[source[event] + 1]):
-                    _add(current, target[r], weight, offset[r], offset[r + 1] - offset[r])
+            _arrive(current, runs, source, bounds[t + late], bounds[t + late + 1])
+        if len(own.run) and t:
+            _arrive(current, own, out, out_bounds[t - 1], out_bounds[t])
         _integrate(membrane, current, bias, beta, theta, fired)
         if t % 16 == 15:  # decaying values end in denormals, which cost a hundred times a normal operation
             _flush(membrane, least)

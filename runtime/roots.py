@@ -4,7 +4,7 @@ An *entry* is one neuron in one step, in aligned time; it *diverges* if float mo
 A neuron remembers what happened since its last *common reset*, the last step in which both fired: both membranes are
 zero after it. So an entry follows from
 
-* the diverging entries of its presynaptic neurons, and
+* the diverging entries of its presynaptic neurons, those of its own layer in the step before, and
 * the earlier diverging entries of its own neuron,
 
 in the steps that the neuron remembers. An entry that follows from none is a *root*: all its inputs agreed, and yet it
@@ -91,12 +91,13 @@ def find_roots(differs: Sequence[BoolArray], resets: Sequence[BoolArray], source
     begin = [np.zeros(array.shape[1], np.int64) for array in differs]
     places: list[tuple[int, int, int, int]] = []
     sets: list[int] = []
+    before: list[dict[int, int]] = [{} for _ in differs]
     for step in range(len(differs[0]) if differs else 0):
         arisen: list[dict[int, int]] = []  # sets of this step's entries, by population and neuron
         for post, differing in enumerate(differs):
             known = remembered[post]
             for pre, connected in sources[post]:
-                _inherit(known, arisen[pre], connected)
+                _inherit(known, before[post] if pre == post else arisen[pre], connected)
             now: dict[int, int] = {}
             for neuron in np.flatnonzero(differing[step]).tolist():
                 if not known[neuron]:
@@ -108,6 +109,7 @@ def find_roots(differs: Sequence[BoolArray], resets: Sequence[BoolArray], source
             for neuron in np.flatnonzero(resets[post][step]).tolist():
                 known[neuron] = 0
                 begin[post][neuron] = step + 1
+        before = arisen
     dragged, alone = _count(sets, len(places))
     found = [
         Root(layer=post, neuron=neuron, step=step, begin=first, dragged=dragged[i] - 1, alone=alone[i] - 1)

@@ -16,7 +16,7 @@ from random_networks import (
 from scipy import sparse
 
 from compiler.errors import VerifyError
-from compiler.ir import INPUT, Network, Projection, Readout, depths, fan_in, to_networkx
+from compiler.ir import INPUT, Network, Projection, Readout, depths, fan_in, recurrent, to_networkx
 from compiler.passes.emit import emit
 from compiler.passes.partition import partition
 from compiler.text import text
@@ -93,9 +93,23 @@ def test_repeated_synapses():
 
 def test_a_projection_that_runs_in_a_circle():
     network = small()
-    back = Projection(pre=1, post=1, weight=stored(np.ones((2, 2))))
+    back = Projection(pre=1, post=0, weight=stored(np.ones((2, 2))))
     message = refused(replace(network, projections=(*network.projections, back)))
-    assert message == "projection 2 runs from population 1 to 1, not forward"
+    assert message == (
+        "projection 2 runs from population 1 to 0, not forward; "
+        "projection 0 skips a layer: a spike takes one step on the chip, so it would arrive 1 early"
+    )
+
+
+def test_a_population_may_hear_itself_and_is_no_deeper_for_it():
+    network = small()
+    own = Projection(pre=1, post=1, weight=stored(np.ones((2, 2))))
+    network = replace(network, projections=(*network.projections, own))
+    verify(network)
+    assert depths(network) == (0, 1)
+    assert recurrent(network) == ("fc2",)
+    alone = replace(network, projections=(network.projections[0], own))
+    assert refused(alone) == "population 'fc2' is not reached from the input"
 
 
 def test_a_projection_that_skips_a_layer():

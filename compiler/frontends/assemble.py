@@ -29,7 +29,8 @@ class Layer:
         Decay and threshold.
     bias : (neurons,) float64
     sources : mapping of int to csr_array (neurons, neurons of the source)
-        Stages from other layers by their place in the sequence, or from ``INPUT``.
+        Stages from other layers by their place in the sequence, or from ``INPUT``; from its own place the spikes of the
+        step before.
     alpha : float
         Share of the synaptic current that a step keeps.
     relays : int
@@ -84,7 +85,7 @@ def unique_names(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def in_order(layers: Sequence[Layer]) -> list[int]:
-    """Places of the layers, each after those that it listens to.
+    """Places of the layers, each after the others that it listens to.
 
     Raises
     ------
@@ -96,12 +97,13 @@ def in_order(layers: Sequence[Layer]) -> list[int]:
         ready = [
             index
             for index, layer in enumerate(layers)
-            if index not in placed and all(source in placed or source == INPUT for source in layer.sources)
+            if index not in placed and all(source in placed or source in (INPUT, index) for source in layer.sources)
         ]
         if not ready:
             stuck = [printable(layer.name) for index, layer in enumerate(layers) if index not in placed]
             raise ModelError(
-                f"layers {', '.join(stuck)} listen to each other in a circle; only feed-forward networks can be lowered"
+                f"layers {', '.join(stuck)} listen to each other in a circle; a layer may listen to itself, but to no "
+                "other that listens to it"
             )
         placed += ready
     return placed
@@ -176,7 +178,7 @@ def _require_reach(network: Network) -> None:
     names = [printable(population.name) for population in network.populations]
     depth = {INPUT: -1} | dict(enumerate(depths(network)))
     for post, name in enumerate(names):
-        sources = [projection.pre for projection in network.projections if projection.post == post]
+        sources = [p.pre for p in network.projections if p.post == post != p.pre]
         if not sources:
             raise ModelError(f"layer {name}: listens to nothing, so it is not reached from the input; leave it away")
         if len({depth[source] for source in sources}) > 1:

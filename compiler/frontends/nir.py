@@ -15,20 +15,12 @@ from compiler.dynamics import MOST_STEPS, RELAY_WEIGHT, Clocks
 from compiler.errors import ModelError, OptionError
 from compiler.fixedpoint import FloatArray, IntArray
 from compiler.frontends.assemble import Layer, assemble, class_of_each, in_order, unique_names
+from compiler.frontends.nir_facts import SpikingNode, facts_of, hint
 from compiler.frontends.nir_file import Graph, Node, read_graph
-from compiler.frontends.nir_file import in_order as nodes_in_order
-from compiler.frontends.nir_neurons import (
-    CONVENTIONS,
-    SPIKING,
-    TOLERANCE,
-    Neurons,
-    Steps,
-    decay_words,
-    neurons_of,
-    require_steps,
-    written_for,
-)
+from compiler.frontends.nir_neurons import CONVENTIONS, SPIKING, TOLERANCE, Steps, neurons_of, require_steps
 from compiler.frontends.nir_nodes import KNOWN, STAGES
+from compiler.frontends.nir_order import in_order as nodes_in_order
+from compiler.frontends.nir_order import loops
 from compiler.frontends.nir_values import Value, added, filtered, scaled, spikes_of
 from compiler.frontends.sensor_layout import sensor_layout
 from compiler.frontends.tensors import printable
@@ -62,16 +54,6 @@ class NirNetwork:
     sha256: str
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Spiking:
-    """A spiking node: what it gets, scaled to its membrane, and its neurons by their decays."""
-
-    node: Node
-    value: Value
-    neurons: Neurons
-    groups: list[IntArray]
-
-
 def read_nir(
     path: str | os.PathLike[str],
     *,
@@ -96,37 +78,21 @@ def read_nir(
     Raises
     ------
     ModelError
-        If the file cannot be read, or holds something else than a feed-forward network that spikes; the message names
-        the node.
+        If the file cannot be read, or holds something else than a network that spikes, feed-forward but for layers that
+        hear themselves; the message names the node.
     OptionError
         If there is no time step, or an option has no such value.
     """
     try:
         graph = read_graph(Path(path))
         if dt is None:
-            raise OptionError(f"{path}: NIR keeps no time step{_hint(graph)}; give --dt SECONDS")
+            raise OptionError(f"{path}: NIR keeps no time step{hint(graph)}; give --dt SECONDS")
         steps = Steps(dt=dt, convention=convention or CONVENTIONS[0])
         require_steps(dt)
         with np.errstate(all="ignore"):  # what is not finite is refused at the end
             return network_of(graph, steps, polarities, polarities_first)
     except ModelError as error:
         raise ModelError(f"{path}: {error}") from error
-
-
-def _written(graph: Graph) -> float | None:
-    """Step that the file was written in, as far as all of its neurons say the same."""
-    found = [written_for(node) for node in graph.nodes.values() if node.type in SPIKING and node.type != "Threshold"]
-    if not found or found[0] is None or any(step is None for step in found):
-        return None
-    return found[0] if all(math.isclose(step, found[0], rel_tol=1e-4) for step in found if step) else None
-
-
-def _hint(graph: Graph) -> str:
-    said = graph.metadata.get("dt")
-    if isinstance(said, np.ndarray) and said.size == 1:
-        return f", but its metadata says dt = {float(said.ravel()[0]):g}"
-    written = _written(graph)
-    return "" if written is None else f", but its r is tau / {written:g}, as of steps of {written:g} s"
 
 
 def network_of(
@@ -146,33 +112,33 @@ def network_of(
     place = sum(len(other.groups) for other in spiking[:voters])
     layers, sensor = _with_held(layers, held, sensor)
     network = assemble(layers, sensor, place, label)
-    facts = _facts(graph, steps, spiking, f"input {printable(entry.name)}: {words}", sensor)
+    facts = facts_of(graph, steps, spiking, f"input {printable(entry.name)}: {words}", sensor)
     facts.append(f"classes: the spikes of {printable(spiking[voters].node.name)} in output {printable(end.name)}")
     return NirNetwork(network=network, facts=tuple(facts), sha256=graph.sha256)
 
 
-def _walk(graph: Graph, steps: Steps, shape: tuple[int, ...]) -> tuple[list[_Spiking], Value]:
+def _walk(graph: Graph, steps: Steps, shape: tuple[int, ...]) -> tuple[list[SpikingNode], Value]:
     """All spiking nodes in order, and what the output gets."""
     heard: dict[str, list[str]] = {name: [] for name in graph.nodes}
     for source, target in graph.edges:
         heard[target].append(source)
     values: dict[str, Value] = {}
-    spiking: list[_Spiking] = []
+    forward: dict[str, Value] = {}
+    spiking: list[SpikingNode] = []
     result: Value | None = None
-    for name in nodes_in_order(graph):
+    late = loops(graph)
+    for name in nodes_in_order(graph, late):
         node = graph.nodes[name]
         if node.type == "Input":
             if heard[name]:
                 raise node.fail("gets values from other nodes; leave these edges away")
             values[name] = spikes_of(INPUT, shape)
             continue
-        try:
-            value = added([values[source] for source in heard[name]])
-        except ModelError as error:
-            raise node.fail(str(error)) from error
+        value = _added(node, [values[source] for source in heard[name] if source not in late.get(name, ())])
         if node.type in SPIKING:
             values[name] = spikes_of(len(spiking), value.shape)
             spiking.append(_spiking(node, value, steps))
+            forward[name] = value
         elif node.type in STAGES:
             values[name] = STAGES[node.type](node, value, steps)
         else:
@@ -181,10 +147,27 @@ def _walk(graph: Graph, steps: Steps, shape: tuple[int, ...]) -> tuple[list[_Spi
         if node.type == "Output":
             result = values[name]
     assert result is not None, "there is one output"
+    for place, one in enumerate(spiking):
+        name = one.node.name
+        if name in late:
+            value = _added(one.node, [forward[name], *(values[source] for source in late[name])])
+            spiking[place] = replace(_spiking(one.node, value, steps), hears_itself=True)
+            if len(one.groups) > 1:
+                raise one.node.fail(
+                    f"hears itself and has {len(one.groups)} membrane time constants, which are layers of their own; "
+                    "give it one"
+                )
     return spiking, result
 
 
-def _spiking(node: Node, value: Value, steps: Steps) -> _Spiking:
+def _added(node: Node, values: Sequence[Value]) -> Value:
+    try:
+        return added(values)
+    except ModelError as error:
+        raise node.fail(str(error)) from error
+
+
+def _spiking(node: Node, value: Value, steps: Steps) -> SpikingNode:
     if not value.size:
         raise node.fail("has no neurons; export it again")
     neurons = neurons_of(node, value.size, value.shape, steps)
@@ -204,16 +187,18 @@ def _spiking(node: Node, value: Value, steps: Steps) -> _Spiking:
             "fewer"
         )
     groups = [np.flatnonzero(decays == decay) for decay in different]
-    return _Spiking(node=node, value=own, neurons=neurons, groups=groups)
+    return SpikingNode(node=node, value=own, neurons=neurons, groups=groups, hears_itself=False)
 
 
-def _layers(spiking: Sequence[_Spiking], positions: IntArray) -> tuple[list[Layer], list[FloatArray]]:
+def _layers(spiking: Sequence[SpikingNode], positions: IntArray) -> tuple[list[Layer], list[FloatArray]]:
     """A layer for each decay of each node, and what flows into the currents of its neurons in every step."""
     first = np.cumsum([0, *(len(one.groups) for one in spiking)]).tolist()
     named = unique_names([one.node.name for one in spiking])
-    layers, held = [], []
+    layers: list[Layer] = []
+    held = []
     for one, name in zip(spiking, named, strict=True):
         for number, rows in enumerate(one.groups, 1):
+            place = len(layers)
             # Neurons of other thresholds are those of one, with their weights and biases in its units.
             theta = float(one.neurons.theta[rows[0]])
             units = theta / one.neurons.theta[rows]
@@ -225,7 +210,9 @@ def _layers(spiking: Sequence[_Spiking], positions: IntArray) -> tuple[list[Laye
                     continue
                 for group, columns in enumerate(spiking[source].groups):
                     sources[first[source] + group] = own[:, columns]
-            reached = {source: weight for source, weight in sources.items() if weight.nnz} or sources
+            reached = {source: weight for source, weight in sources.items() if weight.nnz}
+            if not reached.keys() - {place}:
+                reached = sources
             for weight in reached.values():
                 weight.sort_indices()
             layers.append(
@@ -259,7 +246,7 @@ def _with_held(layers: list[Layer], held: list[FloatArray], sensor: Input) -> tu
         return layers, sensor
     depth: dict[int, int] = {INPUT: -1}
     for index in in_order(layers):
-        depth[index] = max((depth[source] + 1 for source in layers[index].sources), default=0)
+        depth[index] = max((depth[source] + 1 for source in layers[index].sources if source != index), default=0)
     clocked = replace(sensor, clocks=Clocks(channels=1, steps=MOST_STEPS))
     found = []
     relays = range(max(depth[index] for index in lasting))  # one a depth, on the way to the deepest
@@ -303,7 +290,7 @@ def _beside(left: Sparse, right: Sparse) -> Sparse:
     return both
 
 
-def _readout(end: Node, result: Value, spiking: Sequence[_Spiking]) -> tuple[int, IntArray]:
+def _readout(end: Node, result: Value, spiking: Sequence[SpikingNode]) -> tuple[int, IntArray]:
     """The spiking node whose spikes are counted, and the class of each of its neurons."""
     remedy = "end the network with a spiking layer, one neuron or one group of neurons a class"
     if result.alpha:
@@ -320,57 +307,3 @@ def _readout(end: Node, result: Value, spiking: Sequence[_Spiking]) -> tuple[int
             f"votes, and has {len(spiking[source].groups)} membrane time constants; give the last layer one"
         )
     return source, label
-
-
-def _facts(graph: Graph, steps: Steps, spiking: Sequence[_Spiking], sensor: str, clocked: Input) -> list[str]:
-    """What a reader of the file would want to check."""
-    version = printable(graph.version) or "of no version"
-    facts = [f"NIR {version}, read in steps of {steps.dt:g} s ({steps.convention})", sensor]
-    for one in spiking:
-        n = one.neurons
-        decays = " or ".join(decay_words(float(n.beta[rows[0]])) for rows in one.groups[:4])
-        told = f"layer {printable(one.node.name)} ({one.node.type}): {len(n.beta)} neurons, {decays}"
-        told += f", current {one.value.alpha:.6g}" if one.value.alpha else ""
-        told += f", fires at v > {_span(n.theta + n.reset)}, then v = {_span(n.reset)}"
-        if np.any(np.abs(n.gain - 1) > 1e-4):
-            told += f"; a step adds {_span(n.gain)} of its input"
-        facts.append(told)
-    return facts + _drifts(graph, steps, clocked)
-
-
-def _drifts(graph: Graph, steps: Steps, sensor: Input) -> list[str]:
-    """What files are known to lose or to change."""
-    facts = ["v goes to its reset as NIR says; a framework that subtracts the threshold instead means another network"]
-    if any(node.type == "CubaLIF" for node in graph.nodes.values()):
-        facts.append(
-            "a reset leaves currents as they are, as NIR says; snnTorch's Synaptic with reset 'zero' clears them"
-        )
-    written = _written(graph)
-    if written is not None and not math.isclose(written, steps.dt, rel_tol=1e-4):
-        facts.append(
-            f"drift: r is tau / {written:g} in every neuron, as of a file written in steps of {written:g} s; in steps "
-            f"of {steps.dt:g} s its decays and gains are others than there"
-        )
-    rounded = [
-        f"{printable(name)}.{key} ({np.dtype(node.stored(key)).name})"
-        for name, node in graph.nodes.items()
-        for key in ("weight", "bias", "tau", "tau_mem", "tau_syn", "v_threshold")
-        if node.has(key) and (np.dtype(node.stored(key)).kind != "f" or np.dtype(node.stored(key)).itemsize < 4)
-    ]
-    if rounded:
-        facts.append(f"drift: rounded before the file was written: {', '.join(rounded[:6])}; read as they stand")
-    square = [
-        printable(name)
-        for name, node in graph.nodes.items()
-        if node.type in ("Affine", "Linear") and len(set(node.numbers("weight").shape)) == 1
-    ]
-    if square:
-        facts.append(f"square matrices are read as (to, from): {', '.join(square[:6])}")
-    if sensor.clocks.channels:
-        facts.append("biases that go through a synaptic current come from a channel that always has an event")
-    return facts
-
-
-def _span(values: FloatArray) -> str:
-    low, high = float(values.min()), float(values.max())
-    return f"{low:.6g}" if math.isclose(low, high, rel_tol=1e-6, abs_tol=1e-12) else f"{low:.6g} … {high:.6g}"

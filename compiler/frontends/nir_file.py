@@ -15,7 +15,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -250,41 +249,3 @@ def _pairs(graph: Tree, where: str) -> list[tuple[str, str]]:
     ):
         raise ModelError(f"{where} has no list of edges; {DAMAGED}")
     return [(source, target) for source, target in edges]
-
-
-def in_order(graph: Graph) -> tuple[str, ...]:
-    """Names of the nodes, each after those that it hears.
-
-    Raises
-    ------
-    ModelError
-        If some hear each other in a circle, or nothing at all.
-    """
-    heard: dict[str, set[str]] = {name: set() for name in graph.nodes}
-    for source, target in graph.edges:
-        heard[target].add(source)
-    for name, node in graph.nodes.items():
-        if not heard[name] and node.type != INPUT_NODE:
-            raise node.fail("hears nothing, so it is not reached from the input; leave it away")
-    placed: dict[str, None] = {}
-    while len(placed) < len(heard):
-        ready = [name for name, sources in heard.items() if name not in placed and sources <= placed.keys()]
-        if not ready:
-            raise ModelError(_circle(heard, placed))
-        placed |= dict.fromkeys(ready)
-    return tuple(placed)
-
-
-def _circle(heard: Mapping[str, set[str]], placed: Mapping[str, Any]) -> str:
-    """Name one circle of nodes."""
-    name = next(name for name in heard if name not in placed)
-    walked: list[str] = []
-    while name not in walked:
-        walked.append(name)
-        name = next(source for source in sorted(heard[name]) if source not in placed)
-    circle = [*walked[walked.index(name) :], name]
-    shown = " -> ".join(printable(one) for one in reversed(circle))
-    return (
-        f"nodes hear each other in a circle ({shown}); Loihi could run this recurrence, but networks here are lowered "
-        "layer by layer and have none: unroll it or train without"
-    )

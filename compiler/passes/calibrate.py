@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from compiler.errors import DataError
-from compiler.interpret import BoolArray, run_float
+from compiler.interpret import BoolArray, run_float, step_late
 from compiler.ir import INPUT, Network
 
 FEW = 32
@@ -35,9 +35,11 @@ class Calibration:
     events: BoolArray
     spikes: tuple[BoolArray, ...]
 
-    def source(self, pre: int) -> BoolArray:
-        """Spikes of a projection's source population, or the input events."""
-        return self.events if pre == INPUT else self.spikes[pre]
+    def source(self, pre: int, post: int) -> BoolArray:
+        """What a projection brings in each step: spikes of its source population, its own a step late, or events."""
+        if pre == INPUT:
+            return self.events
+        return step_late(self.spikes[pre]) if pre == post else self.spikes[pre]
 
 
 def evenly_spaced(events: BoolArray, count: int = FEW) -> BoolArray:

@@ -55,7 +55,7 @@ def compensated(
         wanted[place] = p.weight.data * scale[row] / step
         stored[place] = 1
         places.append(place)
-        sources.append(calibration.source(p.pre).reshape(-1, p.weight.shape[1]))
+        sources.append(calibration.source(p.pre, post).reshape(-1, p.weight.shape[1]))
         offset += p.weight.shape[1]
     held = np.clip(wanted, -limit, limit)
     active = sparse.csr_array(np.concatenate(sources, axis=1), dtype=np.float32)

@@ -168,7 +168,7 @@ def _decay_flips(network: Network, post: int, calibration: Calibration) -> int:
     realised = replace(population, alpha=(4095 - lost_u) / 4096, beta=(4096 - lost_v) / 4096)
 
     def moved(part: slice) -> IntArray:
-        sums = sum(product(p.weight, calibration.source(p.pre)[part], np.float64) for p in projections)
+        sums = sum(product(p.weight, calibration.source(p.pre, post)[part], np.float64) for p in projections)
         spikes, _ = float_recurrence(realised, np.asarray(sums))
         return np.asarray(np.count_nonzero(spikes != calibration.spikes[post][part]))
 

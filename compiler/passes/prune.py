@@ -7,6 +7,7 @@ become finer. Left out on request only: neurons that did not fire on the trainin
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -56,27 +57,50 @@ def never_fires(network: Network) -> tuple[Mask, ...]:
     that outlasts its step has added up the weights already.
     """
     silent: dict[int, Mask] = {INPUT: np.zeros(network.input.size, np.bool_)}
-    for post, population in enumerate(network.populations):
-        up, total = np.zeros(population.size), np.abs(population.bias)
-        inputs = 0
-        for p in network.projections:
-            if p.post == post:
-                heard = (~silent[p.pre]).astype(np.float64)
-                for rows in row_parts(p.weight):
-                    weight = p.weight[rows]
-                    up[rows] += weight.maximum(0) @ heard
-                    total[rows] += abs(weight) @ heard
-                inputs += p.weight.shape[1]
-        lasts = population.alpha * (1 + 8 * FLOAT32_ROUNDING)
-        gathered = np.inf if lasts >= 1 else 1 / (1 - lasts)
-        slack = (inputs + 8) * FLOAT32_ROUNDING * total * gathered
-        with np.errstate(invalid="ignore"):
-            most = np.maximum(np.where(up > 0, up * gathered, 0.0) + population.bias + slack, 0)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            kept = population.beta * (1 + 8 * FLOAT32_ROUNDING)
-            settled = most / (1 - kept) if kept < 1 else np.where(most > 0, np.inf, 0)
-        silent[post] = settled <= population.theta * (1 - 8 * FLOAT32_ROUNDING)
+    for post in range(len(network.populations)):
+
+        def judge(own: Mask, post: int = post) -> Mask:
+            return _never_fires(network, post, silent | {post: own})
+
+        silent[post] = _grown(network, post, judge)
     return _without_voters(network, tuple(silent[post] for post in range(len(network.populations))))
+
+
+def _grown(network: Network | IntegerNetwork, post: int, judge: Callable[[Mask], Mask]) -> Mask:
+    """Neurons of a population that `judge` finds to do nothing, given those of them that are known to do nothing.
+
+    What it finds is known from then on, until nothing more is found; at once where the population does not hear itself.
+    """
+    found = judge(np.zeros(network.populations[post].size, np.bool_))
+    if any(p.pre == p.post == post for p in network.projections):
+        while not np.array_equal(found, more := judge(found)):
+            found = more
+    return found
+
+
+def _never_fires(network: Network, post: int, silent: Mapping[int, Mask]) -> Mask:
+    """Neurons of one population that cannot fire as long as those that are known to be silent do not."""
+    population = network.populations[post]
+    up, total = np.zeros(population.size), np.abs(population.bias)
+    inputs = 0
+    for p in network.projections:
+        if p.post == post:
+            heard = (~silent[p.pre]).astype(np.float64)
+            for rows in row_parts(p.weight):
+                weight = p.weight[rows]
+                up[rows] += weight.maximum(0) @ heard
+                total[rows] += abs(weight) @ heard
+            inputs += p.weight.shape[1]
+    lasts = population.alpha * (1 + 8 * FLOAT32_ROUNDING)
+    gathered = np.inf if lasts >= 1 else 1 / (1 - lasts)
+    slack = (inputs + 8) * FLOAT32_ROUNDING * total * gathered
+    with np.errstate(invalid="ignore"):
+        most = np.maximum(np.where(up > 0, up * gathered, 0.0) + population.bias + slack, 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        kept = population.beta * (1 + 8 * FLOAT32_ROUNDING)
+        settled = most / (1 - kept) if kept < 1 else np.where(most > 0, np.inf, 0)
+    below: Mask = settled <= population.theta * (1 - 8 * FLOAT32_ROUNDING)
+    return below
 
 
 def never_fired(network: Network, calibration: Calibration) -> tuple[Mask, ...]:
@@ -123,33 +147,50 @@ def removable(network: IntegerNetwork) -> tuple[tuple[Mask, ...], tuple[Mask, ..
         One mask per population; no neuron is in both.
     """
     silent: dict[int, Mask] = {INPUT: np.zeros(network.input.size, np.bool_)}
-    for post, population in enumerate(network.populations):
-        up = np.zeros(population.size)
-        for p in network.projections:
-            if p.post == post:
-                fires = (~silent[p.pre]).astype(np.float64)
-                for rows in row_parts(p.weight):
-                    up[rows] += replace(p, weight=p.weight[rows]).effective().maximum(0) @ fires
-        silent[post] = _cannot_reach(population, up * (1 << MEMBRANE_SHIFT))
+    for post in range(len(network.populations)):
+
+        def judge(own: Mask, post: int = post) -> Mask:
+            return _silent(network, post, silent | {post: own})
+
+        silent[post] = _grown(network, post, judge)
     unheard: dict[int, Mask] = {}
     for pre in reversed(range(len(network.populations))):
-        size = network.populations[pre].size
-        votes = pre == network.readout.population
-        if votes:
-            silent[pre] = np.zeros(size, np.bool_)
-        heard = np.full(size, votes)
-        for p in network.projections:
-            if p.pre == pre:
-                listens = ~(silent[p.post] | unheard[p.post])
-                for rows in row_parts(p.weight):
-                    weight = p.weight[rows]
-                    counts = np.repeat(listens[rows], np.diff(weight.indptr)) & (weight.data != 0)
-                    heard[weight.indices[counts]] = True
-        unheard[pre] = ~heard & ~silent[pre]
+        if pre == network.readout.population:
+            silent[pre] = np.zeros(network.populations[pre].size, np.bool_)
+
+        def deaf(own: Mask, pre: int = pre) -> Mask:
+            return _unheard(network, pre, silent, unheard | {pre: own})
+
+        unheard[pre] = _grown(network, pre, deaf)
         if np.all(silent[pre] | unheard[pre]):
             silent[pre][0] = unheard[pre][0] = False
     indices = range(len(network.populations))
     return tuple(silent[i] for i in indices), tuple(unheard[i] for i in indices)
+
+
+def _silent(network: IntegerNetwork, post: int, silent: Mapping[int, Mask]) -> Mask:
+    """Neurons of one population that cannot fire as long as those that are known to be silent do not."""
+    population = network.populations[post]
+    up = np.zeros(population.size)
+    for p in network.projections:
+        if p.post == post:
+            fires = (~silent[p.pre]).astype(np.float64)
+            for rows in row_parts(p.weight):
+                up[rows] += replace(p, weight=p.weight[rows]).effective().maximum(0) @ fires
+    return _cannot_reach(population, up * (1 << MEMBRANE_SHIFT))
+
+
+def _unheard(network: IntegerNetwork, pre: int, silent: Mapping[int, Mask], unheard: Mapping[int, Mask]) -> Mask:
+    """Neurons of one population, not silent, without a vote or a synapse to one that is neither silent nor unheard."""
+    heard = np.full(network.populations[pre].size, pre == network.readout.population)
+    for p in network.projections:
+        if p.pre == pre:
+            listens = ~(silent[p.post] | unheard[p.post])
+            for rows in row_parts(p.weight):
+                weight = p.weight[rows]
+                counts = np.repeat(listens[rows], np.diff(weight.indptr)) & (weight.data != 0)
+                heard[weight.indices[counts]] = True
+    return ~heard & ~silent[pre]
 
 
 def _cannot_reach(population: IntegerPopulation, inflow: npt.NDArray[np.float64]) -> Mask:

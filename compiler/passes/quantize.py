@@ -335,7 +335,7 @@ def quantize(
     limits: list[FloatArray | None] = [None] * len(recipes)
     if ranges == "observed" and few is not None:
         limits = [
-            observed_sums(population, incoming(network, post), few) * (1 + margin)
+            observed_sums(population, incoming(network, post), post, few) * (1 + margin)
             for post, population in enumerate(network.populations)
         ]
     shortlists, faults = [], []

@@ -94,7 +94,9 @@ def in_batches(calibration: Calibration, measure: Callable[[slice], IntArray | F
         return [np.asarray(part, np.float64) for part in pool.map(measure, parts)]
 
 
-def observed_sums(population: Population, projections: tuple[Projection, ...], calibration: Calibration) -> FloatArray:
+def observed_sums(
+    population: Population, projections: tuple[Projection, ...], post: int, calibration: Calibration
+) -> FloatArray:
     """Largest one-sided sum of each neuron of the float model on the calibration recordings, membrane units.
 
     A current that outlasts its step counts, too, by the share of its register that it fills.
@@ -102,8 +104,8 @@ def observed_sums(population: Population, projections: tuple[Projection, ...], c
     narrower = ONE_STEP_SUM_MAX * (1 << MEMBRANE_SHIFT) / CURRENT_MAX
 
     def largest(part: slice) -> FloatArray:
-        up = sum(product(p.weight.maximum(0), calibration.source(p.pre)[part], np.float64) for p in projections)
-        down = sum(product(p.weight.minimum(0), calibration.source(p.pre)[part], np.float64) for p in projections)
+        up = sum(product(p.weight.maximum(0), calibration.source(p.pre, post)[part], np.float64) for p in projections)
+        down = sum(product(p.weight.minimum(0), calibration.source(p.pre, post)[part], np.float64) for p in projections)
         both: FloatArray = np.maximum(np.max(up, axis=(0, 1)), -np.min(down, axis=(0, 1)))
         if population.alpha:
             lasting = lasting_currents(np.asarray(up + down), population.alpha)
@@ -121,7 +123,7 @@ def flips(layer: Rounded, post: int, calibration: Calibration) -> IntArray:
         merged[p.pre] = merged[p.pre] + p.effective() if p.pre in merged else p.effective()
 
     def moved(part: slice) -> IntArray:
-        sums = sum(integer_sums(weight, calibration.source(pre)[part]) for pre, weight in merged.items())
+        sums = sum(integer_sums(weight, calibration.source(pre, post)[part]) for pre, weight in merged.items())
         spikes, _ = integer_recurrence(layer.population, np.asarray(sums))
         differ: IntArray = np.count_nonzero(spikes != calibration.spikes[post][part], axis=(0, 1))
         return differ
