@@ -67,7 +67,7 @@ class ChipModule(nn.Module):
     Notes
     -----
     ``layers`` holds what NeuroBench looks for: a Linear for each layer that a layer hears, its weights in weight units,
-    and :class:`ChipNeurons`.
+    and :class:`ChipNeurons`. What a layer hears of itself is what it fired in the step before.
     """
 
     def __init__(self, netlist: Netlist) -> None:
@@ -99,9 +99,14 @@ class ChipModule(nn.Module):
         for layer in neurons:
             layer.rest()
         votes = torch.zeros((len(events), events.shape[1], self.classes), dtype=torch.float64)
+        spikes: dict[int, Tensor] = {
+            post: torch.zeros((len(events), stages[0][1].out_features), dtype=torch.float64)
+            for post, stages in enumerate(self._stages)
+        }
         for step in range(events.shape[1]):
-            spikes: dict[int, Tensor] = {INPUT: events[:, step].to(torch.float64)}
+            spikes[INPUT] = events[:, step].to(torch.float64)
             for post, (stages, layer) in enumerate(zip(self._stages, neurons, strict=True)):
+                # in this order the layers before have fired in this step, the layer itself only in the last
                 sums = [linear(spikes[pre]) for pre, linear in stages]
                 spikes[post] = layer(torch.stack(sums).sum(0))
             votes[:, step].index_add_(1, self._label, spikes[self._voters])

@@ -1,8 +1,8 @@
 """A netlist as a lava-dl ``.net`` file, whose limits are narrower than the chip's, and what they change.
 
 The format keeps one threshold for a layer, weights of 8 bits without an exponent, and biases in whole weight steps,
-where the chip counts 64ths of them. Layers follow each other; convolutions are written out as dense layers. A layer
-whose weights are stored with an exponent is rescaled by a power of two, its threshold with it.
+where the chip counts 64ths of them. Layers follow each other and may hear themselves; convolutions are written out as
+dense layers. A layer whose weights are stored with an exponent is rescaled by a power of two, its threshold with it.
 
 What netx does not read, but our own reader does, is in a group of its own: sensor, clocks and the classes that neurons
 vote for.
@@ -23,14 +23,14 @@ from compiler.frontends.hdf5 import Tree
 from compiler.frontends.netx import OWN, integers_of
 from compiler.frontends.netx_file import blocks_of
 from compiler.interpret import BoolArray, run_integer
-from compiler.ir import INPUT, IntegerNetwork
+from compiler.ir import INPUT, IntegerNetwork, IntegerPopulation
 
 MOST_SHIFT = 8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Block:
-    """One dense layer of the file.
+    """One dense layer of the file, ``dense_rec`` if it hears itself.
 
     Parameters
     ----------
@@ -38,6 +38,8 @@ class Block:
         Layer of the netlist.
     weight : (neurons, inputs) int64
         Whole weight steps.
+    own : (neurons, neurons) int64, or None
+        Likewise, from itself.
     bias : (neurons,) int64
         Whole weight steps, rounded.
     threshold, decay_u, decay_v : int
@@ -54,6 +56,7 @@ class Block:
 
     name: str
     weight: IntArray
+    own: IntArray | None
     bias: IntArray
     threshold: int
     decay_u: int
@@ -76,13 +79,17 @@ def blocks_for(network: IntegerNetwork) -> tuple[Block, ...]:
     for post, population in enumerate(network.populations):
         into = [projection for projection in network.projections if projection.post == post]
         before = INPUT if not post else post - 1
-        if any(projection.pre != before for projection in into) or network.readout.population + 1 != len(
+        if any(projection.pre not in (before, post) for projection in into) or network.readout.population + 1 != len(
             network.populations
         ):
             raise ModelError(f"{population.name}: hears more than the layer before it; netx has layers in a row only")
-        weight: IntArray = np.zeros(into[0].weight.shape, np.int64)
+        # side by side from the layer before and, where it hears itself, from its own neurons
+        sources = {before: network.input.size if before == INPUT else network.populations[before].size}
+        sources |= {post: population.size} if any(projection.pre == post for projection in into) else {}
+        parts = {pre: np.zeros((population.size, size), np.int64) for pre, size in sources.items()}
         for projection in into:
-            weight += projection.effective().toarray()
+            parts[projection.pre] += projection.effective().toarray()
+        weight = np.concatenate(list(parts.values()), axis=1)
         # Neurons that the chip leaves out have no synapses and no bias, and fire at no threshold.
         heard = np.any(weight, axis=1) | (population.bias != 0)
         thresholds = np.unique(population.threshold[heard])
@@ -92,15 +99,16 @@ def blocks_for(network: IntegerNetwork) -> tuple[Block, ...]:
                 "--scale-groups 1"
             )
         threshold = int(thresholds[0]) if len(thresholds) else int(population.threshold[0])
-        found.append(
-            _block(population.name, weight, population.bias, threshold, population.decay_u, population.decay_v)
-        )
+        found.append(_block(population, weight, sources[before], threshold))
     return tuple(found)
 
 
-def _block(name: str, weight: IntArray, bias: IntArray, threshold: int, decay_u: int, decay_v: int) -> Block:
+def _block(population: IntegerPopulation, weight: IntArray, inputs: int, threshold: int) -> Block:
+    """A layer with these weights, those of its `inputs` first, then its own."""
+    name = population.name
     shift = _shift(name, weight, threshold)
-    steps = np.ldexp(bias.astype(np.float64), shift - MEMBRANE_SHIFT)
+    shifted = np.ldexp(weight.astype(np.float64), shift).astype(np.int64)
+    steps = np.ldexp(population.bias.astype(np.float64), shift - MEMBRANE_SHIFT)
     whole = round_half_even(steps)
     scaled = np.ldexp(float(threshold), shift)
     if np.abs(whole).max(initial=0) > BIAS_MANTISSA_MAX:
@@ -110,11 +118,12 @@ def _block(name: str, weight: IntArray, bias: IntArray, threshold: int, decay_u:
         )
     return Block(
         name=name,
-        weight=np.ldexp(weight.astype(np.float64), shift).astype(np.int64),
+        weight=shifted[:, :inputs],
+        own=shifted[:, inputs:] if weight.shape[1] > inputs else None,
         bias=whole,
         threshold=max(1, int(np.rint(scaled))),
-        decay_u=decay_u,
-        decay_v=decay_v,
+        decay_u=population.decay_u,
+        decay_v=population.decay_v,
         shift=shift,
         rounded=int(np.count_nonzero(whole != steps)),
         threshold_rounded=bool(scaled != np.rint(scaled)),
@@ -142,11 +151,12 @@ def tree_of(network: IntegerNetwork, blocks: Sequence[Block]) -> Tree:
     for number, block in enumerate(blocks, 1):
         neurons, inputs = block.weight.shape
         layers[str(number)] = {
-            "type": "dense",
+            "type": "dense" if block.own is None else "dense_rec",
             "shape": np.array([neurons]),
             "inFeatures": np.array(inputs),
             "outFeatures": np.array(neurons),
             "weight": block.weight,
+            **({} if block.own is None else {"weight_rec": block.own}),
             "bias": block.bias,
             "neuron": {
                 "type": "CUBA",
@@ -186,7 +196,7 @@ def _fill(group: Any, tree: Tree) -> None:
             text = value.encode("ascii")
             group.create_dataset(name, data=np.array(text if value == "CUBA" else [text], dtype="S10"))
         else:
-            kind = np.int16 if name == "weight" else value.dtype
+            kind = np.int16 if name in ("weight", "weight_rec") else value.dtype
             group.create_dataset(name, data=value.astype(kind), compression="gzip" if value.size > 1024 else None)
 
 

@@ -19,6 +19,7 @@ from compiler.passes.legalize import LimitUse
 from compiler.pipeline import Compilation
 from compiler.targets import load_target
 from runtime.tables import si, table
+from runtime.trace import BoolArray
 
 Json = dict[str, Any]
 
@@ -55,6 +56,7 @@ def netlist_json(netlist: Netlist, uses: Sequence[LimitUse], sha256: str) -> Jso
                 **_lasting(netlist, index),
                 "depth": layer.depth,
                 "synapses_stored": int(np.count_nonzero(into)),
+                **_from_itself(netlist, index, into),
                 "cores": sorted({int(c) for c in core[ids]}),
             }
         )
@@ -84,6 +86,13 @@ def _lasting(netlist: Netlist, layer: int) -> Json:
     if not realised.any():
         return {}
     return {"alpha": netlist.layers[layer].alpha, "alpha_realised": _one_or_many(realised)}
+
+
+def _from_itself(netlist: Netlist, layer: int, into: BoolArray) -> Json:
+    """Stored synapses by which a layer hears itself, of those `into` it, where there are any."""
+    source = netlist.axon_source[netlist.axon_of_synapse()[into]] - netlist.n_inputs
+    own = int(np.count_nonzero(netlist.layer[source[source >= 0]] == layer))
+    return {"synapses_from_itself": own} if own else {}
 
 
 def _one_or_many(values: IntArray | FloatArray) -> Any:
@@ -119,6 +128,7 @@ def _expected(layout: Layout) -> Json:
 def netlist_text(report: Json) -> str:
     """Layers, cores and the fullest core of every limit."""
     lasts = any("alpha" in layer for layer in report["layers"])
+    loops = any("synapses_from_itself" in layer for layer in report["layers"])
     layers = [
         [
             layer["name"],
@@ -126,6 +136,7 @@ def netlist_text(report: Json) -> str:
             f"{layer['compartments']:,}",
             f"{layer['synapses']:,}",
             f"{layer['synapses_stored']:,}",
+            *([f"{layer.get('synapses_from_itself', 0):,}"] if loops else []),
             str(layer["max_fan_in"]),
             _width(layer),
             _text(layer["scale"]),
@@ -143,6 +154,7 @@ def netlist_text(report: Json) -> str:
         "on chip",
         "synapses",
         "stored",
+        *(["from itself"] if loops else []),
         "fan-in",
         "bits",
         "scale",

@@ -69,6 +69,8 @@ def _from_netx(arguments: argparse.Namespace) -> tuple[Netlist, list[str]]:
     path = arguments.checkpoint
     _refuse(arguments, FLOATS, f"is for float networks, {path} holds integers; leave it away")
     _refuse(arguments, MODEL, f"is for checkpoints, the netx file {path} holds all it needs; leave it away")
+    why = f"weighs layouts by what a float network does on recordings, {path} holds integers; leave it away"
+    _refuse(arguments, {"optimize": "cores"}, f"{why}, or give --cores-for")
     progress("reading the network")
     found = read_netx(path, polarities=arguments.polarities, polarities_first=arguments.polarities_first)
     verify(found.network)

@@ -53,3 +53,13 @@ def _fill(group, entries):
             group.create_dataset(key, (1,), "S10", [value[0].encode("ascii")])
         else:
             group.create_dataset(key, data=value)
+
+
+def even(rng, *shape, most=60):
+    """Random even weights."""
+    return 2 * rng.integers(-most // 2, most // 2 + 1, shape)
+
+
+def events(rng, size, steps=40):
+    """A random recording, (steps, inputs) bool."""
+    return rng.random((steps, size)) < 0.3

@@ -137,7 +137,7 @@ def random_checkpoint(*, taxels=5, features=3, hops=4, sizes=(6, 5, 4), seed=0, 
 
 
 def _wiring(draw):
-    """Population sizes by depth, and the projections between neighbouring depths as (pre, post)."""
+    """Population sizes by depth, and projections as (pre, post): between neighbouring depths, and to itself."""
     by_depth = draw(st.lists(st.lists(st.integers(1, 7), min_size=1, max_size=2), min_size=1, max_size=3))
     ids, sizes = [], []
     for layer in by_depth:
@@ -147,6 +147,7 @@ def _wiring(draw):
     for before, after in itertools.pairwise(ids):
         for post in after:
             pairs += [(pre, post) for pre in draw(st.lists(st.sampled_from(before), min_size=1, unique=True))]
+    pairs += [(post, post) for post in draw(st.lists(st.integers(0, len(sizes) - 1), unique=True))]
     return sizes, pairs
 
 

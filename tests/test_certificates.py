@@ -16,7 +16,8 @@ from compiler.passes.quantize import Recipe
 from compiler.pipeline import compile_network
 from models.reference import float_spikes
 from runtime import engine
-from runtime.certificates import _recurrence, certificate_json, certificate_text, certify, float_certainty, wins
+from runtime.certainty import _recurrence, float_certainty
+from runtime.certificates import certificate_json, certificate_text, certify, wins
 from runtime.equivalence import verify
 from runtime.trace import aligned
 from runtime.votes import predictions

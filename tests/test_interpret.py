@@ -10,6 +10,14 @@ from compiler.interpret import channels_last, run_float, run_integer, vote
 from compiler.ir import INPUT
 
 
+def weights_hit(incoming, spikes, post, neuron, t):
+    """Weights that a step brings to a neuron; of its own population, by what fired in the step before."""
+    for pre, weight in incoming:
+        heard = t - (pre == post)
+        if heard >= 0:
+            yield from (w for w, spike in zip(weight[neuron], spikes[pre][heard], strict=True) if spike)
+
+
 def simulate_float(network, events):
     """One neuron and one step at a time, in Python floats."""
     spikes = {INPUT: events.tolist()}
@@ -19,15 +27,13 @@ def simulate_float(network, events):
         spikes[post] = [[False] * population.size for _ in range(steps)]
         membranes[post] = [[0.0] * population.size for _ in range(steps)]
         incoming = [(p.pre, p.weight.toarray().tolist()) for p in network.projections if p.post == post]
-        for i in range(population.size):
-            u, s = 0.0, 0
-            for t in range(steps):
-                current = sum(
-                    w for pre, weight in incoming for w, spike in zip(weight[i], spikes[pre][t], strict=True) if spike
-                )
-                u = population.beta * u * (1 - s) + (current + float(population.bias[i]))
-                s = int(u > population.theta)
-                spikes[post][t][i], membranes[post][t][i] = bool(s), u
+        u, s = [0.0] * population.size, [0] * population.size
+        for t in range(steps):
+            for i in range(population.size):
+                current = sum(weights_hit(incoming, spikes, post, i, t))
+                u[i] = population.beta * u[i] * (1 - s[i]) + (current + float(population.bias[i]))
+                s[i] = int(u[i] > population.theta)
+                spikes[post][t][i], membranes[post][t][i] = bool(s[i]), u[i]
     return spikes, membranes
 
 
@@ -45,19 +51,17 @@ def simulate_integer(network, events):
         spikes[post] = [[False] * population.size for _ in range(steps)]
         membranes[post] = [[0] * population.size for _ in range(steps)]
         incoming = [(pre, weight.tolist()) for pre, weight in dense_weights(network, post).items()]
-        for i in range(population.size):
-            u = v = 0
-            bias = int(population.bias_mantissa[i]) * 2 ** int(population.bias_exponent[i])
-            for t in range(steps):
-                arrived = sum(
-                    w for pre, weight in incoming for w, spike in zip(weight[i], spikes[pre][t], strict=True) if spike
-                )
-                u = decayed(u, population.decay_u + 1) + 64 * arrived
-                v = decayed(v, population.decay_v) + u + bias
-                v = max(-(2**23 - 1), min(2**23 - 1, v))
-                spikes[post][t][i], membranes[post][t][i] = v > 64 * int(population.threshold[i]), v
+        u, v = [0] * population.size, [0] * population.size
+        bias = [int(m) * 2 ** int(e) for m, e in zip(population.bias_mantissa, population.bias_exponent, strict=True)]
+        for t in range(steps):
+            for i in range(population.size):
+                arrived = sum(weights_hit(incoming, spikes, post, i, t))
+                u[i] = decayed(u[i], population.decay_u + 1) + 64 * arrived
+                v[i] = decayed(v[i], population.decay_v) + u[i] + bias[i]
+                v[i] = max(-(2**23 - 1), min(2**23 - 1, v[i]))
+                spikes[post][t][i], membranes[post][t][i] = v[i] > 64 * int(population.threshold[i]), v[i]
                 if spikes[post][t][i]:
-                    v = 0
+                    v[i] = 0
     return spikes, membranes
 
 

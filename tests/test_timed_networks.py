@@ -35,7 +35,7 @@ from models.release import write_released
 from runtime import engine, spec
 from runtime.blocks import lay_out_blocks
 from runtime.causes import explain
-from runtime.certificates import float_certainty
+from runtime.certainty import float_certainty
 from runtime.cli import main
 from runtime.equivalence import require_match, verify
 from runtime.explain import _observe

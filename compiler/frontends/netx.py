@@ -27,11 +27,12 @@ NO_PLACE = {
     "concat": "joins layers that lie differently deep",
     "convT": "is a transposed convolution, which netx itself does not load",
     "dense_comp": "has complex weights",
-    "dense_rec": "hears itself; Loihi could run this recurrence, but networks here are lowered layer by layer",
     "pool": "pools, which netx itself does not load",
     "unpool": "unpools, which netx itself does not load",
 }
 """Why layers that the format knows have no place here."""
+
+ALLOWED = "input, flatten, dense, dense_rec and conv"
 
 OWN = "spikeloom"
 """Group of what our writer adds; others do not read it."""
@@ -109,12 +110,17 @@ def integers_of(
         weight, shape = _synapses(block, shape)
         post = len(populations)
         populations.append(_population(block, math.prod(shape), shape))
-        pre = post - 1 if post else INPUT
-        planes = _planes(block, weight if post else weight[:, positions])
+        sources = {post - 1 if post else INPUT: weight if post else weight[:, positions]}
+        if block.type == "dense_rec":
+            neurons = populations[-1].size
+            sources[post] = sparse.csr_array(_matrix(block, "weight_rec", neurons, neurons))
+        stored = {pre: _planes(block, part) for pre, part in sources.items()}
         projections += [
-            IntegerProjection(pre=pre, post=post, weight=plane, exponent=exponent, bits=8) for plane, exponent in planes
+            IntegerProjection(pre=pre, post=post, weight=plane, exponent=exponent, bits=8)
+            for pre, planes in stored.items()
+            for plane, exponent in planes
         ]
-        facts.append(_fact(block, populations[-1], len(planes)))
+        facts.append(_fact(block, populations[-1], max(len(planes) for planes in stored.values())))
     if not populations:
         raise ModelError(f"has no layer of neurons; {REMEDY}")
     voters = populations[-1].size
@@ -134,7 +140,7 @@ def _input_shape(blocks: Sequence[Block]) -> tuple[int, ...]:
     first = blocks[0]
     if first.type == "input":
         return first.sizes()
-    if first.type == "dense":
+    if first.type in ("dense", "dense_rec"):
         weight = first.integers("weight")
         if weight.ndim == 2 and weight.size:
             return (weight.shape[1],)
@@ -154,26 +160,26 @@ def _synapses(block: Block, shape: tuple[int, ...]) -> tuple[Sparse, tuple[int, 
         return sparse.csr_array(sparse.identity(math.prod(shape), dtype=np.int64, format="csr") * gain), shape
     if "weight" in block.entries and block.inner("weight") is not None:
         raise block.fail("has complex weights, allowed are real ones; use CUBA neurons")
-    if block.type == "dense":
-        return _dense(block, shape)
+    if block.type in ("dense", "dense_rec"):
+        neurons = math.prod(block.sizes())
+        return sparse.csr_array(_matrix(block, "weight", neurons, math.prod(shape))), (neurons,)
     if block.type == "conv":
         return _conv(block, shape)
     if block.type in NO_PLACE:
-        raise block.fail(f"{NO_PLACE[block.type]}; allowed are input, flatten, dense and conv")
-    raise block.fail("is of a type that is not known, allowed are input, flatten, dense and conv; export it again")
+        raise block.fail(f"{NO_PLACE[block.type]}; allowed are {ALLOWED}")
+    raise block.fail(f"is of a type that is not known, allowed are {ALLOWED}; export it again")
 
 
-def _dense(block: Block, shape: tuple[int, ...]) -> tuple[Sparse, tuple[int, ...]]:
-    neurons, heard = math.prod(block.sizes()), math.prod(shape)
-    weight = block.integers("weight")
+def _matrix(block: Block, key: str, neurons: int, heard: int) -> IntArray:
+    weight = block.integers(key)
     weight = weight.reshape(neurons, -1) if weight.ndim == 1 and weight.size == neurons * heard else weight
     if weight.shape != (neurons, heard):
         turned = " (it looks transposed)" if weight.shape == (heard, neurons) else ""
         raise block.fail(
-            f"weight has the shape {list(weight.shape)}, wanted {[neurons, heard]}{turned}; the shapes disagree, "
+            f"{key} has the shape {list(weight.shape)}, wanted {[neurons, heard]}{turned}; the shapes disagree, "
             f"{REMEDY}"
         )
-    return sparse.csr_array(weight), (neurons,)
+    return weight
 
 
 def _conv(block: Block, shape: tuple[int, ...]) -> tuple[Sparse, tuple[int, ...]]:
@@ -318,4 +324,6 @@ def _fact(block: Block, population: IntegerPopulation, planes: int) -> str:
     )
     if block.type == "input":
         told += "; it turns events into currents"
+    if block.type == "dense_rec":
+        told += "; it hears its own spikes of the step before"
     return told + ("; odd weights are stored twice" if planes > 1 else "")

@@ -15,10 +15,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from compiler.errors import CapacityError, OptionError
+from compiler.errors import CapacityError, ModelError, OptionError
 from compiler.fixedpoint import FloatArray, IntArray
 from compiler.interpret import BoolArray, cut, run_float, vote
-from compiler.ir import INPUT, IntegerNetwork, Network, Readout
+from compiler.ir import INPUT, IntegerNetwork, Network, Readout, recurrent
 from compiler.passes.branches import Offers, Path, Widths, offer_forms, settle, usual, votes
 from compiler.passes.calibrate import calibrate, evenly_spaced
 from compiler.passes.needs import Chunk, choose_dense, lists_into
@@ -162,8 +162,13 @@ def search(
     DataError, OptionError
         If the recordings or the widths cannot be used.
     ModelError
-        If a layer has no usable scale at any width.
+        If a layer has no usable scale at any width, or hears itself.
     """
+    if loops := recurrent(network):
+        raise ModelError(
+            f"{', '.join(loops)}: hears itself; combinations of widths are tried layer by layer, for networks without "
+            "recurrence: compile with --weight-bits"
+        )
     widths = check_widths(widths, groups, len(network.populations), target)
     tell("running the float model")
     calibration = calibrate(network, evenly_spaced(events))

@@ -12,6 +12,7 @@ import numpy as np
 
 from compiler.errors import ModelError, OptionError
 from compiler.interpret import channels_last
+from compiler.ir import recurrent
 from compiler.targets import CROSSBARS, Target, load_target
 from compiler.truenorth.needs import needs
 from models.evtouch import Recordings
@@ -54,6 +55,10 @@ def refuse(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], 
     asked = asked_network(arguments.checkpoint, arguments)
     if asked.network.input.clocks.channels:
         raise ModelError(f"{arguments.checkpoint}: has clocks, ways out of them are not known; give one without")
+    if loops := recurrent(asked.network):
+        raise ModelError(
+            f"{arguments.checkpoint}: {', '.join(loops)} hears itself, ways out of that are not known; use loihi1"
+        )
     trial, steps = None, None
     if arguments.calibrate is not None:
         progress("reading the recordings")
