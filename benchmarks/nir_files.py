@@ -130,14 +130,21 @@ def snntorch(folder: Path) -> None:
             if isinstance(module, snn.Leaky | snn.Synaptic):
                 module.reset_hidden()
         store(folder, name, graph, given, run(net, given, net, (snn.Leaky, snn.Synaptic)))
-    loop = nn.Sequential(
-        nn.Linear(INPUTS, HIDDEN),
-        snn.RLeaky(beta=0.5, init_hidden=True, linear_features=HIDDEN),
-        nn.Linear(HIDDEN, CLASSES),
-        leaky(0.9, (CLASSES,)),
-    )
-    graph = export_to_nir(drawn(loop, 2.0), events((INPUTS,))[0], ignore_dims=[0])
-    nir.write(folder / "snntorch_recurrent.nir", graph, compression=None)
+    # a reset with reset_delay would take the input of the step after each spike with it, which NIR cannot say
+    more = {"init_hidden": True, "reset_mechanism": "zero", "reset_delay": False}
+    loops = {
+        "snntorch_recurrent": snn.RLeaky(beta=0.5, threshold=0.6, linear_features=HIDDEN, **more),
+        "snntorch_one_to_one": snn.RLeaky(
+            beta=0.8, threshold=0.6, all_to_all=False, V=torch.linspace(-0.5, 0.5, HIDDEN), **more
+        ),
+    }
+    for name, loop in loops.items():
+        net = nn.Sequential(nn.Linear(INPUTS, HIDDEN), loop, nn.Linear(HIDDEN, CLASSES), leaky(0.9, (CLASSES,)))
+        given = events((INPUTS,))
+        graph = export_to_nir(drawn(net, 2.0), given[0], ignore_dims=[0])
+        for module in (net[1], net[3]):
+            module.reset_mem()
+        store(folder, name, graph, given, run(net, given, net, (snn.Leaky, snn.RLeaky)))
 
 
 def norse(folder: Path) -> None:

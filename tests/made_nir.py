@@ -65,15 +65,17 @@ def affine(rng, rows, columns, gain=1.0, bias=0.3):
     return nir.Affine(weight=weight, bias=rng.normal(size=rows) * bias)
 
 
-def simulate(graph, events, dt, convention="euler"):
+def simulate(graph, events, dt, convention="euler", late=()):
     """Spikes of each spiking node, (steps, neurons) bool, by the names of the nodes; nested graphs are not read.
 
-    Membranes start at their reset, currents at zero.
+    Membranes start at their reset, currents at zero. Along the edges in `late` comes what was sent in the step before.
     """
-    order, heard = [], {name: [a for a, b in graph.edges if b == name] for name in graph.nodes}
+    heard = {name: [a for a, b in graph.edges if b == name] for name in graph.nodes}
+    order, ready = [], {name: [a for a in sources if (a, name) not in late] for name, sources in heard.items()}
     while len(order) < len(heard):
-        order += [n for n in heard if n not in order and all(source in order for source in heard[n])]
+        order += [n for n in ready if n not in order and all(source in order for source in ready[n])]
     state, spikes = {}, {}
+    before = {source: np.zeros(graph.nodes[source].output_type["output"]) for source, _ in late}
     for now in events:
         values = {}
         for name in order:
@@ -81,10 +83,11 @@ def simulate(graph, events, dt, convention="euler"):
             if isinstance(node, nir.Input):
                 values[name] = now.reshape(node.input_type["input"]).astype(float)
                 continue
-            x = sum(values[source] for source in heard[name])
+            x = sum((before if (source, name) in late else values)[source] for source in heard[name])
             values[name] = _step(node, x, state.setdefault(name, {}), dt, convention)
             if isinstance(node, nir.LIF | nir.IF | nir.CubaLIF | nir.Threshold):
                 spikes.setdefault(name, []).append(values[name].ravel() > 0)
+        before = values
     return {name: np.stack(rows) for name, rows in spikes.items()}
 
 

@@ -197,13 +197,46 @@ def test_unknown_nodes_and_those_without_a_place():
     assert message(chain(lif(5), nir.I(np.ones(5)), lif(5)), polarities=1) == line
 
 
-def test_recurrence_is_refused_by_its_nodes():
-    with pytest.raises(ModelError) as caught:
-        read_nir(FILES / "snntorch_recurrent.nir", dt=1e-4)
-    assert str(caught.value) == (
-        f"{FILES}/snntorch_recurrent.nir: nodes hear each other in a circle (1.lif -> 1.w_rec -> 1.lif); Loihi could "
-        "run this recurrence, but networks here are lowered layer by layer and have none: unroll it or train without"
+def ring(*edges, **nodes):
+    """A layer, a further one, and what else there is."""
+    both = {"a": affine(RNG, 5, 4), "b": lif(5), "c": affine(RNG, 5, 5), "d": lif(5)}
+    return graph_with(both | nodes, [("a", "b"), ("b", "c"), ("c", "d"), *edges], (4,), (5,), last="d")
+
+
+def test_circles_that_are_no_layer_hearing_itself():
+    assert message(ring(("d", "w"), ("w", "b"), w=affine(RNG, 5, 5))) == (
+        "nodes hear each other in a circle (b -> c -> d -> w -> b) with 2 spiking ones in it; a spike takes the chip a "
+        "step from one to the next, so it would come back late: a layer may hear itself only, train without the rest"
     )
+    without = "nodes hear each other in a circle ({}) without neurons, so nothing in it takes a step; put a spiking "
+    without += "node into it or train without"
+    assert message(ring(("b", "w"), ("w", "w"), ("w", "d"), w=affine(RNG, 5, 5))) == without.format("w -> w")
+    more = {"v": affine(RNG, 5, 5), "w": affine(RNG, 5, 5)}
+    assert message(ring(("b", "v"), ("v", "w"), ("w", "v"), ("w", "b"), **more)) == without.format("v -> w -> v")
+
+
+def test_loops_that_cannot_be_read():
+    several = {"b": lif(5, tau=np.array([0.05, 0.05, 0.1, 0.1, 0.1]))}
+    assert message(ring(("b", "w"), ("w", "b"), w=affine(RNG, 5, 5), **several)) == (
+        "node b (LIF): hears itself and has 2 membrane time constants, which are layers of their own; give it one"
+    )
+    assert message(ring(("b", "w"), ("a", "w"), ("w", "b"), w=affine(RNG, 5, 5))) == (
+        "node w (Affine): is in the loop of b and hears a too, of which nothing tells the step; give each a stage of "
+        "its own"
+    )
+    assert message(ring(("b", "w"), ("w", "b"), w=affine(RNG, 4, 5))) == (
+        "node b (LIF): gets values of different shapes, [5] and [4]; export it again"
+    )
+    filter_ = nir.LI(tau=np.full(5, 0.06), r=np.ones(5), v_leak=np.zeros(5))
+    assert message(ring(("b", "w"), ("w", "b"), w=filter_)) == (
+        "node b (LIF): gets currents with different time constants; a neuron of the chip has one"
+    )
+    graph = graph_with(
+        {"a": affine(RNG, 5, 4), "b": lif(5), "x": lif(5), "d": lif(5)},
+        [("a", "b"), ("b", "d"), ("x", "x"), ("x", "d")], (4,), (5,), last="d",
+    )  # fmt: skip
+    line = "node x (LIF): hears nothing but itself, so it is not reached from the input; leave it away"
+    assert message(graph) == line
 
 
 def test_shapes_that_disagree():

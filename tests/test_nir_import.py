@@ -12,6 +12,8 @@ from numpy.testing import assert_array_equal
 from compiler.dynamics import with_clocks
 from compiler.frontends.nir import read_nir
 from compiler.interpret import run_float, run_integer
+from compiler.ir import recurrent
+from compiler.passes.quantize import Recipe
 from compiler.pipeline import compile_network
 from runtime import engine, spec
 
@@ -20,6 +22,8 @@ FILES = Path(__file__).parent / "nir"
 READ = {
     "snntorch_leaky": (1e-4, "euler"),
     "snntorch_conv": (1e-4, "euler"),
+    "snntorch_recurrent": (1e-4, "euler"),
+    "snntorch_one_to_one": (1e-4, "euler"),
     "norse_lif": (1e-6, "euler"),  # the square of its dt, which it multiplies into tau
     "norse_iaf": (1.0, "euler"),
     "sinabs_lif": (1.0, "exponential"),
@@ -52,16 +56,20 @@ def test_every_spike_is_that_of_the_package_that_wrote_the_file(name):
     run = np.load(FILES / f"{name}.npz")
     spikes = float_spikes(found.network, run["events"], image=run["events"].shape[1] == 50)
     for node in set(run.files) - {"events"}:
-        layer = node if node in spikes else f"_{node}"  # as SpikingJelly calls it
+        # as SpikingJelly calls it, and as snnTorch the neurons of a recurrent layer
+        layer = next(name for name in (node, f"_{node}", f"{node}.lif") if name in spikes)
         assert run[node].sum() > 4
         assert_array_equal(spikes[layer], run[node])
 
 
-@pytest.mark.parametrize("name", ["snntorch_leaky", "norse_lif", "sinabs_iaf", "spikingjelly_cuba"])
+@pytest.mark.parametrize(
+    "name", ["snntorch_leaky", "snntorch_recurrent", "norse_lif", "sinabs_iaf", "spikingjelly_cuba"]
+)
 def test_one_of_each_package_on_the_chip(name):
     dt, convention = READ[name]
     network = read_nir(FILES / f"{name}.nir", dt=dt, convention=convention).network
-    compiled = compile_network(network)
+    # what rounding moves in a layer that hears itself moves it again, so that one is stored more finely
+    compiled = compile_network(network, recipes=[Recipe(planes=2 if recurrent(network) else 1)])
     events = recording(network, np.load(FILES / f"{name}.npz")["events"], image="iaf" in name)
     given = with_clocks(events, network.input.clocks)
     fast = engine.simulate(compiled.netlist, given, spikes=True, membranes=True)
@@ -72,6 +80,14 @@ def test_one_of_each_package_on_the_chip(name):
     wanted, chip = (run(net, inputs).spikes for run, net in ((run_float, network), (run_integer, compiled.integer)))
     moved = sum(int((a != b).sum()) for a, b in zip(wanted, chip, strict=True))
     assert moved <= 0.1 * sum(int(spikes.sum()) for spikes in wanted)
+
+
+def test_what_recurrence_means_is_said():
+    facts = read_nir(FILES / "snntorch_recurrent.nir", dt=1e-4).facts
+    assert facts[5] == (
+        "1.lif: hears its own spikes of the step before; snnTorch's RLeaky with reset 'zero' means this with "
+        "reset_delay=False, else it loses the input of the step after each spike"
+    )
 
 
 def test_what_snntorch_loses_of_a_synaptic_neuron_is_said():
@@ -106,11 +122,11 @@ def given(seed, size, steps=60, share=0.3):
     return np.random.default_rng(seed).random((steps, size)) < share
 
 
-def compare(graph, size, *, dt=0.02, convention="euler", image=False, least=10):
+def compare(graph, size, *, dt=0.02, convention="euler", image=False, least=10, late=()):
     """Every spiking node against the second reading."""
     events = given(1, size)
     network = lowered(graph, dt, convention).network
-    ours, theirs = float_spikes(network, events, image), simulate(graph, events, dt, convention)
+    ours, theirs = float_spikes(network, events, image), simulate(graph, events, dt, convention, late)
     for name, spikes in theirs.items():
         assert spikes.sum() >= least
         assert_array_equal(ours[name], spikes)
@@ -239,6 +255,62 @@ def test_branches_and_nested_graphs():
     for name, spikes in theirs.items():
         assert spikes.sum() > 10
         assert_array_equal(ours[name], spikes)
+
+
+def loop(neurons, *stages):
+    """A layer of nine that hears itself through stages, one that hears it, and which edge is late."""
+    rng = np.random.default_rng(12)
+    names = [f"w{place}" for place in range(len(stages))]
+    nodes = {"a": affine(rng, 9, 6, 1.5), "b": neurons, **dict(zip(names, stages, strict=True))}
+    nodes |= {"c": affine(rng, 4, 9, 2.0), "d": lif(4, r=2.0)}
+    ring = [*itertools.pairwise(["b", *names, "b"])]
+    return graph_with(nodes, [("a", "b"), *ring, ("b", "c"), ("c", "d")], (6,), (4,)), {ring[0]}
+
+
+@pytest.mark.parametrize("convention", ["euler", "exponential"])
+@pytest.mark.parametrize("kind", ["lif", "thresholds", "cuba", "if", "threshold"])
+def test_a_layer_that_hears_itself(kind, convention):
+    rng = np.random.default_rng(13)
+    neurons = {
+        "lif": lif(9, tau=0.07, r=2.0, leak=0.1, reset=-0.2),
+        "thresholds": lif(9, r=2.0, threshold=rng.uniform(0.3, 0.9, 9)),
+        "cuba": cuba(9, r=2.0, weight=2.0),
+        "if": nir.IF(r=np.full(9, 40.0), v_threshold=np.ones(9), v_reset=np.zeros(9)),
+        "threshold": nir.Threshold(np.full(9, 0.7)),
+    }[kind]
+    graph, late = loop(neurons, affine(rng, 9, 9, 1.5))
+    network = compare(graph, 6, convention=convention, late=late)
+    assert recurrent(network) == ("b",)
+    graph.edges.remove(("w0", "b"))
+    alone = simulate(graph, given(1, 6), 0.02, convention)
+    assert np.count_nonzero(alone["b"] != float_spikes(network, given(1, 6))["b"]) > 20
+
+
+def test_loops_of_several_stages_and_of_none():
+    rng = np.random.default_rng(14)
+    stages = affine(rng, 5, 9), nir.Linear(rng.normal(size=(9, 5))), nir.Scale(np.full(9, 0.5))
+    graph, late = loop(lif(9, r=2.0), *stages)
+    compare(graph, 6, late=late)
+    graph, late = loop(lif(9, r=2.5))
+    network = compare(graph, 6, late=late)
+    assert_array_equal(network.projections[1].weight.toarray(), np.eye(9))
+
+
+def test_a_loop_through_an_image():
+    rng = np.random.default_rng(15)
+    nodes = {
+        "a": image(rng),
+        "b": nir.IF(r=np.full((4, 3, 4), 40.0), v_threshold=np.ones((4, 3, 4))),
+        "w": nir.Conv2d(
+            input_shape=(3, 4), weight=rng.normal(size=(4, 4, 3, 3)) * 0.3, bias=rng.normal(size=4) * 0.1, groups=1,
+            stride=1, padding=1, dilation=1,
+        ),
+        "c": nir.Flatten(np.array([4, 3, 4]), 0, -1),
+        "d": affine(rng, 3, 48),
+        "e": lif(3, r=2.0, threshold=0.2),
+    }  # fmt: skip
+    edges = [("a", "b"), ("b", "w"), ("w", "b"), ("b", "c"), ("c", "d"), ("d", "e")]
+    compare(graph_with(nodes, edges, (2, 5, 6), (3,)), 60, image=True, least=5, late={("b", "w")})
 
 
 def test_groups_of_neurons_vote_for_a_class():
