@@ -2,11 +2,12 @@
 
 ::
 
-    python benchmarks/snntorch_recordings.py objects_train.npz objects_test.npz FOLDER
+    python benchmarks/snntorch_recordings.py objects_train.npz objects_test.npz FOLDER [--recurrent]
 
 The recordings are ``events`` (samples, channels, steps) uint8 and ``labels``, as benchmarks/recordings_npz.py writes
 them, so that this script needs snnTorch and its dependencies and nothing of this package. FOLDER gets
-``snntorch.nir`` and ``snntorch_spikes.npz``: the spikes of both layers on the test split. Everything is seeded.
+``snntorch.nir`` and ``snntorch_spikes.npz``: the spikes of both layers on the test split. With --recurrent the first
+layer hears itself (RLeaky). Everything is seeded.
 """
 
 import argparse
@@ -24,8 +25,8 @@ from torch import nn
 HIDDEN, EPOCHS, BATCH, STEP = 128, 30, 64, 2e-3
 
 
-def network(inputs: int, classes: int) -> nn.Sequential:
-    """Two layers of Leaky neurons that reset to zero."""
+def network(inputs: int, classes: int, recurrent: bool) -> nn.Sequential:
+    """Two layers of Leaky neurons that reset to zero; the first may hear itself."""
 
     def leaky(size: int, beta: float) -> nn.Module:
         return snn.Leaky(
@@ -36,14 +37,24 @@ def network(inputs: int, classes: int) -> nn.Sequential:
             reset_mechanism="zero",
         )
 
-    return nn.Sequential(nn.Linear(inputs, HIDDEN), leaky(HIDDEN, 0.7), nn.Linear(HIDDEN, classes), leaky(classes, 0.9))
+    hidden = leaky(HIDDEN, 0.7)
+    if recurrent:
+        hidden = snn.RLeaky(
+            beta=torch.full((HIDDEN,), 0.7),
+            threshold=torch.full((HIDDEN,), 0.5),
+            linear_features=HIDDEN,
+            spike_grad=surrogate.fast_sigmoid(slope=5),
+            init_hidden=True,
+            reset_mechanism="zero",
+            reset_delay=False,  # else the input of the step after a spike is lost, which NIR cannot say
+        )
+    return nn.Sequential(nn.Linear(inputs, HIDDEN), hidden, nn.Linear(HIDDEN, classes), leaky(classes, 0.9))
 
 
 def run(net: nn.Sequential, events: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Spikes of both layers, (samples, steps, neurons)."""
     for layer in (net[1], net[3]):
-        layer.reset_hidden()
-        layer.mem = torch.zeros(len(events), len(layer.beta))
+        layer.mem = layer.spk = torch.zeros(len(events), len(layer.beta))
     hidden, out = [], []
     for step in range(events.shape[2]):
         hidden.append(net[1](net[0](events[:, :, step])))
@@ -57,11 +68,12 @@ def main() -> None:
     parser.add_argument("train", type=Path)
     parser.add_argument("test", type=Path)
     parser.add_argument("folder", type=Path)
+    parser.add_argument("--recurrent", action="store_true", help="the first layer hears itself")
     arguments = parser.parse_args()
     torch.manual_seed(1)
     train, test = (np.load(path) for path in (arguments.train, arguments.test))
     events, labels = torch.from_numpy(train["events"]).float(), torch.from_numpy(train["labels"])
-    net = network(events.shape[1], int(labels.max()) + 1)
+    net = network(events.shape[1], int(labels.max()) + 1, arguments.recurrent)
     optimiser = torch.optim.Adam(net.parameters(), STEP)
     begun = time.monotonic()
     for epoch in range(EPOCHS):
@@ -81,7 +93,7 @@ def main() -> None:
         accuracy = float((out.sum(1).argmax(1).numpy() == test["labels"]).mean())
     print(f"test split: {100 * accuracy:.2f} %")
     for layer in (net[1], net[3]):
-        layer.reset_hidden()
+        layer.reset_mem()
     nir.write(arguments.folder / "snntorch.nir", export_to_nir(net, given[:1, :, 0], ignore_dims=[0]))
     spikes = {"1": np.packbits(hidden.numpy() > 0), "3": np.packbits(out.numpy() > 0)}
     np.savez_compressed(arguments.folder / "snntorch_spikes.npz", shape=np.array(hidden.shape), **spikes)

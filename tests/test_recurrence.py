@@ -1,0 +1,359 @@
+"""Layers that hear themselves, from the float network to the chip, its commands and other programs."""
+
+import json
+from dataclasses import replace
+
+import nir
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import strategies as st
+from made_files import CLASSES, TAXELS, recordings_folder
+from made_nir import affine, cuba, graph_with, lif, lowered
+from numpy.testing import assert_array_equal
+from random_netlists import SIMULATORS, assert_equal
+from random_networks import LOIHI, chain, compiled, integer_chain, integer_networks, recordings_for, stored
+from test_sanafe import compare as with_sanafe
+from test_sanafe import interpreter  # noqa: F401
+
+from compiler.errors import ModelError, NumericRangeError
+from compiler.interpret import channels_last, run_float, run_integer
+from compiler.ir import IntegerProjection, Projection, recurrent
+from compiler.lift import lift
+from compiler.passes.calibrate import calibrate
+from compiler.passes.prune import never_fires, removable
+from compiler.passes.quantize import Recipe, quantize
+from compiler.passes.widths import search
+from compiler.pipeline import compile_network
+from runtime import cost, engine
+from runtime.blocks import obstacle
+from runtime.certainty import float_certainty
+from runtime.cli import main
+from runtime.equivalence import verify
+from runtime.trace import aligned
+
+SETTINGS = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+FEW = settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+
+
+def hearing_itself(network, post, weight):
+    """A network with one more projection, from a population to itself."""
+    own = Projection(pre=post, post=post, weight=stored(np.asarray(weight, float)))
+    return replace(network, projections=(*network.projections, own))
+
+
+def drawn(seed, *, hidden=12, gain=1.0, alpha=0.0):
+    """Ten channels, a layer that hears itself, four classes; weights of no special values."""
+    rng = np.random.default_rng(seed)
+    first, last = rng.normal(size=(hidden, 10)) * 0.4, rng.normal(size=(4, hidden)) * 0.5
+    network = chain(first, last, beta=0.6, biases=[rng.normal(size=hidden) * 0.05, np.zeros(4)], polarities=2)
+    hears = replace(network.populations[0], alpha=alpha)
+    network = replace(network, populations=(hears, network.populations[1]))
+    return hearing_itself(network, 0, rng.normal(size=(hidden, hidden)) * gain / hidden**0.5)
+
+
+def events_for(seed, samples=6, steps=50):
+    """Recordings (samples, taxels, polarities, steps) of five taxels."""
+    return (np.random.default_rng(seed).random((samples, 5, 2, steps)) < 0.3).astype(np.uint8)
+
+
+# -- what it means -----------------------------------------------------------------------------------------------------
+
+
+def test_what_is_fired_in_a_step_arrives_in_the_next():
+    """The second neuron keeps itself firing once it is hit; it stops the third a step after each spike."""
+    network = chain(np.eye(3), np.eye(3), beta=0.0)
+    network = hearing_itself(network, 0, [[0, 0, 0], [0, 1, 0], [0, -1, 0]])
+    events = np.array([[1, 0, 1], [0, 1, 1], [0, 0, 1], [1, 0, 1]], bool)[None]
+    for steps in (run_float(network, events), run_integer(quantize(network, LOIHI)[0], events)):
+        assert steps.spikes[0][0].astype(int).tolist() == [[1, 0, 1], [0, 1, 1], [0, 1, 0], [1, 1, 0]]
+        assert_array_equal(steps.spikes[1], steps.spikes[0])
+
+
+@SETTINGS
+@given(st.data())
+def test_specification_engines_and_integers_are_the_same(data):
+    network = data.draw(integer_networks(exponents=(-1, 0)))
+    assume(recurrent(network))
+    events = data.draw(recordings_for(network.input.size, samples=1))
+    netlist = compiled(network)
+    traces = []
+    for simulate in SIMULATORS:
+        try:
+            traces.append(simulate(netlist, events[0].T.astype(np.uint8)))
+        except NumericRangeError as error:
+            traces.append(str(error))
+    if isinstance(traces[0], str):
+        assert len(set(traces)) == 1
+        return
+    for trace in traces[1:]:
+        assert_equal(traces[0], trace)
+    ours = run_integer(network, events, membranes=True)
+    for layer in range(len(netlist.layers)):
+        assert_array_equal(ours.spikes[layer][0], aligned(netlist, traces[0].spikes[None], layer)[0])
+        assert_array_equal(ours.membranes[layer][0], aligned(netlist, traces[0].membranes[None], layer)[0])
+
+
+@SETTINGS
+@given(st.integers(0, 2**32 - 1), st.integers(1, 9))
+def test_whole_numbers_without_leak_are_exact_in_floats(seed, hidden):
+    """Every spike and membrane of the float network is the chip's, where its numbers are."""
+    rng = np.random.default_rng(seed)
+    first, own, last = (2 * rng.integers(-60, 61, shape) for shape in ((hidden, 4), (hidden, hidden), (3, hidden)))
+    integer = integer_chain(first, last)
+    loop = IntegerProjection(pre=0, post=0, weight=stored(own), exponent=0, bits=8)
+    integer = replace(
+        integer,
+        populations=tuple(replace(population, decay_v=0) for population in integer.populations),
+        projections=(*integer.projections, loop),
+    )
+    network = hearing_itself(chain(first, last, beta=1.0, theta=100.0), 0, own)
+    events = rng.random((2, 30, 4)) < 0.4
+    wanted = run_float(network, events, membranes=True)
+    netlist = compiled(integer)
+    trace = engine.simulate(netlist, events.transpose(0, 2, 1).astype(np.uint8), spikes=True, membranes=True)
+    for layer in range(2):
+        assert_array_equal(aligned(netlist, trace.spikes, layer), wanted.spikes[layer])
+        assert_array_equal(aligned(netlist, trace.membranes, layer), wanted.membranes[layer] * 64)
+
+
+def test_only_networks_with_recurrence_run_in_steps():
+    without = chain(np.full((3, 4), 0.5), np.full((2, 3), 0.5))
+    assert obstacle(compile_network(without).netlist) is None
+    netlist = compile_network(hearing_itself(without, 0, np.full((3, 3), 0.5))).netlist
+    assert obstacle(netlist) == "a layer hears others than the one before it"
+    assert engine.prepare(netlist).blocks is None
+    assert [layer.depth for layer in netlist.layers] == [0, 1]
+
+
+# -- rounding and pruning ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("alpha", [0.0, 0.5])
+def test_every_spike_of_the_calibration_is_kept_if_asked(alpha):
+    network, events = drawn(1, gain=1.5, alpha=alpha), events_for(2)
+    made = compile_network(network, training_events=events, spike_exact=True)
+    assert [layer.flips for layer in made.exactness] == [0, 0]
+    given_ = channels_last(events)
+    wanted, found = run_float(network, given_), run_integer(made.integer, given_)
+    assert all(spikes.sum() > 30 for spikes in wanted.spikes)
+    for ours, theirs in zip(found.spikes, wanted.spikes, strict=True):
+        assert_array_equal(ours, theirs)
+
+
+def test_spikes_are_judged_on_what_the_layer_itself_fired_a_step_before():
+    network, events = drawn(3, gain=1.5), events_for(4)
+    calibration = calibrate(network, channels_last(events))
+    late = calibration.source(0, 0)
+    assert_array_equal(late[:, 1:], calibration.spikes[0][:, :-1])
+    assert not late[:, 0].any()
+    assert calibration.source(0, 1) is calibration.spikes[0]
+    for recipe in (Recipe(), Recipe(planes=2), Recipe(groups=4)):
+        _, choices = quantize(network, LOIHI, recipes=(recipe,), calibration=calibration)
+        assert choices[0].flips < 0.1 * choices[0].spikes
+
+
+def test_neurons_that_only_excite_each_other_are_silent():
+    """Nothing starts the ring of the first two; the third is driven, and keeps the fourth going."""
+    network = chain([[0, 0], [0, 0], [1, 1], [0, 0]], np.ones((1, 4)))
+    own = np.zeros((4, 4))
+    own[0, 1] = own[1, 0] = own[3, 2] = 2
+    network = hearing_itself(network, 0, own)
+    assert never_fires(network)[0].tolist() == [False, False, False, False]  # a ring might keep itself going
+    cut = chain([[0.05, 0.05], [0.05, 0], [1, 1], [0, 0]], np.ones((1, 4)))
+    cut = hearing_itself(cut, 0, own * [0.1, 0.1, 1, 0])
+    assert never_fires(cut)[0].tolist() == [True, True, False, False]
+    silent, unheard = removable(compile_network(cut, keep_all=True).integer)
+    assert silent[0].tolist() == [True, True, False, False]
+    assert not unheard[0].any()
+
+
+def test_neurons_that_only_each_other_hear_are_left_out():
+    """The first drives the second, which votes; the third and the fourth talk among themselves."""
+    network = chain(np.ones((4, 2)), [[1, 1, 0, 0]])
+    own = np.zeros((4, 4))
+    own[1, 0] = own[3, 2] = 1
+    network = hearing_itself(network, 0, own)
+    made = compile_network(network)
+    assert [removal.unheard for removal in made.removals] == [2, 0]
+    assert made.netlist.layers[0].unheard == (2, 3)
+    own[2, 2] = 1  # what hears itself counts as heard
+    made = compile_network(hearing_itself(replace(network, projections=network.projections[:2]), 0, own))
+    assert made.netlist.layers[0].unheard == (3,)
+
+
+# -- proofs and verdicts -----------------------------------------------------------------------------------------------
+
+
+@FEW
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.5]), st.sampled_from([0.5, 1.5]))
+def test_what_is_certain_is_so_in_float32_and_in_another_order(seed, alpha, gain):
+    network, events = drawn(seed, gain=gain, alpha=alpha), events_for(seed, samples=2)
+    certainty = float_certainty(network, None, events)
+    turned = np.random.default_rng(seed).permutation(12)
+    first, last, own = (p.weight.toarray() for p in network.projections)
+    other = chain(first[turned], last[:, turned], beta=0.6, biases=[network.populations[0].bias[turned], np.zeros(4)])
+    other = hearing_itself(replace(other, input=network.input), 0, own[np.ix_(turned, turned)])
+    other = replace(other, populations=(replace(other.populations[0], alpha=alpha), other.populations[1]))
+    runs = [run_float(network, channels_last(events), dtype=dtype).spikes for dtype in (np.float64, np.float32)]
+    hidden, votes = run_float(other, channels_last(events), dtype=np.float32).spikes
+    runs.append((hidden[..., np.argsort(turned)], votes))
+    for layer, (certain, doubt) in enumerate(certainty):
+        assert np.mean(doubt) < 0.05
+        for run in runs:
+            assert_array_equal(run[layer][~doubt], certain[~doubt])
+
+
+def test_a_loop_of_zeros_proves_as_much_as_none():
+    network, events = drawn(7), events_for(8)
+    zeros = replace(network.projections[2], weight=network.projections[2].weight * 0.0)
+    none, still = (
+        float_certainty(replace(network, projections=(*network.projections[:2], *more)), None, events)
+        for more in ((), (zeros,))
+    )
+    for ours, theirs in zip(none, still, strict=True):
+        assert_array_equal(ours[0], theirs[0])
+        assert_array_equal(ours[1], theirs[1])
+
+
+@pytest.mark.parametrize("alpha", [0.0, 0.5])
+def test_the_verdict_on_a_network(alpha):
+    network, events = drawn(9, gain=1.5, alpha=alpha), events_for(10, samples=8)
+    netlist = compile_network(network, training_events=events, recipes=(Recipe(planes=2),)).netlist
+    files = tuple(map(str, range(8)))
+    found = verify(netlist, network, None, events, np.zeros(8, np.int64), files)
+    assert found.spec_equals_engine
+    assert found.decision_agreement == 1.0
+    assert all(layer.different < 0.05 * layer.float for layer in found.spikes.values())
+    certified = found.certificate.layers["fc1"]
+    assert certified.equal > 0.95 * certified.entries
+    assert not found.breakdowns
+
+
+def test_operations_count_what_a_layer_sends_itself():
+    network, events = drawn(11), events_for(12, samples=3)
+    netlist = compile_network(network, keep_all=True).netlist
+    flat = events.reshape(3, 10, -1)
+    trace = engine.simulate(netlist, flat, spikes=True)
+    fired = np.concatenate([flat.sum(axis=2), trace.counts.spikes], axis=1)
+    expected = fired[:, netlist.axon_source] @ np.diff(netlist.axon_synapses)
+    own = np.isin(netlist.axon_source, 10 + netlist.compartments_of(0))
+    own &= np.isin(netlist.core_of_axon(), netlist.core_of_compartment()[netlist.compartments_of(0)])
+    assert np.diff(netlist.axon_synapses)[own].sum() >= 140
+    found = cost.estimate(cost.prepare(netlist, LOIHI), trace.counts, 50)
+    assert_array_equal(found.synaptic_operations.sum(axis=1), expected)
+
+
+def test_sanafe_runs_it_too(interpreter, tmp_path):  # noqa: F811
+    netlist = compile_network(drawn(13)).netlist
+    for run in with_sanafe(interpreter, netlist, events_for(14, samples=2).reshape(2, 10, -1), tmp_path):
+        assert run.spikes.sum() > 100
+        assert_array_equal(run.spikes, run.expected_spikes)
+        np.testing.assert_allclose(run.ours_simple, run.simple, rtol=1e-9)
+        assert run.ours_energy == pytest.approx(run.energy, rel=1e-9)
+
+
+# -- commands ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """A NIR file with a layer that hears itself, recordings, and its netlist."""
+    folder, rng = tmp_path_factory.mktemp("loop"), np.random.default_rng(0)
+    nodes = {
+        "a": affine(rng, 12, 2 * TAXELS, 1.0),
+        "b": lif(12, r=2.0),
+        "w": nir.Linear(rng.normal(size=(12, 12)) * 0.3),
+        "c": affine(rng, CLASSES, 12, 1.5),
+        "d": lif(CLASSES, r=2.0),
+    }
+    edges = [("a", "b"), ("b", "w"), ("w", "b"), ("b", "c"), ("c", "d")]
+    nir.write(folder / "net.nir", graph_with(nodes, edges, (2 * TAXELS,), (CLASSES,)))
+    shape = (8, TAXELS, 2, 40)
+    train, test = ((rng.random(shape) < 0.3).astype(np.uint8) for _ in range(2))
+    recordings_folder(folder / "data", train=train, test=test)
+    words = ["compile", str(folder / "net.nir"), "--dt", "0.02", "--calibrate", str(folder / "data"), "--planes", "2"]
+    assert main([*words, "-o", str(folder / "net.loom")]) == 0
+    return folder
+
+
+def said(capsys, folder, *words):
+    assert main([word.format(folder) for word in words]) == 0
+    return capsys.readouterr().out
+
+
+FLOAT = ("--checkpoint", "{0}/net.nir", "--dt", "0.02", "--data", "{0}/data")
+
+
+def test_inspect_tells_how_much_a_layer_hears_of_itself(files, capsys):
+    layer = json.loads(said(capsys, files, "inspect", "{0}/net.loom", "--json"))["layers"][0]
+    netlist_ = said(capsys, files, "inspect", "{0}/net.loom")
+    assert "from itself" in netlist_.splitlines()[1]
+    assert 0 < layer["synapses_from_itself"] <= 2 * 144
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("verify", "{0}/net.loom", *FLOAT, "--require", "E0,E2=0.95,E3=1"),
+        ("verify", "{0}/net.loom", *FLOAT, "--engine", "onnx", "--require", "E0"),
+        ("explain", "{0}/net.loom", *FLOAT),
+        ("run", "{0}/net.loom", "--data", "{0}/data"),
+        ("estimate", "{0}/net.loom", "--data", "{0}/data", "--detail", "cycle"),
+        ("anytime", "{0}/net.loom", *FLOAT),
+        ("report", "{0}/net.loom", *FLOAT, "-o", "{0}/report.html"),
+        ("lean", "{0}/net.nir", "--dt", "0.02", "--data", "{0}/data", "-o", "{0}/lean.loom"),
+        ("stress", "{0}/net.loom", *FLOAT, "--seeds", "1"),
+        ("export", "{0}/net.loom", "--to", "onnx", "-o", "{0}/net.onnx"),
+        ("export", "{0}/net.loom", "--to", "sanafe", "-o", "{0}/net.yaml"),
+    ],
+    ids=lambda words: " ".join(words[:1]) + "-" + words[-1].rpartition("/")[2],
+)
+def test_commands_that_run_it(files, capsys, words):
+    assert said(capsys, files, *words)
+
+
+def test_the_netlist_comes_back_from_nir(files, capsys):
+    said(capsys, files, "export", "{0}/net.loom", "--to", "nir", "-o", "{0}/out.nir")
+    said(capsys, files, "compile", "{0}/out.nir", "-o", "{0}/back.loom")
+    assert (files / "back.loom").read_bytes() == (files / "net.loom").read_bytes()
+    graph = nir.read(files / "out.nir")
+    assert ("b", "b_to_b") in graph.edges
+    assert ("b_to_b", "b") in graph.edges
+
+
+def test_what_cannot_have_it_says_so(files, capsys):
+    network = drawn(15)
+    with pytest.raises(ModelError) as caught:
+        search(network, LOIHI, channels_last(events_for(0)), np.zeros(6, np.int64), widths=(4, 8))
+    assert str(caught.value) == (
+        "fc1: hears itself; combinations of widths are tried layer by layer, for networks without recurrence: compile "
+        "with --weight-bits"
+    )
+    words = ["compile", f"{files}/net.nir", "--dt", "0.02", "--target", "truenorth", "-o", f"{files}/x.loom"]
+    assert main(words) == 2
+    assert capsys.readouterr().err == (
+        f"spikeloom: {files}/net.nir: b hears itself, ways out of that are not known; use loihi1\n"
+    )
+
+
+def test_currents_biases_and_loops_together():
+    """A CubaLIF that hears itself through an Affine: its bias goes through the current, from a channel of its own."""
+    rng = np.random.default_rng(16)
+    nodes = {
+        "a": affine(rng, 9, 6, 0.5),
+        "b": cuba(9, r=2.0, weight=2.0),
+        "w": affine(rng, 9, 9, 0.3),
+        "c": affine(rng, 4, 9),
+        "d": lif(4, r=2.0),
+    }
+    edges = [("a", "b"), ("b", "w"), ("w", "b"), ("b", "c"), ("c", "d")]
+    network = lowered(graph_with(nodes, edges, (6,), (4,))).network
+    assert recurrent(network) == ("b",)
+    assert network.input.clocks.channels == 1
+    events = (rng.random((2, 3, 2, 40)) < 0.3).astype(np.uint8)
+    netlist = compile_network(network).netlist
+    given_ = channels_last(events, network.input.clocks)
+    trace = engine.simulate(netlist, given_.transpose(0, 2, 1).astype(np.uint8), spikes=True)
+    for layer, spikes in enumerate(run_integer(lift(netlist), given_).spikes):
+        assert_array_equal(aligned(netlist, trace.spikes, layer), spikes)
