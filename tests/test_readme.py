@@ -2,6 +2,7 @@
 
 import argparse
 import doctest
+import pkgutil
 import re
 import shlex
 from pathlib import Path
@@ -19,6 +20,9 @@ TEXTS = {page: page.read_text("utf-8") for page in PAGES}
 FENCED = re.compile(r"^```.*?^```$", flags=re.MULTILINE | re.DOTALL)
 SHOWN = re.compile(r"^\$ spikeloom (.+)$", flags=re.MULTILINE)
 IN_A_LINE = re.compile(r"`([^`]+)`")
+DOTTED = re.compile(r"`((?:compiler|runtime|models)\.[\w.]+)[(`]")
+OTHERS = {"python", "pip", "pytest", "dask", "helm"}
+"""Programs that have options of their own."""
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 FILE = re.compile(r"\b(?:compiler|runtime|models|tests|benchmarks|examples)/[\w/.-]+\.(?:py|toml|sh|png|md)")
 
@@ -30,6 +34,12 @@ def subcommands(parser):
 
 def options(parser):
     return {option for action in parser._actions for option in action.option_strings}
+
+
+def every_parser(parser):
+    yield parser
+    for below in subcommands(parser).values():
+        yield from every_parser(below)
 
 
 def spoken(text):
@@ -109,6 +119,20 @@ def test_every_link_leads_somewhere(page):
         assert there.exists(), link
         if anchor:
             assert anchor in anchors(TEXTS[there]), link
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
+def test_every_option_spoken_of_is_one_of_some_command(page):
+    known = set().union(*(options(parser) for parser in every_parser(build_parser())))
+    for code in IN_A_LINE.findall(FENCED.sub("", TEXTS[page])):
+        if OTHERS.isdisjoint(code.split()):
+            assert {word.split("=")[0] for word in code.split() if word.startswith("--")} <= known, code
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
+def test_every_name_spoken_of_exists(page):
+    for name in DOTTED.findall(FENCED.sub("", TEXTS[page])):
+        assert pkgutil.resolve_name(name) is not None
 
 
 @pytest.mark.parametrize("page", PAGES, ids=NAMES)
