@@ -74,7 +74,7 @@ def test_the_two_commands_stand_at_the_top():
     first = TEXTS[README].split("```")[1].strip().splitlines()
     assert first == [
         "pip install -c constraints.txt -e . && spikeloom demo",
-        "pip install -c constraints.txt -e '.[test]' && pytest",
+        "pip install -c constraints.txt -e '.[test]' && pytest -n auto --dist loadfile",
     ]
 
 
