@@ -68,8 +68,8 @@ def lay_out_blocks(netlist: Netlist) -> Blocks | None:
     Returns
     -------
     Blocks or None
-        None where a register could overflow or saturate, a layer hears others than the one before it, or synapses are
-        so scattered that rows of 64 would waste memory.
+        None where a register could overflow or saturate, a layer hears itself or others than the one before it, or
+        synapses are so scattered that rows of 64 would waste memory.
     """
     if not _is_pipeline(netlist) or not _in_range(netlist):
         return None
@@ -138,7 +138,7 @@ def lay_out_blocks(netlist: Netlist) -> Blocks | None:
 def obstacle(netlist: Netlist) -> str | None:
     """Why there are no blocks of a netlist; None if there are."""
     if not _is_pipeline(netlist):
-        return "a layer hears others than the one before it"
+        return "a layer hears itself or others than the one before it"
     if not _in_range(netlist):
         return "a sum may leave 16 bits, or a membrane or current its register"
     if lay_out_blocks(netlist) is None:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from random_networks import chain, integer_networks, recordings_for
 
 from compiler.forms import Form
-from compiler.interpret import run_integer
+from compiler.interpret import run_integer, step_late
 from compiler.ir import INPUT
 from compiler.passes.expand import expand_graph_convolution
 from compiler.passes.quantize import round_to_forms
@@ -319,11 +319,8 @@ def test_an_intact_machine_breaks_no_rule(data):
     (events,) = data.draw(recordings_for(integer.input.size, samples=1))
     seen = watched(integer, events)
     for post, population in enumerate(integer.populations):
-        sums = sum(
-            (events if p.pre == INPUT else seen.spikes[p.pre]).astype(float) @ p.effective().toarray().T
-            for p in integer.projections
-            if p.post == post
-        )
+        sent = {INPUT: events, **dict(enumerate(seen.spikes)), post: step_late(seen.spikes[post][None])[0]}
+        sums = sum(sent[p.pre].astype(float) @ p.effective().toarray().T for p in integer.projections if p.post == post)
         broken, fault = suspect_machine(
             population, sums, seen.spikes[post], seen.membranes[post].astype(np.int64), layer=post, depth=0
         )

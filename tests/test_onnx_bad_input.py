@@ -165,9 +165,8 @@ NEURONS = {
         ["s0_new", "u0_new"],
         RAGGED,
     ),
-    "node u0_new (Add): takes the state s0 of a layer as its input, a recurrent connection; only "
-    "feed-forward networks can "
-    "be lowered": lambda: one_neuron(
+    "node u0_new (Add): takes the state s0 of a layer as its input, a recurrent connection, which is not read from "
+    "ONNX; export the network as NIR": lambda: one_neuron(
         *PRODUCT,
         node("MatMul", "s0 v", "again"),
         node("Add", "current again", "both"),

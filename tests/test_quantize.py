@@ -289,8 +289,8 @@ def test_calibration_runs_the_float64_model():
     calibration = calibrate(network, events)
     for found, expected in zip(calibration.spikes, run_float(network, events).spikes, strict=True):
         np.testing.assert_array_equal(found, expected)
-    assert calibration.source(INPUT) is events
-    assert calibration.source(1) is calibration.spikes[1]
+    assert calibration.source(INPUT, 0) is events
+    assert calibration.source(1, 2) is calibration.spikes[1]
 
 
 @pytest.mark.parametrize(

@@ -12,15 +12,27 @@ from made_files import CLASSES, TAXELS, recordings_folder
 from made_nir import affine, cuba, graph_with, lif, lowered
 from numpy.testing import assert_array_equal
 from random_netlists import SIMULATORS, assert_equal
-from random_networks import LOIHI, chain, compiled, integer_chain, integer_networks, recordings_for, stored
+from random_networks import (
+    LOIHI,
+    chain,
+    compiled,
+    integer_chain,
+    integer_networks,
+    recordings_for,
+    small_target,
+    stored,
+)
 from test_sanafe import compare as with_sanafe
 from test_sanafe import interpreter  # noqa: F401
 
-from compiler.errors import ModelError, NumericRangeError
+from compiler.errors import CapacityError, ModelError, NumericRangeError
 from compiler.interpret import channels_last, run_float, run_integer
 from compiler.ir import IntegerProjection, Projection, recurrent
 from compiler.lift import lift
 from compiler.passes.calibrate import calibrate
+from compiler.passes.emit import emit
+from compiler.passes.legalize import require_legal
+from compiler.passes.partition import partition
 from compiler.passes.prune import never_fires, removable
 from compiler.passes.quantize import Recipe, quantize
 from compiler.passes.widths import search
@@ -121,7 +133,7 @@ def test_only_networks_with_recurrence_run_in_steps():
     without = chain(np.full((3, 4), 0.5), np.full((2, 3), 0.5))
     assert obstacle(compile_network(without).netlist) is None
     netlist = compile_network(hearing_itself(without, 0, np.full((3, 3), 0.5))).netlist
-    assert obstacle(netlist) == "a layer hears others than the one before it"
+    assert obstacle(netlist) == "a layer hears itself or others than the one before it"
     assert engine.prepare(netlist).blocks is None
     assert [layer.depth for layer in netlist.layers] == [0, 1]
 
@@ -180,6 +192,30 @@ def test_neurons_that_only_each_other_hear_are_left_out():
     own[2, 2] = 1  # what hears itself counts as heard
     made = compile_network(hearing_itself(replace(network, projections=network.projections[:2]), 0, own))
     assert made.netlist.layers[0].unheard == (3,)
+
+
+# -- cores -------------------------------------------------------------------------------------------------------------
+
+
+def in_pairs(own):
+    """Four neurons with one input."""
+    integer = integer_chain(np.full((4, 1), 2))
+    loop = IntegerProjection(pre=0, post=0, weight=stored(2 * own, own), exponent=0, bits=8)
+    return replace(integer, projections=(*integer.projections, loop))
+
+
+def test_a_layer_is_cut_so_that_its_axons_to_itself_are_enough():
+    pairs = np.kron(np.eye(2, dtype=int), np.ones((2, 2), int))
+    target = small_target(core_axons_out=3)
+    parts = partition(in_pairs(pairs), target)
+    assert [[(chunk.first, chunk.last) for chunk in core] for core in parts.cores] == [[(0, 2)], [(2, 3)], [(3, 4)]]
+    require_legal(emit(in_pairs(pairs), parts, (0, 1, 2), target, {}), target)
+    with pytest.raises(CapacityError) as caught:
+        partition(in_pairs(np.ones((4, 4), int)), target)
+    assert str(caught.value) == (
+        "fc1 neuron 0: 4 used, 3 allowed (loihi1.core.axons_out); split the layers that it feeds over fewer cores, or "
+        "this one over more"
+    )
 
 
 # -- proofs and verdicts -----------------------------------------------------------------------------------------------
@@ -245,7 +281,8 @@ def test_operations_count_what_a_layer_sends_itself():
 
 
 def test_sanafe_runs_it_too(interpreter, tmp_path):  # noqa: F811
-    netlist = compile_network(drawn(13)).netlist
+    # a core each: two lists of one neuron on a core are one packet there
+    netlist = compile_network(drawn(13), cores_for={"fc1": 1, "fc2": 1}).netlist
     for run in with_sanafe(interpreter, netlist, events_for(14, samples=2).reshape(2, 10, -1), tmp_path):
         assert run.spikes.sum() > 100
         assert_array_equal(run.spikes, run.expected_spikes)

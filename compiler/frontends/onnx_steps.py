@@ -132,8 +132,8 @@ def _data(table: Table, neurons: Sequence[Neurons]) -> int:
     if mixed:
         label = printable(table.atoms[mixed[0]].label)
         raise ModelError(
-            f"{heard[mixed[0]].node}: takes the state {label} of a layer as its input, a recurrent connection; only "
-            "feed-forward networks can be lowered"
+            f"{heard[mixed[0]].node}: takes the state {label} of a layer as its input, a recurrent connection, "
+            "which is not read from ONNX; export the network as NIR"
         )
     if len(data) != 1:
         named = ", ".join(f"{printable(table.atoms[atom].label)} ({table.atoms[atom].size})" for atom in data)

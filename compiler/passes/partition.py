@@ -3,7 +3,8 @@
 The integer network is not changed: which neuron sits where has no influence on any spike.
 
 Synaptic memory, axons and compartments are all counted by the rules of the target; the split of a population decides
-how many output axons the populations before it need, so populations are cut from the last to the first.
+how many output axons the populations before it need, so populations are cut from the last to the first. One that hears
+itself needs some for its own chunks, so it is cut again until they are enough.
 """
 
 from __future__ import annotations
@@ -12,6 +13,8 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
+
+import numpy as np
 
 from compiler.errors import CapacityError, OptionError, Violation
 from compiler.fixedpoint import FloatArray
@@ -52,8 +55,34 @@ def _largest(low: int, high: int, fits: Callable[[int], bool]) -> int:
     return low
 
 
-def fill(needs: Needs, population: int) -> tuple[list[Chunk], list[Violation]]:
+Cut = tuple[list[Chunk], list[Violation]]
+"""Chunks of a population, or why one of its neurons fits no core."""
+
+
+def fill(needs: Needs, population: int) -> Cut:
     """Cut one population greedily into chunks that fit an empty core; or say why one neuron does not."""
+    return _charged(needs, population, lambda: _fill(needs, population))
+
+
+def _charged(needs: Needs, population: int, again: Callable[[], Cut]) -> Cut:
+    """Cut a population until its neurons have output axons for its own chunks, too; finer chunks need more."""
+    if not any(projection.pre == projection.post == population for projection in needs.network.projections):
+        return again()
+    others = needs.out_axons[population]
+    charged = np.zeros_like(others)
+    try:
+        while True:
+            needs.out_axons[population] = others + charged
+            chunks, why = again()
+            own = needs.heard(chunks).get(population, charged)
+            if why or np.all(own <= charged):
+                return chunks, why
+            charged = np.maximum(charged, own)
+    finally:
+        needs.out_axons[population] = others
+
+
+def _fill(needs: Needs, population: int) -> Cut:
     size = needs.network.populations[population].size
     chunks: list[Chunk] = []
     first = 0
@@ -152,8 +181,12 @@ def _pack(needs: Needs, chunks: list[Chunk], traffic: Callable[[Chunk, Chunk], f
     return best
 
 
-def spread(needs: Needs, population: int, least: int) -> tuple[list[Chunk], list[Violation]]:
+def spread(needs: Needs, population: int, least: int) -> Cut:
     """Cut one population as evenly as possible into at least so many chunks that fit an empty core; or say why not."""
+    return _charged(needs, population, lambda: _spread(needs, population, least))
+
+
+def _spread(needs: Needs, population: int, least: int) -> Cut:
     name, size = needs.network.populations[population].name, needs.network.populations[population].size
     for parts in range(least, size + 1):
         bounds = [i * size // parts for i in range(parts + 1)]
@@ -161,7 +194,7 @@ def spread(needs: Needs, population: int, least: int) -> tuple[list[Chunk], list
         if not any(needs.excess((chunk,)) for chunk in chunks):
             return chunks, []
         if parts == least:
-            fewest, why = fill(needs, population)
+            fewest, why = _fill(needs, population)
             if why:
                 return [], why
             if least < len(fewest):
