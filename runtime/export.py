@@ -185,7 +185,7 @@ def _netx(arguments: argparse.Namespace) -> Written:
     content = netx_export.file_bytes(netx_export.tree_of(network, blocks))
     facts = {
         "neurons": sum(len(block.bias) for block in blocks),
-        "synapses": int(sum((block.weight != 0).sum() for block in blocks)),
+        "synapses": sum(block.synapses for block in blocks),
         "exact": exact,
         "layers": layers,
         **({} if arguments.data is None else {"recordings": len(data)}),

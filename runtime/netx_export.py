@@ -66,6 +66,11 @@ class Block:
     threshold_rounded: bool
     furthest: float
 
+    @property
+    def synapses(self) -> int:
+        """Weights that are not zero."""
+        return int(np.count_nonzero(self.weight)) + (0 if self.own is None else int(np.count_nonzero(self.own)))
+
 
 def blocks_for(network: IntegerNetwork) -> tuple[Block, ...]:
     """Layers of the file.

@@ -26,8 +26,9 @@ from test_sanafe import compare as with_sanafe
 from test_sanafe import interpreter  # noqa: F401
 
 from compiler.errors import CapacityError, ModelError, NumericRangeError
+from compiler.frontends.netx import read_netx
 from compiler.interpret import channels_last, run_float, run_integer
-from compiler.ir import IntegerProjection, Projection, recurrent
+from compiler.ir import INPUT, IntegerProjection, Projection, recurrent
 from compiler.lift import lift
 from compiler.passes.calibrate import calibrate
 from compiler.passes.emit import emit
@@ -357,6 +358,14 @@ def test_the_netlist_comes_back_from_nir(files, capsys):
     graph = nir.read(files / "out.nir")
     assert ("b", "b_to_b") in graph.edges
     assert ("b_to_b", "b") in graph.edges
+
+
+def test_netx_has_the_loop_in_a_block_of_its_own(files, capsys):
+    said(capsys, files, "compile", "{0}/net.nir", "--dt", "0.02", "-o", "{0}/eight.loom")
+    report = json.loads(said(capsys, files, "export", "{0}/eight.loom", "--to", "netx", "-o", "{0}/net.net", "--json"))
+    found = read_netx(files / "net.net").network
+    assert [(p.pre, p.post) for p in found.projections] == [(INPUT, 0), (0, 0), (0, 1)]
+    assert report["synapses"] == sum(p.weight.count_nonzero() for p in found.projections)
 
 
 def test_what_cannot_have_it_says_so(files, capsys):
