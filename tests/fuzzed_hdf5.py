@@ -27,7 +27,20 @@ from compiler.verify import verify
 FILES = Path(__file__).parent / "nir"
 
 TYPES = ("Affine", "AvgPool2d", "Conv1d", "Conv2d", "CubaLIF", "Delay", "Flatten", "I", "IF", "Identity", "Input", "LI")
-TYPES += ("LIF", "Linear", "NIRGraph", "Output", "Scale", "SumPool2d", "Threshold", "conv", "dense", "flatten", "input")
+TYPES += (
+    "LIF",
+    "Linear",
+    "NIRGraph",
+    "Output",
+    "Scale",
+    "SumPool2d",
+    "Threshold",
+    "conv",
+    "dense",
+    "dense_rec",
+    "flatten",
+    "input",
+)
 NUMBERS = (-(2**63), -(2**31), -100, -1, 0, 1, 2, 3, 7, 100, 2**20, 2**31, 2**62, 1e-300, 1e300, np.nan, np.inf, 0.5)
 SECONDS = 4
 
@@ -58,7 +71,8 @@ def netx_bytes():
         {"type": "input", "shape": np.array([2, 4, 4])},
         block("conv", [3, 3, 3], 2 * rng.integers(-9, 9, (3, 2, 2, 2)), groups=np.array(1), **pairs),
         {"type": "flatten", "shape": np.array([27])},
-        block("dense", [4], 2 * rng.integers(-60, 60, (4, 27))),
+        block("dense_rec", [6], 2 * rng.integers(-60, 60, (6, 27)), weight_rec=rng.integers(-60, 60, (6, 6))),
+        block("dense", [4], 2 * rng.integers(-60, 60, (4, 6))),
     ]
     return file_bytes({"layer": {str(number): layer for number, layer in enumerate(layers)}})
 

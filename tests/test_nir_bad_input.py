@@ -208,6 +208,10 @@ def test_circles_that_are_no_layer_hearing_itself():
         "nodes hear each other in a circle (b -> c -> d -> w -> b) with 2 spiking ones in it; a spike takes the chip a "
         "step from one to the next, so it would come back late: a layer may hear itself only, train without the rest"
     )
+    chain_ = {f"w{i}": affine(RNG, 5, 5) for i in range(20)}
+    around = ["d", *chain_, "b"]
+    line = message(ring(*zip(around, around[1:], strict=False), **chain_))
+    assert line.startswith("nodes hear each other in a circle (b -> c -> d -> w0 -> w1 -> w2 -> w3 -> … -> b) with 2 ")
     without = "nodes hear each other in a circle ({}) without neurons, so nothing in it takes a step; put a spiking "
     without += "node into it or train without"
     assert message(ring(("b", "w"), ("w", "w"), ("w", "d"), w=affine(RNG, 5, 5))) == without.format("w -> w")

@@ -17,6 +17,9 @@ from compiler.frontends.nir_file import INPUT_NODE, Graph
 from compiler.frontends.nir_neurons import SPIKING
 from compiler.frontends.tensors import printable
 
+SHOWN = 8
+"""Nodes of a circle that are named."""
+
 Late = Mapping[str, tuple[str, ...]]
 """Spiking nodes that hear themselves, and the nodes from which that comes."""
 
@@ -85,5 +88,6 @@ def in_order(graph: Graph, late: Late) -> tuple[str, ...]:
 
 def _circle(pairs: list[tuple[str, str]]) -> str:
     """One circle among edges, in the direction in which it runs."""
-    circle = [source for source, _ in nx.find_cycle(nx.DiGraph(pairs))]
-    return " -> ".join(printable(name) for name in [*circle, circle[0]])
+    circle = [printable(source) for source, _ in nx.find_cycle(nx.DiGraph(pairs))]
+    shown = circle if len(circle) <= SHOWN else [*circle[: SHOWN - 1], "…"]
+    return " -> ".join([*shown, circle[0]])
