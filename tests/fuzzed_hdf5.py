@@ -27,20 +27,8 @@ from compiler.verify import verify
 FILES = Path(__file__).parent / "nir"
 
 TYPES = ("Affine", "AvgPool2d", "Conv1d", "Conv2d", "CubaLIF", "Delay", "Flatten", "I", "IF", "Identity", "Input", "LI")
-TYPES += (
-    "LIF",
-    "Linear",
-    "NIRGraph",
-    "Output",
-    "Scale",
-    "SumPool2d",
-    "Threshold",
-    "conv",
-    "dense",
-    "dense_rec",
-    "flatten",
-    "input",
-)
+TYPES += ("LIF", "Linear", "NIRGraph", "Output", "Scale", "SumPool2d", "Threshold")
+TYPES += ("conv", "dense", "dense_rec", "flatten", "input")
 NUMBERS = (-(2**63), -(2**31), -100, -1, 0, 1, 2, 3, 7, 100, 2**20, 2**31, 2**62, 1e-300, 1e300, np.nan, np.inf, 0.5)
 SECONDS = 4
 

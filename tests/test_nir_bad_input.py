@@ -1,6 +1,7 @@
 """NIR files that cannot be used: one clear line each."""
 
 import io
+from itertools import pairwise
 from pathlib import Path
 
 import h5py
@@ -210,7 +211,7 @@ def test_circles_that_are_no_layer_hearing_itself():
     )
     chain_ = {f"w{i}": affine(RNG, 5, 5) for i in range(20)}
     around = ["d", *chain_, "b"]
-    line = message(ring(*zip(around, around[1:], strict=False), **chain_))
+    line = message(ring(*pairwise(around), **chain_))
     assert line.startswith("nodes hear each other in a circle (b -> c -> d -> w0 -> w1 -> w2 -> w3 -> … -> b) with 2 ")
     without = "nodes hear each other in a circle ({}) without neurons, so nothing in it takes a step; put a spiking "
     without += "node into it or train without"
