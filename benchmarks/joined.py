@@ -52,7 +52,9 @@ def main() -> None:
         for towers in arguments.towers or [5]:
             groups = [members[i : i + towers] for i in range(0, len(members) - towers + 1, towers)]
             joined = [join(group, arguments.members[:towers]) for group in groups]
-            of_weights[str(towers)] = _summary([_measured(one, training, test, arguments.float_only) for one in joined])
+            of_weights[str(towers)] = _summary(
+                [_decided(one, test) if arguments.float_only else measured(one, training, test) for one in joined]
+            )
             print(weights, towers, json.dumps(of_weights[str(towers)]["mean"]), file=sys.stderr)
         found[weights] = of_weights
         arguments.output.write_text(json.dumps(found, indent=1) + "\n")
@@ -64,10 +66,8 @@ def _decided(network: Checkpoint, test: Recordings) -> Json:
     return {"float": int(np.sum(float_decisions(network, adjacency, test) == test.labels))}
 
 
-def _measured(network: Checkpoint, training: Recordings, test: Recordings, float_only: bool) -> Json:
+def measured(network: Checkpoint, training: Recordings, test: Recordings) -> Json:
     """Float model and chip at 8 bits."""
-    if float_only:
-        return _decided(network, test)
     _, adjacency = propagation(network, None, "joined")
     decided = float_decisions(network, adjacency, test)
     netlist = compile_network(expand(network, adjacency), training_events=training.events).netlist
