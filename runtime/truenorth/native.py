@@ -29,6 +29,7 @@ from runtime.trace import ENGINES
 from runtime.truenorth import engine, render, spec
 from runtime.truenorth.commands import class_counts, legal
 from runtime.truenorth.refusal import require_crossbar_options
+from runtime.windows import first_part, window_asked
 
 Json = dict[str, Any]
 Outcome = tuple[Json, Callable[[Json], str], int]
@@ -69,7 +70,14 @@ def compile_network(arguments: argparse.Namespace) -> Outcome:
     chip = load_target(arguments.target, CROSSBARS)
     trained = read(arguments.checkpoint, arguments)
     progress("compiling")
-    provenance = {
+    netlist = lower(trained.network, chip, provenance=provenance(trained))
+    require_legal(netlist, chip)
+    return render.netlist_json(netlist, chip, write_crossbars(netlist, arguments.output)), render.netlist_text, 0
+
+
+def provenance(trained: Trained) -> Json:
+    """What a netlist remembers of the network that it is from."""
+    return {
         "spikeloom": version(),
         "checkpoint_sha256": trained.sha256,
         "weights": trained.weights,
@@ -77,9 +85,6 @@ def compile_network(arguments: argparse.Namespace) -> Outcome:
         "copies": trained.network.copies,
         "towers": len(trained.network.towers),
     }
-    netlist = lower(trained.network, chip, provenance=provenance)
-    require_legal(netlist, chip)
-    return render.netlist_json(netlist, chip, write_crossbars(netlist, arguments.output)), render.netlist_text, 0
 
 
 def inspect(arguments: argparse.Namespace) -> Outcome:
@@ -141,6 +146,9 @@ def trained_text(report: Json) -> str:
     training = report["training"]
     if "command" in training:
         lines.append(f"  made by: {training['command']}")
+    if isinstance(training.get("test"), dict) and "correct" in training["test"]:
+        found = training["test"]
+        lines.append(f"  {100 * found['accuracy']:.2f} % of {found['samples']} test recordings")
     for which in report["sets"]:
         if isinstance(training.get(which), dict) and "correct" in training[which]:
             found = training[which]
@@ -258,7 +266,8 @@ def verify(arguments: argparse.Namespace) -> Outcome:
             f"--weights {trained.weights}: {arguments.netlist} was compiled from {netlist.provenance.get('weights')}; "
             "give the same"
         )
-    data = asked_recordings(arguments, netlist, labels_for="verify")
+    percent = window_asked(arguments.window)
+    data = first_part(asked_recordings(arguments, netlist, labels_for="verify"), percent)
     verdict = compare(netlist, trained, data, spec_samples=arguments.spec_samples)
     report = verdict_json(verdict, data, chip)
     return report, verdict_text, 0 if report["exact"] else 1

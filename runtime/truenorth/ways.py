@@ -1,12 +1,13 @@
 """Ways out of what crossbar cores do not have: what each costs in cores and ticks, and in decisions.
 
 Ways that need no training are tried on the float network, each alone, in the layer that needs it; ways that lead spikes
-elsewhere change none and cost cores. Ways that need training name the command; what they reach is not known before.
+elsewhere change none and cost cores. Ways that need training have the figures of a shipped network that was trained so,
+and where there is none the command alone: what it would reach is not known before.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,14 +17,13 @@ from compiler.frontends.systems import GRAPH_SYSTEMS, TACTILESGNET
 from compiler.ir import INPUT, Network, Sparse
 from compiler.passes.expand import expand_first_layer, expand_graph_convolution
 from compiler.targets import Target
+from compiler.truenorth.levels import BIN_TICKS, MOST, Levels, codebook
 from compiler.truenorth.needs import CURRENT, FAN_IN, LEAK, TARGETS, WEIGHTS, Need, targets_of
 from compiler.truenorth.sizes import Split, packed, relays, split
 from models.graphs import NEUTOUCH, build_graph, normalised_adjacency
 from runtime.asked import Asked
-from runtime.truenorth.trials import Change, Levels, Trial, codebook
-
-BIN_TICKS = 20
-"""Ticks of a data step whose partial sums travel as numbers of spikes: one millisecond each of the sensor's 20."""
+from runtime.truenorth.retrained import Shipped, accuracy_on
+from runtime.truenorth.trials import Change, Trial
 
 TERNARY = 2
 """Axons of an input that weights of -1, 0 and 1 steps take."""
@@ -36,6 +36,9 @@ SPARSEST = "mst:0"
 
 FEWER_HOPS = 2
 """Hops of a graph convolution that are left, as trained."""
+
+
+RETRAINED = "after retraining"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,6 +60,9 @@ class Way:
         Ticks that every decision takes more.
     command : str or None
         What trains it.
+    shipped : str or None
+        Network that was trained so, whose figures these are: on test recordings, cores of the whole network unless
+        the way is of a layer.
     note : str
         What else was found.
     """
@@ -68,11 +74,14 @@ class Way:
     bin_ticks: int = 1
     more_ticks: int = 0
     command: str | None = None
+    shipped: str | None = None
     note: str = ""
 
 
 class Planner:
     """Finds and prices the ways out of the needs of a network.
+
+    What needs training has the figures of shipped networks; where nothing of the kind is shipped, none.
 
     Parameters
     ----------
@@ -83,14 +92,19 @@ class Planner:
         On calibration recordings, where there are some.
     path : str
         Of the checkpoint as it was typed.
+    retrained : sequence of Shipped
+        Networks for the same sensor and classes, the smallest first.
     """
 
-    def __init__(self, asked: Asked, chip: Target, trial: Trial | None, path: str) -> None:
+    def __init__(
+        self, asked: Asked, chip: Target, trial: Trial | None, path: str, retrained: Sequence[Shipped] = ()
+    ) -> None:
         self.network: Network = asked.network
         self.asked = asked
         self.chip = chip
         self.trial = trial
         self.path = path
+        self.retrained = retrained
         self.books: dict[tuple[int, int], Levels] = {}
         self.in_time: dict[tuple[int, int], tuple[float | None, str]] = {}
 
@@ -179,6 +193,7 @@ class Planner:
             cores=echoed,
             bin_ticks=1 if echo_parts is None else BIN_TICKS,
         )
+        yield from self._shipped("trained with a leak that is added")
         yield self._retrained("trained history-free", self._no_decay("--membrane-decay"), cores, ticks)
 
     def _current(self, layer: int) -> Iterator[Way]:
@@ -186,6 +201,7 @@ class Planner:
         ticks = 1 if parts is None else BIN_TICKS
         accuracy = self._measured(layer, Change(alpha=0.0))
         yield Way(name="without the current, as it is", accuracy=accuracy, cores=cores, bin_ticks=ticks)
+        yield from self._shipped("trained without currents, with a leak that is added")
         yield self._retrained("trained without lasting currents", self._train(), cores, ticks)
 
     def _fan_in(self, layer: int) -> Iterator[Way]:
@@ -194,6 +210,7 @@ class Planner:
             parts = split(inputs, neurons, copies, self.chip)
             if parts is not None:
                 yield self._in_time(layer, copies, parts)
+        yield from self._shipped("trained in groups of {inputs} inputs")
         before = {p.pre for p in self.network.projections if p.post == layer}
         checkpoint = self.asked.checkpoint
         if before == {0} and checkpoint is not None:
@@ -206,7 +223,7 @@ class Planner:
 
     def _in_time(self, layer: int, copies: int, parts: Split) -> Way:
         if (layer, copies) not in self.in_time:
-            change = Change(levels=self._book(layer, copies), inputs=parts.inputs, most=BIN_TICKS)
+            change = Change(levels=self._book(layer, copies), inputs=parts.inputs, most=MOST)
             accuracy = self._measured(layer, change)
             note = "" if self.trial is None else f"{100 * self.trial.saturated:.2g} % of the partial sums saturate"
             self.in_time[layer, copies] = accuracy, note
@@ -232,6 +249,7 @@ class Planner:
                     accuracy=self._measured(layer, Change(levels=self._book(layer, copies))),
                     cores=cores,
                 )
+        yield from self._shipped("trained in {levels} levels")
         checkpoint = self.asked.checkpoint
         if layer == 0 and checkpoint is not None and checkpoint.system == TACTILESGNET:
             yield from self._fewer_hops(checkpoint)
@@ -269,7 +287,12 @@ class Planner:
         copies = max((m for m in COPIES if packed(weight, m, self.chip) is not None), default=TERNARY)
         cores, _ = self.layer_cores(0, copies, weight)
         name = f"trained on the sparsest graph, {copies} axons an input"
-        yield self._retrained(name, self._train(graph=SPARSEST), cores, 1)
+        known = accuracy_on(SPARSEST, self.retrained[0]) if self.retrained else None
+        if known is None:
+            yield self._retrained(name, self._train(graph=SPARSEST), cores, 1)
+        else:
+            shipped, accuracy, command = known
+            yield Way(name=name, accuracy=accuracy, cores=cores, command=command, shipped=shipped, note=RETRAINED)
 
     def _targets(self, layer: int) -> Iterator[Way]:
         targets, size = targets_of(self.network, layer, self.chip), self.network.populations[layer].size
@@ -307,7 +330,7 @@ class Planner:
             total, groups = total + cores + leading, groups + (parts is not None)
             change = Change(beta=0.0, alpha=0.0, levels=self._book(layer, copies))
             if parts is not None:
-                change = replace(change, inputs=parts.inputs, most=BIN_TICKS)
+                change = replace(change, inputs=parts.inputs, most=MOST)
             changes[layer] = change
         return Way(
             name=f"history-free, {copies} axons an input, split in time, spikes led on",
@@ -320,7 +343,24 @@ class Planner:
     # -- commands ------------------------------------------------------------------------------------------------------
 
     def _retrained(self, name: str, command: str | None, cores: int | None, bin_ticks: int) -> Way:
-        return Way(name=name, cores=cores, bin_ticks=bin_ticks, command=command, note="after retraining")
+        return Way(name=name, cores=cores, bin_ticks=bin_ticks, command=command, note=RETRAINED)
+
+    def _shipped(self, name: str) -> Iterator[Way]:
+        """The smallest shipped network that was trained for the chip, if there is one for this sensor."""
+        for like in self.retrained[:1]:
+            yield self.retrained_way(name.format(inputs=like.inputs, levels=like.levels), like)
+
+    def retrained_way(self, name: str, like: Shipped) -> Way:
+        """A shipped network as a way out, by a name."""
+        return Way(
+            name=name,
+            accuracy=like.accuracy,
+            cores=like.cores,
+            more_ticks=like.depth - len(self.network.populations) + 1,
+            command=like.commands[0],
+            shipped=like.name,
+            note=RETRAINED,
+        )
 
     def _no_decay(self, option: str) -> str:
         return self._train(f"{option} {','.join(f'{p.name}=0' for p in self.network.populations)}")
