@@ -1,4 +1,4 @@
-"""Faults on purpose, and whether ``explain`` names them: the confusion table of the README."""
+"""Faults on purpose, and whether ``explain`` names them: the confusion table of docs/verify.md."""
 
 import sys
 from collections import Counter

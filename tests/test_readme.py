@@ -1,32 +1,146 @@
-"""What the README shows is what the code does."""
+"""What the README and the pages of docs/ show is what the code does, and what they link to is there."""
 
+import argparse
 import doctest
+import pkgutil
 import re
+import shlex
 from pathlib import Path
+
+import pytest
 
 from runtime.cli import build_parser
 
 ROOT = Path(__file__).resolve().parents[1]
-README = (ROOT / "README.md").read_text("utf-8")
+README = ROOT / "README.md"
+PAGES = (README, *sorted((ROOT / "docs").glob("*.md")), ROOT / "models" / "pretrained" / "README.md")
+NAMES = [str(page.relative_to(ROOT)) for page in PAGES]
+TEXTS = {page: page.read_text("utf-8") for page in PAGES}
+
+FENCED = re.compile(r"^```.*?^```$", flags=re.MULTILINE | re.DOTALL)
+SHOWN = re.compile(r"^\$ spikeloom (.+)$", flags=re.MULTILINE)
+IN_A_LINE = re.compile(r"`([^`]+)`")
+DOTTED = re.compile(r"`((?:compiler|runtime|models)\.[\w.]+)[(`]")
+OTHERS = {"python", "pip", "pytest", "dask", "helm"}
+"""Programs that have options of their own."""
+LINK = re.compile(r"\]\(([^)\s]+)\)")
+FILE = re.compile(r"\b(?:compiler|runtime|models|tests|benchmarks|examples)/[\w/.-]+\.(?:py|toml|sh|png|md)")
 
 
-def test_python_session(monkeypatch):
+def subcommands(parser):
+    """Name and parser of each command below one."""
+    return next((action.choices for action in parser._actions if isinstance(action, argparse._SubParsersAction)), {})
+
+
+def options(parser):
+    return {option for action in parser._actions for option in action.option_strings}
+
+
+def every_parser(parser):
+    yield parser
+    for below in subcommands(parser).values():
+        yield from every_parser(below)
+
+
+def spoken(text):
+    """Commands named in prose, with or without options, as lists of words."""
+    for code in IN_A_LINE.findall(FENCED.sub("", text)):
+        words = code.split()
+        if words[0] == "spikeloom" and len(words) > 1:
+            yield words[1:]
+
+
+def anchors(text):
+    """Anchors of the headings of a page, as GitHub makes them."""
+    headings = re.findall(r"^#+ (.+)$", FENCED.sub("", text), flags=re.MULTILINE)
+    plain = [re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-") for heading in headings]
+    return [name if name not in plain[:i] else f"{name}-{plain[:i].count(name)}" for i, name in enumerate(plain)]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
+def test_python_sessions(page, monkeypatch):
     monkeypatch.chdir(ROOT)
-    failed, tried = doctest.testfile(str(ROOT / "README.md"), module_relative=False, encoding="utf-8")
-    assert tried > 5
+    failed, _ = doctest.testfile(str(page), module_relative=False, encoding="utf-8")
     assert failed == 0
 
 
+def test_python_sessions_are_shown():
+    shown = {page.name: len(doctest.DocTestParser().get_examples(text)) for page, text in TEXTS.items()}
+    assert shown["compile.md"] > 20
+    assert shown["simulate.md"] > 5
+
+
 def test_the_two_commands_stand_at_the_top():
-    first = README.split("```")[1].strip().splitlines()
+    first = TEXTS[README].split("```")[1].strip().splitlines()
     assert first == [
         "pip install -c constraints.txt -e . && spikeloom demo",
         "pip install -c constraints.txt -e '.[test]' && pytest",
     ]
 
 
-def test_every_shown_command_is_one_that_the_parser_accepts():
-    shown = re.findall(r"^\$ spikeloom (.+)$", README, flags=re.MULTILINE)
-    assert len(shown) >= 3
-    for words in shown:
-        build_parser().parse_args(words.split())
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
+def test_every_shown_command_is_one_that_the_parser_accepts(page):
+    for words in SHOWN.findall(TEXTS[page]):
+        build_parser().parse_args(shlex.split(words))
+
+
+def test_commands_are_shown():
+    assert sum(len(SHOWN.findall(text)) for text in TEXTS.values()) >= 25
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
+def test_every_command_spoken_of_exists_with_its_options(page):
+    for words in spoken(TEXTS[page]):
+        parser, rest = build_parser(), words
+        while rest and subcommands(parser) and rest[0].islower():
+            assert rest[0] in subcommands(parser), f"spikeloom {' '.join(words)}"
+            parser, rest = subcommands(parser)[rest[0]], rest[1:]
+        named = {word.split("=")[0] for word in rest if word.startswith("--")}
+        assert named <= options(parser), f"spikeloom {' '.join(words)}"
+
+
+def test_the_readme_lists_every_command():
+    listed = re.findall(r"^\| `(\w+)` \|.*\|$", TEXTS[README].split("## Commands")[1].split("\n## ")[0], re.MULTILINE)
+    assert sorted(listed) == sorted(subcommands(build_parser()))
+
+
+def test_the_readme_links_every_page():
+    linked = {link.split("#")[0] for link in LINK.findall(TEXTS[README])}
+    assert {str(page.relative_to(ROOT)) for page in PAGES if page != README} <= linked
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
+def test_every_link_leads_somewhere(page):
+    for link in LINK.findall(FENCED.sub("", TEXTS[page])):
+        if "://" in link:
+            continue
+        path, _, anchor = link.partition("#")
+        there = (page.parent / path).resolve() if path else page
+        assert there.exists(), link
+        if anchor:
+            assert anchor in anchors(TEXTS[there]), link
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
+def test_every_option_spoken_of_is_one_of_some_command(page):
+    known = set().union(*(options(parser) for parser in every_parser(build_parser())))
+    for code in IN_A_LINE.findall(FENCED.sub("", TEXTS[page])):
+        if OTHERS.isdisjoint(code.split()):
+            assert {word.split("=")[0] for word in code.split() if word.startswith("--")} <= known, code
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
+def test_every_name_spoken_of_exists(page):
+    for name in DOTTED.findall(FENCED.sub("", TEXTS[page])):
+        assert pkgutil.resolve_name(name) is not None
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
+def test_every_file_spoken_of_is_there(page):
+    for path in FILE.findall(TEXTS[page]):
+        assert (ROOT / path).exists(), path
+
+
+def test_anchors_are_those_of_github():
+    text = "# NIR, in: `x` and 2 × 3\n```\n# a comment\n```\n## Why not: explain\n" + "## In Python\n" * 3
+    assert anchors(text) == ["nir-in-x-and-2--3", "why-not-explain", "in-python", "in-python-1", "in-python-2"]
