@@ -3,7 +3,7 @@
     python benchmarks/truenorth_engine.py Ev-Objects.zip NET.loom … [--limit 20] [--rounds 5]
 
 Files of ``compile --target truenorth``. Each runs as it is, and those of one tick a data step also with 20: events come
-every 20 ticks, and all else goes on in between. Time is of the process, the least of the rounds, spread over recordings.
+every 20 ticks, and all else goes on in between. Time is CPU time, of each recording the least of the rounds.
 """
 
 from __future__ import annotations

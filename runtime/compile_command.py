@@ -23,7 +23,7 @@ from runtime.asked import Asked, asked_network
 from runtime.inputs import progress, recordings, require_place, version
 from runtime.options import MARGIN, cores_asked
 from runtime.restore import is_whole, take
-from runtime.truenorth import native
+from runtime.truenorth import in_time, native
 from runtime.truenorth.refusal import refuse
 
 Json = dict[str, Any]
@@ -40,7 +40,9 @@ def compile_netlist(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json
     if native.is_named(arguments.checkpoint):
         return native.compile_network(arguments)
     if arguments.target in known_targets(CROSSBARS):
-        return refuse(arguments)
+        return refuse(arguments) if arguments.in_time is None else in_time.compile_network(arguments)
+    if arguments.in_time is not None:
+        raise OptionError(f"--in-time {arguments.in_time}: is for truenorth; give --target truenorth, or leave it away")
     if arguments.margin is not None and arguments.ranges != "observed":
         raise OptionError(
             f"--margin {arguments.margin:g}: only observed ranges have one; add --ranges observed or leave it away"

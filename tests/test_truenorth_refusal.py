@@ -109,13 +109,13 @@ def test_cores_of_a_packed_layer():
 
 
 def test_cores_of_a_split_layer():
-    found = split(2496, 128, 4, CHIP)
-    assert (found.groups, found.inputs, found.partial_cores) == (39, 64, 39)
-    assert found.sum_cores == 43  # 78 partial sums a neuron: three neurons and a clock on 256 axons
-    assert found.cores == 82
+    found = split(2496, 128, 3, CHIP)
+    assert (found.groups, found.inputs, found.partial_cores) == (30, 84, 30)
+    assert found.sum_cores == 32  # 60 partial sums a neuron: four neurons and twelve axons of clocks
+    assert found.cores == 62
     assert split(300, 200, 2, CHIP).partial_cores == 3 * 2  # 400 neurons of partial sums a group
-    assert split(256 * 128, 1, 1, CHIP) is None  # 256 partial sums and a clock are one axon too many
-    assert split(256 * 127, 1, 1, CHIP).sum_cores == 1
+    assert split(252 * 110 + 1, 1, 1, CHIP) is None  # 222 partial sums and 36 axons of clocks are two too many
+    assert split(252 * 110, 1, 1, CHIP).sum_cores == 1
 
 
 def test_cores_of_relays():
@@ -367,7 +367,7 @@ def test_the_text(place, capsys):
     assert f"conv1, all 30 neurons: {leak}" in lines
     assert any(line.startswith("  history-free as it is") and "%" in line for line in lines)
     assert any(line.startswith("  trained history-free ") and "after retraining" in line for line in lines)
-    assert "all of it at once, without training:" in lines
+    assert "all of it at once, without training (--in-time):" in lines
     bare = refused(capsys, place).out.splitlines()
     told = "cores of the layer, ticks of a data step; --calibrate DATA measures what the ways do to decisions"
     assert bare[1] == told

@@ -29,16 +29,24 @@ from compiler.errors import CapacityError, Violation
 from compiler.fixedpoint import IntArray
 from compiler.targets import Target
 from compiler.truenorth.draft import RELAY, Draft, Neuron
-from compiler.truenorth.levels import BIN_TICKS, EMPTYING, MOST, Layer, LevelNetwork, level_points, type_weights
+from compiler.truenorth.levels import (
+    BIN_TICKS,
+    EMPTYING,
+    LIFT,
+    MOST,
+    PULL,
+    Layer,
+    LevelNetwork,
+    gate_axons,
+    level_points,
+    type_weights,
+)
 from compiler.truenorth.lower import place_cores
 from compiler.truenorth.netlist import AXON_TYPES, RESET_LINEAR, RESET_TO, CrossbarNetlist
 from compiler.truenorth.rules import signed_range
 
 CLOCK = AXON_TYPES - 1
 """Type of axons that clocks reach on cores that add up inputs."""
-
-LIFT, PULL = 255, -256
-"""Weights of the clocks of gated neurons."""
 
 RELAYED = 2
 """Ticks that a spike of a split layer takes to the next one, by a relay or without."""
@@ -87,6 +95,12 @@ def _starts(network: LevelNetwork) -> list[int]:
     for layer in network.layers[:-1]:
         starts.append(starts[-1] + (MOST + RELAYED if layer.is_split else 1))
     return starts
+
+
+def first_spikes(network: LevelNetwork) -> dict[str, int]:
+    """Tick in which each layer spikes for the first data step."""
+    starts = _starts(network)
+    return {layer.name: start + layer.is_split * MOST for layer, start in zip(network.layers, starts, strict=True)}
 
 
 @dataclass(slots=True, kw_only=True)
@@ -164,8 +178,7 @@ class _Placing:
     def _gated(self, depth: int, layer: Layer, groups: int, ends: list[list[Place]] | None) -> list[list[Place]]:
         """Neurons that add up partial sums; returns for each the lines of its groups, above zero and below in turn."""
         reach = MOST * groups
-        lifts = (reach - int(layer.threshold.min())) // LIFT + 1
-        pulls = (2 * reach + LIFT * lifts) // -PULL + 2
+        lifts, pulls = gate_axons(groups, int(layer.threshold.min()))
         a_core = min((self.chip.limit("core.axons") - lifts - pulls) // (2 * groups), self.chip.limit("core.neurons"))
         if a_core < 1:
             raise CapacityError(

@@ -37,6 +37,9 @@ MOST_COPIES = 3
 EMPTYING = 4
 """Axons by which a clock empties neurons of partial sums: more than these can hold."""
 
+LIFT, PULL = 255, -256
+"""Weights of the clocks of gated neurons."""
+
 SEARCHED = np.linspace(0.1, 1.0, 19)
 """Shares of the largest weight that are tried as the largest level of a codebook."""
 
@@ -72,7 +75,7 @@ def codebook(weight: FloatArray, copies: int) -> Levels:
     largest = np.maximum(np.abs(weight).max(axis=1, keepdims=True), 1e-12)
     best = np.full(len(weight), np.inf)
     step, level = np.ones(len(weight)), np.zeros(weight.shape)
-    for share in SEARCHED:
+    for share in (*SEARCHED, *(-low / level for level in range(1, -low))):  # the latter: the largest is that level
         tried = share * largest / -low
         rounded = np.clip(np.rint(weight / tried), low, high)
         error = ((rounded * tried - weight) ** 2).sum(axis=1)
@@ -137,7 +140,7 @@ class Layer:
     @property
     def is_split(self) -> bool:
         """Whether its sums travel in time."""
-        return self.width < self.level.shape[1]
+        return bool(self.width < self.level.shape[1])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -225,6 +228,26 @@ def _layer(population: Population, weight: FloatArray, copies: int, chip: Target
     )
 
 
+def gate_axons(groups: int, least: int = 0) -> tuple[int, int]:
+    """Axons of the clocks that lift a gated neuron to its threshold, and that pull it down.
+
+    Parameters
+    ----------
+    groups : int
+        Whose partial sums it adds up.
+    least : int
+        Lowest threshold on its core.
+
+    Examples
+    --------
+    >>> gate_axons(30)
+    (3, 9)
+    """
+    reach = MOST * groups
+    lifts = (reach - least) // LIFT + 1
+    return lifts, (2 * reach + LIFT * lifts) // -PULL + 2
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Run:
     """What a network in levels does.
@@ -245,17 +268,20 @@ class Run:
     largest: tuple[int, ...]
 
 
-def run_levels(network: LevelNetwork, events: npt.NDArray[np.uint8]) -> Run:
-    """Run one recording (channels, steps) through a network in levels; every sum is exact."""
+def run_levels(network: LevelNetwork, events: npt.NDArray[np.uint8], *, most: int = MOST) -> Run:
+    """Run one recording (channels, steps) through a network in levels; every sum is exact.
+
+    Partial sums count `most` at the most; on the chip that is ``MOST``.
+    """
     heard = (events > 0).T.astype(np.float64)  # whole numbers, so that the products are exact and fast
     spikes, partial, saturated, largest = [], [], [], []
     for layer in network.layers:
         sums = [heard[:, group] @ layer.level[:, group].T.astype(np.float64) for group in layer.groups]
         split = layer.is_split
         partial.append(sum(part.size for part in sums) if split else 0)
-        saturated.append(sum(int(np.count_nonzero(np.abs(part) > MOST)) for part in sums) if split else 0)
+        saturated.append(sum(int(np.count_nonzero(np.abs(part) > most)) for part in sums) if split else 0)
         largest.append(max(int(np.abs(part).max(initial=0)) for part in sums) if split else 0)
-        total = sum(np.clip(part, -MOST, MOST) for part in sums) if split else sums[0]
+        total = sum(np.clip(part, -most, most) for part in sums) if split else sums[0]
         spikes.append(total >= layer.threshold)
         heard = spikes[-1].astype(np.float64)
     return Run(spikes=tuple(spikes), partial=tuple(partial), saturated=tuple(saturated), largest=tuple(largest))

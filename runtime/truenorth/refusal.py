@@ -13,6 +13,7 @@ import numpy as np
 from compiler.errors import ModelError, OptionError
 from compiler.interpret import channels_last
 from compiler.targets import CROSSBARS, Target, load_target
+from compiler.truenorth.levels import COPIES
 from compiler.truenorth.needs import needs
 from models.evtouch import Recordings
 from runtime.asked import Asked, asked_network
@@ -21,7 +22,7 @@ from runtime.options import PLACING, ROUNDING
 from runtime.tables import table
 from runtime.truenorth.retrained import shipped_networks
 from runtime.truenorth.trials import Trial
-from runtime.truenorth.ways import COPIES, RETRAINED, Planner, Way
+from runtime.truenorth.ways import RETRAINED, Planner, Way
 
 Json = dict[str, Any]
 
@@ -137,7 +138,7 @@ def refusal_text(report: Json) -> str:
             f"{violation['where']}: {violation['found']}, allowed {violation['allowed']} ({violation['rule']})",
             _ways_table(violation["ways"]),
         ]
-    lines += ["", "all of it at once, without training:", _ways_table(report["together"])]
+    lines += ["", "all of it at once, without training (--in-time):", _ways_table(report["together"])]
     lines += _retrained_lines(report)
     ways = [way for violation in violations for way in violation["ways"] if way["command"] is not None]
     known = {way["command"]: way["shipped"] for way in ways if way["shipped"] not in (None, *_names(report))}

@@ -13,7 +13,7 @@ import numpy as np
 from compiler.fixedpoint import IntArray
 from compiler.interpret import BATCH, BoolArray, Floating, float_recurrence, lasting_currents, product, vote
 from compiler.ir import INPUT, Network, Population
-from compiler.truenorth.levels import Levels
+from compiler.truenorth.levels import LevelNetwork, Levels, run_levels
 from runtime.votes import readout_counts
 
 LEAKS = (0.2, 0.4, 0.6, 0.8, 1.0)
@@ -84,6 +84,15 @@ class Trial:
             clipped, parts = clipped + self._clipped, parts + self._partial
         self.saturated = clipped / max(parts, 1)
         return float(np.mean(np.concatenate(decided) == self.labels))
+
+    def accuracy_of(self, levels: LevelNetwork) -> float:
+        """Share of recordings that a network in whole numbers, as it is on the chip, decides rightly."""
+        decided = []
+        for events in self.parts:
+            for recording in events:
+                votes = run_levels(levels, recording.T).spikes[-1].sum(axis=0)
+                decided.append(np.bincount(levels.label, weights=votes, minlength=levels.classes).argmax())
+        return float(np.mean(np.array(decided) == self.labels))
 
     def leak_for(self, layer: int) -> float:
         """Constant leak that moves the fewest spikes of a layer, its inputs as they are."""

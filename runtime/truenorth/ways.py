@@ -12,12 +12,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from compiler.errors import CapacityError, ModelError
 from compiler.frontends.checkpoint import Checkpoint
 from compiler.frontends.systems import GRAPH_SYSTEMS, TACTILESGNET
 from compiler.ir import INPUT, Network, Sparse
 from compiler.passes.expand import expand_first_layer, expand_graph_convolution
 from compiler.targets import Target
-from compiler.truenorth.levels import BIN_TICKS, MOST, Levels, codebook
+from compiler.truenorth.in_time import lower_in_time
+from compiler.truenorth.levels import BIN_TICKS, COPIES, MOST, MOST_COPIES, Levels, codebook, in_levels
 from compiler.truenorth.needs import CURRENT, FAN_IN, LEAK, TARGETS, WEIGHTS, Need, targets_of
 from compiler.truenorth.sizes import Split, packed, relays, split
 from models.graphs import NEUTOUCH, build_graph, normalised_adjacency
@@ -27,9 +29,6 @@ from runtime.truenorth.trials import Change, Trial
 
 TERNARY = 2
 """Axons of an input that weights of -1, 0 and 1 steps take."""
-
-COPIES = (2, 3, 4)
-"""Axons of an input that are tried; beyond four types repeat."""
 
 SPARSEST = "mst:0"
 """Graph of the built-in sensor with the fewest edges, a tree."""
@@ -134,27 +133,6 @@ class Planner:
         parts = split(weight.shape[1], weight.shape[0], copies, self.chip)
         return (None if parts is None else parts.cores), parts
 
-    def reach(self, layer: int, copies: int) -> int:
-        """Axons that each spike of a layer must reach, with so many an input on every core that hears it."""
-        held, total = self.chip.limit("core.neurons"), 0
-        for projection in self.network.projections:
-            if projection.pre == layer:
-                cores, parts = self.layer_cores(projection.post, copies)
-                size = self.network.populations[projection.post].size
-                total += copies * (-(-2 * size // held) if parts is not None else cores or 1)
-        return total
-
-    def lead_cores(self, layer: int, copies: int) -> int | None:
-        """Cores that lead each spike of a layer where it must go: of relays, or of copies, whichever are fewer."""
-        targets = self.reach(layer, copies)
-        if targets < 2:
-            return 0
-        population, fed = self.network.populations[layer], self._hears_inputs(layer)
-        by_relay = relays(population.size, targets, self.chip)
-        cores, _ = self.layer_cores(layer, copies)
-        by_copy = None if cores is None or not fed else cores * (targets - 1)
-        return min((found for found in (by_relay, by_copy) if found is not None), default=None)
-
     def _hears_inputs(self, layer: int) -> bool:
         return all(p.pre == INPUT for p in self.network.projections if p.post == layer)
 
@@ -206,7 +184,7 @@ class Planner:
 
     def _fan_in(self, layer: int) -> Iterator[Way]:
         inputs, neurons = self.weight(layer).shape[1], self.network.populations[layer].size
-        for copies in COPIES:
+        for copies in range(TERNARY, MOST_COPIES + 1):
             parts = split(inputs, neurons, copies, self.chip)
             if parts is not None:
                 yield self._in_time(layer, copies, parts)
@@ -240,9 +218,9 @@ class Planner:
     def _weights(self, layer: int) -> Iterator[Way]:
         for copies in COPIES:
             cores, parts = self.layer_cores(layer, copies)
-            if parts is not None:
+            if parts is not None and copies <= MOST_COPIES:
                 yield self._in_time(layer, copies, parts)
-            elif cores is not None:
+            elif parts is None and cores is not None:
                 named = "-1, 0, 1" if copies == TERNARY else f"{2**copies} levels"
                 yield Way(
                     name=f"{copies} axons an input, {named} times a step for each neuron",
@@ -320,24 +298,20 @@ class Planner:
     # -- all of it -----------------------------------------------------------------------------------------------------
 
     def together(self, copies: int) -> Way:
-        """All of it without training: history-free, weights in levels, split in time where needed, spikes led on."""
-        changes, total, groups = {}, 0, 0
-        for layer in range(len(self.network.populations)):
-            cores, parts = self.layer_cores(layer, copies)
-            leading = self.lead_cores(layer, copies)
-            if cores is None or leading is None:
-                return Way(name=f"{copies} axons an input: does not fit")
-            total, groups = total + cores + leading, groups + (parts is not None)
-            change = Change(beta=0.0, alpha=0.0, levels=self._book(layer, copies))
-            if parts is not None:
-                change = replace(change, inputs=parts.inputs, most=MOST)
-            changes[layer] = change
+        """All of it without training, as ``compile --in-time`` does it: history-free, weights in levels."""
+        forgetful = tuple(replace(population, beta=0.0, alpha=0.0) for population in self.network.populations)
+        name = f"history-free, {copies} axons an input, sums in time"
+        try:
+            levels = in_levels(replace(self.network, populations=forgetful), copies, self.chip)
+            netlist = lower_in_time(levels, self.chip)
+        except (CapacityError, ModelError):
+            return Way(name=f"{name}: does not fit")
         return Way(
-            name=f"history-free, {copies} axons an input, split in time, spikes led on",
-            accuracy=None if self.trial is None else self.trial.accuracy(changes),
-            cores=total,
-            bin_ticks=BIN_TICKS if groups else 1,
-            more_ticks=groups * BIN_TICKS + 2 * len(changes),
+            name=name,
+            accuracy=None if self.trial is None else self.trial.accuracy_of(levels),
+            cores=netlist.n_cores,
+            bin_ticks=netlist.bin_ticks,
+            more_ticks=netlist.drain - len(forgetful) + 1,
         )
 
     # -- commands ------------------------------------------------------------------------------------------------------
