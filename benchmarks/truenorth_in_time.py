@@ -1,10 +1,11 @@
 """What it takes and what it costs to lead the sums of a trained network through 20 ticks a data step.
 
-    python benchmarks/truenorth_in_time.py DATA CHECKPOINT [options of compile that name the network, such as --graph manual]
+    python benchmarks/truenorth_in_time.py DATA CHECKPOINT [--graph manual]
 
+What follows the checkpoint are options of compile that name the network.
 Every layer forgets within a step, whatever the network was trained with. Test accuracy of the float network as it was
-trained and history-free, then of what ``compile --in-time`` places, for each number of axons an input: with partial sums
-that saturate at 19 and with such that do not, the share of those that do by layer, and the largest of all.
+trained and history-free, then of what ``compile --in-time`` places, for each number of axons an input: with partial
+sums that saturate at 19 and with such that do not, the share of those that do by layer, and the largest of all.
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ from compiler.passes.layout import require_goal
 from compiler.passes.quantize import Recipe
 from compiler.pipeline import compile_network
 from compiler.serialize import read_netlist, write_netlist
-from compiler.targets import CROSSBARS, known_targets, load_target
+from compiler.targets import CROSSBARS, known_targets, load_target, require_target
 from compiler.text import text
 from runtime import render
 from runtime.asked import Asked, asked_network
@@ -35,6 +35,7 @@ LISTED = 20
 def compile_netlist(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
     """Run the command: the report, how to print it, and the exit code."""
     require_place(arguments.output, "-o", arguments)
+    require_target(arguments.target)
     if is_whole(arguments):
         return take(arguments)
     if native.is_named(arguments.checkpoint):

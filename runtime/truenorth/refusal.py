@@ -14,6 +14,7 @@ from compiler.errors import ModelError, OptionError
 from compiler.interpret import channels_last
 from compiler.targets import CROSSBARS, Target, load_target
 from compiler.truenorth.levels import COPIES
+from compiler.truenorth.native import SYSTEM
 from compiler.truenorth.needs import needs
 from models.evtouch import Recordings
 from runtime.asked import Asked, asked_network
@@ -55,7 +56,10 @@ def refuse(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], 
     chip = load_target(arguments.target, CROSSBARS)
     asked = asked_network(arguments.checkpoint, arguments)
     if asked.network.input.clocks.channels:
-        raise ModelError(f"{arguments.checkpoint}: has clocks, ways out of them are not known; give one without")
+        raise ModelError(
+            f"{arguments.checkpoint}: hears clocks, of which ways out are not known; train one for the chip, which may "
+            f"hear them: spikeloom train --system {SYSTEM}"
+        )
     trial, steps = None, None
     if arguments.calibrate is not None:
         progress("reading the recordings")
