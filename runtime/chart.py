@@ -13,7 +13,7 @@ from typing import Any
 
 from compiler.atomic import write_atomically
 from compiler.errors import OptionError
-from compiler.targets import load_target
+from compiler.targets import CROSSBARS, Target, load_target
 from models.events import BIN_S
 from runtime import chart_networks, chart_plan, chart_points, sweep
 from runtime.chart_budget import Budget, parse_budgets, pick
@@ -25,10 +25,10 @@ from runtime.chart_text import chart_text, csv_text
 from runtime.data_commands import add_bin_option
 from runtime.inputs import progress, version
 from runtime.options import DATA_HELP, add_model
+from runtime.truenorth.charted import TICK, time_title
 
 Json = dict[str, Any]
 
-TARGET = "loihi1"
 KIND = "chart"
 STORE = "points.jsonl"
 
@@ -38,7 +38,9 @@ Axes of the grid: bits (2-6, 8, or one a layer as in 8+4+4+8), planes (1-3), gro
 energy, latency, or LAYER:N as in fc1:6+conv1:4), window (per cent of each recording, 25-100% is every quarter,
 25-100%:5 every twentieth), graph (that a network was trained on: of those given, or shipped ones beside them). Choices
 are made on the training split, the test split is reported. A chart that was interrupted goes on with the same command;
-netlists and figures are kept in FOLDER. The exit code is 1 if no point fits a budget.
+netlists and figures are kept in FOLDER. Networks that were trained for TrueNorth stand beside those for Loihi, by their
+own prices: fronts and choices are among the points of the chip of the first network. The exit code is 1 if no point
+fits a budget.
 """
 
 
@@ -79,23 +81,24 @@ def chart(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], i
     from models.protocols import data_digest  # torch, and the engine: no other command waits for them
     from runtime.chart_work import both_splits
 
-    target = load_target(TARGET)
-    grid = Grid() if arguments.grid is None else parse_grid(arguments.grid, target)
+    stores = load_target(chart_networks.COMPARTMENT_CHIP)
+    grid = Grid() if arguments.grid is None else parse_grid(arguments.grid, stores)
     budgets = parse_budgets(arguments.budget)
+    folder = _folder(arguments.output)
+    networks = chart_networks.given_networks(arguments, grid)
+    targets = {network.target: _chip(network.target) for network in networks}
+    target = targets[networks[0].target]
     tables = [table.name for table in target.energy]
     energy = tables[0] if arguments.table is None else arguments.table
     if energy not in tables:
         raise OptionError(f"--table {energy}: {target.title} has no such energy table; give {' or '.join(tables)}")
-    folder = _folder(arguments.output)
-    networks = chart_networks.given_networks(arguments, grid)
     data = Data(path=arguments.data, bin_s=arguments.bin)
-    checkpoint = networks[0].checkpoint
     progress("reading the recordings")
-    splits = both_splits(data, checkpoint.taxels, checkpoint.classes)
+    splits = both_splits(data, networks[0].taxels, networks[0].classes)
     digest = data_digest(splits["train"], splits["test"])
     chart_networks.require_suited(networks, splits, digest)
-    chart_networks.require_grid(networks, grid, target)
-    facts = Facts(data=data, data_sha256=digest, target=target, folder=folder)
+    chart_networks.require_grid(networks, grid, stores)
+    facts = Facts(data=data, data_sha256=digest, targets=targets, folder=folder)
     folder.mkdir(exist_ok=True)
     points, refused, decided, rates = _measured(arguments, networks, grid, facts)
     labels = {split: splits[split].labels.tolist() for split in SPLITS}
@@ -107,6 +110,10 @@ def chart(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], i
     report["measured"] = {"recordings_per_s": rates}
     write_chart(folder, report)
     return report, lambda found: chart_text(found, str(folder)), _code(report)
+
+
+def _chip(name: str) -> Target:
+    return load_target(name, CROSSBARS) if name == chart_networks.CROSSBAR_CHIP else load_target(name)
 
 
 def _code(report: Json) -> int:
@@ -202,6 +209,7 @@ def _named(each: Stored, layout: str) -> Json:
     storage = each.storage
     return {
         "network": each.network.name,
+        "target": each.network.target,
         "graph": each.network.graph,
         "bits": list(storage.bits),
         "planes": storage.planes,
@@ -222,7 +230,8 @@ def _report(
     energy: str,
 ) -> Json:
     """All but the points and what follows from them."""
-    target = facts.target
+    target = facts.targets[networks[0].target]
+    times = {chip.name: _times(chip) for chip in facts.targets.values()}
     described = []
     for network in networks:
         windows = {
@@ -236,13 +245,20 @@ def _report(
         "target": target.name,
         "data": {"path": facts.data.path, "bin_s": facts.data.bin_s, "sha256": facts.data_sha256},
         "tables": {
-            "energy": {table.name: table.title for table in target.energy},
-            "time": {table.name: table.title for table in target.time},
+            "energy": {table.name: table.title for chip in facts.targets.values() for table in chip.energy},
+            "time": {name: title for found in times.values() for name, title in found.items()},
         },
-        "chosen_by": {"energy": energy, "time": target.time[0].name if target.time else None},
+        "chosen_by": {"energy": energy, "time": next(iter(times[target.name]), None)},
         "grid": {name: list(getattr(grid, name)) for name in Grid.__slots__},
         "networks": described,
     }
+
+
+def _times(chip: Target) -> dict[str, str]:
+    """Titles of what a chip's time is known by."""
+    if chip.cores == CROSSBARS:
+        return {TICK: time_title(chip)}
+    return {table.name: table.title for table in chip.time}
 
 
 def _right(decisions: Sequence[int], labels: Sequence[int]) -> Json:
@@ -265,15 +281,23 @@ def _conclude(
             point[split] = chart_points.figures(point[split], model[split][str(point["window"])], labels[split])
     for network in report["networks"]:
         network["float_training"] = _whole(decided[network["name"]], labels)
-    report["expected"] = chart_points.with_expectations(points, report["networks"])
-    chart_points.with_fronts(points, energy, time)
+    networks = report["networks"]
+    own, others = chart_points.by_chip(points, report["target"])
+    chosen_of, beside = chart_points.by_chip(networks, report["target"])
+    if not own:
+        raise OptionError(f"--grid: {report['target']} refuses all configurations; the first: {refused[0]['why'][0]}")
+    report["expected"] = chart_points.with_expectations(own, chosen_of)
+    chart_points.with_expectations(others, beside)
+    chart_points.with_fronts(own, energy, time)
+    for point in others:
+        point["front"] = dict.fromkeys(own[0]["front"], False)
     bin_s = report["data"]["bin_s"]
     report |= {
         "points": points,
         "refused": refused,
-        "recommended": chart_points.recommended(points, report["networks"], energy=energy, time=time, bin_s=bin_s),
-        "saving": chart_points.saving(points, energy),
-        "budget": pick(points, budgets, energy=energy, time=time),
+        "recommended": chart_points.recommended(own, chosen_of, energy=energy, time=time, bin_s=bin_s),
+        "saving": chart_points.saving(own, energy),
+        "budget": pick(own, budgets, energy=energy, time=time),
     }
 
 

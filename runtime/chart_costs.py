@@ -6,7 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from runtime.chart_points import by_chip, own_value
 from runtime.tables import si
+from runtime.truenorth.charted import TICK
 
 Json = dict[str, Any]
 
@@ -37,19 +39,26 @@ def costs_of(report: Json, *, measured: bool = False) -> dict[str, Cost]:
     """Axes of a chart by name; with `measured` also the one whose values depend on the machine that made the chart."""
     energy, time = report["chosen_by"]["energy"], report["chosen_by"]["time"]
     rates = report["measured"]["recordings_per_s"]
+    _, beside = by_chip(report["points"], report["target"])
+
+    def others(figure: str, table: str) -> str:
+        """Tables by which the points of other chips are drawn."""
+        drawn = dict.fromkeys(f"; {p['target']}: {next(iter(p['test'][figure]))}" for p in beside)
+        return "".join(words for words in drawn if not words.endswith(f": {table}"))
+
     found = {
         "energy": Cost(
             title="energy",
-            axis=f"energy of a mean inference ({energy})",
-            value=lambda point: float(point["test"]["energy_j"][energy]),
+            axis=f"energy of a mean inference ({energy}{others('energy_j', energy)})",
+            value=lambda point: own_value(point["test"]["energy_j"], energy),
             said=lambda value: si(value, "J"),
         )
     }
     if time is not None:
         found["latency"] = Cost(
             title="time on the chip",
-            axis=f"time of a mean inference on the chip, simple model ({time})",
-            value=lambda point: float(point["test"]["time_s"][time]),
+            axis=f"time of a mean inference on the chip, {_model(time)}{others('time_s', time)})",
+            value=lambda point: own_value(point["test"]["time_s"], time),
             said=lambda value: si(value, "s"),
         )
     found["operations"] = Cost(
@@ -69,6 +78,17 @@ def costs_of(report: Json, *, measured: bool = False) -> dict[str, Cost]:
             said=counted,
         )
     return found
+
+
+def _model(time: str) -> str:
+    """How a table's times are added up, to an opened bracket.
+
+    Examples
+    --------
+    >>> _model("sanafe"), _model("tick")
+    ('simple model (sanafe', 'real time (tick')
+    """
+    return f"{'real time' if time == TICK else 'simple model'} ({time}"
 
 
 def counted(value: float) -> str:

@@ -8,6 +8,7 @@ from typing import Any
 
 from runtime import svg
 from runtime.chart_costs import Cost, costs_of
+from runtime.chart_points import by_chip
 from runtime.chart_text import NAMES, label
 from runtime.found import number as counted
 from runtime.tables import si
@@ -167,7 +168,7 @@ def log_ticks(low: float, high: float) -> list[float]:
 
 def _float(report: Json, frame: svg.Frame) -> list[str]:
     """The float model of the network with the highest expectation, on whole recordings."""
-    network = max(report["networks"], key=lambda net: net["expected"])
+    network = max(by_chip(report["networks"], report["target"])[0], key=lambda net: net["expected"])
     found = network["float"][max(network["float"], key=int)]["test"]
     y = frame.y(100 * found["accuracy"])
     text = f"float model of {network['name']}: {100 * found['accuracy']:.2f} %"

@@ -10,12 +10,15 @@ from pathlib import Path
 from typing import Any
 
 from compiler.errors import ModelError, OptionError
+from compiler.forms import Form
 from compiler.frontends.checkpoint import Checkpoint
 from compiler.frontends.onnx import SUFFIX
 from compiler.frontends.own import arrays_digest
 from compiler.passes.quantize import Recipe, check_recipes
 from compiler.serialize import is_netlist
 from compiler.targets import Target
+from compiler.truenorth.native import SYSTEM, highest_level
+from compiler.truenorth.trained import is_trained, read_trained
 from models.evtouch import Recordings
 from models.systems import NO_GRAPH
 from runtime.cells import SHORT_EPOCHS, file_safe
@@ -23,6 +26,12 @@ from runtime.chart_grid import Grid
 from runtime.inputs import PRETRAINED, asked_checkpoint, asked_graph, propagation, shipped
 
 Json = dict[str, Any]
+
+COMPARTMENT_CHIP, CROSSBAR_CHIP = "loihi1", "truenorth"
+"""Chips of a chart: of checkpoints, and of networks in whole numbers."""
+
+LOIHI_AXES = ("bits", "planes", "groups", "prune", "cores")
+"""Axes of the grid that networks in whole numbers do not have."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -35,32 +44,47 @@ class Given:
         As typed.
     name : str
         Short, and no other network of the chart has it.
-    checkpoint : Checkpoint
-        What the file holds.
+    target : str
+        Chip that it is compiled for.
     graph : str
         That it was trained on; ``none`` of systems without.
     words : tuple of str
         Of a ``compile`` command that names the network and nothing else.
     sees : str
         Hash over what its first layer sees.
+    sha256, weights, system : str
+        Of the file, and what of it is taken.
+    taxels, classes : int
+    layers : tuple of str
+        Names.
+    training : mapping
+        JSON values, as far as the file knows them.
+    forms : tuple of Form, optional
+        Storage that it was fine-tuned for.
+    levels : int, optional
+        Levels of its weights, of a network that was trained in whole numbers.
     """
 
     path: str
     name: str
-    checkpoint: Checkpoint
+    target: str
     graph: str
     words: tuple[str, ...]
     sees: str
-
-    @property
-    def layers(self) -> tuple[str, ...]:
-        """Names of its layers."""
-        return tuple(self.checkpoint.neurons)
+    sha256: str
+    weights: str
+    system: str
+    taxels: int
+    classes: int
+    layers: tuple[str, ...]
+    training: Mapping[str, Any]
+    forms: tuple[Form, ...] | None = None
+    levels: int | None = None
 
     @property
     def validation(self) -> float | None:
         """Share of recordings that its training left out and then decided right, where the file says so."""
-        found = (self.checkpoint.training or {}).get("validation")
+        found = self.training.get("validation")
         if not isinstance(found, Mapping) or not found.get("samples"):
             return None
         return float(found["correct"] / found["samples"])
@@ -99,6 +123,8 @@ def _read(path: str, arguments: argparse.Namespace) -> Given:
     if path.endswith(SUFFIX):
         raise ModelError(f"{path}: is an ONNX file, a chart takes checkpoints; give the checkpoint that it was made of")
     file = shipped(path)
+    if Path(file).is_file() and is_trained(file):
+        return _read_native(path, arguments)
     if Path(file).is_file() and is_netlist(file):
         raise ModelError(f"{path}: is a netlist, a chart compiles its own; give the checkpoint that it was made from")
     checkpoint = asked_checkpoint(path, arguments)
@@ -109,10 +135,41 @@ def _read(path: str, arguments: argparse.Namespace) -> Given:
     return Given(
         path=path,
         name=Path(path.removeprefix(PRETRAINED)).stem,
-        checkpoint=checkpoint,
+        target=COMPARTMENT_CHIP,
         graph=graph,
         words=("compile", path, *_model_words(own, checkpoint)),
         sees=arrays_digest({"propagation": sees}),
+        sha256=checkpoint.sha256,
+        weights=checkpoint.weights,
+        system=checkpoint.system,
+        taxels=checkpoint.taxels,
+        classes=checkpoint.classes,
+        layers=tuple(checkpoint.neurons),
+        training=checkpoint.training or {},
+        forms=checkpoint.forms,
+    )
+
+
+def _read_native(path: str, arguments: argparse.Namespace) -> Given:
+    """A network that was trained for TrueNorth, which says everything but its weights itself."""
+    trained = read_trained(shipped(path), weights=arguments.weights)
+    network = trained.network
+    weights = ("--weights", arguments.weights) if arguments.weights else ()
+    return Given(
+        path=path,
+        name=Path(path.removeprefix(PRETRAINED)).stem,
+        target=CROSSBAR_CHIP,
+        graph=trained.graph,
+        words=("compile", path, *weights, "--target", CROSSBAR_CHIP),
+        sees="",
+        sha256=trained.sha256,
+        weights=trained.weights,
+        system=SYSTEM,
+        taxels=network.taxels,
+        classes=network.classes,
+        layers=tuple(network.neurons),
+        training=trained.training,
+        levels=2 * highest_level(network.copies) + 1,
     )
 
 
@@ -185,15 +242,15 @@ def require_suited(networks: Sequence[Given], splits: Mapping[str, Recordings], 
     """
     first = networks[0]
     for own in networks:
-        sizes = [(each.checkpoint.taxels, each.checkpoint.classes) for each in (first, own)]
+        sizes = [(each.taxels, each.classes) for each in (first, own)]
         if sizes[0] != sizes[1]:
             raise ModelError(
                 f"{own.path}: has {sizes[1][0]} taxels and {sizes[1][1]} classes, {first.path} has {sizes[0][0]} and "
                 f"{sizes[0][1]}; chart networks of one data set at a time"
             )
-        made = (own.checkpoint.training or {}).get("data_sha256")
+        made = own.training.get("data_sha256")
         if made not in (None, digest):
-            told = (own.checkpoint.training or {}).get("data", "others")
+            told = own.training.get("data", "others")
             raise ModelError(
                 f"{own.path}: was trained on other recordings ({told}) than {splits['test'].source}; give those, or a "
                 "checkpoint that was trained on these"
@@ -201,15 +258,24 @@ def require_suited(networks: Sequence[Given], splits: Mapping[str, Recordings], 
 
 
 def require_grid(networks: Sequence[Given], grid: Grid, target: Target) -> None:
-    """Refuse widths and layouts by layer that do not suit a network's layers.
+    """Refuse widths and layouts by layer that do not suit a network's layers, and those that no network has.
 
     Raises
     ------
     OptionError
-        Naming the network.
+        Naming the network, or the axis.
     """
+    if all(own.levels is not None for own in networks):
+        axes = [axis for axis in LOIHI_AXES if getattr(grid, axis) != getattr(Grid(), axis)]
+        if axes:
+            raise OptionError(
+                f"--grid {axes[0]}: is for {COMPARTMENT_CHIP}, networks for {CROSSBAR_CHIP} have a storage and a "
+                "layout of their own; leave it away"
+            )
     for own in networks:
-        for bits in grid.bits if own.checkpoint.forms is None else ():
+        if own.levels is not None:
+            continue
+        for bits in grid.bits if own.forms is None else ():
             if len(bits) not in (1, len(own.layers)):
                 raise OptionError(
                     f"--grid bits={'+'.join(map(str, bits))}: {len(bits)} widths, {own.path} has {len(own.layers)} "
@@ -227,17 +293,16 @@ def require_grid(networks: Sequence[Given], grid: Grid, target: Target) -> None:
 
 def network_json(own: Given) -> Json:
     """A network for the chart's files."""
-    checkpoint = own.checkpoint
-    training = checkpoint.training or {}
     return {
         "name": own.name,
         "path": own.path,
-        "sha256": checkpoint.sha256,
-        "system": checkpoint.system,
+        "target": own.target,
+        "sha256": own.sha256,
+        "system": own.system,
         "graph": own.graph,
         "has_graph": own.graph != NO_GRAPH,
-        "weights": checkpoint.weights,
-        "fine_tuned": checkpoint.forms is not None,
-        "trained_by": training.get("command"),
+        "weights": own.weights,
+        "fine_tuned": own.forms is not None,
+        "trained_by": own.training.get("command"),
         "validation": own.validation,
     }

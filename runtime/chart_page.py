@@ -10,6 +10,7 @@ from typing import Any
 
 from runtime.chart_costs import costs_of
 from runtime.chart_figure import scatter, tip
+from runtime.chart_points import by_chip
 from runtime.chart_text import NAMES, budget_lines, figures, head, label, saving_lines
 from runtime.markup import facts, figure, paragraph, section, table, unfold
 from runtime.tables import percent, si
@@ -31,6 +32,12 @@ MEANINGS = (
     "Front: no other point is right more often on the test split for the same cost. It describes, nothing is chosen by "
     "it.",
     "Storage: bits of a weight (b), times that a synapse is stored (p), scales in a layer (g).",
+)
+
+
+BESIDE = (
+    "Points of another chip stand at their own prices, named in brackets; fronts and choices leave them out, since "
+    "prices of two chips hold different things."
 )
 
 
@@ -143,6 +150,7 @@ def _chart(report: Json) -> list[str]:
         *_figures(report, "chart", measured=True),
         chosen,
         *(paragraph(line) for line in MEANINGS),
+        *([paragraph(BESIDE)] if by_chip(report["points"], report["target"])[1] else []),
     ]
 
 

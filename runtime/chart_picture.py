@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from runtime.chart_costs import Cost, costs_of
 from runtime.chart_figure import log_ticks, series_of, taken_points
+from runtime.chart_points import by_chip
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -125,7 +126,7 @@ def _panel(axes: Axes, report: Json, name: str, cost: Cost) -> None:
 
 
 def _float_line(axes: Axes, report: Json) -> None:
-    network = max(report["networks"], key=lambda net: net["expected"])
+    network = max(by_chip(report["networks"], report["target"])[0], key=lambda net: net["expected"])
     found = network["float"][max(network["float"], key=int)]["test"]
     axes.axhline(
         100 * found["accuracy"],

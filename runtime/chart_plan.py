@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -35,7 +35,9 @@ class Storage:
     prune : bool
         Whether neurons that never fired on training recordings are left out.
     own : bool
-        Whether the network was fine-tuned for it.
+        Whether the network was fine-tuned for it, or trained in it.
+    levels : int, optional
+        Levels of weights that have no width of their own.
     """
 
     bits: tuple[int, ...]
@@ -43,6 +45,7 @@ class Storage:
     groups: int
     prune: bool
     own: bool = False
+    levels: int | None = None
 
     def words(self) -> list[str]:
         """Options of ``compile`` that ask for it."""
@@ -54,7 +57,9 @@ class Storage:
         return [*words, *(["--prune-unused"] if self.prune else [])]
 
     def label(self) -> str:
-        """Short name: ``4b``, ``8-4-4-8b 2p 3g pruned``."""
+        """Short name: ``4b``, ``8-4-4-8b 2p 3g pruned``, ``7 levels``."""
+        if self.levels is not None:
+            return f"{self.levels} levels"
         words = [f"{'-'.join(map(str, self.bits))}b"]
         words += [] if self.planes == 1 else [f"{self.planes}p"]
         words += [] if self.groups == 1 else [f"{self.groups}g"]
@@ -95,29 +100,29 @@ class Facts:
     data : Data
     data_sha256 : str
         Of both splits.
-    target : Target
-        Chip, with its tables.
+    targets : mapping of str to Target
+        Chips, with their tables, by name.
     folder : Path
         Of the chart.
     """
 
     data: Data
     data_sha256: str
-    target: Target
+    targets: Mapping[str, Target]
     folder: Path
 
-    def key(self, **facts: Any) -> str:
-        """Content key of a piece of work."""
-        shared = {"format": FORMAT, "spikeloom": version(), "data": self.data_sha256, "target": repr(self.target)}
+    def key(self, network: Given, **facts: Any) -> str:
+        """Content key of a piece of work on a network."""
+        target = repr(self.targets[network.target])
+        shared = {"format": FORMAT, "spikeloom": version(), "data": self.data_sha256, "target": target}
         return content_key(shared | {"bin_s": self.data.bin_s} | facts)
 
 
 def identity(network: Given) -> Json:
-    """What tells a float network from others."""
-    checkpoint = network.checkpoint
+    """What tells a network from others."""
     return {
-        "checkpoint": checkpoint.sha256,
-        "weights": checkpoint.weights,
+        "checkpoint": network.sha256,
+        "weights": network.weights,
         "sees": network.sees,
         "options": list(network.words[2:]),  # all but the name of the file
     }
@@ -126,14 +131,17 @@ def identity(network: Given) -> Json:
 def decisions(network: Given, grid: Grid, facts: Facts) -> Point:
     """Work that finds the decisions of a float network."""
     words = from_anywhere([*network.words, "-o", "x.loom"])
-    work = Decide(words=words, sha256=network.checkpoint.sha256, data=_data(facts), windows=tuple(sorted(grid.window)))
-    key = facts.key(what="float", **identity(network), windows=list(work.windows))
+    work = Decide(words=words, sha256=network.sha256, data=_data(facts), windows=tuple(sorted(grid.window)))
+    key = facts.key(network, what="float", **identity(network), windows=list(work.windows))
     return Point(key=key, label=f"{network.name} float", payload=work)
 
 
 def storages(network: Given, grid: Grid) -> Iterator[Storage]:
-    """Every storage that a grid asks for; of a fine-tuned network its own and no other."""
-    forms = network.checkpoint.forms
+    """Every storage that a grid asks for; of a network that was trained in one its own and no other."""
+    forms = network.forms
+    if network.levels is not None:
+        yield Storage(bits=(), planes=1, groups=1, prune=False, own=True, levels=network.levels)
+        return
     if forms is not None:
         bits = tuple(form.bits for form in forms)
         yield Storage(
@@ -148,18 +156,23 @@ def storages(network: Given, grid: Grid) -> Iterator[Storage]:
         yield Storage(bits=bits, planes=planes, groups=groups, prune=bool(prune))
 
 
+def layouts_of(network: Given, grid: Grid) -> tuple[str, ...]:
+    """Layouts that a grid asks for; crossbars have one."""
+    return grid.cores if network.levels is None else Grid().cores
+
+
 def stored_networks(networks: Sequence[Given], grid: Grid, facts: Facts) -> list[Stored]:
     """Every network in every storage, with the work that compiles it."""
     found = []
     for network in networks:
         for storage in storages(network, grid):
             layouts, files = {}, {}
-            for layout in grid.cores:
+            for layout in layouts_of(network, grid):
                 layouts[layout] = from_anywhere(compile_words(network, storage, layout, facts))
-                key = facts.key(what="netlist", **identity(network), storage=storage.words(), layout=layout)
+                key = facts.key(network, what="netlist", **identity(network), storage=storage.words(), layout=layout)
                 files[layout] = facts.folder.resolve() / "netlists" / f"{key}.loom"
-            work = Build(layouts=layouts, sha256=network.checkpoint.sha256, files=files, data=_data(facts))
-            key = facts.key(what="build", **identity(network), storage=storage.words(), layouts=list(grid.cores))
+            work = Build(layouts=layouts, sha256=network.sha256, files=files, data=_data(facts))
+            key = facts.key(network, what="build", **identity(network), storage=storage.words(), layouts=list(layouts))
             found.append(Stored(network=network, storage=storage, build=work, key=key))
     return found
 
@@ -168,7 +181,7 @@ def runs(stored: Stored, layout: str, sha256: str, grid: Grid, facts: Facts) -> 
     """Work that runs a netlist, by window."""
     return {
         window: Point(
-            key=facts.key(what="run", netlist=sha256, window=window),
+            key=facts.key(stored.network, what="run", netlist=sha256, window=window),
             label=f"{stored.network.name} {stored.storage.label()} {layout} {window}%",
             payload=Run(build=stored.build, layout=layout, sha256=sha256, window=window),
         )
@@ -181,7 +194,8 @@ def runs(stored: Stored, layout: str, sha256: str, grid: Grid, facts: Facts) -> 
 
 def compile_words(network: Given, storage: Storage, layout: str, facts: Facts) -> list[str]:
     """What to type after ``spikeloom`` to get a netlist."""
-    words = [*network.words, *storage.words(), "--calibrate", facts.data.path, *_bin_words(facts)]
+    calibrated = [] if storage.levels is not None else ["--calibrate", facts.data.path, *_bin_words(facts)]
+    words = [*network.words, *storage.words(), *calibrated]
     return [*words, *layout_words(layout), "-o", file_name(network, storage, layout)]
 
 

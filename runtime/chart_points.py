@@ -29,6 +29,23 @@ TRAINING = (
 )
 
 
+def own_value(found: Mapping[str, float], table: str) -> float:
+    """A cost by a table, or by the first of those of another chip, whose prices have other names.
+
+    Examples
+    --------
+    >>> own_value({"davies": 1.0, "sanafe": 2.0}, "sanafe"), own_value({"all_in": 3.0, "marginal": 4.0}, "sanafe")
+    (2.0, 3.0)
+    """
+    return float(found[table] if table in found else next(iter(found.values())))
+
+
+def by_chip(entries: Sequence[Json], target: str) -> tuple[list[Json], list[Json]]:
+    """Points or networks of a chip, and those of others; what does not say its chip is of this one."""
+    own = [entry for entry in entries if entry.get("target", target) == target]
+    return own, [entry for entry in entries if entry.get("target", target) != target]
+
+
 # -- one point ---------------------------------------------------------------------------------------------------------
 
 

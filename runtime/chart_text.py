@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from runtime.chart_budget import UNITS
+from runtime.chart_points import by_chip, own_value
 from runtime.found import number
 from runtime.tables import percent, si, table
 
@@ -45,11 +46,17 @@ def figures(point: Json, energy: str, time: str | None) -> list[str]:
         f"{100 * test['low']:.1f} … {100 * test['high']:.1f}",
         f"{100 * test['float']['accuracy']:.2f}",
         f"{test['equal']}",
-        si(test["energy_j"][energy], "J"),
-        "–" if time is None else si(test["time_s"][time], "s"),
+        _cost(test["energy_j"], energy, "J"),
+        "–" if time is None else _cost(test["time_s"], time, "s"),
         f"{test['synaptic_operations']:,.0f}",
         str(point["n_cores"]),
     ]
+
+
+def _cost(found: Json, name: str, unit: str) -> str:
+    """A cost; of a chip whose tables have other names with that of its own."""
+    told = "" if name in found else f" ({next(iter(found))})"
+    return f"{si(own_value(found, name), unit)}{told}"
 
 
 def head(energy: str, time: str | None) -> list[str]:
@@ -96,7 +103,7 @@ def chart_text(report: Json, folder: str) -> str:
                 f"front of test accuracy and {name} (a description, no choice){more}:",
                 _rows(report, on[:LISTED]),
             ]
-    lines += ["", *saving_lines(report)]
+    lines += [*_others(report), "", *saving_lines(report)]
     if report["budget"] is not None:
         lines += ["", *budget_lines(report)]
     lines += [f"does not fit: {_configuration(each)}: {each['why'][0]}" for each in report["refused"][:LISTED]]
@@ -104,6 +111,22 @@ def chart_text(report: Json, folder: str) -> str:
         lines.append(f"does not fit: {len(report['refused']) - LISTED} more, see chart.json")
     lines += ["", f"written: {folder}/chart.html, .svg, .png, .csv, .json; netlists in {folder}/netlists"]
     return "\n".join(lines)
+
+
+def _others(report: Json) -> list[str]:
+    """Points of other chips, each under its own names of prices and time."""
+    _, others = by_chip(report["points"], report["target"])
+    lines = []
+    for chip in dict.fromkeys(point["target"] for point in others):
+        own = [point for point in others if point["target"] == chip]
+        energy, time = (next(iter(own[0]["test"][name])) for name in ("energy_j", "time_s"))
+        shown = [[str(point["number"]), label(point), *figures(point, energy, time)] for point in own]
+        lines += [
+            "",
+            f"on {chip}, whose prices are others (no choice, no front):",
+            table(head(energy, time), shown[:LISTED]),
+        ]
+    return lines
 
 
 def recommended_text(report: Json) -> str:

@@ -23,15 +23,19 @@ from compiler.interpret import cut, vote
 from compiler.netlist import Netlist
 from compiler.pipeline import place, store
 from compiler.serialize import read_netlist, write_netlist
-from compiler.targets import load_target
+from compiler.targets import CROSSBARS, known_targets, load_target
+from compiler.truenorth.netlist import CrossbarNetlist
+from compiler.truenorth.serialize import is_crossbars, read_crossbars
+from compiler.truenorth.trained import Trained, read_trained
 from models.evtouch import Recordings
 from runtime import engine
 from runtime.asked import Asked, asked_network
 from runtime.chart_tasks import SPLITS, Build, Data, Decide, Run
 from runtime.compile_command import provenance, recipes_asked
 from runtime.estimate import estimate
-from runtime.inputs import recordings
+from runtime.inputs import recordings, shipped
 from runtime.options import cores_asked
+from runtime.truenorth import charted
 from runtime.votes import predictions, readout_counts
 from runtime.windows import first_part, steps_of
 
@@ -82,9 +86,25 @@ def both_splits(data: Data, taxels: int, classes: int) -> dict[str, Recordings]:
 def _network(words: tuple[str, ...], sha256: str) -> Asked:
     arguments = parsed(words)
     found = asked_network(arguments.checkpoint, arguments)
-    if found.sha256 != sha256:
-        raise ModelError(f"{arguments.checkpoint}: is another file than where the chart was asked for; copy that here")
+    _require_same(arguments.checkpoint, found.sha256, sha256)
     return found
+
+
+def _is_native(words: tuple[str, ...]) -> bool:
+    return parsed(words).target in known_targets(CROSSBARS)
+
+
+@lru_cache(maxsize=2)
+def _trained(words: tuple[str, ...], sha256: str) -> Trained:
+    arguments = parsed(words)
+    found = read_trained(shipped(arguments.checkpoint), weights=arguments.weights)
+    _require_same(arguments.checkpoint, found.sha256, sha256)
+    return found
+
+
+def _require_same(path: str, found: str, asked: str) -> None:
+    if found != asked:
+        raise ModelError(f"{path}: is another file than where the chart was asked for; copy that here")
 
 
 def parsed(words: tuple[str, ...]) -> argparse.Namespace:
@@ -95,12 +115,12 @@ def parsed(words: tuple[str, ...]) -> argparse.Namespace:
 
 
 @lru_cache(maxsize=1)
-def _read(path: Path, sha256: str) -> Netlist | None:
+def _read(path: Path, sha256: str) -> Netlist | CrossbarNetlist | None:
     """A netlist that is kept; None if it is gone, damaged or another one."""
     if not path.is_file() or hashlib.sha256(path.read_bytes()).hexdigest() != sha256:
         return None
     try:
-        return read_netlist(path)
+        return read_crossbars(path) if is_crossbars(path) else read_netlist(path)
     except FormatError:
         return None
 
@@ -112,6 +132,10 @@ def _decide(work: Decide) -> Json:
     """Decisions of the float32 model by split and window; one run each, since what comes later changes nothing."""
     from models.reference import float_spikes  # torch, so only here
 
+    if _is_native(work.words):
+        network = _trained(work.words, work.sha256).network
+        both = both_splits(work.data, network.taxels, network.classes)
+        return {split: charted.model_decisions(network, data, work.windows) for split, data in both.items()}
     asked = _network(work.words, work.sha256)
     checkpoint, adjacency = asked.checkpoint, asked.adjacency
     assert checkpoint is not None, "a chart takes checkpoints"
@@ -136,8 +160,14 @@ def _decide(work: Decide) -> Json:
 def _build(work: Build) -> Json:
     """Compile what is not there; by layout the netlist's size and hash, or the limits that it breaks."""
     arguments = {layout: parsed(words) for layout, words in work.layouts.items()}
+    words = next(iter(work.layouts.values()))
+    if _is_native(words):
+        try:
+            return {name: charted.build(_trained(words, work.sha256), file) for name, file in work.files.items()}
+        except CapacityError as error:
+            return {name: {"refused": str(error).splitlines()} for name in work.files}
     some = next(iter(arguments.values()))
-    asked = _network(model_words(next(iter(work.layouts.values()))), work.sha256)
+    asked = _network(model_words(words), work.sha256)
     training = both_splits(work.data, asked.network.input.taxels, asked.network.classes)["train"]
     try:
         stored = store(
@@ -210,8 +240,11 @@ def _run(work: Run) -> Json:
     if netlist is None:
         raise FormatError(f"{path}: is not the netlist that was measured before; begin anew with --fresh")
     splits = both_splits(work.build.data, netlist.taxels, netlist.classes)
-    found: Json = {split: _costs(netlist, first_part(data, work.window)) for split, data in splits.items()}
-    found["recordings_per_s"] = _throughput(netlist, first_part(splits["test"], work.window))
+    parts = {split: first_part(data, work.window) for split, data in splits.items()}
+    if isinstance(netlist, CrossbarNetlist):
+        return charted.measure(netlist, parts)
+    found: Json = {split: _costs(netlist, data) for split, data in parts.items()}
+    found["recordings_per_s"] = _throughput(netlist, parts["test"])
     return found
 
 

@@ -16,14 +16,14 @@ from compiler.passes.layout import require_goal
 from compiler.passes.quantize import Recipe
 from compiler.pipeline import compile_network
 from compiler.serialize import read_netlist, write_netlist
-from compiler.targets import CROSSBARS, known_targets, load_target
+from compiler.targets import CROSSBARS, known_targets, load_target, require_target
 from compiler.text import text
 from runtime import render
 from runtime.asked import Asked, asked_network
 from runtime.inputs import progress, recordings, require_place, version
 from runtime.options import MARGIN, cores_asked
 from runtime.restore import is_whole, take
-from runtime.truenorth import native
+from runtime.truenorth import in_time, native
 from runtime.truenorth.refusal import refuse
 
 Json = dict[str, Any]
@@ -35,12 +35,15 @@ LISTED = 20
 def compile_netlist(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
     """Run the command: the report, how to print it, and the exit code."""
     require_place(arguments.output, "-o", arguments)
+    require_target(arguments.target)
     if is_whole(arguments):
         return take(arguments)
     if native.is_named(arguments.checkpoint):
         return native.compile_network(arguments)
     if arguments.target in known_targets(CROSSBARS):
-        return refuse(arguments)
+        return refuse(arguments) if arguments.in_time is None else in_time.compile_network(arguments)
+    if arguments.in_time is not None:
+        raise OptionError(f"--in-time {arguments.in_time}: is for truenorth; give --target truenorth, or leave it away")
     if arguments.margin is not None and arguments.ranges != "observed":
         raise OptionError(
             f"--margin {arguments.margin:g}: only observed ranges have one; add --ranges observed or leave it away"

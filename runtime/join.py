@@ -16,9 +16,11 @@ from compiler.frontends.own import WEIGHTS
 from compiler.frontends.towers import arrays_of
 from compiler.frontends.towers import join as join_networks
 from compiler.serialize import is_netlist
+from compiler.truenorth.native import SYSTEM as NATIVE
 from runtime.finetune import stored_graph
 from runtime.inputs import require_place, shipped
 from runtime.render import tower_line
+from runtime.tables import percent
 from runtime.truenorth import joining, native
 
 SUMMARY = "put several trained networks side by side in one, whose votes add up"
@@ -35,6 +37,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--weights", choices=WEIGHTS, help="epoch to take from each (default: the first of these that it holds)"
     )
+    parser.add_argument(
+        "--data", metavar="PATH", help=f"measure the joined network on its test split and keep that ({NATIVE} only)"
+    )
     parser.add_argument("-o", "--output", required=True, metavar="OUT.pt")
 
 
@@ -48,6 +53,8 @@ def join(arguments: Namespace) -> tuple[Report, Callable[[Report], str], int]:
     """
     if any(native.is_named(name) for name in arguments.checkpoints):
         return joining.join(arguments, join_text)
+    if arguments.data is not None:
+        raise OptionError(f"--data {arguments.data}: is for {NATIVE}; leave it away, and measure with spikeloom run")
     for name in arguments.checkpoints:
         require_place(arguments.output, "-o", Namespace(checkpoint=name))
     found = [_network(name, arguments.weights) for name in arguments.checkpoints]
@@ -119,4 +126,6 @@ def join_text(report: Report) -> str:
     layers = ", ".join(f"{layer['name']} {layer['neurons']:,}" for layer in report["layers"])
     lines = [f"{report['command']}", f"  {len(report['towers'])} towers: {layers}, {report['classes']} classes"]
     lines += [f"    {index}: {tower_line(tower)}" for index, tower in enumerate(report["towers"])]
+    if "test" in report:
+        lines.append(f"  test: {percent(report['test']['correct'], report['test']['samples'])}")
     return "\n".join([*lines, f"  written: {report['file']}"])

@@ -284,6 +284,12 @@ def add_compile(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--calibrate", metavar="PATH", help="recordings whose train split chooses the scales")
     add_bin_option(sub)
     sub.add_argument(
+        "--in-time",
+        type=int,
+        metavar="N",
+        help="truenorth: lower a history-free network, N axons an input (2 to 4), whose sums travel in 20 ticks a step",
+    )
+    sub.add_argument(
         "--ranges", default="proven", help=f"how overflow is excluded: {' or '.join(RANGES)} (default: proven)"
     )
     sub.add_argument("--margin", type=float, help=f"share added to observed ranges (default: {MARGIN:g})")

@@ -334,9 +334,9 @@ def test_unreadable_files(refusal, tmp_path, monkeypatch):
         ),
         (
             ["net.pt", "--target", "loihi2"],
-            "--target loihi2: not modelled; no public per-event energies; allowed: loihi1",
+            "--target loihi2: not modelled; no public per-event energies; allowed: loihi1, truenorth",
         ),
-        (["net.pt", "--target", "../loihi1"], "--target ../loihi1: unknown; allowed: loihi1"),
+        (["net.pt", "--target", "../loihi1"], "--target ../loihi1: unknown; allowed: loihi1, truenorth"),
         *(
             (
                 ["net.pt", "--weight-bits", bits],

@@ -220,6 +220,39 @@ def test_full_cores_and_many_ticks():
     assert_same(expected, one(engine.simulate(netlist, recording[None], spikes=True, membranes=True)))
 
 
+@pytest.mark.parametrize("most", [0, 1 << 15])
+def test_neurons_work_when_they_are_reached_or_all_at_once(most, monkeypatch):
+    netlist, recording = large(), (np.random.default_rng(2).random((78, 20)) < 0.05).astype(np.uint8)
+    expected = engine.simulate(netlist, recording[None], spikes=True, membranes=True)
+    monkeypatch.setattr(engine, "MOST_STEADY", most)
+    prepared = engine.prepare(netlist)
+    assert (prepared.wiring.steady.shape[1] == 0) == (most == 0)
+    assert_same(expected, engine.simulate(prepared, recording[None], spikes=True, membranes=True))
+
+
+def climbing(weight):
+    """A neuron that is given more in every tick than a spike takes from it."""
+    draft = Draft()
+    draft.core(0, 0)
+    line = draft.axon(0)
+    neuron = Neuron(weights=(weight, 0, 0, 0), reset_mode=RESET_LINEAR, negative_saturates=True)
+    number = draft.neuron(0, neuron, layer="layer0")
+    draft.connect(0, line, [number])
+    draft.vote((0, number), 0)
+    draft.clock(0, line, period=1)
+    return draft.netlist(taxels=1, polarities=1, classes=1)
+
+
+def test_a_membrane_that_climbs_to_the_end_of_its_register():
+    netlist = climbing(255)
+    recording = np.zeros((1, 2100), np.uint8)
+    expected = spec.simulate(netlist, recording)
+    assert expected.counts.overflows.sum() > 0  # 254 a tick, 2**19 after 2,064
+    assert_same(expected, one(engine.simulate(netlist, recording[None], spikes=True, membranes=True)))
+    assert engine.prepare(netlist).wiring.steady.shape[1] == 1
+    assert engine.prepare(netlist, careful=True).wiring.steady.shape[1] == 0
+
+
 def test_random_thresholds_depend_on_the_seed_alone():
     draft = Draft()
     draft.core(0, 0)

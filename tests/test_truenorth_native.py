@@ -13,7 +13,7 @@ from compiler.dynamics import NO_CLOCKS, with_clocks
 from compiler.errors import CapacityError
 from compiler.targets import CROSSBARS, load_target
 from compiler.truenorth import rules
-from compiler.truenorth.lower import lower
+from compiler.truenorth.lower import cores_needed, lower
 from compiler.truenorth.native import BASES, crossing_points, faults, highest_level, joined, steepest_leak
 from models.truenorth.network import run_network
 from runtime.truenorth import engine, spec
@@ -151,6 +151,12 @@ def test_what_contradicts_itself_is_told():
     assert faults(replace(network, clocks=NO_CLOCKS)) == [
         f"tower 0, {stage.name}: hears 2 clocks of 0" for stage in rest
     ]
+
+
+@settings(max_examples=20, deadline=None)
+@given(network=NETWORKS | st.builds(random_network, st.integers(0, 9), copies=st.just(3), hidden=st.just((60, 40))))
+def test_cores_are_known_before_lowering(network):
+    assert cores_needed(network, CHIP) == lower(network, CHIP).n_cores
 
 
 def test_only_networks_of_one_kind_are_joined():

@@ -6,15 +6,21 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from made_files import own_file, recordings_folder
+import timed_networks
+from made_files import CLASSES, TAXELS, own_file, recordings_folder
+from native_networks import random_network
 from random_networks import chain, stored
 
 from compiler.interpret import run_float
 from compiler.targets import CROSSBARS, load_target
+from compiler.truenorth.levels import codebook
+from compiler.truenorth.lower import lower
 from compiler.truenorth.needs import CURRENT, FAN_IN, LEAK, TARGETS, WEIGHTS, needs
 from compiler.truenorth.sizes import packed, relays, split
+from compiler.truenorth.trained import write_trained
 from runtime import cli
-from runtime.truenorth.trials import Change, Trial, codebook
+from runtime.truenorth import retrained
+from runtime.truenorth.trials import Change, Trial
 
 CHIP = load_target("truenorth", CROSSBARS)
 
@@ -104,13 +110,13 @@ def test_cores_of_a_packed_layer():
 
 
 def test_cores_of_a_split_layer():
-    found = split(2496, 128, 4, CHIP)
-    assert (found.groups, found.inputs, found.partial_cores) == (39, 64, 39)
-    assert found.sum_cores == 43  # 78 partial sums a neuron: three neurons and a clock on 256 axons
-    assert found.cores == 82
+    found = split(2496, 128, 3, CHIP)
+    assert (found.groups, found.inputs, found.partial_cores) == (30, 84, 30)
+    assert found.sum_cores == 32  # 60 partial sums a neuron: four neurons and twelve axons of clocks
+    assert found.cores == 62
     assert split(300, 200, 2, CHIP).partial_cores == 3 * 2  # 400 neurons of partial sums a group
-    assert split(256 * 128, 1, 1, CHIP) is None  # 256 partial sums and a clock are one axon too many
-    assert split(256 * 127, 1, 1, CHIP).sum_cores == 1
+    assert split(252 * 110 + 1, 1, 1, CHIP) is None  # 222 partial sums and 36 axons of clocks are two too many
+    assert split(252 * 110, 1, 1, CHIP).sum_cores == 1
 
 
 def test_cores_of_relays():
@@ -238,6 +244,13 @@ def place(tmp_path_factory):
     return folder
 
 
+@pytest.fixture(autouse=True)
+def shipped(monkeypatch, tmp_path):
+    """A folder of shipped networks, empty at first."""
+    monkeypatch.setattr(retrained, "_files", lambda pattern: iter(sorted(tmp_path.glob(pattern))))
+    return tmp_path
+
+
 def refused(capsys, place, *words: str):
     path = f"{place}/net.loom"
     assert cli.main(["compile", f"{place}/small.pt", "--target", "truenorth", "-o", path, *words]) == 2
@@ -269,6 +282,76 @@ def test_the_refusal_is_priced(place, capsys):
     assert [way["cores"] is not None for way in report["together"]] == [True] * 3
 
 
+KNOWN = {"command": "spikeloom train …", "data": "data", "data_sha256": "c0ffee", "test_samples": 8}
+
+
+def ship(path, *, taxels=TAXELS, towers=1, reached=None, training=None):
+    """Write a network for the chip as if it were shipped."""
+    network = random_network(1, taxels=taxels, classes=CLASSES, towers=towers, copies=2, clocks=0)
+    record = training or KNOWN | (reached or {"clean": {"correct": 6}, "last": {"correct": 7}})
+    write_trained(path, {"clean": network}, graph="ring", edges=np.zeros((0, 2), int), training=record)
+    return network
+
+
+def test_what_needs_training_has_the_figures_of_a_shipped_network(place, shipped, capsys):
+    network = ship(shipped / "native.pt")
+    ship(shipped / "other.pt", taxels=5)
+    towers = [KNOWN | {"command": f"spikeloom train --seed {seed}"} for seed in (0, 1)]
+    joined = {"command": "spikeloom join …", "towers": towers, "test": {"correct": 7, "samples": 8}}
+    ship(shipped / "wide.pt", towers=2, training=joined)
+    ship(shipped / "silent.pt", reached={"seed": 0})
+    report = json.loads(refused(capsys, place, "--calibrate", f"{place}/data", "--json").out)
+    assert [like["name"] for like in report["retrained"]] == ["pretrained:native", "pretrained:wide"]
+    small, wide = report["retrained"]
+    assert (small["accuracy"], small["cores"], small["ticks"]) == (6 / 8, lower(network, CHIP).n_cores, 24 + 3)
+    assert (wide["accuracy"], wide["cores"], wide["towers"]) == (7 / 8, 2 * small["cores"], 2)
+    assert wide["commands"] == [*(tower["command"] for tower in towers), "spikeloom join …"]
+    for violation in report["violations"]:
+        priced = [way for way in violation["ways"] if way["shipped"] is not None]
+        named = {LEAK: ["trained with a leak that is added"], WEIGHTS: ["trained in 3 levels"], TARGETS: []}
+        assert [way["name"] for way in priced] == named[violation["kind"]]
+        for way in priced:
+            assert (way["accuracy"], way["cores"], way["shipped"]) == (6 / 8, small["cores"], "pretrained:native")
+
+
+def test_the_text_of_what_was_trained(place, shipped, capsys):
+    ship(shipped / "native.pt")
+    lines = refused(capsys, place, "--calibrate", f"{place}/data").out.splitlines()
+    (leak, *_) = (line for line in lines if line.startswith("  trained with a leak that is added"))
+    assert "75.0 % after retraining" in leak
+    told = (
+        "all of it at once, after retraining; accuracy on the 8 test recordings of data, cores and ticks of the whole "
+    )
+    at = lines.index(f"{told}network:")
+    assert lines[at + 2].split()[:4] == ["pretrained:native", "75.0", "%", "after"]
+    assert lines[at + 4 : at + 7] == [
+        "what made the shipped networks:",
+        "  pretrained:native:",
+        "    spikeloom train …",
+    ]
+
+
+def test_networks_of_other_data_are_no_price(tmp_path, shipped, capsys):
+    ship(shipped / "native.pt")
+    (tmp_path / "own").mkdir()
+    for digest, names in (("c0ffee", ["pretrained:native"]), ("0" * 64, [])):
+        own_file(tmp_path / "own" / "x.pt", training={"data_sha256": digest})
+        words = ["compile", f"{tmp_path}/own/x.pt", "--target", "truenorth", "-o", f"{tmp_path}/x.loom", "--json"]
+        assert cli.main(words) == 2
+        found = json.loads(capsys.readouterr().out)
+        assert [like["name"] for like in found["retrained"]] == names
+
+
+def test_the_sparsest_graph_has_the_figures_of_the_network_that_was_trained_on_it(shipped):
+    ship(shipped / "native.pt")
+    (like,) = retrained.shipped_networks(CHIP, taxels=TAXELS, classes=CLASSES)
+    assert retrained.accuracy_on("mst:0", like) is None
+    own_file(shipped / "native-mst0.pt", training=KNOWN | {"clean": {"correct": 5}})
+    assert retrained.accuracy_on("mst:0", like) == ("pretrained:native-mst0", 5 / 8, "spikeloom train …")
+    own_file(shipped / "native-mst0.pt", training=KNOWN | {"clean": {"correct": 5}, "data": "others"})
+    assert retrained.accuracy_on("mst:0", like) is None
+
+
 def test_the_refusal_without_recordings_has_cores_and_ticks(place, capsys):
     report = json.loads(refused(capsys, place, "--json").out)
     ways = [way for violation in report["violations"] for way in violation["ways"]]
@@ -285,7 +368,7 @@ def test_the_text(place, capsys):
     assert f"conv1, all 30 neurons: {leak}" in lines
     assert any(line.startswith("  history-free as it is") and "%" in line for line in lines)
     assert any(line.startswith("  trained history-free ") and "after retraining" in line for line in lines)
-    assert "all of it at once, without training:" in lines
+    assert "all of it at once, without training (--in-time):" in lines
     bare = refused(capsys, place).out.splitlines()
     told = "cores of the layer, ticks of a data step; --calibrate DATA measures what the ways do to decisions"
     assert bare[1] == told
@@ -319,8 +402,24 @@ def test_an_unknown_target_still_says_so(place, capsys):
     words = ["compile", f"{place}/small.pt", "--target", "loihi2", "-o", f"{place}/net.loom"]
     assert cli.main(words) == 2
     assert capsys.readouterr().err == (
-        "spikeloom: --target loihi2: not modelled; no public per-event energies; allowed: loihi1\n"
+        "spikeloom: --target loihi2: not modelled; no public per-event energies; allowed: loihi1, truenorth\n"
     )
+
+
+def test_clocks_are_told_apart(tmp_path, capsys):
+    path = tmp_path / "timed.pt"
+    timed_networks.written(path)
+    words = ["compile", str(path), "--target", "truenorth", "-o", f"{tmp_path}/net.loom"]
+    for more in ([], ["--in-time", "3"]):
+        assert cli.main([*words, *more]) == 2
+        told = capsys.readouterr().err
+        if more:
+            assert told.startswith(f"spikeloom: {path}: has clocks; sums in time are for networks without; ")
+        else:
+            assert told == (
+                f"spikeloom: {path}: hears clocks, of which ways out are not known; train one for the chip, which may "
+                "hear them: spikeloom train --system tactilesgnet-truenorth\n"
+            )
 
 
 @pytest.mark.recordings
@@ -345,6 +444,18 @@ def test_the_released_network(released_checkpoint, objects_zip, tmp_path, capsys
     assert (ternary["cores"], ternary["ticks"]) == (42, 250 * 20 + 3 + 20)
     assert ternary["accuracy"] > 0.9
     assert "--features 3" in retrained["command"]
-    four = report["together"][-1]
-    assert four["cores"] < 200
-    assert four["accuracy"] > 0.85
+    three = report["together"][1]
+    assert (three["cores"], three["ticks"]) == (113, 5043)
+    assert three["accuracy"] > 0.8
+
+
+def test_shipped_networks_for_the_sensor_of_the_paper(monkeypatch):
+    monkeypatch.undo()
+    for classes, name, samples in ((36, "objects", 144), (20, "containers", 60)):
+        found = retrained.shipped_networks(CHIP, taxels=39, classes=classes)
+        small = found[0]
+        assert (small.name, small.samples) == (f"pretrained:{name}-truenorth", samples)
+        assert (small.cores, small.depth, small.levels, small.inputs) == (32, 3, 7, 78)
+        known = retrained.accuracy_on("mst:0", small)
+        assert known is not None
+        assert known[0] == f"pretrained:{name}-mst0"

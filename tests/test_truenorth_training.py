@@ -2,10 +2,12 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from made_files import own_file
 from native_networks import random_network
 
 from compiler.dynamics import clocks_over
@@ -261,9 +263,16 @@ def test_joined_towers_vote_together(data, capsys):
     report = as_json(capsys, "join", "0.pt", "1.pt", "-o", "both.pt")
     assert report["command"] == "spikeloom join 0.pt 1.pt"
     assert [tower["seed"] for tower in report["towers"]] == [0, 1]
+    assert "test" not in report
+    measured = as_json(capsys, "join", "0.pt", "1.pt", "--data", "data", "-o", "both.pt")
+    assert measured["command"] == "spikeloom join 0.pt 1.pt --data data"
     as_json(capsys, "compile", "both.pt", "--target", "truenorth", "-o", "both.loom")
     found = as_json(capsys, "verify", "both.loom", "--checkpoint", "both.pt", "--data", "data", "--spec-samples", "1")
     assert found["exact"]
+    reached = found["correct"] / found["samples"]
+    assert measured["test"] == {
+        **{"correct": found["correct"], "samples": found["samples"], "accuracy": reached, "data": "data"}
+    }
     both, parts = read_trained("both.pt").network, [read_trained(f"{seed}.pt").network for seed in (0, 1)]
     events = synthetic_grasps(per_class=1, steps=12, seed=3)
     votes = [run_network(part, events.events)["fc3"].sum(axis=1).reshape(6, -1, 6).sum(axis=1) for part in parts]
@@ -304,6 +313,13 @@ def test_mistakes_are_told_in_one_line(data, capsys):
     as_json(capsys, "train", *SMALL, "--seed", "1", "-o", "y.pt")
     assert mistake(capsys, *words, "y.pt") == "--checkpoint y.pt: x.loom was compiled from another file; give that one"
     assert mistake(capsys, "join", "x.pt", "-o", "z.pt") == "join: x.pt is one network already; give two or more"
+    assert mistake(capsys, "join", "x.pt", "y.pt", "--data", "synthetic", "-o", "z.pt") == (
+        "--data synthetic: the networks were trained on other recordings; give those"
+    )
+    own_file(Path("own.pt"))
+    assert mistake(capsys, "join", "own.pt", "own.pt", "--data", "data", "-o", "z.pt") == (
+        "--data data: is for tactilesgnet-truenorth; leave it away, and measure with spikeloom run"
+    )
 
 
 def test_a_spike_that_differs_fails(data, capsys):

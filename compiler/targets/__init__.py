@@ -51,6 +51,7 @@ __all__ = [
     "known_targets",
     "load_target",
     "read_target",
+    "require_target",
     "with_tables",
 ]
 
@@ -351,6 +352,22 @@ def known_targets(cores: str = COMPARTMENTS) -> tuple[str, ...]:
     return tuple(sorted(name for name, target in _targets().items() if target.cores == cores))
 
 
+def require_target(name: str) -> None:
+    """Refuse a name that is no target of any kind.
+
+    Raises
+    ------
+    OptionError
+        Listing all of them.
+    """
+    if name not in _targets():
+        raise OptionError(f"--target {name}: {_why(name)}; allowed: {', '.join(sorted(_targets()))}")
+
+
+def _why(name: str) -> str:
+    return _NOT_MODELLED.get(name, "unknown")
+
+
 def load_target(name: str, cores: str = COMPARTMENTS) -> Target:
     """Read a target by name; its cores must be of the kind that the caller can handle.
 
@@ -366,8 +383,6 @@ def load_target(name: str, cores: str = COMPARTMENTS) -> Target:
     """
     found = _targets().get(name)
     if found is None or found.cores != cores:
-        why = (
-            _NOT_MODELLED.get(name, "unknown") if found is None else f"its cores are {found.cores}, this is for {cores}"
-        )
+        why = _why(name) if found is None else f"its cores are {found.cores}, this is for {cores}"
         raise OptionError(f"--target {name}: {why}; allowed: {', '.join(known_targets(cores))}")
     return found

@@ -11,7 +11,7 @@ membranes start where the leak of d ticks brings them to rest, see :func:`compil
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -50,7 +50,8 @@ def lower(network: NativeNetwork, chip: Target, *, provenance: Mapping[str, Any]
     placing = _Placing(network=network, chip=chip)
     for tower in network.towers:
         placing.tower(tower)
-    placing.finish()
+    remedy = "join fewer towers, or train with fewer features or copies"
+    place_cores(placing.draft, placing.wires, chip, remedy)
     return placing.draft.netlist(
         taxels=network.taxels,
         polarities=network.polarities,
@@ -59,6 +60,21 @@ def lower(network: NativeNetwork, chip: Target, *, provenance: Mapping[str, Any]
         target=chip.name,
         provenance=provenance,
     )
+
+
+def cores_needed(network: NativeNetwork, chip: Target) -> int:
+    """Cores that :func:`lower` takes, without placing anything."""
+    most, total = chip.limit("core.neurons"), 0
+    for tower in network.towers:
+        ends = np.ones(tower[-1].neurons, np.int64)
+        for depth in range(len(tower) - 1, -1, -1):
+            stage = tower[depth]
+            cores = -(-ends.reshape(stage.blocks, stage.size).sum(axis=1) // most)
+            total += int(cores.sum())
+            if depth:
+                ends = np.zeros(tower[depth - 1].neurons, np.int64)
+                np.add.at(ends, stage.inputs, network.copies * cores[:, None])
+    return total
 
 
 def _require_axons(network: NativeNetwork, chip: Target) -> None:
@@ -161,17 +177,21 @@ class _Placing:
             initial=-depth * leak,
         )
 
-    def finish(self) -> None:
-        """Give the cores their places, line by line in a square as they were made, and draw the wires."""
-        count, limit = len(self.draft.cores), self.chip.limit("chip.cores")
-        if count > limit:
-            remedy = "join fewer towers, or train with fewer features or copies"
-            broken = Violation(
-                owner="chip", rule=f"{self.chip.name}.chip.cores", used=count, allowed=limit, remedy=remedy
-            )
-            raise CapacityError((broken,))
-        side = max(int(np.ceil(np.sqrt(count))), -(-count // self.chip.limit("mesh.height")))
-        for number, core in enumerate(self.draft.cores):
-            core.y, core.x = divmod(number, side)
-        for source, end in self.wires:
-            self.draft.wire(source, *end)
+
+def place_cores(draft: Draft, wires: Sequence[tuple[Place, tuple[int, ...]]], chip: Target, remedy: str) -> None:
+    """Give cores their places, line by line in a square as they were made, and draw wires to (core, line, delay).
+
+    Raises
+    ------
+    CapacityError
+        If there are more cores than on the chip; `remedy` says what to do about it.
+    """
+    count, limit = len(draft.cores), chip.limit("chip.cores")
+    if count > limit:
+        broken = Violation(owner="chip", rule=f"{chip.name}.chip.cores", used=count, allowed=limit, remedy=remedy)
+        raise CapacityError((broken,))
+    side = max(int(np.ceil(np.sqrt(count))), -(-count // chip.limit("mesh.height")))
+    for number, core in enumerate(draft.cores):
+        core.y, core.x = divmod(number, side)
+    for source, end in wires:
+        draft.wire(source, *end)

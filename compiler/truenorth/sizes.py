@@ -12,6 +12,7 @@ import numpy as np
 
 from compiler.ir import Sparse
 from compiler.targets import Target
+from compiler.truenorth.levels import EMPTYING, gate_axons
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -27,7 +28,8 @@ class Split:
     partial_cores : int
         Of the neurons that add up a group, two for each neuron of the layer: for sums above zero and below.
     sum_cores : int
-        Of the neurons that add up what those send, with an axon for each of them, and one clock a core.
+        Of the neurons that add up what those send, with an axon for each of them, and clocks, see
+        :mod:`compiler.truenorth.in_time`.
     """
 
     groups: int
@@ -78,13 +80,13 @@ def split(inputs: int, neurons: int, copies: int, chip: Target) -> Split | None:
     --------
     >>> from compiler.targets import CROSSBARS, load_target
     >>> split(2496, 128, 2, load_target("truenorth", CROSSBARS))
-    Split(groups=20, inputs=128, partial_cores=20, sum_cores=22)
+    Split(groups=20, inputs=126, partial_cores=20, sum_cores=22)
     """
     axons, held = chip.limit("core.axons"), chip.limit("core.neurons")
-    most = axons // copies
+    most = (axons - EMPTYING) // copies
     groups = -(-inputs // most)
-    a_core = min((axons - 1) // (2 * groups), held)
-    if not a_core:
+    a_core = min((axons - sum(gate_axons(groups))) // (2 * groups), held)
+    if a_core < 1:
         return None
     return Split(
         groups=groups, inputs=most, partial_cores=groups * -(-2 * neurons // held), sum_cores=-(-neurons // a_core)

@@ -24,6 +24,7 @@ from runtime import decisions
 from runtime.inputs import progress, recordings
 from runtime.truenorth import cost, engine, ranc, render
 from runtime.truenorth.trace import Trace
+from runtime.windows import first_part, window_asked
 
 Json = dict[str, Any]
 Outcome = tuple[Json, Callable[[Json], str], int]
@@ -52,9 +53,11 @@ def class_counts(netlist: CrossbarNetlist, votes: IntArray) -> IntArray:
 
 
 def _data(arguments: argparse.Namespace, netlist: CrossbarNetlist, split: str, limit: int | None) -> Recordings:
+    percent = window_asked(getattr(arguments, "window", "100%"))
     progress("reading the recordings")
     classes, taxels = netlist.classes, netlist.taxels
-    return recordings(arguments.data, split, limit=limit, classes=classes, taxels=taxels, bin_s=arguments.bin)
+    found = recordings(arguments.data, split, limit=limit, classes=classes, taxels=taxels, bin_s=arguments.bin)
+    return first_part(found, percent)
 
 
 def _costs(arguments: argparse.Namespace, netlist: CrossbarNetlist, chip: Target, trace: Trace) -> Json:

@@ -11,7 +11,7 @@ import numpy as np
 from compiler.errors import NumericRangeError
 from compiler.fixedpoint import IntArray
 from compiler.targets import CROSSBARS, load_target
-from compiler.truenorth.netlist import RESET_TO, CrossbarNetlist
+from compiler.truenorth.netlist import RESET_LINEAR, RESET_TO, CrossbarNetlist
 from compiler.truenorth.rules import signed_range
 from runtime.truenorth import kernel
 from runtime.truenorth.spec import Neuron, neuron_tick
@@ -20,6 +20,10 @@ from runtime.truenorth.twins import Twins, find_twins
 
 SETTLING = 64
 """Ticks within which a neuron without input must come to rest to be let sleep."""
+
+MOST_STEADY = 1 << 15
+"""Neurons beyond those of the plainest kind that may live through every tick; where there are more, all of these work
+when they are reached, which is less for a large network of which little is active."""
 
 LONGEST_GAP = 8
 """Steady neurons that an axon may skip within a row of weights; so many zeros are added as fast as one number."""
@@ -51,11 +55,19 @@ class Engine:
     wiring: kernel.Wiring
 
 
-def prepare(netlist: CrossbarNetlist) -> Engine:
-    """Arrange a network that breaks no rule of its chip for the kernel."""
+def prepare(netlist: CrossbarNetlist, *, careful: bool = False) -> Engine:
+    """Arrange a network that breaks no rule of its chip for the kernel.
+
+    Parameters
+    ----------
+    netlist : CrossbarNetlist
+    careful : bool
+        Whether neurons that nothing keeps within their register are never run together with others.
+    """
     bits = load_target(netlist.target, CROSSBARS).limit("neuron.membrane_bits")
     low, high = signed_range(bits)
-    twins, steady = _steady_first(netlist, find_twins(netlist, kernel.HALF), low, high)
+    kinds = find_twins(netlist, kernel.HALF)
+    twins, plain, steady, cap = _steady_first(netlist, kinds, low, high, careful=careful)
     first, axons = twins.first_neuron, len(twins.first_axon)
     wired = twins.axon[netlist.axons_at(netlist.cores_at(netlist.wire_x, netlist.wire_y), netlist.wire_line)]
     ticking, clocked = _held(twins, netlist.axons_at(netlist.clock_core, netlist.clock_line))
@@ -70,7 +82,11 @@ def prepare(netlist: CrossbarNetlist) -> Engine:
     axon, neuron, halves = (column[near] for column in _synapses(twins))
     bounds, segments, row = _segments(axon, neuron, halves, axons)
     axon, neuron, halves = (column[~near] for column in _synapses(twins))
-    registers = (netlist.leak, netlist.threshold, netlist.reset, -netlist.negative_threshold)
+    saturates = netlist.negative_saturates == 1
+    under = np.where(saturates, -netlist.negative_threshold, -netlist.reset)
+    linear = (netlist.reset_mode == RESET_LINEAR).astype(np.int64)
+    reset = np.where(linear == 1, 0, netlist.reset)
+    registers = (netlist.leak, netlist.threshold, reset, -netlist.negative_threshold, under, linear)
     wiring = kernel.Wiring(
         offsets=offsets.astype(np.int64),
         feed_bounds=ends[starts].astype(np.int64),
@@ -79,7 +95,8 @@ def prepare(netlist: CrossbarNetlist) -> Engine:
         segment_bounds=bounds,
         segments=segments,
         row=row,
-        steady=np.stack([register[first[:steady]] for register in registers]).astype(np.int32),
+        plain=plain,
+        steady=np.stack([*(register[first[:steady]] for register in registers), cap[:steady]]).astype(np.int32),
         axon_synapses=np.searchsorted(axon, np.arange(axons + 1)).astype(np.int64),
         synapse_neuron=neuron.astype(np.int32),
         synapse_weight=halves,
@@ -102,24 +119,47 @@ def _synapses(twins: Twins) -> tuple[IntArray, IntArray, IntArray]:
     return twins.synapse_axon, twins.synapse_neuron, twins.synapse_halves
 
 
-def _steady_first(netlist: CrossbarNetlist, twins: Twins, low: int, high: int) -> tuple[Twins, int]:
-    """The same kinds with steady neurons first, and how many of them there are.
+def _steady_first(
+    netlist: CrossbarNetlist, twins: Twins, low: int, high: int, *, careful: bool
+) -> tuple[Twins, int, int, IntArray]:
+    """The same kinds with steady neurons first.
 
-    Steady are those without random numbers and reversal that are reset to a value and held at their negative
-    threshold, if their registers and all that can reach them in a tick leave the membrane within its range.
+    Steady are neurons without random numbers and reversal whose registers, and all that can reach them in a tick, leave
+    the membrane within its range: *plain* ones, which are reset to a value and held at their negative threshold, those
+    that are reset to values on both sides, and those that are held and reset by their threshold, as far as they begin a
+    tick at their cap or below.
+
+    Returns
+    -------
+    twins : Twins
+    plain, steady : int
+        How many are plain, and steady in all.
+    cap : (kinds,) int64
+        Highest membrane from which a tick cannot leave the register.
     """
     first = twins.first_neuron
     positive, negative = (
         np.bincount(twins.synapse_neuron, part, len(first))
         for part in (twins.synapse_halves >> kernel.HALF, twins.synapse_halves & kernel.LOWER)
     )
-    plain = (netlist.mask_bits == 0) & (netlist.leak_reversal == 0) & (netlist.reset_mode == RESET_TO)
+    simple = ((netlist.mask_bits == 0) & (netlist.leak_reversal == 0))[first]
+    to_value, linear = ((netlist.reset_mode == mode)[first] for mode in (RESET_TO, RESET_LINEAR))
+    held = (netlist.negative_saturates == 1)[first]
     ends = netlist.reset, netlist.initial
-    most = np.maximum.reduce([netlist.threshold - 1, *ends])[first] + positive + np.maximum(netlist.leak, 0)[first]
+    cap = high - positive - np.maximum(netlist.leak, 0)[first]
+    most = np.maximum.reduce([netlist.threshold - 1, *ends])[first]
     least = np.minimum.reduce([-netlist.negative_threshold, *ends])[first] - negative
     least += np.minimum(netlist.leak, 0)[first]
-    steady = (plain & (netlist.negative_saturates == 1))[first] & (most <= high) & (least >= low)
-    order = np.argsort(~steady, kind="stable")
+    plain = simple & to_value & held & (most <= cap) & (least >= low)
+    other_ends = np.abs(netlist.reset)[first]
+    two_sided = (
+        to_value & ~held & (np.maximum(most, other_ends) <= cap) & (np.minimum(least, least - other_ends) >= low)
+    )
+    by_threshold = linear & held & (netlist.initial[first] <= cap) & (least >= low)
+    others = simple & (two_sided | (by_threshold & (not careful)))
+    if np.count_nonzero(others) > MOST_STEADY:
+        others = np.zeros_like(others)
+    order = np.argsort(np.where(plain, 0, np.where(others, 1, 2)), kind="stable")
     rank = np.argsort(order)
     ends_at = rank[twins.synapse_neuron]
     by_axon = np.lexsort((ends_at, twins.synapse_axon))
@@ -131,7 +171,8 @@ def _steady_first(netlist: CrossbarNetlist, twins: Twins, low: int, high: int) -
         synapse_neuron=ends_at[by_axon],
         synapse_halves=twins.synapse_halves[by_axon],
     )
-    return ordered, int(np.count_nonzero(steady))
+    count = int(np.count_nonzero(plain))
+    return ordered, count, count + int(np.count_nonzero(others)), cap[order]
 
 
 def _segments(
@@ -272,6 +313,9 @@ def simulate(
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         list(pool.map(one, range(samples)))
+    if np.any(merged == kernel.BROKEN_OFF):
+        again = prepare(netlist, careful=True)
+        return simulate(again, events, lengths=lengths, seed=seed, spikes=spikes, membranes=membranes)
     counts = Counts(
         ticks=steps * netlist.bin_ticks + netlist.drain,
         inputs=inputs,

@@ -7,10 +7,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from compiler.errors import ModelError, OptionError
-from compiler.truenorth.native import SYSTEM, joined
+from compiler.truenorth.native import SYSTEM, NativeNetwork, joined
 from compiler.truenorth.trained import Trained, read_trained, write_trained
-from runtime.inputs import require_place, shipped
+from runtime.inputs import progress, recordings, require_place, shipped
 
 Report = dict[str, Any]
 Outcome = tuple[Report, Callable[[Report], str], int]
@@ -45,7 +47,10 @@ def join(arguments: argparse.Namespace, as_text: Callable[[Report], str]) -> Out
         raise ModelError(f"join: {', '.join(arguments.checkpoints)} {error}; give networks of one kind") from error
     words = [name if shipped(name) != name else Path(name).name for name in arguments.checkpoints]
     words += [f"--weights {arguments.weights}"] if arguments.weights else []
-    record = {"command": f"spikeloom join {' '.join(words)}", "towers": towers}
+    words += ["--data", Path(arguments.data).name] if arguments.data is not None else []
+    record: Report = {"command": f"spikeloom join {' '.join(words)}", "towers": towers}
+    if arguments.data is not None:
+        record["test"] = _measured(arguments.data, network, {tower.get("data_sha256") for tower in towers})
     sha256 = write_trained(
         arguments.output, {"last": network}, graph=found[0].graph, edges=found[0].edges, training=record
     )
@@ -59,6 +64,23 @@ def join(arguments: argparse.Namespace, as_text: Callable[[Report], str]) -> Out
         "sha256": sha256,
     }
     return report, as_text, 0
+
+
+def _measured(path: str, network: NativeNetwork, trained_on: set[str | None]) -> Report:
+    """What the joined network reaches on the test split of the data that all its towers were trained on."""
+    from models.protocols import data_digest  # torch, so only here
+    from models.truenorth.network import predict
+
+    progress("reading the recordings")
+    training, test = (
+        recordings(path, split, classes=network.classes, taxels=network.taxels, labels_for="join")
+        for split in ("train", "test")
+    )
+    if trained_on != {data_digest(training, test)}:
+        raise OptionError(f"--data {path}: the networks were trained on other recordings; give those")
+    progress("measuring")
+    correct = int(np.count_nonzero(predict(network, test) == test.labels))
+    return {"correct": correct, "samples": len(test), "accuracy": correct / len(test), "data": Path(path).name}
 
 
 def _records(name: str, trained: Trained) -> list[Report]:

@@ -1,9 +1,11 @@
 """Machine code of the engine: one recording, all its ticks; :mod:`runtime.truenorth.engine` makes the arrays.
 
 Work follows events: a tick visits the axons that have a spike and the neurons that are reached or awake. A neuron
-sleeps while a tick without arrivals would change nothing about it. *Steady* neurons, the first ones, do the plainest
-thing and provably never leave their register: they live through every tick, all at once, and what an axon brings them
-is added in rows of neighbours.
+sleeps while a tick without arrivals would change nothing about it. *Steady* neurons, the first ones, live through every
+tick, all at once, and what an axon brings them is added in rows of neighbours. Those before `plain` are reset to a
+value and held at their negative threshold; the others are reset to values on both sides, or by their threshold. None of
+them can leave its register in a tick that it begins at its cap or below; all but those that are reset by their
+threshold provably do. Where one of these does not, the run is broken off.
 """
 
 from __future__ import annotations
@@ -42,6 +44,11 @@ NO_REST = -(2**31)
 HALF, LOWER = 32, 2**32 - 1
 """Positive and negative weights are added up in one number: in its upper half, and as magnitudes in its lower."""
 
+WORD = 8
+"""Spikes of steady neurons that are looked at together."""
+
+BROKEN_OFF = -1
+
 _STEP_NEURON, _STEP_TICK = np.uint64(STEP_NEURON), np.uint64(STEP_TICK)
 _MIX_1, _MIX_2 = np.uint64(MIX_1), np.uint64(MIX_2)
 _30, _27, _31, _64, _ONE = np.uint64(30), np.uint64(27), np.uint64(31), np.uint64(64), np.uint64(1)
@@ -65,8 +72,11 @@ class Wiring(NamedTuple):
         First steady neuron, the one after the last, and where in `row` the weights for them begin.
     row : (…) int32
         Weights of segments, zero where nothing is joined.
-    steady : (4, steady) int32
-        Leak, threshold, reset and the negative threshold below zero.
+    plain : int
+        Number of plain steady neurons, the first ones.
+    steady : (7, steady) int32
+        Leak, threshold, reset, the negative threshold below zero, what a membrane below that becomes, 1 for a reset by
+        the threshold, and the cap.
     axon_synapses : (axons + 1,) int64
         Crossing points with all other neurons.
     synapse_neuron : (synapses,) int32
@@ -88,6 +98,7 @@ class Wiring(NamedTuple):
     segment_bounds: IntArray
     segments: IntArray
     row: Int32
+    plain: int
     steady: Int32
     axon_synapses: IntArray
     synapse_neuron: Int32
@@ -252,6 +263,26 @@ def _update_steady(membrane: Any, sums: Any, leak: Any, threshold: Any, reset: A
 
 
 @compiled
+def _update_others(
+    membrane: Any, sums: Any, leak: Any, threshold: Any, reset: Any, lowest: Any, under: Any, linear: Any, cap: Any,
+    spikes: Any,
+) -> Any:  # fmt: skip
+    """A tick of the steady neurons that are not plain; whether one is above its cap."""
+    above = np.int32(0)
+    for n in range(len(sums)):
+        v = np.int32(membrane[n] + sums[n] + leak[n])
+        sums[n] = 0
+        spiked = v >= threshold[n]
+        spikes[n] = spiked
+        high = np.int32(reset[n] + linear[n] * (v - threshold[n]))
+        low = under[n] if v < lowest[n] else v
+        left = high if spiked else low
+        membrane[n] = left
+        above |= np.int32(left > cap[n])
+    return above
+
+
+@compiled
 def _send(n: Any, tick: Any, ticks: Any, window: Any, slots: Any, wiring: Any, state: Any, tallies: Any) -> Any:
     """Count a spike and lead it on; 1 where it merges with another before the last tick."""
     tallies.spikes[n] += 1
@@ -266,22 +297,38 @@ def _send(n: Any, tick: Any, ticks: Any, window: Any, slots: Any, wiring: Any, s
     return twice * (later < ticks)
 
 
+@compiled
+def _send_steady(
+    steady: Any, tick: Any, ticks: Any, window: Any, slots: Any, wiring: Any, state: Any, tallies: Any
+) -> Any:
+    """Lead on all spikes of steady neurons; returns those that merge."""
+    merged = 0
+    words = state.steady_spike.view(np.uint64)
+    for word in range(len(words)):
+        if words[word]:
+            for n in range(WORD * word, min(WORD * word + WORD, steady)):
+                if state.steady_spike[n]:
+                    merged += _send(n, tick, ticks, window, slots, wiring, state, tallies)
+    return merged
+
+
 @compiled_and_cached
 def run(
     events: Any, bin_ticks: int, ticks: int, seed: Any, low: int, high: int, slots: int, wiring: Any, tallies: Any
 ) -> int:
-    """Run one recording; fills the tallies and returns the merged spikes.
+    """Run one recording; fills the tallies and returns the merged spikes, or ``BROKEN_OFF``.
 
     `events` is (steps, channels); `slots` is a power of two above every delay: spikes that are due in a tick wait in
     the slot of its lowest bits.
     """
     neurons, axons, window = len(wiring.initial), len(tallies.axons), len(events) * bin_ticks
     leak, threshold, reset, lowest = wiring.steady[0], wiring.steady[1], wiring.steady[2], wiring.steady[3]
-    steady = len(leak)
+    under, linear, cap = wiring.steady[4], wiring.steady[5], wiring.steady[6]
+    steady, plain = len(leak), wiring.plain
     state = State(
         wiring.initial.copy(),
         np.zeros(steady, np.int32),
-        np.zeros(steady, np.uint8),
+        np.zeros((steady + WORD - 1) // WORD * WORD, np.uint8),
         np.zeros(neurons, np.int64),
         np.ones(neurons, np.bool_),
         np.empty(neurons, np.int32),
@@ -296,11 +343,22 @@ def run(
         slot = tick & (slots - 1)
         merged += _inject(events, bin_ticks, tick, slot, wiring, state)
         working = _integrate(slot, wiring, state, tallies.axons, working)
-        held = state.membrane[:steady]
-        _update_steady(held, state.steady_sum, leak, threshold, reset, lowest, state.steady_spike)
-        for n in range(steady):
-            if state.steady_spike[n]:
-                merged += _send(n, tick, ticks, window, slots, wiring, state, tallies)
+        held, sums_in, spiking = state.membrane[:plain], state.steady_sum[:plain], state.steady_spike[:plain]
+        _update_steady(held, sums_in, leak[:plain], threshold[:plain], reset[:plain], lowest[:plain], spiking)
+        if steady > plain and _update_others(
+            state.membrane[plain:steady],
+            state.steady_sum[plain:],
+            leak[plain:],
+            threshold[plain:],
+            reset[plain:],
+            lowest[plain:],
+            under[plain:],
+            linear[plain:],
+            cap[plain:],
+            state.steady_spike[plain:steady],
+        ):
+            return BROKEN_OFF
+        merged += _send_steady(steady, tick, ticks, window, slots, wiring, state, tallies)
         awake = 0
         for k in range(working):
             n = state.work[k]

@@ -14,14 +14,17 @@ from compiler.errors import ModelError, OptionError
 from compiler.interpret import channels_last
 from compiler.ir import recurrent
 from compiler.targets import CROSSBARS, Target, load_target
+from compiler.truenorth.levels import COPIES
+from compiler.truenorth.native import SYSTEM
 from compiler.truenorth.needs import needs
 from models.evtouch import Recordings
 from runtime.asked import Asked, asked_network
 from runtime.inputs import progress, recordings
 from runtime.options import PLACING, ROUNDING
 from runtime.tables import table
+from runtime.truenorth.retrained import shipped_networks
 from runtime.truenorth.trials import Trial
-from runtime.truenorth.ways import COPIES, Planner, Way
+from runtime.truenorth.ways import RETRAINED, Planner, Way
 
 Json = dict[str, Any]
 
@@ -54,7 +57,10 @@ def refuse(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], 
     chip = load_target(arguments.target, CROSSBARS)
     asked = asked_network(arguments.checkpoint, arguments)
     if asked.network.input.clocks.channels:
-        raise ModelError(f"{arguments.checkpoint}: has clocks, ways out of them are not known; give one without")
+        raise ModelError(
+            f"{arguments.checkpoint}: hears clocks, of which ways out are not known; train one for the chip, which may "
+            f"hear them: spikeloom train --system {SYSTEM}"
+        )
     if loops := recurrent(asked.network):
         raise ModelError(
             f"{arguments.checkpoint}: {', '.join(loops)} hears itself, ways out of that are not known; use loihi1"
@@ -80,7 +86,10 @@ def _trial(asked: Asked, data: Recordings) -> Trial:
 
 
 def _report(path: str, asked: Asked, chip: Target, trial: Trial | None, steps: int | None) -> Json:
-    network, planner = asked.network, Planner(asked, chip, trial, path)
+    network = asked.network
+    sensor = {"taxels": network.input.taxels, "classes": network.classes}
+    retrained = shipped_networks(chip, **sensor, checkpoint=asked.checkpoint)
+    planner = Planner(asked, chip, trial, path, retrained)
     found = needs(network, chip)
     if not found:
         raise ModelError(
@@ -103,6 +112,9 @@ def _report(path: str, asked: Asked, chip: Target, trial: Trial | None, steps: i
         "cores_of_chip": chip.limit("chip.cores"),
         "violations": violations,
         "together": together,
+        "retrained": [
+            _way_json(planner.retrained_way(like.name, like), network, steps) | asdict(like) for like in retrained
+        ],
     }
 
 
@@ -135,15 +147,39 @@ def refusal_text(report: Json) -> str:
             f"{violation['where']}: {violation['found']}, allowed {violation['allowed']} ({violation['rule']})",
             _ways_table(violation["ways"]),
         ]
-    lines += ["", "all of it at once, without training:", _ways_table(report["together"])]
-    commands = {
-        way["command"]: way["name"]
-        for violation in violations
-        for way in violation["ways"]
-        if way["command"] is not None
-    }
-    lines += ["", "after retraining:", *(f"  {name}: {command}" for command, name in commands.items())]
+    lines += ["", "all of it at once, without training (--in-time):", _ways_table(report["together"])]
+    lines += _retrained_lines(report)
+    ways = [way for violation in violations for way in violation["ways"] if way["command"] is not None]
+    known = {way["command"]: way["shipped"] for way in ways if way["shipped"] not in (None, *_names(report))}
+    other = {way["command"]: way["name"] for way in ways if way["shipped"] is None}
+    for command, name in known.items():
+        lines += [f"  {name}:", f"    {command}"]
+    if other:
+        lines += ["", "also to be trained; nothing of the kind is shipped, so nothing is known of what it reaches:"]
+        lines += [f"  {name}: {command}" for command, name in other.items()]
     return "\n".join(lines)
+
+
+def _names(report: Json) -> list[str]:
+    return [like["name"] for like in report["retrained"]]
+
+
+def _retrained_lines(report: Json) -> list[str]:
+    """Shipped networks for the chip, what they reached and what makes them."""
+    if not report["retrained"]:
+        return []
+    first = report["retrained"][0]
+    lines = [
+        "",
+        f"all of it at once, after retraining; accuracy on the {first['samples']} test recordings of {first['data']}, "
+        "cores and ticks of the whole network:",
+        _ways_table(report["retrained"]),
+        "",
+        "what made the shipped networks:",
+    ]
+    for like in report["retrained"]:
+        lines += [f"  {like['name']}:", *(f"    {command}" for command in like["commands"])]
+    return lines
 
 
 def _ways_table(ways: list[Json]) -> str:
@@ -161,7 +197,7 @@ def _ways_table(ways: list[Json]) -> str:
 
 def _accuracy(way: Json) -> str:
     if way["command"] is not None:
-        return "after retraining"
+        return RETRAINED if way["accuracy"] is None else f"{100 * way['accuracy']:.1f} % {RETRAINED}"
     if way["accuracy"] is None:
         return "as it is" if way["exact"] else "not measured"
     return f"{100 * way['accuracy']:.1f} %" + (", no spike changes" if way["exact"] else "")

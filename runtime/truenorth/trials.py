@@ -9,36 +9,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
-from compiler.fixedpoint import FloatArray, IntArray
+from compiler.fixedpoint import IntArray
 from compiler.interpret import BATCH, BoolArray, Floating, float_recurrence, lasting_currents, product, vote
 from compiler.ir import INPUT, Network, Population
+from compiler.truenorth.levels import LevelNetwork, Levels, run_levels
 from runtime.votes import readout_counts
-
-SEARCHED = np.linspace(0.1, 1.0, 19)
-"""Shares of the largest weight that are tried as the largest level of a codebook."""
 
 LEAKS = (0.2, 0.4, 0.6, 0.8, 1.0)
 """Constant leaks that are tried, in thresholds."""
 
 FEW = 2
 """Batches of recordings on which a leak is chosen."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Levels:
-    """Weights as whole multiples of a step of each neuron.
-
-    Parameters
-    ----------
-    level : (neurons, inputs) float32
-        Whole numbers.
-    step : (neurons,) float32
-    """
-
-    level: npt.NDArray[np.float32]
-    step: npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -68,31 +50,6 @@ class Change:
     levels: Levels | None = None
     inputs: int | None = None
     most: int | None = None
-
-
-def codebook(weight: FloatArray, copies: int) -> Levels:
-    """Weights (neurons, inputs) in the levels that so many axons an input give: for 2, 3, 4 copies -1…1, -4…3, -8…7.
-
-    The weights of the types are 1 and -1; 1, 2 and -4; 1, 2, 4 and -8, times a step that each neuron has of its own:
-    of those tried, the one of least squared error.
-
-    Examples
-    --------
-    >>> found = codebook(np.array([[0.5, -0.4, 0.02]]), 2)
-    >>> found.level.tolist(), [f"{step:.2f}" for step in found.step]
-    ([[1.0, -1.0, 0.0]], ['0.45'])
-    """
-    low, high = (-1, 1) if copies == 2 else (-(1 << (copies - 1)), (1 << (copies - 1)) - 1)
-    largest = np.maximum(np.abs(weight).max(axis=1, keepdims=True), 1e-12)
-    best = np.full(len(weight), np.inf)
-    step, level = np.ones(len(weight)), np.zeros(weight.shape)
-    for share in SEARCHED:
-        tried = share * largest / -low
-        rounded = np.clip(np.rint(weight / tried), low, high)
-        error = ((rounded * tried - weight) ** 2).sum(axis=1)
-        better = error < best
-        best[better], step[better], level[better] = error[better], tried[better, 0], rounded[better]
-    return Levels(level=level.astype(np.float32), step=step.astype(np.float32))
 
 
 class Trial:
@@ -127,6 +84,15 @@ class Trial:
             clipped, parts = clipped + self._clipped, parts + self._partial
         self.saturated = clipped / max(parts, 1)
         return float(np.mean(np.concatenate(decided) == self.labels))
+
+    def accuracy_of(self, levels: LevelNetwork) -> float:
+        """Share of recordings that a network in whole numbers, as it is on the chip, decides rightly."""
+        decided = []
+        for events in self.parts:
+            for recording in events:
+                votes = run_levels(levels, recording.T).spikes[-1].sum(axis=0)
+                decided.append(np.bincount(levels.label, weights=votes, minlength=levels.classes).argmax())
+        return float(np.mean(np.array(decided) == self.labels))
 
     def leak_for(self, layer: int) -> float:
         """Constant leak that moves the fewest spikes of a layer, its inputs as they are."""

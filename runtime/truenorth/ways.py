@@ -1,41 +1,43 @@
 """Ways out of what crossbar cores do not have: what each costs in cores and ticks, and in decisions.
 
 Ways that need no training are tried on the float network, each alone, in the layer that needs it; ways that lead spikes
-elsewhere change none and cost cores. Ways that need training name the command; what they reach is not known before.
+elsewhere change none and cost cores. Ways that need training have the figures of a shipped network that was trained so,
+and where there is none the command alone: what it would reach is not known before.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from compiler.errors import CapacityError, ModelError
 from compiler.frontends.checkpoint import Checkpoint
 from compiler.frontends.systems import GRAPH_SYSTEMS, TACTILESGNET
 from compiler.ir import INPUT, Network, Sparse
 from compiler.passes.expand import expand_first_layer, expand_graph_convolution
 from compiler.targets import Target
+from compiler.truenorth.in_time import lower_in_time
+from compiler.truenorth.levels import BIN_TICKS, COPIES, MOST, MOST_COPIES, Levels, codebook, in_levels
 from compiler.truenorth.needs import CURRENT, FAN_IN, LEAK, TARGETS, WEIGHTS, Need, targets_of
 from compiler.truenorth.sizes import Split, packed, relays, split
 from models.graphs import NEUTOUCH, build_graph, normalised_adjacency
 from runtime.asked import Asked
-from runtime.truenorth.trials import Change, Levels, Trial, codebook
-
-BIN_TICKS = 20
-"""Ticks of a data step whose partial sums travel as numbers of spikes: one millisecond each of the sensor's 20."""
+from runtime.truenorth.retrained import Shipped, accuracy_on
+from runtime.truenorth.trials import Change, Trial
 
 TERNARY = 2
 """Axons of an input that weights of -1, 0 and 1 steps take."""
-
-COPIES = (2, 3, 4)
-"""Axons of an input that are tried; beyond four types repeat."""
 
 SPARSEST = "mst:0"
 """Graph of the built-in sensor with the fewest edges, a tree."""
 
 FEWER_HOPS = 2
 """Hops of a graph convolution that are left, as trained."""
+
+
+RETRAINED = "after retraining"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,6 +59,9 @@ class Way:
         Ticks that every decision takes more.
     command : str or None
         What trains it.
+    shipped : str or None
+        Network that was trained so, whose figures these are: on test recordings, cores of the whole network unless
+        the way is of a layer.
     note : str
         What else was found.
     """
@@ -68,11 +73,14 @@ class Way:
     bin_ticks: int = 1
     more_ticks: int = 0
     command: str | None = None
+    shipped: str | None = None
     note: str = ""
 
 
 class Planner:
     """Finds and prices the ways out of the needs of a network.
+
+    What needs training has the figures of shipped networks; where nothing of the kind is shipped, none.
 
     Parameters
     ----------
@@ -83,14 +91,19 @@ class Planner:
         On calibration recordings, where there are some.
     path : str
         Of the checkpoint as it was typed.
+    retrained : sequence of Shipped
+        Networks for the same sensor and classes, the smallest first.
     """
 
-    def __init__(self, asked: Asked, chip: Target, trial: Trial | None, path: str) -> None:
+    def __init__(
+        self, asked: Asked, chip: Target, trial: Trial | None, path: str, retrained: Sequence[Shipped] = ()
+    ) -> None:
         self.network: Network = asked.network
         self.asked = asked
         self.chip = chip
         self.trial = trial
         self.path = path
+        self.retrained = retrained
         self.books: dict[tuple[int, int], Levels] = {}
         self.in_time: dict[tuple[int, int], tuple[float | None, str]] = {}
 
@@ -119,27 +132,6 @@ class Planner:
             return fit, None
         parts = split(weight.shape[1], weight.shape[0], copies, self.chip)
         return (None if parts is None else parts.cores), parts
-
-    def reach(self, layer: int, copies: int) -> int:
-        """Axons that each spike of a layer must reach, with so many an input on every core that hears it."""
-        held, total = self.chip.limit("core.neurons"), 0
-        for projection in self.network.projections:
-            if projection.pre == layer:
-                cores, parts = self.layer_cores(projection.post, copies)
-                size = self.network.populations[projection.post].size
-                total += copies * (-(-2 * size // held) if parts is not None else cores or 1)
-        return total
-
-    def lead_cores(self, layer: int, copies: int) -> int | None:
-        """Cores that lead each spike of a layer where it must go: of relays, or of copies, whichever are fewer."""
-        targets = self.reach(layer, copies)
-        if targets < 2:
-            return 0
-        population, fed = self.network.populations[layer], self._hears_inputs(layer)
-        by_relay = relays(population.size, targets, self.chip)
-        cores, _ = self.layer_cores(layer, copies)
-        by_copy = None if cores is None or not fed else cores * (targets - 1)
-        return min((found for found in (by_relay, by_copy) if found is not None), default=None)
 
     def _hears_inputs(self, layer: int) -> bool:
         return all(p.pre == INPUT for p in self.network.projections if p.post == layer)
@@ -179,6 +171,7 @@ class Planner:
             cores=echoed,
             bin_ticks=1 if echo_parts is None else BIN_TICKS,
         )
+        yield from self._shipped("trained with a leak that is added")
         yield self._retrained("trained history-free", self._no_decay("--membrane-decay"), cores, ticks)
 
     def _current(self, layer: int) -> Iterator[Way]:
@@ -186,14 +179,16 @@ class Planner:
         ticks = 1 if parts is None else BIN_TICKS
         accuracy = self._measured(layer, Change(alpha=0.0))
         yield Way(name="without the current, as it is", accuracy=accuracy, cores=cores, bin_ticks=ticks)
+        yield from self._shipped("trained without currents, with a leak that is added")
         yield self._retrained("trained without lasting currents", self._train(), cores, ticks)
 
     def _fan_in(self, layer: int) -> Iterator[Way]:
         inputs, neurons = self.weight(layer).shape[1], self.network.populations[layer].size
-        for copies in COPIES:
+        for copies in range(TERNARY, MOST_COPIES + 1):
             parts = split(inputs, neurons, copies, self.chip)
             if parts is not None:
                 yield self._in_time(layer, copies, parts)
+        yield from self._shipped("trained in groups of {inputs} inputs")
         before = {p.pre for p in self.network.projections if p.post == layer}
         checkpoint = self.asked.checkpoint
         if before == {0} and checkpoint is not None:
@@ -206,7 +201,7 @@ class Planner:
 
     def _in_time(self, layer: int, copies: int, parts: Split) -> Way:
         if (layer, copies) not in self.in_time:
-            change = Change(levels=self._book(layer, copies), inputs=parts.inputs, most=BIN_TICKS)
+            change = Change(levels=self._book(layer, copies), inputs=parts.inputs, most=MOST)
             accuracy = self._measured(layer, change)
             note = "" if self.trial is None else f"{100 * self.trial.saturated:.2g} % of the partial sums saturate"
             self.in_time[layer, copies] = accuracy, note
@@ -223,15 +218,16 @@ class Planner:
     def _weights(self, layer: int) -> Iterator[Way]:
         for copies in COPIES:
             cores, parts = self.layer_cores(layer, copies)
-            if parts is not None:
+            if parts is not None and copies <= MOST_COPIES:
                 yield self._in_time(layer, copies, parts)
-            elif cores is not None:
+            elif parts is None and cores is not None:
                 named = "-1, 0, 1" if copies == TERNARY else f"{2**copies} levels"
                 yield Way(
                     name=f"{copies} axons an input, {named} times a step for each neuron",
                     accuracy=self._measured(layer, Change(levels=self._book(layer, copies))),
                     cores=cores,
                 )
+        yield from self._shipped("trained in {levels} levels")
         checkpoint = self.asked.checkpoint
         if layer == 0 and checkpoint is not None and checkpoint.system == TACTILESGNET:
             yield from self._fewer_hops(checkpoint)
@@ -269,7 +265,12 @@ class Planner:
         copies = max((m for m in COPIES if packed(weight, m, self.chip) is not None), default=TERNARY)
         cores, _ = self.layer_cores(0, copies, weight)
         name = f"trained on the sparsest graph, {copies} axons an input"
-        yield self._retrained(name, self._train(graph=SPARSEST), cores, 1)
+        known = accuracy_on(SPARSEST, self.retrained[0]) if self.retrained else None
+        if known is None:
+            yield self._retrained(name, self._train(graph=SPARSEST), cores, 1)
+        else:
+            shipped, accuracy, command = known
+            yield Way(name=name, accuracy=accuracy, cores=cores, command=command, shipped=shipped, note=RETRAINED)
 
     def _targets(self, layer: int) -> Iterator[Way]:
         targets, size = targets_of(self.network, layer, self.chip), self.network.populations[layer].size
@@ -297,30 +298,43 @@ class Planner:
     # -- all of it -----------------------------------------------------------------------------------------------------
 
     def together(self, copies: int) -> Way:
-        """All of it without training: history-free, weights in levels, split in time where needed, spikes led on."""
-        changes, total, groups = {}, 0, 0
-        for layer in range(len(self.network.populations)):
-            cores, parts = self.layer_cores(layer, copies)
-            leading = self.lead_cores(layer, copies)
-            if cores is None or leading is None:
-                return Way(name=f"{copies} axons an input: does not fit")
-            total, groups = total + cores + leading, groups + (parts is not None)
-            change = Change(beta=0.0, alpha=0.0, levels=self._book(layer, copies))
-            if parts is not None:
-                change = replace(change, inputs=parts.inputs, most=BIN_TICKS)
-            changes[layer] = change
+        """All of it without training, as ``compile --in-time`` does it: history-free, weights in levels."""
+        forgetful = tuple(replace(population, beta=0.0, alpha=0.0) for population in self.network.populations)
+        name = f"history-free, {copies} axons an input, sums in time"
+        try:
+            levels = in_levels(replace(self.network, populations=forgetful), copies, self.chip)
+            netlist = lower_in_time(levels, self.chip)
+        except (CapacityError, ModelError):
+            return Way(name=f"{name}: does not fit")
         return Way(
-            name=f"history-free, {copies} axons an input, split in time, spikes led on",
-            accuracy=None if self.trial is None else self.trial.accuracy(changes),
-            cores=total,
-            bin_ticks=BIN_TICKS if groups else 1,
-            more_ticks=groups * BIN_TICKS + 2 * len(changes),
+            name=name,
+            accuracy=None if self.trial is None else self.trial.accuracy_of(levels),
+            cores=netlist.n_cores,
+            bin_ticks=netlist.bin_ticks,
+            more_ticks=netlist.drain - len(forgetful) + 1,
         )
 
     # -- commands ------------------------------------------------------------------------------------------------------
 
     def _retrained(self, name: str, command: str | None, cores: int | None, bin_ticks: int) -> Way:
-        return Way(name=name, cores=cores, bin_ticks=bin_ticks, command=command, note="after retraining")
+        return Way(name=name, cores=cores, bin_ticks=bin_ticks, command=command, note=RETRAINED)
+
+    def _shipped(self, name: str) -> Iterator[Way]:
+        """The smallest shipped network that was trained for the chip, if there is one for this sensor."""
+        for like in self.retrained[:1]:
+            yield self.retrained_way(name.format(inputs=like.inputs, levels=like.levels), like)
+
+    def retrained_way(self, name: str, like: Shipped) -> Way:
+        """A shipped network as a way out, by a name."""
+        return Way(
+            name=name,
+            accuracy=like.accuracy,
+            cores=like.cores,
+            more_ticks=like.depth - len(self.network.populations) + 1,
+            command=like.commands[0],
+            shipped=like.name,
+            note=RETRAINED,
+        )
 
     def _no_decay(self, option: str) -> str:
         return self._train(f"{option} {','.join(f'{p.name}=0' for p in self.network.populations)}")

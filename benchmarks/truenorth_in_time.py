@@ -1,0 +1,93 @@
+"""What it takes and what it costs to lead the sums of a trained network through 20 ticks a data step.
+
+    python benchmarks/truenorth_in_time.py DATA CHECKPOINT [--graph manual]
+
+What follows the checkpoint are options of compile that name the network.
+Every layer forgets within a step, whatever the network was trained with. Test accuracy of the float network as it was
+trained and history-free, then of what ``compile --in-time`` places, for each number of axons an input: with partial
+sums that saturate at 19 and with such that do not, the share of those that do by layer, and the largest of all.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+
+import numpy as np
+
+from compiler.interpret import channels_last, run_float, vote
+from compiler.ir import Network
+from compiler.targets import CROSSBARS, load_target
+from compiler.truenorth.in_time import lower_in_time
+from compiler.truenorth.levels import COPIES, MOST, LevelNetwork, Run, in_levels, run_levels
+from models.evtouch import Recordings
+from runtime.asked import asked_network
+from runtime.cli import build_parser
+from runtime.inputs import recordings
+from runtime.tables import table
+from runtime.votes import readout_counts
+
+ENDLESS = 1 << 30
+"""More than any partial sum."""
+
+
+def float_right(network: Network, data: Recordings) -> int:
+    """Test recordings that the float network decides rightly."""
+    right = 0
+    for index in range(len(data)):
+        events = channels_last(data.events[index : index + 1, ..., : data.steps_of(index)])
+        spikes = run_float(network, events).spikes[network.readout.population]
+        right += int(vote(readout_counts(network.readout, network.classes, spikes))[0] == data.labels[index])
+    return right
+
+
+def level_right(network: LevelNetwork, data: Recordings, most: int) -> tuple[int, list[Run]]:
+    """The same for a network in levels, and its runs."""
+    runs, right = [], 0
+    for index in range(len(data)):
+        run = run_levels(network, data.events[index].reshape(-1, data.steps)[:, : data.steps_of(index)], most=most)
+        votes = np.bincount(network.label, weights=run.spikes[-1].sum(axis=0), minlength=network.classes)
+        right += int(votes.argmax() == data.labels[index])
+        runs.append(replace(run, spikes=()))
+    return right, runs
+
+
+def main() -> None:
+    """Print the figures."""
+    data_path, *words = sys.argv[1:]
+    arguments = build_parser().parse_args(["compile", *words, "-o", "unused.loom"])
+    network, chip = asked_network(arguments.checkpoint, arguments).network, load_target("truenorth", CROSSBARS)
+    forgetful = replace(network, populations=tuple(replace(p, beta=0.0, alpha=0.0) for p in network.populations))
+    data = recordings(data_path, "test", classes=network.classes, taxels=network.input.taxels)
+
+    def share(right: int) -> str:
+        return f"{right} of {len(data)}, {100 * right / len(data):.2f} %"
+
+    print(f"float as trained: {share(float_right(network, data))}")
+    print(f"float, history-free: {share(float_right(forgetful, data))}")
+    rows = []
+    for copies in COPIES:
+        levels = in_levels(forgetful, copies, chip)
+        netlist = lower_in_time(levels, chip)
+        right, runs = level_right(levels, data, MOST)
+        endless, _ = level_right(levels, data, ENDLESS)
+        split = [index for index, layer in enumerate(levels.layers) if layer.is_split]
+        saturated = [100 * sum(r.saturated[i] for r in runs) / sum(r.partial[i] for r in runs) for i in split]
+        largest = [max(run.largest[i] for run in runs) for i in split]
+        rows.append(
+            [
+                str(copies),
+                str(netlist.n_cores),
+                f"{netlist.ticks(data.steps):,}",
+                share(right),
+                share(endless),
+                ", ".join(f"{levels.layers[i].name} {s:.2g} %" for i, s in zip(split, saturated, strict=True)),
+                ", ".join(map(str, largest)),
+            ]
+        )
+    head = ["axons an input", "cores", "ticks", "saturating at 19", "not saturating", "saturated", "largest"]
+    print(table(head, rows))
+
+
+if __name__ == "__main__":
+    main()
