@@ -42,11 +42,12 @@ def main() -> None:
     parser.add_argument("output", type=Path)
     parser.add_argument("members", nargs="+")
     parser.add_argument("--towers", type=int, action="append", help="members of a joined network (default: 5)")
+    parser.add_argument("--weights", choices=WEIGHTS, action="append", help="epochs to take (default: all three)")
     parser.add_argument("--float-only", action="store_true", help="leave the chip away")
     arguments = parser.parse_args()
     training, test = (load_recordings(arguments.recordings, split) for split in ("train", "test"))
     found: Json = {"data": Path(arguments.recordings).name, "test_samples": len(test)}
-    for weights in WEIGHTS:
+    for weights in arguments.weights or WEIGHTS:
         members = [read_checkpoint(path, weights=weights) for path in arguments.members]
         of_weights: Json = {"1": _summary([_decided(member, test) for member in members])}
         for towers in arguments.towers or [5]:
