@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from compiler.errors import NumericRangeError
 from compiler.fixedpoint import IntArray
@@ -86,6 +87,7 @@ def prepare(netlist: CrossbarNetlist, *, careful: bool = False) -> Engine:
     under = np.where(saturates, -netlist.negative_threshold, -netlist.reset)
     linear = (netlist.reset_mode == RESET_LINEAR).astype(np.int64)
     reset = np.where(linear == 1, 0, netlist.reset)
+    far = np.bincount(axon, minlength=axons) > 0
     registers = (netlist.leak, netlist.threshold, reset, -netlist.negative_threshold, under, linear)
     wiring = kernel.Wiring(
         offsets=offsets.astype(np.int64),
@@ -102,6 +104,7 @@ def prepare(netlist: CrossbarNetlist, *, careful: bool = False) -> Engine:
         synapse_weight=halves,
         number=first.astype(np.int64),
         parameters=_parameters(netlist, wired, bits)[first],
+        direct=_direct(netlist, wired, far)[first],
         instant=_instant(netlist, high)[first],
         initial=netlist.initial[first].astype(np.int32),
     )
@@ -235,6 +238,19 @@ def _held(twins: Twins, aims: IntArray) -> tuple[IntArray, IntArray]:
     """Rows of a table that lead to the first axon of a kind, and that kind; those of its twins say the same."""
     rows = np.flatnonzero(twins.first_axon[twins.axon[aims]] == aims)
     return rows, twins.axon[aims[rows]]
+
+
+def _direct(netlist: CrossbarNetlist, wired: IntArray, far: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+    """Whether the spikes of each neuron need not be queued; `far` axons reach neurons that are not steady."""
+    aims = netlist.axons_at(netlist.cores_at(netlist.wire_x, netlist.wire_y), netlist.wire_line)
+    others = (
+        netlist.axons_at(netlist.feed_core, netlist.feed_line),
+        netlist.axons_at(netlist.clock_core, netlist.clock_line),
+    )
+    alone = np.bincount(np.concatenate([aims, *others]), minlength=netlist.n_axons) == 1
+    found = np.zeros(netlist.n_neurons, np.bool_)
+    found[netlist.wire_neuron] = alone[aims] & ~far[wired] & (netlist.wire_delay == 1)
+    return found
 
 
 def _instant(netlist: CrossbarNetlist, high: int) -> kernel.Int32:

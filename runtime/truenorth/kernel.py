@@ -85,6 +85,8 @@ class Wiring(NamedTuple):
     number : (neurons,) int64
         Which neuron of the network it is, whose random numbers it draws.
     parameters : (neurons, 12) int32
+    direct : (neurons,) bool
+        Whether a spike reaches steady neurons alone, in the next tick, on an axon that nothing else leads to.
     instant : (neurons,) int32
         The leak, below zero, of neurons that start each tick at zero and spike where they do not end it below zero;
         0 for all others.
@@ -105,6 +107,7 @@ class Wiring(NamedTuple):
     synapse_weight: IntArray
     number: IntArray
     parameters: Int32
+    direct: npt.NDArray[np.bool_]
     instant: Int32
     initial: Int32
 
@@ -302,13 +305,31 @@ def _send_steady(
     steady: Any, tick: Any, ticks: Any, window: Any, slots: Any, wiring: Any, state: Any, tallies: Any
 ) -> Any:
     """Lead on all spikes of steady neurons; returns those that merge."""
-    merged = 0
+    merged, last, traced = 0, tick + 1 >= ticks, len(tallies.raster) > 0
+    direct, axon_of, sums, row = wiring.direct, wiring.parameters[:, WIRE_AXON], state.steady_sum, wiring.row
+    bounds, segments, spikes, axons = wiring.segment_bounds, wiring.segments, tallies.spikes, tallies.axons
     words = state.steady_spike.view(np.uint64)
     for word in range(len(words)):
         if words[word]:
             for n in range(WORD * word, min(WORD * word + WORD, steady)):
-                if state.steady_spike[n]:
+                if not state.steady_spike[n]:
+                    continue
+                if not direct[n]:
                     merged += _send(n, tick, ticks, window, slots, wiring, state, tallies)
+                    continue
+                spikes[n] += 1
+                if traced:
+                    tallies.raster[tick, n] = True
+                if last:
+                    continue
+                axon = axon_of[n]
+                axons[axon] += 1
+                for s in range(bounds[axon], bounds[axon + 1]):  # the sums of this tick are taken already
+                    first, end, at = segments[s, 0], segments[s, 1], segments[s, 2]
+                    if end - first == 1:
+                        sums[first] += row[at]
+                    else:
+                        _add(sums[first:end], row[at : at + end - first])
     return merged
 
 

@@ -1,0 +1,50 @@
+"""What is in the recordings: support vector machines on event counts, for comparison with spiking networks.
+
+    python benchmarks/features.py DATA        (needs scikit-learn, which spikeloom does not)
+
+Features are events per channel in so many equal parts of the trial, as they are or as log(1 + events), standardised on
+the training split. Chosen is nothing; cross-validation is on the training split, five parts, shuffled from seed 0.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+import numpy as np
+from sklearn.model_selection import StratifiedKFold, cross_val_score
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
+from sklearn.svm import SVC
+
+from models.evtouch import Recordings, load_recordings
+
+KERNELS = {"linear": SVC(kernel="linear", C=0.1), "rbf": SVC(C=10.0)}
+
+
+def counts(data: Recordings, parts: int) -> np.ndarray:
+    """Events per channel and part of the trial, (samples, channels * parts) float64."""
+    pieces = np.array_split(data.events, parts, axis=-1)
+    return np.stack([piece.sum(axis=-1, dtype=np.float64) for piece in pieces], axis=-1).reshape(len(data), -1)
+
+
+def main() -> None:
+    """Fit, report."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("recordings")
+    arguments = parser.parse_args()
+    training, test = (load_recordings(arguments.recordings, split) for split in ("train", "test"))
+    folds = StratifiedKFold(5, shuffle=True, random_state=0)
+    print("features             kernel   cross-validation   test")
+    for parts in (1, 5, 10):
+        for name, scale in (("events", np.asarray), ("log(1 + events)", np.log1p)):
+            shown, held = (scale(counts(data, parts)) for data in (training, test))
+            for kernel, machine in KERNELS.items():
+                model = make_pipeline(StandardScaler(), machine)
+                across = cross_val_score(model, shown, training.labels, cv=folds).mean()
+                right = int(np.sum(model.fit(shown, training.labels).predict(held) == test.labels))
+                words = f"{parts:2} × {name}"
+                print(f"{words:20} {kernel:8} {across:16.1%}   {right} of {len(test)} ({right / len(test):.1%})")
+
+
+if __name__ == "__main__":
+    main()
