@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from runtime import cli
+
 SHARED = Path(os.environ.get("SPIKELOOM_SHARED", Path(__file__).resolve().parents[2] / "shared"))
 
 
@@ -63,3 +65,16 @@ def golden(request: pytest.FixtureRequest) -> Callable[[str, str], None]:
         assert text == path.read_text(encoding="utf-8"), f"{path} differs; --update-golden writes it anew"
 
     return compare
+
+
+@pytest.fixture
+def spikeloom(capsys, place, monkeypatch) -> Callable[..., tuple[int, str, str]]:
+    """Run a command in the folder `place` of a test file; gives exit code, standard output and standard error."""
+    monkeypatch.chdir(place)
+
+    def command(*words):
+        capsys.readouterr()
+        code = cli.main([str(word) for word in words])
+        return code, *capsys.readouterr()
+
+    return command

@@ -39,19 +39,6 @@ def place(tmp_path_factory):
     return folder
 
 
-@pytest.fixture
-def spikeloom(capsys, place, monkeypatch):
-    """Run a command in that folder; returns exit code, standard output and standard error."""
-    monkeypatch.chdir(place)
-
-    def command(*words):
-        capsys.readouterr()
-        code = cli.main([str(word) for word in words])
-        return code, *capsys.readouterr()
-
-    return command
-
-
 def test_text(spikeloom, golden):
     code, out, err = spikeloom(*ALL)
     assert (code, err) == (0, "")

@@ -21,7 +21,7 @@ from compiler.serialize import netlist_bytes, read_netlist
 from models.evtouch import load_recordings
 from models.graphs import Graph
 from models.protocols import data_digest
-from runtime import chart_tasks, chart_work, cli
+from runtime import chart_tasks, chart_work
 from runtime.chart_text import chart_text
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -55,19 +55,10 @@ def place(tmp_path_factory):
     return folder
 
 
-@pytest.fixture
-def spikeloom(capsys, place, monkeypatch):
-    """Run a command in that folder; returns exit code, standard output and standard error."""
-    monkeypatch.chdir(place)
+@pytest.fixture(autouse=True)
+def nothing_kept():
     chart_work.both_splits.cache_clear()
     chart_work._network.cache_clear()
-
-    def command(*words):
-        capsys.readouterr()
-        code = cli.main([str(word) for word in words])
-        return code, *capsys.readouterr()
-
-    return command
 
 
 @pytest.fixture

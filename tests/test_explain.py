@@ -40,19 +40,6 @@ def place(tmp_path_factory):
 
 
 @pytest.fixture
-def spikeloom(capsys, place, monkeypatch):
-    """Run a command in that folder; returns exit code, standard output and standard error."""
-    monkeypatch.chdir(place)
-
-    def command(*words):
-        capsys.readouterr()
-        code = cli.main([str(word) for word in words])
-        return code, *capsys.readouterr()
-
-    return command
-
-
-@pytest.fixture
 def report(spikeloom):
     """Explain with ``--json``; returns the object."""
 

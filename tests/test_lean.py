@@ -19,7 +19,7 @@ from compiler.passes.prune import deaf_to
 from compiler.pipeline import compile_network
 from compiler.serialize import read_netlist
 from models.events import load_data
-from runtime import cli, engine, leaner
+from runtime import engine, leaner
 from runtime.votes import predictions
 
 WORDS = ("lean", "net.pt", "--data", "data")
@@ -41,19 +41,6 @@ def place(tmp_path_factory):
     own_file(folder / "thin.pt", last=weights(3, gain=2.5, features=4))
     own_file(folder / "more.pt", last=weights(3, sizes=(9, 8, CLASSES + 1)))
     return folder
-
-
-@pytest.fixture
-def spikeloom(capsys, place, monkeypatch):
-    """Run a command in that folder; returns exit code, standard output and standard error."""
-    monkeypatch.chdir(place)
-
-    def command(*words):
-        capsys.readouterr()
-        code = cli.main([str(word) for word in words])
-        return code, *capsys.readouterr()
-
-    return command
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from native_networks import random_network
 from compiler.truenorth.trained import write_trained
 from models.evtouch import load_recordings
 from models.protocols import data_digest
-from runtime import chart_work, cli
+from runtime import chart_work
 
 NATIVE, LOIHI = "native.pt", "ring.pt"
 
@@ -33,18 +33,9 @@ def place(tmp_path_factory):
     return folder
 
 
-@pytest.fixture
-def spikeloom(capsys, place, monkeypatch):
-    """Run a command in that folder; returns exit code, standard output and standard error."""
-    monkeypatch.chdir(place)
+@pytest.fixture(autouse=True)
+def nothing_kept():
     chart_work.both_splits.cache_clear()
-
-    def command(*words):
-        capsys.readouterr()
-        code = cli.main([str(word) for word in words])
-        return code, *capsys.readouterr()
-
-    return command
 
 
 @pytest.fixture

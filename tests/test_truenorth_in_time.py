@@ -30,7 +30,6 @@ from compiler.truenorth.levels import (
     type_weights,
 )
 from compiler.truenorth.rules import faults
-from runtime import cli
 from runtime.truenorth import engine, spec
 
 CHIP = load_target("truenorth", CROSSBARS)
@@ -218,18 +217,6 @@ def place(tmp_path_factory):
     own_file(folder / "keeps.pt")
     recordings_folder(folder / "data")
     return folder
-
-
-@pytest.fixture
-def spikeloom(capsys, place, monkeypatch):
-    monkeypatch.chdir(place)
-
-    def command(*words):
-        capsys.readouterr()
-        code = cli.main([str(word) for word in words])
-        return code, *capsys.readouterr()
-
-    return command
 
 
 COMPILE = ("compile", "free.pt", "--target", "truenorth", "--in-time", "3", "-o", "free.loom")
