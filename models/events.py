@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -270,6 +270,35 @@ def bin_events(
         steps=(steps,),
         notes=(f"times up to {stream.time_s[latest]:g} look like {unit}; write seconds",) if unit else (),
     )
+
+
+def joined_bins(recordings: Recordings, bins: int) -> Recordings:
+    """Recordings in bins as many times as long, which hold an event wherever one of theirs did.
+
+    Parameters
+    ----------
+    recordings : Recordings
+        The last bin of a recording may be a shorter one.
+    bins : int
+        How many make one, at least 1.
+    """
+    lengths = None if recordings.lengths is None else -(-recordings.lengths // bins)
+    return replace(recordings, events=join_bins(recordings.events, bins), lengths=lengths)
+
+
+def join_bins(events: NDArray[np.uint8], bins: int) -> NDArray[np.uint8]:
+    """Events (..., steps) in bins as many times as long, (..., ceil(steps / bins)).
+
+    Examples
+    --------
+    >>> join_bins(np.array([[0, 1, 0, 0, 1]], np.uint8), 2).tolist()
+    [[1, 0, 1]]
+    """
+    *others, steps = events.shape
+    filled = np.zeros((*others, -(-steps // bins) * bins), events.dtype)
+    filled[..., :steps] = events
+    found: NDArray[np.uint8] = filled.reshape(*others, -1, bins).max(axis=-1)
+    return found
 
 
 def _event_files(path: Path) -> dict[str, list[Path]] | None:

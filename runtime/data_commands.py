@@ -14,7 +14,7 @@ from compiler.errors import OptionError
 from compiler.fixedpoint import FloatArray
 from models.describe import RULES, Description, describe
 from models.eventfiles import UNLABELLED
-from models.events import BIN_S, EventCounts, data_splits, load_data, require_events
+from models.events import BIN_S, EventCounts, data_splits, joined_bins, load_data, require_events
 from models.evtouch import Recordings
 from models.fetch import DATA_SETS, data_folder, fetch_data
 from models.graphs import NEUTOUCH
@@ -64,6 +64,7 @@ def add_data_commands(commands: argparse._SubParsersAction[Any]) -> None:
     sub = command("convert", _convert, "write the released layout: SPLIT/sample_N_label_L.npy")
     _source(sub)
     sub.add_argument("--split", default="test", help="split of recordings that have none (default: test)")
+    sub.add_argument("--join", type=int, default=1, metavar="N", help="make one bin of N, an event where one has any")
     sub.add_argument(
         "-o",
         "--output",
@@ -198,15 +199,19 @@ def _convert(arguments: Arguments) -> Outcome:
     lines = arguments.output.lower().endswith(".csv")
     if lines or arguments.output.lower().endswith(".zip"):
         require_place(arguments.output, "-o", arguments)
+    bins = arguments.join
+    if bins < 1:
+        raise OptionError(f"--join {bins}: allowed are 1 or more; choose another")
     count, places = _layout(arguments.taxels)
     present = tuple(SPLITS) if arguments.source == SYNTHETIC else data_splits(arguments.source)
     loaded = [_load(arguments.source, split, arguments.bin, count, places) for split in present or (arguments.split,)]
-    taxels = max(recordings.taxels for recordings, _ in loaded)
-    steps = max(recordings.steps for recordings, _ in loaded)
     for _, counts in loaded:
         show_notes(counts)
+    loaded = [(joined_bins(recordings, bins), counts) for recordings, counts in loaded]
+    taxels = max(recordings.taxels for recordings, _ in loaded)
+    steps = max(recordings.steps for recordings, _ in loaded)
     if lines:
-        write_event_lines(arguments.output, [recordings for recordings, _ in loaded], arguments.bin)
+        write_event_lines(arguments.output, [recordings for recordings, _ in loaded], bins * arguments.bin)
     else:
         write_released(arguments.output, [_grown(recordings, taxels, steps) for recordings, _ in loaded])
     report = {

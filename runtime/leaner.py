@@ -23,6 +23,7 @@ from compiler.passes.prune import deaf_to
 from compiler.passes.quantize import incoming
 from compiler.passes.scales import rounded
 from compiler.pipeline import Compilation, without
+from models.events import join_bins
 from models.evtouch import Recordings
 from runtime import engine
 from runtime.trace import BoolArray
@@ -219,15 +220,11 @@ def without_hops(
 def coarser(of: Scene, netlist: Netlist, bins: int) -> Scene:
     """Bins joined to longer ones: an event wherever there was one in any of them."""
     n_sensor = netlist.taxels * netlist.polarities
-    samples, _, steps = of.flat.shape
-    sensor = of.flat[:, :n_sensor]
-    if steps % bins:
-        sensor = np.concatenate([sensor, np.zeros((samples, n_sensor, -steps % bins), sensor.dtype)], axis=2)
-    joined = sensor.reshape(samples, n_sensor, -1, bins).max(axis=3)
+    joined = join_bins(of.flat[:, :n_sensor], bins)
     lengths = None if of.lengths is None else -(-of.lengths // bins)
     clocks = coarse_netlist(netlist, bins, adapted=False).clocks
     return Scene(
-        flat=with_clocks(joined.reshape(samples, netlist.taxels, netlist.polarities, -1), clocks),
+        flat=with_clocks(joined.reshape(len(joined), netlist.taxels, netlist.polarities, -1), clocks),
         labels=of.labels,
         lengths=lengths,
     )

@@ -222,6 +222,23 @@ def test_convert_to_more_taxels_and_other_bins(own):
     assert (report["taxels"], report["steps"]) == (4, 7 + 1)
 
 
+@pytest.mark.parametrize("split", ["train", "test"])
+def test_convert_to_joined_bins(own, split):
+    start("convert", "own", "-o", "fine.zip")
+    report, _, _ = start("convert", "fine.zip", "-o", "coarse.zip", "--join", "10")
+    fine, coarse = (load_data(own / f"{name}.zip", split)[0].events for name in ("fine", "coarse"))
+    assert (fine.shape[3], coarse.shape[3], report["steps"]) == (36, 4, 4)
+    for bin_ in range(4):
+        np.testing.assert_array_equal(coarse[..., bin_], fine[..., 10 * bin_ : 10 * bin_ + 10].any(axis=3))
+    assert coarse.any()
+
+
+def test_convert_one_recording_to_lines_of_joined_bins(own):
+    (own / "one.csv").write_text("time_s,taxel,polarity\n0.01,1,1\n0.03,1,1\n0.05,0,0\n")
+    start("convert", "one.csv", "-o", "lines.csv", "--join", "2")
+    assert (own / "lines.csv").read_text() == "time_s,taxel,polarity\n0.02,1,1\n0.06,0,0\n"
+
+
 def test_convert_flat_recordings(own):
     start("convert", "own/train", "-o", "out", "--split", "train")
     assert sorted(path.name for path in (own / "out" / "train").iterdir()) == [
@@ -258,6 +275,9 @@ def test_convert_mistakes(own):
     )
     assert message("convert", "own", "-o", "coords.csv", "--bin", "nan", error=OptionError) == (
         "--bin nan: not a duration; give seconds above 0, for example 0.02"
+    )
+    assert message("convert", "own", "-o", "out", "--join", "0", error=OptionError) == (
+        "--join 0: allowed are 1 or more; choose another"
     )
     assert sorted(path.name for path in own.iterdir()) == ["a.csv", "coords.csv", "own"]
 
