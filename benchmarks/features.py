@@ -3,7 +3,8 @@
     python benchmarks/features.py DATA        (needs scikit-learn, which spikeloom does not)
 
 Features are events per channel in so many equal parts of the trial, as they are or as log(1 + events), standardised on
-the training split. Chosen is nothing; cross-validation is on the training split, five parts, shuffled from seed 0.
+the training split; or, as a network of longer bins sees them, bins of so many steps with an event. Chosen is nothing;
+cross-validation is on the training split, five parts, shuffled from seed 0.
 """
 
 from __future__ import annotations
@@ -16,9 +17,12 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC
 
+from models.events import joined_bins
 from models.evtouch import Recordings, load_recordings
 
 KERNELS = {"linear": SVC(kernel="linear", C=0.1), "rbf": SVC(C=10.0)}
+
+BINS = (2, 5, 10, 25, 50)
 
 
 def counts(data: Recordings, parts: int) -> np.ndarray:
@@ -35,15 +39,18 @@ def main() -> None:
     training, test = (load_recordings(arguments.recordings, split) for split in ("train", "test"))
     folds = StratifiedKFold(5, shuffle=True, random_state=0)
     print("features             kernel   cross-validation   test")
+    features = {}
     for parts in (1, 5, 10):
         for name, scale in (("events", np.asarray), ("log(1 + events)", np.log1p)):
-            shown, held = (scale(counts(data, parts)) for data in (training, test))
-            for kernel, machine in KERNELS.items():
-                model = make_pipeline(StandardScaler(), machine)
-                across = cross_val_score(model, shown, training.labels, cv=folds).mean()
-                right = int(np.sum(model.fit(shown, training.labels).predict(held) == test.labels))
-                words = f"{parts:2} × {name}"
-                print(f"{words:20} {kernel:8} {across:16.1%}   {right} of {len(test)} ({right / len(test):.1%})")
+            features[f"{parts:2} × {name}"] = [scale(counts(data, parts)) for data in (training, test)]
+    for steps in BINS:
+        features[f"bins of {steps} steps"] = [counts(joined_bins(data, steps), 1) for data in (training, test)]
+    for words, (shown, held) in features.items():
+        for kernel, machine in KERNELS.items():
+            model = make_pipeline(StandardScaler(), machine)
+            across = cross_val_score(model, shown, training.labels, cv=folds).mean()
+            right = int(np.sum(model.fit(shown, training.labels).predict(held) == test.labels))
+            print(f"{words:20} {kernel:8} {across:16.1%}   {right} of {len(test)} ({right / len(test):.1%})")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """What each change of a training recipe is worth: accuracy and operations of its networks, side by side.
 
     python benchmarks/variants.py DATA OUT.json 'timed=t-s*.pt' 'no clocks=n-s*.pt' … [--picture OUT.png]
+    python benchmarks/variants.py DATA OUT.json '20 ms=a-s*.pt' '200 ms=b-s*.pt@OTHER_DATA' …
 
 Each network is compiled at 8 bits, with scales chosen on training recordings, at its last epoch (nothing chosen) and
 its clean epoch (chosen on validation). Test recordings are only reported.
@@ -33,13 +34,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("recordings")
     parser.add_argument("output", type=Path)
-    parser.add_argument("variants", nargs="+", metavar="NAME=FILES")
+    parser.add_argument("variants", nargs="+", metavar="NAME=FILES[@DATA]")
     parser.add_argument("--picture", type=Path)
     arguments = parser.parse_args()
-    training, test = (load_recordings(arguments.recordings, split) for split in ("train", "test"))
-    found: Json = {"data": Path(arguments.recordings).name, "test_samples": len(test), "variants": {}}
+    found: Json = {"data": Path(arguments.recordings).name, "variants": {}}
     for variant in arguments.variants:
-        name, _, files = variant.rpartition("=")
+        name, _, rest = variant.rpartition("=")
+        files, _, data = rest.partition("@")
+        training, test = (load_recordings(data or arguments.recordings, split) for split in ("train", "test"))
+        if found.setdefault("test_samples", len(test)) != len(test):
+            parser.error(f"{variant}: has {len(test)} test recordings, the others {found['test_samples']}")
         paths = sorted(glob(files))  # noqa: PTH207, the pattern may be absolute
         if not paths:
             parser.error(f"{variant}: no such files")
@@ -71,10 +75,11 @@ def _summary(networks: list[Json]) -> Json:
 def _table(found: Json) -> str:
     """Markdown: a row a variant."""
     percent = 100 / found["test_samples"]
-    lines = ["| variant | seeds | float, last | chip, last | chip, clean | operations |", "|---|---|---|---|---|---|"]
+    lines = ["| variant | seeds | float, last | float, clean | chip, last | chip, clean | operations |"]
+    lines.append("|---|---|---|---|---|---|---|")
     for name, variant in found["variants"].items():
         cells = []
-        for weights, key in (("last", "float"), ("last", "chip"), ("clean", "chip")):
+        for weights, key in (("last", "float"), ("clean", "float"), ("last", "chip"), ("clean", "chip")):
             mean = variant[weights]["mean"][key]
             low, high = (end * percent for end in mean["interval"])
             cells.append(f"{mean['mean'] * percent:.2f}, {mean['std'] * percent:.2f} ({low:.2f} … {high:.2f})")

@@ -10,6 +10,7 @@ import math
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -286,7 +287,7 @@ def joined_bins(recordings: Recordings, bins: int) -> Recordings:
     return replace(recordings, events=join_bins(recordings.events, bins), lengths=lengths)
 
 
-def join_bins(events: NDArray[np.uint8], bins: int) -> NDArray[np.uint8]:
+def join_bins(events: NDArray[Any], bins: int) -> NDArray[Any]:
     """Events (..., steps) in bins as many times as long, (..., ceil(steps / bins)).
 
     Examples
@@ -297,7 +298,7 @@ def join_bins(events: NDArray[np.uint8], bins: int) -> NDArray[np.uint8]:
     *others, steps = events.shape
     filled = np.zeros((*others, -(-steps // bins) * bins), events.dtype)
     filled[..., :steps] = events
-    found: NDArray[np.uint8] = filled.reshape(*others, -1, bins).max(axis=-1)
+    found: NDArray[Any] = filled.reshape(*others, -1, bins).max(axis=-1)
     return found
 
 
