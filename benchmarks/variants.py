@@ -4,7 +4,8 @@
     python benchmarks/variants.py DATA OUT.json '20 ms=a-s*.pt' '200 ms=b-s*.pt@OTHER_DATA' …
 
 Each network is compiled at 8 bits, with scales chosen on training recordings, at its last epoch (nothing chosen) and
-its clean epoch (chosen on validation). Test recordings are only reported.
+its clean epoch (chosen on validation); at its best one, which was chosen on test, beside them. Else test recordings are
+only reported.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from runtime.intervals import of_mean
 
 Json = dict[str, Any]
 
-WEIGHTS = ("last", "clean")
+WEIGHTS = ("last", "clean", "best")
 
 
 def main() -> None:
