@@ -23,6 +23,7 @@ from compiler.frontends.towers import join
 from compiler.passes.expand import expand
 from compiler.pipeline import compile_network
 from compiler.targets import load_target
+from models.events import joined_bins
 from models.evtouch import Recordings, load_recordings
 from runtime.estimate import estimate
 from runtime.inputs import propagation
@@ -63,12 +64,14 @@ def main() -> None:
 
 def _decided(network: Checkpoint, test: Recordings) -> Json:
     """Recordings that the float model has right."""
+    test = joined_bins(test, network.bins)
     _, adjacency = propagation(network, None, "member")
     return {"float": int(np.sum(float_decisions(network, adjacency, test) == test.labels))}
 
 
 def measured(network: Checkpoint, training: Recordings, test: Recordings) -> Json:
     """Float model and chip at 8 bits."""
+    training, test = (joined_bins(each, network.bins) for each in (training, test))
     _, adjacency = propagation(network, None, "joined")
     decided = float_decisions(network, adjacency, test)
     netlist = compile_network(expand(network, adjacency), training_events=training.events).netlist

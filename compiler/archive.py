@@ -171,7 +171,7 @@ def require_manifest(path: Path, manifest: Any, wanted: str, versions: tuple[int
     if manifest.get("version") not in versions:
         raise FormatError(
             f"{path}: has format version {manifest.get('version')}, this program reads "
-            f"{' and '.join(map(str, versions))}; compile it again or update spikeloom"
+            f"{', '.join(map(str, versions))}; compile it again or update spikeloom"
         )
     return dict(manifest)
 

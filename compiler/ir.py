@@ -35,11 +35,15 @@ PART = 1 << 19
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Input:
-    """Event input: channel ``taxel * polarities + polarity``, then one channel for each clock."""
+    """Event input: channel ``taxel * polarities + polarity``, then one channel for each clock.
+
+    A step joins `bins` bins of the recordings, with an event where one of them has any.
+    """
 
     taxels: int
     polarities: int
     clocks: Clocks = NO_CLOCKS
+    bins: int = 1
 
     @property
     def size(self) -> int:

@@ -97,7 +97,7 @@ def lift(netlist: Netlist) -> IntegerNetwork:
     if len(voting) != 1:
         raise FormatError(f"netlist: {len(voting)} layers vote for classes, one is allowed; compile it again")
     return IntegerNetwork(
-        input=Input(taxels=netlist.taxels, polarities=netlist.polarities, clocks=netlist.clocks),
+        input=Input(taxels=netlist.taxels, polarities=netlist.polarities, clocks=netlist.clocks, bins=netlist.bins),
         populations=tuple(populations),
         projections=tuple(projections),
         readout=Readout(

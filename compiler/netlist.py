@@ -114,6 +114,8 @@ class Netlist:
         JSON values only: checkpoint hash, graph, options, version.
     clocks : Clocks
         Input channels beyond those of the sensor, whose events :func:`compiler.dynamics.with_clocks` makes.
+    bins : int
+        Bins of the recordings that a step joins.
     """
 
     target: str
@@ -143,6 +145,7 @@ class Netlist:
     format_index_bits: IntArray
     provenance: Mapping[str, Any]
     clocks: Clocks = NO_CLOCKS
+    bins: int = 1
 
     @property
     def n_inputs(self) -> int:

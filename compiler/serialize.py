@@ -8,7 +8,8 @@ Members, format version 2
 ``sha256``
     Hex digest (0-d string) over all other members in the order below: name, dtype, shape and bytes of each.
 Version 3 is for networks with currents that outlast their step, or with clocks: each layer has ``alpha``, and the
-manifest ``clocks`` (``channels`` and ``steps``), see :mod:`compiler.dynamics`.
+manifest ``clocks`` (``channels`` and ``steps``), see :mod:`compiler.dynamics`. Version 4 is for networks whose steps
+join bins of the recordings: as version 3, and ``bins``.
 
 every array field of :class:`compiler.netlist.Netlist`
     Under its own name and meaning, in the narrowest little-endian signed type that holds it; ``scale`` as float64.
@@ -35,8 +36,8 @@ from compiler.netlist import Layer, Netlist, frozen, read_only, read_only_float
 from compiler.targets import known_targets
 
 FORMAT = "spikeloom-netlist"
-VERSIONS = (2, 3)
-"""Of a usual netlist, and of one with current decay or clocks."""
+VERSIONS = (2, 3, 4)
+"""Of a usual netlist, of one with current decay or clocks, and of one whose steps join bins."""
 
 LARGE = frozenset({"synapse_target", "synapse_weight"})
 """Arrays that stay in the type that they are stored in."""
@@ -44,7 +45,7 @@ LARGE = frozenset({"synapse_target", "synapse_weight"})
 FLOATS = frozenset({"scale"})
 """Array members of real numbers."""
 
-_SCALARS = ("target", "taxels", "polarities", "classes", "layers", "provenance", "clocks")
+_SCALARS = ("target", "taxels", "polarities", "classes", "layers", "provenance", "clocks", "bins")
 ARRAYS = tuple(field.name for field in fields(Netlist) if field.name not in _SCALARS)
 """Array members in file order."""
 
@@ -54,7 +55,7 @@ def manifest_of(netlist: Netlist) -> dict[str, Any]:
     timed = bool(netlist.clocks.channels or any(layer.alpha for layer in netlist.layers))
     manifest: dict[str, Any] = {
         "format": FORMAT,
-        "version": VERSIONS[timed],
+        "version": VERSIONS[2] if netlist.bins > 1 else VERSIONS[timed],
         "target": netlist.target,
         "taxels": netlist.taxels,
         "polarities": netlist.polarities,
@@ -62,7 +63,9 @@ def manifest_of(netlist: Netlist) -> dict[str, Any]:
         "layers": [asdict(layer) for layer in netlist.layers],
         "provenance": dict(netlist.provenance),
     }
-    if timed:
+    if netlist.bins > 1:
+        manifest["bins"] = netlist.bins
+    if timed or netlist.bins > 1:
         manifest["clocks"] = asdict(netlist.clocks)
     else:
         for layer in manifest["layers"]:
@@ -119,6 +122,8 @@ def netlist_of(path: Path, manifest: dict[str, Any], members: Mapping[str, Array
     """
     if manifest["version"] == VERSIONS[0]:
         manifest = _widened(manifest)
+    if manifest["version"] < VERSIONS[2]:
+        manifest = manifest | {"bins": 1}
     faults = _type_faults(manifest, members)
     if faults:
         raise FormatError(f"{path}: {'; '.join(faults)}; compile it again")
@@ -134,6 +139,7 @@ def netlist_of(path: Path, manifest: dict[str, Any], members: Mapping[str, Array
         layers=tuple(Layer(**(layer | {"unheard": tuple(layer["unheard"])})) for layer in manifest["layers"]),
         provenance=manifest["provenance"],
         clocks=Clocks(**manifest["clocks"]),
+        bins=manifest["bins"],
         scale=read_only_float(members["scale"]),
         **{name: (frozen if name in LARGE else read_only)(members[name]) for name in ARRAYS if name not in FLOATS},
     )
@@ -170,6 +176,7 @@ def _type_faults(manifest: dict[str, Any], members: Mapping[str, Array]) -> list
         "provenance": isinstance(manifest.get("provenance"), dict),
         "layers": isinstance(layers, list) and bool(layers) and all(map(_is_layer, layers)),
         "clocks": _are_clocks(manifest.get("clocks")),
+        "bins": _is(manifest.get("bins"), "int", 1) and manifest["bins"] <= MOST_STEPS,
     }
     entries |= {name: _is(manifest.get(name), "int", 1) for name in ("taxels", "polarities", "classes")}
     faults = [f"the manifest has no usable {name}" for name, good in entries.items() if not good]

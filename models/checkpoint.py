@@ -75,6 +75,7 @@ def checkpoint_bytes(
     grid: Grid | None = None,
     dynamics: Dynamics = PLAIN,
     towers: int = 1,
+    bins: int = 1,
 ) -> bytes:
     """File content of a checkpoint; equal input gives equal bytes.
 
@@ -98,6 +99,8 @@ def checkpoint_bytes(
         Decays of single layers, and clocks.
     towers : int
         Networks that lie side by side in the tensors, see :mod:`compiler.frontends.towers`.
+    bins : int
+        Bins of the recordings that a step joins.
     """
     tensors_of_one = next(iter(weights.values()))
     stages = sum(name.startswith("fc") and name.endswith(".weight") for name in tensors_of_one)
@@ -107,9 +110,11 @@ def checkpoint_bytes(
         for name, array in sorted(tensors.items())
     }
     version = VERSIONS[2] if system != TACTILESGNET else VERSIONS[0] if forms is None else VERSIONS[1]
+    version = version if dynamics.is_plain else VERSIONS[3]
+    version = VERSIONS[5] if bins > 1 else VERSIONS[4] if towers > 1 else version
     manifest: dict[str, Any] = {
         "format": FORMAT,
-        "version": VERSIONS[4] if towers > 1 else version if dynamics.is_plain else VERSIONS[3],
+        "version": version,
         "architecture": system,
         "taxels": graph.n_taxels,
         "classes": len(tensors_of_one[f"fc{stages}.bias"]) // towers,
@@ -121,6 +126,8 @@ def checkpoint_bytes(
     }
     if towers > 1:
         manifest["towers"] = towers
+    if bins > 1:
+        manifest["bins"] = bins
     if not dynamics.is_plain:
         manifest["dynamics"] = dynamics.to_json()
     if grid is not None:
@@ -162,6 +169,7 @@ def save_checkpoint(
     grid: Grid | None = None,
     dynamics: Dynamics = PLAIN,
     towers: int = 1,
+    bins: int = 1,
 ) -> None:
     """Write a checkpoint, whole or not at all; parameters as :func:`checkpoint_bytes`.
 
@@ -181,6 +189,7 @@ def save_checkpoint(
         grid=grid,
         dynamics=dynamics,
         towers=towers,
+        bins=bins,
     )
     with write_atomically(path) as file:
         file.write(content)

@@ -124,7 +124,15 @@ def _read(
     path: str, split: str, netlist: Netlist, arguments: argparse.Namespace, limit: int | None = None
 ) -> Recordings:
     progress("reading the recordings")
-    data = recordings(path, split, limit=limit, classes=netlist.classes, taxels=netlist.taxels, bin_s=arguments.bin)
+    data = recordings(
+        path,
+        split,
+        limit=limit,
+        classes=netlist.classes,
+        taxels=netlist.taxels,
+        bin_s=arguments.bin,
+        bins=netlist.bins,
+    )
     check_channels(netlist, data.events.shape[1] * data.events.shape[2] + netlist.clocks.channels)
     return data
 

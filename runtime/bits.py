@@ -110,6 +110,7 @@ def bits(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], in
         "train",
         classes=checkpoint.classes,
         taxels=checkpoint.taxels,
+        bins=checkpoint.bins,
         bin_s=arguments.bin,
         labels_for="--accuracy" if figure == "accuracy" else None,
     )

@@ -63,6 +63,8 @@ class Given:
         Storage that it was fine-tuned for.
     levels : int, optional
         Levels of its weights, of a network that was trained in whole numbers.
+    bins : int
+        Bins of the recordings that a step joins.
     """
 
     path: str
@@ -80,6 +82,7 @@ class Given:
     training: Mapping[str, Any]
     forms: tuple[Form, ...] | None = None
     levels: int | None = None
+    bins: int = 1
 
     @property
     def validation(self) -> float | None:
@@ -147,6 +150,7 @@ def _read(path: str, arguments: argparse.Namespace) -> Given:
         layers=tuple(checkpoint.neurons),
         training=checkpoint.training or {},
         forms=checkpoint.forms,
+        bins=checkpoint.bins,
     )
 
 
@@ -305,4 +309,5 @@ def network_json(own: Given) -> Json:
         "fine_tuned": own.forms is not None,
         "trained_by": own.training.get("command"),
         "validation": own.validation,
+        "bins": own.bins,
     }

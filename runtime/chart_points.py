@@ -170,7 +170,7 @@ def recommended(
     energy, time : str
         Tables to choose by.
     bin_s : float
-        Seconds of a step at the pace of the sensor.
+        Seconds of a bin of the recordings; a step of a network may join several.
     """
     samples = points[0]["test"]["samples"]
     reference = max(network["expected"] for network in networks)
@@ -178,7 +178,8 @@ def recommended(
     cheapest = min(good, key=cost_of(energy), default=None)
     fastest = None
     if time is not None:
-        keeping = [point for point in good if point["train"]["step_s"][time] <= bin_s]
+        bins = {network["name"]: network["bins"] for network in networks}
+        keeping = [point for point in good if point["train"]["step_s"][time] <= bin_s * bins[point["network"]]]
         fastest = min(keeping, key=lambda point: (time_of(time)(point), cost_of(energy)(point)), default=None)
     chosen = {"cheapest": cheapest, "fastest": fastest, "best": best_of(points, energy)}
     return {name: None if point is None else point["number"] for name, point in chosen.items()}

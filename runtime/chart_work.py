@@ -27,6 +27,7 @@ from compiler.targets import CROSSBARS, known_targets, load_target
 from compiler.truenorth.netlist import CrossbarNetlist
 from compiler.truenorth.serialize import is_crossbars, read_crossbars
 from compiler.truenorth.trained import Trained, read_trained
+from models.events import joined_bins
 from models.evtouch import Recordings
 from runtime import engine
 from runtime.asked import Asked, asked_network
@@ -80,6 +81,12 @@ def both_splits(data: Data, taxels: int, classes: int) -> dict[str, Recordings]:
     if data.sha256 not in (None, data_digest(found["train"], found["test"])):
         raise DataError(f"{data.path}: holds other recordings than where the chart was asked for; copy those here")
     return found
+
+
+@lru_cache(maxsize=2)
+def _heard(data: Data, taxels: int, classes: int, bins: int) -> dict[str, Recordings]:
+    """The same in the steps of a network that joins bins."""
+    return {split: joined_bins(found, bins) for split, found in both_splits(data, taxels, classes).items()}
 
 
 @lru_cache(maxsize=2)
@@ -141,7 +148,7 @@ def _decide(work: Decide) -> Json:
     assert checkpoint is not None, "a chart takes checkpoints"
     assert adjacency is not None, "and these have a first layer that sees something"
     found: Json = {}
-    for split, data in both_splits(work.data, checkpoint.taxels, checkpoint.classes).items():
+    for split, data in _heard(work.data, checkpoint.taxels, checkpoint.classes, checkpoint.bins).items():
         counts: dict[int, list[IntArray]] = {window: [] for window in work.windows}
         own = np.full(len(data), data.steps) if data.lengths is None else data.lengths
         for first in range(0, len(data), PART):
@@ -168,7 +175,8 @@ def _build(work: Build) -> Json:
             return {name: {"refused": str(error).splitlines()} for name in work.files}
     some = next(iter(arguments.values()))
     asked = _network(model_words(words), work.sha256)
-    training = both_splits(work.data, asked.network.input.taxels, asked.network.classes)["train"]
+    sensor = asked.network.input
+    training = _heard(work.data, sensor.taxels, asked.network.classes, sensor.bins)["train"]
     try:
         stored = store(
             asked.network,
@@ -239,7 +247,8 @@ def _run(work: Run) -> Json:
         netlist = _read(path, work.sha256)
     if netlist is None:
         raise FormatError(f"{path}: is not the netlist that was measured before; begin anew with --fresh")
-    splits = both_splits(work.build.data, netlist.taxels, netlist.classes)
+    bins = 1 if isinstance(netlist, CrossbarNetlist) else netlist.bins
+    splits = _heard(work.build.data, netlist.taxels, netlist.classes, bins)
     parts = {split: first_part(data, work.window) for split, data in splits.items()}
     if isinstance(netlist, CrossbarNetlist):
         return charted.measure(netlist, parts)

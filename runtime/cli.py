@@ -230,7 +230,7 @@ def _costs(
         spikes=spikes,
         progress=lambda done: progress(f"running: {done} of {len(data)}"),
     )
-    return counts.spikes, estimate_json(netlist, target, found, bin_s=arguments.bin)
+    return counts.spikes, estimate_json(netlist, target, found, bin_s=arguments.bin * netlist.bins)
 
 
 def _demo(_arguments: Arguments) -> Outcome:

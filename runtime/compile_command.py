@@ -64,6 +64,7 @@ def compile_netlist(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json
             classes=asked.network.classes,
             taxels=asked.network.input.taxels,
             bin_s=arguments.bin,
+            bins=asked.network.input.bins,
         ).events
     progress("compiling")
 

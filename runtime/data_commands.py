@@ -22,7 +22,7 @@ from models.grasps import SPLITS, SYNTHETIC, synthetic_split
 from models.release import SOURCES, write_event_lines, write_released
 from models.sensors import read_layout
 from runtime.found import counts_json, counts_text, number, show_notes
-from runtime.inputs import require_place
+from runtime.inputs import require_bins, require_place
 from runtime.tables import table
 
 if TYPE_CHECKING:
@@ -200,8 +200,7 @@ def _convert(arguments: Arguments) -> Outcome:
     if lines or arguments.output.lower().endswith(".zip"):
         require_place(arguments.output, "-o", arguments)
     bins = arguments.join
-    if bins < 1:
-        raise OptionError(f"--join {bins}: allowed are 1 or more; choose another")
+    require_bins(bins)
     count, places = _layout(arguments.taxels)
     present = tuple(SPLITS) if arguments.source == SYNTHETIC else data_splits(arguments.source)
     loaded = [_load(arguments.source, split, arguments.bin, count, places) for split in present or (arguments.split,)]

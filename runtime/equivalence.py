@@ -135,17 +135,17 @@ def require_match(netlist: Netlist, model: Checkpoint | Network) -> None:
     Raises
     ------
     ModelError
-        If taxels, channels, or layer names or sizes differ.
+        If taxels, channels, timing, or layer names or sizes differ.
     """
     ours = {"taxels": netlist.taxels, "channels": netlist.polarities}
-    ours |= _clock_sizes(netlist.clocks) | {layer.name: layer.neurons for layer in netlist.layers}
+    ours |= _timing(netlist.clocks, netlist.bins) | {layer.name: layer.neurons for layer in netlist.layers}
     what = "network" if isinstance(model, Network) else "checkpoint"
     if isinstance(model, Network):
         theirs = {"taxels": model.input.taxels, "channels": model.input.polarities}
-        theirs |= _clock_sizes(model.input.clocks) | {p.name: p.size for p in model.populations}
+        theirs |= _timing(model.input.clocks, model.input.bins) | {p.name: p.size for p in model.populations}
     else:
         theirs = {"taxels": model.taxels, "channels": model.hops.shape[2]}
-        theirs |= _clock_sizes(model.dynamics.clocks) | model.neurons
+        theirs |= _timing(model.dynamics.clocks, model.bins) | model.neurons
     if ours != theirs:
         sizes = [", ".join(f"{name} {neurons}" for name, neurons in side.items()) for side in (ours, theirs)]
         raise ModelError(
@@ -154,8 +154,9 @@ def require_match(netlist: Netlist, model: Checkpoint | Network) -> None:
         )
 
 
-def _clock_sizes(clocks: Clocks) -> dict[str, int]:
-    return {"clocks": clocks.channels, "steps of a clock": clocks.steps} if clocks.channels else {}
+def _timing(clocks: Clocks, bins: int) -> dict[str, int]:
+    found = {"clocks": clocks.channels, "steps of a clock": clocks.steps} if clocks.channels else {}
+    return found | ({"bins of a step": bins} if bins > 1 else {})
 
 
 def _same_run(slow: Trace, prepared: engine.Engine, events: npt.NDArray[np.uint8]) -> bool:

@@ -91,6 +91,7 @@ def explain(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str],
         classes=netlist.classes,
         taxels=netlist.taxels,
         bin_s=arguments.bin,
+        bins=netlist.bins,
     )
     check_channels(netlist, data.events.shape[1] * data.events.shape[2] + netlist.clocks.channels)
     chosen = range(len(data)) if arguments.sample is None else [_index(data, arguments.sample)]

@@ -137,7 +137,7 @@ def _ports(arguments: argparse.Namespace, content: bytes) -> Json:
 
 def _nir(arguments: argparse.Namespace) -> Written:
     netlist = read_netlist(arguments.source)
-    dt = BIN_S if arguments.dt is None else arguments.dt
+    dt = BIN_S * netlist.bins if arguments.dt is None else arguments.dt
     beside = str(sidecar_of(arguments.output))
     require_place(beside, "-o", arguments)
     content = nir_export.export(netlist, dt)
@@ -178,6 +178,7 @@ def _netx(arguments: argparse.Namespace) -> Written:
             classes=netlist.classes,
             taxels=netlist.taxels,
             bin_s=arguments.bin,
+            bins=netlist.bins,
         )
         moved = netx_export.moved_spikes(network, blocks, channels_last(data.events, netlist.clocks))
         for layer in layers:

@@ -118,6 +118,7 @@ def finetune(arguments: argparse.Namespace) -> tuple[Report, Callable[[Report], 
             classes=checkpoint.classes,
             taxels=checkpoint.taxels,
             bin_s=arguments.bin,
+            bins=checkpoint.bins,
             labels_for="fine-tuning",
         )
         for split in ("train", "test")
@@ -169,6 +170,7 @@ def finetune(arguments: argparse.Namespace) -> tuple[Report, Callable[[Report], 
         forms=tuned.forms,
         system=checkpoint.system,
         grid=checkpoint.grid,
+        bins=checkpoint.bins,
     )
     round_to_forms(expand(read_checkpoint(output), adjacency), tuned.forms)  # it compiles, or says why not
     state.unlink(missing_ok=True)

@@ -17,7 +17,7 @@ from compiler.frontends.systems import GRAPH_SYSTEMS, TACTILESGNET, TITLES
 from compiler.netlist import Netlist
 from compiler.truenorth.netlist import CrossbarNetlist
 from compiler.truenorth.trained import is_trained
-from models.events import BIN_S, load_data, need_labels, require_events
+from models.events import BIN_S, MAX_STEPS, joined_bins, load_data, need_labels, require_events
 from models.evtouch import Recordings
 from models.graphs import CHOICES, NEUTOUCH, Graph
 from models.grasps import SYNTHETIC, synthetic_split
@@ -56,11 +56,13 @@ def recordings(
     classes: int | None,
     taxels: int | None,
     bin_s: float = BIN_S,
+    bins: int = 1,
     labels_for: str | None = None,
 ) -> Recordings:
     """Read recordings of any form, or make the package's own synthetic ones; hold both against the network.
 
-    Counts of disorder in event files go to stderr. `labels_for` names what needs the label of every recording.
+    Counts of disorder in event files go to stderr. `bins` of them make a step of the network. `labels_for` names what
+    needs the label of every recording.
 
     Raises
     ------
@@ -72,7 +74,7 @@ def recordings(
         show_counts(data, counts)
         if labels_for is not None:
             need_labels(data, labels_for)
-        return data
+        return joined_bins(data, bins)
     require_events(SYNTHETIC, bin_s)
     grasps = synthetic_split(split, limit=limit)
     if taxels is not None and grasps.taxels != taxels:
@@ -84,7 +86,19 @@ def recordings(
             f"{SYNTHETIC}: label {grasps.labels.max()}, the network has {classes} classes (0..{classes - 1}); "
             "use the network that was trained on these objects"
         )
-    return grasps
+    return joined_bins(grasps, bins)
+
+
+def require_bins(bins: int) -> None:
+    """Refuse a number of bins to join that is none.
+
+    Raises
+    ------
+    OptionError
+        If it is below 1, or more than a recording may have.
+    """
+    if not 1 <= bins <= MAX_STEPS:
+        raise OptionError(f"--join {bins}: allowed are 1 to {MAX_STEPS}; choose another")
 
 
 def asked_recordings(
@@ -99,6 +113,7 @@ def asked_recordings(
         classes=netlist.classes,
         taxels=netlist.taxels,
         bin_s=arguments.bin,
+        bins=1 if isinstance(netlist, CrossbarNetlist) else netlist.bins,
         labels_for=labels_for,
     )
 

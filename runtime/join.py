@@ -82,6 +82,7 @@ def join(arguments: Namespace) -> tuple[Report, Callable[[Report], str], int]:
         grid=joined.grid,
         dynamics=joined.dynamics,
         towers=joined.towers,
+        bins=joined.bins,
     )
     report = {
         **record,

@@ -23,6 +23,7 @@ from runtime import engine
 from runtime.asked import Asked, asked_network
 from runtime.compile_command import storage
 from runtime.estimate import estimate
+from runtime.found import number
 from runtime.inputs import progress, recordings, require_place, version
 from runtime.lean_text import lean_text
 from runtime.leaner import (
@@ -89,7 +90,13 @@ def lean(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], in
     found = [asked_network(path, arguments) for path in arguments.checkpoint]
     first = found[0].network
     for path, asked in zip(arguments.checkpoint, found, strict=True):
-        shape = asked.network.input.taxels, asked.network.input.polarities, asked.network.classes
+        own = asked.network
+        if own.input.bins != first.input.bins:
+            raise OptionError(
+                f"{path}: a step joins {number(own.input.bins, 'bin')}, of {arguments.checkpoint[0]} "
+                f"{first.input.bins}; spikeloom chart compares such networks"
+            )
+        shape = own.input.taxels, own.input.polarities, own.classes
         if shape != (first.input.taxels, first.input.polarities, first.classes):
             raise OptionError(
                 f"{path}: {shape[0]} taxels, {shape[1]} polarities and {shape[2]} classes, {arguments.checkpoint[0]} "
@@ -134,6 +141,7 @@ def _read(arguments: argparse.Namespace, split: str, limit: int | None, asked: A
         classes=asked.network.classes,
         taxels=asked.network.input.taxels,
         bin_s=arguments.bin,
+        bins=asked.network.input.bins,
         labels_for="lean",
     )
 
@@ -208,7 +216,7 @@ class _Session:
         self.loose = replace(self.strict, allowed=allowed)
         self.rows: list[Json] = []
         self.overflowing: list[str] = []
-        self._kept: list[tuple[int, Netlist]] = []
+        self._kept: list[tuple[int, Netlist, Scene]] = []
 
     def report(self) -> Json:
         """Run all trials; afterwards `netlist` is the one that takes least energy, of those that change few enough."""
@@ -235,7 +243,7 @@ class _Session:
         self._bins()
         self._together(hops, changed)
         samples = len(self.training.labels)
-        taken, self.netlist = min(self._kept, key=lambda kept: self._energy(kept[1]))
+        taken, self.netlist, _ = min(self._kept, key=lambda kept: self._energy(kept[1], kept[2]))
         return {
             "taken": taken,
             "samples": {"training": samples, "test": len(self.test.labels)},
@@ -251,9 +259,9 @@ class _Session:
     def _told(self, trial: Trial) -> str:
         return "no training decision changed" if not trial.allowed else f"{trial.allowed} training decisions may change"
 
-    def _energy(self, netlist: Netlist) -> float:
+    def _energy(self, netlist: Netlist, training: Scene) -> float:
         """Joules of a training recording by the first table, or operations where no table prices them."""
-        costs = _costs(netlist, self.target, self.training)[1]
+        costs = _costs(netlist, self.target, training)[1]
         return float(next(iter(costs["energy_j"].values()), costs["operations"]))
 
     def _add(
@@ -287,7 +295,7 @@ class _Session:
             **costs,
         }
         if keep and row["training"]["differ"] <= self.loose.allowed:
-            self._kept.append((len(self.rows), netlist))
+            self._kept.append((len(self.rows), netlist, training))
         self.rows.append(row)
         return row
 
@@ -329,6 +337,7 @@ class _Session:
                     coarse_netlist(self.netlist, bins, adapted=adapted),
                     coarser(self.training, self.netlist, bins),
                     coarser(self.test, self.netlist, bins),
+                    keep=True,
                 )
 
     def _together(self, hops: tuple[int, ...], changed: IntArray) -> None:

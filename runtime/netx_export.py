@@ -177,6 +177,7 @@ def tree_of(network: IntegerNetwork, blocks: Sequence[Block]) -> Tree:
         "polarities": np.array(network.input.polarities),
         "clocks": np.array(network.input.clocks.channels),
         "clock_steps": np.array(network.input.clocks.steps),
+        **({"bins": np.array(network.input.bins)} if network.input.bins > 1 else {}),
         "label": network.readout.label,
     }
     return {"layer": layers, OWN: own}

@@ -98,7 +98,7 @@ def export(netlist: Netlist, form: str) -> bytes:
             "netlist_sha256": hashlib.sha256(netlist_bytes(netlist)).hexdigest(),
             "form": form,
             "input": f"{netlist.taxels} taxels x {netlist.polarities} polarities; "
-            f"channel = taxel * {netlist.polarities} + polarity; 0 or 1{_clock_words(netlist.clocks)}",
+            f"channel = taxel * {netlist.polarities} + polarity; 0 or 1{_timing_words(netlist.clocks, netlist.bins)}",
             "max_depth": netlist.max_depth,
             "layers": [
                 {
@@ -114,11 +114,13 @@ def export(netlist: Netlist, form: str) -> bytes:
     )
 
 
-def _clock_words(clocks: Clocks) -> str:
+def _timing_words(clocks: Clocks, bins: int) -> str:
+    words = f"; a step joins {bins} bins of the recordings" if bins > 1 else ""
     if not clocks.channels:
-        return ""
+        return words
     return (
-        f"; then {clocks.channels} clocks: the k-th, from 0, is 1 in the {clocks.steps} steps from k * {clocks.steps}"
+        f"{words}; then {clocks.channels} clocks: the k-th, from 0, is 1 in the {clocks.steps} steps from k * "
+        f"{clocks.steps}"
     )
 
 

@@ -141,6 +141,9 @@ def add_training(parser: argparse.ArgumentParser) -> None:
     """Add the options of a training."""
     parser.add_argument("--data", required=True, metavar="PATH", help=DATA_HELP)
     add_bin_option(parser)
+    parser.add_argument(
+        "--join", type=int, default=1, metavar="N", help="a step joins N bins, an event where one has any (default: 1)"
+    )
     needing = ", ".join((*GRAPH_SYSTEMS, NATIVE))
     add_system(parser, f"default: {TACTILESGNET}; {needing} need a graph", NATIVE)
     parser.add_argument(

@@ -64,6 +64,7 @@ def netlist_json(netlist: Netlist, uses: Sequence[LimitUse], sha256: str) -> Jso
         "target": netlist.target,
         "taxels": netlist.taxels,
         **({"clocks": asdict(netlist.clocks)} if netlist.clocks.channels else {}),
+        **({"bins": netlist.bins} if netlist.bins > 1 else {}),
         "classes": netlist.classes,
         "neurons": sum(layer.neurons for layer in netlist.layers),
         "compartments": netlist.n_compartments,
@@ -186,6 +187,7 @@ def netlist_text(report: Json) -> str:
             f"({report['synapses_stored']:,} stored, {report['synapses_nonzero']:,} non-zero), {report['cores']} cores "
             f"on {where}",
             *_clock_lines(report),
+            *_bin_lines(report),
             table(head, layers),
             "",
             table(["limit", "used", "allowed", "fill", "fullest core"], limits),
@@ -214,6 +216,11 @@ def _clock_lines(report: Json) -> list[str]:
         return []
     channels, steps = report["clocks"]["channels"], report["clocks"]["steps"]
     return [f"  {channels} clocks of {steps} steps each, {channels * steps} in all, beside the sensor"]
+
+
+def _bin_lines(report: Json) -> list[str]:
+    """How long the steps of a network are; nothing of those that hear the bins of the recordings."""
+    return [f"  a step joins {report['bins']} bins of the recordings"] if "bins" in report else []
 
 
 def _width(layer: Json) -> str:
@@ -347,6 +354,7 @@ def checkpoint_json(checkpoint: Checkpoint, given: tuple[str, ...]) -> Json:
         "classes": checkpoint.classes,
         **({"hops": int(checkpoint.hops.shape[0] - 1)} if checkpoint.system == TACTILESGNET else {}),
         **({"towers": checkpoint.towers} if checkpoint.towers > 1 else {}),
+        **({"bins": checkpoint.bins} if checkpoint.bins > 1 else {}),
         "layers": [{"name": name, "neurons": neurons} for name, neurons in checkpoint.neurons.items()],
         "beta": checkpoint.beta,
         "theta": checkpoint.theta,
@@ -388,6 +396,7 @@ def checkpoint_text(report: Json) -> str:
                 )
                 lines.append(f"  {word} decay by layer: {shown}")
         lines += _clock_lines(report["dynamics"] if report["dynamics"]["clocks"]["channels"] else {})
+    lines += _bin_lines(report)
     training = dict(report["training"] or {})
     if "towers" in report:
         lines.append(f"  {report['towers']} towers vote together, each with a neuron for every class")

@@ -172,8 +172,8 @@ def _facts(
         "netlist": netlist_json(netlist, measure(netlist, target), provenance["netlist"]["sha256"]),
         "cores": report_facts.cores_json(netlist, target, counts),
         "taxels": report_facts.taxels_json(netlist, asked, data, counts, arguments.taxels),
-        "recording": recording_json(netlist, target, asked, data, chosen, costs, bin_s=arguments.bin),
-        "costs": estimate_json(netlist, target, costs, bin_s=arguments.bin),
+        "recording": recording_json(netlist, target, asked, data, chosen, costs, bin_s=arguments.bin * netlist.bins),
+        "costs": estimate_json(netlist, target, costs, bin_s=arguments.bin * netlist.bins),
         "provenance": provenance,
     }
     return found | explained(arguments, account), 1 if found["verify"]["missed"] else 0

@@ -8,6 +8,8 @@
     total = stream.finish()[-1]             # the counts that `spikeloom run` prints
     stream.reset()                          # the next grasp
 
+The bins are steps of the network: where these join several bins of the recordings, an event in any of them counts.
+
 *Lag.* A layer of depth ``d`` integrates data step ``t`` in chip step ``t + d``. So the votes after the bin ``t`` rest
 on the bins up to ``t - d`` of the layer that is read out; :meth:`Stream.finish` runs the steps that are missing. Step
 by step, all spikes and counts equal those of :func:`runtime.engine.simulate` on the whole recording, bit for bit.

@@ -18,7 +18,16 @@ from models.graphs import CHOICES, Graph
 from models.grasps import SYNTHETIC
 from models.recipes import CROSSBARS, RECIPES, RELEASED, STEPS, Recipe, check_recipe, decays_asked
 from models.systems import PADDINGS, sensor_grid, taxels_alone
-from runtime.inputs import asked_graph, asked_places, graph_words, progress, recordings, require_place, version
+from runtime.inputs import (
+    asked_graph,
+    asked_places,
+    graph_words,
+    progress,
+    recordings,
+    require_bins,
+    require_place,
+    version,
+)
 from runtime.training import LAYERS, PICTURES, Job, check_seeds, draw_training, output_of, summary, training_text
 
 Json = dict[str, Any]
@@ -29,6 +38,7 @@ def train(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], i
     from runtime.seeds import train_seeds  # processes, so only here
 
     check_seeds(arguments.seeds)
+    require_bins(arguments.join)
     require_place(arguments.output, "-o", arguments)
     if arguments.picture is not None:
         require_place(arguments.picture, "--picture", arguments)
@@ -81,7 +91,8 @@ def _jobs(
     graph, grid = sensor
     system = arguments.system or TACTILESGNET
     data = arguments.data if arguments.data == SYNTHETIC else training.source
-    words = [f"spikeloom train --data {data}", _system_words(arguments, system), graph_words(arguments)]
+    words = [f"spikeloom train --data {data}", f"--join {arguments.join}" if arguments.join > 1 else ""]
+    words += [_system_words(arguments, system), graph_words(arguments)]
     recipe = _recipe(arguments)
     epochs = recipe.epochs if arguments.epochs is None else arguments.epochs
     command = " ".join(filter(None, [*words, _recipe_words(arguments), f"--epochs {epochs}"]))
@@ -105,6 +116,7 @@ def _jobs(
             grid=grid,
             recipe=recipe,
             copies=arguments.copies or USUAL_COPIES,
+            bins=arguments.join,
         )
         for position, seed in enumerate(range(arguments.seed, arguments.seed + arguments.seeds))
     ]
@@ -146,6 +158,11 @@ def _named_recipe(arguments: argparse.Namespace) -> Recipe:
                 f"--{name.replace('_', '-')} {getattr(arguments, name)}: a network for TrueNorth has a recipe of its "
                 "own, and nothing in it decays; leave it away"
             )
+    if arguments.join != 1:
+        raise OptionError(
+            f"--join {arguments.join}: {NATIVE} hears bins as they are; leave it away, or train on what spikeloom data "
+            "convert --join makes"
+        )
     if arguments.device != "cpu":
         raise OptionError(f"--device {arguments.device}: {NATIVE} is trained on the CPU; leave it away")
     if arguments.spike_penalty is not None:

@@ -21,6 +21,7 @@ from compiler.frontends.systems import TACTILESGNET, Grid
 from compiler.truenorth.native import SYSTEM as NATIVE
 from compiler.truenorth.native import USUAL_COPIES
 from compiler.truenorth.trained import Trained, read_trained, write_trained
+from models.events import joined_bins
 from models.evtouch import Recordings
 from models.graphs import Graph
 from models.recipes import MSE, RELEASED, Recipe
@@ -71,6 +72,8 @@ class Job:
         How it is trained.
     copies : int
         Of an input, for TrueNorth.
+    bins : int
+        Bins of the recordings that a step joins.
     """
 
     training: Recordings
@@ -90,6 +93,11 @@ class Job:
     grid: Grid | None = None
     recipe: Recipe = RELEASED
     copies: int = USUAL_COPIES
+    bins: int = 1
+
+    def heard(self) -> tuple[Recordings, Recordings]:
+        """Training and test recordings in the steps of the network."""
+        return joined_bins(self.training, self.bins), joined_bins(self.test, self.bins)
 
     def propagation(self) -> FloatArray:
         """What the first layer sees."""
@@ -109,7 +117,7 @@ class Job:
             features=self.recipe.features,
             hops=self.recipe.hops,
         )
-        return replace(plain, dynamics=self.recipe.dynamics(LAYERS, plain.beta, self.training.steps))
+        return replace(plain, dynamics=self.recipe.dynamics(LAYERS, plain.beta, -(-self.training.steps // self.bins)))
 
     def _native(self) -> Sizes:
         from models.truenorth.network import sized
@@ -163,8 +171,7 @@ def run_job(job: Job) -> tuple[dict[str, Any], IntArray | None]:
 
     architecture = job.architecture()
     reported = train_both(
-        job.training,
-        job.test,
+        *job.heard(),
         job.propagation(),
         architecture,
         epochs=job.epochs,
@@ -196,6 +203,7 @@ def run_job(job: Job) -> tuple[dict[str, Any], IntArray | None]:
             system=job.system,
             grid=job.grid,
             dynamics=architecture.dynamics,
+            bins=job.bins,
         )
     for file in state_of(job):
         file.unlink(missing_ok=True)
@@ -220,6 +228,7 @@ def recall(job: Job) -> tuple[dict[str, Any], IntArray | None]:
     else:
         ours, theirs = (None if grid is None else grid.to_json() for grid in (job.grid, found.grid))
         differing += ["system"] if found.system != job.system or ours != theirs else []
+        differing += ["bins"] if found.bins != job.bins else []
     _require_same(job, differing, found.weights)
     if not job.draws:
         return _with_file(job, record), None
@@ -279,7 +288,7 @@ def _predictions(job: Job, weights: Mapping[str, Any]) -> IntArray:
         return predict_native(native_network(architecture, weights), job.test)
     network = SpikingNet(architecture, job.propagation())
     network.load_weights(weights)
-    return predict(network, job.test)
+    return predict(network, job.heard()[1])
 
 
 def check_seeds(seeds: int) -> None:

@@ -266,7 +266,7 @@ def watch(arguments: argparse.Namespace) -> tuple[dict[str, Any], Callable[[dict
     from runtime import exits
     from runtime.stream import load
 
-    bin_s = _duration(arguments.bin)
+    bin_s = _duration(arguments.bin)  # of the recordings; a step of the network may join several
     if arguments.bins is not None and arguments.bins < 1:
         raise OptionError(f"--bins {arguments.bins}: not a length; give 1 or more, or leave it out")
     factor = arguments.until_sure
@@ -279,6 +279,7 @@ def watch(arguments: argparse.Namespace) -> tuple[dict[str, Any], Callable[[dict
         )
     live = load(arguments.netlist)
     netlist = live.netlist
+    bin_s *= netlist.bins
     if netlist.polarities != 2:
         raise ModelError(
             f"{arguments.netlist}: {netlist.polarities} polarities per taxel found, event lines have 2; "
@@ -322,7 +323,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Describe the options of the command."""
     parser.add_argument("netlist", metavar="NET.loom")
     parser.add_argument("--input", default="-", metavar="FILE", help="event lines (default: -, standard input)")
-    parser.add_argument("--bin", default="0.02", metavar="SECONDS", help="length of a bin (default: 0.02)")
+    parser.add_argument(
+        "--bin", default="0.02", metavar="SECONDS", help="length of a bin of the recordings (default: 0.02)"
+    )
     parser.add_argument(
         "--bins", type=int, metavar="N", help="length of every grasp: shorter ones are filled up, longer ones cut"
     )

@@ -40,6 +40,7 @@ def measure(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str],
         classes=checkpoint.classes,
         taxels=checkpoint.taxels,
         bin_s=arguments.bin,
+        bins=checkpoint.bins,
     )
     spikes = float_spikes(checkpoint, adjacency, data.events)
     found = yardsticks.measure(checkpoint, adjacency, data.events, spikes, lengths=data.lengths)

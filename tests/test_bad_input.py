@@ -244,8 +244,8 @@ def test_altered_checkpoint(refusal, tmp_path):
 def test_newer_checkpoint(refusal, tmp_path):
     path = tmp_path / "net.pt"
     with zipfile.ZipFile(path, "w") as made:
-        made.writestr("manifest.json", json.dumps({"format": "spikeloom-checkpoint", "version": 6}))
-    assert refusal("inspect", path) == f"{path}: has format version 6, this program reads up to 5; update spikeloom"
+        made.writestr("manifest.json", json.dumps({"format": "spikeloom-checkpoint", "version": 7}))
+    assert refusal("inspect", path) == f"{path}: has format version 7, this program reads up to 6; update spikeloom"
 
 
 def test_checkpoint_zip_bomb(refusal, tmp_path):
@@ -687,8 +687,8 @@ def test_flipped_bits_of_a_netlist(refusal, tmp_path, place):
     ("change", "why"),
     [
         (
-            lambda manifest, _: manifest.update(version=4),
-            "has format version 4, this program reads 2 and 3; compile it again or update spikeloom",
+            lambda manifest, _: manifest.update(version=5),
+            "has format version 5, this program reads 2, 3, 4; compile it again or update spikeloom",
         ),
         (lambda manifest, _: manifest.update(format="x"), "is not a netlist; write one with spikeloom compile"),
         (

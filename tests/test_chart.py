@@ -376,7 +376,7 @@ OUT = ("-o", "bad")
         (
             ("ring.pt", "--data", "data", "--grid", "graph=mst:3", *OUT),
             "--grid graph=mst:3: no checkpoint was trained on that graph, those given on ring; train one and name it: "
-            "spikeloom train --data data --graph mst:3 --epochs 30 -o mst3.pt",
+            "spikeloom train --data data --graph mst:3 --epochs 60 -o mst3.pt",
         ),
         (
             ("ring.pt", "--data", "data", "--grid", "bits=8+4", *OUT),

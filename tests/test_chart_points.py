@@ -47,8 +47,8 @@ def point(number, train, test, energy, time, *, step=20e-6, **axes):
     }
 
 
-def network(name="net", validation=0.9, training=1.0):
-    return {"name": name, "validation": validation, "float_training": training}
+def network(name="net", validation=0.9, training=1.0, bins=1):
+    return {"name": name, "validation": validation, "float_training": training, "bins": bins}
 
 
 def prepared(points, networks=None):
@@ -127,6 +127,8 @@ def test_a_point_that_does_not_keep_pace_with_the_sensor_is_not_the_fastest(poin
     points[4]["train"]["step_s"]["clock"] = 0.03
     found = recommended(points, [network() | {"expected": 0.9}], energy="one", time="clock", bin_s=0.02)
     assert found["fastest"] == 3
+    longer = network(bins=2) | {"expected": 0.9}  # steps of 40 ms
+    assert recommended(points, [longer], energy="one", time="clock", bin_s=0.02)["fastest"] == 5
 
 
 def test_no_point_is_near_the_float_model(points):

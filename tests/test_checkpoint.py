@@ -454,11 +454,11 @@ def test_requests_that_an_own_file_cannot_meet(tmp_path):
     assert refusal(path, weights="best") == "--weights best: the file holds last; choose one that it holds"
 
 
-@pytest.mark.parametrize("version", [6, 0, None, "1\n"])
+@pytest.mark.parametrize("version", [7, 0, None, "1\n"])
 def test_other_versions(tmp_path, version):
     content = rebuilt(own(), lambda manifest, _: manifest.update(version=version))
     assert refusal(write(tmp_path / "x.pt", content)) == (
-        f"has format version {version!r}, this program reads up to 5; update spikeloom"
+        f"has format version {version!r}, this program reads up to 6; update spikeloom"
     )
 
 

@@ -277,7 +277,7 @@ def test_convert_mistakes(own):
         "--bin nan: not a duration; give seconds above 0, for example 0.02"
     )
     assert message("convert", "own", "-o", "out", "--join", "0", error=OptionError) == (
-        "--join 0: allowed are 1 or more; choose another"
+        "--join 0: allowed are 1 to 1000000; choose another"
     )
     assert sorted(path.name for path in own.iterdir()) == ["a.csv", "coords.csv", "own"]
 

@@ -297,8 +297,8 @@ def test_an_array_that_announces_more_than_memory_holds(path):
 
 
 def test_a_newer_version(path):
-    rewrite_manifest(path, version=4)
-    assert refused(path) == "has format version 4, this program reads 2 and 3; compile it again or update spikeloom"
+    rewrite_manifest(path, version=5)
+    assert refused(path) == "has format version 5, this program reads 2, 3, 4; compile it again or update spikeloom"
 
 
 @pytest.mark.parametrize("text", ["{", "[" * 100_000])

@@ -104,6 +104,8 @@ class Checkpoint:
         Decays of single layers, and clocks.
     towers : int
         Networks that lie side by side and vote together, see :mod:`compiler.frontends.towers`.
+    bins : int
+        Bins of the recordings that a step joins.
     """
 
     hops: Float32Array
@@ -124,6 +126,7 @@ class Checkpoint:
     grid: Grid | None = None
     dynamics: Dynamics = PLAIN
     towers: int = 1
+    bins: int = 1
 
     @property
     def places(self) -> int:
@@ -208,12 +211,12 @@ def read_checkpoint(
         if weights not in (None, "last"):
             raise ModelError(f"{where}: --weights {weights}: the file holds the last epoch only; leave --weights away")
         graph, edges, chosen, held = None, None, "last", {"beta": BETA, "theta": THETA}
-        forms, dynamics, towers = None, PLAIN, 1
+        forms, dynamics, towers, bins = None, PLAIN, 1, 1
         assumed = tuple(name for name, value in given.items() if value is None)
     else:
         if run != 0:
             raise ModelError(f"{where}: --run {run}: the file holds only run 0; leave --run away")
-        arrays, chosen, (graph, edges, held, training), (found, grid, dynamics), (forms, towers) = own_arrays(
+        arrays, chosen, (graph, edges, held, training), (found, grid, dynamics), (forms, towers, bins) = own_arrays(
             where, members, weights
         )
         if system not in (None, found):
@@ -252,6 +255,7 @@ def read_checkpoint(
         grid=grid,
         dynamics=dynamics,
         towers=towers,
+        bins=bins,
     )
 
 

@@ -305,9 +305,15 @@ def _own(tree: Tree, inputs: int, voters: int) -> tuple[Input, IntArray] | None:
         said.number_of(key) for key in ("taxels", "polarities", "clocks", "clock_steps")
     )
     clocks = Clocks(channels=channels, steps=steps) if channels else NO_CLOCKS
-    if min(taxels, polarities) < 1 or not 0 <= channels <= MOST_CLOCKS or not 1 <= steps <= MOST_STEPS:
+    bins = said.number_of("bins") if "bins" in entries else 1
+    if (
+        not 1 <= bins <= MOST_STEPS
+        or min(taxels, polarities) < 1
+        or not 0 <= channels <= MOST_CLOCKS
+        or not 1 <= steps <= MOST_STEPS
+    ):
         raise ModelError(f"group {OWN} describes no sensor; {REMEDY}")
-    sensor = Input(taxels=taxels, polarities=polarities, clocks=clocks)
+    sensor = Input(taxels=taxels, polarities=polarities, clocks=clocks, bins=bins)
     label = said.integers("label").ravel()
     if sensor.size != inputs or label.size != voters or label.min() < 0 or label.max() >= voters:
         raise ModelError(

@@ -25,6 +25,9 @@ Version 5 is for networks joined of several, of any system: ``towers`` says how 
 sizes. Arrays hold one tower after the other: ``conv1.hops`` along its features, the others along their first axis, so
 that ``fc1.weight`` has the inputs of one tower. Neuron ``tower * classes + class`` of the last layer votes for that
 class; ``classes`` counts classes. ``dynamics`` and ``forms`` may be there or not; see :mod:`compiler.frontends.towers`.
+
+Version 6 is for networks whose steps join ``bins`` bins of the recordings, with an event where one of them has any.
+``dynamics``, ``forms`` and ``towers`` may be there or not.
 """
 
 from __future__ import annotations
@@ -42,7 +45,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from compiler.dynamics import PLAIN, Dynamics, dynamics_from_json
+from compiler.dynamics import MOST_STEPS, PLAIN, Dynamics, dynamics_from_json
 from compiler.errors import ModelError, OptionError
 from compiler.fixedpoint import THRESHOLD_MANTISSA_MAX, IntArray
 from compiler.forms import Form, plane_distance
@@ -60,9 +63,9 @@ from compiler.frontends.systems import (
 from compiler.frontends.tensors import Arrays, apart, faults_of, size, taxel_faults, tower_faults, wanted_dense
 
 FORMAT = "spikeloom-checkpoint"
-VERSIONS = (1, 2, 3, 4, 5)
+VERSIONS = (1, 2, 3, 4, 5, 6)
 """Of a plain file of a TactileSGNet, of one that holds the forms of a fine-tuning, of another system's, of one with
-decays of single layers or with clocks, and of several joined ones."""
+decays of single layers or with clocks, of several joined ones, and of those whose steps join bins."""
 
 WEIGHTS = ("last", "best", "clean")
 """Sets that our own format can hold."""
@@ -144,9 +147,9 @@ def own_arrays(
     str,
     tuple[str, IntArray, dict[str, float], dict[str, Any]],
     tuple[str, Grid | None, Dynamics],
-    tuple[tuple[Form, ...] | None, int],
+    tuple[tuple[Form, ...] | None, int, int],
 ]:
-    """Arrays of one set, its name; graph, edges, constants, training record; system, grid, dynamics; forms, towers."""
+    """Arrays, their set; graph, edges, constants, training record; system, grid, dynamics; forms, towers, bins."""
     manifest = _manifest(where, members.pop("manifest.json"))
     try:
         arrays: Arrays = {name.removesuffix(".npy"): _read_npy(content) for name, content in members.items()}
@@ -166,12 +169,12 @@ def own_arrays(
         if system not in SYSTEMS:
             raise ValueError(f"architecture {system}")
         grid = grid_from_json(manifest["grid"]) if system == GRID_CNN else None
-        dynamics, towers = PLAIN, 1
-        if manifest["version"] == VERSIONS[4]:
-            towers = manifest["towers"]
-            if type(towers) is not int or towers < 2:
-                raise ValueError(f"{towers} towers")
-        if manifest["version"] == VERSIONS[3] or (towers > 1 and "dynamics" in manifest):
+        dynamics, version = PLAIN, manifest["version"]
+        towers = _count(
+            manifest, "towers", there=version == VERSIONS[4] or (version == VERSIONS[5] and "towers" in manifest)
+        )
+        bins = _count(manifest, "bins", there=version == VERSIONS[5])
+        if version == VERSIONS[3] or (version >= VERSIONS[4] and "dynamics" in manifest):
             stages = sum(re.fullmatch(r"[a-z]+/fc\d+\.weight", name) is not None for name in arrays) // len(sets)
             dynamics = dynamics_from_json(manifest["dynamics"], 1 + stages)
     except (KeyError, TypeError, ValueError, OverflowError, ZeroDivisionError) as error:
@@ -190,7 +193,17 @@ def own_arrays(
     if faults:
         raise ModelError(f"{where}: {'; '.join(faults)}; {_AGAIN}")
     forms = _forms(where, manifest, chosen, towers, dynamics.clocks.channels)
-    return chosen, weights, facts, (system, grid, dynamics), (forms, towers)
+    return chosen, weights, facts, (system, grid, dynamics), (forms, towers, bins)
+
+
+def _count(manifest: dict[str, Any], name: str, *, there: bool) -> int:
+    """A number above 1 that some versions have; 1 where it is not there."""
+    if not there:
+        return 1
+    count = manifest[name]
+    if type(count) is not int or not 2 <= count <= MOST_STEPS:
+        raise ValueError(f"{count} {name}")
+    return count
 
 
 def _forms(where: str, manifest: dict[str, Any], arrays: Arrays, towers: int, clocks: int) -> tuple[Form, ...] | None:

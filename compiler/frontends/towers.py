@@ -202,6 +202,7 @@ FACTS: Mapping[str, Callable[[Checkpoint], str]] = {
     "current decays": _decays(lambda checkpoint, layer: checkpoint.dynamics.alpha(layer)),
     "threshold": lambda checkpoint: repr(checkpoint.theta),
     "clocks": _clocks,
+    "bins of a step": lambda checkpoint: str(checkpoint.bins),
     "storage": _storage,
 }
 """What the networks of a joined one have in common, as text that tells them apart."""

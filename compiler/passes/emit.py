@@ -189,4 +189,5 @@ def emit(
         format_index_bits=read_only([key[2] for key in columns]),
         provenance=dict(provenance),
         clocks=network.input.clocks,
+        bins=network.input.bins,
     )

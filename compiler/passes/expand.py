@@ -240,7 +240,12 @@ def expand(checkpoint: Checkpoint, propagation: FloatArray) -> Network:
     for layer, dense in enumerate(checkpoint.dense, 1):
         stages.append((dense.name, expand_dense(checkpoint, layer), dense.bias.astype(np.float64)))
     return Network(
-        input=Input(taxels=checkpoint.taxels, polarities=checkpoint.hops.shape[2], clocks=dynamics.clocks),
+        input=Input(
+            taxels=checkpoint.taxels,
+            polarities=checkpoint.hops.shape[2],
+            clocks=dynamics.clocks,
+            bins=checkpoint.bins,
+        ),
         populations=tuple(
             Population(
                 name=name,

@@ -74,6 +74,7 @@ def refuse(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], 
             classes=asked.network.classes,
             taxels=asked.network.input.taxels,
             bin_s=arguments.bin,
+            bins=asked.network.input.bins,
             labels_for="compile --target truenorth",
         )
         trial, steps = _trial(asked, data), data.events.shape[3]

@@ -1,0 +1,305 @@
+"""Networks whose steps join bins of the recordings: trained, compiled and used as on recordings of longer bins."""
+
+import contextlib
+import io
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+from test_checkpoint import rebuilt
+
+from compiler.errors import FormatError, ModelError, OptionError
+from compiler.frontends.checkpoint import read_checkpoint
+from compiler.serialize import manifest_of, netlist_bytes, read_netlist, write_netlist
+from compiler.sidecar import restore
+from compiler.truenorth.native import SYSTEM as NATIVE
+from models.events import BIN_S, joined_bins, load_data
+from models.grasps import synthetic_grasps
+from models.release import write_event_lines, write_released
+from runtime import chart_work
+from runtime.cli import main
+from runtime.inputs import require_bins
+
+BINS = 3
+
+TRAINED = ("--graph", "manual", "--epochs", "3")
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """A folder with recordings, the same in longer bins, and a network of each."""
+    folder = tmp_path_factory.mktemp("bins")
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.chdir(folder)
+        splits = [
+            replace(synthetic_grasps(per_class=3, steps=20, seed=seed), split=split)
+            for split, seed in (("train", 1), ("test", 2))
+        ]
+        write_released(folder / "fine", splits)
+        words = (
+            ("data", "convert", "fine", "--join", str(BINS), "-o", "long"),
+            ("train", "--data", "fine", "--join", str(BINS), *TRAINED, "-o", "x.pt"),
+            ("train", "--data", "long", *TRAINED, "-o", "plain.pt"),
+            ("compile", "x.pt", "--calibrate", "fine", "-o", "x.loom"),
+            ("compile", "plain.pt", "--calibrate", "long", "-o", "plain.loom"),
+        )
+        for command in words:
+            assert main([*command, "--json"]) == 0
+    return folder
+
+
+@pytest.fixture
+def report(place, monkeypatch, capsys):
+    """Run a command in the folder: its result."""
+    monkeypatch.chdir(place)
+    capsys.readouterr()
+
+    def run(*words, code=0):
+        assert main([*words, "--json"]) == code
+        out, _ = capsys.readouterr()
+        return json.loads(out)
+
+    return run
+
+
+@pytest.fixture
+def refusal(place, monkeypatch, capsys):
+    """Run a command in the folder that refuses: its line."""
+    monkeypatch.chdir(place)
+    capsys.readouterr()
+
+    def run(*words):
+        assert main(list(words)) == 2
+        out, err = capsys.readouterr()
+        assert not out
+        return err.strip()
+
+    return run
+
+
+# --- training and files -----------------------------------------------------------------------------------------------
+
+
+def test_it_is_the_network_of_recordings_in_longer_bins(place):
+    own, plain = (read_checkpoint(place / f"{name}.pt") for name in ("x", "plain"))
+    assert (own.bins, plain.bins) == (BINS, 1)
+    for ours, theirs in zip((own.hops, own.dense[-1].weight), (plain.hops, plain.dense[-1].weight), strict=True):
+        assert_array_equal(ours, theirs)
+    assert own.training["command"] == f"spikeloom train --data fine --join {BINS} --graph manual --epochs 3 --seed 0"
+    assert own.training["history"] == plain.training["history"]
+    fine = own.training["data_sha256"]
+    assert fine != plain.training["data_sha256"], "the hash is over what the data set holds"
+
+
+def test_the_netlist_is_that_one_but_for_the_bins(place):
+    own, plain = (read_netlist(place / f"{name}.loom") for name in ("x", "plain"))
+    assert (own.bins, plain.bins) == (BINS, 1)
+    assert netlist_bytes(replace(own, bins=1, provenance={})) == netlist_bytes(replace(plain, provenance={}))
+
+
+def test_files_of_other_networks_are_as_before(place):
+    with np.load(place / "plain.loom") as archive:
+        manifest = json.loads(str(archive["manifest"]))
+    assert manifest["version"] == 2
+    assert "bins" not in manifest
+
+
+@pytest.mark.parametrize("bins", [1, 0, 2.5, True, "3", None, 2**20 + 1])
+def test_a_netlist_of_unusable_bins_is_refused(place, tmp_path, monkeypatch, bins):
+    monkeypatch.setattr("compiler.serialize.manifest_of", _with_bins(bins))
+    write_netlist(read_netlist(place / "x.loom"), tmp_path / "y.loom")
+    if bins == 1 and type(bins) is int:
+        assert read_netlist(tmp_path / "y.loom").bins == 1
+        return
+    with pytest.raises(FormatError, match="the manifest has no usable bins; compile it again"):
+        read_netlist(tmp_path / "y.loom")
+
+
+def _with_bins(bins):
+    return lambda netlist: manifest_of(netlist) | {"bins": bins}
+
+
+@pytest.mark.parametrize("bins", [1, 0, True, "3", 2**20 + 1])
+def test_a_checkpoint_of_unusable_bins_is_refused(place, tmp_path, bins):
+    content = rebuilt((place / "x.pt").read_bytes(), lambda manifest, _: manifest.update(bins=bins))
+    (tmp_path / "y.pt").write_bytes(content)
+    with pytest.raises(ModelError, match=f"incomplete manifest .*{bins} bins"):
+        read_checkpoint(tmp_path / "y.pt")
+
+
+def test_a_finished_training_of_other_bins_is_another(refusal):
+    line = refusal("train", "--data", "fine", "--join", "2", *TRAINED, "--resume", "-o", "x.pt")
+    assert line == "spikeloom: x.pt: holds another training (other bins); give its options, or another -o"
+
+
+def test_timed_networks_have_clocks_of_their_own_steps(report, place):
+    report("train", "--data", "fine", "--join", "3", *TRAINED, "--recipe", "timed", "-o", "timed.pt")
+    found = read_checkpoint(place / "timed.pt")
+    assert (found.bins, found.dynamics.clocks.steps) == (3, 1), "7 steps among 8 clocks"
+
+
+@pytest.mark.parametrize("bins", ["0", "-2", "1000001"])
+def test_bins_that_are_none(refusal, bins):
+    for command in (("train", "--graph", "manual", "--data", "fine"), ("data", "convert", "fine")):
+        line = refusal(*command, "--join", bins, "-o", "y.pt")
+        assert line == f"spikeloom: --join {bins}: allowed are 1 to 1000000; choose another"
+
+
+def test_networks_for_truenorth_hear_bins_as_they_are(refusal):
+    words = ("train", "--system", NATIVE, "--graph", "manual", "--data", "fine", "--join", "2", "-o", "y.pt")
+    told = (
+        f"spikeloom: --join 2: {NATIVE} hears bins as they are; leave it away, or train on what spikeloom data convert"
+    )
+    assert refusal(*words) == f"{told} --join makes"
+
+
+# --- every command that reads recordings ------------------------------------------------------------------------------
+
+
+def test_it_decides_on_the_recordings_what_the_other_does_on_longer_bins(report):
+    ours, theirs = (
+        report("run", f"{name}.loom", "--data", data, "--detail", "counts")
+        for name, data in (("x", "fine"), ("plain", "long"))
+    )
+    assert ours["counts"] == theirs["counts"]
+    assert ours["predictions"] == theirs["predictions"]
+    own, other = ours["costs"]["per_inference"], theirs["costs"]["per_inference"]
+    assert own["energy_j"] == other["energy_j"]
+    pace, others = (found["costs"]["pace"] for found in (ours, theirs))
+    assert (pace["bin_s"], others["bin_s"]) == (pytest.approx(BINS * BIN_S), BIN_S)
+    for table, watt in pace["real_time_w"].items():
+        assert watt == pytest.approx(others["real_time_w"][table] / BINS)
+
+
+def test_verify_explain_and_report(report, place):
+    found = [
+        report("verify", f"{name}.loom", "--checkpoint", f"{name}.pt", "--data", data, "--require", "E0")
+        for name, data in (("x", "fine"), ("plain", "long"))
+    ]
+    assert found[0] == found[1]
+    told = ("x.loom", "--checkpoint", "x.pt", "--data", "fine")
+    assert report("explain", *told)["steps"] == 7
+    page = report("report", *told, "-o", "x.html")
+    assert page["costs"]["pace"]["bin_s"] == pytest.approx(BINS * BIN_S)
+    assert (place / "x.html").exists()
+
+
+def test_a_netlist_of_other_bins_is_not_from_this_network(refusal):
+    line = refusal("verify", "plain.loom", "--checkpoint", "x.pt", "--data", "fine")
+    assert "netlist and checkpoint disagree" in line
+    assert f"bins of a step {BINS}" in line
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("anytime", "NET", "--data", "DATA", "--calibrate", "DATA"),
+        ("stress", "NET", "--checkpoint", "CKPT", "--data", "DATA", "--only", "taxels_dead", "--seeds", "1"),
+        ("yardsticks", "CKPT", "--data", "DATA"),
+        ("bits", "CKPT", "--calibrate", "DATA", "--widths", "4,8", "--agreement", "0.5"),
+        ("lean", "CKPT", "--data", "DATA"),
+    ],
+)
+def test_other_commands_find_what_they_find_on_longer_bins(report, words, place):
+    found = []
+    for name, data in (("x", "fine"), ("plain", "long")):
+        names = {"NET": f"{name}.loom", "CKPT": f"{name}.pt", "DATA": data}
+        found.append(_without_names(report(*(names.get(word, word) for word in words))))
+    assert found[0] == found[1]
+
+
+def _without_names(value):
+    """A report without names, hashes, commands, times, and what follows from the length of a step."""
+    told = ("calibrated_on", "command", "source", "chosen", "name", "candidate", "data", "provenance", "netlist")
+    told += ("checkpoint", "sha256")
+    if isinstance(value, dict):
+        return {key: _without_names(entry) for key, entry in value.items() if not any(word in key for word in told)}
+    return [_without_names(entry) for entry in value] if isinstance(value, list) else value
+
+
+def test_a_stream_of_events(report, place):
+    recording = load_data(place / "fine", "test", limit=1)[0]
+    write_event_lines(place / "events.csv", [recording], BIN_S)
+    seen = [
+        report_lines(place, "watch", f"{name}.loom", "--input", "events.csv", "--bin", bin_, "--bins", "7")
+        for name, bin_ in (("x", "0.02"), ("plain", "0.06"))
+    ]
+    assert seen[0] == seen[1]
+    assert seen[0][-2]["time_s"] == pytest.approx(7 * BINS * BIN_S)
+
+
+def report_lines(place, *words):
+    out = io.StringIO()
+    with contextlib.chdir(place), contextlib.redirect_stdout(out):
+        assert main([*words, "--json"]) == 0
+    return [json.loads(line) for line in out.getvalue().splitlines()]
+
+
+def test_a_chart_of_networks_with_different_bins(report, place):
+    report("train", "--data", "fine", *TRAINED, "-o", "bins1.pt")
+    chart_work.both_splits.cache_clear()
+    words = ("--data", "fine", "--grid", "bits=8", "--jobs", "1", "-o", "charted")
+    found = report("chart", "x.pt", "bins1.pt", *words)
+    assert [network["bins"] for network in found["networks"]] == [BINS, 1]
+    own = report("run", "x.loom", "--data", "fine", "--detail", "counts")
+    whole = [point for point in found["points"] if point["window"] == 100]
+    assert whole[0]["test"]["accuracy"] == own["accuracy"]
+    assert [point["test"]["steps"] for point in whole] == [7.0, 20.0]
+
+
+def test_lean_takes_networks_of_one_timing(refusal, report):
+    report("train", "--data", "fine", *TRAINED, "-o", "bins1.pt")
+    line = refusal("lean", "bins1.pt", "x.pt", "--data", "fine")
+    assert line == "spikeloom: x.pt: a step joins 3 bins, of bins1.pt 1; spikeloom chart compares such networks"
+
+
+def test_lean_writes_a_netlist_for_joined_bins(report, place, monkeypatch):
+    for other in ("_trials", "_hops", "_together"):
+        monkeypatch.setattr(f"runtime.lean._Session.{other}", lambda *_: ())
+    found = report("lean", "x.pt", "--data", "fine", "--differ", "0.9", "-o", "lean.loom")
+    taken = found["rows"][found["taken"]]
+    assert (taken["removed"], read_netlist(place / "lean.loom").bins) == ({"bins": 4}, 4 * BINS)
+    ran = report("run", "lean.loom", "--data", "fine", "--detail", "counts")
+    assert ran["accuracy"] == taken["test"]["right"] / 18
+    assert ran["costs"]["per_inference"]["energy_j"] == pytest.approx(taken["energy_j"])
+
+
+# --- what else is made of them ----------------------------------------------------------------------------------------
+
+
+def test_joined_networks_and_fine_tuned_ones_keep_them(report, refusal, place):
+    report("train", "--data", "fine", "--join", str(BINS), *TRAINED, "--seed", "1", "-o", "y.pt")
+    report("join", "x.pt", "y.pt", "-o", "both.pt")
+    assert (read_checkpoint(place / "both.pt").bins, read_checkpoint(place / "both.pt").towers) == (BINS, 2)
+    report("finetune", "x.pt", "--data", "fine", "--weight-bits", "4", "--epochs", "1", "-o", "tuned.pt")
+    assert (read_checkpoint(place / "tuned.pt").bins, len(read_checkpoint(place / "tuned.pt").forms)) == (BINS, 4)
+    assert "bins of a step (x.pt: 3; plain.pt: 1)" in refusal("join", "x.pt", "plain.pt", "-o", "z.pt")
+
+
+def test_inspect_tells(place, monkeypatch, capsys):
+    monkeypatch.chdir(place)
+    for name in ("x.pt", "x.loom"):
+        assert main(["inspect", name]) == 0
+        assert "  a step joins 3 bins of the recordings\n" in capsys.readouterr().out
+    assert main(["inspect", "plain.loom"]) == 0
+    assert "joins" not in capsys.readouterr().out
+
+
+def test_exports(report, place):
+    assert report("export", "x.loom", "--to", "nir", "-o", "x.nir")["dt"] == pytest.approx(BINS * BIN_S)
+    assert netlist_bytes(restore(place / "x.nir", ("euler",))) == (place / "x.loom").read_bytes()
+    report("export", "x.loom", "--to", "netx", "-o", "x.net")
+    report("compile", "x.net", "-o", "again.loom")
+    assert read_netlist(place / "again.loom").bins == BINS
+
+
+def test_one_bin_is_the_recording_itself():
+    recordings = synthetic_grasps(per_class=1, steps=10, seed=0)
+    assert joined_bins(recordings, 1) is recordings
+
+
+def test_option_errors_are_the_users():
+    with pytest.raises(OptionError):
+        require_bins(0)
