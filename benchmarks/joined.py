@@ -69,12 +69,13 @@ def _decided(network: Checkpoint, test: Recordings) -> Json:
     return {"float": int(np.sum(float_decisions(network, adjacency, test) == test.labels))}
 
 
-def measured(network: Checkpoint, training: Recordings, test: Recordings) -> Json:
+def measured(network: Checkpoint, training: Recordings, test: Recordings, *, spike_exact: bool = False) -> Json:
     """Float model and chip at 8 bits."""
     training, test = (joined_bins(each, network.bins) for each in (training, test))
     _, adjacency = propagation(network, None, "joined")
     decided = float_decisions(network, adjacency, test)
-    netlist = compile_network(expand(network, adjacency), training_events=training.events).netlist
+    compilation = compile_network(expand(network, adjacency), training_events=training.events, spike_exact=spike_exact)
+    netlist = compilation.netlist
     events = with_clocks(test.events, netlist.clocks)
     counts, costs = estimate(netlist, load_target("loihi1"), events, lengths=test.lengths)
     chip = predictions(netlist, counts.spikes)

@@ -1,11 +1,10 @@
 """What each change of a training recipe is worth: accuracy and operations of its networks, side by side.
 
     python benchmarks/variants.py DATA OUT.json 'timed=t-s*.pt' 'no clocks=n-s*.pt' … [--picture OUT.png]
-    python benchmarks/variants.py DATA OUT.json '20 ms=a-s*.pt' '200 ms=b-s*.pt@OTHER_DATA' …
 
 Each network is compiled at 8 bits, with scales chosen on training recordings, at its last epoch (nothing chosen) and
 its clean epoch (chosen on validation); at its best one, which was chosen on test, beside them. Else test recordings are
-only reported.
+only reported. `--spike-exact` adds planes and scales of 8 bits until no training spike moves.
 """
 
 from __future__ import annotations
@@ -35,21 +34,24 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("recordings")
     parser.add_argument("output", type=Path)
-    parser.add_argument("variants", nargs="+", metavar="NAME=FILES[@DATA]")
+    parser.add_argument("variants", nargs="+", metavar="NAME=FILES")
+    parser.add_argument("--spike-exact", action="store_true")
     parser.add_argument("--picture", type=Path)
     arguments = parser.parse_args()
-    found: Json = {"data": Path(arguments.recordings).name, "variants": {}}
+    training, test = (load_recordings(arguments.recordings, split) for split in ("train", "test"))
+    found: Json = {"data": Path(arguments.recordings).name, "test_samples": len(test), "variants": {}}
     for variant in arguments.variants:
-        name, _, rest = variant.rpartition("=")
-        files, _, data = rest.partition("@")
-        training, test = (load_recordings(data or arguments.recordings, split) for split in ("train", "test"))
-        if found.setdefault("test_samples", len(test)) != len(test):
-            parser.error(f"{variant}: has {len(test)} test recordings, the others {found['test_samples']}")
+        name, _, files = variant.rpartition("=")
         paths = sorted(glob(files))  # noqa: PTH207, the pattern may be absolute
         if not paths:
             parser.error(f"{variant}: no such files")
         found["variants"][name] = {"commands": [read_checkpoint(path).training["command"] for path in paths]} | {
-            weights: _summary([measured(read_checkpoint(path, weights=weights), training, test) for path in paths])
+            weights: _summary(
+                [
+                    measured(read_checkpoint(path, weights=weights), training, test, spike_exact=arguments.spike_exact)
+                    for path in paths
+                ]
+            )
             for weights in WEIGHTS
         }
         print(name, json.dumps(found["variants"][name]["last"]["mean"]), file=sys.stderr)

@@ -221,14 +221,15 @@ def test_compiled_again_the_bytes_are_the_same(compiled, released_checkpoint, ob
 @pytest.mark.recordings
 def test_the_shipped_network_of_longer_bins(tmp_path, objects_zip):
     """What its card says of it, as float model and on the chip, at a fifth of what steps of 20 ms take."""
-    data, netlist, name = tmp_path / "objects-200ms.zip", tmp_path / "n.loom", "pretrained:objects-200ms"
-    assert command("data", "convert", objects_zip, "--join", 10, "-o", data)[1]["steps"] == 25
-    assert command("compile", name, "--calibrate", data, "-o", netlist)[0] == 0
-    code, report = command("verify", netlist, "--checkpoint", name, "--data", data)
+    netlist, name = tmp_path / "n.loom", "pretrained:objects-200ms"
+    assert command("compile", name, "--calibrate", objects_zip, "-o", netlist)[0] == 0
+    code, report = command("verify", netlist, "--checkpoint", name, "--data", objects_zip)
     assert code == 0
     assert report["accuracy"] == {"float": 133 / 144, "chip": 131 / 144}
     assert report["decision_agreement"] == 142 / 144
-    mean = command("estimate", netlist, "--data", data)[1]["per_inference"]
+    costs = command("estimate", netlist, "--data", objects_zip)[1]
+    assert costs["pace"]["bin_s"] == pytest.approx(0.2)
+    mean = costs["per_inference"]
     assert 1.1e6 < mean["synaptic_operations"] < 1.2e6
     assert 30e-6 < mean["energy_j"]["davies2018"] < 36e-6
 
