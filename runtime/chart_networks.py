@@ -115,7 +115,7 @@ def given_networks(arguments: argparse.Namespace, grid: Grid) -> tuple[Given, ..
     read = [_read(path, arguments) for path in paths]
     for graph in grid.graph:
         if all(_plain(graph) != _plain(own.graph) for own in read):
-            read += [_read(_shipped_for(graph, paths, [own.graph for own in read], arguments.data), arguments)]
+            read += [_read(_shipped_for(graph, paths, read, arguments.data), arguments)]
     if grid.graph:
         wanted = [_plain(graph) for graph in grid.graph]
         read = [own for own in read if _plain(own.graph) in wanted]
@@ -191,7 +191,7 @@ def _plain(graph: str) -> str:
     return file_safe(graph).replace("-", "")
 
 
-def _shipped_for(graph: str, paths: Iterable[str], there: Sequence[str], data: str) -> str:
+def _shipped_for(graph: str, paths: Iterable[str], there: Sequence[Given], data: str) -> str:
     """A shipped checkpoint of another graph beside the given shipped ones: ``pretrained:objects-knn1``.
 
     Raises
@@ -208,7 +208,8 @@ def _shipped_for(graph: str, paths: Iterable[str], there: Sequence[str], data: s
             continue
         return name
     command = ["spikeloom", "train", "--data", data, "--graph", graph, "--epochs", str(SHORT_EPOCHS["graphs"])]
-    others = ", ".join(dict.fromkeys(there))
+    command += ["--join", str(there[0].bins)] if there[0].bins > 1 else []
+    others = ", ".join(dict.fromkeys(own.graph for own in there))
     raise OptionError(
         f"--grid graph={graph}: no checkpoint was trained on that graph, those given on {others}; train one and "
         f"name it: {shlex.join([*command, '-o', f'{_plain(graph)}.pt'])}"

@@ -70,7 +70,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--limit", type=int, metavar="N", help="netx: first N of them only")
     add_bin_option(parser)
     add_model(parser)
-    parser.add_argument("--dt", type=float, metavar="SECONDS", help=f"nir: length of a step (default: {BIN_S:g})")
+    parser.add_argument("--dt", type=float, metavar="SECONDS", help=f"nir: length of a step (default: {BIN_S:g} a bin)")
     parser.add_argument("--strict", action="store_true", help="netx: write nothing that had to be rounded")
     parser.add_argument("-o", "--output", required=True, metavar="FILE")
 

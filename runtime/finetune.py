@@ -18,6 +18,7 @@ from compiler.passes.expand import expand
 from compiler.passes.quantize import round_to_forms
 from compiler.serialize import is_netlist
 from compiler.targets import load_target
+from models.events import joined_bins
 from models.graphs import Graph
 from runtime.data_commands import add_bin_option
 from runtime.inputs import asked_checkpoint, asked_graph, graph_words, propagation, recordings, require_place, shipped
@@ -111,18 +112,18 @@ def finetune(arguments: argparse.Namespace) -> tuple[Report, Callable[[Report], 
         )
     asked = asked_graph(arguments, checkpoint.system)
     name, adjacency = propagation(checkpoint, asked, arguments.checkpoint)
-    training, test = (
+    found = [
         recordings(
             arguments.data,
             split,
             classes=checkpoint.classes,
             taxels=checkpoint.taxels,
             bin_s=arguments.bin,
-            bins=checkpoint.bins,
             labels_for="fine-tuning",
         )
         for split in ("train", "test")
-    )
+    ]
+    training, test = (joined_bins(each, checkpoint.bins) for each in found)
     from models.checkpoint import save_checkpoint
     from models.finetune import finetune as tune
     from models.protocols import data_digest
@@ -154,7 +155,7 @@ def finetune(arguments: argparse.Namespace) -> tuple[Report, Callable[[Report], 
         "seed": arguments.seed,
         "epochs": arguments.epochs,
         "data": training.source,
-        "data_sha256": data_digest(training, test),
+        "data_sha256": data_digest(*found),
         "test_samples": len(test),
         "before": {"correct": tuned.before, "accuracy": tuned.before / len(test)},
         "last": {"correct": tuned.after, "accuracy": tuned.after / len(test), "chosen_on": "nothing"},

@@ -216,7 +216,7 @@ class _Session:
         self.loose = replace(self.strict, allowed=allowed)
         self.rows: list[Json] = []
         self.overflowing: list[str] = []
-        self._kept: list[tuple[int, Netlist, Scene]] = []
+        self._kept: list[tuple[int, Netlist]] = []
 
     def report(self) -> Json:
         """Run all trials; afterwards `netlist` is the one that takes least energy, of those that change few enough."""
@@ -243,7 +243,7 @@ class _Session:
         self._bins()
         self._together(hops, changed)
         samples = len(self.training.labels)
-        taken, self.netlist, _ = min(self._kept, key=lambda kept: self._energy(kept[1], kept[2]))
+        taken, self.netlist = min(self._kept, key=lambda kept: self._energy(kept[1]))
         return {
             "taken": taken,
             "samples": {"training": samples, "test": len(self.test.labels)},
@@ -259,9 +259,9 @@ class _Session:
     def _told(self, trial: Trial) -> str:
         return "no training decision changed" if not trial.allowed else f"{trial.allowed} training decisions may change"
 
-    def _energy(self, netlist: Netlist, training: Scene) -> float:
+    def _energy(self, netlist: Netlist) -> float:
         """Joules of a training recording by the first table, or operations where no table prices them."""
-        costs = _costs(netlist, self.target, training)[1]
+        costs = _costs(netlist, self.target, self.training)[1]
         return float(next(iter(costs["energy_j"].values()), costs["operations"]))
 
     def _add(
@@ -295,7 +295,7 @@ class _Session:
             **costs,
         }
         if keep and row["training"]["differ"] <= self.loose.allowed:
-            self._kept.append((len(self.rows), netlist, training))
+            self._kept.append((len(self.rows), netlist))
         self.rows.append(row)
         return row
 
@@ -337,7 +337,6 @@ class _Session:
                     coarse_netlist(self.netlist, bins, adapted=adapted),
                     coarser(self.training, self.netlist, bins),
                     coarser(self.test, self.netlist, bins),
-                    keep=True,
                 )
 
     def _together(self, hops: tuple[int, ...], changed: IntArray) -> None:

@@ -234,13 +234,12 @@ def coarse_netlist(netlist: Netlist, bins: int, *, adapted: bool) -> Netlist:
     """The netlist for joined bins: clocks as much slower; if `adapted`, what membranes and currents keep in as many."""
     clocks = replace(netlist.clocks, steps=max(1, round(netlist.clocks.steps / bins)))
     if not adapted:
-        return replace(netlist, clocks=clocks, bins=netlist.bins * bins)
+        return replace(netlist, clocks=clocks)
     one = 1 << DECAY_BITS
     keep_v, keep_u = (one - netlist.decay_v) / one, (one - 1 - netlist.decay_u) / one
     return replace(
         netlist,
         clocks=clocks,
-        bins=netlist.bins * bins,
         decay_v=read_only(np.round(one * (1 - keep_v**bins))),
         decay_u=read_only(np.minimum(np.round(one * (1 - keep_u**bins)), one) - 1),
     )

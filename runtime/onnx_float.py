@@ -25,11 +25,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from compiler.dynamics import NO_CLOCKS
 from compiler.errors import ModelError
 from compiler.fixedpoint import FloatArray
 from compiler.frontends.checkpoint import Checkpoint
 from compiler.passes.expand import expand_dense
 from runtime.inputs import version
+from runtime.onnx_graph import timing_words
 from runtime.onnx_nodes import Nodes, Port, model_bytes, require_room
 from runtime.onnx_time import counted, decided, read_sizes, rest
 
@@ -80,7 +82,8 @@ def export_float(checkpoint: Checkpoint, adjacency: FloatArray, form: str, *, gr
             "graph": graph_name,
             "form": form,
             "input": f"{checkpoint.taxels} taxels x {checkpoint.hops.shape[2]} polarities; "
-            f"channel = taxel * {checkpoint.hops.shape[2]} + polarity; 0 or 1",
+            f"channel = taxel * {checkpoint.hops.shape[2]} + polarity; 0 or 1"
+            f"{timing_words(NO_CLOCKS, checkpoint.bins)}",
             "layers": [{"name": name, "neurons": size, "kind": "float32"} for name, size in sizes.items()],
             "beta": checkpoint.beta,
             "theta": checkpoint.theta,

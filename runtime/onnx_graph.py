@@ -98,7 +98,7 @@ def export(netlist: Netlist, form: str) -> bytes:
             "netlist_sha256": hashlib.sha256(netlist_bytes(netlist)).hexdigest(),
             "form": form,
             "input": f"{netlist.taxels} taxels x {netlist.polarities} polarities; "
-            f"channel = taxel * {netlist.polarities} + polarity; 0 or 1{_timing_words(netlist.clocks, netlist.bins)}",
+            f"channel = taxel * {netlist.polarities} + polarity; 0 or 1{timing_words(netlist.clocks, netlist.bins)}",
             "max_depth": netlist.max_depth,
             "layers": [
                 {
@@ -114,7 +114,8 @@ def export(netlist: Netlist, form: str) -> bytes:
     )
 
 
-def _timing_words(clocks: Clocks, bins: int) -> str:
+def timing_words(clocks: Clocks, bins: int) -> str:
+    """What an input hears beside the events of a bin, for the metadata of a file."""
     words = f"; a step joins {bins} bins of the recordings" if bins > 1 else ""
     if not clocks.channels:
         return words

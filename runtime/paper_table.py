@@ -107,7 +107,6 @@ def _row(part: Part, row: Row, cells: list[Json], sha256: str) -> Json:
         "system": row.system,
         "form": row.form,
         "epochs": row.epochs,
-        "decay_epochs": row.decay_epochs,
         "seeds": there,
         "planned": planned,
         "cells": [row.cell(seed) for seed in there],
@@ -174,6 +173,9 @@ def _ends(figures: Sequence[Json]) -> list[int]:
 def schedules(cells: Cells, epochs: int) -> list[Json]:
     """What a shorter training loses against the released one, on the manual graph of each data set.
 
+    It is the beginning of that one, seed by seed, so means are over the seeds that both have; held against the standard
+    error of the whole one.
+
     Parameters
     ----------
     cells : mapping of str to dict
@@ -185,16 +187,16 @@ def schedules(cells: Cells, epochs: int) -> list[Json]:
         return []
     found = []
     for data in dict.fromkeys(cell["data"] for cell in cells.values()):
-        ours: dict[int, Json] = {}
+        of_length: list[dict[int, Json]] = []
         for length in (epochs, EPOCHS):
             row = Row(data=data, system=TACTILESGNET, form="manual", epochs=length)
-            of_row = [cell for cell in cells.values() if row_of(cell) == row]
-            ours[length] = {which: spread([100 * cell[which]["accuracy"] for cell in of_row]) for which in PROTOCOLS}
+            of_length.append({cell["seed"]: cell for cell in cells.values() if row_of(cell) == row})
+        shared = sorted(of_length[0].keys() & of_length[1].keys())
         for which in PROTOCOLS:
-            short, long = ours[epochs][which], ours[EPOCHS][which]
+            short, long = (spread([100 * of[seed][which]["accuracy"] for seed in shared]) for of in of_length)
             entry: Json = {"data": data, "protocol": which, "epochs": epochs, "short": short, "long": long}
-            if short and long and short["std"] is not None and long["std"] is not None:
-                error = math.sqrt(short["std"] ** 2 / short["n"] + long["std"] ** 2 / long["n"])
+            if short and long and long["std"] is not None:
+                error = long["std"] / math.sqrt(long["n"])
                 difference = short["mean"] - long["mean"]
                 entry |= {"difference": difference, "se": error, "within": abs(difference) <= error}
             found.append(entry)

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from compiler.frontends.systems import GCN, GRAPH_SYSTEMS, GRID_CNN, MLP, TACTILESGNET
-from models.schedule import EPOCHS
+from models.schedule import DECAY_EPOCHS, EPOCHS
 from runtime.cells import SAME_PADDING
 from runtime.paper_table import MARGIN, PROTOCOLS
 from runtime.published import RUNS
@@ -63,7 +63,7 @@ def csv_text(rows: Sequence[Json]) -> str:
 
 
 def _flat(row: Json) -> dict[str, Any]:
-    flat = {key: row[key] for key in ("data", "system", "form", "epochs", "decay_epochs")}
+    flat = {key: row[key] for key in ("data", "system", "form", "epochs")}
     flat |= {"seeds": " ".join(map(str, row["seeds"])), "planned": row["planned"], "test_samples": row["test_samples"]}
     flat |= {"paper_mean": _of(row["paper"], "mean"), "paper_std": _of(row["paper"], "std")}
     for protocol in PROTOCOLS:
@@ -128,15 +128,14 @@ def markdown(kind: str, epochs: int, rows: Sequence[Json], shorter: Sequence[Jso
     """
     planned = sum(row["planned"] for row in rows)
     missing = sum(len(row["missing"]) for row in rows)
-    decay = rows[0]["decay_epochs"] if rows else None
     lines = [
         f"# {TITLES[kind]}",
         "",
-        f"{epochs} epochs, the learning rate falls after every {decay}; {planned - missing} of {planned} trainings are "
-        "there. Accuracy in percent: mean (standard deviation) over the seeds, 95 % interval of the mean. "
-        f"*Reproduced*: the paper's mean is within our mean by its protocol ± {MARGIN:g} combined standard errors (the "
-        f"paper's of {RUNS} runs). Chip: Loihi 1 as simulated here, 8 bits, scales chosen on training recordings; "
-        "operations and energy of an inference of a test recording, last epoch.",
+        f"{epochs} epochs, the learning rate falls after every {DECAY_EPOCHS}; {planned - missing} of {planned} "
+        "trainings are there. Accuracy in percent: mean (standard deviation) over the seeds, 95 % interval of the "
+        f"mean. *Reproduced*: the paper's mean is within our mean by its protocol ± {MARGIN:g} combined standard "
+        f"errors (the paper's of {RUNS} runs). Chip: Loihi 1 as simulated here, 8 bits, scales chosen on training "
+        "recordings; operations and energy of an inference of a test recording, last epoch.",
     ]
     for data in dict.fromkeys(row["data"] for row in rows):
         lines += ["", *_section(data, [row for row in rows if row["data"] == data])]
@@ -276,7 +275,7 @@ def _schedule_lines(epochs: int, shorter: Sequence[Json]) -> list[str]:
     ]
     lines = [f"## {epochs} epochs against {EPOCHS}", "", *pipes(heads, map(_schedule_cells, shorter))]
     if not shorter or any("within" not in entry for entry in shorter):
-        lines += ["", "Not shown everywhere yet: two seeds of both lengths are needed."]
+        lines += ["", "Not shown everywhere yet: two seeds that both lengths have are needed."]
     return lines
 
 

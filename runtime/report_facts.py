@@ -186,6 +186,7 @@ def provenance_json(
             "weights": None if checkpoint is None else checkpoint.weights,
             "graph": asked.graph,
             "dynamics": None if checkpoint is None or checkpoint.dynamics.is_plain else checkpoint.dynamics.to_json(),
+            "bins": netlist.bins,
             "training": None if checkpoint is None or checkpoint.training is None else dict(checkpoint.training),
         },
         "data": {

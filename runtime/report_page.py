@@ -80,6 +80,7 @@ def _provenance(report: Json) -> list[str]:
     facts: dict[str, Mapping[str, Any] | None] = {
         "How the netlist was compiled": made["netlist"]["compiled"],
         "Decays by layer, and clocks": made["checkpoint"]["dynamics"],
+        "Steps": {"bins that one joins": made["checkpoint"]["bins"]} if made["checkpoint"]["bins"] > 1 else None,
         "How the network was trained": made["checkpoint"]["training"],
         "Versions": made["versions"],
         "Energy tables": made["chip"]["energy_tables"],

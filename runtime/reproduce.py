@@ -77,9 +77,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--epochs",
         type=int,
         metavar="N",
-        help="of each training, the learning rate falls in proportion (default: {methods} and {graphs})".format(
-            **SHORT_EPOCHS
-        ),
+        help="of each training, the rate falls every 40 (default: {methods} and {graphs})".format(**SHORT_EPOCHS),
     )
     parser.add_argument("--full", action="store_true", help=f"{FULL_SEEDS} seeds of {EPOCHS} epochs, as in the paper")
     parser.add_argument("--resume", action="store_true", help="go on with what the folder holds of this")

@@ -148,6 +148,8 @@ def export(netlist: Netlist, target: Target) -> Iterator[str]:
     if netlist.clocks.channels:
         length, first = netlist.clocks.steps, netlist.n_inputs - netlist.clocks.channels
         yield f"# from neuron {first} on they are clocks: each spikes in {length} steps, one after the other"
+    if netlist.bins > 1:
+        yield f"# a step joins {netlist.bins} bins of the recordings"
     if floating := floating_layers(netlist):
         yield f"# currents of {', '.join(floating)} outlast a step: floats here, whole 64ths on the chip"
     yield "network:"

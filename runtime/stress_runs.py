@@ -17,6 +17,7 @@ import numpy.typing as npt
 from compiler.dynamics import with_clocks
 from compiler.fixedpoint import IntArray
 from compiler.netlist import Netlist
+from models.events import join_bins
 from runtime.battery import NAMES
 from runtime.breakdowns import undecided
 from runtime.damages import Pair
@@ -39,10 +40,11 @@ class Bench:
         The same, prepared.
     sensor : Sensor
     events : (recordings, taxels, polarities, T) uint8
+        In the bins of the recordings, which are disturbed before a network joins them.
     labels : (recordings,) int64
     files : tuple of str
     lengths : (recordings,) int64
-        Steps of each.
+        Bins of each.
     threads : int
         Recordings that run at a time.
     """
@@ -56,6 +58,11 @@ class Bench:
     lengths: IntArray
     threads: int = 1
 
+    def heard(self) -> tuple[Events, IntArray]:
+        """Recordings in steps of the network, and how many steps each has."""
+        bins = self.pair.netlist.bins
+        return join_bins(self.events, bins), -(-self.lengths // bins)
+
 
 def generator(name: str, seed: int) -> np.random.Generator:
     """Source of a perturbation's chance: the same for all levels, so that a harsher one contains a milder one."""
@@ -63,8 +70,9 @@ def generator(name: str, seed: int) -> np.random.Generator:
 
 
 def whole(events: Events, netlist: Netlist, lengths: IntArray) -> Inputs:
-    """Recordings from their first step on."""
-    return Inputs(events=with_clocks(events, netlist.clocks), lengths=lengths, begin=np.zeros_like(lengths))
+    """Recordings from their first bin on."""
+    joined = with_clocks(join_bins(events, netlist.bins), netlist.clocks)
+    return Inputs(events=joined, lengths=-(-lengths // netlist.bins), begin=np.zeros_like(lengths))
 
 
 def by_length(events: Events, lengths: IntArray, change: Callable[[Events], Events]) -> Events:
@@ -78,23 +86,25 @@ def by_length(events: Events, lengths: IntArray, change: Callable[[Events], Even
 
 def after_others(bench: Bench, before: int, rng: np.random.Generator) -> Inputs:
     """Each recording after some others; clocks start again with each."""
-    flat = with_clocks(bench.events, bench.pair.netlist.clocks)
+    heard, lengths = bench.heard()
+    flat = with_clocks(heard, bench.pair.netlist.clocks)
     order = np.stack([rng.permutation(len(flat)) for _ in range(before)] + [np.arange(len(flat))], axis=1)
-    length = bench.lengths[order].sum(axis=1)
+    length = lengths[order].sum(axis=1)
     events = np.zeros((len(flat), flat.shape[1], int(length.max())), np.uint8)
     for i, parts in enumerate(order.tolist()):
-        one = np.concatenate([flat[part, :, : bench.lengths[part]] for part in parts], axis=1)
+        one = np.concatenate([flat[part, :, : lengths[part]] for part in parts], axis=1)
         events[i, :, : one.shape[1]] = one
-    return Inputs(events=events, lengths=length, begin=length - bench.lengths)
+    return Inputs(events=events, lengths=length, begin=length - lengths)
 
 
 def going_round(bench: Bench, rounds: int) -> Inputs:
     """Each recording again and again; clocks run on and end, as they would."""
-    events = np.zeros((*bench.events.shape[:3], bench.events.shape[3] * rounds), np.uint8)
-    for i, length in enumerate(bench.lengths.tolist()):
-        events[i, ..., : length * rounds] = np.tile(bench.events[i, ..., :length], rounds)
-    lengths = bench.lengths * rounds
-    return Inputs(events=with_clocks(events, bench.pair.netlist.clocks), lengths=lengths, begin=lengths - bench.lengths)
+    heard, lengths = bench.heard()
+    events = np.zeros((*heard.shape[:3], heard.shape[3] * rounds), np.uint8)
+    for i, length in enumerate(lengths.tolist()):
+        events[i, ..., : length * rounds] = np.tile(heard[i, ..., :length], rounds)
+    begin = lengths * (rounds - 1)
+    return Inputs(events=with_clocks(events, bench.pair.netlist.clocks), lengths=lengths * rounds, begin=begin)
 
 
 # -- one point ---------------------------------------------------------------------------------------------------------

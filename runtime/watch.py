@@ -327,7 +327,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--bin", default="0.02", metavar="SECONDS", help="length of a bin of the recordings (default: 0.02)"
     )
     parser.add_argument(
-        "--bins", type=int, metavar="N", help="length of every grasp: shorter ones are filled up, longer ones cut"
+        "--bins", type=int, metavar="N", help="steps of every grasp: shorter ones are filled up, longer ones cut"
     )
     parser.add_argument(
         "--origin",

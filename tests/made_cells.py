@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from models.schedule import scaled_decay
+from models.schedule import DECAY_EPOCHS
 from runtime.cells import FORMAT, Row, cell_file, write_cell
 from runtime.published import RECORDINGS
 
@@ -41,7 +41,7 @@ def made_cell(
         "system": system,
         "form": form,
         "epochs": epochs,
-        "decay_epochs": scaled_decay(epochs),
+        "decay_epochs": DECAY_EPOCHS,
         "seed": seed,
         "data_sha256": RECORDINGS[data] if sha256 is None else sha256,
         "test_samples": total,

@@ -4,12 +4,14 @@ import contextlib
 import io
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 from test_checkpoint import rebuilt
 
+from compiler.dynamics import NO_CLOCKS
 from compiler.errors import FormatError, ModelError, OptionError
 from compiler.frontends.checkpoint import read_checkpoint
 from compiler.serialize import manifest_of, netlist_bytes, read_netlist, write_netlist
@@ -18,11 +20,13 @@ from compiler.truenorth.native import SYSTEM as NATIVE
 from models.events import BIN_S, joined_bins, load_data
 from models.grasps import synthetic_grasps
 from models.release import write_event_lines, write_released
-from runtime import chart_work
+from runtime import chart_work, disturbances, stress_runs
 from runtime.cli import main
 from runtime.inputs import require_bins
 
 BINS = 3
+
+NO_MEMORY = "conv1=0,fc1=0,fc2=0,fc3=0"
 
 TRAINED = ("--graph", "manual", "--epochs", "3")
 
@@ -196,7 +200,16 @@ def test_a_netlist_of_other_bins_is_not_from_this_network(refusal):
     "words",
     [
         ("anytime", "NET", "--data", "DATA", "--calibrate", "DATA"),
-        ("stress", "NET", "--checkpoint", "CKPT", "--data", "DATA", "--only", "taxels_dead", "--seeds", "1"),
+        (
+            "stress",
+            "NET",
+            "--checkpoint",
+            "CKPT",
+            "--data",
+            "DATA",
+            "--only",
+            "taxels_dead,warm_state,longer,ties_fire",
+        ),
         ("yardsticks", "CKPT", "--data", "DATA"),
         ("bits", "CKPT", "--calibrate", "DATA", "--widths", "4,8", "--agreement", "0.5"),
         ("lean", "CKPT", "--data", "DATA"),
@@ -217,6 +230,22 @@ def _without_names(value):
     if isinstance(value, dict):
         return {key: _without_names(entry) for key, entry in value.items() if not any(word in key for word in told)}
     return [_without_names(entry) for entry in value] if isinstance(value, list) else value
+
+
+def test_what_is_done_to_recordings_is_done_before_they_are_joined():
+    events = np.zeros((1, 1, 2, 7), np.uint8)
+    events[..., 4] = 1
+    netlist = SimpleNamespace(bins=3, clocks=NO_CLOCKS)
+    late = stress_runs.whole(disturbances.start_late(events, 2), netlist, np.array([7]))
+    assert late.events.tolist() == [[[0, 0, 1]] * 2]
+    assert late.lengths.tolist() == [3]
+
+
+def test_sums_in_time_are_for_networks_that_hear_each_bin(report, refusal):
+    report("train", "--data", "fine", "--join", "3", *TRAINED, "--membrane-decay", NO_MEMORY, "-o", "now.pt")
+    line = refusal("compile", "now.pt", "--target", "truenorth", "--in-time", "2", "-o", "now.loom")
+    assert line.startswith("spikeloom: now.pt: a step joins 3 bins; sums in time are for networks that hear each")
+    assert main(["compile", "x.pt", "--target", "truenorth", "--calibrate", "fine", "-o", "y.loom", "--json"]) == 2
 
 
 def test_a_stream_of_events(report, place):
@@ -255,17 +284,6 @@ def test_lean_takes_networks_of_one_timing(refusal, report):
     assert line == "spikeloom: x.pt: a step joins 3 bins, of bins1.pt 1; spikeloom chart compares such networks"
 
 
-def test_lean_writes_a_netlist_for_joined_bins(report, place, monkeypatch):
-    for other in ("_trials", "_hops", "_together"):
-        monkeypatch.setattr(f"runtime.lean._Session.{other}", lambda *_: ())
-    found = report("lean", "x.pt", "--data", "fine", "--differ", "0.9", "-o", "lean.loom")
-    taken = found["rows"][found["taken"]]
-    assert (taken["removed"], read_netlist(place / "lean.loom").bins) == ({"bins": 4}, 4 * BINS)
-    ran = report("run", "lean.loom", "--data", "fine", "--detail", "counts")
-    assert ran["accuracy"] == taken["test"]["right"] / 18
-    assert ran["costs"]["per_inference"]["energy_j"] == pytest.approx(taken["energy_j"])
-
-
 # --- what else is made of them ----------------------------------------------------------------------------------------
 
 
@@ -274,7 +292,11 @@ def test_joined_networks_and_fine_tuned_ones_keep_them(report, refusal, place):
     report("join", "x.pt", "y.pt", "-o", "both.pt")
     assert (read_checkpoint(place / "both.pt").bins, read_checkpoint(place / "both.pt").towers) == (BINS, 2)
     report("finetune", "x.pt", "--data", "fine", "--weight-bits", "4", "--epochs", "1", "-o", "tuned.pt")
-    assert (read_checkpoint(place / "tuned.pt").bins, len(read_checkpoint(place / "tuned.pt").forms)) == (BINS, 4)
+    report("finetune", "plain.pt", "--data", "long", "--weight-bits", "4", "--epochs", "1", "-o", "plain-tuned.pt")
+    tuned, plain = (read_checkpoint(place / f"{name}.pt") for name in ("tuned", "plain-tuned"))
+    assert (tuned.bins, plain.bins, len(tuned.forms)) == (BINS, 1, 4)
+    assert_array_equal(tuned.dense[0].weight, plain.dense[0].weight)
+    assert tuned.training["data_sha256"] == read_checkpoint(place / "x.pt").training["data_sha256"]
     assert "bins of a step (x.pt: 3; plain.pt: 1)" in refusal("join", "x.pt", "plain.pt", "-o", "z.pt")
 
 
@@ -290,7 +312,11 @@ def test_inspect_tells(place, monkeypatch, capsys):
 def test_exports(report, place):
     assert report("export", "x.loom", "--to", "nir", "-o", "x.nir")["dt"] == pytest.approx(BINS * BIN_S)
     assert netlist_bytes(restore(place / "x.nir", ("euler",))) == (place / "x.loom").read_bytes()
-    report("export", "x.loom", "--to", "netx", "-o", "x.net")
+    exported = [
+        report("export", f"{name}.loom", "--to", "netx", "--data", data, "-o", f"{name}.net")["layers"]
+        for name, data in (("x", "fine"), ("plain", "long"))
+    ]
+    assert exported[0] == exported[1]
     report("compile", "x.net", "-o", "again.loom")
     assert read_netlist(place / "again.loom").bins == BINS
 

@@ -17,7 +17,7 @@ from models.grasps import synthetic_grasps
 from models.networks import Architecture, SpikingNet
 from models.protocols import state_files, train_both, validation_split
 from models.recipes import RELEASED, Recipe
-from models.schedule import DECAY_EPOCHS, scaled_decay
+from models.schedule import DECAY_EPOCHS
 from models.train import Epoch, evaluate, train
 
 GRAPH = build_graph("manual")
@@ -112,8 +112,13 @@ def test_another_decay_is_an_option_that_a_state_remembers(tmp_path):
     assert str(refused.value) == "--decay-epochs 0: allowed are 1 or more; choose another"
 
 
-def test_a_shorter_schedule_falls_in_proportion():
-    assert scaled_decay(100) == DECAY_EPOCHS == RELEASED.decay_epochs
+def test_a_shorter_training_is_the_beginning_of_a_longer_one():
+    recipe = replace(RELEASED, decay_epochs=1)  # so that the rate falls within both
+    short, long = (
+        train(grasps(0), grasps(1), ADJACENCY, SMALL, epochs=n, seed=5, recipe=recipe).history for n in (3, 5)
+    )
+    assert long[:3] == short
+    assert RELEASED.decay_epochs == DECAY_EPOCHS
 
 
 def test_best_weights_are_those_of_the_first_epoch_with_the_most_right(monkeypatch):

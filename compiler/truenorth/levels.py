@@ -188,10 +188,12 @@ def in_levels(network: Network, copies: int, chip: Target) -> LevelNetwork:
     Raises
     ------
     ModelError
-        If a layer remembers, or the network is no chain without clocks.
+        If a layer remembers, a step joins bins, or the network is no chain without clocks.
     """
     if network.input.clocks.channels:
         raise ModelError("has clocks; sums in time are for networks without")
+    if network.input.bins > 1:
+        raise ModelError(f"a step joins {network.input.bins} bins; sums in time are for networks that hear each")
     layers = []
     for index, population in enumerate(network.populations):
         if population.beta or population.alpha:

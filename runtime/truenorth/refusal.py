@@ -113,8 +113,10 @@ def _report(path: str, asked: Asked, chip: Target, trial: Trial | None, steps: i
         "cores_of_chip": chip.limit("chip.cores"),
         "violations": violations,
         "together": together,
-        "retrained": [
-            _way_json(planner.retrained_way(like.name, like), network, steps) | asdict(like) for like in retrained
+        "retrained": [  # which hear each bin
+            _way_json(planner.retrained_way(like.name, like), network, steps and steps * network.input.bins)
+            | asdict(like)
+            for like in retrained
         ],
     }
 

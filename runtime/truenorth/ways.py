@@ -346,6 +346,7 @@ class Planner:
             words.append(f"--system {checkpoint.system}")
         if self.asked.graph and (checkpoint is None or checkpoint.system in GRAPH_SYSTEMS):
             words.append(f"--graph {graph or self.asked.graph}")
+        words += [f"--join {self.network.input.bins}"] if self.network.input.bins > 1 else []
         return " ".join([*words, *([options] if options else []), "-o OUT.pt"])
 
 
