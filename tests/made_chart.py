@@ -74,6 +74,7 @@ def made_chart(*budgets: str) -> dict[str, Any]:
             "fine_tuned": False,
             "trained_by": f"spikeloom train --graph {graph}",
             "validation": validation,
+            "bins": 1,
             "float_training": 1.0,
             "float": {"50": {split: share(n // 2, n) for split, n in SAMPLES.items()}}
             | {"100": {split: share(n * 9 // 10, n) for split, n in SAMPLES.items()}},

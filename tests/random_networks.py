@@ -131,6 +131,7 @@ def random_checkpoint(*, taxels=5, features=3, hops=4, sizes=(6, 5, 4), seed=0, 
         "system": "tactilesgnet",
         "dynamics": PLAIN,
         "towers": 1,
+        "bins": 1,
     }
     # where the weights come from is nothing to the passes
     return Checkpoint(**{field.name: None for field in dataclasses.fields(Checkpoint)} | known)
