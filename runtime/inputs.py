@@ -102,9 +102,16 @@ def require_bins(bins: int) -> None:
 
 
 def asked_recordings(
-    arguments: argparse.Namespace, netlist: Netlist | CrossbarNetlist, *, labels_for: str | None = None
+    arguments: argparse.Namespace,
+    netlist: Netlist | CrossbarNetlist,
+    *,
+    labels_for: str | None = None,
+    joined: bool = True,
 ) -> Recordings:
-    """Recordings that the options of a command name, held against a netlist; as `recordings` otherwise."""
+    """Recordings that the options of a command name, held against a netlist; as `recordings` otherwise.
+
+    In steps of the network if `joined`, else in their own bins.
+    """
     progress("reading the recordings")
     return recordings(
         arguments.data,
@@ -113,7 +120,7 @@ def asked_recordings(
         classes=netlist.classes,
         taxels=netlist.taxels,
         bin_s=arguments.bin,
-        bins=1 if isinstance(netlist, CrossbarNetlist) else netlist.bins,
+        bins=netlist.bins if joined and isinstance(netlist, Netlist) else 1,
         labels_for=labels_for,
     )
 

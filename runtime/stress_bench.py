@@ -17,7 +17,7 @@ from models.sensors import read_layout, sensor_graph
 from runtime.asked import Asked, asked_network
 from runtime.damages import Pair
 from runtime.equivalence import require_match
-from runtime.inputs import progress, recordings, version
+from runtime.inputs import asked_recordings, version
 from runtime.perturbation import Sensor
 from runtime.side_by_side import ready
 from runtime.stress_runs import Bench
@@ -30,16 +30,7 @@ def bench_of(arguments: argparse.Namespace) -> tuple[Bench, Asked, str]:
     netlist = read_netlist(arguments.netlist)
     asked = asked_network(arguments.checkpoint, arguments)
     require_match(netlist, asked.model)
-    progress("reading the recordings")
-    data = recordings(
-        arguments.data,
-        arguments.split,
-        limit=arguments.limit,
-        classes=netlist.classes,
-        taxels=netlist.taxels,
-        bin_s=arguments.bin,
-        labels_for="stress",
-    )
+    data = asked_recordings(arguments, netlist, labels_for="stress", joined=False)
     pair = Pair(netlist=netlist, network=asked.network)
     places, edges = _places(arguments, netlist.taxels), _edges(arguments, asked)
     digest = hashlib.sha256()
