@@ -166,16 +166,17 @@ def _costs(by_data: dict[str, list[Json]]) -> Figure:
 
 
 def _against(axes: Axes, rows: Sequence[Json], costs: Sequence[float]) -> None:
-    """Best epoch and chip of each row over a cost; the name stands over the upper one."""
+    """Best epoch and chip of each row over a cost, dots for seeds; the name stands over the upper one."""
     for row, cost in zip(rows, costs, strict=True):
         spreads = _spreads(row)
         tops = []
         for key in ("best", "chip"):
             label, colour, marker = SERIES[key]
-            mean = spreads[key]["mean"]
+            mean, values = spreads[key]["mean"], spreads[key]["values"]
+            axes.plot([cost] * len(values), values, ".", color=colour, alpha=0.45, markersize=4)
             axes.plot([cost], [mean], marker, color=colour, markersize=5.5, label=label)
-            tops.append(mean)
-        axes.plot([cost, cost], tops, color="0.8", linewidth=0.8, zorder=0)
+            tops += values
+        axes.plot([cost, cost], [min(tops), max(tops)], color="0.8", linewidth=0.8, zorder=0)
         axes.annotate(
             name_of(row),
             (cost, max(tops)),
@@ -187,6 +188,7 @@ def _against(axes: Axes, rows: Sequence[Json], costs: Sequence[float]) -> None:
         )
     if not rows:
         axes.text(0.5, 0.5, "missing", transform=axes.transAxes, ha="center", va="center", color="0.5")
+        axes.set(xticks=[], yticks=[])
     axes.margins(0.08, 0.16)
     axes.grid(alpha=0.3)
 
