@@ -29,11 +29,13 @@ MARGIN = 2.0
 def spread(values: Sequence[float]) -> Json | None:
     """Number, mean, standard deviation and interval of the mean of some accuracies; the last two need two values.
 
+    An interval ends where accuracies do, at 0 and 100.
+
     Examples
     --------
     >>> found = spread([90.0, 88.0])
     >>> {name: round(found[name], 3) for name in ("n", "mean", "std", "low", "high")}
-    {'n': 2, 'mean': 89.0, 'std': 1.414, 'low': 76.294, 'high': 101.706}
+    {'n': 2, 'mean': 89.0, 'std': 1.414, 'low': 76.294, 'high': 100.0}
     >>> spread([90.0]), spread([])
     ({'values': [90.0], 'n': 1, 'mean': 90.0, 'std': None, 'low': None, 'high': None}, None)
     """
@@ -48,8 +50,8 @@ def spread(values: Sequence[float]) -> Json | None:
         "n": len(values),
         "mean": mean,
         "std": statistics.stdev(values),
-        "low": low,
-        "high": high,
+        "low": max(low, 0.0),
+        "high": min(high, 100.0),
     }
 
 
