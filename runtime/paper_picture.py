@@ -166,31 +166,48 @@ def _costs(by_data: dict[str, list[Json]]) -> Figure:
 
 
 def _against(axes: Axes, rows: Sequence[Json], costs: Sequence[float]) -> None:
-    """Best epoch and chip of each row over a cost, dots for seeds; the name stands over the upper one."""
+    """Best epoch and chip of each row over a cost, dots for seeds."""
+    tops = []
     for row, cost in zip(rows, costs, strict=True):
         spreads = _spreads(row)
-        tops = []
+        seen = []
         for key in ("best", "chip"):
             label, colour, marker = SERIES[key]
             mean, values = spreads[key]["mean"], spreads[key]["values"]
             axes.plot([cost] * len(values), values, ".", color=colour, alpha=0.45, markersize=4)
-            axes.plot([cost], [mean], marker, color=colour, markersize=5.5, label=label)
-            tops += values
-        axes.plot([cost, cost], [min(tops), max(tops)], color="0.8", linewidth=0.8, zorder=0)
-        axes.annotate(
-            name_of(row),
-            (cost, max(tops)),
-            xytext=(0, 5),
-            textcoords="offset points",
-            ha="left",
-            fontsize=7,
-            rotation=40,
-        )
-    if not rows:
+            axes.plot([cost], [mean], marker, color=colour, markersize=4.5 if key == "chip" else 7, label=label)
+            seen += values
+        axes.plot([cost, cost], [min(seen), max(seen)], color="0.8", linewidth=0.8, zorder=0)
+        tops.append(max(seen))
+    axes.margins(0.08, 0.08)
+    axes.grid(alpha=0.3)
+    if rows:
+        _name(axes, [name_of(row) for row in rows], costs, tops)
+    else:
         axes.text(0.5, 0.5, "missing", transform=axes.transAxes, ha="center", va="center", color="0.5")
         axes.set(xticks=[], yticks=[])
-    axes.margins(0.08, 0.16)
-    axes.grid(alpha=0.3)
+
+
+def _name(axes: Axes, names: Sequence[str], costs: Sequence[float], tops: Sequence[float]) -> None:
+    """Names in one row above all points, upright and apart, each tied to its point; equal points share theirs."""
+    points: dict[tuple[float, float], list[str]] = {}
+    for name, cost, top in zip(names, costs, tops, strict=True):
+        points.setdefault((cost, top), []).append(name)
+    order = sorted(points)
+    left, right = axes.get_xlim()
+    low, high = axes.get_ylim()
+    row, gap = high, 0.03 * (right - left)
+    places = [cost for cost, _ in order]
+    for index in range(1, len(places)):
+        places[index] = max(places[index], places[index - 1] + gap)
+    places[-1] = min(places[-1], right - gap / 2)
+    for index in range(len(places) - 2, -1, -1):
+        places[index] = min(places[index], places[index + 1] - gap)
+    for place, (cost, top) in zip(places, order, strict=True):
+        axes.plot([cost, place], [top, row], color="0.85", linewidth=0.8, zorder=0)
+        axes.text(place, row, " " + ", ".join(points[cost, top]), ha="center", va="bottom", fontsize=7, rotation=90)
+    axes.set_xlim(left, right)
+    axes.set_ylim(low, high + 0.3 * (high - low))
 
 
 def _quiet(by_data: dict[str, list[Json]]) -> Figure:
