@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-import tempfile
+import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from glob import escape
@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 RANDOM = 8
-"""Letters that `tempfile.mkstemp` draws for a name."""
+"""Letters that are drawn for a name."""
 
 
 @contextmanager
@@ -40,18 +40,19 @@ def remove_leftovers(path: str | os.PathLike[str]) -> None:
         file.unlink(missing_ok=True)
 
 
+def beside(path: Path) -> Path:
+    """A new name for what is to become `path`; known before the file is, so that a signal can never lose it."""
+    return path.parent / f".{path.name}.{secrets.token_hex(RANDOM // 2)}.part"
+
+
 def _write_beside(path: Path) -> Iterator[BinaryIO]:
-    handle, beside = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
+    part = beside(path)
     try:
-        with os.fdopen(handle, "wb") as file:
+        with part.open("xb") as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
-        # mkstemp makes private files; a result should have the permissions of any other new file.
-        mask = os.umask(0)
-        os.umask(mask)
-        Path(beside).chmod(0o666 & ~mask)
-        Path(beside).replace(path)
+        part.replace(path)
     except BaseException:
-        Path(beside).unlink(missing_ok=True)
+        part.unlink(missing_ok=True)
         raise

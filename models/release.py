@@ -9,14 +9,13 @@ import csv
 import io
 import os
 import shutil
-import tempfile
 import zipfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from compiler.atomic import write_atomically
+from compiler.atomic import beside, write_atomically
 from compiler.errors import DataError, OptionError
 from models.events import need_labels
 from models.evtouch import Recordings
@@ -62,17 +61,15 @@ def write_released(path: str | os.PathLike[str], splits: Sequence[Recordings]) -
         return
     if path.exists():
         raise OptionError(f"-o {path}: exists already; choose another name or remove it")
-    beside = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".part", dir=path.absolute().parent))
+    part = beside(path)
     try:
+        part.mkdir()
         for name, content in _members(splits):
-            (beside / name).parent.mkdir(exist_ok=True)
-            (beside / name).write_bytes(content)
-        mask = os.umask(0)  # mkdtemp makes private folders
-        os.umask(mask)
-        beside.chmod(0o777 & ~mask)
-        beside.rename(path)
+            (part / name).parent.mkdir(exist_ok=True)
+            (part / name).write_bytes(content)
+        part.rename(path)
     except BaseException:
-        shutil.rmtree(beside, ignore_errors=True)
+        shutil.rmtree(part, ignore_errors=True)
         raise
 
 

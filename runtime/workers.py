@@ -21,8 +21,8 @@ from compiler.errors import SpikeloomError
 APayload = TypeVar("APayload")
 AResult = TypeVar("AResult")
 
-PATIENCE_S = 5.0
-"""How long a process that was told to end may take for it."""
+PATIENCE_S = 15.0
+"""How long a process that was told to end may take for it; a disk may stall while it writes."""
 
 STOPPED = 143
 """Exit code of a process that a signal ended, as a shell gives it."""
