@@ -1,0 +1,70 @@
+"""Files are written whole or not at all, wherever an interrupt strikes."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+
+from compiler.atomic import remove_leftovers, write_atomically
+
+
+def interrupted_at(line: int, write):
+    """Run `write`; an interrupt strikes at that line of all that it runs (0: none). How many lines there were."""
+    seen = 0
+
+    def trace(_frame, what, _value):
+        nonlocal seen
+        seen += what == "line"
+        if what == "line" and seen == line:
+            raise KeyboardInterrupt
+        return trace
+
+    before = sys.gettrace()
+    sys.settrace(trace)
+    try:
+        write()
+    finally:
+        sys.settrace(before)
+    return seen
+
+
+@pytest.mark.filterwarnings("ignore:Exception ignored in:pytest.PytestUnraisableExceptionWarning")
+def test_an_interrupt_anywhere_leaves_nothing_half_written(tmp_path):
+    path = tmp_path / "x.json"
+
+    def write():
+        with write_atomically(path) as file:
+            file.write(b"new")
+
+    lines = interrupted_at(0, write)
+    assert lines > 20
+    ends, struck = set(), 0
+    for line in range(1, lines + 1):
+        path.write_bytes(b"old")
+        try:
+            interrupted_at(line, write)
+        except KeyboardInterrupt:
+            struck += 1
+        assert [file.name for file in tmp_path.iterdir()] == ["x.json"], line
+        ends.add(path.read_bytes())
+    assert ends == {b"old", b"new"}
+    assert struck > 0.9 * lines
+
+
+def test_leftovers_are_those_of_one_file(tmp_path):
+    path = tmp_path / "x[1].json"
+    with write_atomically(path) as file:
+        (written,) = tmp_path.iterdir()
+        file.write(b"new")
+    for name in (written.name, written.name.replace("x[1]", "x1")):
+        (tmp_path / name).write_bytes(b"half")
+    remove_leftovers(path)
+    assert sorted(file.name for file in tmp_path.iterdir()) == [written.name.replace("x[1]", "x1"), "x[1].json"]
+
+
+def test_permissions_are_those_of_any_new_file(tmp_path):
+    with write_atomically(tmp_path / "a"):
+        pass
+    (tmp_path / "b").write_bytes(b"")
+    assert (tmp_path / "a").stat().st_mode == (tmp_path / "b").stat().st_mode
