@@ -25,7 +25,6 @@ from made_files import (
 )
 from made_files import weights as made_weights
 
-import compiler.atomic
 from compiler import serialize
 from compiler.archive import digest, read_members
 from compiler.errors import FormatError
@@ -808,17 +807,21 @@ def interrupt(*_words, **_options):
     raise KeyboardInterrupt
 
 
+def almost_full(path, mode="r", *options, whole=Path.open, **more):
+    return io.BufferedWriter(FullDisk(path, mode)) if mode == "xb" else whole(path, mode, *options, **more)
+
+
 @pytest.mark.parametrize("old", [b"an older result", None], ids=["over an older file", "new"])
 @pytest.mark.parametrize("words", [["compile", "net.pt", "-o"], ["run", "net.loom", "--data", "data", "--spikes"]])
 @pytest.mark.parametrize(
     ("patched", "replacement", "line"),
     [
         (
-            "fdopen",
-            lambda handle, _mode: io.BufferedWriter(FullDisk(handle, "wb")),
+            "pathlib.Path.open",
+            almost_full,
             "{path}: No space left on device; check space and permissions, nothing was changed",
         ),
-        ("fsync", interrupt, "interrupted; nothing was written"),
+        ("os.fsync", interrupt, "interrupted; nothing was written"),
     ],
     ids=["full disk", "interrupt"],
 )
@@ -826,7 +829,7 @@ def test_an_older_file_stays_intact(refusal, tmp_path, monkeypatch, old, words, 
     path = tmp_path / "result"
     if old is not None:
         path.write_bytes(old)
-    monkeypatch.setattr(compiler.atomic.os, patched, replacement)
+    monkeypatch.setattr(patched, replacement)
     assert refusal(*words, path) == line.format(path=path)
     monkeypatch.undo()
     assert [file.name for file in tmp_path.iterdir()] == ([] if old is None else ["result"])
