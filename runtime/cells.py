@@ -36,7 +36,7 @@ TABLES = ("methods", "graphs")
 METHODS = ((TACTILESGNET, "manual"), (GRID_CNN, NO_PADDING), (MLP, NO_GRAPH), (GCN, "manual"))
 """System, and form of its first layer: graph, or padding of a grid-based CNN; in the order of the paper's table."""
 
-RADII = ("0", "1.5", "2", "2.5", "3", "3.5", "4")
+RADII = ("0", "2", "2.5", "3", "3.5", "4")
 """Sigma of the spanning trees with all pairs nearer than it, in millimetres."""
 
 GRAPHS = (
@@ -44,6 +44,11 @@ GRAPHS = (
     *(f"knn:{k}" for k in range(1, MAX_NEIGHBOURS + 1)),
     *(f"mst:{radius}" for radius in RADII),
 )
+
+SAME_AS = {"mst:1.5": "mst:0"}
+"""A graph of the paper whose pairs are those of another on this sensor, so that one row stands for both: no two taxels
+nearer than 1.5 mm are left unjoined by the tree. The released list of ``mst:1.5`` repeats four of them, see
+``--graph released:mst:1.5``."""
 
 SEEDS = {"methods": 5, "graphs": 3}
 GRID_SEEDS = 3

@@ -9,7 +9,7 @@ from typing import Any
 
 from compiler.frontends.systems import GCN, GRAPH_SYSTEMS, GRID_CNN, MLP, TACTILESGNET
 from models.schedule import DECAY_EPOCHS, EPOCHS
-from runtime.cells import SAME_PADDING
+from runtime.cells import SAME_AS, SAME_PADDING
 from runtime.paper_table import MARGIN, PROTOCOLS
 from runtime.published import RUNS
 from runtime.tables import si, table
@@ -39,11 +39,11 @@ def name_of(row: Json) -> str:
     --------
     >>> [name_of({"table": "methods", "system": s, "form": f}) for s, f in (("gcn", "manual"), ("grid-cnn", "same"))]
     ['GCN, manual graph', 'grid-based CNN, same padding']
-    >>> name_of({"table": "graphs", "system": "tactilesgnet", "form": "mst:1.5"})
-    'mst:1.5'
+    >>> name_of({"table": "graphs", "system": "tactilesgnet", "form": "mst:0"})
+    'mst:0, mst:1.5'
     """
     if row["table"] == "graphs":
-        return str(row["form"])
+        return ", ".join([row["form"], *(name for name, same in SAME_AS.items() if same == row["form"])])
     of = f", {row['form']} graph" if row["system"] in GRAPH_SYSTEMS else ""
     return NAMES[row["system"]] + (", same padding" if row["form"] == SAME_PADDING else of)
 

@@ -20,6 +20,7 @@ from runtime.cell_work import Work, make
 from runtime.cells import (
     FULL_SEEDS,
     GRAPHS,
+    SAME_AS,
     SHORT_EPOCHS,
     TABLES,
     Part,
@@ -171,7 +172,8 @@ def _check(arguments: argparse.Namespace) -> tuple[str, ...]:
         raise OptionError(f"-o {arguments.output}: is not a folder; give the name of one")
     if not place.absolute().parent.is_dir():
         raise OptionError(f"-o {arguments.output}: the folder that it shall be in does not exist; make it first")
-    return tuple(dict.fromkeys(build_graph(name).name for name in arguments.graph or GRAPHS))
+    names = [build_graph(name).name for name in arguments.graph or GRAPHS]
+    return tuple(dict.fromkeys(SAME_AS.get(name, name) for name in names))
 
 
 def _data_sets(paths: Sequence[str]) -> dict[str, DataSet]:

@@ -21,11 +21,12 @@ from compiler.errors import CapacityError, Violation
 from compiler.frontends.checkpoint import read_checkpoint
 from compiler.passes.expand import expand
 from compiler.pipeline import compile_network, without
+from models.graphs import build_graph
 from models.grasps import synthetic_grasps
 from models.networks import Architecture
 from models.release import write_released
 from runtime import engine, paper_picture, paper_table, paper_text
-from runtime.cells import GRAPHS, Row, in_turn, plan, read_cells
+from runtime.cells import GRAPHS, SAME_AS, Row, in_turn, plan, read_cells
 from runtime.cli import main
 from runtime.cluster import ClusterLostError
 from runtime.inputs import propagation
@@ -211,19 +212,32 @@ def test_both_tables_share_their_cells_and_run_the_first_seed_of_all_rows_first(
     parts = plan(["objects"], ("methods", "graphs"))
     assert [(part.table, part.epochs, len(part.cells())) for part in parts] == [
         ("methods", 100, 18),
-        ("graphs", 60, 48),
+        ("graphs", 60, 45),
     ]
     same = plan(["objects"], ("methods", "graphs"), epochs=7, seeds=2)
     cells = in_turn(same)
-    assert len(cells) == 2 * (4 + 16) - 2
-    assert [seed for _, seed in cells] == [0] * 19 + [1] * 19
+    assert len(cells) == 2 * (4 + 15) - 2
+    assert [seed for _, seed in cells] == [0] * 18 + [1] * 18
     full = plan(["objects", "containers"], ("methods", "graphs"), full=True, same_padding=True)
     assert {row.epochs for part in full for row in part.seeds} == {100}
-    assert [len(part.cells()) for part in full] == [2 * 5 * 10, 2 * 16 * 10]
+    assert [len(part.cells()) for part in full] == [2 * 5 * 10, 2 * 15 * 10]
     assert GRAPHS == (
         *("manual", "knn:1", "knn:2", "knn:3", "knn:4", "knn:5", "knn:6", "knn:7", "knn:8"),
-        *("mst:0", "mst:1.5", "mst:2", "mst:2.5", "mst:3", "mst:3.5", "mst:4"),
+        *("mst:0", "mst:2", "mst:2.5", "mst:3", "mst:3.5", "mst:4"),
     )
+
+
+def test_one_row_stands_for_graphs_of_the_same_edges(data, capsys):
+    def edges(name):
+        return set(map(tuple, build_graph(name).edges))
+
+    assert {name: edges(name) == edges(same) for name, same in SAME_AS.items()} == {"mst:1.5": True}
+    assert len({frozenset(edges(name)) for name in GRAPHS}) == len(GRAPHS)
+    words = (*WORDS, "--table", "graphs", "--graph", "mst:1.50", "--graph", "mst:0", "--seeds", "1", "--epochs", "1")
+    report = as_json(capsys, *words)
+    assert [row["form"] for row in report["graphs"]] == ["mst:0"]
+    assert "| mst:0, mst:1.5 | 1 | not available here |" in Path("out/graphs.md").read_text()
+    assert not list(Path("out/networks").glob("*1.5*"))
 
 
 # --- what is there already --------------------------------------------------------------------------------------------
