@@ -112,7 +112,7 @@ def _rounded(value: float | None, digits: int = 3) -> Any:
 # -- Markdown ----------------------------------------------------------------------------------------------------------
 
 
-def markdown(kind: str, epochs: int, rows: Sequence[Json], shorter: Sequence[Json]) -> str:
+def markdown(kind: str, epochs: int, rows: Sequence[Json], noise: Sequence[Json], shorter: Sequence[Json]) -> str:
     """A table of the paper, one section for each data set.
 
     Parameters
@@ -123,6 +123,8 @@ def markdown(kind: str, epochs: int, rows: Sequence[Json], shorter: Sequence[Jso
         Of every training.
     rows : sequence of dict
         See :func:`runtime.paper_table.rows`.
+    noise : sequence of dict
+        See :func:`runtime.paper_noise.differences`.
     shorter : sequence of dict
         See :func:`runtime.paper_table.schedules`; the graphs' table shows it.
     """
@@ -138,7 +140,8 @@ def markdown(kind: str, epochs: int, rows: Sequence[Json], shorter: Sequence[Jso
         "recordings; operations and energy of an inference of a test recording, last epoch.",
     ]
     for data in dict.fromkeys(row["data"] for row in rows):
-        lines += ["", *_section(data, [row for row in rows if row["data"] == data])]
+        of_data = [[each for each in found if each["data"] == data] for found in (rows, noise)]
+        lines += ["", *_section(kind, data, *of_data)]
     if kind == "graphs":
         lines += [
             "",
@@ -149,7 +152,7 @@ def markdown(kind: str, epochs: int, rows: Sequence[Json], shorter: Sequence[Jso
     return "\n".join(lines) + "\n"
 
 
-def _section(data: str, rows: Sequence[Json]) -> list[str]:
+def _section(kind: str, data: str, rows: Sequence[Json], noise: Sequence[Json]) -> list[str]:
     samples = next((row["test_samples"] for row in rows if row["test_samples"]), None)
     one = f" ({samples} test recordings, one is {100 / samples:.2f})" if samples else ""
     heads = ["", "seeds", "paper", *HEADS.values(), "reproduced"]
@@ -157,9 +160,35 @@ def _section(data: str, rows: Sequence[Json]) -> list[str]:
     missing = sum(len(row["missing"]) for row in rows)
     if missing:
         lines += ["", f"Missing: {missing} trainings; `spikeloom reproduce --no-train --json` names them."]
+    lines += _noise_section(kind, noise)
     if any(row["seeds"] for row in rows):
         lines += _chip_section([row for row in rows if row["seeds"]])
     return lines
+
+
+def _noise_section(kind: str, noise: Sequence[Json]) -> list[str]:
+    """Whether rows differ by more than seeds do; nothing where there are too few."""
+    held = [each for each in noise if each["between"] or each["with_operations"]]
+    if not held:
+        return []
+    heads = ["differences", f"{kind} with two seeds or more", "deviation of their means", "by seeds alone", "F", "p"]
+    heads += ["rank correlation with first-layer operations", "p"] if kind == "graphs" else []
+    return ["", *pipes(heads, [_noise_cells(each)[: len(heads)] for each in held])]
+
+
+def _noise_cells(each: Json) -> list[str]:
+    between, rank = each["between"], each["with_operations"]
+    words = [{**HEADS, "chip": "on the chip, last epoch"}[each["reading"]]]
+    if between is None:
+        words += [NONE] * 5
+    else:
+        words += [str(between["rows"]), f"{between['between']:.2f}", f"{between['expected']:.2f}"]
+        words += [f"{between['f']:.2f}", _chance(between["p"])]
+    return [*words, *([NONE] * 2 if rank is None else [f"{rank['rho']:+.2f}", _chance(rank["p"])])]
+
+
+def _chance(p: float) -> str:
+    return f"{p:.2f}" if p >= 0.005 else f"{p:.1g}"
 
 
 def _chip_section(rows: Sequence[Json]) -> list[str]:

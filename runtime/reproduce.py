@@ -15,7 +15,7 @@ from models.events import BIN_S
 from models.evtouch import Recordings
 from models.graphs import NEUTOUCH, build_graph
 from models.schedule import EPOCHS
-from runtime import paper_picture, paper_table, paper_text
+from runtime import paper_noise, paper_picture, paper_table, paper_text
 from runtime.cell_work import Work, make
 from runtime.cells import (
     FULL_SEEDS,
@@ -245,7 +245,8 @@ def write_tables(folder: Path, parts: Sequence[Part], *, pictures: bool) -> Json
     Returns
     -------
     dict
-        ``methods`` and ``graphs``: rows; ``schedule``; ``elsewhere``: cells of no row; ``files``.
+        ``methods`` and ``graphs``: rows; ``methods_differences``, ``graphs_differences``; ``schedule``; ``elsewhere``:
+        cells of no row; ``files``.
     """
     cells = read_cells(folder)
     report: Json = {}
@@ -254,10 +255,12 @@ def write_tables(folder: Path, parts: Sequence[Part], *, pictures: bool) -> Json
     for part in parts:
         rows = paper_table.rows(part, cells)
         shown |= {name for row in rows for name in row["cells"]}
+        noise = paper_noise.differences(rows)
         shorter = paper_table.schedules(cells, part.epochs) if part.table == "graphs" else []
-        report |= {part.table: rows} | ({"schedule": shorter} if part.table == "graphs" else {})
+        report |= {part.table: rows, f"{part.table}_differences": noise}
+        report |= {"schedule": shorter} if part.table == "graphs" else {}
         files[f"{part.table}.csv"] = paper_text.csv_text(rows).encode()
-        files[f"{part.table}.md"] = paper_text.markdown(part.table, part.epochs, rows, shorter).encode()
+        files[f"{part.table}.md"] = paper_text.markdown(part.table, part.epochs, rows, noise, shorter).encode()
         if pictures:
             files |= paper_picture.pictures(part.table, rows)
     report["elsewhere"] = len(cells.keys() - shown)

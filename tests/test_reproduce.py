@@ -14,7 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import RUNTIME
+from hypothesis import given
+from hypothesis import strategies as st
 from made_cells import CAPACITY, kept, made_cell
+from scipy import stats
 
 import models.train
 from compiler.errors import CapacityError, Violation
@@ -25,7 +28,7 @@ from models.graphs import build_graph
 from models.grasps import synthetic_grasps
 from models.networks import Architecture
 from models.release import write_released
-from runtime import engine, paper_picture, paper_table, paper_text
+from runtime import engine, paper_noise, paper_picture, paper_table, paper_text
 from runtime.cells import GRAPHS, SAME_AS, Row, in_turn, plan, read_cells
 from runtime.cli import main
 from runtime.cluster import ClusterLostError
@@ -444,6 +447,47 @@ def test_a_shorter_training_is_compared_where_both_lengths_have_two_seeds():
     assert not paper_table.schedules(dict(enumerate(made)), 100)
     (alone, *_) = paper_table.schedules(dict(enumerate(made[:3])), 60)
     assert "within" not in alone
+
+
+def made_row(table, form, values, operations, data="objects"):
+    spread = paper_table.spread(values)
+    chip = {"last": spread, "first_layer_operations": operations}
+    return {"table": table, "data": data, "form": form, "best": spread, "last": None, "clean": spread, "chip": chip}
+
+
+def test_rows_that_differ_by_more_than_seeds():
+    values = [[90.0, 92.0], [80.0, 82.0], [85.0, 87.0], [84.0]]
+    rows = [made_row("graphs", str(n), each, n) for n, each in enumerate(values)]
+    best, last, _, chip = paper_noise.differences(rows)
+    assert (best["reading"], last["reading"], chip["reading"]) == ("best", "last", "chip")
+    assert best["between"] == chip["between"] == paper_noise.analysis(values[:3])
+    assert best["between"]["rows"] == 3
+    assert best["between"]["within"] == pytest.approx(math.sqrt(2))
+    assert best["between"]["expected"] == pytest.approx(1.0), "two seeds a row"
+    assert best["between"]["between"] == pytest.approx(5.0)
+    assert best["between"]["f"] == pytest.approx(25.0)
+    assert best["between"]["p"] == pytest.approx(0.0134, abs=1e-4)
+    assert best["with_operations"]["rho"] == pytest.approx(-0.4)
+    assert (last["between"], last["with_operations"]) == (None, None)
+    assert [
+        each["with_operations"] for each in paper_noise.differences([row | {"table": "methods"} for row in rows])
+    ] == [None] * 4
+
+
+@given(st.lists(st.lists(st.integers(0, 60), min_size=2, max_size=4), min_size=2, max_size=6))
+def test_analysis_of_variance_is_that_of_scipy(groups):
+    found = paper_noise.analysis(groups)
+    if found is None:
+        assert all(len(set(group)) == 1 for group in groups)
+    else:
+        assert (found["f"], found["p"]) == pytest.approx(tuple(stats.f_oneway(*groups)), rel=1e-6, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("values", "others"), [([1, 2, 3], [1, 2, 3]), ([1, 1, 1, 1], [1, 2, 3, 4]), ([1, 2, 3, 4], [1, 1, 1, 1])]
+)
+def test_no_rank_correlation_of_too_little(values, others):
+    assert paper_noise.rank_correlation(values, others) is None
 
 
 def made_folder(folder: Path) -> Path:
