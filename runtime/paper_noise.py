@@ -112,6 +112,8 @@ def rank_correlation(values: Sequence[float], others: Sequence[float]) -> Json |
     >>> found["rows"], round(found["rho"], 2), round(found["p"], 3)
     (5, 0.82, 0.089)
     """
+    # means of the same counts in another order are the same rank, although floats add up differently
+    values, others = ([round(value, 9) for value in each] for each in (values, others))
     if len(values) < FEWEST or len(set(values)) == 1 or len(set(others)) == 1:
         return None
     from scipy.stats import spearmanr  # half a second that other commands need not wait

@@ -483,6 +483,14 @@ def test_analysis_of_variance_is_that_of_scipy(groups):
         assert (found["f"], found["p"]) == pytest.approx(tuple(stats.f_oneway(*groups)), rel=1e-6, abs=1e-9)
 
 
+def test_ranks_are_those_of_counts():
+    sums = [0.1 + 0.2 + 0.3, 0.3 + 0.2 + 0.1, 1.0, 2.0]
+    assert sums[0] != sums[1]
+    assert paper_noise.rank_correlation(sums, [1, 2, 3, 4]) == paper_noise.rank_correlation(
+        [6, 6, 10, 20], [1, 2, 3, 4]
+    )
+
+
 @pytest.mark.parametrize(
     ("values", "others"), [([1, 2, 3], [1, 2, 3]), ([1, 1, 1, 1], [1, 2, 3, 4]), ([1, 2, 3, 4], [1, 1, 1, 1])]
 )
