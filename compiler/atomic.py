@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import secrets
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from glob import escape
@@ -19,23 +20,27 @@ def write_atomically(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     """Open a new file beside `path`; rename it onto `path` when the block ends well.
 
     Whatever stops the block (an error, a full disk, an interrupt) leaves an existing `path` as it was and no
-    half-written file behind.
+    half-written file behind. A file that is replaced hands its permissions on; of a link the target is replaced.
 
     Raises
     ------
     OSError
-        If the folder does not exist or cannot be written, or the disk is full; ``filename`` is `path`.
+        If the folder does not exist or cannot be written, or the disk is full; ``filename`` is `path`, unless the
+        block raised it for another file.
     """
-    path = Path(path)
+    target = Path(path).resolve()
+    part = beside(target)
     try:
-        yield from _write_beside(path)
+        yield from _write_beside(target, part)
     except OSError as error:
+        if error.filename not in (None, str(part)):
+            raise
         raise OSError(error.errno, error.strerror or str(error), str(path)) from error
 
 
 def remove_leftovers(path: str | os.PathLike[str]) -> None:
     """Remove what a killed process left half-written beside `path`; for a `path` that nobody else is writing."""
-    path = Path(path)
+    path = Path(path).resolve()
     for file in path.parent.glob(f".{escape(path.name)}.{'?' * RANDOM}.part"):
         file.unlink(missing_ok=True)
 
@@ -45,10 +50,11 @@ def beside(path: Path) -> Path:
     return path.parent / f".{path.name}.{secrets.token_hex(RANDOM // 2)}.part"
 
 
-def _write_beside(path: Path) -> Iterator[BinaryIO]:
-    part = beside(path)
+def _write_beside(path: Path, part: Path) -> Iterator[BinaryIO]:
     try:
         with part.open("xb") as file:
+            if path.exists():
+                part.chmod(stat.S_IMODE(path.stat().st_mode))
             yield file
             file.flush()
             os.fsync(file.fileno())

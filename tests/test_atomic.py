@@ -63,6 +63,39 @@ def test_leftovers_are_those_of_one_file(tmp_path):
     assert sorted(file.name for file in tmp_path.iterdir()) == [written.name.replace("x[1]", "x1"), "x[1].json"]
 
 
+def test_a_file_that_is_replaced_hands_its_permissions_on(tmp_path):
+    path = tmp_path / "a"
+    path.write_bytes(b"old")
+    path.chmod(0o600)
+    with write_atomically(path) as file:
+        file.write(b"new")
+    assert (path.read_bytes(), path.stat().st_mode & 0o777) == (b"new", 0o600)
+
+
+def test_of_a_link_the_target_is_replaced(tmp_path):
+    (tmp_path / "there").mkdir()
+    target, link = tmp_path / "there" / "a", tmp_path / "b"
+    for content in (b"old", b"new"):
+        link.unlink(missing_ok=True)
+        link.symlink_to(target)
+        with write_atomically(link) as file:
+            file.write(content)
+        assert link.is_symlink()
+        assert target.read_bytes() == content
+        assert [file.name for file in target.parent.iterdir()] == ["a"]
+
+
+def test_errors_of_other_files_keep_their_names(tmp_path):
+    other = tmp_path / "none" / "other"
+    with pytest.raises(FileNotFoundError) as raised, write_atomically(tmp_path / "a"):
+        other.read_bytes()
+    assert raised.value.filename == str(other)
+    with pytest.raises(FileNotFoundError) as raised, write_atomically(other):
+        pass
+    assert raised.value.filename == str(other)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_permissions_are_those_of_any_new_file(tmp_path):
     with write_atomically(tmp_path / "a"):
         pass
