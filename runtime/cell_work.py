@@ -18,6 +18,7 @@ from runtime import paper_table
 from runtime.cells import FORMAT, SAME_PADDING, Row, write_cell
 from runtime.cluster import ClusterLostError
 from runtime.inputs import progress
+from runtime.locks import only_one
 from runtime.sweep import Point, left_out, spread
 from runtime.training import Job
 from runtime.workers import ProcessDied, ended_by_signal
@@ -72,8 +73,9 @@ def run_cell(work: Work) -> Json:
     from runtime.training import recall, run_job
 
     job = work.job
-    clear(job)
-    record, _ = recall(job) if finished(job) else run_job(job)
+    with only_one(job.output):
+        clear(job)
+        record, _ = recall(job) if finished(job) else run_job(job)
     found = {
         "format": FORMAT,
         "data": work.row.data,

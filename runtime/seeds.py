@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 from compiler.atomic import remove_leftovers
 from compiler.errors import OptionError
 from compiler.fixedpoint import IntArray
+from runtime.locks import only_one
 from runtime.training import Job, recall, run_job, state_of
 from runtime.workers import ProcessDied, cores, ended_by_signal, run_side_by_side
 
@@ -48,10 +49,17 @@ def train_seeds(jobs: Sequence[Job], *, resume: bool) -> list[Result]:
     ------
     OptionError
         If there is something to resume and `resume` is false, or the reverse; if a file holds another training; or if
-        a training ended without a result.
+        a training ended without a result; if another process works on a file.
     KeyboardInterrupt
         On an interrupt or a request to end; its text says what is kept.
     """
+    with ExitStack() as locks:
+        for job in jobs:
+            locks.enter_context(only_one(job.output))
+        return _train(jobs, resume=resume)
+
+
+def _train(jobs: Sequence[Job], *, resume: bool) -> list[Result]:
     results: dict[int, Result] = {}
     for index, job in enumerate(jobs):
         if resume and finished(job):

@@ -10,7 +10,8 @@ from io import FileIO
 from pathlib import Path
 from typing import Any
 
-from compiler.errors import DataError, OptionError
+from compiler.errors import DataError
+from runtime.locks import lock
 
 Json = dict[str, Any]
 
@@ -80,7 +81,7 @@ def opened(path: Path, *, kind: str, version: int, fresh: bool = False) -> Itera
     header = {"spikeloom": "sweep", "format": FORMAT, "kind": kind, "version": version}
     path.touch()
     with path.open("r+b", buffering=0) as file:
-        _lock(path, file)
+        lock(file, f"{path}: another sweep is writing to it; wait for that one, or give another output")
         results, whole = _read(path, file.readall(), header, fresh=fresh)
         file.seek(whole)
         file.truncate()
@@ -106,20 +107,6 @@ def _append(path: Path, file: FileIO, line: bytes) -> None:
             file.seek(before)
             file.truncate()
         raise OSError(error.errno, error.strerror or str(error), str(path)) from error
-
-
-def _lock(path: Path, file: FileIO) -> None:
-    """Keep a second sweep away; the lock goes with the process, however that ends."""
-    try:
-        import fcntl
-    except ImportError:  # not on Windows
-        return
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        raise OptionError(
-            f"{path}: another sweep is writing to it; wait for that one, or give another output"
-        ) from None
 
 
 def _read(path: Path, content: bytes, wanted: Json, *, fresh: bool) -> tuple[dict[str, Json], int]:

@@ -127,10 +127,10 @@ def run_side_by_side(
     try:
         while queue or busy:
             while queue and len(busy) < processes:
-                ours, process = idle.pop() if idle else _begin(context, run)
+                ours, process = _still_alive(idle) or _begin(context, run)
                 index = queue.popleft()
                 busy[ours] = index, process
-                with suppress(BrokenPipeError, ConnectionResetError):  # it died while idle, which is noticed below
+                with suppress(BrokenPipeError, ConnectionResetError):  # it died, which is noticed below
                     ours.send(payloads[index])
             for ready in wait(list(busy)):
                 ours = next(known for known in busy if known is ready)
@@ -171,6 +171,16 @@ def attempt(run: Callable[[APayload], AResult], payload: APayload) -> AResult | 
         return error.with_traceback(None)
     except Exception:  # a defect; not every exception survives the way
         return RuntimeError(traceback.format_exc())
+
+
+def _still_alive(idle: list[tuple[Connection, SpawnProcess]]) -> tuple[Connection, SpawnProcess] | None:
+    """Take an idle process; one that died meanwhile is dropped, which is the fault of no payload."""
+    while idle:
+        ours, process = idle.pop()
+        if process.is_alive():
+            return ours, process
+        ours.close()
+    return None
 
 
 def _begin(context: SpawnContext, run: Callable[[APayload], AResult]) -> tuple[Connection, SpawnProcess]:
