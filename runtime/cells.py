@@ -215,9 +215,11 @@ def read_cells(folder: Path) -> dict[str, Json]:
     Raises
     ------
     DataError
-        If a file there is damaged, of another version, or bears the name of another cell.
+        If a file there is damaged, of another version, or bears the name of another cell, or if two data sets bear
+        one name.
     """
-    found = {}
+    found: dict[str, Json] = {}
+    first: dict[str, Json] = {}
     for file in sorted((folder / "cells").glob("*.json")):
         try:
             cell = json.loads(file.read_text("utf-8"))
@@ -227,6 +229,12 @@ def read_cells(folder: Path) -> dict[str, Json]:
             known = False
         if not known:
             raise DataError(f"{file}: no cell of that name, or one of another version; delete it to measure anew")
+        other = first.setdefault(cell["data"], cell)
+        if cell["data_sha256"] != other["data_sha256"]:
+            raise DataError(
+                f"{file}: is of other recordings named {cell['data']} than {row_of(other).cell(other['seed'])}; "
+                "keep those of one data set"
+            )
         found[file.stem] = cell
     return found
 

@@ -202,8 +202,14 @@ def _chip_section(rows: Sequence[Json]) -> list[str]:
     heads += ["operations saved", "of the first layer", *(f"energy saved, {name}" for name in energies), "cores"]
     if held:
         lines += ["", *pipes([*heads, "decisions changed"], [_quiet_cells(row, energies) for row in held])]
-    refused = [f"- {name_of(row)}: Loihi 1 refuses it: {'; '.join(row['refused'])}" for row in rows if row["refused"]]
+    refused = [_refusal(row) for row in rows if row["refused"]]
     return [*lines, *([""] if refused else []), *refused]
+
+
+def _refusal(row: Json) -> str:
+    fit, seeds = row["chip"]["last"]["n"] if row["chip"] else 0, len(row["seeds"])
+    what = f"{seeds - fit} of {seeds} seeds, the figures are of the others" if fit else "it"
+    return f"- {name_of(row)}: Loihi 1 refuses {what}: {'; '.join(row['refused'])}"
 
 
 def _accuracies(row: Json) -> list[str]:
@@ -356,9 +362,16 @@ def _terminal_cells(row: Json) -> list[str]:
         counted(row),
         NONE if row["paper"] is None else paper_words(row),
         *(_short(row[protocol]) for protocol in PROTOCOLS),
-        _short(row["chip"]["last"]) if row["chip"] else "refused" if row["refused"] else "missing",
+        _chip_words(row),
         NONE if found is None else "yes" if found["within"] else "no",
     ]
+
+
+def _chip_words(row: Json) -> str:
+    if row["chip"] is None:
+        return "refused" if row["refused"] else "missing"
+    last = row["chip"]["last"]
+    return _short(last) + (f", {last['n']} of {len(row['seeds'])} fit" if row["refused"] else "")
 
 
 def _short(spread: Json | None) -> str:

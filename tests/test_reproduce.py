@@ -2,6 +2,7 @@
 
 import csv
 import io
+import itertools
 import json
 import math
 import os
@@ -14,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import RUNTIME
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_cells import CAPACITY, kept, made_cell
 from scipy import stats
@@ -452,7 +453,8 @@ def test_a_shorter_training_is_compared_where_both_lengths_have_two_seeds():
 def made_row(table, form, values, operations, data="objects"):
     spread = paper_table.spread(values)
     chip = {"last": spread, "first_layer_operations": operations}
-    return {"table": table, "data": data, "form": form, "best": spread, "last": None, "clean": spread, "chip": chip}
+    row = {"table": table, "data": data, "form": form, "chip": chip, "refused": None}
+    return row | {"best": spread, "last": None, "clean": spread}
 
 
 def test_rows_that_differ_by_more_than_seeds():
@@ -489,6 +491,43 @@ def test_ranks_are_those_of_counts():
     assert paper_noise.rank_correlation(sums, [1, 2, 3, 4]) == paper_noise.rank_correlation(
         [6, 6, 10, 20], [1, 2, 3, 4]
     )
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.lists(st.tuples(st.integers(0, 4), st.integers(0, 4)), min_size=4, max_size=6))
+def test_few_rows_are_told_by_every_order(pairs):
+    values, others = zip(*pairs, strict=True)
+    found = paper_noise.rank_correlation(values, others)
+    if found is None:
+        assert len(set(values)) == 1 or len(set(others)) == 1
+        return
+    rhos = [stats.spearmanr(order, others).statistic for order in itertools.permutations(values)]
+    low, high = (np.mean([sign * (rho - found["rho"]) >= -1e-9 for rho in rhos]) for sign in (-1, 1))
+    assert found["p"] == pytest.approx(min(1, 2 * min(low, high)))
+
+
+def test_more_rows_are_told_by_the_distribution():
+    rng = np.random.default_rng(0)
+    values, others = rng.normal(size=(2, paper_noise.COUNTED + 1))
+    assert paper_noise.rank_correlation(values, others)["p"] == pytest.approx(stats.spearmanr(values, others).pvalue)
+
+
+def test_a_chip_that_takes_some_seeds(tmp_path, capsys):
+    """Figures of those that fit are shown as such, and count in no statistics of the chip."""
+    cells = [
+        made_cell("objects", system, form, 100, seed, (127 - seed, 125 + seed, 126 - seed), chip=chip)
+        for system, form in (("mlp", "none"), ("grid-cnn", "none"), ("tactilesgnet", "manual"))
+        for seed, chip in enumerate([(119, 120), (120, 121), (118, 119) if system != "grid-cnn" else None])
+    ]
+    kept(tmp_path, *cells)
+    report = as_json(capsys, "reproduce", "--no-train", "-o", str(tmp_path), code=1)
+    text = (tmp_path / "methods.md").read_text("utf-8")
+    words = "- grid-based CNN: Loihi 1 refuses 1 of 3 seeds, the figures are of the others: "
+    assert words + CAPACITY in text
+    between = {each["reading"]: each["between"]["rows"] for each in report["methods_differences"]}
+    assert between == {"best": 3, "last": 3, "clean": 3, "chip": 2}
+    assert main(["reproduce", "--no-train", "-o", str(tmp_path)]) == 1
+    assert "82.99 (0.49), 2 of 3 fit" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -654,6 +693,17 @@ def test_damaged_cells_are_named(tmp_path, capsys):
     for content in ("", "[]", "{}", '{"format": 1}', *(json.dumps(cell | other) for other in others)):
         file.write_text(content)
         assert refused(capsys, "reproduce", "--no-train", "-o", str(tmp_path)) == line
+
+
+def test_cells_of_two_data_sets_of_one_name_are_refused(tmp_path, capsys):
+    one = made_cell("objects", "mlp", "none", 100, 0, (1, 1, 1), chip=(1, 1))
+    kept(
+        tmp_path, one, made_cell("objects", "mlp", "none", 100, 1, (1, 1, 1), chip=(1, 1), samples=60, sha256="0" * 64)
+    )
+    first, second = sorted((tmp_path / "cells").iterdir())
+    assert refused(capsys, "reproduce", "--no-train", "-o", str(tmp_path)) == (
+        f"{second}: is of other recordings named objects than {first.stem}; keep those of one data set"
+    )
 
 
 def test_names_of_cells_are_those_of_files():
