@@ -62,15 +62,14 @@ def main() -> None:
 
 
 def _summary(networks: list[Json]) -> Json:
-    """All networks, and mean, deviation and Student's 95 % interval of each figure."""
+    """All networks, and mean, deviation and Student's 95 % interval of each figure; one network has a mean only."""
     mean: Json = {}
     for key in ("float", "chip", "synaptic_operations"):
         values = [network[key] for network in networks]
-        low, high = of_mean(values) if len(values) > 1 else (values[0], values[0])
         mean[key] = {
             "mean": statistics.mean(values),
-            "std": statistics.stdev(values) if len(values) > 1 else 0.0,
-            "interval": [low, high],
+            "std": statistics.stdev(values) if len(values) > 1 else None,
+            "interval": list(of_mean(values)) if len(values) > 1 else None,
         }
     return {"networks": networks, "mean": mean}
 
@@ -84,8 +83,11 @@ def _table(found: Json) -> str:
         cells = []
         for weights, key in (("last", "float"), ("clean", "float"), ("last", "chip"), ("clean", "chip")):
             mean = variant[weights]["mean"][key]
-            low, high = (end * percent for end in mean["interval"])
-            cells.append(f"{mean['mean'] * percent:.2f}, {mean['std'] * percent:.2f} ({low:.2f} … {high:.2f})")
+            words = f"{mean['mean'] * percent:.2f}"
+            if mean["interval"] is not None:
+                low, high = (end * percent for end in mean["interval"])
+                words += f", {mean['std'] * percent:.2f} ({low:.2f} … {high:.2f})"
+            cells.append(words)
         operations = variant["last"]["mean"]["synaptic_operations"]["mean"] / 1e6
         lines.append(f"| {name} | {len(variant['commands'])} | {' | '.join(cells)} | {operations:.2f} M |")
     return "\n".join(lines)

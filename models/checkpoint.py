@@ -27,6 +27,10 @@ _EPOCH = (1980, 1, 1, 0, 0, 0)
 Tensors = Mapping[str, npt.NDArray[np.float32]]
 
 
+CHOSEN_ON = {"last": "nothing", "best": "the test split", "clean": "a part of the training split"}
+"""What decided which epoch the weights of a set are from."""
+
+
 def training_record(
     reported: Reported, training: Recordings, test: Recordings, *, command: str, seed: int
 ) -> dict[str, Any]:
@@ -50,9 +54,7 @@ def training_record(
                 "epoch": epoch,
                 "correct": history[epoch - 1].correct,
                 "accuracy": history[epoch - 1].accuracy,
-                "chosen_on": {"last": "nothing", "best": "the test split", "clean": "a part of the training split"}[
-                    name
-                ],
+                "chosen_on": CHOSEN_ON[name],
             }
             for name, epoch in chosen.items()
         },

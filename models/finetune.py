@@ -23,14 +23,14 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 from tqdm import tqdm
 
-from compiler.errors import DataError, ModelError, OptionError
+from compiler.errors import ModelError, OptionError
 from compiler.fixedpoint import BIAS_EXPONENT_MAX, BIAS_MANTISSA_MAX, MEMBRANE_SHIFT, THRESHOLD_MANTISSA_MAX
 from compiler.forms import Form, reach, step_units
 from compiler.frontends.checkpoint import Checkpoint
 from compiler.frontends.own import arrays_digest
+from compiler.frontends.towers import arrays_of
 from compiler.interpret import channels_last
 from compiler.ir import Network
 from compiler.passes.calibrate import Calibration, calibrate, evenly_spaced
@@ -40,7 +40,7 @@ from models.evtouch import Recordings
 from models.networks import Weights
 from models.quantised import QuantisedNet, time_first
 from models.resume import TrainingState, pack, read_state, unpack, write_state
-from models.train import one_thread, rate_loss
+from models.train import one_thread, rate_loss, require_finite
 
 BATCH = 4
 """Recordings per step of the optimizer: the weights are rounded anew for each."""
@@ -243,6 +243,10 @@ def finetune(
     forms = initial_forms(network, calibration, widths, groups, target.choices["synapse.exponent"])
     options = {
         "checkpoint": checkpoint.sha256,
+        "network": arrays_digest(arrays_of(checkpoint)),
+        "beta": checkpoint.beta,
+        "theta": checkpoint.theta,
+        "chip": target.name,
         "graph": arrays_digest({"adjacency": adjacency}),
         "training data": arrays_digest(training.identity()),
         "test data": arrays_digest(test.identity()),
@@ -297,24 +301,13 @@ def _epoch(
         rates = model(time_first(training.events[chosen]), lengths)
         loss = rate_loss(rates, labels)
         loss.backward()  # type: ignore[no-untyped-call]
-        _require_finite(model, loss, index + 1)
+        require_finite(model, float(loss.detach()), index + 1, step + 1)
         optimizer.step()
         model.clip_weights()
         model.make_legal()
         total += float(loss.detach()) * len(chosen)
         correct += int(np.sum(rates.detach().numpy().argmax(axis=1) == labels))
     return TunedEpoch(epoch=index + 1, loss=total / len(order), correct=correct)
-
-
-def _require_finite(model: QuantisedNet, loss: Tensor, epoch: int) -> None:
-    """Stop before the weights are touched: those that are no numbers cannot be rounded."""
-    gradients = [parameter.grad for parameter in model.parameters() if parameter.grad is not None]
-    for name, values in (("loss", [loss.detach()]), ("gradient", gradients)):
-        found = sum(float(value.sum()) for value in values)
-        if not math.isfinite(found):
-            raise DataError(
-                f"epoch {epoch}: the {name} is {found}, a finite number is needed; the epochs before it are kept"
-            )
 
 
 def count_right(model: QuantisedNet, recordings: Recordings) -> int:

@@ -229,18 +229,16 @@ class SpikingNet(nn.Module):
 
     def rates(self, layers: Mapping[str, tuple[Tensor, Tensor]], lengths: Tensor | None = None) -> Tensor:
         """Spikes per step of each output neuron, from what `layers` returned."""
-        spikes = layers[self.dense[-1]][0]
-        if lengths is None:
-            return spikes.mean(0)
-        inside = torch.arange(len(spikes), device=spikes.device)[:, None] < lengths
-        return torch.sum(spikes * inside[..., None], dim=0) / lengths[:, None]
+        return _rates(layers[self.dense[-1]][0], lengths)
 
-    def activity(self, layers: Mapping[str, tuple[Tensor, Tensor]]) -> Tensor:
+    def activity(self, layers: Mapping[str, tuple[Tensor, Tensor]], lengths: Tensor | None = None) -> Tensor:
         """Share of the synapses behind neurons that carry a spike, mean over steps and samples; one number."""
         used, there = torch.zeros(()), 0
         for source, layer in zip(layers, self.dense, strict=False):
             inputs, outputs = self.get_submodule(layer).get_parameter("weight").shape
-            used = used + layers[source][0].mean().cpu() * (inputs * outputs)
+            spikes = layers[source][0]
+            share = spikes.mean() if lengths is None else _rates(spikes, lengths).mean()
+            used = used + share.cpu() * (inputs * outputs)
             there += inputs * outputs
         return used / there
 
@@ -248,7 +246,9 @@ class SpikingNet(nn.Module):
         """Copy of the weights."""
         state = {name: p.detach() for name, p in self.named_parameters()}
         for index, layer in enumerate(("conv1", *self.dense)):
-            state |= {n: self._scaled(index, p) for n, p in state.items() if n.startswith(layer) and "bias" not in n}
+            state |= {
+                n: self._scaled(index, p) for n, p in state.items() if n.startswith(f"{layer}.") and "bias" not in n
+            }
         arrays = {name: p.cpu().numpy() for name, p in state.items()}
         found = {name: (array.T if _turned(name) else array) for name, array in arrays.items()}
         if self.architecture.system == MLP:
@@ -281,6 +281,14 @@ def relayed(clocks: Clocks, like: Tensor) -> Tensor:
     steps, samples, _ = like.shape
     ticks = torch.from_numpy(clocks.events(steps).T.copy()).to(like)
     return ticks[:, None].expand(steps, samples, clocks.channels)
+
+
+def _rates(spikes: Tensor, lengths: Tensor | None) -> Tensor:
+    """Spikes per step of (steps, samples, neurons), without the steps that were filled up."""
+    if lengths is None:
+        return spikes.mean(0)
+    inside = torch.arange(len(spikes), device=spikes.device)[:, None] < lengths
+    return torch.sum(spikes * inside[..., None], dim=0) / lengths[:, None]
 
 
 def _first_layer(architecture: Architecture, generator: torch.Generator) -> nn.Module:

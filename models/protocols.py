@@ -20,7 +20,7 @@ from models.recipes import RELEASED, Recipe
 from models.train import Sizes, Trained, train
 
 VALIDATION_SHARE = 0.2
-"""Share of each class that the first training leaves out."""
+"""Share of each class that the first training leaves out, rounded down to whole recordings."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -43,7 +43,7 @@ class Reported:
 
 
 def validation_split(training: Recordings) -> tuple[Recordings, Recordings]:
-    """Leave a fifth of every class out; the same recordings whatever the seed of the training.
+    """Leave a fifth of every class out, rounded down, one at least; the same recordings whatever the training's seed.
 
     Returns
     -------

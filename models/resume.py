@@ -62,13 +62,18 @@ def read_state(path: str | os.PathLike[str], options: Mapping[str, Any]) -> Trai
         raise ModelError(f"{path}: no interrupted training to resume; leave --resume away")
     if path.stat().st_size > SIZE_LIMIT:
         raise ModelError(f"{path}: {path.stat().st_size} bytes, {SIZE_LIMIT} allowed; this is no training state")
+    damaged = f"{path}: is not a training state or is damaged; delete it and train anew"
     try:
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
+        content = path.read_bytes()
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            if sum(member.file_size for member in archive.infolist()) > len(content):  # states are not compressed
+                raise ModelError(damaged)
+        with np.load(io.BytesIO(content), allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         header = json.loads(str(arrays.pop("header")))
-        found, progress = header["options"], header["progress"]
-    except (zipfile.BadZipFile, ValueError, KeyError, EOFError, TypeError) as error:
-        raise ModelError(f"{path}: is not a training state or is damaged; delete it and train anew") from error
+        found, progress = dict(header["options"]), dict(header["progress"])
+    except (zipfile.BadZipFile, ValueError, KeyError, EOFError, TypeError, RuntimeError, RecursionError) as error:
+        raise ModelError(damaged) from error  # RuntimeError: members are encrypted, or packed in ways unknown here
     differing = sorted(name for name in {*found, *options} if found.get(name) != options.get(name))
     if differing:
         raise OptionError(

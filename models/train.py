@@ -56,7 +56,7 @@ class Epoch:
     epoch : int
         Counted from 1.
     learning_rate : float
-        While it ran.
+        When it began.
     training_loss, test_loss : float
         The recipe's loss, by default the mean squared error of the spike rates against zeros and a one; mean over the
         recordings. A penalty on spikes counts in training only.
@@ -246,12 +246,24 @@ def require_device(device: str) -> None:
         raise OptionError("--device cuda: this machine has no usable GPU; leave --device away")
 
 
-def _require_finite(loss: float, epoch: int, step: int) -> None:
-    if not math.isfinite(loss):
-        raise DataError(
-            f"epoch {epoch}, step {step}: the loss is {loss}, a finite number is needed; the state of the epoch before "
-            "is kept, try a lower learning rate"
-        )
+def require_finite(network: torch.nn.Module, loss: float, epoch: int, step: int) -> None:
+    """Stop before the weights are touched.
+
+    Spikes hide a weight that is no number, since it exceeds no threshold and leaves the loss finite; the gradients of
+    the layers before it show it.
+
+    Raises
+    ------
+    DataError
+        If the loss or a gradient is no longer a number.
+    """
+    gradients = [parameter.grad for parameter in network.parameters() if parameter.grad is not None]
+    for name, found in (("loss", loss), ("gradient", sum(float(each.sum()) for each in gradients))):
+        if not math.isfinite(found):
+            raise DataError(
+                f"epoch {epoch}, step {step}: the {name} is {found}, a finite number is needed; the state of the epoch "
+                "before is kept"
+            )
 
 
 def _restore(
@@ -342,12 +354,12 @@ def _train_epoch(
         if isinstance(network, SpikingNet) and recipe.penalty:
             layers = network.layers(shown)
             loss = _loss(recipe, network.rates(layers, inside).cpu(), recordings.labels[chosen])
-            loss = loss + recipe.penalty * network.activity(layers)
+            loss = loss + recipe.penalty * network.activity(layers, inside)
         else:
             loss = _loss(recipe, network(shown, inside).cpu(), recordings.labels[chosen])
         found = float(loss.detach())
-        _require_finite(found, epoch, step)
         loss.backward()  # type: ignore[no-untyped-call]
+        require_finite(network, found, epoch, step)
         optimizer.step()
         total += found * len(chosen)
     return total / len(order)

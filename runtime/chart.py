@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
-import math
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -14,7 +13,6 @@ from typing import Any
 from compiler.atomic import write_atomically
 from compiler.errors import OptionError
 from compiler.targets import CROSSBARS, Target, load_target
-from models.events import BIN_S
 from runtime import chart_networks, chart_plan, chart_points, sweep
 from runtime.chart_budget import Budget, parse_budgets, pick
 from runtime.chart_grid import Grid, parse_grid
@@ -23,7 +21,7 @@ from runtime.chart_plan import Facts, Stored
 from runtime.chart_tasks import FORMAT, SPLITS, Data
 from runtime.chart_text import chart_text, csv_text
 from runtime.data_commands import add_bin_option
-from runtime.inputs import progress, version
+from runtime.inputs import bin_words, progress, version
 from runtime.options import DATA_HELP, add_model
 from runtime.truenorth.charted import TICK, time_title
 
@@ -129,7 +127,7 @@ def _command(arguments: argparse.Namespace) -> str:
     ]
     words += ["--directed"] if arguments.directed else []
     words += ["--run", str(arguments.run)] if arguments.run else []
-    words += [] if math.isclose(arguments.bin, BIN_S) else ["--bin", f"{arguments.bin:g}"]
+    words += bin_words(arguments.bin)
     words += [word for budget in arguments.budget for word in ("--budget", budget)]
     return shlex.join([*words, "-o", arguments.output])
 

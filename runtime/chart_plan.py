@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -11,11 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from compiler.targets import Target
-from models.events import BIN_S
 from runtime.chart_grid import Grid
 from runtime.chart_networks import Given
 from runtime.chart_tasks import FORMAT, Build, Data, Decide, Run
-from runtime.inputs import version
+from runtime.inputs import bin_words, version
 from runtime.sweep import Point, content_key
 from runtime.windows import WHOLE
 
@@ -194,7 +192,7 @@ def runs(stored: Stored, layout: str, sha256: str, grid: Grid, facts: Facts) -> 
 
 def compile_words(network: Given, storage: Storage, layout: str, facts: Facts) -> list[str]:
     """What to type after ``spikeloom`` to get a netlist."""
-    calibrated = [] if storage.levels is not None else ["--calibrate", facts.data.path, *_bin_words(facts)]
+    calibrated = [] if storage.levels is not None else ["--calibrate", facts.data.path, *bin_words(facts.data.bin_s)]
     words = [*network.words, *storage.words(), *calibrated]
     return [*words, *layout_words(layout), "-o", file_name(network, storage, layout)]
 
@@ -247,10 +245,6 @@ def file_name(network: Given, storage: Storage, layout: str) -> str:
 def commands(stored: Stored, layout: str, window: int, facts: Facts) -> list[str]:
     """What to type to get a point: its netlist, then its figures."""
     compiled = compile_words(stored.network, stored.storage, layout, facts)
-    words = ["run", compiled[-1], "--data", facts.data.path, *_bin_words(facts), "--detail", "counts"]
+    words = ["run", compiled[-1], "--data", facts.data.path, *bin_words(facts.data.bin_s), "--detail", "counts"]
     words += [] if window == WHOLE else ["--window", f"{window}%"]
     return [shlex.join(["spikeloom", *each]) for each in (compiled, words)]
-
-
-def _bin_words(facts: Facts) -> list[str]:
-    return [] if math.isclose(facts.data.bin_s, BIN_S) else ["--bin", f"{facts.data.bin_s:g}"]

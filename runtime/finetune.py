@@ -21,7 +21,17 @@ from compiler.targets import load_target
 from models.events import joined_bins
 from models.graphs import Graph
 from runtime.data_commands import add_bin_option
-from runtime.inputs import asked_checkpoint, asked_graph, graph_words, propagation, recordings, require_place, shipped
+from runtime.inputs import (
+    asked_checkpoint,
+    asked_graph,
+    bin_words,
+    graph_words,
+    propagation,
+    recordings,
+    require_place,
+    shipped,
+)
+from runtime.locks import only_one
 from runtime.options import DATA_HELP, add_model
 from runtime.tables import percent, table
 
@@ -91,7 +101,12 @@ def finetune(arguments: argparse.Namespace) -> tuple[Report, Callable[[Report], 
         On an interrupt; its text says what is kept.
     """
     require_place(arguments.output, "-o", arguments)
-    output = Path(arguments.output)
+    with only_one(Path(arguments.output)):
+        return _finetuned(arguments, Path(arguments.output)), finetune_text, 0
+
+
+def _finetuned(arguments: argparse.Namespace, output: Path) -> Report:
+    """Fine-tune and write the checkpoint; return the report."""
     state = _state(output, resume=arguments.resume)
     target = load_target(arguments.target)
     widths = _widths(arguments.weight_bits)
@@ -124,7 +139,7 @@ def finetune(arguments: argparse.Namespace) -> tuple[Report, Callable[[Report], 
         for split in ("train", "test")
     ]
     training, test = (joined_bins(each, checkpoint.bins) for each in found)
-    from models.checkpoint import save_checkpoint
+    from models.checkpoint import CHOSEN_ON, save_checkpoint
     from models.finetune import finetune as tune
     from models.protocols import data_digest
 
@@ -145,12 +160,10 @@ def finetune(arguments: argparse.Namespace) -> tuple[Report, Callable[[Report], 
     except KeyboardInterrupt:
         kept = f"the epochs so far are kept in {state}; go on with the same command and --resume"
         raise KeyboardInterrupt(kept if state.exists() else "") from None
-    words = graph_words(arguments)
     record = {
-        "command": f"spikeloom finetune {Path(arguments.checkpoint).name} {words + ' ' if words else ''}--data "
-        f"{training.source} --weight-bits {arguments.weight_bits} --scale-groups {arguments.scale_groups} "
-        f"--epochs {arguments.epochs} --seed {arguments.seed}",
+        "command": " ".join(_words(arguments, training.source)),
         "fine_tuned_from": checkpoint.sha256,
+        "fine_tuned_weights": checkpoint.weights,
         "weight_bits": widths,
         "seed": arguments.seed,
         "epochs": arguments.epochs,
@@ -158,7 +171,11 @@ def finetune(arguments: argparse.Namespace) -> tuple[Report, Callable[[Report], 
         "data_sha256": data_digest(*found),
         "test_samples": len(test),
         "before": {"correct": tuned.before, "accuracy": tuned.before / len(test)},
-        "last": {"correct": tuned.after, "accuracy": tuned.after / len(test), "chosen_on": "nothing"},
+        "last": {
+            "correct": tuned.after,
+            "accuracy": tuned.after / len(test),
+            "chosen_on": CHOSEN_ON[checkpoint.weights],
+        },
         "history": [[epoch.loss, epoch.correct] for epoch in tuned.history],
     }
     save_checkpoint(
@@ -176,7 +193,23 @@ def finetune(arguments: argparse.Namespace) -> tuple[Report, Callable[[Report], 
     round_to_forms(expand(read_checkpoint(output), adjacency), tuned.forms)  # it compiles, or says why not
     state.unlink(missing_ok=True)
     sha256 = hashlib.sha256(output.read_bytes()).hexdigest()
-    return record | {"file": output.name, "sha256": sha256}, finetune_text, 0
+    return record | {"file": output.name, "sha256": sha256}
+
+
+def _words(arguments: argparse.Namespace, source: str) -> list[str]:
+    """The words that ask for the same fine-tuning."""
+    words = ["spikeloom", "finetune", Path(arguments.checkpoint).name, *graph_words(arguments).split()]
+    given = {
+        "--run": arguments.run or None,
+        "--weights": arguments.weights,
+        "--beta": arguments.beta,
+        "--theta": arguments.theta,
+        "--target": None if arguments.target == "loihi1" else arguments.target,
+    }
+    words += [word for option, value in given.items() if value is not None for word in (option, str(value))]
+    words += ["--data", source, *bin_words(arguments.bin), "--weight-bits", arguments.weight_bits]
+    words += ["--scale-groups", str(arguments.scale_groups), "--epochs", str(arguments.epochs)]
+    return [*words, "--seed", str(arguments.seed)]
 
 
 def finetune_text(report: Report) -> str:

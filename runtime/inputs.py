@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 import zipfile
 from importlib import metadata, resources
@@ -167,6 +168,11 @@ def graph_words(arguments: argparse.Namespace) -> str:
     words = [f"--graph {arguments.graph}"] if arguments.graph else []
     words += [f"{option} {Path(name).name}" for option, name in files.items() if name]
     return " ".join([*words, *(["--directed"] if arguments.directed else [])])
+
+
+def bin_words(bin_s: float) -> list[str]:
+    """Words that ask for a width of a time bin; none for the usual one."""
+    return [] if math.isclose(bin_s, BIN_S) else ["--bin", f"{bin_s:g}"]
 
 
 def propagation(checkpoint: Checkpoint, asked: Graph | None, where: str) -> tuple[str, FloatArray]:

@@ -21,6 +21,7 @@ from models.systems import PADDINGS, sensor_grid, taxels_alone
 from runtime.inputs import (
     asked_graph,
     asked_places,
+    bin_words,
     graph_words,
     progress,
     recordings,
@@ -91,7 +92,11 @@ def _jobs(
     graph, grid = sensor
     system = arguments.system or TACTILESGNET
     data = arguments.data if arguments.data == SYNTHETIC else training.source
-    words = [f"spikeloom train --data {data}", f"--join {arguments.join}" if arguments.join > 1 else ""]
+    words = [
+        f"spikeloom train --data {data}",
+        " ".join(bin_words(arguments.bin)),
+        f"--join {arguments.join}" if arguments.join > 1 else "",
+    ]
     words += [_system_words(arguments, system), graph_words(arguments)]
     recipe = _recipe(arguments)
     epochs = recipe.epochs if arguments.epochs is None else arguments.epochs

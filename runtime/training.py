@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import statistics
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +18,7 @@ from compiler.fixedpoint import FloatArray, IntArray
 from compiler.frontends.checkpoint import Checkpoint, read_checkpoint
 from compiler.frontends.own import WEIGHTS
 from compiler.frontends.systems import TACTILESGNET, Grid
+from compiler.frontends.towers import arrays_of
 from compiler.truenorth.native import SYSTEM as NATIVE
 from compiler.truenorth.native import USUAL_COPIES
 from compiler.truenorth.trained import Trained, read_trained, write_trained
@@ -222,27 +223,24 @@ def recall(job: Job) -> tuple[dict[str, Any], IntArray | None]:
     """
     found: Checkpoint | Trained = read_trained(job.output) if job.system == NATIVE else read_checkpoint(job.output)
     record = dict(found.training or {})
-    differing = _differing(job, record, found.graph)
+    differing = _differing(job, record, found)
     if isinstance(found, Trained):
         differing += ["copies"] if found.network.copies != job.copies else []
     else:
         ours, theirs = (None if grid is None else grid.to_json() for grid in (job.grid, found.grid))
         differing += ["system"] if found.system != job.system or ours != theirs else []
         differing += ["bins"] if found.bins != job.bins else []
-    _require_same(job, differing, found.weights)
+    _require_same(job, differing, found.sets)
     if not job.draws:
         return _with_file(job, record), None
     if isinstance(found, Trained):
         from models.truenorth.network import predict
 
         return _with_file(job, record), predict(found.network, job.test)
-    weights = {"conv1.hops": found.hops, "conv1.bias": found.conv_bias}
-    weights |= {f"{dense.name}.weight": dense.weight for dense in found.dense}
-    weights |= {f"{dense.name}.bias": dense.bias for dense in found.dense}
-    return _with_file(job, record), _predictions(job, weights)
+    return _with_file(job, record), _predictions(job, arrays_of(found))
 
 
-def _differing(job: Job, record: Mapping[str, Any], graph: str | None) -> list[str]:
+def _differing(job: Job, record: Mapping[str, Any], found: Checkpoint | Trained) -> list[str]:
     """In what a finished training is another one."""
     from models.protocols import data_digest
 
@@ -253,23 +251,26 @@ def _differing(job: Job, record: Mapping[str, Any], graph: str | None) -> list[s
         "device": job.device,
     }
     differing = [name.removesuffix("_sha256") for name, value in wanted.items() if record.get(name) != value]
-    if graph != job.graph.name:
+    if found.graph != job.graph.name or found.edges is None or not np.array_equal(found.edges, job.graph.edges):
         differing.append("graph")
     if record.get("recipe", RELEASED.to_json()) != job.recipe.to_json():
         differing.append("recipe")
     return differing
 
 
-def _require_same(job: Job, differing: list[str], weights: str) -> None:
-    """Refuse another training, and one without the epoch that a picture needs."""
+def _require_same(job: Job, differing: list[str], sets: Collection[str]) -> None:
+    """Refuse another training, and one without an epoch that a picture or ``--keep`` needs."""
     if differing:
         raise OptionError(
             f"{job.output}: holds another training (other {', '.join(differing)}); give its options, or another -o"
         )
-    if job.draws and weights != "last":
+    if job.draws and "last" not in sets:
         raise OptionError(
             f"{job.output}: was written without its last epoch, which --picture draws; leave --picture away"
         )
+    if not set(job.keep) <= set(sets):
+        words = " ".join(f"--keep {which}" for which in sets)
+        raise OptionError(f"{job.output}: holds only what {words} kept; give these, or another -o")
 
 
 def _with_file(job: Job, record: Mapping[str, Any]) -> dict[str, Any]:
@@ -303,12 +304,12 @@ def check_seeds(seeds: int) -> None:
         raise OptionError(f"--seeds {seeds}: at least 1 is needed; give a positive number")
 
 
-def summary(records: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
-    """Mean and standard deviation of the accuracy over seeds, by protocol."""
-    result = {}
+def summary(records: list[dict[str, Any]]) -> dict[str, dict[str, float | None]]:
+    """Mean and standard deviation of the accuracy over seeds, by protocol; one seed has no deviation."""
+    result: dict[str, dict[str, float | None]] = {}
     for protocol in WEIGHTS:
         values = [record[protocol]["accuracy"] for record in records]
-        spread = statistics.stdev(values) if len(values) > 1 else 0.0
+        spread = statistics.stdev(values) if len(values) > 1 else None
         result[protocol] = {"mean": statistics.fmean(values), "std": spread, "min": min(values), "max": max(values)}
     return result
 

@@ -438,6 +438,31 @@ def test_activity_is_the_share_of_synapses_that_carry_a_spike():
     assert float(network.activity(layers).detach()) == pytest.approx(carried / synapses, rel=1e-5)
 
 
+def test_activity_does_not_count_steps_that_were_filled_up():
+    training = grasps(1)
+    _, sizes = small_timed(training)
+    network = SpikingNet(sizes, ADJACENCY, seed=2)
+    one, other = (torch.from_numpy(training.events[i : i + 1].transpose(3, 0, 1, 2).astype(np.float32)) for i in (0, 3))
+    short = other[:17]
+    alone = [float(network.activity(network.layers(events)).detach()) for events in (one, short)]
+    together = torch.cat([one, torch.cat([short, torch.zeros_like(other[17:])])], dim=1)
+    lengths = torch.tensor([len(one), len(short)])
+    found = float(network.activity(network.layers(together), lengths).detach())
+    assert found == pytest.approx(np.mean(alone), rel=1e-5)
+    assert alone[0] != pytest.approx(alone[1], rel=1e-2)
+
+
+def test_the_tenth_layer_is_not_scaled_as_the_first():
+    """A name may begin as another one does."""
+    layers = ("conv1", *(f"fc{number}" for number in range(1, 11)))
+    dynamics = replace(TIMED, clocks=0, alphas=(("fc1", 0.95),)).dynamics(layers, 0.2, 30)
+    sizes = Architecture(taxels=39, classes=3, features=2, hidden=(4,) * 9, dynamics=dynamics)
+    network = SpikingNet(sizes, ADJACENCY, seed=0)
+    found = network.export_weights()
+    assert not np.allclose(found["fc1.weight"], network.fc1.weight.detach().numpy().T)
+    assert_array_equal(found["fc10.weight"], network.fc10.weight.detach().numpy().T)
+
+
 def test_a_penalty_on_spikes_makes_them_fewer():
     training = grasps(1)
     _, sizes = small_timed(training)

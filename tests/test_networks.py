@@ -305,6 +305,7 @@ def checkpoint_of(network: SpikingNet) -> Checkpoint:
         edges=None,
         layout="state_dict",
         weights="last",
+        sets=("last",),
         runs=1,
         training=None,
         forms=(),

@@ -2,6 +2,7 @@
 
 import json
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -187,6 +188,11 @@ def test_an_interrupted_fine_tuning_goes_on_to_the_same_bytes(tmp_path):
     with pytest.raises(OptionError) as caught:
         finetune(checkpoint, adjacency, train, test, LOIHI, resume=True, **(options | {"epochs": 5}))
     assert "epochs" in str(caught.value)
+    moved = replace(checkpoint, conv_bias=checkpoint.conv_bias + 1)  # as other epochs of the same file are
+    for other, what in ((moved, "network"), (replace(checkpoint, beta=0.6), "beta")):
+        with pytest.raises(OptionError) as caught:
+            finetune(other, adjacency, train, test, LOIHI, resume=True, **options)
+        assert f"belongs to a training with other {what}" in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -223,7 +229,7 @@ def test_a_loss_that_is_no_number(tmp_path, monkeypatch, loss, name, found):
     with pytest.raises(DataError) as caught:
         finetune(checkpoint, adjacency, data, data, LOIHI, bits=[4], epochs=2)
     assert str(caught.value) == (
-        f"epoch 1: the {name} is {found}, a finite number is needed; the epochs before it are kept"
+        f"epoch 1, step 1: the {name} is {found}, a finite number is needed; the state of the epoch before is kept"
     )
 
 

@@ -1,6 +1,8 @@
 """The training loop: the released protocol, repeatable to the byte."""
 
+import io
 import json
+import zipfile
 from dataclasses import replace
 
 import numpy as np
@@ -238,6 +240,49 @@ def test_a_damaged_state_is_refused(tmp_path):
     assert str(refused.value) == f"{state}: is not a training state or is damaged; delete it and train anew"
 
 
+def packed(content: bytes) -> bytes:
+    """The same archive, compressed."""
+    found = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(content)) as old, zipfile.ZipFile(found, "w", zipfile.ZIP_DEFLATED) as new:
+        for name in old.namelist():
+            new.writestr(name, old.read(name))
+    return found.getvalue()
+
+
+def encrypted(content: bytes) -> bytes:
+    """Every member says that it needs a password."""
+    return content.replace(b"PK\x03\x04\x2d\x00\x00", b"PK\x03\x04\x2d\x00\x01").replace(
+        b"PK\x01\x02\x2d\x03\x2d\x00\x00", b"PK\x01\x02\x2d\x03\x2d\x00\x01"
+    )
+
+
+def with_header(header: str):
+    def made(content: bytes) -> bytes:
+        with np.load(io.BytesIO(content)) as file:
+            arrays = {name: file[name] for name in file.files} | {"header": np.array(header)}
+        found = io.BytesIO()
+        np.savez(found, **arrays)
+        return found.getvalue()
+
+    return made
+
+
+@pytest.mark.parametrize(
+    "change",
+    [packed, encrypted, with_header("[" * 9000), with_header('{"options": 1, "progress": {}}'), with_header("[]")],
+    ids=["packed", "encrypted", "deep", "number", "list"],
+)
+def test_a_crafted_state_is_refused(tmp_path, change):
+    state = tmp_path / "x.state"
+    train(grasps(0), grasps(1), ADJACENCY, SMALL, epochs=1, state=state)
+    content = state.read_bytes()
+    state.write_bytes(change(content))
+    assert state.read_bytes() != content
+    with pytest.raises(ModelError) as refused:
+        train(grasps(0), grasps(1), ADJACENCY, SMALL, epochs=1, state=state, resume=True)
+    assert str(refused.value) == f"{state}: is not a training state or is damaged; delete it and train anew"
+
+
 def test_a_loss_that_is_no_number_stops_and_keeps_the_state(tmp_path, monkeypatch):
     state = tmp_path / "x.state"
     train(grasps(0), grasps(1), ADJACENCY, SMALL, epochs=1, state=state)
@@ -247,10 +292,26 @@ def test_a_loss_that_is_no_number_stops_and_keeps_the_state(tmp_path, monkeypatc
     with pytest.raises(DataError) as stopped:
         train(grasps(0), grasps(1), ADJACENCY, SMALL, epochs=1, seed=1, state=state)
     assert str(stopped.value) == (
-        "epoch 1, step 2: the loss is nan, a finite number is needed; the state of the epoch before is kept, "
-        "try a lower learning rate"
+        "epoch 1, step 2: the loss is nan, a finite number is needed; the state of the epoch before is kept"
     )
     assert state.read_bytes() == kept
+
+
+def test_a_weight_that_is_no_number_shows_in_the_gradient(monkeypatch):
+    """No spike comes of it, so that the loss alone would hide it."""
+    made = SpikingNet.__init__
+
+    def broken(self, *arguments, **options):
+        made(self, *arguments, **options)
+        with torch.no_grad():
+            self.fc1.weight[0, 0] = float("nan")
+
+    monkeypatch.setattr(SpikingNet, "__init__", broken)
+    with pytest.raises(DataError) as stopped:
+        train(grasps(0), grasps(1), ADJACENCY, SMALL, epochs=1)
+    assert str(stopped.value) == (
+        "epoch 1, step 1: the gradient is nan, a finite number is needed; the state of the epoch before is kept"
+    )
 
 
 def test_a_gpu_that_is_absent_or_unknown_is_refused():

@@ -6,7 +6,9 @@ import random
 import signal
 import subprocess
 import sys
+import threading
 import time
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,8 +23,10 @@ from models.evtouch import load_recordings
 from models.grasps import synthetic_grasps
 from models.release import write_released
 from runtime.cli import main
+from runtime.locks import only_one
 from runtime.seeds import side_by_side
 from runtime.training import draw_training, summary
+from runtime.workers import run_side_by_side
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -54,6 +58,7 @@ def test_one_seed_reports_both_protocols_and_stores_three_epochs(data, capsys):
         "clean": "a part of the training split",
     }
     assert report["protocols"] == summary([run])
+    assert report["protocols"]["last"]["std"] is None
     assert [file.name for file in data.glob("x.pt*")] == ["x.pt"], "states of the training are left"
     epochs = {name: read_checkpoint("x.pt", weights=name) for name in ("last", "best", "clean")}
     for name, checkpoint in epochs.items():
@@ -296,6 +301,42 @@ def test_another_decay_is_stored_and_told_apart(data, capsys):
     assert usual["command"] == "spikeloom train --data data --graph manual --epochs 3 --seed 0"
 
 
+def test_resume_does_not_take_another_graph_of_the_same_name(data, capsys):
+    words = ["train", "--data", "data", "--taxels", "39", "--edges", "edges.csv", "--epochs", "1", "-o", "x.pt"]
+    ring = [f"{taxel},{(taxel + 1) % 39}" for taxel in range(39)]
+    Path("edges.csv").write_text("\n".join(["source,target", *ring]))
+    as_json(capsys, *words)
+    assert main([*words, "--resume"]) == 0
+    Path("edges.csv").write_text("\n".join(["source,target", *ring[:-1], "38,1"]))
+    capsys.readouterr()
+    assert main([*words, "--resume"]) == 2
+    assert capsys.readouterr().err.endswith(
+        "x.pt: holds another training (other graph); give its options, or another -o\n"
+    )
+
+
+def test_resume_misses_an_epoch_that_was_not_kept(data, capsys):
+    as_json(capsys, *WORDS, "--epochs", "1", "--keep", "last", "--keep", "clean", "-o", "x.pt")
+    as_json(capsys, *WORDS, "--epochs", "1", "--keep", "clean", "-o", "x.pt", "--resume")
+    assert refused(capsys, "--epochs", "1", "--keep", "best", "-o", "x.pt", "--resume") == (
+        "x.pt: holds only what --keep last --keep clean kept; give these, or another -o"
+    )
+
+
+def test_one_process_works_on_a_file(data, capsys):
+    pytest.importorskip("fcntl")
+    with only_one(Path("x.pt")):
+        assert Path("x.pt.lock").exists()
+        for options in ([], ["--resume"]):
+            assert refused(capsys, "--epochs", "1", "-o", "x.pt", *options) == (
+                "x.pt: another process is working on it; wait for that one, or give another -o"
+            )
+        as_json(capsys, *WORDS, "--epochs", "1", "-o", "y.pt")
+    Path("x.pt.lock").write_bytes(b"")  # as a killed process leaves it
+    as_json(capsys, *WORDS, "--epochs", "1", "-o", "x.pt")
+    assert sorted(file.name for file in data.glob("*.pt*")) == ["x.pt", "y.pt"]
+
+
 def test_resume_does_not_take_another_training_for_this_one(data, capsys):
     as_json(capsys, *WORDS, "--epochs", "1", "--keep", "best", "-o", "x.pt")
     assert refused(capsys, "--epochs", "2", "--seed", "3", "-o", "x.pt", "--resume") == (
@@ -362,6 +403,24 @@ def test_a_worker_that_fails_ends_all(run, error, line):
     with pytest.raises(error) as raised:
         side_by_side([job, job], [0, 1], {}, run)
     assert str(raised.value) == line
+
+
+def dies_when_idle(first: bool) -> int:
+    """The process that worked on the first payload dies when it has nothing to do."""
+    if first:
+        threading.Timer(0.3, os._exit, [9]).start()
+    return os.getpid()
+
+
+def test_a_process_that_dies_without_work_is_the_fault_of_no_payload():
+    found = []
+    with closing(run_side_by_side([True, False], dies_when_idle, processes=1)) as at_work:
+        for place, result in at_work:
+            found.append((place, result))
+            time.sleep(1)
+    assert [place for place, _ in found] == [0, 1]
+    assert all(isinstance(result, int) for _, result in found), found
+    assert found[0][1] != found[1][1]
 
 
 def test_the_report_fits_a_terminal(data, capsys):

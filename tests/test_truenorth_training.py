@@ -20,7 +20,7 @@ from models.recipes import CROSSBARS
 from models.release import write_released
 from models.surrogate import FAST_SIGMOID, Surrogate
 from models.systems import propagation_of
-from models.truenorth.network import NativeArchitecture, native_network, predict, run_network, sized
+from models.truenorth.network import NativeArchitecture, native_network, predict, run_layers, run_network, sized
 from models.truenorth.neurons import block_sums, integrate
 from runtime.cli import main
 
@@ -103,6 +103,23 @@ def test_shorter_recordings_count_their_own_steps():
     both = net(events, torch.tensor([9, 5]))
     torch.testing.assert_close(both[0], net(events[:, :1])[0])
     torch.testing.assert_close(both[1], net(events[:5, 1:])[0])
+
+
+def test_equal_votes_stay_equal():
+    """With twelve voters a class, the shares of single steps are no binary fractions, and their sums would differ."""
+    sizes = replace(SIZES, voters=6, clocks=clocks_over(2, 40))
+    net = network(sizes=sizes)
+    rng, equal = np.random.default_rng(3), 0
+    for lengths in (None, torch.tensor([40] * 200)):
+        events = torch.tensor(rng.random((40, 200, 6, 2)) < 0.3, dtype=torch.float32)
+        *_, spikes = run_layers(net.rounded(), net.inputs, sizes.clocks, events, net.surrogate)
+        counts = spikes.detach().numpy().sum(0).reshape(200, 12, 3).sum(1)
+        rates = net(events, lengths).detach().numpy()
+        for one, other in ((0, 1), (0, 2), (1, 2)):
+            difference = np.sign(counts[:, one] - counts[:, other])
+            np.testing.assert_array_equal(difference, np.sign(rates[:, one] - rates[:, other]))
+            equal += np.count_nonzero((difference == 0) & (counts[:, one] > 0))
+    assert equal > 10
 
 
 def test_a_seed_gives_the_same_weights():

@@ -90,6 +90,8 @@ class Checkpoint:
         Kind of file.
     weights : {"last", "best", "clean"}
         Epoch that the weights are from.
+    sets : tuple of str
+        All epochs that the file holds.
     runs : int
         Trainings that the file holds; this is one of them.
     training : mapping or None
@@ -118,6 +120,7 @@ class Checkpoint:
     edges: IntArray | None
     layout: str
     weights: str
+    sets: tuple[str, ...]
     runs: int
     training: Mapping[str, Any] | None
     forms: tuple[Form, ...] | None
@@ -211,13 +214,14 @@ def read_checkpoint(
         if weights not in (None, "last"):
             raise ModelError(f"{where}: --weights {weights}: the file holds the last epoch only; leave --weights away")
         graph, edges, chosen, held = None, None, "last", {"beta": BETA, "theta": THETA}
+        sets: tuple[str, ...] = ("last",)
         forms, dynamics, towers, bins = None, PLAIN, 1, 1
         assumed = tuple(name for name, value in given.items() if value is None)
     else:
         if run != 0:
             raise ModelError(f"{where}: --run {run}: the file holds only run 0; leave --run away")
-        arrays, chosen, (graph, edges, held, training), (found, grid, dynamics), (forms, towers, bins) = own_arrays(
-            where, members, weights
+        arrays, (chosen, sets), (graph, edges, held, training), (found, grid, dynamics), (forms, towers, bins) = (
+            own_arrays(where, members, weights)
         )
         if system not in (None, found):
             raise OptionError(f"--system {system}: {where} holds a {found}; leave --system away")
@@ -247,6 +251,7 @@ def read_checkpoint(
         edges=edges,
         layout=layout,
         weights=chosen,
+        sets=sets,
         runs=runs,
         training=training,
         forms=forms,

@@ -5,9 +5,9 @@ Our own format is a plain zip (members stored, not compressed) that needs neithe
 ``manifest.json``
     ``format`` ("spikeloom-checkpoint"), ``version``, ``architecture`` ("tactilesgnet"), ``taxels``, ``classes``,
     ``beta``, ``theta``, ``graph`` (``name`` and ``edges``, pairs of source and target, repeats adding up),
-    ``weights`` (the sets in the file: ``last``, and ``best`` where the epoch that did best on the test split was
-    kept), ``training`` (how it was made and what it reached) and ``sha256`` over all of these and all arrays.
-``last/NAME.npy``, ``best/NAME.npy``
+    ``weights`` (the sets in the file, one at least: ``last``, ``best`` on the test split, ``clean`` on a part of the
+    training split), ``training`` (how it was made and what it reached) and ``sha256`` over all of these and all arrays.
+``last/NAME.npy``, ``best/NAME.npy``, ``clean/NAME.npy``
     float32: ``conv1.hops`` (K + 1, features, channels), ``conv1.bias``, ``weight`` and ``bias`` of ``fc1``, ``fc2`` …
 
 Version 2 adds ``forms`` to the manifest: how the chip stores each layer that the network was fine-tuned for, an
@@ -144,12 +144,12 @@ def own_arrays(
     where: str, members: dict[str, bytes], weights: str | None
 ) -> tuple[
     Arrays,
-    str,
+    tuple[str, tuple[str, ...]],
     tuple[str, IntArray, dict[str, float], dict[str, Any]],
     tuple[str, Grid | None, Dynamics],
     tuple[tuple[Form, ...] | None, int, int],
 ]:
-    """Arrays, their set; graph, edges, constants, training record; system, grid, dynamics; forms, towers, bins."""
+    """Arrays; their set, all sets; graph, edges, constants, record; system, grid, dynamics; forms, towers, bins."""
     manifest = _manifest(where, members.pop("manifest.json"))
     try:
         arrays: Arrays = {name.removesuffix(".npy"): _read_npy(content) for name, content in members.items()}
@@ -193,7 +193,7 @@ def own_arrays(
     if faults:
         raise ModelError(f"{where}: {'; '.join(faults)}; {_AGAIN}")
     forms = _forms(where, manifest, chosen, towers, dynamics.clocks.channels)
-    return chosen, weights, facts, (system, grid, dynamics), (forms, towers, bins)
+    return chosen, (weights, tuple(sets)), facts, (system, grid, dynamics), (forms, towers, bins)
 
 
 def _count(manifest: dict[str, Any], name: str, *, there: bool) -> int:

@@ -239,11 +239,11 @@ class NativeNet(nn.Module):
         architecture = self.architecture
         *_, spikes = run_layers(self.rounded(), self.inputs, architecture.clocks, events, self.surrogate)
         steps, samples, _ = spikes.shape
-        votes = spikes.view(steps, samples, -1, architecture.classes).mean(2)
-        if lengths is None:
-            return votes.mean(0)
-        inside = torch.arange(steps)[:, None] < lengths
-        return torch.sum(votes * inside[..., None], dim=0) / lengths[:, None]
+        cast = spikes.view(steps, samples, -1, architecture.classes)
+        if lengths is not None:
+            cast = cast * (torch.arange(steps)[:, None] < lengths)[..., None, None]
+        votes = cast.sum((0, 2))  # divided once and last, so that equal votes stay equal
+        return votes / (cast.shape[2] * (steps if lengths is None else lengths[:, None]))
 
     def export_weights(self) -> Arrays:
         """Whole numbers of every layer: ``level``, ``threshold``, ``floor`` and ``leak`` after the layer's name."""
