@@ -20,7 +20,7 @@ from unittest.mock import patch
 
 import numpy as np
 
-from compiler.frontends.systems import MLP
+from compiler.frontends.systems import GRAPH_SYSTEMS, MLP
 from models.events import BIN_S
 from models.evtouch import Recordings
 from models.graphs import NEUTOUCH
@@ -56,7 +56,7 @@ def main() -> None:
         runs = []
         for seed in range(asked.seeds):
             words = ["train", "--data", asked.recordings, "--system", asked.system, "--graph", "manual"]
-            words = words[:5] if asked.system == MLP else words
+            words = words if asked.system in GRAPH_SYSTEMS else words[:5]
             words += ["--seed", str(seed), "--epochs", str(asked.epochs), "-o", "none.pt"]
             (job,) = planned(build_parser().parse_args(words), training, test)
             order = order_of(kind, training, seed)

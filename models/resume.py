@@ -5,7 +5,9 @@ from __future__ import annotations
 import io
 import json
 import os
+import tokenize
 import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +21,13 @@ from compiler.atomic import write_atomically
 from compiler.errors import ModelError, OptionError
 
 SIZE_LIMIT = 2**30
+
+DAMAGES = (
+    *(zipfile.BadZipFile, zlib.error, RuntimeError),  # RuntimeError: encrypted, or packed in a way that is not known
+    *(ValueError, KeyError, EOFError, TypeError, RecursionError),
+    *(SyntaxError, tokenize.TokenError),  # of the header of an array
+)
+"""What reading a damaged state may raise."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -72,8 +81,8 @@ def read_state(path: str | os.PathLike[str], options: Mapping[str, Any]) -> Trai
             arrays = {name: file[name] for name in file.files}
         header = json.loads(str(arrays.pop("header")))
         found, progress = dict(header["options"]), dict(header["progress"])
-    except (zipfile.BadZipFile, ValueError, KeyError, EOFError, TypeError, RuntimeError, RecursionError) as error:
-        raise ModelError(damaged) from error  # RuntimeError: members are encrypted, or packed in ways unknown here
+    except DAMAGES as error:
+        raise ModelError(damaged) from error
     differing = sorted(name for name in {*found, *options} if found.get(name) != options.get(name))
     if differing:
         raise OptionError(

@@ -44,6 +44,9 @@ Network = SpikingNet | NativeNet
 
 DEVICES = ("cpu", "cuda")
 
+MOST_SEED = 2**63 - 1
+"""What a torch generator takes."""
+
 TEST_BATCH = 2  # larger batches outgrow the cache
 
 
@@ -229,6 +232,8 @@ def _check_options(epochs: int, decay_epochs: int, seed: int, device: str) -> No
     for name, value, least in (("epochs", epochs, 1), ("decay-epochs", decay_epochs, 1), ("seed", seed, 0)):
         if value < least:
             raise OptionError(f"--{name} {value}: allowed are {least} or more; choose another")
+    if seed > MOST_SEED:
+        raise OptionError(f"--seed {seed}: allowed are 0 to {MOST_SEED}; choose another")
     require_device(device)
 
 

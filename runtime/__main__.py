@@ -2,6 +2,16 @@
 
 import sys
 
-from runtime.cli import main
 
-sys.exit(main())
+def main() -> int:
+    """Run the command; an interrupt while Python still loads it is told as any other."""
+    try:
+        from runtime.cli import main as command
+    except KeyboardInterrupt:
+        sys.stderr.write("spikeloom: interrupted; nothing was written\n")
+        return 2
+    return command()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

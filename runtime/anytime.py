@@ -162,7 +162,7 @@ def _float_votes(arguments: argparse.Namespace, netlist: Netlist, data: Recordin
     from compiler.interpret import cut
     from runtime.equivalence import require_match, spikes_of
 
-    asked = asked_network(arguments.checkpoint, arguments)
+    asked = asked_network(arguments.checkpoint, arguments, netlist)
     require_match(netlist, asked.model)
     readout, lengths = asked.network.readout, _lengths(data)
     votes = []

@@ -17,6 +17,7 @@ from compiler.frontends.nir_neurons import CONVENTIONS
 from compiler.frontends.onnx import SUFFIX as ONNX
 from compiler.frontends.onnx import OnnxNetwork, read_onnx
 from compiler.ir import Network
+from compiler.netlist import Netlist
 from compiler.passes.expand import expand
 from compiler.sidecar import read_said
 from runtime.inputs import asked_checkpoint, asked_graph, progress, propagation
@@ -69,8 +70,10 @@ class Asked:
         return self.network if self.checkpoint is None else self.checkpoint
 
 
-def asked_network(path: str, arguments: argparse.Namespace) -> Asked:
+def asked_network(path: str, arguments: argparse.Namespace, netlist: Netlist | None = None) -> Asked:
     """Read what a command is given.
+
+    Of a checkpoint that holds several epochs, the one that `netlist` was compiled from where the options name none.
 
     Raises
     ------
@@ -81,6 +84,9 @@ def asked_network(path: str, arguments: argparse.Namespace) -> Asked:
     _require_fit(path, suffix, arguments)
     if suffix is None:
         checkpoint = asked_checkpoint(path, arguments)
+        if netlist is not None and arguments.weights is None and _from_file(netlist, checkpoint):
+            made = netlist.provenance["weights"]
+            checkpoint = asked_checkpoint(path, argparse.Namespace(**(vars(arguments) | {"weights": made})))
         graph, adjacency = propagation(checkpoint, asked_graph(arguments, checkpoint.system), path)
         return Asked(
             network=expand(checkpoint, adjacency),
@@ -99,6 +105,14 @@ def asked_network(path: str, arguments: argparse.Namespace) -> Asked:
     dt = arguments.dt if said is None else said.dt
     convention = arguments.convention or (CONVENTIONS[0] if said is None else said.convention)
     return _asked(read_nir(path, dt=dt, convention=convention, **layout), "nir", {"dt": dt, "convention": convention})
+
+
+def _from_file(netlist: Netlist, checkpoint: Checkpoint) -> bool:
+    """Whether a netlist was compiled from another epoch of the same file."""
+    made = netlist.provenance
+    if made.get("checkpoint_sha256") != checkpoint.sha256:
+        return False
+    return made.get("weights") in checkpoint.sets and made["weights"] != checkpoint.weights
 
 
 def _asked(found: OnnxNetwork | NirNetwork, kind: str, read_as: Mapping[str, Any]) -> Asked:

@@ -31,6 +31,9 @@ NO_PADDING, SAME_PADDING = PADDINGS
 KEYS = frozenset({"data_sha256", "decay_epochs", "test_samples", "last", "best", "clean", "chip"})
 """Of a cell's file, beside format, row and seed."""
 
+ENERGIES = ("davies2018", "sanafe")
+"""Tables that a cell's energies are priced by."""
+
 TABLES = ("methods", "graphs")
 
 METHODS = ((TACTILESGNET, "manual"), (GRID_CNN, NO_PADDING), (MLP, NO_GRAPH), (GCN, "manual"))
@@ -224,7 +227,7 @@ def read_cells(folder: Path) -> dict[str, Json]:
         try:
             cell = json.loads(file.read_text("utf-8"))
             known = cell["format"] == FORMAT and row_of(cell).cell(cell["seed"]) == file.stem and set(cell) >= KEYS
-            known = known and cell["decay_epochs"] == DECAY_EPOCHS
+            known = known and cell["decay_epochs"] == DECAY_EPOCHS and _adds_up(cell)
         except (OSError, ValueError, KeyError, TypeError):
             known = False
         if not known:
@@ -237,6 +240,23 @@ def read_cells(folder: Path) -> dict[str, Json]:
             )
         found[file.stem] = cell
     return found
+
+
+def _adds_up(cell: Json) -> bool:
+    """Whether the figures of a cell are there, and shares of its test recordings."""
+    samples, chip = cell["test_samples"], cell["chip"]
+    held = [cell[which] for which in ("last", "best", "clean")]
+    right = [figures["correct"] for figures in held]
+    if "refused" not in chip:
+        both = [chip[which] for which in ("last", "clean")]
+        right += [figures[key] for figures in both for key in ("correct", "equal")]
+        right += [figures["without_quiet"][key] for figures in both for key in ("correct", "equal_to_chip")]
+        energies = [figures[key] for figures in both for key in ("energy_j", "first_layer_energy_j")]
+        energies += [figures["without_quiet"]["energy_j"] for figures in both]
+        if any(set(energy) != set(ENERGIES) for energy in energies):
+            return False
+    shares = all(figures["accuracy"] == figures["correct"] / samples for figures in held)
+    return shares and all(type(count) is int and 0 <= count <= samples for count in right)
 
 
 def row_of(cell: Mapping[str, Any]) -> Row:

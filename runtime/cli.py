@@ -168,7 +168,7 @@ def _verify(arguments: Arguments) -> Outcome:
             )
         required = parse_requirements(arguments.require)
     netlist = read_netlist(arguments.netlist)
-    asked = asked_network(arguments.checkpoint, arguments)
+    asked = asked_network(arguments.checkpoint, arguments, netlist)
     original = None if arguments.original is None else asked_network(arguments.original, arguments)
     data = _recordings(arguments, netlist, labels_for="verify")
     account = Account(netlist, data, checked=arguments.spec_samples)

@@ -79,7 +79,7 @@ def explain(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str],
     if arguments.top < 1:
         raise OptionError(f"--top {arguments.top}: at least 1 root can be shown; give a positive number")
     netlist = read_netlist(arguments.netlist)
-    asked = asked_network(arguments.checkpoint, arguments)
+    asked = asked_network(arguments.checkpoint, arguments, netlist)
     checkpoint, graph = asked.checkpoint, asked.graph
     require_match(netlist, asked.model)
     _warn(netlist, asked)

@@ -20,6 +20,7 @@ from compiler.serialize import is_netlist
 from compiler.targets import load_target
 from models.events import joined_bins
 from models.graphs import Graph
+from models.grasps import SYNTHETIC
 from runtime.data_commands import add_bin_option
 from runtime.inputs import (
     asked_checkpoint,
@@ -161,7 +162,7 @@ def _finetuned(arguments: argparse.Namespace, output: Path) -> Report:
         kept = f"the epochs so far are kept in {state}; go on with the same command and --resume"
         raise KeyboardInterrupt(kept if state.exists() else "") from None
     record = {
-        "command": " ".join(_words(arguments, training.source)),
+        "command": " ".join(_words(arguments, SYNTHETIC if arguments.data == SYNTHETIC else training.source)),
         "fine_tuned_from": checkpoint.sha256,
         "fine_tuned_weights": checkpoint.weights,
         "weight_bits": widths,

@@ -149,7 +149,7 @@ def add_training(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--padding",
         choices=PADDINGS,
-        help="of a grid-cnn's window: none, moving by 2 (default), or same, which no Loihi core holds",
+        help="of a grid-cnn's window: none, moving by 2 (default), or same, of which no Loihi core holds all neurons",
     )
     add_graph_options(parser, "to train on")
     defaults = ", ".join(f"{recipe.epochs} ({name})" for name, recipe in RECIPES.items())
@@ -179,7 +179,7 @@ def add_training(parser: argparse.ArgumentParser) -> None:
         "--decay-epochs",
         type=int,
         metavar="N",
-        help=f"the learning rate falls to a tenth after N epochs (default: {DECAY_EPOCHS}, as released)",
+        help=f"the learning rate falls to a tenth after every N epochs and one (default: {DECAY_EPOCHS}, as released)",
     )
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of weights and order (default: 0)")
     parser.add_argument("--seeds", type=int, default=1, metavar="N", help="train N seeds side by side (default: 1)")

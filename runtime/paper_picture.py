@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from runtime.paper_text import counted, name_of
 
@@ -83,7 +83,10 @@ def _accuracies(by_data: dict[str, list[Json]]) -> Figure:
             _accuracy_row(axes, place, row)
         axes.set_yticks(range(len(rows)), [_counted(row) for row in rows])
         axes.set_ylim(len(rows) - 0.5, -0.5)
-        axes.set(xlabel="accuracy (%); bar: 95 % interval of the mean, dots: seeds", title=_titled(data, rows))
+        axes.set(
+            xlabel="accuracy (%); bar: 95 % interval of the mean, cut at the frame; dots: seeds",
+            title=_titled(data, rows),
+        )
         _keep_readable(axes, rows)
         axes.grid(axis="x", alpha=0.3)
         for place in range(1, len(rows)):
@@ -136,19 +139,21 @@ def _titled(data: str, rows: Sequence[Json]) -> str:
     return f"{data}, {rows[0]['epochs']} epochs"
 
 
-def _legend(figure: Figure, panels: Sequence[Axes]) -> None:
-    """One legend under all panels; each label once."""
+def _legend(figure: Figure, panels: Sequence[Axes], *, above: bool = False) -> None:
+    """One legend under all panels, or above them; each label once."""
     entries: dict[str, Artist] = {}
     for axes in panels:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             entries.setdefault(label, handle)
     if entries:
         columns = 3 if figure.get_figwidth() > WIDTH else 2
-        figure.legend(list(entries.values()), list(entries), loc="outside lower center", ncols=columns, fontsize=8)
+        loc: Literal["outside upper center", "outside lower center"]
+        loc = "outside upper center" if above else "outside lower center"
+        figure.legend(list(entries.values()), list(entries), loc=loc, ncols=columns, fontsize=8)
 
 
 def _costs(by_data: dict[str, list[Json]]) -> Figure:
-    """Accuracy on the chip against first-layer operations, and against the energy of an inference."""
+    """Accuracy at the last epoch, as float model and on the chip, against first-layer operations and energy."""
     figure, panels = _panels(by_data, 2, 4.6)
     for column, (data, rows) in enumerate(by_data.items()):
         there = [row for row in rows if row["chip"]]
@@ -156,7 +161,7 @@ def _costs(by_data: dict[str, list[Json]]) -> Figure:
         energy = [1e6 * row["chip"]["energy_j"][ENERGY] for row in there]
         for axes, costs in ((panels[0, column], operations), (panels[1, column], energy)):
             _against(axes, there, costs)
-            axes.set_ylabel("accuracy (%)")
+            axes.set_ylabel("accuracy at the last epoch (%); dots: seeds")
         panels[0, column].set(
             xlabel="first-layer synaptic operations an inference (million)", title=_titled(data, rows)
         )
@@ -166,12 +171,12 @@ def _costs(by_data: dict[str, list[Json]]) -> Figure:
 
 
 def _against(axes: Axes, rows: Sequence[Json], costs: Sequence[float]) -> None:
-    """Best epoch and chip of each row over a cost, dots for seeds."""
+    """Float model and chip of each row over a cost, dots for seeds."""
     tops = []
     for row, cost in zip(rows, costs, strict=True):
         spreads = _spreads(row)
         seen = []
-        for key in ("best", "chip"):
+        for key in ("last", "chip"):
             label, colour, marker = SERIES[key]
             mean, values = spreads[key]["mean"], spreads[key]["values"]
             axes.plot([cost] * len(values), values, ".", color=colour, alpha=0.45, markersize=4)
@@ -219,7 +224,7 @@ def _quiet(by_data: dict[str, list[Json]]) -> Figure:
         panels[0, column].set(xlabel="neurons of the first layer, mean over seeds", title=_titled(data, rows))
         _savings(panels[1, column], rows)
         panels[1, column].set(xlabel="saved without neurons that fired in no training recording (%)")
-    _legend(figure, [*panels[0]])
+    _legend(figure, [*panels[0]], above=True)
     panels[1, 0].legend(loc="center right", fontsize=8)
     return figure
 
@@ -251,7 +256,7 @@ def _savings(axes: Axes, rows: Sequence[Json]) -> None:
         for label, key in zip(shares, ("first_layer_operations", "synaptic_operations", "energy_j"), strict=True):
             before, after = _pair(chip, key) if chip else (0.0, 0.0)
             shares[label].append(100 * (1 - after / before) if before else 0.0)
-    for offset, (label, widths), colour in zip((-0.27, 0.0, 0.27), shares.items(), ("C1", "C0", "C2"), strict=True):
+    for offset, (label, widths), colour in zip((-0.27, 0.0, 0.27), shares.items(), ("C9", "C5", "C2"), strict=True):
         axes.barh([place + offset for place in range(len(rows))], widths, height=0.25, label=label, color=colour)
     for place, row in enumerate(rows):
         if not row["chip"]:

@@ -29,7 +29,7 @@ MARGIN = 2.0
 def spread(values: Sequence[float]) -> Json | None:
     """Number, mean, standard deviation and interval of the mean of some accuracies; the last two need two values.
 
-    An interval ends where accuracies do, at 0 and 100.
+    An interval ends where accuracies do, at 0 and 100. Equal values do not tell how wide it is.
 
     Examples
     --------
@@ -45,13 +45,14 @@ def spread(values: Sequence[float]) -> Json | None:
     if len(values) == 1:
         return {"values": [mean], "n": 1, "mean": mean, "std": None, "low": None, "high": None}
     low, high = of_mean(values)
+    wide = len(set(values)) > 1
     return {
         "values": list(values),
         "n": len(values),
         "mean": mean,
         "std": statistics.stdev(values),
-        "low": max(low, 0.0),
-        "high": min(high, 100.0),
+        "low": max(low, 0.0) if wide else None,
+        "high": min(high, 100.0) if wide else None,
     }
 
 

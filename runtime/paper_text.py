@@ -159,7 +159,7 @@ def _section(kind: str, data: str, rows: Sequence[Json], noise: Sequence[Json]) 
     lines = [f"## {data}{one}", "", *pipes(heads, [_accuracies(row) for row in rows])]
     missing = sum(len(row["missing"]) for row in rows)
     if missing:
-        lines += ["", f"Missing: {missing} trainings; `spikeloom reproduce --no-train --json` names them."]
+        lines += ["", f"Missing: {missing} trainings; `spikeloom reproduce --no-train --json -o FOLDER` names them."]
     lines += _noise_section(kind, noise)
     if any(row["seeds"] for row in rows):
         lines += _chip_section([row for row in rows if row["seeds"]])
@@ -243,7 +243,8 @@ def spread_words(spread: Json | None) -> str:
         return "missing"
     if spread["std"] is None:
         return f"{spread['mean']:.2f} (one seed)"
-    return f"{spread['mean']:.2f} ({spread['std']:.2f}), {spread['low']:.1f} … {spread['high']:.1f}"
+    words = f"{spread['mean']:.2f} ({spread['std']:.2f})"
+    return words if spread["low"] is None else f"{words}, {spread['low']:.1f} … {spread['high']:.1f}"
 
 
 def verdict(row: Json) -> str:

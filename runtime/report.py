@@ -75,7 +75,7 @@ def report(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], 
 
         sha256 = hashlib.sha256(Path(arguments.netlist).read_bytes()).hexdigest()
         stability = {"stress": read_stress(arguments.stress, arguments.netlist, sha256)}
-    asked = asked_network(arguments.checkpoint, arguments)
+    asked = asked_network(arguments.checkpoint, arguments, netlist)
     _require_origin(arguments, netlist, asked)
     chart = None if arguments.chart is None else read_chart(arguments.chart, asked.sha256, arguments.checkpoint)
     data = asked_recordings(arguments, netlist, labels_for="report")

@@ -28,7 +28,7 @@ Json = dict[str, Any]
 def bench_of(arguments: argparse.Namespace) -> tuple[Bench, Asked, str]:
     """Everything that is stressed, the float network, and a hash of the recordings."""
     netlist = read_netlist(arguments.netlist)
-    asked = asked_network(arguments.checkpoint, arguments)
+    asked = asked_network(arguments.checkpoint, arguments, netlist)
     require_match(netlist, asked.model)
     data = asked_recordings(arguments, netlist, labels_for="stress", joined=False)
     pair = Pair(netlist=netlist, network=asked.network)

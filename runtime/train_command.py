@@ -45,6 +45,9 @@ def train(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], i
         require_place(arguments.picture, "--picture", arguments)
         if Path(arguments.picture).suffix not in PICTURES:
             raise OptionError(f"--picture {arguments.picture}: allowed are {', '.join(PICTURES)}; name one of these")
+        for seed in range(arguments.seed, arguments.seed + arguments.seeds):
+            if output_of(arguments.output, seed, arguments.seeds).absolute() == Path(arguments.picture).absolute():
+                raise OptionError(f"--picture {arguments.picture}: is a network that -o names; give another name")
     sensor = _sensor(arguments)
     training, test = both_splits(arguments.data, sensor[0].n_taxels, arguments.bin)
     jobs = _jobs(arguments, sensor, training, test)

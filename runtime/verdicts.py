@@ -49,7 +49,9 @@ def verify_text(report: Json) -> str:
         *(f"breakdown: {breakdown['text']}" for breakdown in report["breakdowns"]),
     ]
     if not report["same_checkpoint"]:
-        lines.append("note: the netlist was compiled from another checkpoint file than this one")
+        lines.append(
+            "note: the netlist was compiled from another checkpoint file than this one, or from other weights of it"
+        )
     if report["not_compared"]:
         left = ", ".join(f"{name} {count:,}" for name, count in report["not_compared"].items())
         lines.append(f"not compared, left out because nobody hears them: {left}")

@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import sys
+import types
 import zipfile
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from compiler.targets import EVENTS, load_target
 from compiler.text import text
 from models.graphs import build_graph
 from runtime import cli, compile_command, inputs
+from runtime.__main__ import main as start
 from runtime.inputs import recordings
 
 SIZES = {"conv1": TAXELS * FEATURES, "fc1": 9, "fc2": 8, "fc3": CLASSES}
@@ -438,7 +440,33 @@ def test_verify_says_when_the_checkpoint_is_another_one(spikeloom, tmp_path):
     own_file(tmp_path / "other.pt", last=made_weights(5))
     words = ["verify", "net.loom", "--checkpoint", tmp_path / "other.pt", "--data", "data", "--min-agreement", "0"]
     assert json.loads(spikeloom(*words, "--json")[1])["same_checkpoint"] is False
-    assert "note: the netlist was compiled from another checkpoint file than this one\n" in spikeloom(*words)[1]
+    note = "note: the netlist was compiled from another checkpoint file than this one, or from other weights of it\n"
+    assert note in spikeloom(*words)[1]
+
+
+def test_an_interrupt_while_python_loads_the_command(monkeypatch, capsys):
+    class Loading(types.ModuleType):
+        def __getattr__(self, name):
+            raise KeyboardInterrupt
+
+    monkeypatch.setitem(sys.modules, "runtime.cli", Loading("runtime.cli"))
+    assert start() == 2
+    assert capsys.readouterr().err == "spikeloom: interrupted; nothing was written\n"
+
+
+def test_the_epoch_is_that_of_the_netlist(spikeloom, tmp_path):
+    """A checkpoint may hold several; one that is named is taken all the same."""
+    net, both = tmp_path / "best.loom", tmp_path / "both.pt"
+    own_file(both, last=made_weights(5), best=made_weights(0))
+    assert spikeloom("compile", both, "--weights", "best", "-o", net)[0] == 0
+    words = ["verify", net, "--checkpoint", both, "--data", "data", "--min-agreement", "0", "--json"]
+    for options, same in (((), True), (("--weights", "best"), True), (("--weights", "last"), False)):
+        assert json.loads(spikeloom(*words, *options)[1])["same_checkpoint"] is same
+    words = ["report", net, "--checkpoint", both, "--data", "data", "-o", tmp_path / "page.html"]
+    assert spikeloom(*words)[0] == 0
+    assert spikeloom(*words, "--weights", "last")[2].endswith(
+        "best.loom: compiled for weights best, this is last; give --weights best\n"
+    )
 
 
 def test_verify_at_most_all_recordings_by_the_specification(spikeloom):

@@ -689,7 +689,13 @@ def test_damaged_cells_are_named(tmp_path, capsys):
     kept(tmp_path, cell)
     (file,) = (tmp_path / "cells").iterdir()
     line = f"{file}: no cell of that name, or one of another version; delete it to measure anew"
-    others = ({"seed": 1}, {"format": 2}, {"decay_epochs": 12})
+    last, chip = cell["last"], cell["chip"]
+    others = [{"seed": 1}, {"format": 2}, {"decay_epochs": 12}]
+    others += [{"last": last | {"correct": correct}} for correct in ("x", 9999, -1, 2, 1.0)]
+    others += [
+        {"chip": chip | {"last": chip["last"] | {"energy_j": {"sanafe": 1.0}}}},
+        {"chip": {"last": chip["last"]}},
+    ]
     for content in ("", "[]", "{}", '{"format": 1}', *(json.dumps(cell | other) for other in others)):
         file.write_text(content)
         assert refused(capsys, "reproduce", "--no-train", "-o", str(tmp_path)) == line

@@ -123,6 +123,7 @@ def test_pictures_of_equal_trainings_are_equal(tmp_path):
         (["--seeds", "0"], "--seeds 0: at least 1 is needed; give a positive number"),
         (["--epochs", "0"], "--epochs 0: allowed are 1 or more; choose another"),
         (["--seed", "-1"], "--seed -1: allowed are 0 or more; choose another"),
+        (["--seed", str(10**22)], f"--seed {10**22}: allowed are 0 to {2**63 - 1}; choose another"),
         (["--device", "tpu"], "--device tpu: unknown; allowed: cpu, cuda"),
         (["--picture", "x.jpg"], "--picture x.jpg: allowed are .png, .svg, .pdf; name one of these"),
         (["--picture", "none/x.png"], "--picture none/x.png: the folder does not exist; make it first"),
@@ -132,6 +133,15 @@ def test_wrong_options(data, capsys, words, line):
     assert main(["train", "--data", "data", "--graph", "manual", "-o", "x.pt", *words]) == 2
     assert capsys.readouterr().err == f"spikeloom: {line}\n"
     assert not (data / "x.pt").exists()
+
+
+@pytest.mark.parametrize("seeds", ["1", "2"])
+def test_a_picture_does_not_replace_a_network(data, capsys, seeds):
+    picture = "x.png" if seeds == "1" else "./x-seed1.png"
+    assert refused(capsys, "--epochs", "1", "--seeds", seeds, "-o", "x.png", "--picture", picture) == (
+        f"--picture {picture}: is a network that -o names; give another name"
+    )
+    assert [file.name for file in data.iterdir()] == ["data"]
 
 
 def test_a_graph_must_be_named(data, capsys):
