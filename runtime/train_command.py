@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from compiler.errors import OptionError
+from compiler.errors import DataError, OptionError
 from compiler.frontends.own import WEIGHTS
 from compiler.frontends.systems import GRAPH_SYSTEMS, GRID_CNN, TACTILESGNET, TITLES, Grid
 from compiler.truenorth.native import SYSTEM as NATIVE
@@ -68,10 +68,17 @@ def both_splits(data: str, taxels: int, bin_s: float) -> tuple[Recordings, Recor
         If they cannot be used.
     """
     progress("reading the recordings")
-    shared: dict[str, Any] = {"taxels": taxels, "bin_s": bin_s, "labels_for": "training"}
-    training = recordings(data, "train", classes=None, **shared)
-    test = recordings(data, "test", classes=int(training.labels.max()) + 1, **shared)
+    shared: dict[str, Any] = {"taxels": taxels, "bin_s": bin_s, "labels_for": "training", "classes": None}
+    training, test = (recordings(data, split, **shared) for split in ("train", "test"))
     progress("")
+    known = int(training.labels.max())
+    if test.labels.max() > known:
+        first = int((test.labels > known).argmax())
+        where = f"{test.source}: {test.split}/{test.files[first]}"
+        raise DataError(
+            f"{where}: label {test.labels[first]}, the training recordings have 0..{known}; add some of it to them, or "
+            "leave it out of the test split"
+        )
     return training, test
 
 

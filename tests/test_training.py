@@ -3,6 +3,7 @@
 import json
 import os
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -133,6 +134,17 @@ def test_wrong_options(data, capsys, words, line):
     assert main(["train", "--data", "data", "--graph", "manual", "-o", "x.pt", *words]) == 2
     assert capsys.readouterr().err == f"spikeloom: {line}\n"
     assert not (data / "x.pt").exists()
+
+
+def test_a_class_that_only_the_test_split_has(data, capsys):
+    for file in (data / "data" / "train").glob("*_label_5.npy"):
+        file.unlink()
+    line = refused(capsys, "--epochs", "1", "-o", "x.pt")
+    assert re.fullmatch(
+        r"data: test/sample_\d+_label_5\.npy: label 5, the training recordings have 0\.\.4; add some of it to them, "
+        r"or leave it out of the test split",
+        line,
+    ), line
 
 
 @pytest.mark.parametrize("seeds", ["1", "2"])
