@@ -29,7 +29,8 @@ from runtime.inputs import (
     require_place,
     version,
 )
-from runtime.training import LAYERS, PICTURES, Job, check_seeds, draw_training, output_of, summary, training_text
+from runtime.training import LAYERS, Job, check_seeds, output_of, summary, training_text
+from runtime.training_picture import PICTURES, draw_training
 
 Json = dict[str, Any]
 

@@ -1,4 +1,4 @@
-"""The ``train`` command: one seed trained and written, reported by both protocols, with pictures."""
+"""The ``train`` command: one seed trained and written, reported by both protocols."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from compiler.truenorth.trained import Trained, read_trained, write_trained
 from models.events import joined_bins
 from models.evtouch import Recordings
 from models.graphs import Graph
-from models.recipes import MSE, RELEASED, Recipe
+from models.recipes import RELEASED, Recipe
 from models.systems import HOPS, filters_of, propagation_of
 from runtime.intervals import wilson
 from runtime.tables import table
@@ -35,9 +35,6 @@ if TYPE_CHECKING:
 
 LAYERS = ("conv1", "fc1", "fc2", "fc3")
 """Layers of the networks that are trained."""
-
-PICTURES = (".png", ".svg", ".pdf")
-"""Kinds of picture that `draw_training` writes."""
 
 TITLES = {
     "last": "last epoch",
@@ -339,65 +336,3 @@ def training_text(report: dict[str, Any]) -> str:
         lines.append(f"  mean of {len(runs)} seeds: last {means[0]}, paper {means[1]}, clean {means[2]}")
     written = textwrap.wrap(f"written: {files}", WIDTH, initial_indent="  ", subsequent_indent="    ")
     return "\n".join([*lines, *written])
-
-
-def draw_training(path: str, records: list[dict[str, Any]], labels: IntArray, predictions: list[IntArray]) -> None:
-    """Draw learning curves of all seeds and the confusion matrix of their last epochs, summed.
-
-    Parameters
-    ----------
-    path : str
-        PNG, SVG or PDF to write, whole or not at all.
-    records : list of dict
-        Training records.
-    labels : (samples,) int64
-        True classes.
-    predictions : list of (samples,) int64
-        One per record.
-    """
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt
-    from matplotlib.ticker import MaxNLocator
-
-    from compiler.atomic import write_atomically
-
-    classes = int(max(labels.max(), *(p.max() for p in predictions))) + 1
-    confusion = np.zeros((classes, classes), np.int64)
-    for predicted in predictions:
-        np.add.at(confusion, (labels, predicted), 1)
-    samples = records[0]["test_samples"]
-    figure, (left, middle, right) = plt.subplots(
-        1, 3, figsize=(13, 4.2), layout="constrained", width_ratios=(1, 1, 1.05)
-    )
-    for index, record in enumerate(records):
-        history = np.array(record["history"])
-        epochs = np.arange(1, len(history) + 1)
-        colour = f"C{index}"
-        left.semilogy(epochs, history[:, 0], color=colour, label=f"seed {record['seed']}")
-        left.semilogy(epochs, history[:, 1], color=colour, linestyle="--")
-        middle.plot(epochs, 100 * history[:, 2] / samples, color=colour, label=f"seed {record['seed']}")
-        clean = record["clean"]
-        middle.plot(clean["epoch"], 100 * clean["accuracy"], "o", color=colour, markeredgecolor="black")
-    loss = (records[0].get("recipe") or {}).get("loss", MSE)
-    measured = "squared error of spike rates" if loss == MSE else loss
-    left.set(xlabel="epoch", ylabel=measured, title="loss: training solid, test dashed")
-    middle.set(xlabel="epoch", ylabel="test accuracy (%)", title="accuracy; circle: epoch of the clean protocol")
-    for axes in (left, middle):
-        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-        axes.grid(alpha=0.3)
-    middle.legend(loc="lower right")
-    image = right.imshow(confusion, cmap="cividis")
-    right.set(xlabel="decision", ylabel="class", title="confusion, last epoch")
-    right.xaxis.set_major_locator(MaxNLocator(integer=True))
-    right.yaxis.set_major_locator(MaxNLocator(integer=True))
-    figure.colorbar(image, ax=right, label="test recordings")
-    with write_atomically(path) as file:
-        figure.savefig(file, format=Path(path).suffix.removeprefix(".") or "png", dpi=120, metadata=_no_date(path))
-    plt.close(figure)
-
-
-def _no_date(path: str) -> dict[str, Any]:
-    """Metadata that keeps equal pictures equal: SVG and PDF would store the date."""
-    return {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}.get(Path(path).suffix, {})

@@ -26,7 +26,8 @@ from models.release import write_released
 from runtime.cli import main
 from runtime.locks import only_one
 from runtime.seeds import side_by_side
-from runtime.training import draw_training, summary
+from runtime.training import summary
+from runtime.training_picture import draw_training
 from runtime.workers import run_side_by_side
 
 ROOT = Path(__file__).resolve().parents[1]
