@@ -57,8 +57,11 @@ def draw_training(path: str, records: list[dict[str, Any]], labels: IntArray, pr
     measured = "squared error of spike rates" if loss == MSE else loss
     left.set(xlabel="epoch", ylabel=measured, title="loss: training solid, test dashed")
     middle.set(xlabel="epoch", ylabel="test accuracy (%)", title="accuracy; circle: epoch of the clean protocol")
+    longest = max(len(record["history"]) for record in records)
     for axes in (left, middle):
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+        if longest == 1:
+            axes.set_xticks([1])
         axes.grid(alpha=0.3)
     middle.legend(loc="lower right")
     image = right.imshow(confusion, cmap="cividis")
