@@ -179,7 +179,7 @@ def add_training(parser: argparse.ArgumentParser) -> None:
         "--decay-epochs",
         type=int,
         metavar="N",
-        help=f"the learning rate falls to a tenth after every N epochs and one (default: {DECAY_EPOCHS}, as released)",
+        help=f"the learning rate falls to a tenth every N epochs, after epoch N + 1 first (default: {DECAY_EPOCHS})",
     )
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of weights and order (default: 0)")
     parser.add_argument("--seeds", type=int, default=1, metavar="N", help="train N seeds side by side (default: 1)")

@@ -84,7 +84,7 @@ def _accuracies(by_data: dict[str, list[Json]]) -> Figure:
         axes.set_yticks(range(len(rows)), [_counted(row) for row in rows])
         axes.set_ylim(len(rows) - 0.5, -0.5)
         axes.set(
-            xlabel="accuracy (%); bar: 95 % interval of the mean, cut at the frame; dots: seeds",
+            xlabel="accuracy (%)\nbar: 95 % interval of the mean, cut at the frame; dots: seeds",
             title=_titled(data, rows),
         )
         _keep_readable(axes, rows)
