@@ -12,15 +12,16 @@ import argparse
 
 import numpy as np
 
-from compiler.dynamics import with_clocks
-from compiler.frontends.checkpoint import read_checkpoint
-from compiler.passes.expand import expand
-from compiler.pipeline import compile_network
-from models.evtouch import load_recordings
-from runtime import course, exits
-from runtime.anytime import ALLOWED
-from runtime.inputs import propagation
-from runtime.tables import table
+from spikeloom.compiler.dynamics import with_clocks
+from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.targets.loihi1.compilation import compile_network
+from spikeloom.models.recordings.evtouch import load_recordings
+from spikeloom.runtime.commands.choose.anytime import ALLOWED
+from spikeloom.runtime.commands.inputs import propagation
+from spikeloom.runtime.costs import course
+from spikeloom.runtime.report.tables import table
+from spikeloom.runtime.studies.anytime import exits
 
 
 def main() -> None:

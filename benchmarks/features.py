@@ -19,8 +19,8 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC
 
-from models.events import joined_bins
-from models.evtouch import Recordings, load_recordings
+from spikeloom.models.recordings.events import joined_bins
+from spikeloom.models.recordings.evtouch import Recordings, load_recordings
 
 KERNELS = {"linear": SVC(kernel="linear", C=0.1), "rbf": SVC(C=10.0)}
 

@@ -23,9 +23,9 @@ import numpy as np
 import workload
 from growth_chart import draw
 
-from compiler.atomic import write_atomically
-from compiler.netlist import Netlist
-from runtime.engine import Engine, prepare, simulate
+from spikeloom.compiler.formats.atomic import write_atomically
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.runtime.machines.loihi1.engine import Engine, prepare, simulate
 
 DENSITIES = (0.001, 0.003, 0.01, 0.03, 0.1, 0.2, 0.5)
 STEPS = (30, 100, 300, 1000, 3000)

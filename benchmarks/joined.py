@@ -17,19 +17,19 @@ from typing import Any
 
 import numpy as np
 
-from compiler.dynamics import with_clocks
-from compiler.frontends.checkpoint import Checkpoint, read_checkpoint
-from compiler.frontends.towers import join
-from compiler.passes.expand import expand
-from compiler.pipeline import compile_network
-from compiler.targets import load_target
-from models.events import joined_bins
-from models.evtouch import Recordings, load_recordings
-from runtime.estimate import estimate
-from runtime.inputs import propagation
-from runtime.intervals import of_mean
-from runtime.measured import float_decisions
-from runtime.votes import predictions
+from spikeloom.compiler.dynamics import with_clocks
+from spikeloom.compiler.formats.checkpoint import Checkpoint, read_checkpoint
+from spikeloom.compiler.formats.towers import join
+from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.targets.base import load_target
+from spikeloom.compiler.targets.loihi1.compilation import compile_network
+from spikeloom.models.recordings.events import joined_bins
+from spikeloom.models.recordings.evtouch import Recordings, load_recordings
+from spikeloom.runtime.commands.inputs import propagation
+from spikeloom.runtime.costs.estimate import estimate
+from spikeloom.runtime.machines.votes import predictions
+from spikeloom.runtime.report.intervals import of_mean
+from spikeloom.runtime.studies.paper.measured import float_decisions
 
 Json = dict[str, Any]
 

@@ -14,10 +14,10 @@ import time
 
 import numpy as np
 
-from models.evtouch import load_recordings
-from runtime.engine import simulate
-from runtime.stream import Stream, load
-from runtime.votes import class_counts
+from spikeloom.models.recordings.evtouch import load_recordings
+from spikeloom.runtime.machines.loihi1.engine import simulate
+from spikeloom.runtime.machines.loihi1.stream import Stream, load
+from spikeloom.runtime.machines.votes import class_counts
 
 
 def timed_grasp(stream: Stream, recording: np.ndarray, pace_s: float) -> tuple[list[float], np.ndarray]:

@@ -14,13 +14,13 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from compiler.frontends.checkpoint import read_checkpoint
-from compiler.passes.expand import expand
-from compiler.pipeline import compile_network
-from models.evtouch import load_recordings
-from models.graphs import build_graph, normalised_adjacency
-from models.reference import float_spikes
-from runtime import engine
+from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.targets.loihi1.compilation import compile_network
+from spikeloom.models.graphs import build_graph, normalised_adjacency
+from spikeloom.models.networks.reference import float_spikes
+from spikeloom.models.recordings.evtouch import load_recordings
+from spikeloom.runtime.machines.loihi1 import engine
 
 
 def timed(action: Callable[[], Any]) -> tuple[float, Any]:

@@ -22,12 +22,12 @@ import numpy as np
 import onnx
 import onnxruntime
 
-from compiler.atomic import write_atomically
-from compiler.netlist import Netlist
-from compiler.serialize import read_netlist
-from models.evtouch import load_recordings
-from runtime import engine, onnx_engine
-from runtime.inputs import version
+from spikeloom.compiler.formats.atomic import write_atomically
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
+from spikeloom.models.recordings.evtouch import load_recordings
+from spikeloom.runtime.commands.inputs import version
+from spikeloom.runtime.machines.loihi1 import engine, onnx_engine
 
 FEW = 8
 """Recordings of a lap in which each goes in alone."""

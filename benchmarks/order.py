@@ -20,13 +20,13 @@ from unittest.mock import patch
 
 import numpy as np
 
-from compiler.frontends.systems import GRAPH_SYSTEMS, MLP
-from models.events import BIN_S
-from models.evtouch import Recordings
-from models.graphs import NEUTOUCH
-from models.train import train
-from runtime.cli import build_parser
-from runtime.train_command import both_splits, planned
+from spikeloom.compiler.systems import GRAPH_SYSTEMS, MLP
+from spikeloom.models.graphs import NEUTOUCH
+from spikeloom.models.recordings.events import BIN_S
+from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.models.training.train import train
+from spikeloom.runtime.cli import build_parser
+from spikeloom.runtime.commands.training.train import both_splits, planned
 
 ORDERS = ("shuffled", "fixed", "listed")
 

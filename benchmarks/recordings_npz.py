@@ -8,7 +8,7 @@ import sys
 
 import numpy as np
 
-from models.events import BIN_S, load_data
+from spikeloom.models.recordings.events import BIN_S, load_data
 
 
 def main() -> None:

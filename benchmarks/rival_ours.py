@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 from worker import Job, Task, UnfitError, serve
 
-from compiler.netlist import Netlist
-from compiler.serialize import read_netlist
-from compiler.targets import load_target
-from runtime import charges, cost, timing
-from runtime.engine import prepare, simulate
-from runtime.trace import BoolArray, Trace, unpack
+from spikeloom.compiler.targets.base import load_target
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
+from spikeloom.runtime.costs import charges, cost
+from spikeloom.runtime.machines.loihi1 import timing
+from spikeloom.runtime.machines.loihi1.engine import prepare, simulate
+from spikeloom.runtime.machines.loihi1.trace import BoolArray, Trace, unpack
 
 Run = Callable[[Any], Trace]
 """Runs events (recordings, channels, steps); what it computes beyond the trace is computed and thrown away."""

@@ -30,11 +30,11 @@ import numpy as np
 import workload
 from rivals_chart import digits, draw
 
-from compiler.atomic import write_atomically
-from compiler.netlist import Netlist
-from compiler.serialize import read_netlist, write_netlist
-from models.evtouch import load_recordings
-from runtime.tables import table
+from spikeloom.compiler.formats.atomic import write_atomically
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist, write_netlist
+from spikeloom.models.recordings.evtouch import load_recordings
+from spikeloom.runtime.report.tables import table
 
 HERE = Path(__file__).parent
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")

@@ -16,21 +16,22 @@ from typing import Any
 
 import numpy as np
 
-from compiler.atomic import write_atomically
-from compiler.frontends.checkpoint import Checkpoint, read_checkpoint
-from compiler.interpret import vote
-from compiler.passes.expand import expand
-from compiler.passes.quantize import Recipe
-from compiler.pipeline import compile_network
-from compiler.targets import load_target
-from models.evtouch import Recordings, load_recordings
-from models.graphs import build_graph, normalised_adjacency
-from models.reference import float_spikes
-from runtime import cost, engine
-from runtime.intervals import wilson
-from runtime.levels import mcnemar
-from runtime.trace import aligned, heard
-from runtime.votes import predictions
+from spikeloom.compiler.formats.atomic import write_atomically
+from spikeloom.compiler.formats.checkpoint import Checkpoint, read_checkpoint
+from spikeloom.compiler.interpret import vote
+from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.targets.base import load_target
+from spikeloom.compiler.targets.loihi1.compilation import compile_network
+from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe
+from spikeloom.models.graphs import build_graph, normalised_adjacency
+from spikeloom.models.networks.reference import float_spikes
+from spikeloom.models.recordings.evtouch import Recordings, load_recordings
+from spikeloom.runtime.costs import cost
+from spikeloom.runtime.equivalence.levels import mcnemar
+from spikeloom.runtime.machines.loihi1 import engine
+from spikeloom.runtime.machines.loihi1.trace import aligned, heard
+from spikeloom.runtime.machines.votes import predictions
+from spikeloom.runtime.report.intervals import wilson
 
 Options = dict[str, Any]
 

@@ -24,13 +24,13 @@ import numpy as np
 from growth_chart import draw_skins
 from scipy import sparse
 
-from compiler.atomic import write_atomically
-from compiler.ir import INPUT, Input, Network, Population, Projection, Readout
-from compiler.passes.chips import chip_count
-from compiler.passes.expand import expand_graph_convolution
-from compiler.pipeline import compile_network
-from compiler.targets import load_target
-from runtime import engine
+from spikeloom.compiler.formats.atomic import write_atomically
+from spikeloom.compiler.ir import INPUT, Input, Network, Population, Projection, Readout
+from spikeloom.compiler.passes.expand import expand_graph_convolution
+from spikeloom.compiler.targets.base import load_target
+from spikeloom.compiler.targets.loihi1.compilation import compile_network
+from spikeloom.compiler.targets.loihi1.layout.chips import chip_count
+from spikeloom.runtime.machines.loihi1 import engine
 
 TAXELS = (1000, 2000, 5000, 10000, 20000)
 SIDE, FEATURES, HIDDEN, CLASSES, HOPS = 16, 16, 64, 10, 4

@@ -10,7 +10,7 @@ import sys
 import time
 from collections.abc import Iterator
 
-from runtime.workers import one_thread_each, run_side_by_side
+from spikeloom.runtime.studies.jobs.workers import one_thread_each, run_side_by_side
 
 
 def nothing(number: int) -> int:

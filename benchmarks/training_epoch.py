@@ -23,12 +23,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from compiler.frontends.systems import SYSTEMS, TACTILESGNET
-from models.evtouch import Recordings, load_recordings
-from models.graphs import Graph, build_graph, normalised_adjacency
-from models.networks import Architecture, SpikingNet
-from models.systems import HOPS, PADDINGS, filters_of, propagation_of, sensor_grid
-from models.train import Epoch, rate_loss, train
+from spikeloom.compiler.systems import SYSTEMS, TACTILESGNET
+from spikeloom.models.graphs import Graph, build_graph, normalised_adjacency
+from spikeloom.models.networks.networks import Architecture, SpikingNet
+from spikeloom.models.recordings.evtouch import Recordings, load_recordings
+from spikeloom.models.systems import HOPS, PADDINGS, filters_of, propagation_of, sensor_grid
+from spikeloom.models.training.train import Epoch, rate_loss, train
 
 TURNS, STEPS = 5, 6
 RATE = 1e-3

@@ -15,13 +15,13 @@ from pathlib import Path
 
 import numpy as np
 
-from compiler.dynamics import Clocks, with_clocks
-from compiler.truenorth.levels import BIN_TICKS
-from compiler.truenorth.netlist import CrossbarNetlist
-from compiler.truenorth.serialize import read_crossbars
-from models.evtouch import Recordings, load_recordings
-from runtime.tables import table
-from runtime.truenorth import engine
+from spikeloom.compiler.dynamics import Clocks, with_clocks
+from spikeloom.compiler.targets.truenorth.codebook import BIN_TICKS
+from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
+from spikeloom.compiler.targets.truenorth.netlist_file import read_crossbars
+from spikeloom.models.recordings.evtouch import Recordings, load_recordings
+from spikeloom.runtime.machines.truenorth import engine
+from spikeloom.runtime.report.tables import table
 
 
 def stretched(netlist: CrossbarNetlist) -> CrossbarNetlist:

@@ -15,17 +15,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from compiler.interpret import channels_last, run_float, vote
-from compiler.ir import Network
-from compiler.targets import CROSSBARS, load_target
-from compiler.truenorth.in_time import lower_in_time
-from compiler.truenorth.levels import COPIES, MOST, LevelNetwork, Run, in_levels, run_levels
-from models.evtouch import Recordings
-from runtime.asked import asked_network
-from runtime.cli import build_parser
-from runtime.inputs import recordings
-from runtime.tables import table
-from runtime.votes import readout_counts
+from spikeloom.compiler.interpret import channels_last, run_float, vote
+from spikeloom.compiler.ir import Network
+from spikeloom.compiler.targets.base import CROSSBARS, load_target
+from spikeloom.compiler.targets.truenorth.codebook import COPIES, MOST, LevelNetwork, Run, in_levels, run_levels
+from spikeloom.compiler.targets.truenorth.in_time import lower_in_time
+from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.runtime.cli import build_parser
+from spikeloom.runtime.commands.inputs import recordings
+from spikeloom.runtime.commands.load_network import asked_network
+from spikeloom.runtime.machines.votes import readout_counts
+from spikeloom.runtime.report.tables import table
 
 ENDLESS = 1 << 30
 """More than any partial sum."""

@@ -20,9 +20,9 @@ from typing import Any
 import matplotlib.pyplot as plt
 from joined import measured
 
-from compiler.frontends.checkpoint import read_checkpoint
-from models.evtouch import load_recordings
-from runtime.intervals import of_mean
+from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.models.recordings.evtouch import load_recordings
+from spikeloom.runtime.report.intervals import of_mean
 
 Json = dict[str, Any]
 

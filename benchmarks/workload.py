@@ -15,17 +15,17 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from compiler.fixedpoint import ONE_STEP_SUM_MAX, FloatArray, IntArray, decay, encode_bias
-from compiler.forms import decay_registers
-from compiler.ir import INPUT, Input, IntegerNetwork, IntegerPopulation, IntegerProjection, Readout
-from compiler.netlist import Netlist
-from compiler.passes.emit import emit
-from compiler.passes.expand import expand_graph_convolution
-from compiler.passes.legalize import require_legal
-from compiler.passes.partition import partition
-from compiler.passes.place import core_traffic, place
-from compiler.targets import load_target
-from models.graphs import build_graph, normalised_adjacency
+from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX, FloatArray, IntArray, decay, encode_bias
+from spikeloom.compiler.ir import INPUT, Input, IntegerNetwork, IntegerPopulation, IntegerProjection, Readout
+from spikeloom.compiler.passes.expand import expand_graph_convolution
+from spikeloom.compiler.targets.base import load_target
+from spikeloom.compiler.targets.loihi1.emit import emit
+from spikeloom.compiler.targets.loihi1.layout.partition import partition
+from spikeloom.compiler.targets.loihi1.layout.place import core_traffic, place
+from spikeloom.compiler.targets.loihi1.legalize import require_legal
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.targets.loihi1.storage.weight_storage import decay_registers
+from spikeloom.models.graphs import build_graph, normalised_adjacency
 
 SpikeArray = npt.NDArray[np.bool_]
 

@@ -1,6 +1,6 @@
 """Loihi's integer arithmetic: decay, saturation, bias encoding. Exact and small; int64 in, int64 out.
 
-Every rounding that a chip register performs is written here once, for arrays. (:mod:`runtime.spec` states the same
+Every rounding that a chip register performs is written here once, for arrays. (:mod:`loihi1.spec` states the same
 rules a second time in plain Python integers, on purpose: the tests hold the two together.)
 
 References

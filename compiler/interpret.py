@@ -17,9 +17,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from compiler.dynamics import NO_CLOCKS, Clocks, with_clocks
-from compiler.fixedpoint import MEMBRANE_MAX, MEMBRANE_SHIFT, IntArray
-from compiler.ir import INPUT, IntegerNetwork, IntegerPopulation, IntegerProjection, Network, Population, Sparse
+from spikeloom.compiler.dynamics import NO_CLOCKS, Clocks, with_clocks
+from spikeloom.compiler.fixedpoint import MEMBRANE_MAX, MEMBRANE_SHIFT, IntArray
+from spikeloom.compiler.ir import (
+    INPUT,
+    IntegerNetwork,
+    IntegerPopulation,
+    IntegerProjection,
+    Network,
+    Population,
+    Sparse,
+)
 
 BoolArray = npt.NDArray[np.bool_]
 Floating = npt.NDArray[np.floating[Any]]
@@ -106,7 +114,7 @@ def step_late(spikes: BoolArray) -> BoolArray:
 def float_recurrence(
     population: Population, sums: Floating, *, own: Floating | None = None, membranes: bool = False
 ) -> tuple[BoolArray, Floating | None]:
-    """LIF of the definition in :class:`compiler.ir.Population` on given synaptic sums, in their type.
+    """LIF of the definition in :class:`ir.Population` on given synaptic sums, in their type.
 
     `sums` is overwritten. `own` (neurons, neurons), of the same type, is from each neuron (row) of a population that
     hears itself to each.
@@ -149,7 +157,7 @@ def integer_recurrence(
     membranes: bool = False,
     saturates: bool = True,
 ) -> tuple[BoolArray, IntArray | None]:
-    """Loihi's compartment on given synaptic sums (in weight units); :mod:`runtime.spec` holds the definition.
+    """Loihi's compartment on given synaptic sums (in weight units); :mod:`loihi1.spec` holds the definition.
 
     Runs in float64, exactly: registers times a 12-bit factor stay below 2**36, a product with 2**-12 only moves the
     point, and truncation is the chip's rounding toward zero. With `saturates` off the membrane has no limits, which

@@ -3,7 +3,7 @@
 Populations are numbered by their place in the tuple; ``INPUT`` (-1) stands for the input wherever a projection names
 its source. A projection from a population to itself is recurrent: it brings the spikes of the step before. Weights are
 sparse matrices whose *stored* entries are the structural synapses: a stored zero is a synapse of weight zero. What one
-object can know is checked on construction, everything else in :mod:`compiler.verify`.
+object can know is checked on construction, everything else in :mod:`compiler.invariants`.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from compiler.dynamics import NO_CLOCKS, Clocks
-from compiler.fixedpoint import DECAY_BITS, FloatArray, IntArray
+from spikeloom.compiler.dynamics import NO_CLOCKS, Clocks
+from spikeloom.compiler.fixedpoint import DECAY_BITS, FloatArray, IntArray
 
 INPUT = -1
 """Source id of a projection that starts at the input."""
@@ -130,7 +130,7 @@ class Network:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class IntegerPopulation:
-    """The same neurons in Loihi's registers; units as in :class:`compiler.netlist.Netlist`.
+    """The same neurons in Loihi's registers; units as in :class:`netlist.Netlist`.
 
     Parameters
     ----------

@@ -7,9 +7,18 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from compiler.fixedpoint import FloatArray, IntArray
-from compiler.ir import INPUT, Input, IntegerNetwork, IntegerPopulation, IntegerProjection, Network, Population, Sparse
-from compiler.netlist import Netlist
+from spikeloom.compiler.fixedpoint import FloatArray, IntArray
+from spikeloom.compiler.ir import (
+    INPUT,
+    Input,
+    IntegerNetwork,
+    IntegerPopulation,
+    IntegerProjection,
+    Network,
+    Population,
+    Sparse,
+)
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
 
 _COMPARTMENT_FIELDS = (
     "layer",

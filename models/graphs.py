@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from compiler.errors import ModelError, OptionError
+from spikeloom.compiler.errors import ModelError, OptionError
 
 if TYPE_CHECKING:
     import networkx

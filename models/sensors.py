@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from compiler.errors import DataError, OptionError
-from models.csvtable import Table, read_table
-from models.graphs import CHOICES, Graph, build_graph
+from spikeloom.compiler.errors import DataError, OptionError
+from spikeloom.models.graphs import CHOICES, Graph, build_graph
+from spikeloom.models.recordings.csvtable import Table, read_table
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -143,7 +143,7 @@ def sensor_graph(
     Parameters
     ----------
     graph : str, optional
-        Name of a graph, see `models.graphs.build_graph`.
+        Name of a graph, see `spikeloom.models.graphs.build_graph`.
     taxels : path or str, optional
         Positions of the taxels, or with `edges` also their number; see `read_layout`.
     edges : path, optional

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from compiler.errors import DataError, OptionError
-from compiler.frontends.systems import GCN, GRID_CNN, MLP, TACTILESGNET, Grid, taxel_propagation, window_forms
-from models.graphs import NEUTOUCH, Graph, normalised_adjacency
+from spikeloom.compiler.errors import DataError, OptionError
+from spikeloom.compiler.systems import GCN, GRID_CNN, MLP, TACTILESGNET, Grid, taxel_propagation, window_forms
+from spikeloom.models.graphs import NEUTOUCH, Graph, normalised_adjacency
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -89,7 +89,7 @@ def with_self_loops(edges: IntArray, n: int) -> FloatArray:
 
 
 def propagation_of(system: str, edges: IntArray, taxels: int, grid: Grid | None, filters: int) -> FloatArray:
-    """What the first layer sees, in the form that :func:`compiler.passes.expand.stack_of` takes.
+    """What the first layer sees, in the form that :func:`expand.stack_of` takes.
 
     Parameters
     ----------

@@ -18,39 +18,24 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from compiler.atomic import write_atomically
-from compiler.dynamics import with_clocks
-from compiler.errors import OptionError, SpikeloomError, UnfinishedError
-from compiler.fixedpoint import IntArray
-from compiler.netlist import Netlist
-from compiler.passes.legalize import measure
-from compiler.serialize import is_netlist, read_netlist
-from compiler.targets import load_target, with_tables
-from compiler.truenorth.serialize import is_crossbars
-from models.evtouch import Recordings
-from models.grasps import SYNTHETIC
-from runtime import (
-    anytime,
-    bits,
-    chart,
-    decisions,
-    explain,
-    export,
-    finetune,
-    join,
-    lean,
-    render,
-    report,
-    reproduce,
-    stress,
-    verdicts,
-    watch,
-    yardstick_command,
-)
-from runtime.asked import asked_network
-from runtime.compile_command import compile_netlist
-from runtime.data_commands import add_data_commands
-from runtime.inputs import (
+from spikeloom.compiler.dynamics import with_clocks
+from spikeloom.compiler.errors import OptionError, SpikeloomError, UnfinishedError
+from spikeloom.compiler.fixedpoint import IntArray
+from spikeloom.compiler.formats.atomic import write_atomically
+from spikeloom.compiler.targets.base import load_target, with_tables
+from spikeloom.compiler.targets.loihi1.legalize import measure
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.targets.loihi1.netlist_file import is_netlist, read_netlist
+from spikeloom.compiler.targets.truenorth.netlist_file import is_crossbars
+from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.models.recordings.grasps import SYNTHETIC
+from spikeloom.models.recordings.windows import first_part, window_asked
+from spikeloom.runtime.commands.check import explain, stress
+from spikeloom.runtime.commands.check import yardsticks as yardstick_command
+from spikeloom.runtime.commands.choose import anytime, bits, chart, lean
+from spikeloom.runtime.commands.exchange import export, watch
+from spikeloom.runtime.commands.exchange.data import add_data_commands
+from spikeloom.runtime.commands.inputs import (
     asked_checkpoint,
     asked_recordings,
     progress,
@@ -58,7 +43,10 @@ from runtime.inputs import (
     require_place,
     version,
 )
-from runtime.options import (
+from spikeloom.runtime.commands.load_network import asked_network
+from spikeloom.runtime.commands.main_job import report
+from spikeloom.runtime.commands.main_job.compile import compile_netlist
+from spikeloom.runtime.commands.options import (
     MIN_AGREEMENT,
     add_compile,
     add_detail,
@@ -67,13 +55,15 @@ from runtime.options import (
     add_training,
     add_verify,
 )
-from runtime.spent import Account, explained
-from runtime.tables import show
-from runtime.trace import BoolArray
-from runtime.train_command import train
-from runtime.truenorth import commands as truenorth
-from runtime.truenorth import native
-from runtime.windows import first_part, window_asked
+from spikeloom.runtime.commands.training import finetune, join, reproduce
+from spikeloom.runtime.commands.training.train import train
+from spikeloom.runtime.costs.spent import Account, explained
+from spikeloom.runtime.equivalence import verdicts
+from spikeloom.runtime.machines.loihi1.trace import BoolArray
+from spikeloom.runtime.machines.truenorth import commands as truenorth
+from spikeloom.runtime.machines.truenorth import native
+from spikeloom.runtime.report import decisions, render
+from spikeloom.runtime.report.tables import show
 
 Arguments = argparse.Namespace
 Report = dict[str, Any]
@@ -117,9 +107,9 @@ def _inspect(arguments: Arguments) -> Outcome:
 
 
 def _run(arguments: Arguments) -> Outcome:
-    from runtime import engine
-    from runtime.trace import aligned
-    from runtime.votes import class_counts, predictions
+    from spikeloom.runtime.machines.loihi1 import engine
+    from spikeloom.runtime.machines.loihi1.trace import aligned
+    from spikeloom.runtime.machines.votes import class_counts, predictions
 
     if arguments.spikes is not None:
         require_place(arguments.spikes, "--spikes", arguments)
@@ -152,8 +142,8 @@ def _run(arguments: Arguments) -> Outcome:
 
 
 def _verify(arguments: Arguments) -> Outcome:
-    from runtime.equivalence import verify
-    from runtime.levels import levels_of, parse_requirements, unmet
+    from spikeloom.runtime.equivalence.levels import levels_of, parse_requirements, unmet
+    from spikeloom.runtime.equivalence.verify import verify
 
     if is_crossbars(arguments.netlist):
         return native.verify(arguments)
@@ -198,7 +188,7 @@ def _verify(arguments: Arguments) -> Outcome:
 
 
 def _estimate(arguments: Arguments) -> Outcome:
-    from runtime.estimates import estimate_text
+    from spikeloom.runtime.costs.estimates import estimate_text
 
     if is_crossbars(arguments.netlist):
         return truenorth.estimate(arguments)
@@ -215,8 +205,8 @@ def _costs(
     arguments: Arguments, netlist: Netlist, data: Recordings, spikes: BoolArray | None = None
 ) -> tuple[IntArray, Report]:
     """Spikes of each compartment, and what the recordings cost at the detail that was asked for; fills `spikes`."""
-    from runtime.estimate import estimate
-    from runtime.estimates import estimate_json
+    from spikeloom.runtime.costs.estimate import estimate
+    from spikeloom.runtime.costs.estimates import estimate_json
 
     progress("running")
     target = load_target(netlist.target)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from runtime import cli
+from spikeloom.runtime import cli
 
 SHARED = Path(os.environ.get("SPIKELOOM_SHARED", Path(__file__).resolve().parents[2] / "shared"))
 

@@ -10,21 +10,20 @@ from dataclasses import dataclass
 import numpy as np
 from random_networks import compiled, random_checkpoint
 
-from compiler.errors import SpikeloomError
-from compiler.forms import Form
-from compiler.frontends.checkpoint import Checkpoint
-from compiler.interpret import channels_last
-from compiler.ir import IntegerNetwork
-from compiler.lift import lift
-from compiler.netlist import Netlist
-from compiler.passes.expand import expand
-from compiler.passes.quantize import Recipe, round_to_forms
-from compiler.pipeline import compile_network
-from models.graphs import normalised_adjacency
-from runtime import engine
-from runtime.causes import Explanation, Observed, explain
-from runtime.explain import left_out
-from runtime.suspects import (
+from spikeloom.compiler.errors import SpikeloomError
+from spikeloom.compiler.formats.checkpoint import Checkpoint
+from spikeloom.compiler.interpret import channels_last
+from spikeloom.compiler.ir import IntegerNetwork
+from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.targets.loihi1.compilation import compile_network
+from spikeloom.compiler.targets.loihi1.lift import lift
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe, round_to_forms
+from spikeloom.compiler.targets.loihi1.storage.weight_storage import Form
+from spikeloom.models.graphs import normalised_adjacency
+from spikeloom.runtime.commands.check.explain import left_out
+from spikeloom.runtime.equivalence.causes import Explanation, Observed, explain
+from spikeloom.runtime.equivalence.suspects import (
     BETA,
     BIAS,
     GRAPH,
@@ -37,7 +36,8 @@ from runtime.suspects import (
     TRUNCATION,
     WEIGHTS,
 )
-from runtime.trace import aligned
+from spikeloom.runtime.machines.loihi1 import engine
+from spikeloom.runtime.machines.loihi1.trace import aligned
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -14,15 +14,15 @@ from pathlib import Path
 import numpy as np
 from fuzzed_bytes import changed_bytes
 
-from compiler.errors import SpikeloomError
-from compiler.frontends import hdf5_child
-from compiler.frontends.hdf5 import assembled
-from compiler.frontends.netx import integers_of
-from compiler.frontends.netx_file import blocks_of
-from compiler.frontends.nir import network_of
-from compiler.frontends.nir_file import graph_of
-from compiler.frontends.nir_neurons import Steps
-from compiler.verify import verify
+from spikeloom.compiler.errors import SpikeloomError
+from spikeloom.compiler.formats import hdf5_child
+from spikeloom.compiler.formats.hdf5 import assembled
+from spikeloom.compiler.formats.netx.layout import blocks_of
+from spikeloom.compiler.formats.netx.reader import integers_of
+from spikeloom.compiler.formats.nir.file import graph_of
+from spikeloom.compiler.formats.nir.neurons import Steps
+from spikeloom.compiler.formats.nir.reader import network_of
+from spikeloom.compiler.invariants import verify
 
 FILES = Path(__file__).parent / "nir"
 
@@ -42,7 +42,7 @@ def sources():
 @cache
 def netx_bytes():
     """A good netx file."""
-    from runtime.netx_export import file_bytes
+    from spikeloom.runtime.formats.netx_export import file_bytes
 
     rng = np.random.default_rng(0)
 

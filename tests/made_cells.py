@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from models.schedule import DECAY_EPOCHS
-from runtime.cells import FORMAT, Row, cell_file, write_cell
-from runtime.published import RECORDINGS
+from spikeloom.models.training.schedule import DECAY_EPOCHS
+from spikeloom.runtime.studies.paper.cells import FORMAT, Row, cell_file, write_cell
+from spikeloom.runtime.studies.paper.published import RECORDINGS
 
 SAMPLES = {"objects": 144, "containers": 60}
 

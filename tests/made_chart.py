@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from runtime import chart_points
-from runtime.chart_budget import parse_budgets, pick
-from runtime.chart_points import share
+from spikeloom.runtime.studies.chart import points as chart_points
+from spikeloom.runtime.studies.chart.budget import parse_budgets, pick
+from spikeloom.runtime.studies.chart.points import share
 
 TABLES = {"energy": {"one": "prices <one>", "two": "prices two"}, "time": {"clock": "times"}}
 SAMPLES = {"train": 400, "test": 100}

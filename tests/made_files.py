@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from compiler.frontends.checkpoint import Checkpoint, read_checkpoint
-from models.checkpoint import save_checkpoint
-from models.graphs import Graph, normalised_adjacency
+from spikeloom.compiler.formats.checkpoint import Checkpoint, read_checkpoint
+from spikeloom.models.graphs import Graph, normalised_adjacency
+from spikeloom.models.networks.checkpoint import save_checkpoint
 
 TAXELS, FEATURES, CLASSES, STEPS = 6, 5, 4, 24
 

@@ -7,9 +7,9 @@ import numpy as np
 import torch
 from torch import nn
 
-from compiler.passes.quantize import Recipe
-from models.lif import LIF, OneStep
-from models.module import compile_module
+from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe
+from spikeloom.models.networks.lif import LIF, OneStep
+from spikeloom.models.networks.module import compile_module
 
 TAXELS, CLASSES = 6, 3
 RING = np.array([[i, (i + 1) % TAXELS] for i in range(TAXELS)] + [[(i + 1) % TAXELS, i] for i in range(TAXELS)])

@@ -7,9 +7,9 @@ import numpy as np
 import torch
 from torch.nn import functional
 
-from compiler.frontends.nir import network_of
-from compiler.frontends.nir_file import graph_of
-from compiler.frontends.nir_neurons import Steps
+from spikeloom.compiler.formats.nir.file import graph_of
+from spikeloom.compiler.formats.nir.neurons import Steps
+from spikeloom.compiler.formats.nir.reader import network_of
 
 
 def tree_of(graph):

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from compiler.dynamics import clocks_over
-from compiler.truenorth.native import UNIT, NativeNetwork, Stage, highest_level, steepest_leak
+from spikeloom.compiler.dynamics import clocks_over
+from spikeloom.compiler.targets.truenorth.native import UNIT, NativeNetwork, Stage, highest_level, steepest_leak
 
 
 def random_stage(rng, name, inputs, size, depth, *, copies, clocks) -> Stage:

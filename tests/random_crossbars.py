@@ -5,7 +5,7 @@ from dataclasses import fields
 import numpy as np
 from hypothesis import strategies as st
 
-from compiler.truenorth.draft import Draft, Neuron
+from spikeloom.compiler.targets.truenorth.builder import Draft, Neuron
 
 WEIGHTS = st.one_of(st.integers(-256, 255), st.integers(-3, 3))
 NEURONS = st.builds(

@@ -5,9 +5,9 @@ from dataclasses import dataclass, fields
 import numpy as np
 from hypothesis import strategies as st
 
-from compiler.netlist import Layer, Netlist, read_only, read_only_float
-from runtime import engine, spec
-from runtime.trace import Counts, Trace
+from spikeloom.compiler.targets.loihi1.netlist import Layer, Netlist, read_only, read_only_float
+from spikeloom.runtime.machines.loihi1 import engine, spec
+from spikeloom.runtime.machines.loihi1.trace import Counts, Trace
 
 MEMORYLESS = 4095
 """decay_u of a current that forgets everything in one step."""

@@ -9,11 +9,11 @@ from hypothesis import assume
 from hypothesis import strategies as st
 from scipy import sparse
 
-from compiler.dynamics import PLAIN
-from compiler.errors import CapacityError
-from compiler.fixedpoint import weight_step
-from compiler.frontends.checkpoint import Checkpoint, Dense
-from compiler.ir import (
+from spikeloom.compiler.dynamics import PLAIN
+from spikeloom.compiler.errors import CapacityError
+from spikeloom.compiler.fixedpoint import weight_step
+from spikeloom.compiler.formats.checkpoint import Checkpoint, Dense
+from spikeloom.compiler.ir import (
     INPUT,
     Input,
     IntegerNetwork,
@@ -24,9 +24,9 @@ from compiler.ir import (
     Projection,
     Readout,
 )
-from compiler.passes.emit import emit
-from compiler.passes.partition import partition
-from compiler.targets import Quantity, Target, load_target
+from spikeloom.compiler.targets.base import Quantity, Target, load_target
+from spikeloom.compiler.targets.loihi1.emit import emit
+from spikeloom.compiler.targets.loihi1.layout.partition import partition
 
 LOIHI = load_target("loihi1")
 """The chip that most tests compile for."""

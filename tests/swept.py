@@ -12,8 +12,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from compiler.errors import CapacityError, DataError, Violation
-from runtime.sweep import Point, content_key, sweep
+from spikeloom.compiler.errors import CapacityError, DataError, Violation
+from spikeloom.runtime.studies.jobs.sweep import Point, content_key, sweep
 
 KIND = "test"
 

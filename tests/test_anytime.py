@@ -10,13 +10,16 @@ from made_files import CLASSES, events, own_file, recordings_folder, weights
 from numpy.testing import assert_allclose, assert_array_equal
 from timed_networks import written
 
-from compiler.dynamics import with_clocks
-from compiler.serialize import read_netlist, write_netlist
-from compiler.targets import load_target
-from models.events import load_data
-from runtime import cli, cost, course, engine, estimate, exits
-from runtime.trace import Counts
-from runtime.votes import class_counts, predictions
+from spikeloom.compiler.dynamics import with_clocks
+from spikeloom.compiler.targets.base import load_target
+from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist, write_netlist
+from spikeloom.models.recordings.events import load_data
+from spikeloom.runtime import cli
+from spikeloom.runtime.costs import cost, course, estimate
+from spikeloom.runtime.machines.loihi1 import engine
+from spikeloom.runtime.machines.loihi1.trace import Counts
+from spikeloom.runtime.machines.votes import class_counts, predictions
+from spikeloom.runtime.studies.anytime import exits
 
 STEPS = 60
 

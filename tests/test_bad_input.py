@@ -25,11 +25,12 @@ from made_files import (
 )
 from made_files import weights as made_weights
 
-from compiler import serialize
-from compiler.archive import digest, read_members
-from compiler.errors import FormatError
-from models.graphs import CHOICES
-from runtime import cli, inputs
+from spikeloom.compiler.errors import FormatError
+from spikeloom.compiler.formats.archive import digest, read_members
+from spikeloom.compiler.targets.loihi1 import netlist_file as serialize
+from spikeloom.models.graphs import CHOICES
+from spikeloom.runtime import cli
+from spikeloom.runtime.commands import inputs
 
 GIVE_CHECKPOINT = "give a file of spikeloom train or of the released layout"
 GIVE_DATA = "give the folder or zip that holds train/ and test/"
@@ -838,7 +839,7 @@ def test_an_older_file_stays_intact(refusal, tmp_path, monkeypatch, old, words, 
 
 
 def test_an_interrupted_comparison(refusal, monkeypatch):
-    monkeypatch.setattr("runtime.engine.simulate", interrupt)
+    monkeypatch.setattr("spikeloom.runtime.machines.loihi1.engine.simulate", interrupt)
     words = ["verify", "net.loom", "--checkpoint", "net.pt", "--data", "data"]
     assert refusal(*words) == "interrupted; nothing was written"
 
@@ -847,7 +848,7 @@ def test_memory_that_does_not_suffice(refusal, monkeypatch):
     def exhausted(*_words, **_options):
         raise MemoryError("Unable to allocate 9.9 TiB")
 
-    monkeypatch.setattr("runtime.engine.simulate", exhausted)
+    monkeypatch.setattr("spikeloom.runtime.machines.loihi1.engine.simulate", exhausted)
     assert refusal("run", "net.loom", "--data", "data") == (
         "out of memory (Unable to allocate 9.9 TiB); give fewer recordings with --limit"
     )

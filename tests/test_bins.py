@@ -11,18 +11,20 @@ import pytest
 from numpy.testing import assert_array_equal
 from test_checkpoint import rebuilt
 
-from compiler.dynamics import NO_CLOCKS
-from compiler.errors import FormatError, ModelError, OptionError
-from compiler.frontends.checkpoint import read_checkpoint
-from compiler.serialize import manifest_of, netlist_bytes, read_netlist, write_netlist
-from compiler.sidecar import restore
-from compiler.truenorth.native import SYSTEM as NATIVE
-from models.events import BIN_S, joined_bins, load_data
-from models.grasps import synthetic_grasps
-from models.release import write_event_lines, write_released
-from runtime import chart_work, disturbances, stress_runs
-from runtime.cli import main
-from runtime.inputs import require_bins
+from spikeloom.compiler.dynamics import NO_CLOCKS
+from spikeloom.compiler.errors import FormatError, ModelError, OptionError
+from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.formats.nir.sidecar import restore
+from spikeloom.compiler.targets.loihi1.netlist_file import manifest_of, netlist_bytes, read_netlist, write_netlist
+from spikeloom.compiler.targets.truenorth.native import SYSTEM as NATIVE
+from spikeloom.models.recordings.events import BIN_S, joined_bins, load_data
+from spikeloom.models.recordings.grasps import synthetic_grasps
+from spikeloom.models.recordings.release import write_event_lines, write_released
+from spikeloom.runtime.cli import main
+from spikeloom.runtime.commands.inputs import require_bins
+from spikeloom.runtime.studies.chart import work as chart_work
+from spikeloom.runtime.studies.stress import disturbances
+from spikeloom.runtime.studies.stress import runs as stress_runs
 
 BINS = 3
 
@@ -112,7 +114,7 @@ def test_files_of_other_networks_are_as_before(place):
 
 @pytest.mark.parametrize("bins", [1, 0, 2.5, True, "3", None, 2**20 + 1])
 def test_a_netlist_of_unusable_bins_is_refused(place, tmp_path, monkeypatch, bins):
-    monkeypatch.setattr("compiler.serialize.manifest_of", _with_bins(bins))
+    monkeypatch.setattr("spikeloom.compiler.targets.loihi1.netlist_file.manifest_of", _with_bins(bins))
     write_netlist(read_netlist(place / "x.loom"), tmp_path / "y.loom")
     if bins == 1 and type(bins) is int:
         assert read_netlist(tmp_path / "y.loom").bins == 1

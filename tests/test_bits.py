@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from made_files import TAXELS, events, own_file, recordings_folder, weights
 
-from compiler.passes.widths import Found, Point
-from compiler.serialize import read_netlist
-from models.fetch import data_folder
-from runtime import bits, cli
+from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
+from spikeloom.compiler.targets.loihi1.storage.width_search import Found, Point
+from spikeloom.models.recordings.fetch import data_folder
+from spikeloom.runtime import cli
+from spikeloom.runtime.commands.choose import bits
 
 COMMAND = ("bits", "net.pt", "--calibrate", "data", "--widths", "2,4", "--samples", "9")
 

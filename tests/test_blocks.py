@@ -6,15 +6,15 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from random_netlists import Axon, Neuron, assert_equal, build, by_engine, by_steps, recording_of
 
-from compiler.errors import NumericRangeError
-from compiler.frontends.checkpoint import read_checkpoint
-from compiler.netlist import Netlist
-from compiler.passes.expand import expand
-from compiler.passes.quantize import Recipe
-from compiler.pipeline import compile_network
-from runtime import engine, spec
-from runtime.blocks import lay_out_blocks
-from runtime.trace import Charges, pack, unpack
+from spikeloom.compiler.errors import NumericRangeError
+from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.targets.loihi1.compilation import compile_network
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe
+from spikeloom.runtime.machines.loihi1 import engine, spec
+from spikeloom.runtime.machines.loihi1.blocks import lay_out_blocks
+from spikeloom.runtime.machines.loihi1.trace import Charges, pack, unpack
 
 REPEATABLE = settings(max_examples=60, deadline=None, derandomize=True)
 
@@ -253,8 +253,8 @@ def test_scattered_synapses_take_the_other_kernel():
 @pytest.mark.recordings
 @pytest.mark.parametrize("recipe", [Recipe(), Recipe(planes=2, groups=8), Recipe(bits=2)])
 def test_the_released_network(released_checkpoint, objects_zip, recipe):
-    from models.evtouch import load_recordings
-    from models.graphs import build_graph, normalised_adjacency
+    from spikeloom.models.graphs import build_graph, normalised_adjacency
+    from spikeloom.models.recordings.evtouch import load_recordings
 
     graph = build_graph("manual")
     checkpoint = read_checkpoint(released_checkpoint)

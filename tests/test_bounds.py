@@ -13,9 +13,9 @@ from random_networks import (
     recordings_for,
 )
 
-from compiler.interpret import run_integer
-from compiler.passes.bounds import prove_ranges
-from compiler.passes.quantize import Recipe, quantize
+from spikeloom.compiler.interpret import run_integer
+from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe, quantize
+from spikeloom.compiler.targets.loihi1.storage.range_proof import prove_ranges
 
 
 def with_registers(network, **changes):

@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 from made_files import CLASSES, STEPS, TAXELS, events, small_checkpoint, weights
 
-from compiler.passes.expand import expand
-from compiler.passes.quantize import Recipe
-from compiler.pipeline import compile_network
-from runtime import cli, verdicts
-from runtime.breakdowns import breakdowns
-from runtime.equivalence import verify
-from runtime.levels import levels_of
+from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.targets.loihi1.compilation import compile_network
+from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe
+from spikeloom.runtime import cli
+from spikeloom.runtime.equivalence import verdicts
+from spikeloom.runtime.equivalence.breakdowns import breakdowns
+from spikeloom.runtime.equivalence.levels import levels_of
+from spikeloom.runtime.equivalence.verify import verify
 
 FILES = tuple("abcdef")
 LABELS = np.arange(6) % CLASSES

@@ -8,13 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from random_networks import chain, integer_networks, recordings_for
 
-from compiler.forms import Form
-from compiler.interpret import run_integer, step_late
-from compiler.ir import INPUT
-from compiler.passes.expand import expand_graph_convolution
-from compiler.passes.quantize import round_to_forms
-from runtime.causes import Explanation, Observed, explain
-from runtime.suspects import (
+from spikeloom.compiler.interpret import run_integer, step_late
+from spikeloom.compiler.ir import INPUT
+from spikeloom.compiler.passes.expand import expand_graph_convolution
+from spikeloom.compiler.targets.loihi1.storage.quantize import round_to_forms
+from spikeloom.compiler.targets.loihi1.storage.weight_storage import Form
+from spikeloom.runtime.equivalence.causes import Explanation, Observed, explain
+from spikeloom.runtime.equivalence.suspects import (
     BETA,
     BIAS,
     GRAPH,

@@ -8,19 +8,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_files import CLASSES, FEATURES, TAXELS, events, ring, small_checkpoint, weights
 
-from compiler.frontends.checkpoint import Checkpoint
-from compiler.interpret import channels_last, run_float, vote
-from compiler.lift import lift
-from compiler.passes.expand import expand
-from compiler.passes.quantize import Recipe
-from compiler.pipeline import compile_network
-from models.reference import float_spikes
-from runtime import engine
-from runtime.certainty import _recurrence, float_certainty
-from runtime.certificates import certificate_json, certificate_text, certify, wins
-from runtime.equivalence import verify
-from runtime.trace import aligned
-from runtime.votes import predictions
+from spikeloom.compiler.formats.checkpoint import Checkpoint
+from spikeloom.compiler.interpret import channels_last, run_float, vote
+from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.targets.loihi1.compilation import compile_network
+from spikeloom.compiler.targets.loihi1.lift import lift
+from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe
+from spikeloom.models.networks.reference import float_spikes
+from spikeloom.runtime.equivalence.certainty import _recurrence, float_certainty
+from spikeloom.runtime.equivalence.certificates import certificate_json, certificate_text, certify, wins
+from spikeloom.runtime.equivalence.verify import verify
+from spikeloom.runtime.machines.loihi1 import engine
+from spikeloom.runtime.machines.loihi1.trace import aligned
+from spikeloom.runtime.machines.votes import predictions
 
 SIZES = (9, 8, CLASSES)
 

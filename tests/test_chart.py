@@ -16,13 +16,14 @@ import pytest
 from commands import RUNTIME
 from made_files import CLASSES, events, own_file, recordings_folder, ring, weights
 
-from compiler.errors import CapacityError, OptionError, SpikeloomError, Violation
-from compiler.serialize import netlist_bytes, read_netlist
-from models.evtouch import load_recordings
-from models.graphs import Graph
-from models.protocols import data_digest
-from runtime import chart_tasks, chart_work
-from runtime.chart_text import chart_text
+from spikeloom.compiler.errors import CapacityError, OptionError, SpikeloomError, Violation
+from spikeloom.compiler.targets.loihi1.netlist_file import netlist_bytes, read_netlist
+from spikeloom.models.graphs import Graph
+from spikeloom.models.recordings.evtouch import load_recordings
+from spikeloom.models.training.protocols import data_digest
+from spikeloom.runtime.studies.chart import tasks as chart_tasks
+from spikeloom.runtime.studies.chart import work as chart_work
+from spikeloom.runtime.studies.chart.text import chart_text
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -174,7 +175,7 @@ def test_asked_again_nothing_is_measured_and_every_byte_is_the_same(made, spikel
     def never(_work):
         raise AssertionError("measured again")
 
-    monkeypatch.setattr("runtime.chart_work.measure", never)
+    monkeypatch.setattr("spikeloom.runtime.studies.chart.work.measure", never)
     assert spikeloom(*CHART, "-o", "out", "--json")[0] == 0
     assert {file.name: file.read_bytes() for file in (place / "out").glob("chart.*")} == before
 
@@ -186,7 +187,7 @@ def test_one_more_window_compiles_nothing(made, spikeloom, monkeypatch):
         worked.append(work)
         return measure(work)
 
-    monkeypatch.setattr("runtime.chart_work.measure", watched)
+    monkeypatch.setattr("spikeloom.runtime.studies.chart.work.measure", watched)
     words = [word if word != GRID else GRID.replace("50-100%:50", "25%,50%,100%") for word in CHART]
     assert spikeloom(*words, "-o", "out", "--json")[0] == 0
     runs = [work for work in worked if isinstance(work, chart_tasks.Run)]
@@ -287,8 +288,8 @@ def test_a_shipped_checkpoint_stands_in_for_a_graph_that_is_asked_for(spikeloom,
             raise OptionError(f"{path}: no such shipped checkpoint")
         return files[path]
 
-    monkeypatch.setattr("runtime.chart_networks.shipped", shipped)
-    monkeypatch.setattr("runtime.inputs.shipped", shipped)
+    monkeypatch.setattr("spikeloom.runtime.studies.chart.networks.shipped", shipped)
+    monkeypatch.setattr("spikeloom.runtime.commands.inputs.shipped", shipped)
     words = ("chart", "pretrained:rings", "--data", "data", "--jobs", "1", "-o", "shipped", "--json", "--grid")
     code, out, _ = spikeloom(*words, "bits=8,window=100%,graph=ring/knn:1")
     assert code == 0
@@ -319,7 +320,7 @@ def refusing(monkeypatch):
             raise CapacityError((VIOLATION,))
         return store(network, recipes=recipes, **options)
 
-    monkeypatch.setattr("runtime.chart_work.store", picky)
+    monkeypatch.setattr("spikeloom.runtime.studies.chart.work.store", picky)
     return refused
 
 
@@ -433,7 +434,7 @@ def test_a_netlist_is_no_checkpoint(made, spikeloom, place):
 
 
 def test_a_store_of_another_version(made, spikeloom, place, monkeypatch):
-    monkeypatch.setattr("runtime.chart.FORMAT", chart_tasks.FORMAT + 1)
+    monkeypatch.setattr("spikeloom.runtime.commands.choose.chart.FORMAT", chart_tasks.FORMAT + 1)
     code, out, err = spikeloom(*CHART, "-o", "out")
     assert (code, out) == (2, "")
     assert err.startswith(f"spikeloom: {Path('out') / 'points.jsonl'}: ")
@@ -475,7 +476,9 @@ def test_workers_of_a_scheduler_in_another_folder_find_the_same(made, spikeloom)
 @pytest.mark.parametrize("what", ["data", "network"])
 def test_a_worker_that_has_other_files_says_so(made, spikeloom, place, monkeypatch, what):
     handed, measure = [], chart_work.measure
-    monkeypatch.setattr("runtime.chart_work.measure", lambda work: handed.append(work) or measure(work))
+    monkeypatch.setattr(
+        "spikeloom.runtime.studies.chart.work.measure", lambda work: handed.append(work) or measure(work)
+    )
     spikeloom(*[word if word != GRID else "bits=6,window=100%" for word in CHART], "-o", f"files-{what}")
     work = next(each for each in handed if isinstance(each, chart_tasks.Build))
     chart_work.both_splits.cache_clear()

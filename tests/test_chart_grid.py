@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from compiler.errors import OptionError
-from compiler.passes.layout import GOALS
-from compiler.targets import load_target
-from runtime.chart_grid import Grid, axes, parse_grid
+from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.targets.base import load_target
+from spikeloom.compiler.targets.loihi1.layout.choose import GOALS
+from spikeloom.runtime.studies.chart.grid import Grid, axes, parse_grid
 
 TARGET = load_target("loihi1")
 WIDTHS = (2, 3, 4, 5, 6, 8)

@@ -9,11 +9,11 @@ from browser import Page
 from made_chart import made_chart
 from made_files import own_file, recordings_folder
 
-from runtime import cli
-from runtime.chart_figure import SERIES, SHAPES, scatter, series_of
-from runtime.chart_page import chart_page
-from runtime.chart_picture import COLOURS, MARKERS, pictures
-from runtime.chart_text import chart_text, csv_text
+from spikeloom.runtime import cli
+from spikeloom.runtime.studies.chart.figure import SERIES, SHAPES, scatter, series_of
+from spikeloom.runtime.studies.chart.page import chart_page
+from spikeloom.runtime.studies.chart.picture import COLOURS, MARKERS, pictures
+from spikeloom.runtime.studies.chart.text import chart_text, csv_text
 
 
 @pytest.fixture
@@ -196,7 +196,7 @@ def reported(capsys, place, monkeypatch):
 
 
 def with_sha(chart, place):
-    from compiler.frontends.checkpoint import read_checkpoint
+    from spikeloom.compiler.formats.checkpoint import read_checkpoint
 
     chart["networks"][0]["sha256"] = read_checkpoint(place / "net.pt").sha256
     (place / "charted").mkdir(exist_ok=True)

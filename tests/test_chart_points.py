@@ -4,9 +4,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from compiler.errors import OptionError
-from runtime.chart_budget import Budget, parse_budgets, pick
-from runtime.chart_points import (
+from spikeloom.compiler.errors import OptionError
+from spikeloom.runtime.studies.chart.budget import Budget, parse_budgets, pick
+from spikeloom.runtime.studies.chart.points import (
     TRAINING,
     VALIDATION,
     front,

@@ -15,15 +15,15 @@ import numpy as np
 import pytest
 import torch
 
-from compiler.errors import ModelError, OptionError
-from compiler.frontends.checkpoint import SIZE_LIMIT, read_checkpoint
-from compiler.frontends.own import content_digest
-from models.checkpoint import checkpoint_bytes, save_checkpoint, training_record
-from models.evtouch import Recordings
-from models.graphs import Graph
-from models.networks import Architecture
-from models.protocols import Reported
-from models.train import Epoch, Trained
+from spikeloom.compiler.errors import ModelError, OptionError
+from spikeloom.compiler.formats.checkpoint import SIZE_LIMIT, read_checkpoint
+from spikeloom.compiler.formats.checkpoint_file import content_digest
+from spikeloom.models.graphs import Graph
+from spikeloom.models.networks.checkpoint import checkpoint_bytes, save_checkpoint, training_record
+from spikeloom.models.networks.networks import Architecture
+from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.models.training.protocols import Reported
+from spikeloom.models.training.train import Epoch, Trained
 
 TAXELS, FEATURES, HOPS, SIZES, CLASSES = 6, 4, 3, (5, 7), 3
 NOT_A_CHECKPOINT = "is not a checkpoint; give a file of spikeloom train or of the released layout"
@@ -429,7 +429,7 @@ def test_own_format_is_byte_deterministic():
 def test_own_format_needs_neither_torch_nor_pickle(tmp_path):
     write(tmp_path / "x.pt", own())
     program = (
-        "import sys; from compiler.frontends.checkpoint import read_checkpoint; "
+        "import sys; from spikeloom.compiler.formats.checkpoint import read_checkpoint; "
         f"assert read_checkpoint({str(tmp_path / 'x.pt')!r}).classes == {CLASSES}; assert 'torch' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", program], check=True, cwd=Path(__file__).parents[1])

@@ -16,16 +16,16 @@ from numpy.testing import assert_array_equal
 from random_networks import float_networks
 from timed_networks import events_of, written
 
-from compiler.dynamics import with_clocks
-from compiler.errors import OptionError
-from compiler.interpret import run_integer, vote
-from compiler.lift import lift
-from compiler.pipeline import compile_network
-from compiler.serialize import read_netlist
-from models.chip_module import ChipModule, neurobench_model
-from models.chip_module import vote as torch_vote
-from runtime.cli import main
-from runtime.votes import readout_counts
+from spikeloom.compiler.dynamics import with_clocks
+from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.interpret import run_integer, vote
+from spikeloom.compiler.targets.loihi1.compilation import compile_network
+from spikeloom.compiler.targets.loihi1.lift import lift
+from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
+from spikeloom.runtime.cli import main
+from spikeloom.runtime.machines.chip_module import ChipModule, neurobench_model
+from spikeloom.runtime.machines.chip_module import vote as torch_vote
+from spikeloom.runtime.machines.votes import readout_counts
 
 SETTINGS = settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
@@ -78,8 +78,8 @@ import numpy as np, torch
 from neurobench.benchmarks import Benchmark
 from neurobench.metrics.static import ConnectionSparsity, Footprint
 from neurobench.metrics.workload import ActivationSparsity, ClassificationAccuracy, SynapticOperations
-from compiler.serialize import read_netlist
-from models.chip_module import neurobench_model, vote
+from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
+from spikeloom.runtime.machines.chip_module import neurobench_model, vote
 
 with np.load(sys.argv[2]) as data:
     events, labels = torch.from_numpy(data["events"]).float(), torch.from_numpy(data["labels"])

@@ -8,18 +8,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 from random_networks import LOIHI, integer_chain, small_target
 
-from compiler.coremap import core_map
-from compiler.errors import CapacityError, OptionError
-from compiler.passes.chips import chip_count, chip_of_core, place_on_chips, share
-from compiler.passes.emit import emit
-from compiler.passes.expand import expand_graph_convolution
-from compiler.passes.layout import asked_cores, lay_out, require_goal
-from compiler.passes.legalize import LimitUse, measure, require_legal
-from compiler.passes.place import place
-from compiler.serialize import read_netlist, write_netlist
-from runtime import cost, engine, sanafe, spec, timing
-from runtime.estimate import estimate
-from runtime.estimates import estimate_json, estimate_text
+from spikeloom.compiler.errors import CapacityError, OptionError
+from spikeloom.compiler.passes.expand import expand_graph_convolution
+from spikeloom.compiler.targets.loihi1.emit import emit
+from spikeloom.compiler.targets.loihi1.layout.chips import chip_count, chip_of_core, place_on_chips, share
+from spikeloom.compiler.targets.loihi1.layout.choose import asked_cores, lay_out, require_goal
+from spikeloom.compiler.targets.loihi1.layout.core_graph import core_map
+from spikeloom.compiler.targets.loihi1.layout.place import place
+from spikeloom.compiler.targets.loihi1.legalize import LimitUse, measure, require_legal
+from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist, write_netlist
+from spikeloom.runtime.costs import cost
+from spikeloom.runtime.costs.estimate import estimate
+from spikeloom.runtime.costs.estimates import estimate_json, estimate_text
+from spikeloom.runtime.formats import sanafe
+from spikeloom.runtime.machines.loihi1 import engine, spec, timing
 
 SMALL = small_target(core_compartments=4, chip_cores=2, mesh_width=2, mesh_height=1, mesh_tile_cores=1)
 """Two cores of four neurons a chip, one on each tile."""

@@ -14,18 +14,20 @@ import numpy as np
 import pytest
 from made_files import CLASSES, FEATURES, STEPS, TAXELS, events, own_file, recordings_folder, released, state_dict
 from made_files import weights as made_weights
+from spikeloom.runtime.__main__ import main as start
 
-from compiler.errors import ModelError
-from compiler.interpret import channels_last, run_integer
-from compiler.lift import lift
-from compiler.pipeline import STAGES
-from compiler.serialize import read_netlist
-from compiler.targets import EVENTS, load_target
-from compiler.text import text
-from models.graphs import build_graph
-from runtime import cli, compile_command, inputs
-from runtime.__main__ import main as start
-from runtime.inputs import recordings
+from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.interpret import channels_last, run_integer
+from spikeloom.compiler.targets.base import EVENTS, load_target
+from spikeloom.compiler.targets.loihi1.compilation import STAGES
+from spikeloom.compiler.targets.loihi1.lift import lift
+from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
+from spikeloom.compiler.text import text
+from spikeloom.models.graphs import build_graph
+from spikeloom.runtime import cli
+from spikeloom.runtime.commands import inputs
+from spikeloom.runtime.commands.inputs import recordings
+from spikeloom.runtime.commands.main_job import compile as compile_command
 
 SIZES = {"conv1": TAXELS * FEATURES, "fc1": 9, "fc2": 8, "fc3": CLASSES}
 
@@ -449,7 +451,7 @@ def test_an_interrupt_while_python_loads_the_command(monkeypatch, capsys):
         def __getattr__(self, name):
             raise KeyboardInterrupt
 
-    monkeypatch.setitem(sys.modules, "runtime.cli", Loading("runtime.cli"))
+    monkeypatch.setitem(sys.modules, "spikeloom.runtime.cli", Loading("spikeloom.runtime.cli"))
     assert start() == 2
     assert capsys.readouterr().err == "spikeloom: interrupted; nothing was written\n"
 

@@ -19,14 +19,14 @@ from types import SimpleNamespace
 import pytest
 from swept import KIND, VIOLATION, begun, points, square
 
-from compiler.errors import CapacityError, DataError, OptionError, UnfinishedError
-from models.grasps import synthetic_grasps
-from models.protocols import data_digest
-from models.release import write_released
-from runtime.cell_work import splits_on_worker
-from runtime.cli import main
-from runtime.cluster import facts, refusal, require_alike, source_digest
-from runtime.sweep import sweep
+from spikeloom.compiler.errors import CapacityError, DataError, OptionError, UnfinishedError
+from spikeloom.models.recordings.grasps import synthetic_grasps
+from spikeloom.models.recordings.release import write_released
+from spikeloom.models.training.protocols import data_digest
+from spikeloom.runtime.cli import main
+from spikeloom.runtime.studies.jobs.cluster import facts, refusal, require_alike, source_digest
+from spikeloom.runtime.studies.jobs.sweep import sweep
+from spikeloom.runtime.studies.paper.cell_work import splits_on_worker
 
 pytest.importorskip("distributed", reason="distributed is not installed (extra 'cluster')")
 
@@ -186,7 +186,7 @@ def test_a_scheduler_that_is_lost_leaves_what_came(made, tmp_path, monkeypatch):
         f"--scheduler {cluster.address}: was lost\n3 of 5 points are kept in {tmp_path / 'x.store'}"
     )
     assert list(raised.value.results.values()) == expected(3)
-    monkeypatch.setattr("runtime.cluster.CONNECT_S", 0.5)
+    monkeypatch.setattr("spikeloom.runtime.studies.jobs.cluster.CONNECT_S", 0.5)
     with pytest.raises(OptionError) as refused:
         swept_there(tmp_path, asked, cluster.address)
     assert str(refused.value) == (
@@ -201,7 +201,7 @@ def test_a_scheduler_that_is_lost_leaves_what_came(made, tmp_path, monkeypatch):
 
 def test_workers_that_are_not_alike_are_refused(made, tmp_path):
     other = tmp_path / "other"
-    for package in ("compiler", "runtime", "models"):
+    for package in ("spikeloom",):
         shutil.copytree(ROOT / package, other / package, ignore=shutil.ignore_patterns("pretrained", "__pycache__"))
     with (other / "runtime" / "sweep.py").open("a") as file:
         file.write("# another line\n")
@@ -294,7 +294,11 @@ def test_without_dask(tmp_path, monkeypatch):
 
 
 def test_dask_is_loaded_where_it_is_asked_for_only():
-    code = "import sys, runtime.cli, runtime.cluster; sys.exit('distributed' in sys.modules or 'dask' in sys.modules)"
+    code = (
+        "import sys, spikeloom.runtime.cli, "
+        "spikeloom.runtime.studies.jobs.cluster; "
+        "sys.exit('distributed' in sys.modules or 'dask' in sys.modules)"
+    )
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0
 
 
@@ -304,7 +308,7 @@ def test_dask_is_loaded_where_it_is_asked_for_only():
 @pytest.mark.slow
 def test_cells_of_the_paper_made_on_a_cluster_are_those_made_here(made, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("runtime.cells.METHODS", (("mlp", "none"), ("gcn", "manual")))
+    monkeypatch.setattr("spikeloom.runtime.studies.paper.cells.METHODS", (("mlp", "none"), ("gcn", "manual")))
     splits = [
         replace(synthetic_grasps(per_class=2, steps=10, seed=seed), split=split)
         for split, seed in (("train", 1), ("test", 2))

@@ -4,14 +4,14 @@ import networkx as nx
 import numpy as np
 import pytest
 
-from compiler.coremap import core_map
-from compiler.frontends.checkpoint import read_checkpoint
-from compiler.passes.expand import expand
-from compiler.passes.legalize import measure
-from compiler.pipeline import compile_network
-from compiler.targets import load_target
-from models.graphs import normalised_adjacency
-from runtime.inputs import shipped
+from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.targets.base import load_target
+from spikeloom.compiler.targets.loihi1.compilation import compile_network
+from spikeloom.compiler.targets.loihi1.layout.core_graph import core_map
+from spikeloom.compiler.targets.loihi1.legalize import measure
+from spikeloom.models.graphs import normalised_adjacency
+from spikeloom.runtime.commands.inputs import shipped
 
 TARGET = load_target("loihi1")
 

@@ -8,15 +8,16 @@ from made_files import events, small_checkpoint
 from random_netlists import Axon, Neuron, build
 from random_networks import LOIHI, small_target
 
-from compiler.passes.emit import emit
-from compiler.passes.expand import expand
-from compiler.passes.partition import partition
-from compiler.passes.place import core_traffic, place
-from compiler.passes.quantize import Recipe, quantize
-from compiler.targets import EnergyTable, Quantity
-from runtime import cost, engine, spec
-from runtime.estimate import estimate
-from runtime.estimates import estimate_json, estimate_text
+from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.targets.base import EnergyTable, Quantity
+from spikeloom.compiler.targets.loihi1.emit import emit
+from spikeloom.compiler.targets.loihi1.layout.partition import partition
+from spikeloom.compiler.targets.loihi1.layout.place import core_traffic, place
+from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe, quantize
+from spikeloom.runtime.costs import cost
+from spikeloom.runtime.costs.estimate import estimate
+from spikeloom.runtime.costs.estimates import estimate_json, estimate_text
+from spikeloom.runtime.machines.loihi1 import engine, spec
 
 PICOJOULES = {
     "davies2018": {

@@ -9,17 +9,19 @@ from numpy.testing import assert_allclose, assert_array_equal
 from random_networks import chain, compiled, integer_chain, random_checkpoint
 from timed_networks import written
 
-from compiler.errors import OptionError
-from compiler.forms import decay_registers
-from compiler.frontends.checkpoint import read_checkpoint
-from compiler.lift import lift
-from compiler.passes.expand import expand
-from compiler.passes.quantize import Recipe
-from compiler.pipeline import compile_network
-from models.graphs import normalised_adjacency
-from runtime import damages, engine, float_engine, other_networks, spec
-from runtime.blocks import lay_out_blocks
-from runtime.damages import Pair
+from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.targets.loihi1.compilation import compile_network
+from spikeloom.compiler.targets.loihi1.lift import lift
+from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe
+from spikeloom.compiler.targets.loihi1.storage.weight_storage import decay_registers
+from spikeloom.models.graphs import normalised_adjacency
+from spikeloom.runtime.equivalence import float_engine
+from spikeloom.runtime.machines.loihi1 import engine, spec
+from spikeloom.runtime.machines.loihi1.blocks import lay_out_blocks
+from spikeloom.runtime.studies.stress import damages, other_networks
+from spikeloom.runtime.studies.stress.damages import Pair
 
 
 def made(seed=0, recipe=None, taxels=6):

@@ -9,14 +9,14 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 import numpy as np
 import pytest
 
-from compiler.errors import DataError, OptionError
-from models import fetch
-from models.events import load_data
-from models.fetch import DataSet
-from models.grasps import synthetic_split
-from models.release import write_event_lines, write_released
-from runtime.data_commands import add_bin_option, add_data_commands
-from runtime.found import show_counts
+from spikeloom.compiler.errors import DataError, OptionError
+from spikeloom.models.recordings import fetch
+from spikeloom.models.recordings.events import load_data
+from spikeloom.models.recordings.fetch import DataSet
+from spikeloom.models.recordings.found import show_counts
+from spikeloom.models.recordings.grasps import synthetic_split
+from spikeloom.models.recordings.release import write_event_lines, write_released
+from spikeloom.runtime.commands.exchange.data import add_bin_option, add_data_commands
 
 
 def start(*words):
@@ -362,7 +362,7 @@ def test_matplotlib_is_loaded_for_pictures_only():
     import sys
 
     code = (
-        "import sys, runtime.data_commands, runtime.data_picture\n"
+        "import sys, spikeloom.runtime.commands.exchange.data, spikeloom.runtime.report.data_picture\n"
         "assert not {'matplotlib', 'torch'} & set(sys.modules), 'loaded early'"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)

@@ -5,7 +5,7 @@ import json
 import pytest
 from made_files import TAXELS, own_file
 
-from runtime.cli import main
+from spikeloom.runtime.cli import main
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 
-from runtime import disturbances as d
+from spikeloom.runtime.studies.stress import disturbances as d
 
 REPEATABLE = settings(max_examples=40, deadline=None, derandomize=True)
 

@@ -12,20 +12,20 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from timed_networks import GRAPH, SMALL, TIMING, events_of, louder, written
 
-from compiler.dynamics import NO_CLOCKS, PLAIN, Clocks, Dynamics, clocks_over, dynamics_faults, with_clocks
-from compiler.errors import ModelError, OptionError
-from compiler.frontends.checkpoint import read_checkpoint
-from models.currents import accumulate, accumulate_steps, lasting_current
-from models.graphs import normalised_adjacency
-from models.grasps import synthetic_grasps
-from models.layers import LifSteps, lif
-from models.networks import Architecture, SpikingNet
-from models.recipes import RECIPES, RELEASED, TIMED, Recipe, check_recipe, decays_asked
-from models.reference import float_membranes, float_spikes
-from models.release import write_released
-from models.surrogate import FAST_SIGMOID, RECTANGLE, Surrogate
-from models.train import evaluate, train
-from runtime.cli import main
+from spikeloom.compiler.dynamics import NO_CLOCKS, PLAIN, Clocks, Dynamics, clocks_over, dynamics_faults, with_clocks
+from spikeloom.compiler.errors import ModelError, OptionError
+from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.models.graphs import normalised_adjacency
+from spikeloom.models.networks.currents import accumulate, accumulate_steps, lasting_current
+from spikeloom.models.networks.layers import LifSteps, lif
+from spikeloom.models.networks.networks import Architecture, SpikingNet
+from spikeloom.models.networks.reference import float_membranes, float_spikes
+from spikeloom.models.networks.surrogate import FAST_SIGMOID, RECTANGLE, Surrogate
+from spikeloom.models.recordings.grasps import synthetic_grasps
+from spikeloom.models.recordings.release import write_released
+from spikeloom.models.training.recipes import RECIPES, RELEASED, TIMED, Recipe, check_recipe, decays_asked
+from spikeloom.models.training.train import evaluate, train
+from spikeloom.runtime.cli import main
 
 ADJACENCY = normalised_adjacency(GRAPH.edges, 39)
 SIGMOID = Surrogate(shape=FAST_SIGMOID, width=0.25, reset=False)

@@ -14,13 +14,13 @@ from random_networks import (
     tight_targets,
 )
 
-from compiler.interpret import run_integer
-from compiler.ir import INPUT, fan_in
-from compiler.passes.emit import emit
-from compiler.passes.legalize import require_legal
-from compiler.passes.quantize import Recipe, quantize
-from runtime import spec
-from runtime.trace import aligned
+from spikeloom.compiler.interpret import run_integer
+from spikeloom.compiler.ir import INPUT, fan_in
+from spikeloom.compiler.targets.loihi1.emit import emit
+from spikeloom.compiler.targets.loihi1.legalize import require_legal
+from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe, quantize
+from spikeloom.runtime.machines.loihi1 import spec
+from spikeloom.runtime.machines.loihi1.trace import aligned
 
 
 @settings(deadline=None, max_examples=60)

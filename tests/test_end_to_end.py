@@ -10,15 +10,16 @@ import numpy as np
 import pytest
 from made_files import own_file, recordings_folder, weights
 
-from compiler.frontends.checkpoint import read_checkpoint
-from compiler.netlist import Netlist
-from compiler.passes.expand import expand
-from compiler.pipeline import compile_network
-from compiler.serialize import netlist_bytes, read_netlist
-from models.evtouch import load_recordings
-from models.graphs import build_graph, normalised_adjacency
-from models.reference import float_spikes
-from runtime import cli, engine, spec
+from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.targets.loihi1.compilation import compile_network
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.targets.loihi1.netlist_file import netlist_bytes, read_netlist
+from spikeloom.models.graphs import build_graph, normalised_adjacency
+from spikeloom.models.networks.reference import float_spikes
+from spikeloom.models.recordings.evtouch import load_recordings
+from spikeloom.runtime import cli
+from spikeloom.runtime.machines.loihi1 import engine, spec
 
 RIGHT = 127  # of 144, by the released code's own outputs
 SAMPLES = 3  # recordings that the specification runs too
@@ -259,7 +260,7 @@ def test_specification_equals_engine_on_containers(tmp_path, containers):
 
 WITHOUT_TORCH = """
 import sys
-from runtime.cli import main
+from spikeloom.runtime.cli import main
 code = main(sys.argv[1:])
 unwanted = "torch" in sys.modules
 sys.exit("torch was imported" if unwanted else code)
@@ -292,7 +293,7 @@ def test_run_and_estimate_never_import_torch(small, words):
 
 
 def test_started_as_a_program(small):
-    words = [sys.executable, "-m", "runtime"]
+    words = [sys.executable, "-m", "spikeloom"]
     done = subprocess.run([*words, "inspect", "nowhere.pt"], cwd=small, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == (

@@ -20,9 +20,9 @@ from random_netlists import (
     recordings,
 )
 
-from compiler.errors import NumericRangeError
-from runtime import engine, kernel, spec
-from runtime.trace import Counts, Trace
+from spikeloom.compiler.errors import NumericRangeError
+from spikeloom.runtime.machines.loihi1 import engine, kernel, spec
+from spikeloom.runtime.machines.loihi1.trace import Counts, Trace
 
 REPEATABLE = settings(max_examples=150, deadline=None, derandomize=True)
 
@@ -282,5 +282,9 @@ def test_the_kernel_compiles_where_nothing_can_be_cached(monkeypatch):
 
 
 def test_simulators_do_not_load_torch():
-    code = "import sys, runtime.engine, runtime.spec; sys.exit('torch' in sys.modules)"
+    code = (
+        "import sys, spikeloom.runtime.machines.loihi1.engine, "
+        "spikeloom.runtime.machines.loihi1.spec; "
+        "sys.exit('torch' in sys.modules)"
+    )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -10,18 +10,20 @@ from hypothesis import strategies as st
 from made_files import STEPS, events, own_file, recordings_folder, small_checkpoint, weights
 from random_netlists import Neuron, build
 
-from compiler.errors import DataError, ModelError
-from compiler.interpret import channels_last, run_float
-from compiler.lift import lift
-from compiler.netlist import read_only
-from compiler.passes.expand import expand
-from compiler.passes.quantize import Recipe
-from compiler.pipeline import compile_network
-from models.reference import float_membranes, float_spikes
-from runtime import cli, engine, equivalence, spec
-from runtime.equivalence import LADDER, realised, verify
-from runtime.intervals import wilson
-from runtime.votes import class_counts, predictions
+from spikeloom.compiler.errors import DataError, ModelError
+from spikeloom.compiler.interpret import channels_last, run_float
+from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.targets.loihi1.compilation import compile_network
+from spikeloom.compiler.targets.loihi1.lift import lift
+from spikeloom.compiler.targets.loihi1.netlist import read_only
+from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe
+from spikeloom.models.networks.reference import float_membranes, float_spikes
+from spikeloom.runtime import cli
+from spikeloom.runtime.equivalence import verify as equivalence
+from spikeloom.runtime.equivalence.verify import LADDER, realised, verify
+from spikeloom.runtime.machines.loihi1 import engine, spec
+from spikeloom.runtime.machines.votes import class_counts, predictions
+from spikeloom.runtime.report.intervals import wilson
 
 LAYERS = ["conv1", "fc1", "fc2", "fc3"]
 LABELS = np.array([0, 1, 2, 3, 0, 1])

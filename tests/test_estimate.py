@@ -7,15 +7,15 @@ import pytest
 from made_files import events, small_checkpoint
 from random_networks import LOIHI
 
-from compiler.errors import DataError
-from compiler.passes.expand import expand
-from compiler.passes.quantize import Recipe
-from compiler.pipeline import compile_network
-from runtime import cost as cost_of
-from runtime import engine, timing
-from runtime.charges import charges, simple_from
-from runtime.estimate import estimate
-from runtime.estimates import estimate_json, estimate_text
+from spikeloom.compiler.errors import DataError
+from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.targets.loihi1.compilation import compile_network
+from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe
+from spikeloom.runtime.costs import cost as cost_of
+from spikeloom.runtime.costs.charges import charges, simple_from
+from spikeloom.runtime.costs.estimate import estimate
+from spikeloom.runtime.costs.estimates import estimate_json, estimate_text
+from spikeloom.runtime.machines.loihi1 import engine, timing
 
 LENGTHS = np.array([30, 7, 1, 30])
 

@@ -9,15 +9,15 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from compiler.errors import DataError, OptionError
-from models import events, fetch
-from models.describe import describe
-from models.eventfiles import UNLABELLED, likely_unit, read_stream
-from models.events import BIN_S, GAP_S, MAX_STEPS, bin_events, data_splits, load_data, need_labels
-from models.evtouch import load_recordings
-from models.fetch import DataSet
-from models.grasps import synthetic_grasps
-from models.release import write_released
+from spikeloom.compiler.errors import DataError, OptionError
+from spikeloom.models.recordings import events, fetch
+from spikeloom.models.recordings.describe import describe
+from spikeloom.models.recordings.eventfiles import UNLABELLED, likely_unit, read_stream
+from spikeloom.models.recordings.events import BIN_S, GAP_S, MAX_STEPS, bin_events, data_splits, load_data, need_labels
+from spikeloom.models.recordings.evtouch import load_recordings
+from spikeloom.models.recordings.fetch import DataSet
+from spikeloom.models.recordings.grasps import synthetic_grasps
+from spikeloom.models.recordings.release import write_released
 
 HEADER = "time_s,taxel,polarity\n"
 
@@ -183,7 +183,7 @@ def test_tiny_bins_are_too_many_bins(write):
 
 
 def test_memory_is_checked_first(write, monkeypatch):
-    monkeypatch.setattr("models.evtouch.MAX_TOTAL_BYTES", 1000)
+    monkeypatch.setattr("spikeloom.models.recordings.evtouch.MAX_TOTAL_BYTES", 1000)
     path = write("d/a.csv", "19.99,0,1\n")
     assert message(load_data, path) == "a.csv: recordings of 2000 bytes, limit 1000; split the data set"
     path.write_text("4,0,1\n")

@@ -11,9 +11,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from compiler.errors import DataError
-from models import evtouch
-from models.evtouch import Recordings, load_recordings
+from spikeloom.compiler.errors import DataError
+from spikeloom.models.recordings import evtouch
+from spikeloom.models.recordings.evtouch import Recordings, load_recordings
 
 GIVE = "give the folder or zip that holds train/ and test/"
 DAMAGED = "truncated or damaged; copy or download it again"

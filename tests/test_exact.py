@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from random_networks import LOIHI, chain, random_checkpoint
 
-from compiler.errors import OptionError
-from compiler.interpret import run_integer
-from compiler.passes.calibrate import calibrate
-from compiler.passes.exact import make_exact
-from compiler.passes.expand import expand
-from compiler.passes.quantize import Recipe, quantize
-from compiler.pipeline import compile_network
-from compiler.verify import verify
+from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.interpret import run_integer
+from spikeloom.compiler.invariants import verify
+from spikeloom.compiler.passes.calibrate import calibrate
+from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.targets.loihi1.compilation import compile_network
+from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe, quantize
+from spikeloom.compiler.targets.loihi1.storage.spike_exact import make_exact
 
 
 def layer(seed, *, inputs=30, outputs=20, samples=40, outlier=0.0):

@@ -9,19 +9,21 @@ from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 from random_netlists import Axon, Neuron, build, large_netlist, netlists, recordings
 
-from compiler.dynamics import with_clocks
-from compiler.errors import NumericRangeError
-from compiler.frontends.checkpoint import read_checkpoint
-from compiler.interpret import vote
-from compiler.lift import lift
-from compiler.netlist import read_only
-from compiler.passes.expand import expand
-from compiler.pipeline import compile_network
-from models.evtouch import load_recordings
-from models.graphs import normalised_adjacency
-from runtime import course, engine, exits
-from runtime.inputs import shipped
-from runtime.votes import predictions
+from spikeloom.compiler.dynamics import with_clocks
+from spikeloom.compiler.errors import NumericRangeError
+from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.interpret import vote
+from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.targets.loihi1.compilation import compile_network
+from spikeloom.compiler.targets.loihi1.lift import lift
+from spikeloom.compiler.targets.loihi1.netlist import read_only
+from spikeloom.models.graphs import normalised_adjacency
+from spikeloom.models.recordings.evtouch import load_recordings
+from spikeloom.runtime.commands.inputs import shipped
+from spikeloom.runtime.costs import course
+from spikeloom.runtime.machines.loihi1 import engine
+from spikeloom.runtime.machines.votes import predictions
+from spikeloom.runtime.studies.anytime import exits
 
 
 @st.composite

@@ -7,12 +7,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_networks import random_checkpoint
 
-from compiler.errors import ModelError
-from compiler.interpret import run_float
-from compiler.ir import INPUT, depths, fan_in
-from compiler.passes.expand import expand, expand_graph_convolution, probe_affine
-from compiler.verify import verify
-from models.graphs import build_graph, normalised_adjacency
+from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.interpret import run_float
+from spikeloom.compiler.invariants import verify
+from spikeloom.compiler.ir import INPUT, depths, fan_in
+from spikeloom.compiler.passes.expand import expand, expand_graph_convolution, probe_affine
+from spikeloom.models.graphs import build_graph, normalised_adjacency
 
 # Pairs of taxels within three hops times 64 features and 2 polarities. The hand-drawn graph, the tree and 1, 3 and 4
 # neighbours are also published counts.

@@ -6,21 +6,33 @@ import numpy as np
 import pytest
 from made_files import CLASSES, FEATURES, STEPS, TAXELS, own_file, recordings_folder, weights
 
-from compiler.frontends.checkpoint import read_checkpoint
-from compiler.interpret import channels_last, run_float
-from compiler.lift import lift
-from compiler.passes.expand import expand
-from compiler.passes.quantize import Recipe
-from compiler.pipeline import compile_network
-from compiler.serialize import read_netlist
-from models.events import load_data
-from models.graphs import build_graph, normalised_adjacency
-from runtime import cli, engine
-from runtime.causes import Observed, RootCause, explain
-from runtime.explain import left_out, remedy
-from runtime.roots import Root
-from runtime.suspects import BETA, BIAS, CAUSES, LEFT_OUT, SATURATION, THRESHOLD, TIE, TRUNCATION, UNKNOWN, WEIGHTS
-from runtime.trace import aligned
+from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.interpret import channels_last, run_float
+from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.targets.loihi1.compilation import compile_network
+from spikeloom.compiler.targets.loihi1.lift import lift
+from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
+from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe
+from spikeloom.models.graphs import build_graph, normalised_adjacency
+from spikeloom.models.recordings.events import load_data
+from spikeloom.runtime import cli
+from spikeloom.runtime.commands.check.explain import left_out, remedy
+from spikeloom.runtime.equivalence.causes import Observed, RootCause, explain
+from spikeloom.runtime.equivalence.roots import Root
+from spikeloom.runtime.equivalence.suspects import (
+    BETA,
+    BIAS,
+    CAUSES,
+    LEFT_OUT,
+    SATURATION,
+    THRESHOLD,
+    TIE,
+    TRUNCATION,
+    UNKNOWN,
+    WEIGHTS,
+)
+from spikeloom.runtime.machines.loihi1 import engine
+from spikeloom.runtime.machines.loihi1.trace import aligned
 
 EXPLAIN = ("explain", "net.loom", "--checkpoint", "net.pt", "--data", "data")
 SIZES = {"conv1": TAXELS * FEATURES, "fc1": 9, "fc2": 8, "fc3": CLASSES}

@@ -9,10 +9,11 @@ import pytest
 from random_netlists import Axon, Neuron, build
 from test_timing import LOIHI, six_steps
 
-from compiler.errors import OptionError
-from compiler.netlist import read_only
-from compiler.serialize import write_netlist
-from runtime import export, sanafe
+from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.targets.loihi1.netlist import read_only
+from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist
+from spikeloom.runtime.commands.exchange import export
+from spikeloom.runtime.formats import sanafe
 
 SIX_STEPS = """\
 # spikeloom netlist for SANA-FE 2.2.9 and its loihi.yaml; give the neurons of group input 'spikes'

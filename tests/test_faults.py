@@ -18,12 +18,12 @@ from faults import (
     small_base,
 )
 
-from compiler.frontends.checkpoint import read_checkpoint
-from compiler.interpret import channels_last
-from compiler.passes.quantize import Recipe
-from models.events import load_data
-from models.graphs import build_graph
-from runtime.suspects import CAUSES, TIE, TRUNCATION
+from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.interpret import channels_last
+from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe
+from spikeloom.models.graphs import build_graph
+from spikeloom.models.recordings.events import load_data
+from spikeloom.runtime.equivalence.suspects import CAUSES, TIE, TRUNCATION
 
 EACH = 20
 """Faults of each kind in small networks."""

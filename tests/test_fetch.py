@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from compiler.errors import DataError, OptionError
-from models import fetch
-from models.fetch import DATA_SETS, DataSet, data_folder, fetch_data, find_data
+from spikeloom.compiler.errors import DataError, OptionError
+from spikeloom.models.recordings import fetch
+from spikeloom.models.recordings.fetch import DATA_SETS, DataSet, data_folder, fetch_data, find_data
 
 CONTENT = np.random.default_rng(0).bytes(200_000)
 OTHER = bytes(len(CONTENT))

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from compiler.fixedpoint import (
+from spikeloom.compiler.fixedpoint import (
     ACCUMULATOR_MAX,
     BIAS_EXPONENT_MAX,
     BIAS_MANTISSA_MAX,

@@ -10,16 +10,17 @@ from numpy.testing import assert_array_equal
 from random_networks import chain, compiled, float_networks, integer_chain, recordings_for
 from timed_networks import TIMING, events_of, written
 
-from compiler.dynamics import with_clocks
-from compiler.errors import SpikeloomError
-from compiler.frontends.checkpoint import read_checkpoint
-from compiler.interpret import run_float, vote
-from compiler.passes.expand import expand
-from compiler.pipeline import compile_network
-from models.reference import float_spikes
-from runtime import engine, float_engine
-from runtime.trace import aligned, unpack
-from runtime.votes import readout_counts
+from spikeloom.compiler.dynamics import with_clocks
+from spikeloom.compiler.errors import SpikeloomError
+from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.interpret import run_float, vote
+from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.targets.loihi1.compilation import compile_network
+from spikeloom.models.networks.reference import float_spikes
+from spikeloom.runtime.equivalence import float_engine
+from spikeloom.runtime.machines.loihi1 import engine
+from spikeloom.runtime.machines.loihi1.trace import aligned, unpack
+from spikeloom.runtime.machines.votes import readout_counts
 
 REPEATABLE = settings(max_examples=30, deadline=None, derandomize=True)
 
@@ -167,8 +168,8 @@ def test_a_window_that_opens_late_misses_the_first_steps():
 
 @pytest.mark.recordings
 def test_every_spike_of_the_released_network(released_checkpoint, objects_zip):
-    from models.evtouch import load_recordings
-    from models.graphs import build_graph, normalised_adjacency
+    from spikeloom.models.graphs import build_graph, normalised_adjacency
+    from spikeloom.models.recordings.evtouch import load_recordings
 
     checkpoint = read_checkpoint(released_checkpoint)
     adjacency = normalised_adjacency(build_graph("manual").edges, 39)

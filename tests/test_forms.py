@@ -6,8 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_networks import BITS, chain, float_networks
 
-from compiler.fixedpoint import quantise_weights, weight_step
-from compiler.forms import (
+from spikeloom.compiler.fixedpoint import quantise_weights, weight_step
+from spikeloom.compiler.invariants import verify
+from spikeloom.compiler.ir import IntegerNetwork
+from spikeloom.compiler.targets.loihi1.storage.weight_storage import (
     Form,
     one_sided_sums,
     plane_distance,
@@ -17,8 +19,6 @@ from compiler.forms import (
     scales,
     split_planes,
 )
-from compiler.ir import IntegerNetwork
-from compiler.verify import verify
 
 
 @st.composite

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from compiler.errors import ModelError, OptionError
-from models import graphs
-from models.graphs import (
+from spikeloom.compiler.errors import ModelError, OptionError
+from spikeloom.models import graphs
+from spikeloom.models.graphs import (
     NEUTOUCH,
     Graph,
     build_graph,
@@ -369,6 +369,6 @@ def test_a_graph_checks_its_own_parts():
 
 
 def test_graphs_load_neither_torch_nor_networkx():
-    code = "import sys, models.graphs; print(sorted({'torch', 'networkx', 'scipy'} & set(sys.modules)))"
+    code = "import sys, spikeloom.models.graphs; print(sorted({'torch', 'networkx', 'scipy'} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"

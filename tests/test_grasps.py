@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from compiler.errors import ModelError, OptionError
-from models.graphs import NEUTOUCH
-from models.grasps import SHAPES, synthetic_grasps
+from spikeloom.compiler.errors import ModelError, OptionError
+from spikeloom.models.graphs import NEUTOUCH
+from spikeloom.models.recordings.grasps import SHAPES, synthetic_grasps
 
 
 def features(recordings) -> np.ndarray:

@@ -13,12 +13,12 @@ from fuzzed_bytes import changed_bytes
 from fuzzed_hdf5 import content_outcome, sources
 from random_networks import chain
 
-from compiler.errors import FormatError, ModelError
-from compiler.frontends.hdf5 import tree_of
-from compiler.frontends.nir_neurons import CONVENTIONS
-from compiler.pipeline import compile_network
-from compiler.sidecar import restore, sidecar_bytes, sidecar_of
-from runtime import nir_export
+from spikeloom.compiler.errors import FormatError, ModelError
+from spikeloom.compiler.formats.hdf5 import tree_of
+from spikeloom.compiler.formats.nir.neurons import CONVENTIONS
+from spikeloom.compiler.formats.nir.sidecar import restore, sidecar_bytes, sidecar_of
+from spikeloom.compiler.targets.loihi1.compilation import compile_network
+from spikeloom.runtime.formats import nir_export
 
 TESTS = Path(__file__).parent
 BATCH = 2000
@@ -80,7 +80,7 @@ def test_bytes_that_the_library_cannot_read_are_told_as_that():
 
 
 def test_a_library_that_dies_is_a_damaged_file(monkeypatch, tmp_path):
-    from compiler.frontends import hdf5
+    from spikeloom.compiler.formats import hdf5
 
     for body in ("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)", "raise SystemExit(3)", ""):
         child = tmp_path / "child.py"

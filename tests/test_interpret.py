@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_networks import chain, dense_weights, float_networks, integer_chain, integer_networks, recordings_for
 
-from compiler.interpret import channels_last, run_float, run_integer, vote
-from compiler.ir import INPUT
+from spikeloom.compiler.interpret import channels_last, run_float, run_integer, vote
+from spikeloom.compiler.ir import INPUT
 
 
 def weights_hit(incoming, spikes, post, neuron, t):

@@ -15,12 +15,12 @@ from random_networks import (
 )
 from scipy import sparse
 
-from compiler.errors import VerifyError
-from compiler.ir import INPUT, Network, Projection, Readout, depths, fan_in, recurrent, to_networkx
-from compiler.passes.emit import emit
-from compiler.passes.partition import partition
-from compiler.text import text
-from compiler.verify import verify
+from spikeloom.compiler.errors import VerifyError
+from spikeloom.compiler.invariants import verify
+from spikeloom.compiler.ir import INPUT, Network, Projection, Readout, depths, fan_in, recurrent, to_networkx
+from spikeloom.compiler.targets.loihi1.emit import emit
+from spikeloom.compiler.targets.loihi1.layout.partition import partition
+from spikeloom.compiler.text import text
 
 replace = dataclasses.replace
 

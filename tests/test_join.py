@@ -11,29 +11,30 @@ from numpy.testing import assert_array_equal
 from test_checkpoint import rebuilt
 from timed_networks import GRAPH, TIMING, events_of, written
 
-from compiler.dynamics import PLAIN, Clocks, Dynamics, with_clocks
-from compiler.errors import ModelError
-from compiler.forms import Form
-from compiler.frontends.checkpoint import read_checkpoint
-from compiler.frontends.onnx import read_onnx
-from compiler.frontends.towers import SHARED, arrays_of, join, members, side_by_side, towers_of
-from compiler.interpret import channels_last, run_float, run_integer, vote
-from compiler.passes.expand import expand
-from compiler.passes.quantize import round_to_forms
-from compiler.pipeline import compile_network
-from models.checkpoint import checkpoint_bytes, save_checkpoint
-from models.events import load_data
-from models.graphs import build_graph
-from models.grasps import synthetic_grasps
-from models.quantised import quantised_spikes
-from models.reference import float_membranes, float_spikes
-from models.release import write_released
-from runtime import engine, yardsticks
-from runtime.cli import main
-from runtime.equivalence import verify
-from runtime.measured import float_decisions
-from runtime.trace import aligned
-from runtime.votes import class_counts, readout_counts
+from spikeloom.compiler.dynamics import PLAIN, Clocks, Dynamics, with_clocks
+from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.formats.onnx.reader import read_onnx
+from spikeloom.compiler.formats.towers import SHARED, arrays_of, join, members, side_by_side, towers_of
+from spikeloom.compiler.interpret import channels_last, run_float, run_integer, vote
+from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.targets.loihi1.compilation import compile_network
+from spikeloom.compiler.targets.loihi1.storage.quantize import round_to_forms
+from spikeloom.compiler.targets.loihi1.storage.weight_storage import Form
+from spikeloom.models.graphs import build_graph
+from spikeloom.models.networks.checkpoint import checkpoint_bytes, save_checkpoint
+from spikeloom.models.networks.quantised import quantised_spikes
+from spikeloom.models.networks.reference import float_membranes, float_spikes
+from spikeloom.models.recordings.events import load_data
+from spikeloom.models.recordings.grasps import synthetic_grasps
+from spikeloom.models.recordings.release import write_released
+from spikeloom.runtime.cli import main
+from spikeloom.runtime.costs import yardsticks
+from spikeloom.runtime.equivalence.verify import verify
+from spikeloom.runtime.machines.loihi1 import engine
+from spikeloom.runtime.machines.loihi1.trace import aligned
+from spikeloom.runtime.machines.votes import class_counts, readout_counts
+from spikeloom.runtime.studies.paper.measured import float_decisions
 
 SYSTEMS = ("tactilesgnet", "gcn", "mlp", "grid-cnn")
 SEEDS = (1, 2, 3)

@@ -17,20 +17,21 @@ from random_networks import (
     tight_targets,
 )
 
-from compiler.errors import CapacityError, NumericRangeError, OptionError
-from compiler.ir import depths
-from compiler.passes import forecast as forecast_module
-from compiler.passes import place as place_module
-from compiler.passes.calibrate import Calibration
-from compiler.passes.emit import emit
-from compiler.passes.fastest import _useful, estimate, fastest
-from compiler.passes.forecast import Forecast, sample, tables
-from compiler.passes.layout import GOALS, asked_cores, lay_out, require_goal
-from compiler.passes.legalize import require_legal
-from compiler.passes.needs import Needs
-from compiler.passes.partition import cut, partition
-from runtime import cost, engine, timing
-from runtime.trace import Counts, aligned
+from spikeloom.compiler.errors import CapacityError, NumericRangeError, OptionError
+from spikeloom.compiler.ir import depths
+from spikeloom.compiler.passes.calibrate import Calibration
+from spikeloom.compiler.targets.loihi1.emit import emit
+from spikeloom.compiler.targets.loihi1.layout import forecast as forecast_module
+from spikeloom.compiler.targets.loihi1.layout import place as place_module
+from spikeloom.compiler.targets.loihi1.layout.choose import GOALS, asked_cores, lay_out, require_goal
+from spikeloom.compiler.targets.loihi1.layout.core_needs import Needs
+from spikeloom.compiler.targets.loihi1.layout.forecast import Forecast, sample, tables
+from spikeloom.compiler.targets.loihi1.layout.latency_search import _useful, estimate, fastest
+from spikeloom.compiler.targets.loihi1.layout.partition import cut, partition
+from spikeloom.compiler.targets.loihi1.legalize import require_legal
+from spikeloom.runtime.costs import cost
+from spikeloom.runtime.machines.loihi1 import engine, timing
+from spikeloom.runtime.machines.loihi1.trace import Counts, aligned
 
 WITHOUT_SHRINKING = tuple(phase for phase in Phase if phase is not Phase.shrink)
 

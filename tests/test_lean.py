@@ -11,16 +11,17 @@ from numpy.testing import assert_array_equal
 from random_netlists import Axon, Neuron, build
 from timed_networks import written
 
-from compiler.ir import INPUT
-from compiler.lift import lift
-from compiler.netlist import read_only
-from compiler.passes.expand import expand
-from compiler.passes.prune import deaf_to
-from compiler.pipeline import compile_network
-from compiler.serialize import read_netlist
-from models.events import load_data
-from runtime import engine, leaner
-from runtime.votes import predictions
+from spikeloom.compiler.ir import INPUT
+from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.passes.prune import deaf_to
+from spikeloom.compiler.targets.loihi1.compilation import compile_network
+from spikeloom.compiler.targets.loihi1.lift import lift
+from spikeloom.compiler.targets.loihi1.netlist import read_only
+from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
+from spikeloom.models.recordings.events import load_data
+from spikeloom.runtime.machines.loihi1 import engine
+from spikeloom.runtime.machines.votes import predictions
+from spikeloom.runtime.studies.pruning import leaner
 
 WORDS = ("lean", "net.pt", "--data", "data")
 STEPS = 40

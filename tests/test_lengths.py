@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from made_files import CLASSES, TAXELS, own_file, weights
 
-from compiler.interpret import run_integer
-from compiler.lift import lift
-from compiler.serialize import read_netlist
-from models.events import load_data
-from models.networks import Architecture, SpikingNet
-from models.protocols import validation_split
-from models.train import evaluate, predict, train
-from runtime.cli import main
+from spikeloom.compiler.interpret import run_integer
+from spikeloom.compiler.targets.loihi1.lift import lift
+from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
+from spikeloom.models.networks.networks import Architecture, SpikingNet
+from spikeloom.models.recordings.events import load_data
+from spikeloom.models.training.protocols import validation_split
+from spikeloom.models.training.train import evaluate, predict, train
+from spikeloom.runtime.cli import main
 
 STEPS = (5, 40, 17, 17, 90, 1)
 

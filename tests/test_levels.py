@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from compiler.errors import OptionError
-from runtime.cli import main
-from runtime.equivalence import LayerSpikes
-from runtime.levels import Level, levels_of, mcnemar, parse_requirements, spike_agreement, unmet
+from spikeloom.compiler.errors import OptionError
+from spikeloom.runtime.cli import main
+from spikeloom.runtime.equivalence.levels import Level, levels_of, mcnemar, parse_requirements, spike_agreement, unmet
+from spikeloom.runtime.equivalence.verify import LayerSpikes
 
 
 def layer(float_: int, chip: int, different: int) -> LayerSpikes:

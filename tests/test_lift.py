@@ -9,16 +9,16 @@ from hypothesis import strategies as st
 from random_netlists import Axon, Neuron, build
 from random_networks import dense_weights, integer_chain, integer_networks, recordings_for, small_target
 
-from compiler.errors import CapacityError, FormatError, NumericRangeError
-from compiler.interpret import run_integer
-from compiler.ir import INPUT, IntegerNetwork
-from compiler.lift import lift
-from compiler.netlist import Netlist, read_only
-from compiler.passes.emit import emit
-from compiler.passes.partition import partition
-from compiler.verify import verify
-from runtime import engine
-from runtime.trace import aligned
+from spikeloom.compiler.errors import CapacityError, FormatError, NumericRangeError
+from spikeloom.compiler.interpret import run_integer
+from spikeloom.compiler.invariants import verify
+from spikeloom.compiler.ir import INPUT, IntegerNetwork
+from spikeloom.compiler.targets.loihi1.emit import emit
+from spikeloom.compiler.targets.loihi1.layout.partition import partition
+from spikeloom.compiler.targets.loihi1.lift import lift
+from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_only
+from spikeloom.runtime.machines.loihi1 import engine
+from spikeloom.runtime.machines.loihi1.trace import aligned
 
 MANY = settings(max_examples=120, deadline=None, derandomize=True)
 

@@ -6,11 +6,11 @@ import torch
 from made_modules import CLASSES, NETS, TAXELS, example_of, graph_net, mlp, seeded
 from torch import nn
 
-from compiler.errors import ModelError
-from compiler.interpret import channels_last, run_float
-from models.lif import LIF, AllSteps, OneStep, reset
-from models.module import compile_module, module_network
-from runtime.equivalence import verify
+from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.interpret import channels_last, run_float
+from spikeloom.models.networks.lif import LIF, AllSteps, OneStep, reset
+from spikeloom.models.networks.module import compile_module, module_network
+from spikeloom.runtime.equivalence.verify import verify
 
 STEPS = 12
 
@@ -181,7 +181,9 @@ REFUSED = {
     "allowed); only affine stages between LIF layers can become synapses": lambda: nn.Sequential(
         nn.Linear(4, 3), LIF(), nn.Sequential(nn.Linear(3, 2), nn.ReLU()), LIF()
     ),
-    "module: has no LIF layer, so nothing spikes; put models.lif.LIF between its stages": lambda: nn.Linear(4, 2),
+    "module: has no LIF layer, so nothing spikes; put spikeloom.models.networks.lif.LIF between its stages": lambda: (
+        nn.Linear(4, 2)
+    ),
     "module 1: is called 2 times in a step, each LIF layer holds the neurons of one place; use one for each": twice,
     "module: returns a tuple, wanted one tensor, the spikes of its classes": Pair,
     "module: its output is no count of the spikes of its last LIF layer; return these spikes, or their sum over a "

@@ -10,13 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from compiler.frontends.checkpoint import Checkpoint, Dense, read_checkpoint
-from compiler.passes.expand import expand_graph_convolution
-from models.evtouch import load_recordings
-from models.graphs import build_graph, normalised_adjacency
-from models.layers import SURROGATE_HALF_WIDTH, LifSteps, lif, spike_linear, tag_convolution
-from models.networks import Architecture, SpikingNet
-from models.reference import float_membranes, float_spikes
+from spikeloom.compiler.formats.checkpoint import Checkpoint, Dense, read_checkpoint
+from spikeloom.compiler.passes.expand import expand_graph_convolution
+from spikeloom.models.graphs import build_graph, normalised_adjacency
+from spikeloom.models.networks.layers import SURROGATE_HALF_WIDTH, LifSteps, lif, spike_linear, tag_convolution
+from spikeloom.models.networks.networks import Architecture, SpikingNet
+from spikeloom.models.networks.reference import float_membranes, float_spikes
+from spikeloom.models.recordings.evtouch import load_recordings
 
 BETA, THETA = 0.2, 0.5
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from made_netx import conv, dense, given_input, neuron, write
 
-from compiler.errors import ModelError
-from compiler.frontends.netx import read_netx
-from runtime.cli import main
+from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.formats.netx.reader import read_netx
+from spikeloom.runtime.cli import main
 
 
 def line(tmp_path, *layers, **more):

@@ -13,15 +13,15 @@ from numpy.testing import assert_array_equal
 from random_networks import chain
 from timed_networks import written
 
-from compiler.errors import ModelError
-from compiler.frontends.netx import integers_of, read_netx
-from compiler.frontends.netx_file import blocks_of
-from compiler.lift import lift
-from compiler.passes.quantize import Recipe
-from compiler.pipeline import compile_network
-from compiler.serialize import read_netlist
-from runtime import netx_export
-from runtime.cli import main
+from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.formats.netx.layout import blocks_of
+from spikeloom.compiler.formats.netx.reader import integers_of, read_netx
+from spikeloom.compiler.targets.loihi1.compilation import compile_network
+from spikeloom.compiler.targets.loihi1.lift import lift
+from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
+from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe
+from spikeloom.runtime.cli import main
+from spikeloom.runtime.formats import netx_export
 
 SETTINGS = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 

@@ -10,16 +10,16 @@ import torch
 from made_netx import conv, dense, even, events, flatten, given_input, neuron, write
 from numpy.testing import assert_array_equal
 
-from compiler.frontends.netx import integers_of, read_netx
-from compiler.frontends.netx_file import read_blocks
-from compiler.frontends.sensor_layout import sensor_layout
-from compiler.interpret import run_integer
-from compiler.lift import lift
-from compiler.placing import place_integers
-from compiler.serialize import read_netlist
-from compiler.verify import verify
-from runtime import engine
-from runtime.cli import main
+from spikeloom.compiler.formats.netx.layout import read_blocks
+from spikeloom.compiler.formats.netx.reader import integers_of, read_netx
+from spikeloom.compiler.interpret import run_integer
+from spikeloom.compiler.invariants import verify
+from spikeloom.compiler.sensor_layout import sensor_layout
+from spikeloom.compiler.targets.loihi1.lift import lift
+from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
+from spikeloom.compiler.targets.loihi1.placing import place_integers
+from spikeloom.runtime.cli import main
+from spikeloom.runtime.machines.loihi1 import engine
 
 
 def lif(weight, bias, spikes, *, u, v, threshold, own=None):

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from made_nir import affine, chain, cuba, graph_with, lif, lowered, tree_of
 
-from compiler.errors import ModelError, OptionError
-from compiler.frontends import hdf5
-from compiler.frontends.nir import read_nir
-from compiler.frontends.nir_file import graph_of
-from runtime.cli import main
+from spikeloom.compiler.errors import ModelError, OptionError
+from spikeloom.compiler.formats import hdf5
+from spikeloom.compiler.formats.nir.file import graph_of
+from spikeloom.compiler.formats.nir.reader import read_nir
+from spikeloom.runtime.cli import main
 
 RNG = np.random.default_rng(0)
 FILES = Path(__file__).parent / "nir"
@@ -182,8 +182,8 @@ def test_unknown_nodes_and_those_without_a_place():
     graph = two_layers()
     tree = tree_of(graph)
     tree["node"]["nodes"]["n0"]["type"] = "Quantum\n"
-    from compiler.frontends.nir import network_of
-    from compiler.frontends.nir_neurons import Steps
+    from spikeloom.compiler.formats.nir.neurons import Steps
+    from spikeloom.compiler.formats.nir.reader import network_of
 
     with pytest.raises(ModelError) as caught:
         network_of(graph_of(tree, ""), Steps(dt=0.02, convention="euler"))

@@ -15,18 +15,19 @@ from numpy.testing import assert_allclose, assert_array_equal
 from random_networks import float_networks
 from timed_networks import events_of, written
 
-from compiler.dynamics import with_clocks
-from compiler.errors import FormatError, ModelError, OptionError
-from compiler.frontends.nir import read_nir
-from compiler.frontends.nir_neurons import CONVENTIONS
-from compiler.ir import INPUT
-from compiler.lift import lift
-from compiler.netlist import read_only
-from compiler.pipeline import compile_network
-from compiler.serialize import netlist_bytes, read_netlist, write_netlist
-from compiler.sidecar import restore, sidecar_bytes, sidecar_of
-from runtime import engine, nir_export
-from runtime.cli import main
+from spikeloom.compiler.dynamics import with_clocks
+from spikeloom.compiler.errors import FormatError, ModelError, OptionError
+from spikeloom.compiler.formats.nir.neurons import CONVENTIONS
+from spikeloom.compiler.formats.nir.reader import read_nir
+from spikeloom.compiler.formats.nir.sidecar import restore, sidecar_bytes, sidecar_of
+from spikeloom.compiler.ir import INPUT
+from spikeloom.compiler.targets.loihi1.compilation import compile_network
+from spikeloom.compiler.targets.loihi1.lift import lift
+from spikeloom.compiler.targets.loihi1.netlist import read_only
+from spikeloom.compiler.targets.loihi1.netlist_file import netlist_bytes, read_netlist, write_netlist
+from spikeloom.runtime.cli import main
+from spikeloom.runtime.formats import nir_export
+from spikeloom.runtime.machines.loihi1 import engine
 
 FEW = settings(max_examples=10, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 SETTINGS = settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])

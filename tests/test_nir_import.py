@@ -9,13 +9,13 @@ import pytest
 from made_nir import affine, chain, cuba, graph_with, lif, lowered, simulate
 from numpy.testing import assert_array_equal
 
-from compiler.dynamics import with_clocks
-from compiler.frontends.nir import read_nir
-from compiler.interpret import run_float, run_integer
-from compiler.ir import recurrent
-from compiler.passes.quantize import Recipe
-from compiler.pipeline import compile_network
-from runtime import engine, spec
+from spikeloom.compiler.dynamics import with_clocks
+from spikeloom.compiler.formats.nir.reader import read_nir
+from spikeloom.compiler.interpret import run_float, run_integer
+from spikeloom.compiler.ir import recurrent
+from spikeloom.compiler.targets.loihi1.compilation import compile_network
+from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe
+from spikeloom.runtime.machines.loihi1 import engine, spec
 
 FILES = Path(__file__).parent / "nir"
 

@@ -12,11 +12,11 @@ from made_modules import exported, one_step
 from made_onnx import CONSTANTS, STAGE, STATE_IN, body, model, neuron, node, scanned, two_layers, value
 from onnx import ModelProto, TensorProto, helper, numpy_helper
 
-from compiler.errors import SpikeloomError
-from compiler.frontends import onnx_file
-from compiler.frontends.onnx import read_onnx
-from models.lif import LIF
-from runtime import cli
+from spikeloom.compiler.errors import SpikeloomError
+from spikeloom.compiler.formats.onnx import file as onnx_file
+from spikeloom.compiler.formats.onnx.reader import read_onnx
+from spikeloom.models.networks.lif import LIF
+from spikeloom.runtime import cli
 
 AFFINE = "is not affine in its input; only affine operators between two spiking layers can become synapses"
 RESET = (

@@ -14,9 +14,11 @@ from made_files import own_file, recordings_folder
 from random_netlists import Axon, Neuron, build, large_netlist, netlists, recordings
 from test_timing import six_steps
 
-from compiler.errors import DataError, ModelError, NumericRangeError, OptionError
-from compiler.netlist import read_only
-from runtime import cli, engine, onnx_engine, onnx_graph, onnx_nodes, onnx_plan, spec
+from spikeloom.compiler.errors import DataError, ModelError, NumericRangeError, OptionError
+from spikeloom.compiler.targets.loihi1.netlist import read_only
+from spikeloom.runtime import cli
+from spikeloom.runtime.formats import onnx_graph, onnx_nodes, onnx_plan
+from spikeloom.runtime.machines.loihi1 import engine, onnx_engine, spec
 
 FORMS = onnx_graph.FORMS
 SETTINGS = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])

@@ -16,17 +16,19 @@ from random_netlists import Axon, Neuron, build, large_netlist
 from test_export import run
 from test_onnx_engine import three_neurons
 
-from compiler.errors import FormatError, ModelError, OptionError
-from compiler.netlist import read_only
-from compiler.passes.expand import expand
-from compiler.passes.quantize import Recipe
-from compiler.pipeline import compile_network
-from compiler.serialize import netlist_bytes, write_netlist
-from models.reference import float_spikes
-from runtime import cli, engine, onnx_engine, onnx_float, onnx_graph
-from runtime.inputs import version
-from runtime.onnx_nodes import port_words
-from runtime.onnx_plan import digits, is_pipeline, plan
+from spikeloom.compiler.errors import FormatError, ModelError, OptionError
+from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.targets.loihi1.compilation import compile_network
+from spikeloom.compiler.targets.loihi1.netlist import read_only
+from spikeloom.compiler.targets.loihi1.netlist_file import netlist_bytes, write_netlist
+from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe
+from spikeloom.models.networks.reference import float_spikes
+from spikeloom.runtime import cli
+from spikeloom.runtime.commands.inputs import version
+from spikeloom.runtime.formats import onnx_float, onnx_graph
+from spikeloom.runtime.formats.onnx_nodes import port_words
+from spikeloom.runtime.formats.onnx_plan import digits, is_pipeline, plan
+from spikeloom.runtime.machines.loihi1 import engine, onnx_engine
 
 FORMS = onnx_graph.FORMS
 

@@ -30,18 +30,18 @@ from made_onnx import (
     two_layers,
 )
 
-from compiler.compare import compare
-from compiler.errors import ModelError, OptionError
-from compiler.frontends.onnx import read_onnx
-from compiler.frontends.sensor_layout import sensor_layout
-from compiler.interpret import channels_last, run_float
-from compiler.lift import lift
-from compiler.passes.quantize import Recipe
-from compiler.pipeline import compile_network
-from compiler.serialize import read_netlist
-from models.lif import LIF, AllSteps
-from models.module import compile_module, module_network
-from runtime import cli
+from spikeloom.compiler.errors import ModelError, OptionError
+from spikeloom.compiler.formats.onnx.reader import read_onnx
+from spikeloom.compiler.interpret import channels_last, run_float
+from spikeloom.compiler.sensor_layout import sensor_layout
+from spikeloom.compiler.targets.loihi1.compare import compare
+from spikeloom.compiler.targets.loihi1.compilation import compile_network
+from spikeloom.compiler.targets.loihi1.lift import lift
+from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
+from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe
+from spikeloom.models.networks.lif import LIF, AllSteps
+from spikeloom.models.networks.module import compile_module, module_network
+from spikeloom.runtime import cli
 
 needs_dynamo = pytest.mark.skipif(
     importlib.util.find_spec("onnxscript") is None, reason="torch's newer exporter needs onnxscript"

@@ -5,10 +5,10 @@ import pytest
 from onnx import helper
 from onnx.reference import ReferenceEvaluator
 
-from compiler.errors import ModelError
-from compiler.frontends.onnx_affine import apply, check
-from compiler.frontends.onnx_file import Node
-from compiler.frontends.onnx_values import INPUT_ATOM, Affine, Table
+from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.formats.onnx.affine import apply, check
+from spikeloom.compiler.formats.onnx.file import Node
+from spikeloom.compiler.formats.onnx.values import INPUT_ATOM, Affine, Table
 
 RNG = np.random.default_rng(0)
 EDGES = np.array([0, 2, 2, 1])

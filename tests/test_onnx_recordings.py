@@ -7,12 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from compiler.frontends.checkpoint import read_checkpoint
-from compiler.serialize import read_netlist
-from models.evtouch import load_recordings
-from models.graphs import build_graph, normalised_adjacency
-from models.reference import float_spikes
-from runtime import cli, engine, onnx_engine, onnx_float
+from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
+from spikeloom.models.graphs import build_graph, normalised_adjacency
+from spikeloom.models.networks.reference import float_spikes
+from spikeloom.models.recordings.evtouch import load_recordings
+from spikeloom.runtime import cli
+from spikeloom.runtime.formats import onnx_float
+from spikeloom.runtime.machines.loihi1 import engine, onnx_engine
 
 PART = 48
 SETS = {"objects_zip": ("objects", (576, 144)), "containers_zip": ("containers", (240, 60))}

@@ -20,12 +20,12 @@ from random_networks import (
     words_of_list,
 )
 
-from compiler.errors import CapacityError
-from compiler.ir import INPUT, Input, IntegerNetwork, IntegerProjection, Readout
-from compiler.passes.emit import emit
-from compiler.passes.legalize import LimitUse, list_words, measure, require_legal
-from compiler.passes.needs import Chunk, index_bits
-from compiler.passes.partition import Partition, partition
+from spikeloom.compiler.errors import CapacityError
+from spikeloom.compiler.ir import INPUT, Input, IntegerNetwork, IntegerProjection, Readout
+from spikeloom.compiler.targets.loihi1.emit import emit
+from spikeloom.compiler.targets.loihi1.layout.core_needs import Chunk, index_bits
+from spikeloom.compiler.targets.loihi1.layout.partition import Partition, partition
+from spikeloom.compiler.targets.loihi1.legalize import LimitUse, list_words, measure, require_legal
 
 MIXED = [8, 6, 4, 2]
 

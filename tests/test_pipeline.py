@@ -4,21 +4,21 @@ import numpy as np
 import pytest
 from random_networks import random_checkpoint
 
-from compiler.errors import DataError, ModelError, OptionError
-from compiler.interpret import channels_last, run_float, run_integer, vote
-from compiler.ir import IntegerNetwork, Network, fan_in
-from compiler.lift import lift
-from compiler.netlist import Netlist, one_step_bounds
-from compiler.passes.bounds import prove_ranges
-from compiler.passes.expand import expand
-from compiler.passes.quantize import Recipe
-from compiler.pipeline import STAGES, compile_network
-from compiler.serialize import netlist_bytes, read_netlist, write_netlist
-from compiler.text import text
-from models.evtouch import load_recordings
-from models.graphs import build_graph, normalised_adjacency
-from runtime import engine
-from runtime.trace import aligned
+from spikeloom.compiler.errors import DataError, ModelError, OptionError
+from spikeloom.compiler.interpret import channels_last, run_float, run_integer, vote
+from spikeloom.compiler.ir import IntegerNetwork, Network, fan_in
+from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.targets.loihi1.compilation import STAGES, compile_network
+from spikeloom.compiler.targets.loihi1.lift import lift
+from spikeloom.compiler.targets.loihi1.netlist import Netlist, one_step_bounds
+from spikeloom.compiler.targets.loihi1.netlist_file import netlist_bytes, read_netlist, write_netlist
+from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe
+from spikeloom.compiler.targets.loihi1.storage.range_proof import prove_ranges
+from spikeloom.compiler.text import text
+from spikeloom.models.graphs import build_graph, normalised_adjacency
+from spikeloom.models.recordings.evtouch import load_recordings
+from spikeloom.runtime.machines.loihi1 import engine
+from spikeloom.runtime.machines.loihi1.trace import aligned
 
 
 def ring(taxels):
@@ -157,7 +157,7 @@ def test_another_graph():
 @pytest.fixture(scope="module")
 def released(released_checkpoint):
     pytest.importorskip("torch")
-    from compiler.frontends.checkpoint import read_checkpoint
+    from spikeloom.compiler.formats.checkpoint import read_checkpoint
 
     return read_checkpoint(released_checkpoint)
 

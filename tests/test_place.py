@@ -7,11 +7,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_networks import LOIHI, integer_chain, integer_networks, small_target
 
-from compiler.passes import place as place_module
-from compiler.passes.emit import emit
-from compiler.passes.needs import Chunk
-from compiler.passes.partition import Partition, partition
-from compiler.passes.place import core_traffic, hops, place, place_within
+from spikeloom.compiler.targets.loihi1.emit import emit
+from spikeloom.compiler.targets.loihi1.layout import place as place_module
+from spikeloom.compiler.targets.loihi1.layout.core_needs import Chunk
+from spikeloom.compiler.targets.loihi1.layout.partition import Partition, partition
+from spikeloom.compiler.targets.loihi1.layout.place import core_traffic, hops, place, place_within
 
 
 def cost(traffic, tiles, width):

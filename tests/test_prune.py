@@ -7,16 +7,16 @@ from hypothesis import strategies as st
 from made_files import events, small_checkpoint
 from random_networks import chain, float_networks, integer_networks, random_checkpoint, recordings_for
 
-from compiler.errors import OptionError
-from compiler.interpret import channels_last, run_float, run_integer
-from compiler.lift import lift
-from compiler.passes.expand import expand
-from compiler.passes.prune import compact, disconnect, either, never_fires, nobody, removable
-from compiler.pipeline import compile_network
-from compiler.serialize import read_netlist, write_netlist
-from runtime import engine, spec
-from runtime.equivalence import verify
-from runtime.trace import aligned, heard
+from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.interpret import channels_last, run_float, run_integer
+from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.passes.prune import compact, disconnect, either, never_fires, nobody, removable
+from spikeloom.compiler.targets.loihi1.compilation import compile_network
+from spikeloom.compiler.targets.loihi1.lift import lift
+from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist, write_netlist
+from spikeloom.runtime.equivalence.verify import verify
+from spikeloom.runtime.machines.loihi1 import engine, spec
+from spikeloom.runtime.machines.loihi1.trace import aligned, heard
 
 
 @settings(deadline=None, max_examples=80)

@@ -9,25 +9,25 @@ import pytest
 import torch
 from made_files import ring, small_checkpoint, weights
 
-from compiler.errors import DataError, ModelError, OptionError
-from compiler.fixedpoint import ONE_STEP_SUM_MAX
-from compiler.frontends.checkpoint import read_checkpoint
-from compiler.frontends.own import content_digest
-from compiler.interpret import channels_last, run_integer
-from compiler.lift import lift
-from compiler.passes.calibrate import calibrate
-from compiler.passes.expand import expand
-from compiler.passes.quantize import Recipe, round_to_forms
-from compiler.pipeline import compile_network
-from compiler.targets import load_target
-from models.checkpoint import save_checkpoint
-from models.evtouch import Recordings, load_recordings
-from models.finetune import finetune, initial_forms
-from models.graphs import build_graph, normalised_adjacency
-from models.quantised import QuantisedNet, quantised_spikes, time_first
-from runtime import engine
-from runtime.cli import main
-from runtime.trace import aligned, heard
+from spikeloom.compiler.errors import DataError, ModelError, OptionError
+from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX
+from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.formats.checkpoint_file import content_digest
+from spikeloom.compiler.interpret import channels_last, run_integer
+from spikeloom.compiler.passes.calibrate import calibrate
+from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.targets.base import load_target
+from spikeloom.compiler.targets.loihi1.compilation import compile_network
+from spikeloom.compiler.targets.loihi1.lift import lift
+from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe, round_to_forms
+from spikeloom.models.graphs import build_graph, normalised_adjacency
+from spikeloom.models.networks.checkpoint import save_checkpoint
+from spikeloom.models.networks.quantised import QuantisedNet, quantised_spikes, time_first
+from spikeloom.models.recordings.evtouch import Recordings, load_recordings
+from spikeloom.models.training.finetune import finetune, initial_forms
+from spikeloom.runtime.cli import main
+from spikeloom.runtime.machines.loihi1 import engine
+from spikeloom.runtime.machines.loihi1.trace import aligned, heard
 
 LOIHI = load_target("loihi1")
 EXPONENTS = LOIHI.choices["synapse.exponent"]
@@ -74,7 +74,7 @@ def test_batches_do_not_mix(tmp_path):
 
 def test_gradients_are_those_of_the_rounded_float_model(tmp_path):
     """At 8 bits and with scales this fine the straight-through gradient is the float model's, to a few parts in 100."""
-    from models.networks import Architecture, SpikingNet
+    from spikeloom.models.networks.networks import Architecture, SpikingNet
 
     checkpoint, adjacency = small_checkpoint(tmp_path)
     data = recordings(checkpoint, 1, samples=3)
@@ -225,7 +225,7 @@ def test_options_that_cannot_be(tmp_path, options, message):
 def test_a_loss_that_is_no_number(tmp_path, monkeypatch, loss, name, found):
     checkpoint, adjacency = small_checkpoint(tmp_path)
     data = recordings(checkpoint, 0)
-    monkeypatch.setattr("models.finetune.rate_loss", loss)
+    monkeypatch.setattr("spikeloom.models.training.finetune.rate_loss", loss)
     with pytest.raises(DataError) as caught:
         finetune(checkpoint, adjacency, data, data, LOIHI, bits=[4], epochs=2)
     assert str(caught.value) == (

@@ -6,18 +6,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_networks import BITS, LOIHI, chain, dense_weights, float_networks, recordings_for
 
-from compiler.errors import DataError, ModelError, OptionError
-from compiler.fixedpoint import ONE_STEP_SUM_MAX, weight_step
-from compiler.forms import Form, decay_registers, round_population
-from compiler.forms import one_sided_sums as proven_sums
-from compiler.interpret import run_float, run_integer
-from compiler.ir import INPUT
-from compiler.passes import quantize as quantize_module
-from compiler.passes.bounds import prove_ranges
-from compiler.passes.calibrate import calibrate, evenly_spaced
-from compiler.passes.quantize import Recipe, quantize
-from compiler.text import text
-from compiler.verify import verify
+from spikeloom.compiler.errors import DataError, ModelError, OptionError
+from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX, weight_step
+from spikeloom.compiler.interpret import run_float, run_integer
+from spikeloom.compiler.invariants import verify
+from spikeloom.compiler.ir import INPUT
+from spikeloom.compiler.passes.calibrate import calibrate, evenly_spaced
+from spikeloom.compiler.targets.loihi1.storage import quantize as quantize_module
+from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe, quantize
+from spikeloom.compiler.targets.loihi1.storage.range_proof import prove_ranges
+from spikeloom.compiler.targets.loihi1.storage.weight_storage import Form, decay_registers, round_population
+from spikeloom.compiler.targets.loihi1.storage.weight_storage import one_sided_sums as proven_sums
+from spikeloom.compiler.text import text
 
 
 def recordings(network, seed, *, samples=4, steps=30, rate=0.3):

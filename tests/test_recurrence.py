@@ -25,25 +25,26 @@ from random_networks import (
 from test_sanafe import compare as with_sanafe
 from test_sanafe import interpreter  # noqa: F401
 
-from compiler.errors import CapacityError, ModelError, NumericRangeError
-from compiler.frontends.netx import read_netx
-from compiler.interpret import channels_last, run_float, run_integer
-from compiler.ir import INPUT, IntegerProjection, Projection, recurrent
-from compiler.lift import lift
-from compiler.passes.calibrate import calibrate
-from compiler.passes.emit import emit
-from compiler.passes.legalize import require_legal
-from compiler.passes.partition import partition
-from compiler.passes.prune import never_fires, removable
-from compiler.passes.quantize import Recipe, quantize
-from compiler.passes.widths import search
-from compiler.pipeline import compile_network
-from runtime import cost, engine
-from runtime.blocks import obstacle
-from runtime.certainty import float_certainty
-from runtime.cli import main
-from runtime.equivalence import verify
-from runtime.trace import aligned
+from spikeloom.compiler.errors import CapacityError, ModelError, NumericRangeError
+from spikeloom.compiler.formats.netx.reader import read_netx
+from spikeloom.compiler.interpret import channels_last, run_float, run_integer
+from spikeloom.compiler.ir import INPUT, IntegerProjection, Projection, recurrent
+from spikeloom.compiler.passes.calibrate import calibrate
+from spikeloom.compiler.passes.prune import never_fires, removable
+from spikeloom.compiler.targets.loihi1.compilation import compile_network
+from spikeloom.compiler.targets.loihi1.emit import emit
+from spikeloom.compiler.targets.loihi1.layout.partition import partition
+from spikeloom.compiler.targets.loihi1.legalize import require_legal
+from spikeloom.compiler.targets.loihi1.lift import lift
+from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe, quantize
+from spikeloom.compiler.targets.loihi1.storage.width_search import search
+from spikeloom.runtime.cli import main
+from spikeloom.runtime.costs import cost
+from spikeloom.runtime.equivalence.certainty import float_certainty
+from spikeloom.runtime.equivalence.verify import verify
+from spikeloom.runtime.machines.loihi1 import engine
+from spikeloom.runtime.machines.loihi1.blocks import obstacle
+from spikeloom.runtime.machines.loihi1.trace import aligned
 
 SETTINGS = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 FEW = settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.too_slow])

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from made_files import events, ring, small_checkpoint, weights
 
-from models.evtouch import load_recordings
-from models.graphs import build_graph, normalised_adjacency
-from models.reference import BATCH, float_membranes, float_spikes
+from spikeloom.models.graphs import build_graph, normalised_adjacency
+from spikeloom.models.networks.reference import BATCH, float_membranes, float_spikes
+from spikeloom.models.recordings.evtouch import load_recordings
 
 
 def step_by_step(checkpoint, adjacency, recording, dtype):
@@ -114,7 +114,7 @@ def test_weights_act_taxel_by_taxel(tmp_path):
 @pytest.fixture(scope="module")
 def released_run(released_checkpoint, objects_zip, shared_dir):
     """Checkpoint, propagation matrix, recordings, float32 spikes and the published outputs."""
-    from compiler.frontends.checkpoint import read_checkpoint
+    from spikeloom.compiler.formats.checkpoint import read_checkpoint
 
     checkpoint, graph = read_checkpoint(released_checkpoint), build_graph("manual")
     adjacency = normalised_adjacency(graph.edges, graph.n_taxels)

@@ -15,17 +15,19 @@ from made_files import CLASSES, FEATURES, STEPS, TAXELS, own_file, recordings_fo
 from numpy.testing import assert_allclose, assert_array_equal
 from timed_networks import written
 
-from compiler.dynamics import with_clocks
-from compiler.frontends.checkpoint import read_checkpoint
-from compiler.frontends.systems import GRAPH_SYSTEMS, GRID_CNN, SYSTEMS
-from compiler.serialize import read_netlist, write_netlist
-from compiler.targets import load_target
-from models.events import load_data
-from models.graphs import normalised_adjacency
-from models.reference import float_membranes, float_spikes
-from runtime import cli, cost, engine
-from runtime.report_traces import MARK, ROWS, drawn, raster
-from runtime.trace import aligned
+from spikeloom.compiler.dynamics import with_clocks
+from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.systems import GRAPH_SYSTEMS, GRID_CNN, SYSTEMS
+from spikeloom.compiler.targets.base import load_target
+from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist, write_netlist
+from spikeloom.models.graphs import normalised_adjacency
+from spikeloom.models.networks.reference import float_membranes, float_spikes
+from spikeloom.models.recordings.events import load_data
+from spikeloom.runtime import cli
+from spikeloom.runtime.costs import cost
+from spikeloom.runtime.machines.loihi1 import engine
+from spikeloom.runtime.machines.loihi1.trace import aligned
+from spikeloom.runtime.report.page.traces import MARK, ROWS, drawn, raster
 
 REPORT = ("report", "net.loom", "--checkpoint", "net.pt", "--data", "data", "-o", "out.html")
 HEADINGS = ["Verdict", "Decisions", "Cores", "Taxels", "One recording", "Energy and time", "Provenance"]

@@ -20,23 +20,27 @@ from hypothesis import strategies as st
 from made_cells import CAPACITY, kept, made_cell
 from scipy import stats
 
-import models.train
-from compiler.errors import CapacityError, Violation
-from compiler.frontends.checkpoint import read_checkpoint
-from compiler.passes.expand import expand
-from compiler.pipeline import compile_network, without
-from models.graphs import build_graph
-from models.grasps import synthetic_grasps
-from models.networks import Architecture
-from models.release import write_released
-from runtime import engine, paper_noise, paper_picture, paper_table, paper_text
-from runtime.cells import GRAPHS, SAME_AS, Row, in_turn, plan, read_cells
-from runtime.cli import main
-from runtime.cluster import ClusterLostError
-from runtime.inputs import propagation
-from runtime.published import Published
-from runtime.votes import class_counts
-from runtime.workers import ProcessDied
+import spikeloom.models.training.train
+from spikeloom.compiler.errors import CapacityError, Violation
+from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.targets.loihi1.compilation import compile_network, without
+from spikeloom.models.graphs import build_graph
+from spikeloom.models.networks.networks import Architecture
+from spikeloom.models.recordings.grasps import synthetic_grasps
+from spikeloom.models.recordings.release import write_released
+from spikeloom.runtime.cli import main
+from spikeloom.runtime.commands.inputs import propagation
+from spikeloom.runtime.machines.loihi1 import engine
+from spikeloom.runtime.machines.votes import class_counts
+from spikeloom.runtime.studies.jobs.cluster import ClusterLostError
+from spikeloom.runtime.studies.jobs.workers import ProcessDied
+from spikeloom.runtime.studies.paper import noise as paper_noise
+from spikeloom.runtime.studies.paper import picture as paper_picture
+from spikeloom.runtime.studies.paper import table as paper_table
+from spikeloom.runtime.studies.paper import text as paper_text
+from spikeloom.runtime.studies.paper.cells import GRAPHS, SAME_AS, Row, in_turn, plan, read_cells
+from spikeloom.runtime.studies.paper.published import Published
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -50,9 +54,9 @@ def data(tmp_path, monkeypatch) -> Path:
     The working folder is where the data is.
     """
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("models.networks.Architecture", small)
-    monkeypatch.setattr("runtime.measured.compile_network", uncalibrated)
-    monkeypatch.setattr("runtime.paper_picture.DPI", 30)
+    monkeypatch.setattr("spikeloom.models.networks.networks.Architecture", small)
+    monkeypatch.setattr("spikeloom.runtime.studies.paper.measured.compile_network", uncalibrated)
+    monkeypatch.setattr("spikeloom.runtime.studies.paper.picture.DPI", 30)
     made(tmp_path / "Ev-Grasps")
     return tmp_path
 
@@ -122,8 +126,8 @@ def test_the_table_of_methods_from_nothing(data, capsys):
 
 
 def test_figures_are_those_of_compile_verify_and_estimate(data, capsys, monkeypatch):
-    monkeypatch.setattr("runtime.measured.compile_network", compile_network)
-    monkeypatch.setattr("runtime.cells.METHODS", (("gcn", "manual"),))
+    monkeypatch.setattr("spikeloom.runtime.studies.paper.measured.compile_network", compile_network)
+    monkeypatch.setattr("spikeloom.runtime.studies.paper.cells.METHODS", (("gcn", "manual"),))
     as_json(capsys, *METHODS)
     network = f"out/networks/{GCN_NAME}.pt"
     found = json.loads(Path(f"out/cells/{GCN_NAME}.json").read_text())["chip"]
@@ -188,8 +192,8 @@ def test_a_network_that_the_chip_refuses_is_trained_and_says_why(data, capsys, m
             raise CapacityError((Violation(owner=owner, rule=rule, used=axons, allowed=4096, remedy=remedy),))
         return compile_network(network)
 
-    monkeypatch.setattr("runtime.measured.compile_network", refusing)
-    monkeypatch.setattr("runtime.cells.METHODS", (("mlp", "none"), ("mlp", "none")))
+    monkeypatch.setattr("spikeloom.runtime.studies.paper.measured.compile_network", refusing)
+    monkeypatch.setattr("spikeloom.runtime.studies.paper.cells.METHODS", (("mlp", "none"), ("mlp", "none")))
     report = as_json(capsys, *WORDS, "--table", "methods", "--seeds", "1", "--epochs", "1", "--same-padding")
     rows = {row["form"]: row for row in report["methods"]}
     assert rows["none"]["refused"] is None
@@ -285,14 +289,14 @@ def test_interrupted_it_goes_on_to_the_same_bytes(data, capsys, monkeypatch):
     words = [word if word != "out" else "whole" for word in METHODS]
     whole = as_json(capsys, *words)
     epochs = iter(range(9))
-    train_epoch = models.train._train_epoch
+    train_epoch = spikeloom.models.training.train._train_epoch
 
     def interrupted(*arguments, **options):
         if next(epochs) == 8:
             raise KeyboardInterrupt
         return train_epoch(*arguments, **options)
 
-    monkeypatch.setattr("models.train._train_epoch", interrupted)
+    monkeypatch.setattr("spikeloom.models.training.train._train_epoch", interrupted)
     assert main([*METHODS]) == 2
     assert capsys.readouterr().err.splitlines()[-1] == (
         "spikeloom: interrupted; 1 of 4 cells and the epochs so far are kept in out; go on with the same command and "
@@ -305,7 +309,7 @@ def test_interrupted_it_goes_on_to_the_same_bytes(data, capsys, monkeypatch):
     assert refused(capsys, *METHODS) == (
         "-o out: holds 1 of these cells and 1 more that are begun; go on with --resume, or give another folder"
     )
-    monkeypatch.setattr("models.train._train_epoch", train_epoch)
+    monkeypatch.setattr("spikeloom.models.training.train._train_epoch", train_epoch)
     report = as_json(capsys, *METHODS, "--resume")
     assert report["methods"] == whole["methods"]
     for kind in ("cells/*", "networks/*", "methods.*"):
@@ -388,8 +392,8 @@ def test_cells_that_are_lost_are_told_and_can_be_gone_on_with(data, capsys, monk
             raise ending
         yield points[1], ending
 
-    monkeypatch.setattr("runtime.cells.METHODS", (("mlp", "none"), ("gcn", "manual")))
-    monkeypatch.setattr("runtime.cell_work.spread", losing)
+    monkeypatch.setattr("spikeloom.runtime.studies.paper.cells.METHODS", (("mlp", "none"), ("gcn", "manual")))
+    monkeypatch.setattr("spikeloom.runtime.studies.paper.cell_work.spread", losing)
     assert main([*METHODS]) == 1
     died = f"{GCN_NAME}: its process ended early (exit code -9), 3 times, perhaps for lack of memory; left out"
     assert capsys.readouterr().err.splitlines()[-3:] == [
@@ -590,7 +594,7 @@ def test_csv_holds_the_figures(tmp_path, capsys):
 
 
 def test_pictures_show_what_is_there_and_are_equal_for_equal_cells(tmp_path, monkeypatch):
-    monkeypatch.setattr("runtime.paper_picture.DPI", 30)
+    monkeypatch.setattr("spikeloom.runtime.studies.paper.picture.DPI", 30)
     cells = read_cells(made_folder(tmp_path))
     parts = plan(["objects", "containers"], ("methods", "graphs"))
     for part in parts:

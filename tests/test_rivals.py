@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from random_netlists import Axon, Neuron, build
 
-from compiler.fixedpoint import ONE_STEP_SUM_MAX
-from runtime.engine import prepare, simulate
-from runtime.trace import aligned
+from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX
+from spikeloom.runtime.machines.loihi1.engine import prepare, simulate
+from spikeloom.runtime.machines.loihi1.trace import aligned
 
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
 

@@ -17,14 +17,16 @@ from random_netlists import large_netlist
 from test_timing import DETAILED, ENERGY_PJ, LOIHI, SANAFE, SIMPLE, six_steps
 from timed_networks import events_of, written
 
-from compiler.dynamics import with_clocks
-from compiler.frontends.checkpoint import read_checkpoint
-from compiler.netlist import Netlist, read_only
-from compiler.passes.expand import expand
-from compiler.pipeline import compile_network
-from models.evtouch import load_recordings
-from models.graphs import build_graph, normalised_adjacency
-from runtime import energy, engine, sanafe, timing
+from spikeloom.compiler.dynamics import with_clocks
+from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.targets.loihi1.compilation import compile_network
+from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_only
+from spikeloom.models.graphs import build_graph, normalised_adjacency
+from spikeloom.models.recordings.evtouch import load_recordings
+from spikeloom.runtime.costs import energy
+from spikeloom.runtime.formats import sanafe
+from spikeloom.runtime.machines.loihi1 import engine, timing
 
 FIT = next(table for table in LOIHI.energy if table.name == "sanafe")
 

@@ -8,16 +8,23 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_networks import BITS, LOIHI, chain, float_networks, recordings_for
 
-from compiler.errors import OptionError
-from compiler.fixedpoint import ONE_STEP_SUM_MAX
-from compiler.forms import Form, one_sided_sums, round_population
-from compiler.interpret import run_integer
-from compiler.passes.bounds import prove_ranges
-from compiler.passes.calibrate import calibrate
-from compiler.passes.compensate import compensated
-from compiler.passes.quantize import Recipe, quantize
-from compiler.passes.scales import choose_levels, finest_thresholds, flips, group_by_fineness, planes_from, rounded
-from compiler.verify import verify
+from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX
+from spikeloom.compiler.interpret import run_integer
+from spikeloom.compiler.invariants import verify
+from spikeloom.compiler.passes.calibrate import calibrate
+from spikeloom.compiler.targets.loihi1.storage.compensate import compensated
+from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe, quantize
+from spikeloom.compiler.targets.loihi1.storage.range_proof import prove_ranges
+from spikeloom.compiler.targets.loihi1.storage.scales import (
+    choose_levels,
+    finest_thresholds,
+    flips,
+    group_by_fineness,
+    planes_from,
+    rounded,
+)
+from spikeloom.compiler.targets.loihi1.storage.weight_storage import Form, one_sided_sums, round_population
 
 LOIHI_EXPONENTS = LOIHI.choices["synapse.exponent"]
 

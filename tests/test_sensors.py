@@ -3,10 +3,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from compiler.errors import DataError, OptionError
-from models.csvtable import read_table
-from models.graphs import build_graph, normalised_adjacency
-from models.sensors import MAX_TAXELS, read_edges, read_layout, read_taxels, sensor_graph
+from spikeloom.compiler.errors import DataError, OptionError
+from spikeloom.models.graphs import build_graph, normalised_adjacency
+from spikeloom.models.recordings.csvtable import read_table
+from spikeloom.models.sensors import MAX_TAXELS, read_edges, read_layout, read_taxels, sensor_graph
 
 SQUARE = "x,y\n" + "".join(f"{4 * (i % 5)},{4 * (i // 5)}\n" for i in range(25))
 
@@ -93,7 +93,7 @@ def test_files_that_are_no_tables(write, tmp_path, monkeypatch):
     )
     path.write_bytes(b"1,2\n\xff")
     assert message(read_table, path, ("a",)) == "t.csv: not text in UTF-8 (byte 4); save it as CSV"
-    monkeypatch.setattr("models.csvtable.MAX_TABLE_BYTES", 3)
+    monkeypatch.setattr("spikeloom.models.recordings.csvtable.MAX_TABLE_BYTES", 3)
     assert message(read_table, path, ("a",)) == "t.csv: more than 3 bytes, the limit of a table; split it"
 
 
@@ -245,7 +245,7 @@ def test_all_warnings_come(write):
 def test_parts_agree_with_networkx(seed):
     import networkx
 
-    from models.sensors import _parts
+    from spikeloom.models.sensors import _parts
 
     rng = np.random.default_rng(seed)
     n = int(rng.integers(2, 80))

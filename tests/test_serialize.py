@@ -14,12 +14,20 @@ import pytest
 from hypothesis import given, settings
 from random_networks import LOIHI, integer_chain, integer_networks
 
-from compiler import archive
-from compiler.errors import CapacityError, FormatError
-from compiler.netlist import Netlist
-from compiler.passes.emit import emit
-from compiler.passes.partition import partition
-from compiler.serialize import ARRAYS, LARGE, inconsistencies, is_netlist, netlist_bytes, read_netlist, write_netlist
+from spikeloom.compiler.errors import CapacityError, FormatError
+from spikeloom.compiler.formats import archive
+from spikeloom.compiler.targets.loihi1.emit import emit
+from spikeloom.compiler.targets.loihi1.layout.partition import partition
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.targets.loihi1.netlist_file import (
+    ARRAYS,
+    LARGE,
+    inconsistencies,
+    is_netlist,
+    netlist_bytes,
+    read_netlist,
+    write_netlist,
+)
 
 
 def placed(network, provenance=None):

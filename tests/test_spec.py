@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from random_netlists import MEMORYLESS, SIMULATORS, Axon, Neuron, build
 
-from compiler.errors import DataError, NumericRangeError
-from compiler.netlist import Netlist
-from runtime.trace import Trace, aligned
+from spikeloom.compiler.errors import DataError, NumericRangeError
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.runtime.machines.loihi1.trace import Trace, aligned
 
 NEVER = 2**17 - 1
 

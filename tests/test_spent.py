@@ -9,10 +9,13 @@ import pytest
 from made_files import STEPS, own_file, recordings_folder
 from random_netlists import Axon, Neuron, build, large_netlist
 
-from compiler.netlist import read_only
-from compiler.serialize import read_netlist, write_netlist
-from compiler.targets import load_target
-from runtime import blocks, cli, engine, equivalence, estimate
+from spikeloom.compiler.targets.base import load_target
+from spikeloom.compiler.targets.loihi1.netlist import read_only
+from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist, write_netlist
+from spikeloom.runtime import cli
+from spikeloom.runtime.costs import estimate
+from spikeloom.runtime.equivalence import verify as equivalence
+from spikeloom.runtime.machines.loihi1 import blocks, engine
 
 RUN = ("run", "net.loom", "--data", "data")
 ESTIMATE = ("estimate", "net.loom", "--data", "data")

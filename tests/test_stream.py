@@ -12,17 +12,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_netlists import Axon, Neuron, build, large_netlist, netlists, recordings
 
-from compiler.errors import DataError, FormatError, NumericRangeError
-from compiler.frontends.checkpoint import read_checkpoint
-from compiler.netlist import Netlist, read_only
-from compiler.passes.expand import expand
-from compiler.pipeline import compile_network
-from compiler.serialize import write_netlist
-from models.evtouch import load_recordings
-from models.graphs import build_graph, normalised_adjacency
-from runtime import engine
-from runtime.stream import Step, Stream, load, open_stream
-from runtime.votes import class_counts
+from spikeloom.compiler.errors import DataError, FormatError, NumericRangeError
+from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.targets.loihi1.compilation import compile_network
+from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_only
+from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist
+from spikeloom.models.graphs import build_graph, normalised_adjacency
+from spikeloom.models.recordings.evtouch import load_recordings
+from spikeloom.runtime.machines.loihi1 import engine
+from spikeloom.runtime.machines.loihi1.stream import Step, Stream, load, open_stream
+from spikeloom.runtime.machines.votes import class_counts
 
 
 def voting(netlist: Netlist, classes: int = 3) -> Netlist:
@@ -277,5 +277,9 @@ def test_load_refuses_what_is_no_netlist(tmp_path):
 
 
 def test_streams_do_not_load_torch():
-    code = "import sys, runtime.stream, runtime.watch; sys.exit('torch' in sys.modules)"
+    code = (
+        "import sys, spikeloom.runtime.machines.loihi1.stream, "
+        "spikeloom.runtime.commands.exchange.watch; "
+        "sys.exit('torch' in sys.modules)"
+    )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -9,28 +9,38 @@ from made_files import CLASSES, STEPS, TAXELS, events, own_file, recordings_fold
 from numpy.testing import assert_array_equal
 from timed_networks import events_of, written
 
-from compiler.dynamics import with_clocks
-from compiler.frontends.checkpoint import read_checkpoint
-from compiler.frontends.towers import join
-from compiler.interpret import vote
-from compiler.passes.expand import expand
-from compiler.passes.quantize import Recipe
-from compiler.pipeline import compile_network
-from compiler.serialize import write_netlist
-from models.graphs import NEUTOUCH
-from models.reference import float_spikes
-from runtime import cli, engine, spec
-from runtime.battery import BATTERY, NAMES, levels_of
-from runtime.damages import Pair
-from runtime.intervals import wilson
-from runtime.perturbation import Sensor
-from runtime.side_by_side import evaluate, ready
-from runtime.stress_bench import distances
-from runtime.stress_runs import Bench, after_others, by_length, clean, generator, going_round, measure, whole
-from runtime.stress_text import stress_text
-from runtime.stress_verdicts import curve, parse_requirement, reasons, spread, unmet
-from runtime.trace import unpack
-from runtime.votes import class_counts, readout_counts
+from spikeloom.compiler.dynamics import with_clocks
+from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.formats.towers import join
+from spikeloom.compiler.interpret import vote
+from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.targets.loihi1.compilation import compile_network
+from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist
+from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe
+from spikeloom.models.graphs import NEUTOUCH
+from spikeloom.models.networks.reference import float_spikes
+from spikeloom.runtime import cli
+from spikeloom.runtime.equivalence.side_by_side import evaluate, ready
+from spikeloom.runtime.machines.loihi1 import engine, spec
+from spikeloom.runtime.machines.loihi1.trace import unpack
+from spikeloom.runtime.machines.votes import class_counts, readout_counts
+from spikeloom.runtime.report.intervals import wilson
+from spikeloom.runtime.studies.stress.battery import BATTERY, NAMES, levels_of
+from spikeloom.runtime.studies.stress.bench import distances
+from spikeloom.runtime.studies.stress.damages import Pair
+from spikeloom.runtime.studies.stress.perturbation import Sensor
+from spikeloom.runtime.studies.stress.runs import (
+    Bench,
+    after_others,
+    by_length,
+    clean,
+    generator,
+    going_round,
+    measure,
+    whole,
+)
+from spikeloom.runtime.studies.stress.text import stress_text
+from spikeloom.runtime.studies.stress.verdicts import curve, parse_requirement, reasons, spread, unmet
 
 NAMES_LISTED = ", ".join(NAMES)
 REPORT = ("report", "net.loom", "--checkpoint", "net.pt", "--data", "data")
@@ -116,13 +126,13 @@ def test_clean_recordings_are_what_reference_and_engine_say(bench):
 
 
 def _adjacency(bench):
-    from models.graphs import normalised_adjacency
+    from spikeloom.models.graphs import normalised_adjacency
 
     return normalised_adjacency(bench.sensor.checkpoint.edges, TAXELS)
 
 
 def test_different_spikes_are_those_of_verify(bench):
-    from runtime.equivalence import verify
+    from spikeloom.runtime.equivalence.verify import verify
 
     verdict = verify(
         bench.pair.netlist, bench.sensor.checkpoint, _adjacency(bench), bench.events, bench.labels, bench.files
@@ -293,7 +303,7 @@ def test_all_systems_timed_and_joined(tmp_path, system):
         reference, _ = clean(made)
         spikes = list(float_spikes(checkpoint, seen, recordings).values())[-1]
         assert_array_equal(reference.votes["float"], readout_counts(network.readout, network.classes, spikes))
-        from runtime.battery import why_not
+        from spikeloom.runtime.studies.stress.battery import why_not
 
         skipped = {name: why_not(name, made.pair, made.sensor) for name in NAMES}
         if system in ("mlp", "grid-cnn"):
@@ -480,7 +490,9 @@ def test_a_sweep_goes_on_from_what_is_there(spikeloom, place, monkeypatch):
     words = ("--only", "events_lost,longer", "--seeds", "2", "--jobs", "1", "-o", "kept.json")
     code, once, _ = spikeloom(*words)
     assert code == 0
-    monkeypatch.setattr("runtime.stress.measure_point", None)  # everything is known: nothing may be measured
+    monkeypatch.setattr(
+        "spikeloom.runtime.commands.check.stress.measure_point", None
+    )  # everything is known: nothing may be measured
     assert spikeloom(*words)[:2] == (0, once)
     assert (place / "kept.json.points").exists()
 
@@ -612,7 +624,7 @@ def test_a_netlist_of_another_architecture_is_refused(spikeloom, place, tmp_path
 
 
 def test_planes_have_no_fewer_bits(bench):
-    from runtime.battery import why_not
+    from spikeloom.runtime.studies.stress.battery import why_not
 
     netlist = compile_network(bench.pair.network, recipes=(Recipe(planes=2),)).netlist
     pair = Pair(netlist=netlist, network=bench.pair.network)

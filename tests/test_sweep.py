@@ -13,9 +13,9 @@ import pytest
 import swept
 from swept import KIND, VIOLATION, begun, points, square
 
-from compiler.errors import CapacityError, DataError, OptionError, UnfinishedError
-from runtime.cli import main
-from runtime.sweep import Point, content_key, sweep
+from spikeloom.compiler.errors import CapacityError, DataError, OptionError, UnfinishedError
+from spikeloom.runtime.cli import main
+from spikeloom.runtime.studies.jobs.sweep import Point, content_key, sweep
 
 ROOT = Path(__file__).resolve().parents[1]
 HEADER = '{"spikeloom": "sweep", "format": 1, "kind": "test", "version": 1}\n'
@@ -227,7 +227,7 @@ def test_what_is_no_store_is_left_alone(tmp_path, content, fresh):
 
 def test_one_sweep_at_a_time(tmp_path):
     pytest.importorskip("fcntl")
-    from runtime.sweep_store import opened
+    from spikeloom.runtime.studies.jobs.sweep_store import opened
 
     with opened(tmp_path / "x.store", kind=KIND, version=1):
         assert refused(OptionError, tmp_path, fresh=True) == (
@@ -239,7 +239,7 @@ def test_the_command_to_go_on_with_is_told(monkeypatch, capsys):
     def unfinished(_arguments):
         raise UnfinishedError("a: left out\n5 of 6 points are kept in x", resume=("--resume",))
 
-    monkeypatch.setattr("runtime.reproduce.reproduce", unfinished)
+    monkeypatch.setattr("spikeloom.runtime.commands.training.reproduce.reproduce", unfinished)
     assert main(["reproduce", "--data", "a b", "-o", "x"]) == 1
     assert capsys.readouterr().err.splitlines() == [
         "spikeloom: a: left out",

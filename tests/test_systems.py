@@ -12,24 +12,23 @@ from made_files import released
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy import sparse
 
-from compiler.errors import CapacityError, DataError, ModelError, OptionError
-from compiler.frontends.checkpoint import read_checkpoint
-from compiler.frontends.systems import GCN, GRAPH_SYSTEMS, GRID_CNN, MLP, SYSTEMS, Grid, in_order
-from compiler.interpret import channels_last, run_float
-from compiler.passes.expand import expand, probe_affine
-from compiler.pipeline import compile_network
-from compiler.targets import load_target
-from models.checkpoint import checkpoint_bytes, save_checkpoint
-from models.evtouch import load_recordings
-from models.finetune import finetune
-from models.graphs import NEUTOUCH, build_graph
-from models.grasps import synthetic_grasps
-from models.layers import SURROGATE_HALF_WIDTH, filter_places
-from models.networks import Architecture, SpikingNet
-from models.quantised import time_first
-from models.reference import float_spikes
-from models.release import write_released
-from models.systems import (
+from spikeloom.compiler.errors import CapacityError, DataError, ModelError, OptionError
+from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.interpret import channels_last, run_float
+from spikeloom.compiler.passes.expand import expand, probe_affine
+from spikeloom.compiler.systems import GCN, GRAPH_SYSTEMS, GRID_CNN, MLP, SYSTEMS, Grid, in_order
+from spikeloom.compiler.targets.base import load_target
+from spikeloom.compiler.targets.loihi1.compilation import compile_network
+from spikeloom.models.graphs import NEUTOUCH, build_graph
+from spikeloom.models.networks.checkpoint import checkpoint_bytes, save_checkpoint
+from spikeloom.models.networks.layers import SURROGATE_HALF_WIDTH, filter_places
+from spikeloom.models.networks.networks import Architecture, SpikingNet
+from spikeloom.models.networks.quantised import time_first
+from spikeloom.models.networks.reference import float_spikes
+from spikeloom.models.recordings.evtouch import load_recordings
+from spikeloom.models.recordings.grasps import synthetic_grasps
+from spikeloom.models.recordings.release import write_released
+from spikeloom.models.systems import (
     filters_of,
     grid_cells,
     propagation_of,
@@ -37,9 +36,10 @@ from models.systems import (
     taxels_alone,
     with_self_loops,
 )
-from models.train import evaluate, train
-from runtime.cli import main
-from runtime.equivalence import verify
+from spikeloom.models.training.finetune import finetune
+from spikeloom.models.training.train import evaluate, train
+from spikeloom.runtime.cli import main
+from spikeloom.runtime.equivalence.verify import verify
 
 NEW = (MLP, GCN, GRID_CNN)
 FORMED = ((MLP, "none"), (GCN, "none"), (GRID_CNN, "none"), (GRID_CNN, "same"))

@@ -12,36 +12,36 @@ from random_netlists import Axon, Neuron, build
 from random_networks import chain, integer_population
 from timed_networks import TIMING, events_of, written
 
-from compiler.dynamics import NO_CLOCKS, PLAIN, Clocks, Dynamics, with_clocks
-from compiler.errors import DataError, ModelError, NumericRangeError
-from compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, MEMBRANE_MAX, ONE_STEP_SUM_MAX
-from compiler.forms import current_load, decay_registers
-from compiler.frontends.checkpoint import read_checkpoint
-from compiler.interpret import channels_last, run_float, run_integer
-from compiler.ir import Input
-from compiler.lift import lift
-from compiler.netlist import one_step_bounds
-from compiler.passes.bounds import prove_ranges
-from compiler.passes.expand import expand
-from compiler.passes.prune import never_fires
-from compiler.passes.quantize import Recipe, quantize
-from compiler.pipeline import compile_network
-from compiler.serialize import netlist_bytes, read_netlist, write_netlist
-from compiler.targets import load_target
-from compiler.text import text
-from models.grasps import synthetic_grasps
-from models.reference import float_spikes
-from models.release import write_released
-from runtime import engine, spec
-from runtime.blocks import lay_out_blocks
-from runtime.causes import explain
-from runtime.certainty import float_certainty
-from runtime.cli import main
-from runtime.equivalence import require_match, verify
-from runtime.explain import _observe
-from runtime.stream import open_stream
-from runtime.trace import aligned
-from runtime.votes import class_counts
+from spikeloom.compiler.dynamics import NO_CLOCKS, PLAIN, Clocks, Dynamics, with_clocks
+from spikeloom.compiler.errors import DataError, ModelError, NumericRangeError
+from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, MEMBRANE_MAX, ONE_STEP_SUM_MAX
+from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.interpret import channels_last, run_float, run_integer
+from spikeloom.compiler.ir import Input
+from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.passes.prune import never_fires
+from spikeloom.compiler.targets.base import load_target
+from spikeloom.compiler.targets.loihi1.compilation import compile_network
+from spikeloom.compiler.targets.loihi1.lift import lift
+from spikeloom.compiler.targets.loihi1.netlist import one_step_bounds
+from spikeloom.compiler.targets.loihi1.netlist_file import netlist_bytes, read_netlist, write_netlist
+from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe, quantize
+from spikeloom.compiler.targets.loihi1.storage.range_proof import prove_ranges
+from spikeloom.compiler.targets.loihi1.storage.weight_storage import current_load, decay_registers
+from spikeloom.compiler.text import text
+from spikeloom.models.networks.reference import float_spikes
+from spikeloom.models.recordings.grasps import synthetic_grasps
+from spikeloom.models.recordings.release import write_released
+from spikeloom.runtime.cli import main
+from spikeloom.runtime.commands.check.explain import _observe
+from spikeloom.runtime.equivalence.causes import explain
+from spikeloom.runtime.equivalence.certainty import float_certainty
+from spikeloom.runtime.equivalence.verify import require_match, verify
+from spikeloom.runtime.machines.loihi1 import engine, spec
+from spikeloom.runtime.machines.loihi1.blocks import lay_out_blocks
+from spikeloom.runtime.machines.loihi1.stream import open_stream
+from spikeloom.runtime.machines.loihi1.trace import aligned
+from spikeloom.runtime.machines.votes import class_counts
 
 REPEATABLE = settings(max_examples=25, deadline=None, derandomize=True)
 
@@ -208,7 +208,7 @@ def test_recordings_without_their_clocks_are_refused(compiled):
             simulate()
         assert str(error.value) == (
             "recordings: 78 input channels found, the netlist has 81, 3 of them clocks "
-            "(compiler.dynamics.with_clocks); "
+            "(spikeloom.compiler.dynamics.with_clocks); "
             "use recordings of the sensor that the network was compiled for"
         )
 
@@ -424,7 +424,7 @@ def test_a_wrong_current_register_is_named(timed, compiled):
     )
     events = events_of(40, samples=1, steps=40)
     run = run_integer(wrong, channels_last(events, TIMING.clocks), membranes=True)
-    from runtime.causes import Observed
+    from spikeloom.runtime.equivalence.causes import Observed
 
     observed = Observed(spikes=tuple(s[0] for s in run.spikes), membranes=tuple(m[0] for m in run.membranes))
     found = explain(network, wrong, channels_last(events, TIMING.clocks)[0], observed, may_compensate=True)
@@ -508,7 +508,7 @@ def test_onnxruntime_runs_the_chip_with_its_clocks(data, capsys):
 
 
 def test_watch_decides_as_run(data, capsys):
-    from models.evtouch import load_recordings
+    from spikeloom.models.recordings.evtouch import load_recordings
 
     capsys.readouterr()
     decided = as_json(capsys, f"run {data}/x.loom --data {data}/data")

@@ -8,11 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_netlists import Axon, Neuron, build, by_engine, large_netlist, netlists, recordings
 
-from compiler.errors import ModelError
-from compiler.netlist import read_only
-from compiler.targets import LATENCIES, Quantity, load_target
-from runtime import cost, energy, engine, sanafe, timing
-from runtime.timing_spec import Chip
+from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.targets.base import LATENCIES, Quantity, load_target
+from spikeloom.compiler.targets.loihi1.netlist import read_only
+from spikeloom.runtime.costs import cost, energy
+from spikeloom.runtime.formats import sanafe
+from spikeloom.runtime.machines.loihi1 import engine, timing
+from spikeloom.runtime.machines.loihi1.timing_spec import Chip
 
 LOIHI = load_target("loihi1")
 (SANAFE,) = LOIHI.time

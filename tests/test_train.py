@@ -10,17 +10,17 @@ import pytest
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
 
-import models.train
-from compiler.errors import DataError, ModelError, OptionError
-from models.checkpoint import checkpoint_bytes, training_record
-from models.evtouch import Recordings
-from models.graphs import build_graph, normalised_adjacency
-from models.grasps import synthetic_grasps
-from models.networks import Architecture, SpikingNet
-from models.protocols import state_files, train_both, validation_split
-from models.recipes import RELEASED, Recipe
-from models.schedule import DECAY_EPOCHS
-from models.train import Epoch, evaluate, train
+import spikeloom.models.training.train
+from spikeloom.compiler.errors import DataError, ModelError, OptionError
+from spikeloom.models.graphs import build_graph, normalised_adjacency
+from spikeloom.models.networks.checkpoint import checkpoint_bytes, training_record
+from spikeloom.models.networks.networks import Architecture, SpikingNet
+from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.models.recordings.grasps import synthetic_grasps
+from spikeloom.models.training.protocols import state_files, train_both, validation_split
+from spikeloom.models.training.recipes import RELEASED, Recipe
+from spikeloom.models.training.schedule import DECAY_EPOCHS
+from spikeloom.models.training.train import Epoch, evaluate, train
 
 GRAPH = build_graph("manual")
 ADJACENCY = normalised_adjacency(GRAPH.edges, 39)
@@ -131,7 +131,7 @@ def test_best_weights_are_those_of_the_first_epoch_with_the_most_right(monkeypat
         kept.append(network.export_weights())
         return 0.5, next(right)
 
-    monkeypatch.setattr(models.train, "evaluate", fake)
+    monkeypatch.setattr(spikeloom.models.training.train, "evaluate", fake)
     trained = train(grasps(0), grasps(1), ADJACENCY, SMALL, epochs=4)
     assert trained.best_epoch == 2
     assert [epoch.accuracy for epoch in trained.history] == [2 / 12, 5 / 12, 5 / 12, 3 / 12]
@@ -304,7 +304,7 @@ def test_a_loss_that_is_no_number_stops_and_keeps_the_state(tmp_path, monkeypatc
     train(grasps(0), grasps(1), ADJACENCY, SMALL, epochs=1, state=state)
     kept = state.read_bytes()
     steps = iter((1.0, float("nan")))
-    monkeypatch.setattr(models.train, "rate_loss", lambda rates, _: rates.sum() * next(steps))
+    monkeypatch.setattr(spikeloom.models.training.train, "rate_loss", lambda rates, _: rates.sum() * next(steps))
     with pytest.raises(DataError) as stopped:
         train(grasps(0), grasps(1), ADJACENCY, SMALL, epochs=1, seed=1, state=state)
     assert str(stopped.value) == (

@@ -18,17 +18,17 @@ import numpy as np
 import pytest
 from commands import RUNTIME
 
-from compiler.errors import DataError, OptionError
-from compiler.frontends.checkpoint import read_checkpoint
-from models.evtouch import load_recordings
-from models.grasps import synthetic_grasps
-from models.release import write_released
-from runtime.cli import main
-from runtime.locks import only_one
-from runtime.seeds import side_by_side
-from runtime.training import summary
-from runtime.training_picture import draw_training
-from runtime.workers import run_side_by_side
+from spikeloom.compiler.errors import DataError, OptionError
+from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.models.recordings.evtouch import load_recordings
+from spikeloom.models.recordings.grasps import synthetic_grasps
+from spikeloom.models.recordings.release import write_released
+from spikeloom.runtime.cli import main
+from spikeloom.runtime.studies.jobs.locks import only_one
+from spikeloom.runtime.studies.jobs.workers import run_side_by_side
+from spikeloom.runtime.studies.training.picture import draw_training
+from spikeloom.runtime.studies.training.seeds import side_by_side
+from spikeloom.runtime.studies.training.training import summary
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -179,7 +179,7 @@ def test_killed_at_random_points_it_resumes_to_the_same_bytes(data):
     # the seed of the delays is fixed, the moment of a kill is not: wherever it falls, the result must be the same
     delays = random.Random(7)
     epochs = "40"
-    words = [sys.executable, "-m", "runtime", "train", "--data", "data", "--graph", "manual", "--epochs", epochs]
+    words = [sys.executable, "-m", "spikeloom", "train", "--data", "data", "--graph", "manual", "--epochs", epochs]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     subprocess.run([*words, "-o", "whole.pt"], check=True, env=environment, capture_output=True)
     killed = 0
@@ -278,7 +278,7 @@ def test_an_interrupt_before_the_first_epoch(data, capsys, monkeypatch):
     def interrupt(*_words, **_options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("models.train._train_epoch", interrupt)
+    monkeypatch.setattr("spikeloom.models.training.train._train_epoch", interrupt)
     assert refused(capsys, "--epochs", "2", "-o", "x.pt") == "interrupted; nothing was written"
     assert not list(data.glob("x.pt*"))
 

@@ -9,10 +9,10 @@ import pytest
 from made_files import CLASSES, STEPS, TAXELS, events, own_file, recordings_folder
 from native_networks import random_network
 
-from compiler.truenorth.trained import write_trained
-from models.evtouch import load_recordings
-from models.protocols import data_digest
-from runtime import chart_work
+from spikeloom.compiler.targets.truenorth.native_file import write_trained
+from spikeloom.models.recordings.evtouch import load_recordings
+from spikeloom.models.training.protocols import data_digest
+from spikeloom.runtime.studies.chart import work as chart_work
 
 NATIVE, LOIHI = "native.pt", "ring.pt"
 

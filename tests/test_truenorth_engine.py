@@ -8,13 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_crossbars import assert_same, crossbars, events
 
-from compiler.errors import DataError, NumericRangeError
-from compiler.targets import CROSSBARS, load_target
-from compiler.truenorth.draft import Draft, Neuron, history_free
-from compiler.truenorth.netlist import RESET_LINEAR, RESET_NONE, RESET_TO
-from compiler.truenorth.rules import faults
-from runtime.truenorth import engine, spec
-from runtime.truenorth.trace import Counts, Trace
+from spikeloom.compiler.errors import DataError, NumericRangeError
+from spikeloom.compiler.targets.base import CROSSBARS, load_target
+from spikeloom.compiler.targets.truenorth.builder import Draft, Neuron, history_free
+from spikeloom.compiler.targets.truenorth.legalize import faults
+from spikeloom.compiler.targets.truenorth.netlist import RESET_LINEAR, RESET_NONE, RESET_TO
+from spikeloom.runtime.machines.truenorth import engine, spec
+from spikeloom.runtime.machines.truenorth.trace import Counts, Trace
 
 CHIP = load_target("truenorth", CROSSBARS)
 

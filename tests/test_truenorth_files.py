@@ -9,15 +9,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_crossbars import crossbars
 
-from compiler import archive
-from compiler.errors import FormatError
-from compiler.netlist import read_only
-from compiler.serialize import is_netlist, read_netlist
-from compiler.targets import CROSSBARS, load_target
-from compiler.truenorth.draft import Draft, Neuron, history_free
-from compiler.truenorth.netlist import CrossbarNetlist
-from compiler.truenorth.rules import faults
-from compiler.truenorth.serialize import (
+from spikeloom.compiler.errors import FormatError
+from spikeloom.compiler.formats import archive
+from spikeloom.compiler.targets.base import CROSSBARS, load_target
+from spikeloom.compiler.targets.loihi1.netlist import read_only
+from spikeloom.compiler.targets.loihi1.netlist_file import is_netlist, read_netlist
+from spikeloom.compiler.targets.truenorth.builder import Draft, Neuron, history_free
+from spikeloom.compiler.targets.truenorth.legalize import faults
+from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
+from spikeloom.compiler.targets.truenorth.netlist_file import (
     ARRAYS,
     FORMAT,
     crossbar_bytes,
@@ -26,8 +26,8 @@ from compiler.truenorth.serialize import (
     read_crossbars,
     write_crossbars,
 )
-from runtime import cli
-from runtime.truenorth import engine
+from spikeloom.runtime import cli
+from spikeloom.runtime.machines.truenorth import engine
 
 
 def network() -> CrossbarNetlist:

@@ -12,12 +12,11 @@ from made_files import STEPS, own_file, recordings_folder
 from random_crossbars import assert_same
 from random_networks import chain
 
-from compiler.dynamics import Clocks
-from compiler.errors import CapacityError, ModelError
-from compiler.interpret import run_float
-from compiler.targets import CROSSBARS, load_target
-from compiler.truenorth.in_time import first_spikes, lower_in_time
-from compiler.truenorth.levels import (
+from spikeloom.compiler.dynamics import Clocks
+from spikeloom.compiler.errors import CapacityError, ModelError
+from spikeloom.compiler.interpret import run_float
+from spikeloom.compiler.targets.base import CROSSBARS, load_target
+from spikeloom.compiler.targets.truenorth.codebook import (
     BIN_TICKS,
     COPIES,
     MOST,
@@ -29,8 +28,9 @@ from compiler.truenorth.levels import (
     run_levels,
     type_weights,
 )
-from compiler.truenorth.rules import faults
-from runtime.truenorth import engine, spec
+from spikeloom.compiler.targets.truenorth.in_time import first_spikes, lower_in_time
+from spikeloom.compiler.targets.truenorth.legalize import faults
+from spikeloom.runtime.machines.truenorth import engine, spec
 
 CHIP = load_target("truenorth", CROSSBARS)
 NARROW = replace(CHIP, limits=dict(CHIP.limits) | {"core.axons": replace(CHIP.limits["core.axons"], value=60)})

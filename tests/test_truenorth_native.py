@@ -9,16 +9,23 @@ from hypothesis import strategies as st
 from native_networks import defined_spikes, random_events, random_network
 from random_crossbars import assert_same
 
-from compiler.dynamics import NO_CLOCKS, with_clocks
-from compiler.errors import CapacityError
-from compiler.targets import CROSSBARS, load_target
-from compiler.truenorth import rules
-from compiler.truenorth.lower import cores_needed, lower
-from compiler.truenorth.native import BASES, crossing_points, faults, highest_level, joined, steepest_leak
-from models.truenorth.network import run_network
-from runtime.truenorth import engine, spec
-from runtime.truenorth.commands import class_counts
-from runtime.truenorth.twins import find_twins
+from spikeloom.compiler.dynamics import NO_CLOCKS, with_clocks
+from spikeloom.compiler.errors import CapacityError
+from spikeloom.compiler.targets.base import CROSSBARS, load_target
+from spikeloom.compiler.targets.truenorth import legalize as rules
+from spikeloom.compiler.targets.truenorth.lower import cores_needed, lower
+from spikeloom.compiler.targets.truenorth.native import (
+    BASES,
+    crossing_points,
+    faults,
+    highest_level,
+    joined,
+    steepest_leak,
+)
+from spikeloom.models.truenorth.network import run_network
+from spikeloom.runtime.machines.truenorth import engine, spec
+from spikeloom.runtime.machines.truenorth.commands import class_counts
+from spikeloom.runtime.machines.truenorth.twins import find_twins
 
 CHIP = load_target("truenorth", CROSSBARS)
 

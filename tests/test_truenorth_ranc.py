@@ -10,12 +10,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from random_crossbars import WEIGHTS, crossbars, events
 
-from compiler.errors import ModelError
-from compiler.truenorth.draft import Draft, Neuron
-from compiler.truenorth.netlist import RESET_LINEAR, RESET_NONE
-from compiler.truenorth.serialize import write_crossbars
-from runtime import cli
-from runtime.truenorth import ranc, spec
+from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.targets.truenorth.builder import Draft, Neuron
+from spikeloom.compiler.targets.truenorth.netlist import RESET_LINEAR, RESET_NONE
+from spikeloom.compiler.targets.truenorth.netlist_file import write_crossbars
+from spikeloom.runtime import cli
+from spikeloom.runtime.formats import ranc
+from spikeloom.runtime.machines.truenorth import spec
 
 SHARED_WITH_RANC = st.builds(
     Neuron,

@@ -11,16 +11,16 @@ from made_files import CLASSES, TAXELS, own_file, recordings_folder
 from native_networks import random_network
 from random_networks import chain, stored
 
-from compiler.interpret import run_float
-from compiler.targets import CROSSBARS, load_target
-from compiler.truenorth.levels import codebook
-from compiler.truenorth.lower import lower
-from compiler.truenorth.needs import CURRENT, FAN_IN, LEAK, TARGETS, WEIGHTS, needs
-from compiler.truenorth.sizes import packed, relays, split
-from compiler.truenorth.trained import write_trained
-from runtime import cli
-from runtime.truenorth import retrained
-from runtime.truenorth.trials import Change, Trial
+from spikeloom.compiler.interpret import run_float
+from spikeloom.compiler.targets.base import CROSSBARS, load_target
+from spikeloom.compiler.targets.truenorth.codebook import codebook
+from spikeloom.compiler.targets.truenorth.core_counts import packed, relays, split
+from spikeloom.compiler.targets.truenorth.lower import lower
+from spikeloom.compiler.targets.truenorth.native_file import write_trained
+from spikeloom.compiler.targets.truenorth.needs import CURRENT, FAN_IN, LEAK, TARGETS, WEIGHTS, needs
+from spikeloom.runtime import cli
+from spikeloom.runtime.machines.truenorth import retrained
+from spikeloom.runtime.machines.truenorth.trials import Change, Trial
 
 CHIP = load_target("truenorth", CROSSBARS)
 

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from compiler.errors import RuleError
-from compiler.targets import CROSSBARS, load_target
-from compiler.truenorth.draft import Draft, Neuron
-from compiler.truenorth.rules import faults, require_legal
+from spikeloom.compiler.errors import RuleError
+from spikeloom.compiler.targets.base import CROSSBARS, load_target
+from spikeloom.compiler.targets.truenorth.builder import Draft, Neuron
+from spikeloom.compiler.targets.truenorth.legalize import faults, require_legal
 
 CHIP = load_target("truenorth", CROSSBARS)
 

@@ -10,19 +10,26 @@ import torch
 from made_files import own_file
 from native_networks import random_network
 
-from compiler.dynamics import clocks_over
-from compiler.errors import ModelError, OptionError
-from compiler.truenorth.native import faults
-from compiler.truenorth.serialize import read_crossbars, write_crossbars
-from compiler.truenorth.trained import PARTS, is_trained, read_trained, write_trained
-from models.grasps import synthetic_grasps
-from models.recipes import CROSSBARS
-from models.release import write_released
-from models.surrogate import FAST_SIGMOID, Surrogate
-from models.systems import propagation_of
-from models.truenorth.network import NativeArchitecture, native_network, predict, run_layers, run_network, sized
-from models.truenorth.neurons import block_sums, integrate
-from runtime.cli import main
+from spikeloom.compiler.dynamics import clocks_over
+from spikeloom.compiler.errors import ModelError, OptionError
+from spikeloom.compiler.targets.truenorth.native import faults
+from spikeloom.compiler.targets.truenorth.native_file import PARTS, is_trained, read_trained, write_trained
+from spikeloom.compiler.targets.truenorth.netlist_file import read_crossbars, write_crossbars
+from spikeloom.models.networks.surrogate import FAST_SIGMOID, Surrogate
+from spikeloom.models.recordings.grasps import synthetic_grasps
+from spikeloom.models.recordings.release import write_released
+from spikeloom.models.systems import propagation_of
+from spikeloom.models.training.recipes import CROSSBARS
+from spikeloom.models.truenorth.network import (
+    NativeArchitecture,
+    native_network,
+    predict,
+    run_layers,
+    run_network,
+    sized,
+)
+from spikeloom.models.truenorth.neurons import block_sums, integrate
+from spikeloom.runtime.cli import main
 
 SMOOTH = Surrogate(shape=FAST_SIGMOID, width=0.5, reset=False)
 SIZES = NativeArchitecture(taxels=6, classes=3, features=4, groups=2, hidden=(6, 4), clocks=clocks_over(2, 9))

@@ -16,17 +16,20 @@ import numpy as np
 import pytest
 from random_netlists import Axon, Neuron, build, large_netlist
 
-from compiler.errors import DataError, ModelError, OptionError
-from compiler.frontends.checkpoint import read_checkpoint
-from compiler.netlist import Netlist, read_only
-from compiler.passes.expand import expand
-from compiler.pipeline import compile_network
-from compiler.serialize import write_netlist
-from models.events import load_data
-from models.evtouch import load_recordings
-from models.graphs import build_graph, normalised_adjacency
-from runtime import course, engine, exits, watch
-from runtime.votes import class_counts
+from spikeloom.compiler.errors import DataError, ModelError, OptionError
+from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.targets.loihi1.compilation import compile_network
+from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_only
+from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist
+from spikeloom.models.graphs import build_graph, normalised_adjacency
+from spikeloom.models.recordings.events import load_data
+from spikeloom.models.recordings.evtouch import load_recordings
+from spikeloom.runtime.commands.exchange import watch
+from spikeloom.runtime.costs import course
+from spikeloom.runtime.machines.loihi1 import engine
+from spikeloom.runtime.machines.votes import class_counts
+from spikeloom.runtime.studies.anytime import exits
 
 HEADER = "time_s,taxel,polarity"
 TAXELS = "found, allowed are 0 to 9; use events of the sensor that the network was compiled for"
@@ -440,7 +443,7 @@ def test_a_reader_that_goes_away_ends_it(pair_file, lines, monkeypatch):
 
 SCRIPT = """
 import argparse, signal, sys
-from runtime import watch
+from spikeloom.runtime.commands.exchange import watch
 signal.signal(signal.SIGINT, signal.default_int_handler)  # jobs in the background start with interrupts ignored
 parser = argparse.ArgumentParser()
 parser.add_argument("--json", action="store_true")

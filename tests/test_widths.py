@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from random_networks import LOIHI, chain, random_checkpoint, small_target
 
-from compiler.errors import ModelError, OptionError
-from compiler.interpret import cut, run_float, run_integer, vote
-from compiler.passes import branches
-from compiler.passes.calibrate import calibrate, evenly_spaced
-from compiler.passes.expand import expand
-from compiler.passes.legalize import measure
-from compiler.passes.prune import disconnect, never_fires
-from compiler.passes.quantize import Recipe, assemble, shortlist
-from compiler.passes.widths import Found, Point, check_widths, front, search
-from compiler.pipeline import compile_network
+from spikeloom.compiler.errors import ModelError, OptionError
+from spikeloom.compiler.interpret import cut, run_float, run_integer, vote
+from spikeloom.compiler.passes.calibrate import calibrate, evenly_spaced
+from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.passes.prune import disconnect, never_fires
+from spikeloom.compiler.targets.loihi1.compilation import compile_network
+from spikeloom.compiler.targets.loihi1.legalize import measure
+from spikeloom.compiler.targets.loihi1.storage import branches
+from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe, assemble, shortlist
+from spikeloom.compiler.targets.loihi1.storage.width_search import Found, Point, check_widths, front, search
 
 WIDTHS = (2, 4, 8)
 

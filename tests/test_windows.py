@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from made_files import CLASSES, STEPS, events, own_file, recordings_folder
 
-from compiler.errors import OptionError
-from models.evtouch import Recordings
-from runtime import cli, engine
-from runtime.windows import first_part, window_asked
+from spikeloom.compiler.errors import OptionError
+from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.models.recordings.windows import first_part, window_asked
+from spikeloom.runtime import cli
+from spikeloom.runtime.machines.loihi1 import engine
 
 
 def made(lengths=None, *, samples=3, steps=10):
@@ -51,11 +52,11 @@ def test_what_is_no_part(words):
 
 
 def test_the_chip_decides_a_part_as_it_does_when_more_follows(tmp_path):
-    from compiler.dynamics import with_clocks
-    from compiler.serialize import read_netlist
-    from models.events import load_data
-    from runtime.trace import aligned
-    from runtime.votes import class_counts, predictions
+    from spikeloom.compiler.dynamics import with_clocks
+    from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
+    from spikeloom.models.recordings.events import load_data
+    from spikeloom.runtime.machines.loihi1.trace import aligned
+    from spikeloom.runtime.machines.votes import class_counts, predictions
 
     recordings_folder(tmp_path / "data", test=events(2, samples=8))
     own_file(tmp_path / "net.pt")

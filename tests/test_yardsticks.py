@@ -12,16 +12,16 @@ import pytest
 from made_files import recordings_folder, small_checkpoint
 from random_networks import random_checkpoint
 
-from compiler.errors import DataError
-from compiler.frontends.checkpoint import Dense
-from compiler.interpret import channels_last, run_float
-from compiler.passes.expand import expand
-from compiler.pipeline import compile_network
-from compiler.serialize import write_netlist
-from models.evtouch import load_recordings
-from models.graphs import build_graph, normalised_adjacency
-from runtime import cli
-from runtime.yardsticks import HOROWITZ, measure, yardsticks_json, yardsticks_text
+from spikeloom.compiler.errors import DataError
+from spikeloom.compiler.formats.checkpoint import Dense
+from spikeloom.compiler.interpret import channels_last, run_float
+from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.targets.loihi1.compilation import compile_network
+from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist
+from spikeloom.models.graphs import build_graph, normalised_adjacency
+from spikeloom.models.recordings.evtouch import load_recordings
+from spikeloom.runtime import cli
+from spikeloom.runtime.costs.yardsticks import HOROWITZ, measure, yardsticks_json, yardsticks_text
 
 PAIR = np.array([[0.0, 1.0], [1.0, 0.0]])
 """Propagation between two taxels."""
@@ -217,7 +217,7 @@ def test_equal_to_the_package(package, tmp_path, seed):
 
 @pytest.mark.recordings
 def test_the_released_network_in_round_figures(released_checkpoint, objects_zip):
-    from compiler.frontends.checkpoint import read_checkpoint
+    from spikeloom.compiler.formats.checkpoint import read_checkpoint
 
     checkpoint = read_checkpoint(released_checkpoint)
     graph = build_graph("manual")

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from compiler.dynamics import Clocks, Dynamics
-from models.checkpoint import checkpoint_bytes
-from models.graphs import NEUTOUCH, build_graph
-from models.networks import Architecture, SpikingNet
-from models.systems import filters_of, propagation_of, sensor_grid
+from spikeloom.compiler.dynamics import Clocks, Dynamics
+from spikeloom.models.graphs import NEUTOUCH, build_graph
+from spikeloom.models.networks.checkpoint import checkpoint_bytes
+from spikeloom.models.networks.networks import Architecture, SpikingNet
+from spikeloom.models.systems import filters_of, propagation_of, sensor_grid
 
 GRAPH = build_graph("manual")
 

@@ -1,1 +1,1 @@
-"""One file per pass; the order lives in :mod:`compiler.pipeline`."""
+"""One file per pass; the order lives in :mod:`loihi1.compilation`."""

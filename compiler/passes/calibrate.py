@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from compiler.errors import DataError
-from compiler.interpret import BoolArray, run_float, step_late
-from compiler.ir import INPUT, Network
+from spikeloom.compiler.errors import DataError
+from spikeloom.compiler.interpret import BoolArray, run_float, step_late
+from spikeloom.compiler.ir import INPUT, Network
 
 FEW = 32
 """Recordings on which storage is chosen, evenly spaced over the split: eight thousand steps a neuron."""

@@ -15,13 +15,13 @@ from collections.abc import Callable
 import numpy as np
 from scipy import sparse
 
-from compiler.dynamics import RELAY_WEIGHT
-from compiler.errors import ModelError
-from compiler.fixedpoint import FloatArray
-from compiler.frontends.checkpoint import Checkpoint
-from compiler.frontends.systems import TACTILESGNET, TITLES, in_order
-from compiler.frontends.towers import inputs_of
-from compiler.ir import INPUT, Input, Network, Population, Projection, Sparse
+from spikeloom.compiler.dynamics import RELAY_WEIGHT
+from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.fixedpoint import FloatArray
+from spikeloom.compiler.formats.checkpoint import Checkpoint
+from spikeloom.compiler.formats.towers import inputs_of
+from spikeloom.compiler.ir import INPUT, Input, Network, Population, Projection, Sparse
+from spikeloom.compiler.systems import TACTILESGNET, TITLES, in_order
 
 AFFINE_TOLERANCE = 1e-9
 """Largest deviation from affinity, relative to the stage's largest response, that rounding in float64 explains."""
@@ -45,7 +45,7 @@ def effective_weight(stack: FloatArray, filters: FloatArray) -> FloatArray:
 
 
 def stack_of(checkpoint: Checkpoint, propagation: FloatArray) -> FloatArray:
-    """Stack (filters, places, taxels) of a checkpoint's first layer, see :mod:`compiler.frontends.systems`.
+    """Stack (filters, places, taxels) of a checkpoint's first layer, see :mod:`compiler.systems`.
 
     Parameters
     ----------

@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from compiler.fixedpoint import MEMBRANE_SHIFT, IntArray
-from compiler.ir import INPUT, IntegerNetwork, IntegerPopulation, Network, Sparse, row_parts, with_data
-from compiler.passes.calibrate import Calibration
+from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT, IntArray
+from spikeloom.compiler.ir import INPUT, IntegerNetwork, IntegerPopulation, Network, Sparse, row_parts, with_data
+from spikeloom.compiler.passes.calibrate import Calibration
 
 Mask = npt.NDArray[np.bool_]
 

@@ -6,7 +6,7 @@ in a few of them; each group of the second hears a share of every group of the f
 for each class in every group. The dense layers hear the clocks, which the chip gives them from outside.
 
 What the chip rounds is rounded in every pass, and the gradient goes past the rounding as if it were not there: what is
-trained is what the chip computes, :class:`compiler.truenorth.native.NativeNetwork`.
+trained is what the chip computes, :class:`native.NativeNetwork`.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from compiler.dynamics import NO_CLOCKS, Clocks
-from compiler.errors import OptionError
-from compiler.targets import CROSSBARS, load_target
-from compiler.truenorth.native import (
+from spikeloom.compiler.dynamics import NO_CLOCKS, Clocks
+from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.targets.base import CROSSBARS, load_target
+from spikeloom.compiler.targets.truenorth.native import (
     LEAK_MOST,
     THRESHOLD_MOST,
     UNIT,
@@ -31,9 +31,9 @@ from compiler.truenorth.native import (
     Stage,
     highest_level,
 )
-from models.evtouch import Recordings
-from models.surrogate import RECTANGLE, Surrogate
-from models.truenorth.neurons import block_sums, integrate
+from spikeloom.models.networks.surrogate import RECTANGLE, Surrogate
+from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.models.truenorth.neurons import block_sums, integrate
 
 CHIP = "truenorth"
 
@@ -79,7 +79,7 @@ class NativeArchitecture:
     voters : int
         Output neurons of a class in each group.
     copies : int
-        Axons of an input, see :mod:`compiler.truenorth.native`.
+        Axons of an input, see :mod:`truenorth.native`.
     clocks : Clocks
         That the dense layers hear.
     floor : float

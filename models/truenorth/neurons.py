@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from models.layers import events_of, rows_of
-from models.surrogate import FAST_SIGMOID, Surrogate
+from spikeloom.models.networks.layers import events_of, rows_of
+from spikeloom.models.networks.surrogate import FAST_SIGMOID, Surrogate
 
 
 def integrate(current: Tensor, threshold: Tensor, floor: Tensor, surrogate: Surrogate) -> Tensor:

@@ -1,0 +1,214 @@
+"""Archives of arrays: an uncompressed ``.npz`` with a JSON manifest and a hash, which numpy alone can read.
+
+What all netlist files share, whatever chip they are for. Equal members give equal bytes: they are stored, not
+compressed, in the order given and with a fixed date. Nothing is ever pickled.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+import struct
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from spikeloom.compiler.errors import FormatError
+from spikeloom.compiler.formats.atomic import write_atomically
+
+Array = np.ndarray[Any, Any]
+
+FORMATS = {
+    "spikeloom-netlist": "cores of compartments (Loihi)",
+    "spikeloom-crossbars": "crossbar cores (TrueNorth)",
+    "spikeloom-native": "a network trained for TrueNorth, not yet compiled",
+}
+"""What a manifest may say that an archive is."""
+
+SIZE_LIMIT = 2**32
+"""Bytes that a netlist file may have, 4 GiB: some hundred times the synapses of a whole chip."""
+
+_EPOCH = (1980, 1, 1, 0, 0, 0)
+_ZIP_ERRORS = (zipfile.BadZipFile, struct.error, ValueError, EOFError, OverflowError, MemoryError, RuntimeError)
+"""What zipfile and numpy raise on content that is no netlist; a header may announce more than the memory holds."""
+
+
+def narrow(array: Array) -> Array:
+    """The same numbers in the narrowest little-endian signed type that holds them; real numbers as float64."""
+    if array.dtype.kind == "f":
+        return array.astype("<f8")
+    for dtype in ("<i1", "<i2", "<i4"):
+        info = np.iinfo(dtype)
+        if not array.size or (info.min <= array.min() and array.max() <= info.max):
+            return array.astype(dtype)
+    return array.astype("<i8")
+
+
+def digest(members: Mapping[str, Array]) -> str:
+    """Hex sha256 over name, dtype, shape and bytes of each member, in their order."""
+    found = hashlib.sha256()
+    for name, array in members.items():
+        found.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
+        found.update(np.ascontiguousarray(array).tobytes())
+    return found.hexdigest()
+
+
+def archive_bytes(manifest: Mapping[str, Any], arrays: Mapping[str, Array]) -> bytes:
+    """Content of a file: the manifest, the arrays in their order, and the hash over all of them."""
+    members: dict[str, Array] = {"manifest": np.array(json.dumps(manifest, sort_keys=True))}
+    members |= {name: narrow(array) for name, array in arrays.items()}
+    members["sha256"] = np.array(digest(members))
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
+        for name, array in members.items():
+            content = io.BytesIO()
+            np.lib.format.write_array(content, array, version=(1, 0), allow_pickle=False)
+            archive.writestr(zipfile.ZipInfo(f"{name}.npy", date_time=_EPOCH), content.getvalue())
+    return file.getvalue()
+
+
+def write_archive(content: bytes, path: str | os.PathLike[str]) -> str:
+    """Write a file, whole or not at all; return its sha256.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written; an older file is left as it was.
+    """
+    with write_atomically(path) as file:
+        file.write(content)
+    return hashlib.sha256(content).hexdigest()
+
+
+def require_file(path: Path) -> None:
+    """Refuse a path that is no file.
+
+    Raises
+    ------
+    FormatError
+    """
+    if not path.is_file():
+        found = "is not a file" if path.exists() else "no such file"
+        raise FormatError(f"{path}: {found}; write one with spikeloom compile")
+
+
+def read_members(path: Path) -> dict[str, Array]:
+    """All members of an archive by name.
+
+    Raises
+    ------
+    FormatError
+        If it is too large, truncated, compressed or no archive of arrays.
+    OSError
+        If it cannot be read.
+    """
+    if path.stat().st_size > SIZE_LIMIT:
+        raise FormatError(f"{path}: {path.stat().st_size} bytes, {SIZE_LIMIT} allowed; this is no netlist of one chip")
+    file = io.BytesIO(path.read_bytes())
+    try:
+        with zipfile.ZipFile(file) as archive:
+            infos = archive.infolist()
+            if any(info.compress_type != zipfile.ZIP_STORED for info in infos):
+                raise FormatError(f"{path}: has compressed members, a netlist stores them plainly; compile it again")
+            if sum(info.file_size for info in infos) > len(file.getbuffer()):
+                raise FormatError(f"{path}: declares more bytes than it has; compile it again")
+            found: dict[str, Array] = {}
+            for info in infos:
+                content = io.BytesIO(archive.read(info))
+                found[info.filename.removesuffix(".npy")] = np.lib.format.read_array(content, allow_pickle=False)
+            return found
+    except _ZIP_ERRORS as error:
+        raise FormatError(f"{path}: is truncated or not a netlist ({error}); compile it again") from error
+
+
+def stated_format(path: Path) -> str | None:
+    """Format that the manifest of an archive names, None where there is no such thing; nothing else is read."""
+    try:
+        with zipfile.ZipFile(path) as archive, archive.open("manifest.npy") as member:
+            manifest = json.loads(str(np.lib.format.read_array(member, allow_pickle=False)))
+    except (*_ZIP_ERRORS, KeyError, OSError):
+        return None
+    stated = manifest.get("format") if isinstance(manifest, dict) else None
+    return stated if isinstance(stated, str) else None
+
+
+def read_manifest(path: Path, members: Mapping[str, Array], wanted: str, versions: tuple[int, ...]) -> dict[str, Any]:
+    """Manifest of an archive, as :func:`require_manifest` wants it.
+
+    Raises
+    ------
+    FormatError
+        If there is none, or it is of another format or version.
+    """
+    missing = sorted({"manifest", "sha256"} - set(members))
+    if missing:
+        raise FormatError(f"{path}: is not a netlist (no {' and no '.join(missing)}); write one with spikeloom compile")
+    try:
+        manifest = json.loads(str(members["manifest"]))
+    except (ValueError, RecursionError) as error:
+        raise FormatError(f"{path}: has an unreadable manifest; compile it again") from error
+    return require_manifest(path, manifest, wanted, versions)
+
+
+def require_manifest(path: Path, manifest: Any, wanted: str, versions: tuple[int, ...]) -> dict[str, Any]:
+    """Refuse a JSON value that is no manifest of a format, one of ``FORMATS``, in a version that is read.
+
+    Raises
+    ------
+    FormatError
+        What is wrong first.
+    """
+    stated = manifest.get("format") if isinstance(manifest, dict) else None
+    if isinstance(stated, str) and stated in FORMATS and stated != wanted:
+        raise FormatError(f"{path}: holds {FORMATS[stated]}, this is for {FORMATS[wanted]}; give such a file")
+    if stated != wanted:
+        raise FormatError(f"{path}: is not a netlist; write one with spikeloom compile")
+    if manifest.get("version") not in versions:
+        raise FormatError(
+            f"{path}: has format version {manifest.get('version')}, this program reads "
+            f"{', '.join(map(str, versions))}; compile it again or update spikeloom"
+        )
+    return dict(manifest)
+
+
+def read_archive(
+    path: Path, wanted: str, versions: tuple[int, ...], arrays: tuple[str, ...]
+) -> tuple[dict[str, Any], dict[str, Array]]:
+    """Manifest and members of a file of a format, one of ``FORMATS``, that matches its hash.
+
+    Raises
+    ------
+    FormatError
+        If it is missing, truncated, altered, or of another format or version.
+    OSError
+        If it cannot be read.
+    """
+    require_file(path)
+    members = read_members(path)
+    manifest = read_manifest(path, members, wanted, versions)
+    require_whole(path, members, arrays)
+    return manifest, members
+
+
+def require_whole(path: Path, members: dict[str, Array], arrays: tuple[str, ...]) -> None:
+    """Refuse an archive with other members, or that does not match its hash.
+
+    The hash is taken out of the members.
+
+    Raises
+    ------
+    FormatError
+        What is wrong first.
+    """
+    stated = str(members.pop("sha256"))
+    names = {"manifest", *arrays}
+    if set(members) != names:
+        odd = ", ".join(sorted(names ^ set(members)))
+        raise FormatError(f"{path}: has missing or unknown members ({odd}); compile it again")
+    if digest({"manifest": members["manifest"], **{name: members[name] for name in arrays}}) != stated:
+        raise FormatError(f"{path}: its content does not match its hash, so it was altered; compile it again")

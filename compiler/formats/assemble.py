@@ -1,0 +1,189 @@
+"""Put spiking layers and what lies between them together as a network, or say why the chip cannot have it.
+
+What reads a network from elsewhere, an ONNX graph or a torch module, ends here: with layers, each with its decay, its
+threshold and affine stages from other layers, and with how the output is counted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.fixedpoint import FloatArray, IntArray
+from spikeloom.compiler.formats.tensors import printable
+from spikeloom.compiler.ir import INPUT, Input, Network, Population, Projection, Readout, Sparse, depths
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Layer:
+    """A spiking layer.
+
+    Parameters
+    ----------
+    name : str
+        For messages and as the population's name.
+    beta, theta : float
+        Decay and threshold.
+    bias : (neurons,) float64
+    sources : mapping of int to csr_array (neurons, neurons of the source)
+        Stages from other layers by their place in the sequence, or from ``INPUT``; from its own place the spikes of the
+        step before.
+    alpha : float
+        Share of the synaptic current that a step keeps.
+    relays : int
+        How many of the last neurons relay a channel that always has an event, see :mod:`compiler.dynamics`.
+    """
+
+    name: str
+    beta: float
+    theta: float
+    bias: FloatArray
+    sources: Mapping[int, Sparse]
+    alpha: float = 0.0
+    relays: int = 0
+
+
+def class_of_each(counts: Sparse) -> IntArray | None:
+    """Class that each neuron votes for, where the output adds up spikes so, else None.
+
+    Parameters
+    ----------
+    counts : csr_array (classes, neurons)
+        What the output is, in terms of spikes.
+
+    Examples
+    --------
+    >>> from scipy import sparse
+    >>> class_of_each(sparse.csr_array([[0.5, 0.5, 0.0], [0.0, 0.0, 0.5]])).tolist()
+    [0, 0, 1]
+    >>> class_of_each(sparse.csr_array([[1.0, -1.0]])) is None
+    True
+    """
+    columns = counts.tocsc()
+    one_each = np.all(np.diff(columns.indptr) == 1)
+    if not one_each or not columns.nnz or columns.data[0] <= 0 or np.ptp(columns.data) > 1e-12 * columns.data[0]:
+        return None
+    label: IntArray = columns.indices.astype(np.int64)
+    return label
+
+
+def unique_names(names: Sequence[str]) -> tuple[str, ...]:
+    """The names, or ``layer1`` … for those that are empty or not alone.
+
+    Examples
+    --------
+    >>> unique_names(["conv", "", "fc", "fc"])
+    ('conv', 'layer2', 'layer3', 'layer4')
+    """
+    usable = [
+        name if name and names.count(name) == 1 and len(name) < 40 and name.isprintable() else "" for name in names
+    ]
+    return tuple(name or f"layer{place}" for place, name in enumerate(usable, 1))
+
+
+def in_order(layers: Sequence[Layer]) -> list[int]:
+    """Places of the layers, each after the others that it listens to.
+
+    Raises
+    ------
+    ModelError
+        If some listen to each other in a circle.
+    """
+    placed: list[int] = []
+    while len(placed) < len(layers):
+        ready = [
+            index
+            for index, layer in enumerate(layers)
+            if index not in placed and all(source in placed or source in (INPUT, index) for source in layer.sources)
+        ]
+        if not ready:
+            stuck = [printable(layer.name) for index, layer in enumerate(layers) if index not in placed]
+            raise ModelError(
+                f"layers {', '.join(stuck)} listen to each other in a circle; a layer may listen to itself, but to no "
+                "other that listens to it"
+            )
+        placed += ready
+    return placed
+
+
+def assemble(layers: Sequence[Layer], sensor: Input, voters: int, label: IntArray) -> Network:
+    """Network of the layers.
+
+    Parameters
+    ----------
+    layers : sequence of Layer
+        In any order.
+    sensor : Input
+        Where the events come from.
+    voters : int
+        Layer whose spikes are counted.
+    label : (neurons,) int64
+        Class that each of its neurons votes for.
+
+    Raises
+    ------
+    ModelError
+        If the layers are in a circle, some are not reached from the input, skip a layer, or have constants or weights
+        that no chip's neuron has.
+    """
+    order = in_order(layers)
+    place = {INPUT: INPUT} | {old: new for new, old in enumerate(order)}
+    populations: list[Population] = []
+    projections = []
+    for layer in (layers[index] for index in order):
+        _require_neuron(layer)
+        post = len(populations)
+        populations.append(
+            Population(
+                name=layer.name,
+                beta=layer.beta,
+                theta=layer.theta,
+                bias=layer.bias,
+                alpha=layer.alpha,
+                relays=layer.relays,
+            )
+        )
+        for source, weight in sorted(layer.sources.items(), key=lambda entry: place[entry[0]]):
+            projections.append(Projection(pre=place[source], post=post, weight=weight))
+    network = Network(
+        input=sensor,
+        populations=tuple(populations),
+        projections=tuple(projections),
+        readout=Readout(population=place[voters], label=label),
+        classes=int(label.max(initial=0)) + 1,
+    )
+    _require_reach(network)
+    return network
+
+
+def _require_neuron(layer: Layer) -> None:
+    where = f"layer {printable(layer.name)}"
+    if not 0 <= layer.beta <= 1:
+        raise ModelError(f"{where}: keeps {layer.beta:g} of its membrane in a step, allowed are 0 to 1; train it again")
+    if not 0 <= layer.alpha < 1:
+        raise ModelError(
+            f"{where}: keeps {layer.alpha:g} of its current in a step, allowed is less than 1; train again"
+        )
+    if not 0 < layer.theta < np.inf:
+        raise ModelError(f"{where}: has the threshold {layer.theta:g}, allowed are numbers above 0; train it again")
+    if not all(np.all(np.isfinite(values)) for values in (layer.bias, *(w.data for w in layer.sources.values()))):
+        raise ModelError(f"{where}: has weights or biases that are not finite; train it again")
+
+
+def _require_reach(network: Network) -> None:
+    """A spike takes one step on the chip, so all sources of a layer must lie equally deep."""
+    names = [printable(population.name) for population in network.populations]
+    depth = {INPUT: -1} | dict(enumerate(depths(network)))
+    for post, name in enumerate(names):
+        sources = [p.pre for p in network.projections if p.post == post != p.pre]
+        if not sources:
+            raise ModelError(f"layer {name}: listens to nothing, so it is not reached from the input; leave it away")
+        if len({depth[source] for source in sources}) > 1:
+            heard = " and ".join("the input" if source == INPUT else names[source] for source in sources)
+            raise ModelError(
+                f"layer {name}: listens to {heard}, which lie differently deep; a spike takes one step on the chip and "
+                "would arrive too early, so put a spiking layer into the shorter way"
+            )

@@ -1,0 +1,302 @@
+"""Read trained checkpoints of all systems: our own files, the released layout and bare state dicts.
+
+Our own format is read by :mod:`formats.checkpoint_file`, files of ``torch.save`` by :mod:`formats.released_file`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from spikeloom.compiler.dynamics import PLAIN, Dynamics
+from spikeloom.compiler.errors import ModelError, OptionError
+from spikeloom.compiler.fixedpoint import IntArray
+from spikeloom.compiler.formats.checkpoint_file import (
+    WEIGHTS,
+    Float32Array,
+    own_arrays,
+    own_members,
+    require_constants,
+)
+from spikeloom.compiler.formats.released_file import GIVE, read_released
+from spikeloom.compiler.formats.tensors import Arrays
+from spikeloom.compiler.ir import Readout
+from spikeloom.compiler.systems import (
+    GRID_CNN,
+    MLP,
+    SYSTEMS,
+    TACTILESGNET,
+    Grid,
+    kernel_of,
+    window_forms,
+)
+from spikeloom.compiler.targets.loihi1.storage.weight_storage import Form
+
+BETA, THETA = 0.2, 0.5
+"""Decay and threshold of the released code; files in its layout do not hold them."""
+
+SIZE_LIMIT = 2**28
+"""Bytes that a checkpoint may have: 256 MiB, a hundred times the released ones."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Dense:
+    """A fully connected stage.
+
+    Parameters
+    ----------
+    name : str
+        ``fc1`` …
+    weight : (outputs, inputs) float32
+        Of a joined network with the inputs of one tower: no row has weights from another one.
+    bias : (outputs,) float32
+    """
+
+    name: str
+    weight: Float32Array
+    bias: Float32Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Checkpoint:
+    """Trained weights, and what is known about them.
+
+    Parameters
+    ----------
+    system : str
+        One of ``SYSTEMS``.
+    hops : (filters, features, channels) float32
+        Filters of the first layer: of a TactileSGNet K + 1, one for each hop.
+    conv_bias : (features,) float32
+    dense : tuple of Dense
+        Fully connected stages in order.
+    beta, theta : float
+        Membrane decay and threshold.
+    assumed : tuple of str
+        Which of ``beta`` and ``theta`` neither the file nor the user gave.
+    graph : str or None
+        Name of the graph that it was trained on.
+    edges : (edges, 2) int64 or None
+        Its edge list, (source, target).
+    layout : {"spikeloom", "released", "state_dict"}
+        Kind of file.
+    weights : {"last", "best", "clean"}
+        Epoch that the weights are from.
+    sets : tuple of str
+        All epochs that the file holds.
+    runs : int
+        Trainings that the file holds; this is one of them.
+    training : mapping or None
+        JSON values: how it was made and what it reached.
+    forms : tuple of Form, or None
+        How the chip stores each layer, where the network was fine-tuned for it.
+    sha256 : str
+        Of the file.
+    grid : Grid or None
+        Of a grid-based CNN.
+    dynamics : Dynamics
+        Decays of single layers, and clocks.
+    towers : int
+        Networks that lie side by side and vote together, see :mod:`formats.towers`.
+    bins : int
+        Bins of the recordings that a step joins.
+    """
+
+    hops: Float32Array
+    conv_bias: Float32Array
+    dense: tuple[Dense, ...]
+    beta: float
+    theta: float
+    assumed: tuple[str, ...]
+    graph: str | None
+    edges: IntArray | None
+    layout: str
+    weights: str
+    sets: tuple[str, ...]
+    runs: int
+    training: Mapping[str, Any] | None
+    forms: tuple[Form, ...] | None
+    sha256: str
+    system: str = TACTILESGNET
+    grid: Grid | None = None
+    dynamics: Dynamics = PLAIN
+    towers: int = 1
+    bins: int = 1
+
+    @property
+    def places(self) -> int:
+        """Number of places that the first fully connected stage was trained on."""
+        heard = self.dense[0].weight.shape[1] - self.dynamics.clocks.channels
+        return int(heard * self.towers // self.hops.shape[1])
+
+    @property
+    def taxels(self) -> int:
+        """Number of taxels of the sensor."""
+        if self.grid is not None:
+            return len(self.grid.cells)
+        return len(self.hops) if self.system == MLP else self.places
+
+    @property
+    def classes(self) -> int:
+        """Number of classes."""
+        return len(self.dense[-1].bias) // self.towers
+
+    @property
+    def neurons(self) -> dict[str, int]:
+        """Neurons of each layer, the relays of clocks among those of the first."""
+        first = self.places * self.hops.shape[1] + self.dynamics.clocks.channels
+        return {"conv1": int(first)} | {dense.name: len(dense.bias) for dense in self.dense}
+
+    @property
+    def readout(self) -> Readout:
+        """The vote: each tower has one neuron for each class."""
+        label = np.arange(len(self.dense[-1].bias)) % self.classes
+        return Readout(population=len(self.dense), label=label)
+
+
+def read_checkpoint(
+    path: str | os.PathLike[str],
+    *,
+    run: int = 0,
+    weights: str | None = None,
+    beta: float | None = None,
+    theta: float | None = None,
+    system: str | None = None,
+    cells: IntArray | None = None,
+) -> Checkpoint:
+    """Read a checkpoint of any known layout.
+
+    Parameters
+    ----------
+    path : path
+        File.
+    run : int
+        Which run of a released file.
+    weights : {"last", "best", "clean"}, optional
+        Which epoch, where the file holds several; the first of these that it holds without. The best one was chosen
+        on the test split, the clean one on a part of the training split.
+    beta, theta : float, optional
+        Decay and threshold; taken from the file, or from the released code where the file does not say.
+    system : str, optional
+        Which system it is; the file tells by itself.
+    cells : (taxels, 2) int64, optional
+        Row and column of each taxel on the grid of a grid-based CNN, where the file does not say.
+
+    Raises
+    ------
+    ModelError
+        If the file is no checkpoint, holds code, is damaged or altered, does not hold what is asked for, or its
+        tensors do not make the system; every fault of the tensors is listed.
+    OptionError
+        If `system` is another than the file's, or `weights`, `beta` or `theta` has a value that does not exist, or a
+        fine-tuned network had another one.
+    """
+    if weights is not None and weights not in WEIGHTS:
+        raise OptionError(f"--weights {weights}: unknown; choose from {', '.join(WEIGHTS)}")
+    if system is not None and system not in SYSTEMS:
+        raise OptionError(f"--system {system}: unknown; choose from {', '.join(SYSTEMS)}")
+    require_constants("", OptionError, beta, theta)
+    where, path = str(path), Path(path)
+    content = _content(where, path)
+    members = own_members(where, content)
+    given = {"beta": beta, "theta": theta}
+    if members is None:
+        arrays, layout, runs, training, found = read_released(where, content, run, system)
+        grid = _released_grid(where, arrays, cells) if found == GRID_CNN else None
+        if weights not in (None, "last"):
+            raise ModelError(f"{where}: --weights {weights}: the file holds the last epoch only; leave --weights away")
+        graph, edges, chosen, held = None, None, "last", {"beta": BETA, "theta": THETA}
+        sets: tuple[str, ...] = ("last",)
+        forms, dynamics, towers, bins = None, PLAIN, 1, 1
+        assumed = tuple(name for name, value in given.items() if value is None)
+    else:
+        if run != 0:
+            raise ModelError(f"{where}: --run {run}: the file holds only run 0; leave --run away")
+        arrays, (chosen, sets), (graph, edges, held, training), (found, grid, dynamics), (forms, towers, bins) = (
+            own_arrays(where, members, weights)
+        )
+        if system not in (None, found):
+            raise OptionError(f"--system {system}: {where} holds a {found}; leave --system away")
+        layout, runs, assumed = "spikeloom", 1, ()
+        for name, value in given.items():
+            if forms is not None and value not in (None, held[name]):
+                raise OptionError(
+                    f"--{name} {value:g}: {where} was fine-tuned with {held[name]:g}; leave --{name} away"
+                )
+        if beta is not None and dynamics.betas:
+            raise OptionError(
+                f"--beta {beta:g}: {where} has a decay for each layer, {', '.join(f'{b:g}' for b in dynamics.betas)}; "
+                "leave --beta away"
+            )
+    stages = sorted({key.split(".")[0] for key in arrays if key.startswith("fc")}, key=lambda name: int(name[2:]))
+    return Checkpoint(
+        hops=_plain(arrays["conv1.hops"]),
+        conv_bias=_plain(arrays["conv1.bias"]),
+        dense=tuple(
+            Dense(name=name, weight=_plain(arrays[f"{name}.weight"]), bias=_plain(arrays[f"{name}.bias"]))
+            for name in stages
+        ),
+        beta=held["beta"] if beta is None else beta,
+        theta=held["theta"] if theta is None else theta,
+        assumed=assumed,
+        graph=graph,
+        edges=edges,
+        layout=layout,
+        weights=chosen,
+        sets=sets,
+        runs=runs,
+        training=training,
+        forms=forms,
+        sha256=hashlib.sha256(content).hexdigest(),
+        system=found,
+        grid=grid,
+        dynamics=dynamics,
+        towers=towers,
+        bins=bins,
+    )
+
+
+def _released_grid(where: str, arrays: Arrays, cells: IntArray | None) -> Grid:
+    """Grid of a file that does not say what it is: which of the two forms, the number of places tells."""
+    if cells is None:
+        raise ModelError(f"{where}: where the taxels lie on the grid is not in this file; name the sensor")
+    filters, features, _ = arrays["conv1.hops"].shape
+    places = arrays["fc1.weight"].shape[1] // features
+    forms = window_forms(cells, kernel_of(filters))
+    counts = {form: math.prod(grid.places(kernel_of(filters))) for form, grid in forms.items()}
+    for form, count in counts.items():
+        if count == places:
+            return forms[form]
+    sizes = " or ".join(f"{count} (padding {form})" for form, count in counts.items())
+    raise ModelError(
+        f"{where}: fc1 was trained on {places} places, a window of {kernel_of(filters)} * {kernel_of(filters)} on this "
+        f"sensor has {sizes}; give the sensor that it was trained on"
+    )
+
+
+def _plain(array: npt.NDArray[Any]) -> Float32Array:
+    copy = np.array(array, np.float32, order="C")
+    copy.flags.writeable = False
+    return copy
+
+
+def _content(where: str, path: Path) -> bytes:
+    """Bytes of the file."""
+    if not path.is_file():
+        raise ModelError(f"{where}: no such file; {GIVE}")
+    try:
+        with path.open("rb") as file:
+            content = file.read(SIZE_LIMIT + 1)
+    except OSError as error:
+        raise ModelError(f"{where}: cannot be read ({error.strerror or error}); check its permissions") from error
+    if len(content) > SIZE_LIMIT:
+        raise ModelError(f"{where}: more than {SIZE_LIMIT} bytes, the limit of a checkpoint; {GIVE}")
+    return content

@@ -1,0 +1,174 @@
+"""Convolutions and poolings as the sparse matrices that they are, for any number of space axes.
+
+A convolution here is a cross-correlation, as in torch: kernels are not turned round. Images are (channels, space),
+flat in that order.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+
+from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.ir import Sparse
+
+COEFFICIENT_LIMIT = 2**25
+"""Products of a kernel's weights with places: more than twice the synapses of a whole chip."""
+
+IMPOSSIBLE = "has a kernel size, stride or dilation below 1 or a padding below 0; export it again"
+
+Padding = Sequence[tuple[int, int]]
+"""Zeros before and after each space axis."""
+
+
+def same_padding(kernel: Sequence[int], dilation: Sequence[int]) -> Padding:
+    """Padding that keeps the size at a stride of 1; the odd zero comes after, as in torch.
+
+    Examples
+    --------
+    >>> same_padding((3, 2), (1, 1))
+    [(1, 1), (0, 1)]
+    """
+    total = [step * (size - 1) for size, step in zip(kernel, dilation, strict=True)]
+    return [(zeros // 2, zeros - zeros // 2) for zeros in total]
+
+
+def places(
+    space: Sequence[int], kernel: Sequence[int], stride: Sequence[int], padding: Padding, dilation: Sequence[int]
+) -> tuple[int, ...]:
+    """Places that a kernel takes on each axis.
+
+    Examples
+    --------
+    >>> places((5, 4), (3, 2), (2, 1), [(1, 1), (0, 0)], (1, 1))
+    (3, 3)
+
+    Raises
+    ------
+    ModelError
+        If it takes none.
+    """
+    numbers = [*kernel, *stride, *dilation]
+    pads = [zeros for pair in padding for zeros in pair]
+    if min(numbers, default=1) < 1 or min(pads, default=0) < 0:
+        raise ModelError(IMPOSSIBLE)
+    found = []
+    for size, taps, step, (before, after), apart in zip(space, kernel, stride, padding, dilation, strict=True):
+        covered = size + before + after - apart * (taps - 1)
+        if covered < 1:
+            raise ModelError(f"has a kernel of {taps} for {size} places; export it again")
+        found.append((covered - 1) // step + 1)
+    return tuple(found)
+
+
+def convolution(
+    shape: Sequence[int],
+    weight: npt.NDArray[np.floating],
+    *,
+    stride: Sequence[int],
+    padding: Padding,
+    dilation: Sequence[int],
+    groups: int = 1,
+) -> tuple[Sparse, tuple[int, ...]]:
+    """Matrix of a convolution, and the shape of what it gives.
+
+    Parameters
+    ----------
+    shape : (channels, *space)
+        Of the input.
+    weight : (filters, channels / groups, *kernel) float64
+        Kernels.
+    stride, dilation : one for each space axis
+    padding : zeros before and after, for each space axis
+    groups : int
+        Parts of the channels that do not mix.
+
+    Returns
+    -------
+    matrix : csr_array (size of the result, size of the input) float64
+        Without weights of zero.
+    shape : (filters, *places)
+
+    Raises
+    ------
+    ModelError
+        If sizes do not fit each other, or the matrix would be too large.
+
+    Examples
+    --------
+    >>> matrix, shape = convolution((1, 3), np.array([[[1.0, 2.0]]]), stride=[1], padding=[(0, 0)], dilation=[1])
+    >>> shape, matrix.toarray().tolist()
+    ((1, 2), [[1.0, 2.0, 0.0], [0.0, 1.0, 2.0]])
+    """
+    channels, *space = shape
+    filters, each, *kernel = weight.shape
+    if groups < 1 or channels != each * groups or filters % groups:
+        raise ModelError(
+            f"has kernels for {each} channels in {groups} groups and {filters} filters, its input has {channels} "
+            f"channels{_turned(channels, filters, each, groups)}; export it again"
+        )
+    out = places(space, kernel, stride, padding, dilation)
+    if weight.size * math.prod(out) > COEFFICIENT_LIMIT:
+        raise ModelError(
+            f"has {weight.size * math.prod(out):,} weights once written out, {COEFFICIENT_LIMIT:,} are allowed; this "
+            "is no network of one chip"
+        )
+    # For each place and tap: where in the input it looks, and whether that is inside.
+    flat = np.zeros((1,) * (2 * len(space)), np.int64)
+    inside = np.ones((1,) * (2 * len(space)), np.bool_)
+    for axis, size in enumerate(space):
+        looks = np.add.outer(
+            np.arange(out[axis]) * stride[axis] - padding[axis][0], np.arange(kernel[axis]) * dilation[axis]
+        )
+        spread = [1] * (2 * len(space))
+        spread[axis], spread[len(space) + axis] = out[axis], kernel[axis]
+        flat = flat * size + looks.reshape(spread)
+        inside = inside & ((looks >= 0) & (looks < size)).reshape(spread)
+    points, taps = math.prod(out), math.prod(kernel)
+    looked = np.broadcast_to(flat, (*out, *kernel)).reshape(points, taps)
+    counts = np.broadcast_to(inside, (*out, *kernel)).reshape(points, taps)
+    channel = np.arange(filters)[:, None] // (filters // groups) * each + np.arange(each)
+    rows = np.arange(filters)[:, None, None, None] * points + np.arange(points)[None, None, :, None]
+    columns = channel[:, :, None, None] * math.prod(space) + looked[None, None]
+    values = weight.reshape(filters, each, 1, taps)
+    whole = (filters, each, points, taps)
+    kept = np.broadcast_to(counts[None, None], whole) & (np.broadcast_to(values, whole) != 0)
+    parts = [np.broadcast_to(part, whole)[kept] for part in (values, rows, columns)]
+    matrix = sparse.coo_array(
+        (parts[0].astype(np.float64), (parts[1], parts[2])), shape=(filters * points, math.prod(shape))
+    ).tocsr()
+    matrix.sort_indices()
+    return matrix, (filters, *out)
+
+
+def _turned(channels: int, filters: int, each: int, groups: int) -> str:
+    """What would explain kernels that do not fit."""
+    return " (they would fit with filters and channels exchanged)" if channels == filters and each * groups > 0 else ""
+
+
+def pooling(
+    shape: Sequence[int], *, kernel: Sequence[int], stride: Sequence[int], padding: Padding, mean: bool
+) -> tuple[Sparse, tuple[int, ...]]:
+    """Matrix of a sum or mean over windows, channel by channel; zeros of the padding count.
+
+    Examples
+    --------
+    >>> matrix, shape = pooling((1, 2, 2), kernel=(2, 2), stride=(2, 2), padding=[(0, 0)] * 2, mean=True)
+    >>> shape, matrix.toarray().tolist()
+    ((1, 1, 1), [[0.25, 0.25, 0.25, 0.25]])
+    """
+    if min(kernel) < 1:
+        raise ModelError(IMPOSSIBLE)
+    share = 1 / math.prod(kernel) if mean else 1.0
+    return convolution(
+        shape,
+        np.full((shape[0], 1, *kernel), share),
+        stride=stride,
+        padding=padding,
+        dilation=[1] * len(kernel),
+        groups=shape[0],
+    )

@@ -1,0 +1,344 @@
+"""Read a network from lava-dl's ``.net`` files as what it is: integers, registers and all."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy import sparse
+
+from spikeloom.compiler.dynamics import MOST_CLOCKS, MOST_STEPS, NO_CLOCKS, Clocks
+from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.fixedpoint import BIAS_MANTISSA_MAX, THRESHOLD_MANTISSA_MAX, IntArray
+from spikeloom.compiler.formats.hdf5 import Tree
+from spikeloom.compiler.formats.kernels import convolution
+from spikeloom.compiler.formats.netx.layout import BIAS_EXPONENT, DEFAULT_INPUT_WEIGHT, REMEDY, Block, read_blocks
+from spikeloom.compiler.ir import (
+    INPUT,
+    MANTISSA,
+    Input,
+    IntegerNetwork,
+    IntegerPopulation,
+    IntegerProjection,
+    Readout,
+    Sparse,
+)
+from spikeloom.compiler.sensor_layout import sensor_layout
+
+NEURONS = ("CUBA", "LOIHI")
+
+NO_PLACE = {
+    "average": "averages spikes into numbers",
+    "concat": "joins layers that lie differently deep",
+    "convT": "is a transposed convolution, which netx itself does not load",
+    "dense_comp": "has complex weights",
+    "pool": "pools, which netx itself does not load",
+    "unpool": "unpools, which netx itself does not load",
+}
+"""Why layers that the format knows have no place here."""
+
+ALLOWED = "input, flatten, dense, dense_rec and conv"
+
+OWN = "spikeloom"
+"""Group of what our writer adds; others do not read it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class NetxNetwork:
+    """A network, and what was found about the file that it is from.
+
+    Parameters
+    ----------
+    network : IntegerNetwork
+        Integer stage: the numbers of the file.
+    facts : tuple of str
+        What was read and what was assumed, for people.
+    sha256 : str
+        Of the file.
+    """
+
+    network: IntegerNetwork
+    facts: tuple[str, ...]
+    sha256: str
+
+
+def read_netx(
+    path: str | os.PathLike[str], *, polarities: int | None = None, polarities_first: bool | None = None
+) -> NetxNetwork:
+    """Read a network.
+
+    Parameters
+    ----------
+    path : path
+        File.
+    polarities, polarities_first : optional
+        See :func:`sensor_layout.sensor_layout`.
+
+    Raises
+    ------
+    ModelError
+        If the file cannot be read, or holds what the chip's neurons here do not do; the message names the layer.
+    OptionError
+        If there are no such polarities.
+    """
+    try:
+        blocks, tree, sha256 = read_blocks(Path(path))
+        network, facts = integers_of(blocks, tree, polarities, polarities_first)
+        return NetxNetwork(network=network, facts=tuple(facts), sha256=sha256)
+    except ModelError as error:
+        raise ModelError(f"{path}: {error}") from error
+
+
+def integers_of(
+    blocks: Sequence[Block], tree: Tree, polarities: int | None = None, polarities_first: bool | None = None
+) -> tuple[IntegerNetwork, list[str]]:
+    """Integer network of the layers of a file, and facts; raises as :func:`read_netx`."""
+    shape = _input_shape(blocks)
+    own = _own(tree, math.prod(shape), math.prod(blocks[-1].sizes()))
+    if own is None:
+        sensor, positions, words = sensor_layout(shape, polarities=polarities, polarities_first=polarities_first)
+    else:
+        sensor, positions, words = (
+            own[0],
+            np.arange(own[0].size),
+            f"{own[0].taxels} taxels, {own[0].polarities} polarities",
+        )
+    facts = [f"netx, {len(blocks)} layers, read as they stand", f"input: {words}"]
+    populations: list[IntegerPopulation] = []
+    projections: list[IntegerProjection] = []
+    for block in blocks:
+        if block.type == "flatten":
+            shape = (math.prod(shape),)
+            continue
+        if block.type == "input" and block.inner("neuron") is None:
+            continue
+        weight, shape = _synapses(block, shape)
+        post = len(populations)
+        populations.append(_population(block, math.prod(shape), shape))
+        sources = {post - 1 if post else INPUT: weight if post else weight[:, positions]}
+        if block.type == "dense_rec":
+            neurons = populations[-1].size
+            sources[post] = sparse.csr_array(_matrix(block, "weight_rec", neurons, neurons))
+        stored = {pre: _planes(block, part) for pre, part in sources.items()}
+        projections += [
+            IntegerProjection(pre=pre, post=post, weight=plane, exponent=exponent, bits=8)
+            for pre, planes in stored.items()
+            for plane, exponent in planes
+        ]
+        facts.append(_fact(block, populations[-1], max(len(planes) for planes in stored.values())))
+    if not populations:
+        raise ModelError(f"has no layer of neurons; {REMEDY}")
+    voters = populations[-1].size
+    label = np.arange(voters) if own is None else own[1]
+    facts.append(f"classes: the spikes of {populations[-1].name}, {'a neuron each' if own is None else 'in groups'}")
+    network = IntegerNetwork(
+        input=sensor,
+        populations=tuple(populations),
+        projections=tuple(projections),
+        readout=Readout(population=len(populations) - 1, label=label),
+        classes=int(label.max()) + 1,
+    )
+    return network, facts
+
+
+def _input_shape(blocks: Sequence[Block]) -> tuple[int, ...]:
+    first = blocks[0]
+    if first.type == "input":
+        return first.sizes()
+    if first.type in ("dense", "dense_rec"):
+        weight = first.integers("weight")
+        if weight.ndim == 2 and weight.size:
+            return (weight.shape[1],)
+        return (first.number_of("inFeatures"),)
+    raise first.fail("the shape of its input is nowhere, wanted is a layer of type input before it; add one")
+
+
+def _synapses(block: Block, shape: tuple[int, ...]) -> tuple[Sparse, tuple[int, ...]]:
+    """Weights of a layer, csr_array (neurons, what it hears) int64, and the shape of its neurons."""
+    delay = block.entries.get("delay")
+    if isinstance(delay, np.ndarray) and np.any(block.integers("delay")):
+        raise block.fail("has synaptic delays, allowed are none here; train without")
+    if block.type == "input":
+        if block.number:
+            raise block.fail("is not the first; export one network")
+        gain = block.number_of("weight") if "weight" in block.entries else DEFAULT_INPUT_WEIGHT
+        return sparse.csr_array(sparse.identity(math.prod(shape), dtype=np.int64, format="csr") * gain), shape
+    if "weight" in block.entries and block.inner("weight") is not None:
+        raise block.fail("has complex weights, allowed are real ones; use CUBA neurons")
+    if block.type in ("dense", "dense_rec"):
+        neurons = math.prod(block.sizes())
+        return sparse.csr_array(_matrix(block, "weight", neurons, math.prod(shape))), (neurons,)
+    if block.type == "conv":
+        return _conv(block, shape)
+    if block.type in NO_PLACE:
+        raise block.fail(f"{NO_PLACE[block.type]}; allowed are {ALLOWED}")
+    raise block.fail(f"is of a type that is not known, allowed are {ALLOWED}; export it again")
+
+
+def _matrix(block: Block, key: str, neurons: int, heard: int) -> IntArray:
+    weight = block.integers(key)
+    weight = weight.reshape(neurons, -1) if weight.ndim == 1 and weight.size == neurons * heard else weight
+    if weight.shape != (neurons, heard):
+        turned = " (it looks transposed)" if weight.shape == (heard, neurons) else ""
+        raise block.fail(
+            f"{key} has the shape {list(weight.shape)}, wanted {[neurons, heard]}{turned}; the shapes disagree, "
+            f"{REMEDY}"
+        )
+    return weight
+
+
+def _conv(block: Block, shape: tuple[int, ...]) -> tuple[Sparse, tuple[int, ...]]:
+    weight = block.integers("weight")
+    if weight.ndim == 5 and weight.shape[4] == 1:
+        weight = weight[..., 0]
+    if weight.ndim != 4 or not weight.size or len(shape) != 3:
+        raise block.fail(
+            f"weight has the shape {list(weight.shape)} and its input {list(shape)}, wanted are (filters, channels, "
+            f"height, width) and (channels, height, width); {REMEDY}"
+        )
+    try:
+        matrix, out = convolution(
+            shape,
+            weight.astype(np.float64),
+            stride=block.pair("stride"),
+            padding=[(zeros, zeros) for zeros in block.pair("padding")],
+            dilation=block.pair("dilation"),
+            groups=block.number_of("groups"),
+        )
+    except ModelError as error:
+        if str(error).startswith("layer "):
+            raise
+        raise block.fail(str(error)) from error
+    declared = block.sizes()
+    if declared != out:
+        turned = "; its axes look exchanged" if declared == (out[0], out[2], out[1]) else ""
+        raise block.fail(f"gives {list(out)}, the file says {list(declared)}{turned}; {REMEDY}")
+    return matrix.astype(np.int64), out
+
+
+def _planes(block: Block, weight: Sparse) -> list[tuple[Sparse, int]]:
+    """Mantissas and exponents that make up whole weights; mantissas of 8 bits are even."""
+    weight.eliminate_zeros()
+    weight.sort_indices()
+    data = weight.data
+    if data.size and (data.min() < -256 or data.max() > 255):
+        raise block.fail(
+            f"has weights from {data.min()} to {data.max()}, allowed are -256 to 255; netx would clip them"
+        )
+    if not np.any(data % 2):
+        return [(_with(weight, data), 0)]
+    if np.abs(data).max() <= 127:
+        return [(_with(weight, 2 * data), -1)]
+    odd = data % 2
+    units = _with(weight, 2 * odd)  # one half step, stored twice as large at half the value
+    units.eliminate_zeros()
+    return [(_with(weight, data - odd), 0), (units, -1)]
+
+
+def _with(weight: Sparse, data: IntArray) -> Sparse:
+    parts = (data.astype(MANTISSA), weight.indices.copy(), weight.indptr.copy())
+    return sparse.csr_array(parts, shape=weight.shape)
+
+
+def _population(block: Block, size: int, shape: tuple[int, ...]) -> IntegerPopulation:
+    neuron = block.inner("neuron")
+    if neuron is None:
+        raise block.fail("has no neuron, so its membranes are the result, and a chip counts spikes; leave it away")
+    kind = neuron.get("type")
+    if kind not in NEURONS:
+        raise block.fail(
+            f"has neurons of type {str(kind)[:20]!r}, allowed are {' and '.join(NEURONS)}; train with them"
+        )
+    graded = neuron.get("gradedSpike")
+    bits = neuron.get("messageBits")
+    if any(isinstance(value, np.ndarray) and np.any(value) for value in (graded, bits)):
+        raise block.fail("sends graded spikes, which Loihi 1 does not have; train without")
+    for key, allowed in (("refDelay", 1), ("wgtExp", 0)):
+        if key in neuron and block.number_of(key, neuron) != allowed:
+            raise block.fail(f"{key} is {block.number_of(key, neuron)}, allowed is {allowed}; train it so")
+    decay_u, decay_v = block.number_of("iDecay", neuron) - 1, block.number_of("vDecay", neuron)
+    if not (0 <= decay_u <= 4095 and 0 <= decay_v <= 4095):
+        raise block.fail(
+            f"has iDecay {decay_u + 1} and vDecay {decay_v}, allowed are 1 to 4096 and 0 to 4095; train it again"
+        )
+    threshold = block.number_of("vThMant", neuron)
+    if not 0 <= threshold <= THRESHOLD_MANTISSA_MAX:
+        raise block.fail(f"vThMant is {threshold}, allowed are 0 to {THRESHOLD_MANTISSA_MAX}; train it again")
+    bias = _bias(block, size, shape)
+    return IntegerPopulation(
+        name=f"{block.type}{block.number}",
+        beta=(4096 - decay_v) / 4096,
+        theta=float(max(threshold, 1)),
+        alpha=(4095 - decay_u) / 4096,
+        scale=np.ones(size),
+        decay_u=decay_u,
+        decay_v=decay_v,
+        threshold=np.full(size, threshold),
+        bias_mantissa=bias,
+        bias_exponent=np.where(bias != 0, BIAS_EXPONENT, 0),
+    )
+
+
+def _bias(block: Block, size: int, shape: tuple[int, ...]) -> IntArray:
+    """Bias of each neuron, in weight steps: one for all, one for a channel, or one each."""
+    if "bias" not in block.entries:
+        return np.zeros(size, np.int64)
+    values = block.integers("bias").ravel()
+    if values.size not in (1, shape[0], size):
+        raise block.fail(f"bias has {values.size} values for {size} neurons; the shapes disagree, {REMEDY}")
+    if np.any(np.abs(values) > BIAS_MANTISSA_MAX):
+        raise block.fail(
+            f"has biases up to {np.abs(values).max()}, allowed are {BIAS_MANTISSA_MAX} steps; train it again"
+        )
+    each: IntArray = np.repeat(values, size // values.size)
+    return each
+
+
+def _own(tree: Tree, inputs: int, voters: int) -> tuple[Input, IntArray] | None:
+    """Sensor and vote that our own writer tells beside the layers, or None.
+
+    Raises
+    ------
+    ModelError
+        If they do not fit the layers.
+    """
+    entries = tree.get(OWN)
+    if not isinstance(entries, dict):
+        return None
+    said = Block(number=-1, type=OWN, entries=entries)
+    taxels, polarities, channels, steps = (
+        said.number_of(key) for key in ("taxels", "polarities", "clocks", "clock_steps")
+    )
+    clocks = Clocks(channels=channels, steps=steps) if channels else NO_CLOCKS
+    bins = said.number_of("bins") if "bins" in entries else 1
+    if (
+        not 1 <= bins <= MOST_STEPS
+        or min(taxels, polarities) < 1
+        or not 0 <= channels <= MOST_CLOCKS
+        or not 1 <= steps <= MOST_STEPS
+    ):
+        raise ModelError(f"group {OWN} describes no sensor; {REMEDY}")
+    sensor = Input(taxels=taxels, polarities=polarities, clocks=clocks, bins=bins)
+    label = said.integers("label").ravel()
+    if sensor.size != inputs or label.size != voters or label.min() < 0 or label.max() >= voters:
+        raise ModelError(
+            f"group {OWN} is for {sensor.size} inputs and {label.size} voting neurons, the layers have {inputs} and "
+            f"{voters}; {REMEDY}"
+        )
+    return sensor, label
+
+
+def _fact(block: Block, population: IntegerPopulation, planes: int) -> str:
+    told = (
+        f"{population.name}: {population.size} neurons, decay_u {population.decay_u}, decay_v {population.decay_v}, "
+        f"fires at v > 64 * {population.threshold[0]}"
+    )
+    if block.type == "input":
+        told += "; it turns events into currents"
+    if block.type == "dense_rec":
+        told += "; it hears its own spikes of the step before"
+    return told + ("; odd weights are stored twice" if planes > 1 else "")

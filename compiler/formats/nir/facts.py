@@ -1,0 +1,131 @@
+"""What the reader of a NIR file would want to check: what was read, what assumed, what such files are known to lose."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from spikeloom.compiler.fixedpoint import FloatArray, IntArray
+from spikeloom.compiler.formats.nir.file import Graph, Node
+from spikeloom.compiler.formats.nir.neurons import SPIKING, Neurons, Steps, decay_words, written_for
+from spikeloom.compiler.formats.nir.values import Value
+from spikeloom.compiler.formats.tensors import printable
+from spikeloom.compiler.ir import Input
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SpikingNode:
+    """A spiking node in steps.
+
+    Parameters
+    ----------
+    node : Node
+        As the file has it.
+    value : Value
+        What it gets, scaled to its membrane.
+    neurons : Neurons
+        Its numbers.
+    groups : list of int64 array
+        Its neurons by their decays.
+    hears_itself : bool
+        Whether it is in a loop.
+    """
+
+    node: Node
+    value: Value
+    neurons: Neurons
+    groups: list[IntArray]
+    hears_itself: bool
+
+
+def hint(graph: Graph) -> str:
+    """What a file tells about the time step that it was written in, to go on a sentence; empty if nothing."""
+    said = graph.metadata.get("dt")
+    if isinstance(said, np.ndarray) and said.size == 1:
+        return f", but its metadata says dt = {float(said.ravel()[0]):g}"
+    written = _written(graph)
+    return "" if written is None else f", but its r is tau / {written:g}, as of steps of {written:g} s"
+
+
+def _written(graph: Graph) -> float | None:
+    """Step that the file was written in, as far as all of its neurons say the same."""
+    found = [written_for(node) for node in graph.nodes.values() if node.type in SPIKING and node.type != "Threshold"]
+    if not found or found[0] is None or any(step is None for step in found):
+        return None
+    return found[0] if all(math.isclose(step, found[0], rel_tol=1e-4) for step in found if step) else None
+
+
+def facts_of(graph: Graph, steps: Steps, spiking: Sequence[SpikingNode], sensor: str, clocked: Input) -> list[str]:
+    """Lines for people.
+
+    Parameters
+    ----------
+    graph : Graph
+        The file.
+    steps : Steps
+        How it was read.
+    spiking : sequence of SpikingNode
+        Its layers.
+    sensor : str
+        What its input was taken for.
+    clocked : Input
+        The network's input.
+    """
+    version = printable(graph.version) or "of no version"
+    facts = [f"NIR {version}, read in steps of {steps.dt:g} s ({steps.convention})", sensor]
+    for one in spiking:
+        n = one.neurons
+        decays = " or ".join(decay_words(float(n.beta[rows[0]])) for rows in one.groups[:4])
+        told = f"layer {printable(one.node.name)} ({one.node.type}): {len(n.beta)} neurons, {decays}"
+        told += f", current {one.value.alpha:.6g}" if one.value.alpha else ""
+        told += f", fires at v > {_span(n.theta + n.reset)}, then v = {_span(n.reset)}"
+        if np.any(np.abs(n.gain - 1) > 1e-4):
+            told += f"; a step adds {_span(n.gain)} of its input"
+        facts.append(told)
+    return facts + _drifts(graph, steps, spiking, clocked)
+
+
+def _drifts(graph: Graph, steps: Steps, spiking: Sequence[SpikingNode], sensor: Input) -> list[str]:
+    """What files are known to lose or to change."""
+    facts = ["v goes to its reset as NIR says; a framework that subtracts the threshold instead means another network"]
+    if any(node.type == "CubaLIF" for node in graph.nodes.values()):
+        facts.append(
+            "a reset leaves currents as they are, as NIR says; snnTorch's Synaptic with reset 'zero' clears them"
+        )
+    if looped := [printable(one.node.name) for one in spiking if one.hears_itself]:
+        facts.append(
+            f"{', '.join(looped)}: hears its own spikes of the step before; snnTorch's RLeaky with reset 'zero' means "
+            "this with reset_delay=False, else it loses the input of the step after each spike"
+        )
+    written = _written(graph)
+    if written is not None and not math.isclose(written, steps.dt, rel_tol=1e-4):
+        facts.append(
+            f"drift: r is tau / {written:g} in every neuron, as of a file written in steps of {written:g} s; in steps "
+            f"of {steps.dt:g} s its decays and gains are others than there"
+        )
+    rounded = [
+        f"{printable(name)}.{key} ({np.dtype(node.stored(key)).name})"
+        for name, node in graph.nodes.items()
+        for key in ("weight", "bias", "tau", "tau_mem", "tau_syn", "v_threshold")
+        if node.has(key) and (np.dtype(node.stored(key)).kind != "f" or np.dtype(node.stored(key)).itemsize < 4)
+    ]
+    if rounded:
+        facts.append(f"drift: rounded before the file was written: {', '.join(rounded[:6])}; read as they stand")
+    square = [
+        printable(name)
+        for name, node in graph.nodes.items()
+        if node.type in ("Affine", "Linear") and len(set(node.numbers("weight").shape)) == 1
+    ]
+    if square:
+        facts.append(f"square matrices are read as (to, from): {', '.join(square[:6])}")
+    if sensor.clocks.channels:
+        facts.append("biases that go through a synaptic current come from a channel that always has an event")
+    return facts
+
+
+def _span(values: FloatArray) -> str:
+    low, high = float(values.min()), float(values.max())
+    return f"{low:.6g}" if math.isclose(low, high, rel_tol=1e-6, abs_tol=1e-12) else f"{low:.6g} … {high:.6g}"

@@ -1,0 +1,181 @@
+"""What each node of NIR that is no spiking neuron does to a value."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TypeVar
+
+import numpy as np
+from scipy import sparse
+
+from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.fixedpoint import FloatArray
+from spikeloom.compiler.formats.kernels import Padding, convolution, pooling, same_padding
+from spikeloom.compiler.formats.nir.file import Node
+from spikeloom.compiler.formats.nir.neurons import Steps, one, spread
+from spikeloom.compiler.formats.nir.values import Value, filtered, reshaped, scaled, shifted, through
+
+Made = TypeVar("Made")
+
+DENSE_LIMIT = 2**28
+"""Weights of a matrix that is written out once for each place of an axis."""
+
+KNOWN = {
+    "CubaLI": "its state is filtered twice, a neuron of the chip filters once; use LI",
+    "Delay": "delays spikes, which networks here do not; train without",
+    "I": "integrates without leak and never spikes; use IF",
+}
+"""Why nodes that NIR knows have no place here."""
+
+
+def _linear(node: Node, value: Value, _steps: Steps) -> Value:
+    weight = node.numbers("weight")
+    if weight.ndim != 2:
+        raise node.fail(f"weight has the shape {list(weight.shape)}, allowed are (to, from); export it again")
+    rows, columns = weight.shape
+    if value.shape[-1:] != (columns,):
+        raise node.fail(_misfit(weight.shape, value))
+    copies = math.prod(value.shape[:-1])
+    if copies * weight.size > DENSE_LIMIT:
+        raise node.fail(f"has {copies * weight.size:,} weights, {DENSE_LIMIT:,} are allowed; this fits no chip")
+    matrix = sparse.csr_array(weight)
+    if copies != 1:
+        matrix = sparse.csr_array(sparse.kron(sparse.identity(copies), matrix, format="csr"))
+    result = through(value, matrix, (*value.shape[:-1], rows))
+    if node.type == "Linear":
+        return result
+    return shifted(result, np.tile(_each(node, "bias", rows), copies))
+
+
+def _misfit(shape: tuple[int, ...], value: Value) -> str:
+    """Why a matrix does not fit what it gets."""
+    rows, columns = shape
+    said = f"weight is for {columns} values, it gets {list(value.shape)}"
+    if value.shape[-1:] == (rows,):
+        return f"{said}; the matrix looks transposed, NIR wants (to, from)"
+    if value.size == columns:
+        return f"{said}; a Flatten is missing before it"
+    return f"{said}; the shapes disagree, export it again"
+
+
+def _each(node: Node, key: str, size: int) -> FloatArray:
+    values = node.numbers(key).ravel()
+    if values.size != size:
+        raise node.fail(f"{key} has {values.size} values, wanted {size}; export it again")
+    return values
+
+
+def _scale(node: Node, value: Value, _steps: Steps) -> Value:
+    return scaled(value, spread(node, "scale", value.size, value.shape))
+
+
+def _image(node: Node, value: Value, axes: int) -> tuple[int, ...]:
+    """Channels and space of what a node gets; axes of length 1 in front are the batch's."""
+    sizes = list(value.shape)
+    while len(sizes) > axes + 1 and sizes[0] == 1:
+        sizes.pop(0)
+    if len(sizes) != axes + 1:
+        wanted = "[channels, length]" if axes == 1 else "[channels, height, width]"
+        raise node.fail(f"gets {list(value.shape)}, wanted {wanted}; the shapes disagree, export it again")
+    return tuple(sizes)
+
+
+def _padding(node: Node, kernel: tuple[int, ...], dilation: tuple[int, ...], stride: tuple[int, ...]) -> Padding:
+    said = node.values.get("padding")
+    if not isinstance(said, str):
+        return [(zeros, zeros) for zeros in node.whole("padding", len(kernel))]
+    if said == "valid":
+        return [(0, 0)] * len(kernel)
+    if said == "same":
+        if set(stride) != {1}:
+            raise node.fail(f"has the padding 'same' at a stride of {max(stride)}, allowed is 1; export it again")
+        return same_padding(kernel, dilation)
+    raise node.fail(f"has the padding {said[:20]!r}, allowed are numbers, 'same' and 'valid'; export it again")
+
+
+def _conv(node: Node, value: Value, _steps: Steps) -> Value:
+    axes = 1 if node.type == "Conv1d" else 2
+    weight = node.numbers("weight")
+    if weight.ndim != axes + 2 or not weight.size:
+        raise node.fail(
+            f"weight has the shape {list(weight.shape)}, allowed are (filters, channels, *kernel); export it again"
+        )
+    shape, kernel = _image(node, value, axes), weight.shape[2:]
+    if node.has("input_shape"):
+        declared = node.whole("input_shape")
+        if declared != shape[1:]:
+            turned = "; its axes look exchanged" if declared == shape[:0:-1] else ""
+            raise node.fail(f"is for inputs of {list(declared)}, it gets {list(shape[1:])}{turned}; export it again")
+    stride, dilation = node.whole("stride", axes), node.whole("dilation", axes)
+    padding, groups = _padding(node, kernel, dilation, stride), node.whole("groups", 1)[0]
+    matrix, out = _named(
+        node,
+        lambda: convolution(shape, weight, stride=stride, padding=padding, dilation=dilation, groups=groups),
+    )
+    bias = np.repeat(_each(node, "bias", out[0]), math.prod(out[1:])) if node.has("bias") else None
+    result = through(value, matrix, out)
+    return result if bias is None else shifted(result, bias)
+
+
+def _pool(node: Node, value: Value, _steps: Steps) -> Value:
+    shape = _image(node, value, 2)
+    kernel, stride = node.whole("kernel_size", 2), node.whole("stride", 2)
+    padding = _padding(node, kernel, (1, 1), stride)
+    mean = node.type == "AvgPool2d"
+    if max(kernel) > max(shape) + 2 * max(max(pair) for pair in padding):
+        raise node.fail(f"has a window of {list(kernel)} for {list(shape[1:])} places; export it again")
+    matrix, out = _named(node, lambda: pooling(shape, kernel=kernel, stride=stride, padding=padding, mean=mean))
+    return through(value, matrix, out)
+
+
+def _named(node: Node, make: Callable[[], Made]) -> Made:
+    try:
+        return make()
+    except ModelError as error:
+        raise node.fail(str(error)) from error
+
+
+def _flatten(node: Node, value: Value, _steps: Steps) -> Value:
+    first = node.whole("start_dim", 1)[0] if node.has("start_dim") else 1
+    last = node.whole("end_dim", 1)[0] if node.has("end_dim") else -1
+    axes = len(value.shape)
+    first, last = (end + axes if end < 0 else end for end in (first, last))
+    if not 0 <= first < axes or not first <= last < axes:
+        # one axis is flat whatever is said about others
+        if axes == 1:
+            return value
+        raise node.fail(f"flattens axes {first} to {last} of {list(value.shape)}; the shapes disagree, export it again")
+    shape = value.shape
+    return reshaped(value, (*shape[:first], math.prod(shape[first : last + 1]), *shape[last + 1 :]))
+
+
+def _integrator(node: Node, value: Value, steps: Steps) -> Value:
+    """A leaky integrator that does not spike: the synaptic filter of what comes after it."""
+    kept = steps.keeps(node, "tau", value.size, value.shape)
+    alpha = one(node, "tau", kept)
+    gain = (1 - kept) * spread(node, "r", value.size, value.shape)
+    drive = (1 - kept) * spread(node, "v_leak", value.size, value.shape)
+    if not alpha:
+        return shifted(scaled(value, gain), drive)
+    return _named(node, lambda: filtered(value, alpha, gain, drive))
+
+
+def _same(_node: Node, value: Value, _steps: Steps) -> Value:
+    return value
+
+
+STAGES: dict[str, Callable[[Node, Value, Steps], Value]] = {
+    "Affine": _linear,
+    "AvgPool2d": _pool,
+    "Conv1d": _conv,
+    "Conv2d": _conv,
+    "Flatten": _flatten,
+    "Identity": _same,
+    "LI": _integrator,
+    "Linear": _linear,
+    "Output": _same,
+    "Scale": _scale,
+    "SumPool2d": _pool,
+}
+"""By type what a node makes of a value; each raises ModelError, with the node's name."""

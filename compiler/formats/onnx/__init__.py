@@ -1,0 +1,1 @@
+"""ONNX files: reader and writer."""

@@ -1,0 +1,238 @@
+"""Find the neurons in what a graph computes: ``u <- beta * u * (1 - s) + current``, ``s = u > theta``.
+
+A membrane is affine in what varies. The part that comes from an earlier membrane must be what is left of that after a
+reset to zero; the rest must come from the input and from spikes of the same step. How the file writes that, by a
+product, a Where, with the reset before or after the decay, makes no difference here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.fixedpoint import FloatArray
+from spikeloom.compiler.formats.onnx.values import (
+    INPUT_ATOM,
+    MEMBRANE,
+    PRODUCT,
+    SPIKE,
+    Affine,
+    Table,
+    diagonal,
+    one_each,
+)
+from spikeloom.compiler.formats.tensors import printable
+from spikeloom.compiler.ir import Sparse
+
+EQUAL = 1e-12
+"""Relative difference that reordered arithmetic on two constants explains."""
+
+RESET = (
+    "only u <- beta * u * (1 - s) + current, a reset to zero by the spike of the step before, can be lowered to the "
+    "chip's neuron"
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Neurons:
+    """A layer in one step.
+
+    Parameters
+    ----------
+    membrane : int
+        Atom.
+    node : str
+        Operator that makes the membrane.
+    previous : int or None
+        Atom of the membrane, or of the state input, that it comes from.
+    gate : int or None
+        State input that holds the spikes of the step before, where there is one.
+    spike : int
+        Atom of its spikes.
+    beta, theta : float
+        Decay and threshold; no decay in a first step that starts at zero.
+    strict : bool
+        Fires above the threshold; else at it, too.
+    current : mapping of int to csr_array
+        What else it is made of, by atom.
+    bias : (neurons,) float64
+    """
+
+    membrane: int
+    node: str
+    previous: int | None
+    gate: int | None
+    spike: int
+    beta: float | None
+    theta: float
+    strict: bool
+    current: Mapping[int, Sparse]
+    bias: FloatArray
+
+
+def neurons_of(table: Table, outputs: Mapping[str, Affine]) -> list[Neurons]:
+    """Every layer in every step, in the order in which a graph computes them.
+
+    Parameters
+    ----------
+    table : Table
+        After the graph was run.
+    outputs : mapping
+        Its outputs by name.
+
+    Raises
+    ------
+    ModelError
+        Naming the operator of the first membrane that is none of such neurons, and why.
+    """
+    found = []
+    for membrane, definition in table.definitions.items():
+        try:
+            neurons = _read(table, membrane, definition, outputs)
+        except ModelError as error:
+            raise ModelError(f"{table.nodes[membrane]}: {error}") from error
+        if neurons is not None:
+            found.append(neurons)
+    return found
+
+
+def _read(table: Table, membrane: int, definition: Affine, outputs: Mapping[str, Affine]) -> Neurons | None:
+    points = [index for index, point in enumerate(table.points) if point.membrane == membrane]
+    spikes = [index for index, atom in enumerate(table.atoms) if atom.kind == SPIKE and atom.of[0] in points]
+    if not spikes:
+        return None
+    if len(points) > 1 or len(spikes) > 1:
+        raise ModelError("is compared in several ways, which is no spike; compare a membrane with one threshold")
+    theta = table.points[points[0]].theta
+    if np.ptp(theta) > 0:
+        raise ModelError(
+            f"has thresholds from {theta.min():g} to {theta.max():g} in one layer; give all its neurons the same one"
+        )
+    terms = dict(definition.terms)
+    previous, gate, beta = _carried(table, membrane, spikes[0], terms, outputs)
+    for atom, weight in terms.items():
+        _require_current(table, atom, weight, previous, membrane)
+    return Neurons(
+        membrane=membrane,
+        node=table.nodes[membrane],
+        previous=previous,
+        gate=gate,
+        spike=spikes[0],
+        beta=beta,
+        theta=float(theta[0]) if len(theta) else 0.0,
+        strict=table.atoms[spikes[0]].strict,
+        current=terms,
+        bias=definition.bias,
+    )
+
+
+def _carried(
+    table: Table, membrane: int, spike: int, terms: dict[int, Sparse], outputs: Mapping[str, Affine]
+) -> tuple[int | None, int | None, float | None]:
+    """Take what is kept of an earlier membrane out of the terms: from which, gated by what, and which share."""
+    products = [atom for atom in terms if table.atoms[atom].kind == PRODUCT]
+    if len(products) > 1:
+        raise ModelError(f"multiplies {len(products)} pairs of values; {RESET}")
+    if not products:
+        return _already_reset(table, membrane, spike, terms, outputs)
+    pair = table.atoms[products[0]].of
+    linear = [atom for atom in pair if atom in terms and table.atoms[atom].kind in (INPUT_ATOM, MEMBRANE)]
+    kept = [atom for atom in linear if _decay(terms[atom]) is not None] or linear
+    shown = table.atoms[products[0]].label
+    if len(kept) != 1:
+        raise ModelError(f"holds {printable(shown)} in a way that is no reset; {RESET}")
+    previous = kept[0]
+    gate = pair[0] if pair[1] == previous else pair[1]
+    beta, removed = _decay(terms.pop(previous)), _decay(terms.pop(products[0]))
+    if beta is None or removed is None:
+        raise ModelError(
+            f"mixes or weighs the neurons of {printable(table.atoms[previous].label)} differently; {RESET}"
+        )
+    if abs(beta + removed) > EQUAL * max(abs(beta), abs(removed)):
+        raise ModelError(f"keeps {beta:g} of a membrane and {beta + removed:g} of it after a spike; {RESET}")
+    if table.atoms[gate].kind == SPIKE:
+        _require_same_threshold(table, previous, gate, spike)
+    if table.atoms[previous].kind == INPUT_ATOM:
+        _require_output(outputs, {membrane: 1.0}, f"membrane of {printable(table.atoms[previous].label)}")
+        if table.atoms[gate].kind == INPUT_ATOM:
+            _require_output(outputs, {spike: 1.0}, f"spikes of {printable(table.atoms[gate].label)}")
+    return previous, gate if table.atoms[gate].kind == INPUT_ATOM else None, beta
+
+
+def _decay(terms: Sparse) -> float | None:
+    """The one factor of all neurons, each on itself; factors that differ in the last digits are one."""
+    single = one_each(terms)
+    if single is None or terms.shape[0] != terms.shape[1]:
+        return None
+    factor, column = single
+    if not np.array_equal(column, np.arange(len(column))) or np.ptp(factor) > EQUAL * abs(factor[0]):
+        return None
+    return float(factor[0])
+
+
+def _already_reset(
+    table: Table, membrane: int, spike: int, terms: dict[int, Sparse], outputs: Mapping[str, Affine]
+) -> tuple[int | None, None, float | None]:
+    """A state input that holds the membrane after its reset, so that nothing is reset at its use."""
+    pair = table.known.get((PRODUCT, min(membrane, spike), max(membrane, spike)))
+    states = [atom for atom in terms if table.atoms[atom].kind == INPUT_ATOM and _decay(terms[atom]) is not None]
+    factors = [] if pair is None else [
+        factor
+        for output in outputs.values()
+        if (factor := _multiple(output, {membrane: 1.0, pair: -1.0})) is not None
+    ]  # fmt: skip
+    if not factors or not states:
+        return None, None, None
+    if len(states) > 1:
+        shown = " and ".join(printable(table.atoms[atom].label) for atom in states)
+        raise ModelError(f"could carry either of {shown}; {RESET}, say which with a product that resets it")
+    beta = _decay(terms.pop(states[0]))
+    assert beta is not None
+    return states[0], None, beta * factors[0]
+
+
+def _multiple(value: Affine, wanted: Mapping[int, float]) -> float | None:
+    """By what the value is a multiple of a sum of atoms, if it is."""
+    found = {atom: diagonal(own) for atom, own in value.terms.items()}
+    if set(found) != set(wanted) or np.any(value.bias) or any(factor is None for factor in found.values()):
+        return None
+    ratios = [(found[atom] or 0.0) / factor for atom, factor in wanted.items()]
+    return ratios[0] if all(abs(r - ratios[0]) <= EQUAL * abs(ratios[0]) for r in ratios) else None
+
+
+def is_output(outputs: Mapping[str, Affine], wanted: Mapping[int, float]) -> str | None:
+    """Name of the output that is exactly this sum of atoms, or None."""
+    return next((name for name, value in outputs.items() if _multiple(value, wanted) == 1), None)
+
+
+def _require_output(outputs: Mapping[str, Affine], wanted: Mapping[int, float], what: str) -> None:
+    if is_output(outputs, wanted) is None:
+        raise ModelError(f"takes the {what} as a state, and no output gives it back; add it to the outputs")
+
+
+def _require_same_threshold(table: Table, previous: int, gate: int, spike: int) -> None:
+    """A reset by a comparison of the state itself must use the comparison that makes the spikes."""
+    old, new = (table.atoms[atom] for atom in (gate, spike))
+    same = np.array_equal(table.points[old.of[0]].theta, table.points[new.of[0]].theta) and old.strict == new.strict
+    if not same:
+        raise ModelError(
+            f"resets {printable(table.atoms[previous].label)} by another threshold than it fires by; {RESET}"
+        )
+
+
+def _require_current(table: Table, atom: int, terms: Sparse, previous: int | None, membrane: int) -> None:
+    """Whether the rest is a current: from the input or from spikes; says what it is where it is not."""
+    found = table.atoms[atom]
+    label = printable(found.label)
+    if found.kind == MEMBRANE:
+        raise ModelError(f"takes the membrane of {label}, not its spikes, as its input or without a reset; {RESET}")
+    if found.kind == PRODUCT:
+        raise ModelError(f"holds {label} in a way that is no reset; {RESET}")
+    factor = _decay(terms)
+    own = found.kind == SPIKE and table.points[found.of[0]].membrane == previous
+    state = found.kind == INPUT_ATOM and previous is None and found.size == table.atoms[membrane].size
+    if factor is not None and factor < 0 and (own or state):
+        raise ModelError(f"loses {-factor:g} for a spike of {label}, a reset by subtraction; {RESET}")

@@ -1,0 +1,250 @@
+"""Operators that are linear in one operand while the others are constant: products, convolutions, means and sums.
+
+Each is said twice: as numbers, in numpy's own terms, and as the matrix that takes the flat operand to the flat result.
+"""
+
+from __future__ import annotations
+
+import string
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from scipy import sparse
+
+from spikeloom.compiler.formats.onnx.file import Array, Node
+from spikeloom.compiler.formats.onnx.moves import Operands, axes_of, scatter_place
+from spikeloom.compiler.formats.onnx.values import COEFFICIENT_LIMIT, Table, size_of
+from spikeloom.compiler.ir import Sparse
+
+Matrix = Callable[[Node, Table, Operands, int], Sparse]
+Numbers = Callable[[Node, Table, Operands], list[Array]]
+
+
+def _matrix(out: Array, place: Array, weight: Array, shape: tuple[int, int]) -> Sparse:
+    """csr_array of the weights that are not zero, between broadcast positions; a position of -1 is no element."""
+    rows, columns, values = (flat.ravel() for flat in np.broadcast_arrays(out, place, weight))
+    kept = (values != 0) & (columns >= 0)
+    matrix = sparse.coo_array((values[kept].astype(np.float64), (rows[kept], columns[kept])), shape=shape).tocsr()
+    matrix.sum_duplicates()
+    matrix.sort_indices()
+    return matrix
+
+
+def _contract(table: Table, spelled: str, place: Array, weight: Array, columns: int) -> Sparse:
+    """Matrix of ``einsum("place,weight->out")``; `place` holds positions of the operand, -1 for none."""
+    (left, right), out = spelled.split("->", maxsplit=1)[0].split(","), spelled.split("->")[1]
+    if any(len(set(labels)) != len(labels) for labels in (left, right, out)) or not set(out) <= set(left + right):
+        raise ValueError("a sum that is not known")
+    every = out + "".join(sorted(set(left + right) - set(out)))
+    sizes: dict[str, int] = {}
+    for labels, shape in ((left, place.shape), (right, weight.shape)):
+        for label, size in zip(labels, shape, strict=True):
+            if sizes.setdefault(label, size) != size:
+                raise ValueError("sizes that do not fit each other")
+    table.room([sizes[label] for label in every], COEFFICIENT_LIMIT)
+
+    def spread(array: Array, labels: str) -> Array:
+        order = sorted(range(len(labels)), key=lambda axis: every.index(labels[axis]))
+        return array.transpose(order).reshape([sizes[label] if label in labels else 1 for label in every])
+
+    target = np.arange(size_of([sizes[label] for label in out])).reshape([sizes[label] for label in out])
+    return _matrix(spread(target, out), spread(place, left), spread(weight, right), (target.size, columns))
+
+
+def _positions(array: Array) -> Array:
+    return np.arange(array.size).reshape(array.shape)
+
+
+def _matmul(_node: Node, table: Table, operands: Operands) -> list[Array]:
+    first, second = operands
+    batch = np.broadcast_shapes(first.shape[:-2], second.shape[:-2])
+    table.room((*batch, *first.shape[-2:-1], *second.shape[-1:]))
+    return [np.matmul(first, second)]
+
+
+def _matmul_matrix(_node: Node, table: Table, operands: Operands, which: int) -> Sparse:
+    first, second = operands
+    sides = [_positions(first), second] if which == 0 else [first, _positions(second)]
+    sides[0] = sides[0][None] if first.ndim == 1 else sides[0]
+    sides[1] = sides[1][:, None] if second.ndim == 1 else sides[1]
+    batch = table.room(np.broadcast_shapes(sides[0].shape[:-2], sides[1].shape[:-2]))
+    for side, array in enumerate(sides):
+        table.room((*batch, *array.shape[-2:]))
+        sides[side] = np.broadcast_to(array, (*batch, *array.shape[-2:]))
+    letters = string.ascii_lowercase[: len(batch)]
+    labels = [f"{letters}yz", f"{letters}zx"]
+    spelled = f"{labels[which]},{labels[1 - which]}->{letters}yx"
+    return _contract(table, spelled, sides[which], sides[1 - which], operands[which].size)
+
+
+def _gemm(node: Node, table: Table, operands: Operands) -> list[Array]:
+    a, b = (o.T if node.attributes.get(key, 0) else o for o, key in zip(operands, ("transA", "transB"), strict=False))
+    table.room((len(a), b.shape[1]))
+    product = node.attributes.get("alpha", 1.0) * (a @ b)
+    if len(operands) > 2 and operands[2] is not None:
+        product = product + node.attributes.get("beta", 1.0) * operands[2]
+    return [product]
+
+
+def _gemm_matrix(node: Node, table: Table, operands: Operands, which: int) -> Sparse:
+    labels = ["zy" if node.attributes.get("transA", 0) else "yz", "xz" if node.attributes.get("transB", 0) else "zx"]
+    spelled = f"{labels[which]},{labels[1 - which]}->yx"
+    weight = node.attributes.get("alpha", 1.0) * operands[1 - which]
+    return _contract(table, spelled, _positions(operands[which]), weight, operands[which].size)
+
+
+def _einsum(node: Node, table: Table, operands: Operands) -> list[Array]:
+    spelled = _equation(node, operands)
+    sizes = {label: n for part, o in zip(spelled.split("->")[0].split(","), operands, strict=True)
+             for label, n in zip(part, o.shape, strict=True)}  # fmt: skip
+    table.room(list(sizes.values()), COEFFICIENT_LIMIT)
+    return [np.einsum(spelled, *operands)]
+
+
+def _equation(node: Node, operands: Operands) -> str:
+    spelled = str(node.attributes["equation"]).replace(" ", "").lower()
+    if "->" not in spelled or "." in spelled or len(operands) > 2:
+        raise ValueError("an equation that is not known")
+    return spelled
+
+
+def _einsum_matrix(node: Node, table: Table, operands: Operands, which: int) -> Sparse:
+    spelled = _equation(node, operands)
+    parts, out = spelled.split("->")[0].split(","), spelled.split("->")[1]
+    other = (parts[1 - which], operands[1 - which]) if len(parts) == 2 else ("", np.array(1.0))
+    return _contract(
+        table, f"{parts[which]},{other[0]}->{out}", _positions(operands[which]), other[1], operands[which].size
+    )
+
+
+def _reduce_axes(node: Node, operands: Operands) -> tuple[int, ...]:
+    axes = axes_of(node, operands, 1)
+    every = range(operands[0].ndim)
+    if axes is None or not axes:
+        return () if axes is not None and node.attributes.get("noop_with_empty_axes", 0) else tuple(every)
+    return tuple(every[axis] for axis in axes)
+
+
+def _reduce(node: Node, _table: Table, operands: Operands) -> list[Array]:
+    reduce: dict[str, Callable[..., Any]] = {
+        "ReduceSum": np.sum,
+        "ReduceMean": np.mean,
+        "ReduceMax": np.max,
+        "ReduceMin": np.min,
+        "ReduceProd": np.prod,
+    }
+    kept = bool(node.attributes.get("keepdims", 1))
+    return [np.asarray(reduce[node.op](operands[0], axis=_reduce_axes(node, operands), keepdims=kept))]
+
+
+def _reduce_matrix(node: Node, table: Table, operands: Operands, _which: int) -> Sparse:
+    shape, axes = operands[0].shape, _reduce_axes(node, operands)
+    letters = string.ascii_lowercase[: len(shape)]
+    out = "".join(label for axis, label in enumerate(letters) if axis not in axes)
+    share = 1.0 if node.op == "ReduceSum" else 1 / size_of([shape[axis] for axis in axes])
+    return _contract(table, f"{letters},->{out}", _positions(operands[0]), np.array(share), operands[0].size)
+
+
+def _windows(node: Node, table: Table, data: Array, kernel: Sequence[int], filling: float) -> Array:
+    """Patches of (batch, channels, *space): (batch, channels, *places, *kernel)."""
+    space = data.ndim - 2
+    strides = [int(n) for n in node.attributes.get("strides", [1] * space)]
+    dilations = [int(n) for n in node.attributes.get("dilations", [1] * space)]
+    pads = [int(n) for n in node.attributes.get("pads", [0] * 2 * space)]
+    if node.attributes.get("auto_pad", "NOTSET") not in ("NOTSET", "VALID") or node.attributes.get("ceil_mode", 0):
+        raise ValueError("auto_pad and ceil_mode are not known")
+    if min(*pads, 0) < 0 or min(*strides, *dilations, *kernel) < 1 or space < 1:
+        raise ValueError("impossible windows")
+    sides = [(0, 0), (0, 0), *zip(pads[:space], pads[space:], strict=True)]
+    table.room([size + sum(side) for size, side in zip(data.shape, sides, strict=True)])
+    padded = np.pad(data, sides, constant_values=filling)
+    reach = [(k - 1) * d + 1 for k, d in zip(kernel, dilations, strict=True)]
+    view = np.lib.stride_tricks.sliding_window_view(padded, reach, axis=tuple(range(2, data.ndim)))
+    step = [
+        slice(None),
+        slice(None),
+        *(slice(None, None, s) for s in strides),
+        *(slice(None, None, d) for d in dilations),
+    ]
+    view = view[tuple(step)]
+    table.room(view.shape, COEFFICIENT_LIMIT)
+    return view
+
+
+def _grouped(node: Node, table: Table, operands: Operands, data: Array, filling: float) -> tuple[Array, Array, str]:
+    """Windows and weights of a convolution with their groups as an axis, and how to contract them."""
+    weight, groups = operands[1], int(node.attributes.get("group", 1))
+    if weight.ndim != data.ndim or data.ndim < 3 or groups < 1 or weight.shape[1] * groups != data.shape[1]:
+        raise ValueError("sizes that do not fit each other")
+    windows = _windows(node, table, data, weight.shape[2:], filling)
+    windows = windows.reshape(data.shape[0], groups, weight.shape[1], *windows.shape[2:])
+    space = data.ndim - 2
+    places, kernel = string.ascii_lowercase[:space], string.ascii_lowercase[space : 2 * space]
+    filters = weight.reshape(groups, len(weight) // groups, *weight.shape[1:])
+    return windows, filters, f"xyz{places}{kernel},ywz{kernel}->xyw{places}"
+
+
+def _conv(node: Node, table: Table, operands: Operands) -> list[Array]:
+    data, weight = operands[0], operands[1]
+    windows, filters, spelled = _grouped(node, table, operands, data, 0.0)
+    out = np.einsum(spelled, windows, filters, optimize=True)
+    out = out.reshape(len(data), len(weight), *out.shape[3:])
+    if len(operands) > 2 and operands[2] is not None:
+        out = out + operands[2].reshape(-1, *[1] * (data.ndim - 2))
+    return [out]
+
+
+def _conv_matrix(node: Node, table: Table, operands: Operands, _which: int) -> Sparse:
+    windows, filters, spelled = _grouped(node, table, operands, _positions(operands[0]), -1)
+    return _contract(table, spelled, windows, filters, operands[0].size)
+
+
+def _pooled(node: Node, table: Table, data: Array) -> tuple[Array, int]:
+    """Windows of positions to average over, and how many axes of the data have windows."""
+    space = data.ndim - 2
+    if node.op == "GlobalAveragePool":
+        return _positions(data).reshape(*data.shape[:2], *[1] * space, *data.shape[2:]), space
+    kernel = [int(n) for n in node.attributes["kernel_shape"]]
+    return _windows(node, table, _positions(data), kernel, -1), space
+
+
+def _pool(node: Node, table: Table, operands: Operands) -> list[Array]:
+    windows, space = _pooled(node, table, operands[0])
+    axes = tuple(range(-space, 0))
+    summed = np.where(windows >= 0, operands[0].ravel()[windows], 0.0).sum(axis=axes)
+    if node.op != "GlobalAveragePool" and not node.attributes.get("count_include_pad", 0):
+        return [summed / (windows >= 0).sum(axis=axes)]
+    return [summed / size_of(windows.shape[-space:])]
+
+
+def _pool_matrix(node: Node, table: Table, operands: Operands, _which: int) -> Sparse:
+    windows, space = _pooled(node, table, operands[0])
+    kernel = size_of(windows.shape[-space:])
+    places = windows.reshape(-1, kernel)
+    counted = node.op == "GlobalAveragePool" or node.attributes.get("count_include_pad", 0)
+    share = 1 / (np.full(len(places), kernel) if counted else (places >= 0).sum(axis=1))
+    return _matrix(np.arange(len(places))[:, None], places, share[:, None], (len(places), operands[0].size))
+
+
+def scatter_matrix(node: Node, operands: Operands) -> Sparse:
+    """What a scattering sum adds to its data, from its updates."""
+    flat = np.ravel_multi_index(scatter_place(node, operands), operands[0].shape)
+    return _matrix(flat.ravel(), np.arange(operands[2].size), np.array(1.0), (operands[0].size, operands[2].size))
+
+
+LINEAR: Mapping[str, tuple[Numbers, Matrix | None, tuple[int, ...]]] = {
+    "AveragePool": (_pool, _pool_matrix, (0,)),
+    "Conv": (_conv, _conv_matrix, (0,)),
+    "Einsum": (_einsum, _einsum_matrix, (0, 1)),
+    "Gemm": (_gemm, _gemm_matrix, (0, 1)),
+    "GlobalAveragePool": (_pool, _pool_matrix, (0,)),
+    "MatMul": (_matmul, _matmul_matrix, (0, 1)),
+    "MatMulInteger": (_matmul, _matmul_matrix, (0, 1)),
+    "ReduceMax": (_reduce, None, ()),
+    "ReduceMean": (_reduce, _reduce_matrix, (0,)),
+    "ReduceMin": (_reduce, None, ()),
+    "ReduceProd": (_reduce, None, ()),
+    "ReduceSum": (_reduce, _reduce_matrix, (0,)),
+}
+"""By operator: as numbers, as a matrix (None: constants only), and which operands may vary."""

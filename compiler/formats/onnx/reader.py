@@ -1,0 +1,233 @@
+"""Read a spiking network from an ONNX file: one step with its state as inputs and outputs, or all steps unrolled.
+
+The graph is run on values that vary, in float64: what is affine between two spiking layers becomes weights, what is
+held against a threshold becomes a layer, and everything else is refused by name.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.fixedpoint import IntArray
+from spikeloom.compiler.formats.assemble import Layer, assemble, unique_names
+from spikeloom.compiler.formats.onnx.affine import check
+from spikeloom.compiler.formats.onnx.file import BOOL, DOUBLE, Declared, Graph, Model, read_model
+from spikeloom.compiler.formats.onnx.gates import as_affine
+from spikeloom.compiler.formats.onnx.lif import Neurons, is_output, neurons_of
+from spikeloom.compiler.formats.onnx.order import inner
+from spikeloom.compiler.formats.onnx.run import run
+from spikeloom.compiler.formats.onnx.steps import Unrolled, group, readout
+from spikeloom.compiler.formats.onnx.values import INPUT_ATOM, Affine, Table
+from spikeloom.compiler.formats.tensors import printable
+from spikeloom.compiler.ir import INPUT, Network, Sparse
+from spikeloom.compiler.sensor_layout import sensor_layout
+
+SUFFIX = ".onnx"
+
+OPEN_STEPS = 3
+"""Steps that are run where a file leaves their number open: two show what carries on, a third that it goes on so."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class OnnxNetwork:
+    """A network, and what was found about the file that it is from.
+
+    Parameters
+    ----------
+    network : Network
+        Float stage, in float64.
+    steps : int
+        Steps that the file holds; 1 where state goes in and out.
+    facts : tuple of str
+        What was read and what was assumed, for people.
+    sha256 : str
+        Of the file and of its external data.
+    """
+
+    network: Network
+    steps: int
+    facts: tuple[str, ...]
+    sha256: str
+
+
+def read_onnx(
+    path: str | os.PathLike[str], *, polarities: int | None = None, polarities_first: bool | None = None
+) -> OnnxNetwork:
+    """Read a network.
+
+    Parameters
+    ----------
+    path : path
+        File; data that it keeps beside itself must lie in its folder.
+    polarities : int, optional
+        Polarities of the input, where its shape does not tell.
+    polarities_first : bool, optional
+        Whether the input counts polarity by polarity, where its shape does not tell.
+
+    Raises
+    ------
+    ModelError
+        If the file cannot be read, or holds something else than a feed-forward network of leaky integrate-and-fire
+        neurons with affine stages; the message names the operator.
+    OptionError
+        If there are no such polarities.
+    """
+    try:
+        # A constant may divide by zero on its way, as degrees of lonely taxels do; what counts is checked at the end.
+        with np.errstate(all="ignore"):
+            model = read_model(Path(path))
+            return _network(model, polarities, polarities_first)
+    except ModelError as error:
+        raise ModelError(f"{path}: {error}") from error
+
+
+def _network(model: Model, polarities: int | None, polarities_first: bool | None) -> OnnxNetwork:
+    table = Table()
+    facts: list[str] = []
+    graph = _undecided(model.graph, facts)
+    loops = any(node.op in ("Loop", "Scan") for node in graph.nodes)
+    shapes: dict[int, tuple[int, ...]] = {}
+    given = {}
+    for declared in graph.inputs:
+        shape = _fixed(declared, graph, facts, loops=loops)
+        atom = table.atom(INPUT_ATOM, declared.name, math.prod(table.room(shape)), binary=declared.kind == BOOL)
+        shapes[atom], given[declared.name] = shape, table.value(atom, shape)
+    results = zip(graph.outputs, run(graph, {}, given, table), strict=True)
+    outputs = {name: as_affine(table, value) for name, value in results}
+    for name, value in outputs.items():
+        try:
+            check(table, value)
+        except ModelError as error:
+            raise ModelError(f"output {printable(name)}: {error}") from error
+    found = group(table, neurons_of(table, outputs), shapes)
+    voters, label, counted = readout(table, found, outputs)
+    sensor, positions, words = sensor_layout(found.shape, polarities=polarities, polarities_first=polarities_first)
+    names = _names(graph, table, found)
+    double = any(declared.kind == DOUBLE for declared in graph.inputs)
+    layers = [
+        Layer(
+            name=names[index],
+            beta=found.beta[index],
+            theta=_threshold(found.layers[index][0], double=double),
+            bias=found.bias[index],
+            sources={
+                source: _columns(weight, positions) if source == INPUT else weight
+                for source, weight in found.sources[index].items()
+            },
+        )
+        for index in range(len(found.layers))
+    ]
+    network = assemble(layers, sensor, voters, label)
+    facts += _facts(model, table, found, outputs, names, words)
+    facts.append(f"classes: the spikes of {names[voters]} in output {printable(counted)}")
+    return OnnxNetwork(network=network, steps=len(found.layers[0]), facts=tuple(facts), sha256=model.sha256)
+
+
+def _fixed(declared: Declared, graph: Graph, facts: list[str], *, loops: bool) -> tuple[int, ...]:
+    """Shape of an input; an open size in front is the batch's, or time and batch of a graph that loops over steps."""
+    meanings = (f"time, read as {OPEN_STEPS} steps", "the batch's, read as 1") if loops else ("the batch's, read as 1",)
+    shape: list[int] = []
+    for axis, size in enumerate(declared.shape):
+        if isinstance(size, int):
+            shape.append(size)
+            continue
+        alone = all(size not in (*other.shape[:axis], *other.shape[axis + 1 :]) for other in graph.inputs)
+        if axis >= len(meanings) or (size and not alone):
+            raise ModelError(
+                f"input {printable(declared.name)}: has an open size {size or '?'!r}, allowed are fixed ones; export "
+                "without dynamic axes"
+            )
+        fact = f"the open size {size or '?'!r} is {meanings[axis]}"
+        facts += [] if fact in facts else [fact]
+        shape.append(OPEN_STEPS if loops and axis == 0 else 1)
+    return tuple(shape)
+
+
+def _undecided(graph: Graph, facts: list[str]) -> Graph:
+    """The graph with what a decision is taken from in place of the decision: of most spikes, the lowest on a tie."""
+    makers = {name: node for node in graph.nodes for name in node.outputs}
+    outputs = []
+    for output in graph.outputs:
+        name, node = output, makers.get(output)
+        if node is not None and node.op == "ArgMax" and node.inputs and not node.attributes.get("select_last_index", 0):
+            facts.append(f"output {printable(name)}: the class of the largest of {printable(node.inputs[0])}")
+            name = node.inputs[0]
+        outputs += [] if name in outputs else [name]
+    return replace(graph, outputs=tuple(outputs))
+
+
+def _columns(weight: Sparse, positions: IntArray) -> Sparse:
+    taken = weight[:, positions]
+    taken.sort_indices()
+    return taken
+
+
+def _threshold(neurons: Neurons, *, double: bool) -> float:
+    """Threshold of a strict comparison: of ``u >= theta`` the next number below, in the arithmetic of the file."""
+    if neurons.strict:
+        return neurons.theta
+    if double:
+        return float(np.nextafter(neurons.theta, -np.inf))
+    return float(np.nextafter(np.float32(neurons.theta), np.float32(-np.inf)))
+
+
+def _names(graph: Graph, table: Table, found: Unrolled) -> tuple[str, ...]:
+    """Names of the modules that the layers' weights belong to, as far as the file keeps them."""
+    graphs, makers = [graph], {}
+    for each in graphs:
+        makers.update({name: node for node in each.nodes for name in node.outputs})
+        graphs += [part for node in each.nodes for part in inner(node)]
+    parameters = {name for each in graphs for name in each.constants if re.search(r"[./]", name)}
+    ends = {table.atoms[n.membrane].label for layer in found.layers for n in layer}
+    names = []
+    for layer in found.layers:
+        seen: set[str] = set()
+        pending = [table.atoms[layer[0].membrane].label]
+        owners: list[list[str]] = []
+        while pending:
+            name = pending.pop()
+            if name in parameters:
+                owners.append(re.split(r"[./]", name)[:-1])
+            if name in seen or name not in makers or (name in ends and seen):
+                continue
+            seen.add(name)
+            pending += makers[name].inputs
+        shared = [words[0] for words in zip(*owners, strict=False) if len(set(words)) == 1]
+        names.append(shared[-1] if shared and not shared[-1].isdecimal() else "")
+    return unique_names(names)
+
+
+def _facts(
+    model: Model, table: Table, found: Unrolled, outputs: Mapping[str, Affine], names: tuple[str, ...], words: str
+) -> list[str]:
+    """What a reader of the file would want to check."""
+    steps = len(found.layers[0])
+    form = "one step, state in and out from zero" if steps == 1 else f"{steps} steps unrolled"
+    facts = [
+        f"{model.producer or 'unknown producer'}, operators of version {model.opset}: {form}",
+        f"input {printable(table.atoms[found.data].label)}: {words}",
+    ]
+    used = {found.data}
+    for name, layer, beta in zip(names, found.layers, found.beta, strict=True):
+        n = layer[0]
+        sign = ">" if n.strict else ">="
+        told = f"layer {name}: {len(n.bias)} neurons, decay {beta:g}, fires at u {sign} {n.theta:g}"
+        if n.previous is not None:
+            held = is_output(outputs, {n.membrane: 1.0}) or "after the reset"
+            told += f", membrane {printable(table.atoms[n.previous].label)} -> {printable(held)}"
+            used |= {n.previous} | ({n.gate} if n.gate is not None else set())
+        if not n.strict:
+            told += "; >= is read as > the next number below"
+        facts.append(told)
+    ignored = [
+        printable(atom.label) for index, atom in enumerate(table.atoms) if atom.kind == INPUT_ATOM and index not in used
+    ]
+    return facts + ([f"inputs without effect on a spike: {', '.join(ignored)}"] if ignored else [])

@@ -1,0 +1,192 @@
+"""Run a graph on values that vary: operators in order, loops step by step, membranes set apart as they are met."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.formats.onnx.affine import apply, check
+from spikeloom.compiler.formats.onnx.file import Array, Graph, Node
+from spikeloom.compiler.formats.onnx.order import inner, membranes, ordered, reads
+from spikeloom.compiler.formats.onnx.values import (
+    INPUT_ATOM,
+    MEMBRANE,
+    NODE_WORK,
+    Affine,
+    Table,
+    Value,
+    diagonal,
+    size_of,
+)
+from spikeloom.compiler.formats.tensors import printable
+
+STEP_LIMIT = 4096
+"""Steps of a Scan or a Loop that are unrolled."""
+
+_MISFIT = (ArithmeticError, AttributeError, LookupError, MemoryError, TypeError, ValueError)
+"""What numpy and scipy were seen to raise on operands or attributes that do not fit each other."""
+
+
+def run(graph: Graph, outer: Mapping[str, Value], given: Mapping[str, Value], table: Table) -> list[Value]:
+    """Values of a graph's outputs.
+
+    Parameters
+    ----------
+    graph : Graph
+    outer : mapping
+        Values around it, where it is inside another graph.
+    given : mapping
+        Values of its inputs.
+    table : Table
+        Takes the membranes and comparisons that are met.
+
+    Raises
+    ------
+    ModelError
+        Naming the operator that cannot be evaluated, or is not affine, and why.
+    """
+    values: dict[str, Value] = {**outer, **graph.constants, **given}
+    order = ordered(graph, values)
+    held = membranes(
+        order, graph.outputs, {name for name, value in values.items() if not isinstance(value, np.ndarray)}
+    )
+    last = {name: index for index, node in enumerate(order) for name in reads(node)}
+    for index, node in enumerate(order):
+        try:
+            table.spend(NODE_WORK)
+            results = _evaluate(node, values, table)
+            for name, result in zip(node.outputs, results, strict=False):
+                values[name] = _set_apart(node, name, result, table) if name in held else result
+        except ModelError as error:
+            raise ModelError(f"{node}: {error}") from error
+        except _MISFIT as error:
+            reason = " ".join(f"{error}".split())[:120] or type(error).__name__
+            raise ModelError(f"{node}: cannot be evaluated ({reason}); export it again") from error
+        for name in reads(node):
+            if last[name] == index and name not in outer and name not in graph.outputs:
+                values.pop(name, None)
+    for name in graph.outputs:
+        if name not in values:
+            raise ModelError(f"output {printable(name)}: its operator does not give so many results; export it again")
+    return [values[name] for name in graph.outputs]
+
+
+def _set_apart(node: Node, name: str, value: Value, table: Table) -> Value:
+    """Make a membrane an atom of its own, and remember what it is made of."""
+    if not isinstance(value, Affine):
+        return value
+    check(table, value)
+    only = next(iter(value.terms), -1)
+    known = len(value.terms) == 1 and diagonal(value.terms[only]) == 1 and not np.any(value.bias)
+    if known and table.atoms[only].kind in (INPUT_ATOM, MEMBRANE):
+        return value
+    atom = table.atom(MEMBRANE, name, size_of(value.shape))
+    table.definitions[atom], table.nodes[atom] = value, str(node)
+    return table.value(atom, value.shape)
+
+
+def _evaluate(node: Node, values: Mapping[str, Value], table: Table) -> list[Value]:
+    operands = [values[name] if name else None for name in node.inputs]
+    match node.op:
+        case "Constant":
+            results: list[Value] = [_constant(node)]
+        case "Shape" | "Size":
+            shape = np.array(_present(operands[0]).shape, np.int64)
+            cut = shape[node.attributes.get("start", 0) : node.attributes.get("end", len(shape))]
+            results = [cut if node.op == "Shape" else np.array(size_of(_present(operands[0]).shape))]
+        case "If":
+            results = run(node.attributes["then_branch" if _truth(operands[0]) else "else_branch"], values, {}, table)
+        case "Loop":
+            results = _loop(node, values, operands, table)
+        case "Scan":
+            results = _scan(node, values, operands, table)
+        case _ if inner(node):
+            raise ModelError("holds a graph; only If, Loop and Scan may")
+        case _:
+            results = apply(node, table, operands)
+    return results
+
+
+def _present(value: Value | None) -> Value:
+    if value is None:
+        raise ModelError("lacks an operand; export it again")
+    return value
+
+
+def _constant(node: Node) -> Array:
+    for name in ("value", "value_float", "value_int", "value_floats", "value_ints"):
+        if name in node.attributes:
+            return np.asarray(node.attributes[name])
+    raise ModelError("holds no number")
+
+
+def _truth(value: Value | None) -> bool:
+    if not isinstance(value, np.ndarray):
+        raise ModelError("depends on what varies; only a fixed choice or number of steps can be unrolled")
+    return bool(value.reshape(()))
+
+
+def _taken(value: Value, index: int, axis: int, table: Table) -> Value:
+    """One step of a sequence."""
+    node = Node(name="step", op="Gather", inputs=(), outputs=("step",), attributes={"axis": axis})
+    return apply(node, table, [value, np.array(index)])[0]
+
+
+def _stacked(parts: list[Value], axis: int, table: Table) -> Value:
+    """Steps side by side again."""
+    apart = Node(name="stack", op="Unsqueeze", inputs=(), outputs=("stack",), attributes={"axes": [axis]})
+    beside = Node(name="stack", op="Concat", inputs=(), outputs=("stack",), attributes={"axis": axis})
+    return apply(beside, table, [apply(apart, table, [part])[0] for part in parts])[0]
+
+
+def _steps(count: int) -> range:
+    if not 1 <= count <= STEP_LIMIT:
+        raise ModelError(f"runs {count} steps, allowed are 1 to {STEP_LIMIT}; export a shorter recording")
+    return range(count)
+
+
+def _loop(node: Node, values: Mapping[str, Value], operands: list[Value | None], table: Table) -> list[Value]:
+    body = node.attributes["body"]
+    count, going = operands[0], operands[1]
+    if not isinstance(count, np.ndarray):
+        raise ModelError("runs an unknown number of steps; only a fixed one can be unrolled")
+    state: list[Value] = [value for value in operands[2:] if value is not None]
+    carried = len(state)
+    if len(body.inputs) != carried + 2 or len(body.outputs) < carried + 1:
+        raise ModelError("has a body of other inputs or outputs than it carries; export it again")
+    kept: list[list[Value]] = [[] for _ in body.outputs[carried + 1 :]]
+    for step in _steps(int(count.reshape(()))):
+        if going is not None and not _truth(going):
+            break
+        names = [value.name for value in body.inputs]
+        given = dict(zip(names, [np.array(step), np.array(True), *state], strict=True))
+        going, *results = run(body, values, given, table)
+        state = results[:carried]
+        for parts, result in zip(kept, results[carried:], strict=True):
+            parts.append(result)
+    return [*state, *(_stacked(parts, 0, table) for parts in kept)]
+
+
+def _scan(node: Node, values: Mapping[str, Value], operands: list[Value | None], table: Table) -> list[Value]:
+    body, inputs = node.attributes["body"], int(node.attributes["num_scan_inputs"])
+    carried = len(operands) - inputs
+    if any(node.attributes.get(f"scan_{side}_directions", ()) for side in ("input", "output") if any(
+        node.attributes.get(f"scan_{side}_directions", ()))):  # fmt: skip
+        raise ModelError("runs backwards in time; only forward can be lowered")
+    everything = [value for value in operands if value is not None]
+    if not 1 <= inputs <= len(operands) or len(everything) != len(operands) or len(body.inputs) != len(operands):
+        raise ModelError("has a body of other inputs than it is given; export it again")
+    state, sequences = everything[:carried], everything[carried:]
+    taken = node.attributes.get("scan_input_axes", [0] * inputs)
+    put = node.attributes.get("scan_output_axes", [0] * (len(body.outputs) - carried))
+    kept: list[list[Value]] = [[] for _ in body.outputs[carried:]]
+    for step in _steps(sequences[0].shape[taken[0]]):
+        slices = [_taken(value, step, axis, table) for value, axis in zip(sequences, taken, strict=True)]
+        names = [value.name for value in body.inputs]
+        results = run(body, values, dict(zip(names, [*state, *slices], strict=True)), table)
+        state = results[:carried]
+        for parts, result in zip(kept, results[carried:], strict=True):
+            parts.append(result)
+    return [*state, *(_stacked(parts, axis, table) for parts, axis in zip(kept, put, strict=True))]

@@ -1,0 +1,278 @@
+"""Group the neurons of a graph into layers: of one step as they are, of several steps by what carries on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.fixedpoint import FloatArray, IntArray
+from spikeloom.compiler.formats.assemble import class_of_each
+from spikeloom.compiler.formats.onnx.lif import EQUAL, RESET, Neurons
+from spikeloom.compiler.formats.onnx.values import INPUT_ATOM, MEMBRANE, SPIKE, Affine, Table
+from spikeloom.compiler.formats.tensors import printable
+from spikeloom.compiler.ir import INPUT, Sparse
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Unrolled:
+    """Layers, each with its neurons in every step.
+
+    Parameters
+    ----------
+    layers : list of list of Neurons
+        By layer, then step; one step where state goes in and out of the graph.
+    data : int
+        Atom of the input that brings the events.
+    shape : tuple of int
+        Of that input in one step.
+    sources : list of mapping of int to csr_array
+        Stages into each layer by the place of the source or ``INPUT``; columns of the input are flat positions in it.
+    bias : list of (neurons,) float64
+    beta, theta : list of float
+    """
+
+    layers: list[list[Neurons]]
+    data: int
+    shape: tuple[int, ...]
+    sources: list[dict[int, Sparse]]
+    bias: list[FloatArray]
+    beta: list[float]
+    theta: list[float]
+
+
+def group(table: Table, neurons: Sequence[Neurons], shapes: Mapping[int, tuple[int, ...]]) -> Unrolled:
+    """Bring steps together.
+
+    Parameters
+    ----------
+    table : Table
+    neurons : sequence of Neurons
+        In every step, in order.
+    shapes : mapping of int to tuple of int
+        Shape of each input of the graph by its atom.
+
+    Raises
+    ------
+    ModelError
+        If there are no neurons, steps are unlike each other, or it is not clear which input brings the events.
+    """
+    if not neurons:
+        raise ModelError(f"holds no spiking layer: no membrane is compared with a threshold; {RESET}")
+    layers = _chains(table, neurons)
+    data = _data(table, neurons)
+    step_of = {n.spike: (index, step) for index, layer in enumerate(layers) for step, n in enumerate(layer)}
+    shape, positions = _time(table, layers, data, shapes[data])
+    sources: list[dict[int, Sparse]] = []
+    bias = []
+    for layer in layers:
+        every = [
+            _sources(table, n, step, step_of, data, positions[step] if positions is not None else None)
+            for step, n in enumerate(layer)
+        ]
+        for step in range(1, len(layer)):
+            _require_like(layer, step, every)
+        sources.append(every[0])
+        bias.append(layer[0].bias)
+        if layer[-1].beta is None:
+            raise ModelError(
+                f"{layer[0].node}: keeps no membrane from step to step, so its decay is unknown; export one "
+                "step with its state as inputs and outputs, or at least two steps"
+            )
+    return Unrolled(
+        layers=layers,
+        data=data,
+        shape=shape,
+        sources=sources,
+        bias=bias,
+        beta=[float(layer[-1].beta or 0.0) for layer in layers],
+        theta=[layer[0].theta for layer in layers],
+    )
+
+
+def _chains(table: Table, neurons: Sequence[Neurons]) -> list[list[Neurons]]:
+    """Neurons that carry on from each other, in order of steps."""
+    after: dict[int, Neurons] = {}
+    for n in neurons:
+        if n.previous is not None and table.atoms[n.previous].kind == MEMBRANE:
+            if n.previous in after:
+                raise ModelError(
+                    f"{n.node}: carries on from {printable(table.atoms[n.previous].label)}, as another layer does; "
+                    "each membrane belongs to one layer"
+                )
+            after[n.previous] = n
+    heads = [n for n in neurons if n.previous is None or table.atoms[n.previous].kind == INPUT_ATOM]
+    chains = []
+    for head in heads:
+        chain = [head]
+        while (following := after.get(chain[-1].membrane)) is not None:
+            chain.append(following)
+        chains.append(chain)
+    for chain in chains:
+        if len(chain) != len(chains[0]):
+            raise ModelError(
+                f"{chain[0].node}: runs {len(chain)} steps, another layer {len(chains[0])}; all layers run together"
+            )
+        if len(chain) > 1 and chain[0].previous is not None:
+            raise ModelError(
+                f"{chain[0].node}: several steps of a network whose state goes in and out; export one step alone, or "
+                "let the state start at zero"
+            )
+    return chains
+
+
+def _data(table: Table, neurons: Sequence[Neurons]) -> int:
+    """The one input that is no state."""
+    states = {atom for n in neurons for atom in (n.previous, n.gate)}
+    heard = {atom: n for n in reversed(neurons) for atom in n.current}
+    data = sorted(atom for atom in heard if table.atoms[atom].kind == INPUT_ATOM)
+    mixed = [atom for atom in data if atom in states]
+    if mixed:
+        label = printable(table.atoms[mixed[0]].label)
+        raise ModelError(
+            f"{heard[mixed[0]].node}: takes the state {label} of a layer as its input, a recurrent connection, "
+            "which is not read from ONNX; export the network as NIR"
+        )
+    if len(data) != 1:
+        named = ", ".join(f"{printable(table.atoms[atom].label)} ({table.atoms[atom].size})" for atom in data)
+        where = f"{heard[data[-1]].node}: " if data else ""
+        raise ModelError(
+            f"{where}{len(data)} inputs are no state of a neuron{f': {named}' if named else ''}; one must bring the "
+            "events, and every other be a membrane or its spikes"
+        )
+    return data[0]
+
+
+def _time(
+    table: Table, layers: list[list[Neurons]], data: int, shape: tuple[int, ...]
+) -> tuple[tuple[int, ...], list[IntArray] | None]:
+    """Shape of one step of the input, and the flat positions of each step; None where there is one step."""
+    steps = len(layers[0])
+    if steps == 1:
+        return shape, None
+    every = np.arange(table.atoms[data].size).reshape(shape)
+    for axis in range(len(shape)):
+        if shape[axis] != steps:
+            continue
+        by_step = np.moveaxis(every, axis, 0).reshape(steps, -1)
+        fits = all(
+            np.isin(layer[step].current[data].indices, by_step[step]).all()
+            for layer in layers
+            for step in range(steps)
+            if data in layer[step].current
+        )
+        if fits:
+            return shape[:axis] + shape[axis + 1 :], list(by_step)
+    shown = f"[{', '.join(map(str, shape))}]"
+    raise ModelError(
+        f"input {printable(table.atoms[data].label)} {shown}: no axis of it is the time of the {steps} steps; let each "
+        "step read its own events, in order"
+    )
+
+
+def _sources(
+    table: Table,
+    n: Neurons,
+    step: int,
+    step_of: Mapping[int, tuple[int, int]],
+    data: int,
+    positions: IntArray | None,
+) -> dict[int, Sparse]:
+    found = {}
+    for atom, weight in n.current.items():
+        if atom == data:
+            found[INPUT] = weight if positions is None else weight[:, positions]
+        elif atom not in step_of:
+            raise ModelError(
+                f"{n.node}: takes {printable(table.atoms[atom].label)}, which is no spike of a layer; {RESET}"
+            )
+        else:
+            layer, when = step_of[atom]
+            if when != step:
+                raise ModelError(
+                    f"{n.node}: listens to {printable(table.atoms[atom].label)} of another step; only spikes of the "
+                    "same step can be lowered"
+                )
+            found[layer] = weight
+    for weight in found.values():
+        weight.sort_indices()
+    return found
+
+
+def _require_like(layer: list[Neurons], step: int, every: list[dict[int, Sparse]]) -> None:
+    """Whether a step is the first one again; a threshold and a bias that both moved are the same neuron."""
+    first, this = layer[0], layer[step]
+    last = step + 1 == len(layer)
+    shift = first.theta - this.theta if last else 0.0
+    decays = [n.beta for n in layer[1:]]
+    same = (
+        set(every[0]) == set(every[step])
+        and this.strict == first.strict
+        and abs(this.theta + shift - first.theta) <= EQUAL
+        and this.beta == decays[0]
+        and np.allclose(this.bias + shift, first.bias, rtol=EQUAL, atol=EQUAL)
+        and all(_equal(every[0][source], every[step][source]) for source in every[0])
+    )
+    if not same:
+        raise ModelError(
+            f"{this.node}: step {step} differs from step 0 in weights, bias, decay or threshold; all steps must be the "
+            "same, from a state of zero"
+        )
+
+
+def _equal(first: Sparse, second: Sparse) -> bool:
+    if first is second:
+        return True
+    return (
+        first.shape == second.shape
+        and np.array_equal(first.indptr, second.indptr)
+        and np.array_equal(first.indices, second.indices)
+        and np.allclose(first.data, second.data, rtol=EQUAL, atol=0)
+    )
+
+
+def readout(table: Table, found: Unrolled, outputs: Mapping[str, Affine]) -> tuple[int, IntArray, str]:
+    """Layer that votes, the class of each of its neurons, and the output that counts them.
+
+    Raises
+    ------
+    ModelError
+        If no output is a count of the spikes of the last layer, or several count them differently.
+    """
+    heard = {source for sources in found.sources for source in sources}
+    ends = [index for index in range(len(found.layers)) if index not in heard]
+    votes: list[tuple[int, IntArray, str]] = []
+    for index in ends:
+        spikes = [n.spike for n in found.layers[index]]
+        for name, value in outputs.items():
+            others = [atom for atom in value.terms if atom not in spikes]
+            # A running count goes in and out as a state.
+            counter = all(table.atoms[atom].kind == INPUT_ATOM for atom in others) and len(others) <= 1
+            if not counter or any(spike not in value.terms for spike in spikes) or np.ptp(value.bias) > 0:
+                continue
+            first = value.terms[spikes[0]]
+            label = class_of_each(first)
+            if label is not None and all(_equal(first, value.terms[spike]) for spike in spikes):
+                votes.append((index, label, name))
+    plain = [vote for vote in votes if np.array_equal(vote[1], np.arange(len(vote[1])))]
+    summed = [vote for vote in votes if not np.array_equal(vote[1], np.arange(len(vote[1])))]
+    chosen = summed or plain
+    if not chosen:
+        raise ModelError(_no_vote(table, outputs))
+    if any(vote[0] != chosen[0][0] or not np.array_equal(vote[1], chosen[0][1]) for vote in chosen):
+        shown = ", ".join(printable(vote[2]) for vote in chosen)
+        raise ModelError(f"outputs {shown} count spikes differently; leave one of them, the classes")
+    return chosen[0]
+
+
+def _no_vote(table: Table, outputs: Mapping[str, Affine]) -> str:
+    shown = ", ".join(printable(name) for name in outputs)
+    membranes = any(table.atoms[atom].kind not in (SPIKE, INPUT_ATOM) for o in outputs.values() for atom in o.terms)
+    spikes = any(table.atoms[atom].kind == SPIKE for output in outputs.values() for atom in output.terms)
+    seen = "membranes" if membranes and not spikes else "other values"
+    return (
+        f"outputs {shown}: none counts the spikes of the last layer, they hold {seen}; give its spikes, or their sum "
+        "over time, one neuron or one group of neurons a class"
+    )

@@ -1,0 +1,280 @@
+"""Read the released layout: files of ``torch.save`` with a first layer and dense weights, one state dict per run.
+
+A ``.t7`` file is a dict whose ``net_list`` holds the state dicts, with the weights of the *last* epoch, while
+``best_acc`` belongs to the best one. It holds no graph, no decay and no threshold. Bare state dicts are read too, both
+kinds in torch's zip and in its older format, with the keys of current torch_geometric (``conv1.lins.0.weight`` …) or
+of old releases (``conv1.lin.weight``, the filters of all hops side by side).
+
+The other systems are told by their keys: ``fc0.weight`` of an MLP (inputs ``taxel * 2 + polarity``), a
+``conv1.lin.weight`` with ``conv1.bias`` of a GCN (with self loops), ``conv1.weight`` of a grid-based CNN, whose picture
+is flattened channel by channel.
+
+torch is imported here only, late, and always told ``weights_only=True``: files that hold code are refused.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import pickle
+import re
+import struct
+import warnings
+import zipfile
+from collections.abc import Collection, Mapping
+from typing import Any, NoReturn
+
+import numpy as np
+
+from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.formats.tensors import Arrays, Shape, faults_of, printable, size, taxel_faults, wanted_dense
+from spikeloom.compiler.systems import GCN, GRID_CNN, MLP, TACTILESGNET, TITLES
+
+CHANNELS = 2
+"""Polarities of a recording; old keys do not say how many channels a hop has."""
+
+DENSE_STAGES = 3
+
+_OLD_TORCH = b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19."  # the pickled magic number that torch < 1.6 wrote first
+GIVE = "give a file of spikeloom train or of the released layout"
+NOT_A_CHECKPOINT = f"is not a checkpoint; {GIVE}"
+DAMAGED = "is truncated or damaged; copy it again"
+_ERRORS = (
+    pickle.UnpicklingError,
+    struct.error,
+    ArithmeticError,
+    AssertionError,
+    AttributeError,
+    EOFError,
+    LookupError,
+    MemoryError,
+    OSError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+)  # what torch's reader was seen to raise on damaged files
+
+
+def read_released(
+    where: str, content: bytes, run: int, system: str | None = None
+) -> tuple[Arrays, str, int, dict[str, Any] | None, str]:
+    """Read the content of a torch file.
+
+    Parameters
+    ----------
+    where : str
+        For messages.
+    content : bytes
+        The whole file.
+    run : int
+        Which state dict of ``net_list``.
+    system : str, optional
+        What the tensors must be; by default their names tell.
+
+    Returns
+    -------
+    arrays : dict
+        float32 under the names of our own format: ``conv1.hops``, ``conv1.bias``, ``fc1.weight`` …
+    layout : {"released", "state_dict"}
+    runs : int
+        How many the file holds.
+    training : dict or None
+        What the file tells of its training.
+    system : str
+        Which one it is.
+
+    Raises
+    ------
+    ModelError
+        As :func:`checkpoint.read_checkpoint` says.
+    """
+    loaded = _load(where, content)
+    if isinstance(loaded, dict) and "net_list" in loaded:
+        states = loaded["net_list"]
+        if not isinstance(states, list | tuple) or not states:
+            raise ModelError(f"{where}: net_list holds no run; give the file of a finished training")
+        _require_run(where, run, len(states))
+        arrays = _arrays(where, states[run], len(content), system)
+        known = system or _told(arrays)
+        unified = _unified(where, arrays, known)
+        return unified, "released", len(states), _training(loaded, run, len(states)), known
+    arrays = _arrays(where, loaded, len(content), system)
+    _require_run(where, run, 1)
+    known = system or _told(arrays)
+    return _unified(where, arrays, known), "state_dict", 1, None, known
+
+
+def _told(names: Collection[str]) -> str:
+    """System that the names of the tensors belong to."""
+    if "fc0.weight" in names:
+        return MLP
+    if "conv1.weight" in names:
+        return GRID_CNN
+    if "conv1.lin.weight" in names and "conv1.bias" in names:
+        return GCN
+    return TACTILESGNET
+
+
+def _require_run(where: str, run: int, runs: int) -> None:
+    if not 0 <= run < runs:
+        held = "only run 0" if runs == 1 else f"runs 0 to {runs - 1}"
+        raise ModelError(f"{where}: --run {run}: the file holds {held}; choose one that it holds")
+
+
+def _load(where: str, content: bytes) -> Any:
+    """Let torch read the content, after a look at what it is; a zip has been opened before."""
+    if content[:2] == b"PK":
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            torch_file = any(name.endswith("/data.pkl") for name in archive.namelist())
+    else:
+        torch_file = content[:1] == b"\x80"
+    if not torch_file:
+        raise ModelError(f"{where}: {NOT_A_CHECKPOINT}")
+    import torch
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # torch warns of its own old storage classes
+            return torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
+    except _ERRORS as error:
+        if isinstance(error, pickle.UnpicklingError) and (named := re.search(r"GLOBAL ([\w.]+)", str(error))):
+            raise ModelError(
+                f"{where}: is a pickle that calls {named[1]}, allowed are tensors alone, since code in a file could "
+                "do anything; save the state_dict and nothing else"
+            ) from error
+        if re.search(r"Unsupported operand 1(4\d|5[0-2])\b", str(error)):  # what protocol 4 added
+            raise ModelError(
+                f"{where}: is pickled with protocol 4 or newer, which torch does not read without running it; "
+                "save it with torch.save as it is by default"
+            ) from error
+        known = content[:2] == b"PK" or content.startswith(_OLD_TORCH)
+        raise ModelError(f"{where}: {DAMAGED if known else NOT_A_CHECKPOINT}") from error
+
+
+def _arrays(where: str, state: Any, file_size: int, system: str | None) -> Arrays:
+    """Convert the tensors of a state dict to float32 arrays."""
+    import torch
+
+    if not isinstance(state, Mapping) or not any(re.match(r"(conv|fc)\d", str(key)) for key in state):
+        keys = [printable(str(key)) for key in state] if isinstance(state, Mapping) else [type(state).__name__]
+        raise ModelError(
+            f"{where}: holds neither net_list nor weights of a TactileSGNet, but {', '.join(keys[:5]) or 'nothing'}; "
+            "give its state_dict"
+        )
+    faults = [
+        f"{printable(str(name))} {fault}"
+        for name, value in state.items()
+        if (fault := _tensor_fault(value, file_size)) is not None
+    ]
+    if faults:
+        _refuse(where, faults, system or _told(set(map(str, state))))
+    return {str(name): value.detach().to(torch.float32).numpy() for name, value in state.items()}
+
+
+def _tensor_fault(value: Any, file_size: int) -> str | None:
+    import torch
+
+    if not isinstance(value, torch.Tensor):
+        return f"is a {type(value).__name__}, wanted a tensor"
+    if value.layout != torch.strided or value.device.type != "cpu" or not value.is_floating_point():
+        return f"is a tensor of {str(value.dtype).removeprefix('torch.')}, wanted plain floating-point numbers"
+    # A tensor may repeat its storage through strides of zero, and so be far larger than the file.
+    if value.numel() * value.element_size() > file_size:
+        return f"claims {value.numel()} values, more than the file holds"
+    return None
+
+
+def _unified(where: str, arrays: Arrays, system: str) -> Arrays:
+    """Check everything and bring all key styles to the names of our own format."""
+    if system == TACTILESGNET:
+        return _unified_hops(where, arrays)
+    first = {MLP: "fc0.weight", GCN: "conv1.lin.weight", GRID_CNN: "conv1.weight"}[system]
+    bias = "fc0.bias" if system == MLP else "conv1.bias"
+    features = size(arrays, first, 4 if system == GRID_CNN else 2, 0, "features")
+    shapes: dict[str, tuple[int | str, ...]] = {
+        MLP: (features, "taxels * polarities"),
+        GCN: (features, CHANNELS),
+        GRID_CNN: (features, CHANNELS, size(arrays, first, 4, 2, "kernel"), size(arrays, first, 4, 3, "kernel")),
+    }
+    inputs: int | str = features if system == MLP else "places * features"
+    wanted = {first: shapes[system], bias: (features,)} | wanted_dense(arrays, DENSE_STAGES, inputs)
+    faults = faults_of(arrays, wanted, TITLES[system])
+    if not faults:
+        assert isinstance(features, int)
+        faults = taxel_faults(arrays, features)
+        shape = arrays[first].shape
+        if system == MLP and shape[1] % CHANNELS:
+            faults.append(f"fc0.weight has {shape[1]} inputs, not a whole number of taxels with {CHANNELS} polarities")
+        if system == GRID_CNN and shape[2] != shape[3]:
+            faults.append(f"conv1.weight has a window of {shape[2]} * {shape[3]}, wanted a square one")
+    if faults:
+        _refuse(where, faults, system)
+    weight = arrays.pop(first)
+    if system == GRID_CNN:
+        filters = weight.transpose(2, 3, 0, 1).reshape(-1, len(weight), CHANNELS)
+    else:
+        filters = weight.reshape(len(weight), -1, CHANNELS).transpose(1, 0, 2)
+    return {"conv1.hops": filters, "conv1.bias": arrays.pop(bias), **arrays}
+
+
+def _unified_hops(where: str, arrays: Arrays) -> Arrays:
+    """The same of a TactileSGNet, which has two key styles."""
+    hops = [int(match[1]) for key in arrays if (match := re.fullmatch(r"conv1\.lins\.(0|[1-9]\d?)\.weight", key))]
+    features: int | str
+    wanted: dict[str, Shape]
+    if not hops and "conv1.lin.weight" in arrays:
+        bias = "conv1.lin.bias"
+        features = size(arrays, "conv1.lin.weight", 2, 0, "features")
+        wanted = {"conv1.lin.weight": (features, f"hops * {CHANNELS}"), bias: (features,)}
+    else:
+        bias = "conv1.bias"
+        first = f"conv1.lins.{min(hops, default=0)}.weight"
+        features, channels = (size(arrays, first, 2, axis, word) for axis, word in enumerate(("features", "channels")))
+        wanted = {f"conv1.lins.{k}.weight": (features, channels) for k in range(max(hops, default=0) + 1)}
+        wanted[bias] = (features,)
+    faults = faults_of(arrays, wanted | wanted_dense(arrays, DENSE_STAGES))
+    if not faults:
+        assert isinstance(features, int)
+        faults = taxel_faults(arrays, features)
+    if not faults and not hops and arrays["conv1.lin.weight"].shape[1] % CHANNELS:
+        columns = arrays["conv1.lin.weight"].shape[1]
+        faults = [f"conv1.lin.weight has {columns} columns, not a whole number of hops with {CHANNELS} channels each"]
+    if faults:
+        _refuse(where, faults, TACTILESGNET)
+    if hops:
+        filters = np.stack([arrays.pop(f"conv1.lins.{k}.weight") for k in range(len(hops))])
+    else:
+        side_by_side = arrays.pop("conv1.lin.weight")
+        filters = side_by_side.reshape(len(side_by_side), -1, CHANNELS).transpose(1, 0, 2)
+    return {"conv1.hops": filters, "conv1.bias": arrays.pop(bias), **arrays}
+
+
+def _refuse(where: str, faults: list[str], system: str) -> NoReturn:
+    raise ModelError(f"{where}: {'; '.join(faults)}; give the weights of {TITLES[system]}")
+
+
+def _training(loaded: Mapping[str, Any], run: int, runs: int) -> dict[str, Any]:
+    """What the released script stored beside the weights, as JSON values; unknown where it is not as it wrote it."""
+    epochs = loaded.get("num_epochs")
+    training: dict[str, Any] = {"runs": runs, "weights": "last epoch"}
+    if isinstance(epochs, int):
+        training["epochs"] = epochs
+        accuracies = loaded.get("acc_list")  # the tensor of a run is listed once per epoch
+        if isinstance(accuracies, list | tuple) and 0 <= (run + 1) * epochs - 1 < len(accuracies):
+            last = _number(accuracies[(run + 1) * epochs - 1], -1)
+            if last is not None:
+                training["last_acc"] = last
+    best = _number(loaded.get("best_acc"), run)
+    if best is not None:
+        training["best_acc"] = best
+        training["best_acc_note"] = "of the best epoch on the test split, not of these weights"
+    return training
+
+
+def _number(values: Any, index: int) -> float | None:
+    import torch
+
+    if not isinstance(values, torch.Tensor) or values.dim() != 1 or not -len(values) <= index < len(values):
+        return None
+    number = float(values[index])
+    return round(number, 4) if math.isfinite(number) else None

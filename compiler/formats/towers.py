@@ -1,0 +1,208 @@
+"""Several trained networks as one: towers that lie side by side and add up their votes.
+
+A joined network has the filters of all its towers in its first layer, and fully connected layers that are blocks: a
+neuron hears its own tower, and the relays of clocks, of which there is one set for all. Each tower therefore spikes
+as it does alone. Its last layer has a neuron for every class and tower, ``tower * classes + class``; the class whose
+neurons spike most wins.
+
+Neurons of the first layer count as in any network of the system, with the features of all towers at each place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from hashlib import sha256
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.fixedpoint import IntArray
+from spikeloom.compiler.formats.checkpoint import Checkpoint
+from spikeloom.compiler.formats.tensors import Arrays, apart, together
+from spikeloom.compiler.systems import in_order
+from spikeloom.compiler.targets.loihi1.storage.weight_storage import Form
+
+SHARED = -1
+"""Tower of the relays of clocks."""
+
+
+def towers_of(checkpoint: Checkpoint) -> tuple[IntArray, ...]:
+    """Tower of each neuron, one array a layer; relays of clocks are `SHARED`."""
+    towers = np.arange(checkpoint.towers)
+    features = np.repeat(towers, checkpoint.hops.shape[1] // checkpoint.towers)
+    first = in_order(checkpoint.system, np.tile(features, (checkpoint.places, 1)))
+    relays = np.full(checkpoint.dynamics.clocks.channels, SHARED)
+    dense = (np.repeat(towers, len(stage.bias) // checkpoint.towers) for stage in checkpoint.dense)
+    return (np.concatenate([first, relays]), *dense)
+
+
+def inputs_of(checkpoint: Checkpoint, layer: int) -> IntArray:
+    """Neurons of the layer before that each tower of a fully connected layer hears, (towers, inputs), in order."""
+    before = towers_of(checkpoint)[layer - 1]
+    return np.stack([np.flatnonzero((before == t) | (before == SHARED)) for t in range(checkpoint.towers)])
+
+
+def members(checkpoint: Checkpoint) -> tuple[Checkpoint, ...]:
+    """The networks that a checkpoint was joined from, or the one that it is."""
+    if checkpoint.towers == 1:
+        return (checkpoint,)
+    every = apart(arrays_of(checkpoint), checkpoint.towers)
+    owners = towers_of(checkpoint)
+    return tuple(
+        replace(
+            checkpoint,
+            hops=arrays["conv1.hops"],
+            conv_bias=arrays["conv1.bias"],
+            dense=tuple(
+                replace(stage, weight=arrays[f"{stage.name}.weight"], bias=arrays[f"{stage.name}.bias"])
+                for stage in checkpoint.dense
+            ),
+            forms=None
+            if checkpoint.forms is None
+            else tuple(
+                replace(form, threshold=form.threshold[(owner == tower) | (owner == SHARED)])
+                for form, owner in zip(checkpoint.forms, owners, strict=True)
+            ),
+            towers=1,
+        )
+        for tower, arrays in enumerate(every)
+    )
+
+
+def side_by_side(
+    checkpoint: Checkpoint, every: Sequence[Mapping[str, npt.NDArray[Any]]]
+) -> dict[str, npt.NDArray[Any]]:
+    """Values of all neurons from those of each tower; by layer, (..., neurons)."""
+    found = {}
+    for (name, neurons), owner in zip(checkpoint.neurons.items(), towers_of(checkpoint), strict=True):
+        first = every[0][name]
+        found[name] = np.empty((*first.shape[:-1], neurons), first.dtype)
+        for tower, values in enumerate(every):
+            found[name][..., (owner == tower) | (owner == SHARED)] = values[name]
+    return found
+
+
+def arrays_of(checkpoint: Checkpoint) -> Arrays:
+    """Arrays as a file holds them."""
+    arrays: Arrays = {"conv1.hops": checkpoint.hops, "conv1.bias": checkpoint.conv_bias}
+    for stage in checkpoint.dense:
+        arrays |= {f"{stage.name}.weight": stage.weight, f"{stage.name}.bias": stage.bias}
+    return arrays
+
+
+def join(checkpoints: Sequence[Checkpoint], names: Sequence[str]) -> Checkpoint:
+    """One network of all towers; where it is from, its training record and hash, are those of the first.
+
+    Parameters
+    ----------
+    checkpoints : sequence of Checkpoint
+        Of one system, sensor, graph, sizes, neurons and clocks, and of one storage where they were fine-tuned; joined
+        ones give all their towers.
+    names : sequence of str
+        For messages.
+
+    Raises
+    ------
+    ModelError
+        If they disagree in any of these; all of them are listed.
+    """
+    differing = [
+        f"{what} ({names[0]}: {tell(checkpoints[0])}; {'; '.join(others)})"
+        for what, tell in FACTS.items()
+        if (others := _others(checkpoints, names, tell))
+    ]
+    if differing:
+        raise ModelError(
+            f"join: the networks differ in {', '.join(differing)}; give networks of one system, sensor and timing"
+        )
+    every = [member for checkpoint in checkpoints for member in members(checkpoint)]
+    arrays = together([arrays_of(member) for member in every])
+    joined = replace(
+        every[0],
+        hops=arrays["conv1.hops"],
+        conv_bias=arrays["conv1.bias"],
+        dense=tuple(
+            replace(stage, weight=arrays[f"{stage.name}.weight"], bias=arrays[f"{stage.name}.bias"])
+            for stage in every[0].dense
+        ),
+        forms=None,
+        towers=len(every),
+    )
+    return replace(joined, forms=_joined_forms(joined, every))
+
+
+def _joined_forms(joined: Checkpoint, every: Sequence[Checkpoint]) -> tuple[Form, ...] | None:
+    forms = [member.forms for member in every if member.forms is not None]
+    if not forms:
+        return None
+    thresholds = side_by_side(
+        joined, [dict(zip(joined.neurons, (form.threshold for form in one), strict=True)) for one in forms]
+    )
+    return tuple(replace(form, threshold=thresholds[name]) for name, form in zip(joined.neurons, forms[0], strict=True))
+
+
+def _others(checkpoints: Sequence[Checkpoint], names: Sequence[str], tell: Callable[[Checkpoint], str]) -> list[str]:
+    first = tell(checkpoints[0])
+    told = zip(names[1:], map(tell, checkpoints[1:]), strict=True)
+    return [f"{name}: {found}" for name, found in told if found != first]
+
+
+def _sensor(checkpoint: Checkpoint) -> str:
+    grid = checkpoint.grid
+    held = f"{checkpoint.taxels} taxels x {checkpoint.hops.shape[2]}"
+    if grid is None:
+        return held
+    return (
+        f"{held} on a grid of {grid.rows} x {grid.columns}, stride {grid.stride}, padding {grid.padding}, "
+        f"cells #{_digest(grid.cells)}"
+    )
+
+
+def _graph(checkpoint: Checkpoint) -> str:
+    edges = np.zeros((0, 2), np.int64) if checkpoint.edges is None else checkpoint.edges
+    ordered = edges[np.lexsort(edges.T[::-1])]
+    return f"{len(ordered)} edges #{_digest(ordered)}"
+
+
+def _digest(values: IntArray) -> str:
+    return sha256(np.ascontiguousarray(values, "<i8").tobytes()).hexdigest()[:8]
+
+
+def _layers(checkpoint: Checkpoint) -> str:
+    features = checkpoint.hops.shape[1] // checkpoint.towers
+    sizes = [f"{stage.name} {len(stage.bias) // checkpoint.towers}" for stage in checkpoint.dense]
+    return ", ".join([f"{len(checkpoint.hops)} filters of {features} features", *sizes])
+
+
+def _decays(of: Callable[[Checkpoint, int], float]) -> Callable[[Checkpoint], str]:
+    return lambda checkpoint: ", ".join(f"{of(checkpoint, i)!r}" for i in range(1 + len(checkpoint.dense)))
+
+
+def _clocks(checkpoint: Checkpoint) -> str:
+    clocks = checkpoint.dynamics.clocks
+    return f"{clocks.channels} of {clocks.steps} steps" if clocks.channels else "none"
+
+
+def _storage(checkpoint: Checkpoint) -> str:
+    if checkpoint.forms is None:
+        return "none"
+    return ", ".join(f"{form.bits} bits with exponents {list(form.exponents)}" for form in checkpoint.forms)
+
+
+FACTS: Mapping[str, Callable[[Checkpoint], str]] = {
+    "system": lambda checkpoint: checkpoint.system,
+    "sensor": _sensor,
+    "graph": _graph,
+    "classes": lambda checkpoint: str(checkpoint.classes),
+    "layers": _layers,
+    "membrane decays": _decays(lambda checkpoint, layer: checkpoint.dynamics.beta(layer, checkpoint.beta)),
+    "current decays": _decays(lambda checkpoint, layer: checkpoint.dynamics.alpha(layer)),
+    "threshold": lambda checkpoint: repr(checkpoint.theta),
+    "clocks": _clocks,
+    "bins of a step": lambda checkpoint: str(checkpoint.bins),
+    "storage": _storage,
+}
+"""What the networks of a joined one have in common, as text that tells them apart."""

@@ -1,0 +1,168 @@
+"""The spiking systems for touch: they differ in what their first layer sees, and in nothing else.
+
+Neuron (place p, feature f) of the first layer gets ``sum_k sum_j M_k[p, j] <g_k[f], x_j> + b_f``, where x_j are the
+polarities of taxel j: a stack of matrices M (filters, places, taxels), here called the *propagation*, and one filter
+g_k (features, channels) for each of them.
+
+===============  ======================================================  ======================
+system           M_k                                                     places
+===============  ======================================================  ======================
+tactilesgnet     k-th power of the normalised adjacency [1]_             taxels
+gcn              one: the adjacency with self loops, normalised [2]_     taxels
+mlp              picks taxel k                                           one
+grid-cnn         picks the taxels that cell k of the window covers       positions of the window
+===============  ======================================================  ======================
+
+References
+----------
+.. [1] J. Du et al., "Topology Adaptive Graph Convolutional Networks", 2017, arXiv:1710.10370.
+.. [2] T. N. Kipf and M. Welling, "Semi-Supervised Classification with Graph Convolutional Networks", ICLR 2017,
+   arXiv:1609.02907: the renormalisation trick.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from spikeloom.compiler.fixedpoint import FloatArray, IntArray
+
+TACTILESGNET, GRID_CNN, MLP, GCN = SYSTEMS = ("tactilesgnet", "grid-cnn", "mlp", "gcn")
+
+GRAPH_SYSTEMS = (TACTILESGNET, GCN)
+"""Those that have a taxel graph."""
+
+TITLES = {TACTILESGNET: "a TactileSGNet", GRID_CNN: "a grid-based CNN", MLP: "an MLP", GCN: "a GCN"}
+"""What they are called in a sentence."""
+
+SMALL_GRID = 4096
+"""Cells along one side of a grid, at most."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Grid:
+    """A grid of cells over a sensor, and how a window moves over it.
+
+    Parameters
+    ----------
+    rows, columns : int
+        Cells.
+    stride, padding : int
+        Of the window; the padding is empty.
+    cells : (taxels, 2) int64
+        Row and column of each taxel; two in one cell add up.
+    """
+
+    rows: int
+    columns: int
+    stride: int
+    padding: int
+    cells: IntArray
+
+    def places(self, kernel: int) -> tuple[int, int]:
+        """Positions of a square window, down and across; zero where it is larger than the grid."""
+        down, across = (
+            max(0, (side + 2 * self.padding - kernel) // self.stride + 1) for side in (self.rows, self.columns)
+        )
+        return down, across
+
+    def propagation(self, kernel: int) -> FloatArray:
+        """Stack (kernel * kernel, places, taxels): which taxels each cell of the window covers, place by place."""
+        down, across = self.places(kernel)
+        stack = np.zeros((kernel * kernel, down * across, len(self.cells)))
+        for taxel, (row, column) in enumerate((self.cells + self.padding).tolist()):
+            for tap in range(kernel * kernel):
+                i, left = divmod(row - tap // kernel, self.stride)
+                j, over = divmod(column - tap % kernel, self.stride)
+                if not left and not over and 0 <= i < down and 0 <= j < across:
+                    stack[tap, i * across + j, taxel] = 1.0
+        return stack
+
+    def to_json(self) -> dict[str, Any]:
+        """JSON values."""
+        whole = {name: getattr(self, name) for name in ("rows", "columns", "stride", "padding")}
+        return whole | {"cells": self.cells.tolist()}
+
+
+def grid_from_json(values: Mapping[str, Any]) -> Grid:
+    """Inverse of :meth:`Grid.to_json`.
+
+    Raises
+    ------
+    KeyError, TypeError, ValueError
+        If they are no grid.
+    """
+    sizes = [values[name] for name in ("rows", "columns", "stride", "padding")]
+    cells = np.array(values["cells"], np.int64).reshape(-1, 2)
+    if any(type(size) is not int or not 0 <= size <= SMALL_GRID for size in sizes) or 0 in sizes[:3]:
+        raise ValueError(f"grid of {sizes}")
+    if not len(cells) or cells.min() < 0 or np.any(cells >= sizes[:2]):
+        raise ValueError("taxels outside the grid")
+    cells.flags.writeable = False
+    return Grid(rows=sizes[0], columns=sizes[1], stride=sizes[2], padding=sizes[3], cells=cells)
+
+
+def grid_over(cells: IntArray, *, stride: int, padding: int) -> Grid:
+    """The smallest grid that holds the cells of all taxels."""
+    rows, columns = (int(most) + 1 for most in cells.max(axis=0))
+    return Grid(rows=rows, columns=columns, stride=stride, padding=padding, cells=cells)
+
+
+def window_forms(cells: IntArray, kernel: int) -> dict[str, Grid]:
+    """The two forms of the grid-based CNN: a window that moves by 2 without padding, and one that keeps the size."""
+    return {
+        "none": grid_over(cells, stride=2, padding=0),
+        "same": grid_over(cells, stride=1, padding=kernel // 2),
+    }
+
+
+def taxel_propagation(taxels: int) -> FloatArray:
+    """Stack (taxels, 1, taxels) that picks one taxel after the other."""
+    return np.eye(taxels)[:, None, :]
+
+
+def feature_major(system: str) -> bool:
+    """Whether neurons of the first layer count ``feature * places + place``, as a flattened picture does.
+
+    The others count ``place * features + feature``.
+    """
+    return system == GRID_CNN
+
+
+def in_order(system: str, array: Any) -> Any:
+    """(places, features, ...) to (neurons, ...), in the order of the system's neurons."""
+    turned = array.swapaxes(0, 1) if feature_major(system) else array
+    return turned.reshape(-1, *array.shape[2:])
+
+
+def kernel_of(filters: int) -> int:
+    """Side of a square window with so many cells; 0 if there is none."""
+    side = math.isqrt(filters)
+    return side if side * side == filters else 0
+
+
+def shape_faults(system: str, filters: int, places: int, taxels: int, grid: Grid | None) -> list[str]:
+    """What is wrong about a first layer that was made for so many places.
+
+    Examples
+    --------
+    >>> shape_faults(MLP, 39, 1, 39, None), shape_faults(GCN, 2, 39, 39, None)
+    ([], ['a GCN has 1 filter, conv1.hops has 2'])
+    """
+    match system:
+        case "gcn" if filters != 1:
+            return [f"a GCN has 1 filter, conv1.hops has {filters}"]
+        case "mlp" if filters != taxels or places != 1:
+            return [f"an MLP has a filter for each of its {taxels} taxels and one place, here {filters} and {places}"]
+        case "grid-cnn":
+            kernel = kernel_of(filters)
+            if not kernel or grid is None:
+                return [f"a grid-based CNN has a grid and a square window, conv1.hops has {filters} cells"]
+            if math.prod(grid.places(kernel)) != places or len(grid.cells) != taxels:
+                fits = f"{math.prod(grid.places(kernel))} places and {len(grid.cells)} taxels"
+                return [f"the grid has {fits}, the weights are for {places} and {taxels}"]
+    return []

@@ -1,0 +1,1 @@
+"""Which neuron sits on which core, and which core on which tile."""

@@ -1,0 +1,241 @@
+"""Choose how many cores each layer gets, by what the layout is for: few cores, little energy or short steps.
+
+The integer network is not changed: which neuron sits where has no influence on any spike.
+
+A layer on more cores is swept and fed in parallel, but each of its spikes, and each spike that it hears, is sent to
+more of them. Layouts are judged by :mod:`layout.forecast`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+
+import numpy as np
+
+from spikeloom.compiler.errors import CapacityError, OptionError
+from spikeloom.compiler.fixedpoint import FloatArray, IntArray
+from spikeloom.compiler.ir import IntegerNetwork
+from spikeloom.compiler.passes.calibrate import Calibration
+from spikeloom.compiler.targets.base import PICOSECONDS, Target
+from spikeloom.compiler.targets.loihi1.layout.chips import place_on_chips
+from spikeloom.compiler.targets.loihi1.layout.core_needs import Chunk, Needs
+from spikeloom.compiler.targets.loihi1.layout.forecast import Expectation, Forecast, sample, tables
+from spikeloom.compiler.targets.loihi1.layout.latency_search import estimate, fastest, tiles_for
+from spikeloom.compiler.targets.loihi1.layout.partition import Partition, arrange, chunks_of, cut, partition
+from spikeloom.compiler.targets.loihi1.layout.place import Placement, core_traffic, place_within
+
+GOALS = ("cores", "energy", "latency")
+"""What a layout may be chosen for."""
+
+WORTH = 1e-3
+"""Share of a step's energy that another layout has to save."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Layout:
+    """A placed partition.
+
+    Parameters
+    ----------
+    parts : Partition
+        Chunks of each core.
+    placement : Placement
+        Tiles.
+    expected : Expectation, optional
+        Time and energy of a step, where these can be told.
+    """
+
+    parts: Partition
+    placement: Placement
+    expected: Expectation | None
+
+
+def asked_cores(
+    network: IntegerNetwork, cores_for: Mapping[str, int], target: Target, chips: int = 1
+) -> dict[int, int]:
+    """Least number of cores by population, from names.
+
+    Raises
+    ------
+    OptionError
+        If there is no such layer, or the chip or the layer cannot be cut so often.
+    """
+    names = [population.name for population in network.populations]
+    found = {}
+    for name, least in cores_for.items():
+        if name not in names:
+            raise OptionError(f"--cores-for {name}={least}: no such layer; layers are {', '.join(names)}")
+        population, allowed = names.index(name), chips * target.limit("chip.cores")
+        size = network.populations[population].size
+        if least > allowed:
+            raise OptionError(
+                f"--cores-for {name}={least}: {_named(target, chips)} {allowed} cores ({target.name}.chip.cores); "
+                f"give {allowed} or fewer"
+            )
+        if least > size:
+            raise OptionError(
+                f"--cores-for {name}={least}: {name} has {size} neurons on the chip; give {size} or fewer"
+            )
+        found[population] = least
+    return found
+
+
+def _named(target: Target, chips: int) -> str:
+    return f"{target.title} has" if chips == 1 else f"{chips} chips {target.title} have"
+
+
+def require_goal(
+    goal: str, cores_for: Mapping[str, int] | None, target: Target, *, calibrated: bool, chips: int = 1
+) -> None:
+    """Refuse a goal that is unknown or cannot be judged, and a number of chips that is none.
+
+    Raises
+    ------
+    OptionError
+        Saying what it needs.
+    """
+    if goal not in GOALS:
+        raise OptionError(f"--optimize {goal}: no such goal; give one of {', '.join(GOALS)}")
+    if chips < 1:
+        raise OptionError(f"--chips {chips}: not a number of chips; give 1 or more")
+    if goal == "cores":
+        return
+    if chips > 1:
+        raise OptionError(f"--optimize {goal}: links between chips are not modelled; leave --chips away")
+    if cores_for:
+        raise OptionError(f"--optimize {goal}: chooses the cores of every layer itself; leave --cores-for away")
+    if not calibrated:
+        raise OptionError(f"--optimize {goal}: needs firing rates; give --calibrate")
+    if tables(target) is None:
+        raise OptionError(f"--optimize {goal}: {target.title} has no time or no energy table; give another target")
+
+
+def lay_out(
+    network: IntegerNetwork,
+    target: Target,
+    *,
+    goal: str = "cores",
+    cores_for: Mapping[str, int] | None = None,
+    chips: int = 1,
+    rates: tuple[FloatArray, ...] | None = None,
+    calibration: Calibration | None = None,
+    identity: tuple[IntArray, ...] | None = None,
+) -> tuple[Layout, Layout]:
+    """Choose a layout for a goal.
+
+    Parameters
+    ----------
+    network : IntegerNetwork
+        Integer stage, what the chip holds of it.
+    target : Target
+        Limits, latencies and prices.
+    goal : str
+        One of ``GOALS``: fewest cores, least expected energy of a step, shortest expected step.
+    cores_for : mapping of str to int, optional
+        Least number of cores of a layer, by name. These hold no other layer.
+    chips : int
+        Number of chips at most; as few are used as hold the cores.
+    rates : tuple of (neurons,) float64, optional
+        Spikes per step, from calibration.
+    calibration : Calibration, optional
+        Spikes of the float model, for what a step is expected to take.
+    identity : tuple of (neurons left,) int64, optional
+        Which neurons of the calibration the chip holds; all by default.
+
+    Returns
+    -------
+    chosen, usual : Layout
+        The layout, and that of fewest cores; often they are one.
+
+    Raises
+    ------
+    CapacityError
+        If a limit cannot be kept.
+    OptionError
+        If the goal is unknown or cannot be judged, or the cores asked for do not exist.
+    """
+    require_goal(goal, cores_for, target, calibrated=calibration is not None, chips=chips)
+    least = asked_cores(network, cores_for or {}, target, chips)
+    priced = tables(target)
+    forecast = None
+    if calibration is not None and priced is not None:
+        all_neurons = tuple(np.arange(population.size) for population in network.populations)
+        activity = sample(network, calibration, identity or all_neurons)
+        forecast = Forecast(Needs(network, target), activity, *priced)
+
+    def placed(parts: Partition, tiles: int | None = None) -> Layout:
+        traffic = core_traffic(network, parts, rates)
+        placement = place_on_chips(traffic, target) if tiles is None else place_within(traffic, target, tiles)
+        return Layout(parts=parts, placement=placement, expected=expect(parts, placement))
+
+    def expect(parts: Partition, placement: Placement) -> Expectation | None:
+        if forecast is None or len(parts.cores) > target.limit("chip.cores"):
+            return None
+        return forecast.expect(parts, placement.tiles, core_traffic(network, parts, forecast.rates))
+
+    usual = placed(partition(network, target, rates, chips=chips))
+    if least:
+        return placed(partition(network, target, rates, cores_for=least, chips=chips)), usual
+    if forecast is None or goal == "cores":
+        return usual, usual
+    if goal == "energy":
+        best = usual
+        allowed = _expected(usual).step_j * (1 - WORTH)
+        for parts in _thrifty(forecast, rates):
+            if _least_energy(forecast, parts) < allowed:
+                thrifty = placed(parts)
+                if _expected(thrifty).step_j < allowed:
+                    best, allowed = thrifty, _expected(thrifty).step_j
+        return best, usual
+    found = fastest(forecast)
+    if found is None or estimate(forecast, found) >= _expected(usual).step_ns * PICOSECONDS:
+        return usual, usual
+    fast = placed(arrange(forecast.needs, found), tiles_for(forecast, len(found)))
+    return min([usual, fast], key=lambda layout: _expected(layout).step_ns), usual
+
+
+def _expected(layout: Layout) -> Expectation:
+    assert layout.expected is not None
+    return layout.expected
+
+
+# -- energy ------------------------------------------------------------------------------------------------------------
+
+
+def _thrifty(forecast: Forecast, rates: tuple[FloatArray, ...] | None) -> list[Partition]:
+    """Partitions of little energy: each layer cut where its synapses and the packets to it cost least by themselves.
+
+    The stored zeros of dense lists that are visited become fewer with more cores, the packets more.
+    """
+    needs = forecast.needs
+    fewest = chunks_of(cut(needs, {}))
+    spread: dict[int, int] = {}
+    for population, count in fewest.items():
+        costs = {}
+        for more in range(count, min(2 * count + 2, needs.network.populations[population].size) + 1):
+            with suppress(CapacityError, OptionError):  # too many for the sources, or too few
+                chunks = [chunk for chunk in cut(needs, {population: more}) if chunk.population == population]
+                costs[len(chunks)] = sum(_cost(forecast, chunk) for chunk in chunks)
+        best = min(costs, key=lambda parts: (costs[parts], parts), default=count)
+        if best > count:
+            spread[population] = best
+    found = []
+    for least in [spread, fewest, *({population: parts} for population, parts in spread.items() if len(spread) > 1)]:
+        with suppress(CapacityError, OptionError):  # the layers before may have to be cut more often for it
+            found.append(partition(needs.network, needs.target, rates, cores_for=least, shared=True))
+    return found
+
+
+def _least_energy(forecast: Forecast, parts: Partition) -> float:
+    """Joules of a step if no packet had to leave its tile."""
+    traffic = core_traffic(forecast.needs.network, parts, forecast.rates)
+    return forecast.expect(parts, (0,) * len(parts.cores), traffic).step_j
+
+
+def _cost(forecast: Forecast, chunk: Chunk) -> float:
+    """Joules of a step that the synapses of a chunk on a core of its own and the packets to it cost."""
+    _, spent = forecast.listening(chunk, 0, lean=forecast.needs.lean((chunk,)))
+    packets = sum(float(forecast.rates[pre] @ axons) for pre, axons in forecast.needs.heard([chunk]).items())
+    return spent + forecast.joule("packet") * packets

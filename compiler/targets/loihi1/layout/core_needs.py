@@ -1,0 +1,219 @@
+"""Count what the core needs that holds given neurons: compartments, axons, words, slots.
+
+Nothing is changed. Neurons are looked at in *chunks*, runs of neighbours of one population.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from spikeloom.compiler.fixedpoint import IntArray
+from spikeloom.compiler.ir import INPUT, IntegerNetwork, IntegerProjection
+from spikeloom.compiler.targets.base import Target
+from spikeloom.compiler.targets.loihi1.legalize import LimitUse, list_words
+
+SPARSE_SHARE = 0.75
+"""A list goes sparse when it stores at most this share of what the dense form would store and visit."""
+
+SynapseFormat = tuple[int, int, int]
+"""Weight bits, exponent and index bits (0 if dense)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, order=True)
+class Chunk:
+    """Neurons ``first … last - 1`` of one population."""
+
+    population: int
+    first: int
+    last: int
+
+    @property
+    def size(self) -> int:
+        """Number of neurons."""
+        return self.last - self.first
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Lists:
+    """Synapse lists from one projection into one chunk, one per source neuron with a non-zero weight.
+
+    Parameters
+    ----------
+    projection : int
+        Index in the network.
+    source : (lists,) int64
+        Neuron of the source population.
+    nonzero : (lists,) int64
+        Non-zero synapses of each list.
+    first, last : (lists,) int64
+        First and last neuron of the chunk (counted within it) with a non-zero weight.
+    """
+
+    projection: int
+    source: IntArray
+    nonzero: IntArray
+    first: IntArray
+    last: IntArray
+
+
+def lists_into(network: IntegerNetwork, chunk: Chunk) -> tuple[Lists, ...]:
+    """Collect the synapse lists that a chunk's core has to store, zero weights left out."""
+    found = []
+    for index, projection in enumerate(network.projections):
+        if projection.post == chunk.population:
+            part = projection.weight[chunk.first : chunk.last].tocoo()
+            keep = part.data != 0
+            row, column = part.coords[0][keep], part.coords[1][keep]
+            pre = projection.weight.shape[1]
+            nonzero = np.bincount(column, minlength=pre)
+            # rows ascend, and of repeated indices the last assignment stays
+            first, last = np.zeros((2, pre), np.int64)
+            last[column] = row
+            first[column[::-1]] = row[::-1]
+            source = np.flatnonzero(nonzero)
+            found.append(
+                Lists(
+                    projection=index,
+                    source=source,
+                    nonzero=nonzero[source],
+                    first=first[source],
+                    last=last[source],
+                )
+            )
+    return tuple(found)
+
+
+def index_bits(highest: int, target: Target) -> int:
+    """Narrowest sparse index that reaches compartment `highest` of a core."""
+    return min(bits for bits in target.choices["synapse.index_bits"] if bits and highest < 1 << bits)
+
+
+def choose_dense(
+    lists: Lists, projection: IntegerProjection, base: int, size: int, *, lean: bool, target: Target
+) -> tuple[IntArray, IntArray]:
+    """Decide the form of each list of a chunk that starts at compartment `base` of its core.
+
+    Parameters
+    ----------
+    lean : bool
+        Prefer few visited synapses (sparse unless nearly full) to few words.
+
+    Returns
+    -------
+    dense : (lists,) bool as int64
+        1 where the list is stored dense.
+    words : (lists,) int64
+        Words that it takes.
+    """
+    span = lists.last - lists.first + 1
+    sparse_words = list_words(lists.nonzero, projection.bits, index_bits(base + size - 1, target), target)
+    dense_words = list_words(span, projection.bits, 0, target)
+    possible = base + lists.first <= target.limit("core.dense_base")
+    wanted = lists.nonzero > SPARSE_SHARE * span if lean else dense_words < sparse_words
+    dense = possible & wanted
+    return dense.astype(np.int64), np.where(dense, dense_words, sparse_words)
+
+
+class Needs:
+    """What chunks need, computed once per chunk and base."""
+
+    def __init__(self, network: IntegerNetwork, target: Target) -> None:
+        self.network = network
+        self.target = target
+        self.forget()
+        self._lists: dict[Chunk, tuple[Lists, ...]] = {}
+        self._stored: dict[tuple[Chunk, int, bool], tuple[int, frozenset[SynapseFormat]]] = {}
+        self._thresholds: dict[Chunk, frozenset[int]] = {}
+        self._lean: dict[tuple[Chunk, ...], bool] = {}
+
+    def lists(self, chunk: Chunk) -> tuple[Lists, ...]:
+        """Synapse lists of a chunk."""
+        if chunk not in self._lists:
+            self._lists[chunk] = lists_into(self.network, chunk)
+        return self._lists[chunk]
+
+    def drop(self, chunk: Chunk) -> None:
+        """Forget the lists of a chunk that was only tried."""
+        self._lists.pop(chunk, None)
+
+    def stored(self, chunk: Chunk, base: int, *, lean: bool = False) -> tuple[int, frozenset[SynapseFormat]]:
+        """Words and synapse formats of a chunk's lists if it starts at compartment `base` of its core."""
+        key = (chunk, base, lean)
+        if key not in self._stored:
+            words, formats = 0, set()
+            for lists in self.lists(chunk):
+                projection = self.network.projections[lists.projection]
+                dense, taken = choose_dense(lists, projection, base, chunk.size, lean=lean, target=self.target)
+                words += int(taken.sum())
+                index = index_bits(base + chunk.size - 1, self.target)
+                formats |= {(projection.bits, projection.exponent, 0 if flag else index) for flag in np.unique(dense)}
+            self._stored[key] = words, frozenset(formats)
+        return self._stored[key]
+
+    def uses(self, chunks: tuple[Chunk, ...], *, lean: bool = False) -> dict[str, int]:
+        """Use of each limit by a core that holds these chunks in this order."""
+        base = words = 0
+        thresholds: set[int] = set()
+        decays: set[tuple[int, int]] = set()
+        formats: set[SynapseFormat] = set()
+        for chunk in chunks:
+            more, used = self.stored(chunk, base, lean=lean)
+            words += more
+            formats |= used
+            base += chunk.size
+            population = self.network.populations[chunk.population]
+            if chunk not in self._thresholds:
+                self._thresholds[chunk] = frozenset(population.threshold[chunk.first : chunk.last].tolist())
+            thresholds |= self._thresholds[chunk]
+            decays.add((population.decay_u, population.decay_v))
+        return {
+            "core.compartments": base,
+            "core.axons_in": sum(len(lists.source) for chunk in chunks for lists in self.lists(chunk)),
+            "core.axons_out": int(sum(self.out_axons[c.population][c.first : c.last].sum() for c in chunks)),
+            "core.synapse_words": words,
+            "core.threshold_slots": len(thresholds),
+            "core.synapse_formats": len(formats),
+            "core.compartment_configs": len(decays),
+        }
+
+    def excess(self, chunks: tuple[Chunk, ...], *, lean: bool = False) -> list[LimitUse]:
+        """Limits that such a core breaks."""
+        uses = self.uses(chunks, lean=lean)
+        return [
+            LimitUse(name=rule, used=used, allowed=self.target.limit(rule), core=None)
+            for rule, used in uses.items()
+            if used > self.target.limit(rule)
+        ]
+
+    def lean(self, chunks: tuple[Chunk, ...]) -> bool:
+        """Whether such a core has room for lists of few visited synapses; its output axons do not matter."""
+        if chunks not in self._lean:
+            self._lean[chunks] = all(use.name == "core.axons_out" for use in self.excess(chunks, lean=True))
+        return self._lean[chunks]
+
+    def forget(self) -> None:
+        """Charge no source with any output axon."""
+        self.out_axons = [np.zeros(population.size, np.int64) for population in self.network.populations]
+
+    def heard(self, chunks: Iterable[Chunk]) -> dict[int, IntArray]:
+        """Output axons that the sources of chunks need, one for each of their lists, by population."""
+        axons: dict[int, IntArray] = {}
+        for chunk in chunks:
+            for lists in self.lists(chunk):
+                pre = self.network.projections[lists.projection].pre
+                if pre != INPUT:
+                    axons.setdefault(pre, np.zeros(self.network.populations[pre].size, np.int64))[lists.source] += 1
+        return axons
+
+    def listen(self, chunks: Iterable[Chunk]) -> None:
+        """Charge the sources of chunks with these."""
+        for pre, axons in self.heard(chunks).items():
+            self.out_axons[pre] += axons
+
+
+def lean_fits(network: IntegerNetwork, target: Target, chunks: tuple[Chunk, ...]) -> bool:
+    """Whether a core still holds its chunks when lists prefer few visited synapses to few words."""
+    return Needs(network, target).lean(chunks)

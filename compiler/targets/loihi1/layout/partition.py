@@ -1,0 +1,304 @@
+"""Cut populations into chunks that fit a core and pack the chunks on as few cores as possible.
+
+The integer network is not changed: which neuron sits where has no influence on any spike.
+
+Synaptic memory, axons and compartments are all counted by the rules of the target; the split of a population decides
+how many output axons the populations before it need, so populations are cut from the last to the first. One that hears
+itself needs some for its own chunks, so it is cut again until they are enough.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from spikeloom.compiler.errors import CapacityError, OptionError, Violation
+from spikeloom.compiler.fixedpoint import FloatArray
+from spikeloom.compiler.ir import IntegerNetwork
+from spikeloom.compiler.targets.base import Target
+from spikeloom.compiler.targets.loihi1.layout.core_needs import Chunk, Needs
+from spikeloom.compiler.targets.loihi1.legalize import LimitUse, violation
+
+EXACT_CHUNKS = 10
+"""Up to this many chunks the packing is searched exhaustively; above it, first fit."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Partition:
+    """Chunks of each core, in their order on it.
+
+    Parameters
+    ----------
+    cores : tuple of tuple of Chunk
+        First core first.
+    bound : int
+        No legal partition can use fewer cores than this.
+    """
+
+    cores: tuple[tuple[Chunk, ...], ...]
+    bound: int
+
+
+def _largest(low: int, high: int, fits: Callable[[int], bool]) -> int:
+    """Largest value in ``low … high`` that fits, given that `low` does and that fitting is monotone.
+
+    For chunks it is, in every limit but the synapse formats (all lists of the larger chunk may be dense); there a
+    smaller chunk than the largest may come out, which fits as well.
+    """
+    while low < high:
+        middle = (low + high + 1) // 2
+        low, high = (middle, high) if fits(middle) else (low, middle - 1)
+    return low
+
+
+Cut = tuple[list[Chunk], list[Violation]]
+"""Chunks of a population, or why one of its neurons fits no core."""
+
+
+def fill(needs: Needs, population: int) -> Cut:
+    """Cut one population greedily into chunks that fit an empty core; or say why one neuron does not."""
+    return _charged(needs, population, lambda: _fill(needs, population))
+
+
+def _charged(needs: Needs, population: int, again: Callable[[], Cut]) -> Cut:
+    """Cut a population until its neurons have output axons for its own chunks, too; finer chunks need more."""
+    if not any(projection.pre == projection.post == population for projection in needs.network.projections):
+        return again()
+    others = needs.out_axons[population]
+    charged = np.zeros_like(others)
+    try:
+        while True:
+            needs.out_axons[population] = others + charged
+            chunks, why = again()
+            own = needs.heard(chunks).get(population, charged)
+            if why or np.all(own <= charged):
+                return chunks, why
+            charged = np.maximum(charged, own)
+    finally:
+        needs.out_axons[population] = others
+
+
+def _fill(needs: Needs, population: int) -> Cut:
+    size = needs.network.populations[population].size
+    chunks: list[Chunk] = []
+    first = 0
+    while first < size:
+        one = Chunk(population=population, first=first, last=first + 1)
+        if needs.excess((one,)):
+            return [], _worst(needs, population)
+
+        def fits(last: int, first: int = first) -> bool:
+            tried = Chunk(population=population, first=first, last=last)
+            fit = not needs.excess((tried,))
+            needs.drop(tried)
+            return fit
+
+        most = min(size, first + needs.target.limit("core.compartments"))
+        chunks.append(Chunk(population=population, first=first, last=_largest(first + 1, most, fits)))
+        first = chunks[-1].last
+    return chunks, []
+
+
+def _worst(needs: Needs, population: int) -> list[Violation]:
+    """For each limit that single neurons of a population break: the one that breaks it most."""
+    found: dict[str, tuple[LimitUse, int]] = {}
+    for neuron in range(needs.network.populations[population].size):
+        for use in needs.excess((Chunk(population=population, first=neuron, last=neuron + 1),)):
+            if use.name not in found or use.used > found[use.name][0].used:
+                found[use.name] = use, neuron
+    name = needs.network.populations[population].name
+    return [violation(use, f"{name} neuron {neuron}", needs.target) for use, neuron in found.values()]
+
+
+def order_on_core(needs: Needs, chunks: tuple[Chunk, ...]) -> tuple[Chunk, ...]:
+    """Densest chunks first: a dense list must start low on its core, a sparse one need not."""
+
+    def key(chunk: Chunk) -> tuple[float, Chunk]:
+        spans = sum(int((lists.last - lists.first + 1).sum()) for lists in needs.lists(chunk))
+        nonzero = sum(int(lists.nonzero.sum()) for lists in needs.lists(chunk))
+        return -nonzero / max(spans, 1), chunk
+
+    return tuple(sorted(chunks, key=key))
+
+
+def _core_bound(needs: Needs, chunks: list[Chunk]) -> int:
+    """Cores that compartments and synaptic memory need at least, however the network is cut."""
+    compartments = sum(chunk.size for chunk in chunks)
+    # Cutting a list elsewhere moves header and index bits, so memory is bounded by the mantissas alone.
+    payload = sum(
+        int(lists.nonzero.sum()) * needs.network.projections[lists.projection].bits
+        for chunk in chunks
+        for lists in needs.lists(chunk)
+    )
+    memory = needs.target.limit("synapse.word_bits") * needs.target.limit("core.synapse_words")
+    return max(-(-compartments // needs.target.limit("core.compartments")), -(-payload // memory))
+
+
+def _pack(needs: Needs, chunks: list[Chunk], traffic: Callable[[Chunk, Chunk], float]) -> list[tuple[Chunk, ...]]:
+    """Put chunks on the fewest cores; among equals, keep most traffic within a core."""
+    known: dict[frozenset[Chunk], bool] = {}
+
+    def fits(group: tuple[Chunk, ...]) -> bool:
+        key = frozenset(group)
+        if key not in known:
+            known[key] = not needs.excess(order_on_core(needs, group))
+        return known[key]
+
+    if len(chunks) > EXACT_CHUNKS:
+        cores: list[tuple[Chunk, ...]] = []
+        for chunk in sorted(chunks, key=lambda c: (-needs.stored(c, 0)[0], c)):
+            for i, core in enumerate(cores):
+                if fits((*core, chunk)):
+                    cores[i] = (*core, chunk)
+                    break
+            else:
+                cores.append((chunk,))
+        return cores
+
+    best: list[tuple[Chunk, ...]] = [(chunk,) for chunk in chunks]
+    best_kept = 0.0
+
+    def search(index: int, cores: list[tuple[Chunk, ...]], kept: float) -> None:
+        nonlocal best, best_kept
+        if len(cores) > len(best):
+            return
+        if index == len(chunks):
+            if (len(cores), -kept) < (len(best), -best_kept):
+                best, best_kept = list(cores), kept
+            return
+        chunk = chunks[index]
+        for i, core in enumerate(cores):
+            if fits((*core, chunk)):
+                gained = sum(traffic(chunk, other) + traffic(other, chunk) for other in core)
+                search(index + 1, [*cores[:i], (*core, chunk), *cores[i + 1 :]], kept + gained)
+        search(index + 1, [*cores, (chunk,)], kept)
+
+    search(0, [], 0.0)
+    return best
+
+
+def spread(needs: Needs, population: int, least: int) -> Cut:
+    """Cut one population as evenly as possible into at least so many chunks that fit an empty core; or say why not."""
+    return _charged(needs, population, lambda: _spread(needs, population, least))
+
+
+def _spread(needs: Needs, population: int, least: int) -> Cut:
+    name, size = needs.network.populations[population].name, needs.network.populations[population].size
+    for parts in range(least, size + 1):
+        bounds = [i * size // parts for i in range(parts + 1)]
+        chunks = [Chunk(population=population, first=first, last=last) for first, last in pairwise(bounds)]
+        if not any(needs.excess((chunk,)) for chunk in chunks):
+            return chunks, []
+        if parts == least:
+            fewest, why = _fill(needs, population)
+            if why:
+                return [], why
+            if least < len(fewest):
+                raise OptionError(
+                    f"--cores-for {name}={least}: {name} needs {len(fewest)} cores at least; give {len(fewest)} or more"
+                )
+    return [], _worst(needs, population)
+
+
+def cut(needs: Needs, least: Mapping[int, int]) -> list[Chunk]:
+    """Cut every population: evenly into at least so many chunks if it is in `least`, else into full ones.
+
+    Raises
+    ------
+    CapacityError
+        If a single neuron exceeds a limit; lists every violation.
+    OptionError
+        If a population needs more chunks than `least` says.
+    """
+    chunks: list[Chunk] = []
+    violations: list[Violation] = []
+    needs.forget()
+    for population in reversed(range(len(needs.network.populations))):
+        found, why = spread(needs, population, least[population]) if population in least else fill(needs, population)
+        violations = why + violations
+        chunks += found
+        needs.listen(found)
+    if violations:
+        raise CapacityError(tuple(violations))
+    return sorted(chunks)
+
+
+def chunks_of(chunks: Iterable[Chunk]) -> dict[int, int]:
+    """Number of chunks of each population."""
+    return dict(sorted(Counter(chunk.population for chunk in chunks).items()))
+
+
+def arrange(needs: Needs, groups: Iterable[tuple[Chunk, ...]], chips: int = 1) -> Partition:
+    """Put groups of chunks on cores, in order.
+
+    Raises
+    ------
+    CapacityError
+        If the chips have too few cores.
+    """
+    cores = sorted((order_on_core(needs, group) for group in groups), key=min)
+    used = LimitUse(name="chip.cores", used=len(cores), allowed=chips * needs.target.limit("chip.cores"), core=None)
+    if used.used > used.allowed:
+        owner = "chip" if chips == 1 else f"{chips} chips"
+        raise CapacityError((violation(used, owner, needs.target),))
+    return Partition(cores=tuple(cores), bound=_core_bound(needs, [chunk for core in cores for chunk in core]))
+
+
+def partition(
+    network: IntegerNetwork,
+    target: Target,
+    rates: tuple[FloatArray, ...] | None = None,
+    *,
+    cores_for: Mapping[int, int] | None = None,
+    shared: bool = False,
+    chips: int = 1,
+) -> Partition:
+    """Assign every neuron to a core.
+
+    Parameters
+    ----------
+    network : IntegerNetwork
+        Integer stage.
+    target : Target
+        Limits of a core and of the chip.
+    rates : tuple of (neurons,) float64, optional
+        Spikes per step of each population, to prefer packings that keep traffic within a core; all equal without.
+    cores_for : mapping of int to int, optional
+        At least so many cores for a population, which is cut as evenly as possible.
+    shared : bool
+        Whether these cores may hold other populations, too.
+    chips : int
+        Number of chips at most.
+
+    Returns
+    -------
+    Partition
+        Fewest cores that the cut into chunks, full ones by default, allows if the densest chunk of a core comes
+        first, searched exhaustively up to ``EXACT_CHUNKS`` chunks.
+
+    Raises
+    ------
+    CapacityError
+        If a single neuron exceeds a limit or the chips have too few cores; lists every violation.
+    OptionError
+        If a population needs more cores than `cores_for` says.
+    """
+    needs = Needs(network, target)
+    least = cores_for or {}
+    chunks = cut(needs, least)
+
+    def traffic(source: Chunk, listener: Chunk) -> float:
+        total = 0.0
+        for lists in needs.lists(listener):
+            if network.projections[lists.projection].pre == source.population:
+                inside = lists.source[(lists.source >= source.first) & (lists.source < source.last)]
+                total += float(rates[source.population][inside].sum()) if rates is not None else len(inside)
+        return total
+
+    alone = [chunk for chunk in chunks if chunk.population in least and not shared]
+    groups = _pack(needs, [chunk for chunk in chunks if chunk not in alone], traffic)
+    return arrange(needs, [*groups, *((chunk,) for chunk in alone)], chips)

@@ -1,0 +1,107 @@
+"""Read a netlist back as an integer network: the inverse of :mod:`loihi1.emit`, cores forgotten.
+
+Synapses of weight zero are stored by chance (inside dense lists) and are left out. A layer whose weights all rounded
+to zero stores no synapse; it is given an empty projection from where it would listen. Neurons that the chip does not
+hold come back without synapses or bias, so that they never fire.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+
+from spikeloom.compiler.errors import FormatError
+from spikeloom.compiler.fixedpoint import THRESHOLD_MANTISSA_MAX, IntArray
+from spikeloom.compiler.ir import INPUT, Input, IntegerNetwork, IntegerPopulation, IntegerProjection, Readout
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
+
+
+def _one(netlist: Netlist, layer: int, field: str) -> int:
+    values = np.unique(getattr(netlist, field)[netlist.compartments_of(layer)])
+    if len(values) != 1:
+        raise FormatError(
+            f"layer {netlist.layers[layer].name}: has {len(values)} values of {field}, one is allowed; compile it again"
+        )
+    return int(values[0])
+
+
+def lift(netlist: Netlist) -> IntegerNetwork:
+    """Collect compartments to populations and axons to projections, one per pair of layers and weight format.
+
+    Raises
+    ------
+    FormatError
+        If the compartments of a layer have different decays, or several layers vote, which the network form cannot
+        say.
+    """
+    populations = []
+    for index, layer in enumerate(netlist.layers):
+        ids = netlist.compartments_of(index)
+        held = netlist.neuron[ids]
+
+        def whole(values: npt.NDArray[Any], missing: float, held: IntArray = held, size: int = layer.neurons) -> Any:
+            array = np.full(size, missing, values.dtype)
+            array[held] = values
+            return array
+
+        populations.append(
+            IntegerPopulation(
+                name=layer.name,
+                beta=layer.beta,
+                theta=layer.theta,
+                alpha=layer.alpha,
+                scale=whole(netlist.scale[ids], 1.0),
+                decay_u=_one(netlist, index, "decay_u"),
+                decay_v=_one(netlist, index, "decay_v"),
+                threshold=whole(netlist.threshold[ids], THRESHOLD_MANTISSA_MAX),
+                bias_mantissa=whole(netlist.bias_mantissa[ids], 0),
+                bias_exponent=whole(netlist.bias_exponent[ids], 0),
+            )
+        )
+    axon = netlist.axon_of_synapse()
+    source, form = netlist.axon_source[axon], netlist.axon_format[axon]
+    target = netlist.synapse_compartment()
+    inner = source >= netlist.n_inputs
+    pre = np.where(inner, netlist.layer[np.where(inner, source - netlist.n_inputs, 0)], INPUT)
+    column = np.where(inner, netlist.neuron[np.where(inner, source - netlist.n_inputs, 0)], source)
+    post, row = netlist.layer[target], netlist.neuron[target]
+    exponent, bits = netlist.format_exponent[form], netlist.format_weight_bits[form]
+    kinds = np.stack([post, pre, exponent, bits])
+    sizes = {INPUT: netlist.n_inputs} | {i: layer.neurons for i, layer in enumerate(netlist.layers)}
+    projections = []
+    code = ((post * (len(netlist.layers) + 1) + pre + 1) * 64 + exponent + 32) * 16 + bits  # one number sorts faster
+    for kind in kinds[:, np.unique(code, return_index=True)[1]].T:
+        held = np.all(kinds == kind[:, None], axis=0) & (netlist.synapse_weight != 0)
+        weight = sparse.csr_array(
+            (netlist.synapse_weight[held].astype(np.int64), (row[held], column[held])),
+            shape=(sizes[int(kind[0])], sizes[int(kind[1])]),
+        )
+        weight.sum_duplicates()
+        projections.append(
+            IntegerProjection(
+                pre=int(kind[1]), post=int(kind[0]), weight=weight, exponent=int(kind[2]), bits=int(kind[3])
+            )
+        )
+    reached = {projection.post for projection in projections if projection.pre != projection.post}
+    for index, layer in enumerate(netlist.layers):
+        if index not in reached:
+            before = next((i for i, other in enumerate(netlist.layers) if other.depth == layer.depth - 1), INPUT)
+            nothing = sparse.csr_array((layer.neurons, sizes[before]), dtype=np.int64)
+            projections.append(
+                IntegerProjection(pre=before, post=index, weight=nothing, exponent=0, bits=layer.weight_bits)
+            )
+    voting = np.unique(netlist.layer[netlist.readout_class >= 0])
+    if len(voting) != 1:
+        raise FormatError(f"netlist: {len(voting)} layers vote for classes, one is allowed; compile it again")
+    return IntegerNetwork(
+        input=Input(taxels=netlist.taxels, polarities=netlist.polarities, clocks=netlist.clocks, bins=netlist.bins),
+        populations=tuple(populations),
+        projections=tuple(projections),
+        readout=Readout(
+            population=int(voting[0]), label=netlist.readout_class[netlist.compartments_of(int(voting[0]))]
+        ),
+        classes=netlist.classes,
+    )

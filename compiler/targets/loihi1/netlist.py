@@ -1,0 +1,267 @@
+"""The netlist: cores, compartments, axons and synapses as flat integer arrays.
+
+Ids
+---
+*Compartments* are numbered ``0 … n_compartments-1``, core after core; those of core ``k`` are
+``core_compartments[k] … core_compartments[k+1]-1``. *Axons* (input axons, one synapse list each) are numbered the
+same way through ``core_axons``; the synapses of axon ``a`` are ``axon_synapses[a] … axon_synapses[a+1]-1``.
+
+An axon listens to one *source*, a single integer: ``0 … n_inputs-1`` is an input channel (channel
+``taxel * polarities + polarity``, then the clocks), ``n_inputs + c`` is compartment ``c``. The output axons of a
+compartment are the axons that name it as source; they are not stored a second time.
+
+A synapse targets compartment ``synapse_target`` *of its core* (0-based within the core) with the signed mantissa
+``synapse_weight``; it adds ``mantissa * 2**exponent`` of its list's format, shifted left by six, to the target's
+synaptic sum. A list whose format has ``index_bits == 0`` is dense: it stores one weight for every compartment from
+its first target to its last, zeros included.
+
+Time
+----
+At chip step ``t`` an axon carries a spike if its input channel has an event in data step ``t``, or if its source
+compartment spiked in chip step ``t - 1``. A compartment of a layer of depth ``d`` integrates in the steps
+``d … d + T - 1`` of a recording of ``T`` steps and is held at zero, silent, outside them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from spikeloom.compiler.dynamics import NO_CLOCKS, Clocks
+from spikeloom.compiler.fixedpoint import FloatArray, IntArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Layer:
+    """One population of the network, as the netlist remembers it.
+
+    Parameters
+    ----------
+    name : str
+        ``conv1``, ``fc1`` …
+    neurons : int
+        Neurons of the float model's layer; the chip may hold fewer compartments.
+    unheard : tuple of int
+        Neurons left out although they fire, because nobody hears them; any other that is missing cannot fire.
+    depth : int
+        Steps that the layer lags behind the data.
+    beta, theta : float
+        Decay and threshold of the float model.
+    weight_bits : int
+        Storage width of the mantissas.
+    synapses : int
+        Structural synapses into the layer, before zeros were dropped.
+    max_fan_in : int
+        Largest structural fan-in of a neuron.
+    alpha : float
+        Current decay of the float model.
+    """
+
+    name: str
+    neurons: int
+    unheard: tuple[int, ...]
+    depth: int
+    beta: float
+    theta: float
+    weight_bits: int
+    synapses: int
+    max_fan_in: int
+    alpha: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Netlist:
+    """A placed integer network; see the module docstring for ids and time.
+
+    Parameters
+    ----------
+    target : str
+        Name of the chip.
+    taxels, polarities, classes : int
+        Sensor size and number of classes; ``n_inputs = taxels * polarities``, and the clocks.
+    layers : tuple of Layer
+        In order of depth; ``readout_class`` says which of them votes.
+    core_tile : (cores,) int64
+        Tile of each core, row-major on the mesh (``x = tile % width``, ``y = tile // width``).
+    core_compartments, core_axons : (cores + 1,) int64
+        Range bounds, see above.
+    layer, neuron : (compartments,) int64
+        Which neuron of which layer a compartment is.
+    decay_u, decay_v : (compartments,) int64
+        Registers: the current loses ``(decay_u + 1)/4096``, the membrane ``decay_v/4096`` a step.
+    threshold : (compartments,) int64
+        Mantissa; a spike needs ``v > 64 * threshold``.
+    bias_mantissa, bias_exponent : (compartments,) int64
+        ``mantissa * 2**exponent`` is added to the membrane, unshifted.
+    scale : (compartments,) float64
+        Weight units (mantissa times 2**exponent) per unit of the float model's membrane; a membrane register
+        holds 64ths of a weight unit, so float membrane = register / (64 * scale). No register of the chip.
+    readout_class : (compartments,) int64
+        Class that a spike votes for, -1 for none.
+    axon_source, axon_format : (axons,) int64
+        Source id and synapse format of each axon.
+    axon_synapses : (axons + 1,) int64
+        Range bounds into the synapses.
+    synapse_target, synapse_weight : (synapses,) of an integer type
+        Compartment within the core, and mantissa; in as few bytes as hold them.
+    format_weight_bits, format_exponent, format_index_bits : (formats,) int64
+        Synapse formats of the whole netlist; a core uses some of them.
+    provenance : mapping
+        JSON values only: checkpoint hash, graph, options, version.
+    clocks : Clocks
+        Input channels beyond those of the sensor, whose events :func:`dynamics.with_clocks` makes.
+    bins : int
+        Bins of the recordings that a step joins.
+    """
+
+    target: str
+    taxels: int
+    polarities: int
+    classes: int
+    layers: tuple[Layer, ...]
+    core_tile: IntArray
+    core_compartments: IntArray
+    core_axons: IntArray
+    layer: IntArray
+    neuron: IntArray
+    decay_u: IntArray
+    decay_v: IntArray
+    threshold: IntArray
+    bias_mantissa: IntArray
+    bias_exponent: IntArray
+    scale: FloatArray
+    readout_class: IntArray
+    axon_source: IntArray
+    axon_format: IntArray
+    axon_synapses: IntArray
+    synapse_target: IntArray
+    synapse_weight: IntArray
+    format_weight_bits: IntArray
+    format_exponent: IntArray
+    format_index_bits: IntArray
+    provenance: Mapping[str, Any]
+    clocks: Clocks = NO_CLOCKS
+    bins: int = 1
+
+    @property
+    def n_inputs(self) -> int:
+        """Number of input channels."""
+        return self.taxels * self.polarities + self.clocks.channels
+
+    @property
+    def n_cores(self) -> int:
+        """Number of cores in use."""
+        return len(self.core_tile)
+
+    @property
+    def n_compartments(self) -> int:
+        """Number of compartments on all cores."""
+        return len(self.layer)
+
+    @property
+    def n_axons(self) -> int:
+        """Number of input axons on all cores."""
+        return len(self.axon_source)
+
+    @property
+    def n_synapses(self) -> int:
+        """Number of stored synapses, zeros in dense lists included."""
+        return len(self.synapse_weight)
+
+    @property
+    def max_depth(self) -> int:
+        """Steps that the slowest layer lags behind the data."""
+        return max(layer.depth for layer in self.layers)
+
+    def compartments_of(self, layer: int) -> IntArray:
+        """Compartment ids of a layer, ordered by neuron; shape (compartments of the layer,)."""
+        ids = np.flatnonzero(self.layer == layer)
+        return ids[np.argsort(self.neuron[ids], kind="stable")]
+
+    def core_of_compartment(self) -> IntArray:
+        """Core of each compartment; shape (compartments,)."""
+        return np.repeat(np.arange(self.n_cores), np.diff(self.core_compartments))
+
+    def core_of_axon(self) -> IntArray:
+        """Core of each axon; shape (axons,)."""
+        return np.repeat(np.arange(self.n_cores), np.diff(self.core_axons))
+
+    def synapses_of(self, core: int) -> tuple[IntArray, IntArray, IntArray]:
+        """Synapses of one core: source, compartment and effective weight of each; all (synapses of the core,) int64.
+
+        Core by core, what holds for all synapses is found without arrays of them all.
+        """
+        axons = slice(*self.core_axons[core : core + 2].tolist())
+        ends = self.axon_synapses[axons.start : axons.stop + 1]
+        held, length = slice(*ends[[0, -1]].tolist()), np.diff(ends)
+        exponent = np.repeat(self.format_exponent[self.axon_format[axons]], length)
+        return (
+            np.repeat(self.axon_source[axons], length),
+            self.synapse_target[held] + self.core_compartments[core],
+            in_units(self.synapse_weight[held], exponent),
+        )
+
+    def axon_of_synapse(self) -> IntArray:
+        """Axon of each synapse; shape (synapses,)."""
+        return np.repeat(np.arange(self.n_axons), np.diff(self.axon_synapses))
+
+    def effective_weight(self) -> IntArray:
+        """``mantissa * 2**exponent`` of each synapse; shape (synapses,). Exact: at exponent -1 mantissas are even."""
+        exponent = self.format_exponent[self.axon_format[self.axon_of_synapse()]]
+        return in_units(self.synapse_weight, exponent)
+
+    def synapse_compartment(self) -> IntArray:
+        """Compartment id that each synapse targets; shape (synapses,)."""
+        base = self.core_compartments[self.core_of_axon()]
+        return self.synapse_target + base[self.axon_of_synapse()]
+
+
+def one_step_bounds(netlist: Netlist) -> tuple[IntArray, IntArray]:
+    """Largest positive and negative synaptic sum that one step can bring to each compartment.
+
+    No order of arrival and no input can bring a running sum outside ``-negative … positive``: it is reached when
+    every positive (negative) synapse is hit at once.
+
+    Returns
+    -------
+    positive, negative : (compartments,) int64
+        Non-negative magnitudes in weight units.
+    """
+    positive, negative = np.zeros((2, netlist.n_compartments), np.int64)
+    for core in range(netlist.n_cores):
+        _, compartment, weight = netlist.synapses_of(core)
+        first, last = netlist.core_compartments[core : core + 2]
+        for sums, share in ((positive, weight), (negative, -weight)):
+            # float64 sums of integers below 2**53 are exact
+            sums[first:last] = np.bincount(compartment - first, np.maximum(share, 0), last - first)
+    return positive, negative
+
+
+def in_units(mantissa: IntArray, exponent: IntArray) -> IntArray:
+    """``mantissa * 2**exponent``, int64; at exponent -1 mantissas are even."""
+    wide = mantissa.astype(np.int64)
+    return np.where(exponent < 0, wide >> 1, wide << np.maximum(exponent, 0))
+
+
+def frozen(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """The same array, read-only from now on."""
+    array.flags.writeable = False
+    return array
+
+
+def read_only(array: npt.ArrayLike) -> IntArray:
+    """Copy to a read-only int64 array, as every field of a netlist but ``scale`` is."""
+    copy = np.array(array, dtype=np.int64)
+    copy.flags.writeable = False
+    return copy
+
+
+def read_only_float(array: npt.ArrayLike) -> FloatArray:
+    """Copy to a read-only float64 array."""
+    copy = np.array(array, dtype=np.float64)
+    copy.flags.writeable = False
+    return copy

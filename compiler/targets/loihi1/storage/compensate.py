@@ -1,0 +1,137 @@
+"""Round the weights of a layer so that the errors of its synapses cancel on what the layer usually gets.
+
+Nearest rounding treats synapses one by one. Here they are rounded one after the other, and what one gains or loses is
+made up for by those still to come, as far as their inputs spike together; the bias takes up the mean that is left.
+No register, width or count changes.
+
+References
+----------
+.. [1] B. Hassibi, D. Stork, "Second order derivatives for network pruning: Optimal Brain Surgeon", NIPS 1992.
+.. [2] E. Frantar et al., "GPTQ: Accurate post-training quantization for generative pre-trained transformers", 2022,
+   arXiv:2210.17323: the order-by-order update through a Cholesky factor.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import sparse
+from scipy.linalg import solve_triangular
+
+from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX, FloatArray, IntArray
+from spikeloom.compiler.ir import Population, Projection
+from spikeloom.compiler.passes.calibrate import Calibration
+from spikeloom.compiler.targets.loihi1.storage.scales import Rounded, flips
+from spikeloom.compiler.targets.loihi1.storage.weight_storage import Form, loads, reach, scales, step_units, store
+
+DAMPING = 1e-3
+"""Share of the mean activity that is added to each input's own: inputs that never spiked are rounded to nearest."""
+
+BLOCK = 64
+"""Columns whose errors are passed on to all later ones at once: the same sums, as one matrix product."""
+
+
+def compensated(
+    population: Population,
+    projections: tuple[Projection, ...],
+    form: Form,
+    post: int,
+    calibration: Calibration,
+    observed: FloatArray | None = None,
+) -> Rounded | None:
+    """Round one population with compensation; None where a bias has no register value.
+
+    Weights that the range cuts off stay at its end: their errors are not passed on. A neuron whose sums would leave
+    the accumulator, or that keeps fewer of its spikes (one that fires from its bias alone, say), is rounded to
+    nearest instead. `observed` as for :func:`scales.rounded`.
+    """
+    scale, step = scales(population, form), step_units(form.bits, form.exponents)
+    offset, width = 0, sum(p.weight.shape[1] for p in projections)
+    wanted, stored = np.zeros((2, population.size, width))
+    places, sources = [], []
+    limit = reach(form.bits, form.exponents)
+    for p in projections:
+        row = np.repeat(np.arange(population.size), np.diff(p.weight.indptr))
+        place = row, offset + p.weight.indices
+        wanted[place] = p.weight.data * scale[row] / step
+        stored[place] = 1
+        places.append(place)
+        sources.append(calibration.source(p.pre, post).reshape(-1, p.weight.shape[1]))
+        offset += p.weight.shape[1]
+    held = np.clip(wanted, -limit, limit)
+    active = sparse.csr_array(np.concatenate(sources, axis=1), dtype=np.float32)
+    together = (active.T @ active).toarray().astype(np.float64) / active.shape[0]
+    rate = np.diag(together)
+    steps = np.zeros(wanted.shape, np.int64)
+    for rows, columns in _alike(stored):
+        part = np.ix_(rows, columns)
+        steps[part] = np.clip(_round_in_turn(held[part], together[np.ix_(columns, columns)]), -limit, limit)
+
+    def stored_as(steps: IntArray, errors: FloatArray) -> Rounded | None:
+        try:
+            bias = population.bias + errors
+            integer, planes = store(population, projections, form, [steps[place] for place in places], bias)
+        except ValueError:
+            return None
+        sums = loads(integer, planes) if observed is None else observed * scale
+        return Rounded(form=form, population=integer, projections=planes, reached=float(np.max(sums, initial=0)))
+
+    nearest = np.rint(held).astype(np.int64)
+    plain = stored_as(nearest, np.zeros(population.size))
+    errors = (held - steps) @ rate * step / scale
+    errors[population.size - population.relays :] = 0  # a relay has no bias
+    layer = stored_as(steps, errors)
+    if layer is None or plain is None:
+        return None
+    back = flips(layer, post, calibration) > flips(plain, post, calibration)
+    if observed is None:
+        back |= loads(layer.population, layer.projections) > ONE_STEP_SUM_MAX
+    steps[back], errors[back] = nearest[back], 0
+    return stored_as(steps, errors)
+
+
+def _alike(stored: FloatArray) -> list[tuple[IntArray, IntArray]]:
+    """Neurons with synapses from the same inputs, and these inputs."""
+    groups: dict[bytes, list[int]] = {}
+    for row in range(len(stored)):
+        groups.setdefault(stored[row].tobytes(), []).append(row)
+    return [(np.array(rows), np.flatnonzero(stored[rows[0]])) for rows in groups.values()]
+
+
+def _round_in_turn(weight: FloatArray, together: FloatArray) -> FloatArray:
+    """Round columns one after the other, the most active first, each error passed on to the columns that follow.
+
+    Parameters
+    ----------
+    weight : (neurons, inputs) float64
+        In steps.
+    together : (inputs, inputs) float64
+        Mean of ``x x^T``.
+    """
+    inputs = weight.shape[1]
+    order = np.argsort(-np.diag(together), kind="stable")
+    follow = _follow(
+        together[np.ix_(order, order)] + np.eye(inputs) * (DAMPING * np.trace(together) / max(inputs, 1) + 1e-12)
+    )
+    left = weight[:, order]
+    rounded = np.empty_like(left)
+    for start in range(0, inputs, BLOCK):
+        end = min(start + BLOCK, inputs)
+        errors = np.empty((len(left), end - start))
+        for j in range(start, end):
+            rounded[:, j] = np.rint(left[:, j])
+            errors[:, j - start] = left[:, j] - rounded[:, j]
+            left[:, j + 1 : end] -= np.outer(errors[:, j - start], follow[j, j + 1 : end])
+        left[:, end:] -= errors @ follow[start:end, end:]
+    back = np.empty_like(rounded)
+    back[:, order] = rounded
+    return back
+
+
+def _follow(together: FloatArray) -> FloatArray:
+    """Share of each input's error that each later one makes up for: the Cholesky factor of the inverse, rows scaled.
+
+    The factor is that of the reversed matrix, inverted and turned round, so that the inverse itself is never formed.
+    """
+    lower = np.linalg.cholesky(together[::-1, ::-1])
+    upper: FloatArray = solve_triangular(lower, np.eye(len(lower)), lower=True)[::-1, ::-1]
+    return upper / np.diag(upper)[:, None]

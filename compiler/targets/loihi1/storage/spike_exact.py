@@ -1,0 +1,175 @@
+"""Add planes and scales, layer by layer, until every calibration spike is the float64 model's.
+
+Each layer is judged on the float64 model's own input, so that one layer's errors do not hide another's: if no layer
+moves a spike, the whole network does not. Where spikes still move, it is said which limit of the chip is in the way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from spikeloom.compiler.fixedpoint import THRESHOLD_MANTISSA_MAX, IntArray
+from spikeloom.compiler.interpret import float_recurrence, product
+from spikeloom.compiler.ir import IntegerNetwork, Network
+from spikeloom.compiler.passes.calibrate import Calibration, fewer
+from spikeloom.compiler.targets.base import Target
+from spikeloom.compiler.targets.loihi1.storage.quantize import (
+    Candidate,
+    Choice,
+    Recipe,
+    assemble,
+    explain_choice,
+    incoming,
+    round_with_more,
+    shortlist,
+)
+from spikeloom.compiler.targets.loihi1.storage.scales import finest_thresholds, flips, in_batches
+from spikeloom.compiler.targets.loihi1.storage.weight_storage import current_load, decay_registers, reach, step_units
+
+SHARED = 0.8
+"""A neuron whose threshold is below this share of its own finest is held back by those it shares the threshold with."""
+
+AT_LIMIT = 0.99
+"""A register counts as full from this share on."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Exactness:
+    """What was tried for one population, and what is in the way of exactness.
+
+    Parameters
+    ----------
+    layer : str
+        Population.
+    tried : tuple of (planes, groups, spikes that move)
+        In order, on ``calibrate.FEW`` recordings; the best was taken, and rounded anew on ``calibrate.MANY``.
+    flips, spikes : int
+        Spikes that move in what was taken, and all spikes of the float64 model, on all calibration recordings.
+    limits : tuple of (limit, spikes that move)
+        Spikes that still move, by what keeps their neuron's scale from being finer.
+    decay : int
+        Spikes that move if nothing but the 12-bit decay deviates.
+    """
+
+    layer: str
+    tried: tuple[tuple[int, int, int], ...]
+    flips: int
+    spikes: int
+    limits: tuple[tuple[str, int], ...]
+    decay: int
+
+
+def make_exact(
+    network: Network,
+    target: Target,
+    calibration: Calibration,
+    *,
+    bits: int = 8,
+    tell: Callable[[str], None] = lambda _what: None,
+) -> tuple[IntegerNetwork, tuple[Choice, ...], tuple[Exactness, ...]]:
+    """Choose planes and scales of every population.
+
+    Parameters
+    ----------
+    network : Network
+        Float stage.
+    target : Target
+        Permitted widths, exponents and thresholds.
+    calibration : Calibration
+        Float64 spikes on all training recordings.
+    bits : int
+        Storage width of a mantissa.
+    tell : callable
+        Told the name of each population as it starts.
+
+    Returns
+    -------
+    IntegerNetwork
+        Integer stage.
+    tuple of Choice, tuple of Exactness
+        One per population.
+
+    Raises
+    ------
+    ModelError
+        If a population has no usable scale.
+    """
+    slots = target.limit("core.threshold_slots")
+    steps = (1, 1), (2, 1), (2, slots), (3, slots)
+    ladder = [Recipe(bits=bits, planes=planes, groups=groups) for planes, groups in steps]
+    exponents = target.choices["synapse.exponent"]
+    few = fewer(calibration)
+    chosen, found = [], []
+    for post, population in enumerate(network.populations):
+        tell(population.name)
+        best: Candidate | None = None
+        tried: list[tuple[int, int, int]] = []
+        for recipe in ladder:
+            if recipe.planes > 2 and best is not None and not len(_full_range(network, post, best)):
+                break  # the planes hold every weight already
+            candidate = shortlist(network, post, recipe, exponents, few, None, clip=False)[0]
+            moved = candidate.flips or 0
+            tried.append((recipe.planes, recipe.groups, moved))
+            if best is None or moved <= (best.flips or 0):
+                best = candidate
+            if not moved and not flips(candidate.layer, post, calibration).any():
+                break
+        assert best is not None, "the ladder has steps"
+        if best.flips:
+            best = round_with_more(network, post, best, calibration)
+        moved_by = flips(best.layer, post, calibration)
+        chosen.append(replace(best, flips=int(moved_by.sum())))
+        found.append(
+            Exactness(
+                layer=population.name,
+                tried=tuple(tried),
+                spikes=int(np.count_nonzero(calibration.spikes[post])),
+                flips=int(moved_by.sum()),
+                limits=_limits(network, post, best, moved_by, slots) if moved_by.any() else (),
+                decay=_decay_flips(network, post, calibration) if moved_by.any() else 0,
+            )
+        )
+    choices = tuple(explain_choice(network, post, c, calibration) for post, c in enumerate(chosen))
+    return assemble(network, [c.layer for c in chosen]), choices, tuple(found)
+
+
+def _full_range(network: Network, post: int, candidate: Candidate) -> IntArray:
+    """Neurons whose largest weight fills the planes."""
+    form, scale = candidate.layer.form, candidate.layer.population.scale
+    peak = np.zeros(len(scale))
+    for p in incoming(network, post):
+        row = np.repeat(np.arange(len(scale)), np.diff(p.weight.indptr))
+        np.maximum.at(peak, row, np.abs(p.weight.data) * scale[row])
+    steps = peak / step_units(form.bits, form.exponents)
+    return np.flatnonzero(steps >= AT_LIMIT * reach(form.bits, form.exponents))
+
+
+def _limits(
+    network: Network, post: int, candidate: Candidate, moved: IntArray, slots: int
+) -> tuple[tuple[str, int], ...]:
+    form = candidate.layer.form
+    population, projections = network.populations[post], incoming(network, post)
+    finest = finest_thresholds(population, projections, form.bits, form.exponents, 1.0, None)
+    fullest = "24-bit current" if current_load(candidate.layer.population.decay_u) > 1 else "21-bit accumulator"
+    cause = np.full(population.size, fullest, dtype=object)
+    cause[_full_range(network, post, candidate)] = "range of the planes"
+    cause[form.threshold >= AT_LIMIT * THRESHOLD_MANTISSA_MAX] = "17-bit threshold"
+    cause[form.threshold < SHARED * finest] = f"{slots} thresholds a core"
+    counted = {str(name): int(moved[cause == name].sum()) for name in sorted(set(cause))}
+    return tuple((name, count) for name, count in sorted(counted.items(), key=lambda pair: -pair[1]) if count)
+
+
+def _decay_flips(network: Network, post: int, calibration: Calibration) -> int:
+    population, projections = network.populations[post], incoming(network, post)
+    lost_u, lost_v = decay_registers(population.beta, population.alpha)
+    realised = replace(population, alpha=(4095 - lost_u) / 4096, beta=(4096 - lost_v) / 4096)
+
+    def moved(part: slice) -> IntArray:
+        sums = sum(product(p.weight, calibration.source(p.pre, post)[part], np.float64) for p in projections)
+        spikes, _ = float_recurrence(realised, np.asarray(sums))
+        return np.asarray(np.count_nonzero(spikes != calibration.spikes[post][part]))
+
+    return int(np.sum(in_batches(calibration, moved)))

@@ -1,0 +1,294 @@
+"""How a population is stored: width and exponents of its weights, threshold of each neuron; and rounding to that.
+
+This is the one place where weights become mantissas, for the compiler and for quantisation-aware training alike.
+
+A scale is never stored beside a threshold: a neuron whose threshold is ``T`` weight units has ``T / theta`` weight
+units to each membrane unit of the float model, so the threshold carries no rounding at all.
+
+*Planes.* A synapse may be stored several times, with different exponents; the chip adds them up. Two planes of eight
+bits are one weight of up to 16 bits. Only a weight that the finest plane cannot hold uses the next one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from spikeloom.compiler.fixedpoint import (
+    CURRENT_MAX,
+    DECAY_BITS,
+    MEMBRANE_MAX,
+    MEMBRANE_SHIFT,
+    ONE_STEP_SUM_MAX,
+    FloatArray,
+    IntArray,
+    encode_bias,
+    round_half_even,
+    weight_step,
+)
+from spikeloom.compiler.ir import (
+    MANTISSA,
+    IntegerPopulation,
+    IntegerProjection,
+    Population,
+    Projection,
+    one_sided,
+    row_parts,
+    with_data,
+)
+
+DECAY_ONE = 1 << DECAY_BITS
+
+FORGETS = DECAY_ONE - 1
+"""`decay_u` of a current that forgets everything in one step."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Form:
+    """How one population is stored.
+
+    Parameters
+    ----------
+    bits : int
+        Storage width of a mantissa.
+    exponents : tuple of int
+        Exponent of each plane, finest first.
+    threshold : (neurons,) int64
+        Threshold mantissas, at least 1.
+    """
+
+    bits: int
+    exponents: tuple[int, ...]
+    threshold: IntArray
+
+
+def decay_registers(beta: float, alpha: float = 0.0) -> tuple[int, int]:
+    """Registers ``decay_u`` and ``decay_v`` nearest to a current decay and a membrane decay.
+
+    The chip's current loses one part in 4096 more than its register says. So it can forget all, which a membrane
+    cannot, and cannot keep all.
+
+    Examples
+    --------
+    >>> decay_registers(0.2)
+    (4095, 3277)
+    >>> decay_registers(0.2, 0.95)
+    (204, 3277)
+    """
+    return min(4095, max(0, round(4096 * (1 - alpha)) - 1)), min(4095, max(0, round(4096 * (1 - beta))))
+
+
+def plane_distance(bits: int) -> int:
+    """Largest difference of exponents at which two planes leave no gap between their values.
+
+    Examples
+    --------
+    >>> [plane_distance(bits) for bits in (8, 4, 2)]
+    [7, 3, 1]
+    """
+    codes = (256 - weight_step(bits)) // weight_step(bits)
+    return (2 * codes + 1).bit_length() - 1
+
+
+def reach(bits: int, exponents: tuple[int, ...]) -> int:
+    """Largest magnitude that planes hold together, in steps of the finest one.
+
+    Examples
+    --------
+    >>> reach(8, (0,)), reach(8, (-1, 6)), reach(2, (0, 1))
+    (127, 16383, 3)
+    """
+    codes = (256 - weight_step(bits)) // weight_step(bits)
+    return codes * sum(1 << (exponent - exponents[0]) for exponent in exponents)
+
+
+def step_units(bits: int, exponents: tuple[int, ...]) -> float:
+    """Weight units of one step of the finest plane."""
+    return float(weight_step(bits) * 2.0 ** exponents[0])
+
+
+def round_steps(weight: FloatArray, scale: FloatArray | float, bits: int, exponents: tuple[int, ...]) -> IntArray:
+    """Round weights to whole steps of the finest plane and clip them to what the planes hold.
+
+    Parameters
+    ----------
+    weight : (...) float64
+        Real weights.
+    scale : (...) float64
+        Weight units per real unit; broadcasts against `weight`.
+
+    Examples
+    --------
+    >>> round_steps(np.array([1.0, -0.3, 100.0]), 254.0, 8, (0,)).tolist()
+    [127, -38, 127]
+    """
+    limit = reach(bits, exponents)
+    return np.clip(round_half_even(weight * (scale / step_units(bits, exponents))), -limit, limit)
+
+
+def split_planes(steps: IntArray, bits: int, exponents: tuple[int, ...]) -> list[IntArray]:
+    """Mantissas of each plane, finest first, which add up to given steps of the finest one.
+
+    A coarser plane is zero wherever the finer ones hold the value.
+
+    Examples
+    --------
+    >>> [plane.tolist() for plane in split_planes(np.array([5, 127, 128, -300]), 8, (-1, 6))]
+    [[10, 254, 0, -88], [0, 0, 2, -4]]
+    """
+    codes = (256 - weight_step(bits)) // weight_step(bits)
+    rest, mantissas = steps, []
+    for k in range(len(exponents) - 1, 0, -1):
+        ratio = 1 << (exponents[k] - exponents[0])
+        code = np.clip(round_half_even(rest / ratio), -codes, codes)
+        code = np.where(np.abs(rest) <= reach(bits, exponents[:k]), 0, code)
+        rest = rest - code * ratio
+        mantissas.append(code * weight_step(bits))
+    return [rest * weight_step(bits), *reversed(mantissas)]
+
+
+def scales(population: Population, form: Form) -> FloatArray:
+    """Weight units per membrane unit of the float model; shape (neurons,)."""
+    found: FloatArray = form.threshold / population.theta
+    return found
+
+
+def store_steps(projection: Projection, steps: IntArray, form: Form) -> tuple[IntegerProjection, ...]:
+    """One integer projection for each plane in use; the finest holds every structural synapse.
+
+    Parameters
+    ----------
+    steps : (synapses,) int64
+        Weights in steps of the finest plane, in the order of the projection's synapses.
+    """
+    stored = []
+    for plane, mantissa in enumerate(split_planes(steps, form.bits, form.exponents)):
+        weight = with_data(projection.weight, mantissa.astype(MANTISSA))
+        if plane:
+            weight = weight.copy()
+            weight.eliminate_zeros()
+        if not plane or weight.nnz:
+            stored.append(
+                IntegerProjection(
+                    pre=projection.pre,
+                    post=projection.post,
+                    weight=weight,
+                    exponent=form.exponents[plane],
+                    bits=form.bits,
+                )
+            )
+    return tuple(stored)
+
+
+def nearest_steps(population: Population, projection: Projection, form: Form) -> IntArray:
+    """Weights of a projection in whole steps of the finest plane, each rounded to the nearest; shape (synapses,)."""
+    weight, scale = projection.weight, scales(population, form)
+    steps = np.empty(weight.nnz, np.int32)
+    for rows in row_parts(weight):
+        held = slice(weight.indptr[rows.start], weight.indptr[rows.stop])
+        each = np.repeat(scale[rows], np.diff(weight.indptr[rows.start : rows.stop + 1]))
+        steps[held] = round_steps(weight.data[held], each, form.bits, form.exponents)
+    return steps
+
+
+def store(
+    population: Population,
+    projections: tuple[Projection, ...],
+    form: Form,
+    steps: Sequence[IntArray],
+    bias: FloatArray | None = None,
+) -> tuple[IntegerPopulation, tuple[IntegerProjection, ...]]:
+    """Registers of one population and its synapses, whose weights are given in steps.
+
+    Parameters
+    ----------
+    steps : sequence of (synapses,) int64
+        One array per projection.
+    bias : (neurons,) float64, optional
+        Instead of the population's, model units.
+
+    Raises
+    ------
+    ValueError
+        If a bias has no register value at this scale.
+    """
+    scale = scales(population, form)
+    wanted = population.bias if bias is None else bias
+    mantissa, exponent = encode_bias(wanted * scale * (1 << MEMBRANE_SHIFT))
+    decay_u, decay_v = decay_registers(population.beta, population.alpha)
+    integer = IntegerPopulation(
+        name=population.name,
+        beta=population.beta,
+        theta=population.theta,
+        alpha=population.alpha,
+        scale=scale,
+        decay_u=decay_u,
+        decay_v=decay_v,
+        threshold=form.threshold,
+        bias_mantissa=mantissa,
+        bias_exponent=exponent,
+    )
+    pairs = zip(projections, steps, strict=True)
+    return integer, tuple(plane for p, data in pairs for plane in store_steps(p, data, form))
+
+
+def round_population(
+    population: Population, projections: tuple[Projection, ...], form: Form
+) -> tuple[IntegerPopulation, tuple[IntegerProjection, ...]]:
+    """Registers of one population and its synapses, everything rounded to the nearest; raises as :func:`store`."""
+    return store(population, projections, form, [nearest_steps(population, p, form) for p in projections])
+
+
+def current_load(decay_u: int) -> float:
+    """Share of its register that a current can fill, against that of the accumulator which a sum of one step fills.
+
+    A current that loses ``(decay_u + 1) / 4096`` a step adds up to ``4096 / (decay_u + 1)`` sums, in a register four
+    times as wide. At least 1: the accumulator comes first.
+
+    Examples
+    --------
+    >>> current_load(4095), round(current_load(204), 3)
+    (1.0, 4.995)
+    """
+    return max(1.0, ONE_STEP_SUM_MAX * (4096 / (decay_u + 1)) * (1 << MEMBRANE_SHIFT) / CURRENT_MAX)
+
+
+def one_sided_sums(projections: tuple[IntegerProjection, ...], neurons: int) -> IntArray:
+    """Largest one-sided synaptic sum that any input can bring to each neuron, weight units; shape (neurons,).
+
+    Planes count one by one, which covers every order of their arrival.
+    """
+    up, down = two_sums(projections, neurons)
+    return np.maximum(up, down)
+
+
+def two_sums(projections: tuple[IntegerProjection, ...], neurons: int) -> tuple[IntArray, IntArray]:
+    """Largest positive and negative synaptic sum of each neuron, as magnitudes; see :func:`one_sided_sums`."""
+    up, down = np.zeros(neurons, np.int64), np.zeros(neurons, np.int64)
+    for projection in projections:
+        positive, negative = one_sided(projection)
+        up += positive
+        down += negative
+    return up, down
+
+
+def loads(population: IntegerPopulation, projections: tuple[IntegerProjection, ...]) -> FloatArray:
+    """One-sided sums, or more where a current that outlasts its step fills a register sooner; shape (neurons,).
+
+    What is within ``ONE_STEP_SUM_MAX`` overflows neither accumulator nor current, whatever the input. Nor does it
+    saturate a membrane, unless that keeps more than half of itself: the scale would then be too coarse.
+    """
+    up, down = two_sums(projections, population.size)
+    worst = np.maximum(up, down).astype(np.float64)
+    if population.decay_u == FORGETS:
+        return worst
+    fullest = worst * current_load(population.decay_u)
+    if 2 * population.decay_v >= DECAY_ONE:
+        gather, lost = (1 << MEMBRANE_SHIFT) * DECAY_ONE / (population.decay_u + 1), population.decay_v / DECAY_ONE
+        held = (1 - lost) * (population.threshold << MEMBRANE_SHIFT)
+        rise = held + gather * up + np.maximum(population.bias, 0)
+        fall = (gather * down + np.maximum(-population.bias, 0)) / lost
+        fullest = np.maximum(fullest, np.maximum(rise, fall) * (ONE_STEP_SUM_MAX / MEMBRANE_MAX))
+    return fullest

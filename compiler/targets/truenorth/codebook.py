@@ -1,0 +1,289 @@
+"""A history-free network in levels: weights as whole multiples of a step of each neuron, sums that may saturate.
+
+A membrane that forgets within a step (decay 0) is the one that a TactileSGNet and a crossbar core have in common. With
+its weights in the levels that ``m`` axons of an input give, a neuron spikes where ``sum_i k_i x_i`` of whole numbers
+reaches a threshold, a whole number, too. Sums over more inputs than fit a core are made of partial sums, which count
+``MOST`` at the most, above zero and below: that is what :mod:`truenorth.in_time` can lead from core to core.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.fixedpoint import FloatArray, IntArray
+from spikeloom.compiler.ir import INPUT, Network, Population
+from spikeloom.compiler.targets.base import Target
+from spikeloom.compiler.targets.loihi1.netlist import read_only
+from spikeloom.compiler.targets.truenorth.netlist import AXON_TYPES
+
+BoolArray = npt.NDArray[np.bool_]
+
+BIN_TICKS = 20
+"""Ticks of a data step whose sums travel in time: a millisecond each of the sensor's 20."""
+
+MOST = BIN_TICKS - 1
+"""Spikes that a partial sum sends at the most."""
+
+COPIES = (2, 3, 4)
+"""Axons of an input that can be asked for."""
+
+MOST_COPIES = 3
+"""Axons of an input of a layer that hears a clock: with four every type is an input's."""
+
+EMPTYING = 4
+"""Axons by which a clock empties neurons of partial sums: more than these can hold."""
+
+LIFT, PULL = 255, -256
+"""Weights of the clocks of gated neurons."""
+
+SEARCHED = np.linspace(0.1, 1.0, 19)
+"""Shares of the largest weight that are tried as the largest level of a codebook."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Levels:
+    """Weights as whole multiples of a step of each neuron.
+
+    Parameters
+    ----------
+    level : (neurons, inputs) float32
+        Whole numbers.
+    step : (neurons,) float32
+    """
+
+    level: npt.NDArray[np.float32]
+    step: npt.NDArray[np.float32]
+
+
+def codebook(weight: FloatArray, copies: int) -> Levels:
+    """Weights (neurons, inputs) in the levels that so many axons an input give: for 2, 3, 4 copies -1…1, -4…3, -8…7.
+
+    The weights of the types are 1 and -1; 1, 2 and -4; 1, 2, 4 and -8, times a step that each neuron has of its own:
+    of those tried, the one of least squared error.
+
+    Examples
+    --------
+    >>> found = codebook(np.array([[0.5, -0.4, 0.02]]), 2)
+    >>> found.level.tolist(), [f"{step:.2f}" for step in found.step]
+    ([[1.0, -1.0, 0.0]], ['0.45'])
+    """
+    low, high = (-1, 1) if copies == 2 else (-(1 << (copies - 1)), (1 << (copies - 1)) - 1)
+    largest = np.maximum(np.abs(weight).max(axis=1, keepdims=True), 1e-12)
+    best = np.full(len(weight), np.inf)
+    step, level = np.ones(len(weight)), np.zeros(weight.shape)
+    for share in (*SEARCHED, *(-low / level for level in range(1, -low))):  # the latter: the largest is that level
+        tried = share * largest / -low
+        rounded = np.clip(np.rint(weight / tried), low, high)
+        error = ((rounded * tried - weight) ** 2).sum(axis=1)
+        better = error < best
+        best[better], step[better], level[better] = error[better], tried[better, 0], rounded[better]
+    return Levels(level=level.astype(np.float32), step=step.astype(np.float32))
+
+
+def type_weights(copies: int) -> tuple[int, ...]:
+    """Weights of the four axon types, in levels, with so many axons an input: its own first, then none.
+
+    Examples
+    --------
+    >>> type_weights(2), type_weights(3), type_weights(4)
+    ((1, -1, 0, 0), (1, 2, -4, 0), (1, 2, 4, -8))
+    """
+    own = (1, -1) if copies == 2 else (*(1 << bit for bit in range(copies - 1)), -(1 << (copies - 1)))
+    return (*own, *[0] * (AXON_TYPES - copies))
+
+
+def level_points(levels: IntArray, copies: int) -> IntArray:
+    """Which axons of an input to join, as 0 and 1 along a new last axis, so that each level comes out.
+
+    Examples
+    --------
+    >>> level_points(np.array([-4, -1, 0, 3]), 3).tolist(), level_points(np.array([-1, 0, 1]), 2).tolist()
+    ([[0, 0, 1], [1, 1, 1], [0, 0, 0], [1, 1, 0]], [[0, 1], [0, 0], [1, 0]])
+    """
+    if copies == 2:
+        return np.stack([levels > 0, levels < 0], axis=-1).astype(np.int64)
+    found: IntArray = levels[..., None] >> np.arange(copies) & 1
+    return found
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Layer:
+    """Neurons that spike where the sum of their levels reaches their threshold.
+
+    Parameters
+    ----------
+    name : str
+    level : (neurons, inputs) int64
+    threshold : (neurons,) int64
+    copies : int
+        Axons of an input.
+    width : int
+        Inputs that are added up together; fewer than there are where the sum travels in time.
+    """
+
+    name: str
+    level: IntArray
+    threshold: IntArray
+    copies: int
+    width: int
+
+    @property
+    def groups(self) -> list[slice]:
+        """Inputs that are added up together."""
+        inputs = self.level.shape[1]
+        return [slice(first, min(first + self.width, inputs)) for first in range(0, inputs, self.width)]
+
+    @property
+    def is_split(self) -> bool:
+        """Whether its sums travel in time."""
+        return bool(self.width < self.level.shape[1])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LevelNetwork:
+    """A chain of history-free layers in whole numbers.
+
+    Parameters
+    ----------
+    taxels, polarities, classes : int
+    layers : tuple of Layer
+    label : (voters,) int64
+        Class that each neuron of the last layer votes for.
+    """
+
+    taxels: int
+    polarities: int
+    classes: int
+    layers: tuple[Layer, ...]
+    label: IntArray
+
+
+def group_width(copies: int, chip: Target) -> int:
+    """Inputs of a group, with the axons of a clock beside.
+
+    Examples
+    --------
+    >>> from spikeloom.compiler.targets.base import CROSSBARS, load_target
+    >>> [group_width(copies, load_target("truenorth", CROSSBARS)) for copies in (2, 3)]
+    [126, 84]
+    """
+    return (chip.limit("core.axons") - EMPTYING) // copies
+
+
+def in_levels(network: Network, copies: int, chip: Target) -> LevelNetwork:
+    """Round a history-free network to levels.
+
+    Parameters
+    ----------
+    network : Network
+        A chain of layers.
+    copies : int
+        Axons of an input, 2 to 4; layers that hear a clock take three at the most.
+    chip : Target
+
+    Raises
+    ------
+    ModelError
+        If a layer remembers, a step joins bins, or the network is no chain without clocks.
+    """
+    if network.input.clocks.channels:
+        raise ModelError("has clocks; sums in time are for networks without")
+    if network.input.bins > 1:
+        raise ModelError(f"a step joins {network.input.bins} bins; sums in time are for networks that hear each")
+    layers = []
+    for index, population in enumerate(network.populations):
+        if population.beta or population.alpha:
+            what, kept = ("membranes", population.beta) if population.beta else ("currents", population.alpha)
+            raise ModelError(f"{population.name}: keeps {kept:g} of its {what} a step, sums in time forget all")
+        heard = [projection for projection in network.projections if projection.post == index]
+        if [projection.pre for projection in heard] != [index - 1 if index else INPUT]:
+            raise ModelError(f"{population.name}: does not hear the layer before and nothing else")
+        layers.append(_layer(population, heard[0].weight.toarray(), copies, chip))
+    return LevelNetwork(
+        taxels=network.input.taxels,
+        polarities=network.input.polarities,
+        classes=network.classes,
+        layers=tuple(layers),
+        label=network.readout.label,
+    )
+
+
+def _layer(population: Population, weight: FloatArray, copies: int, chip: Target) -> Layer:
+    """Levels of a layer: in as many copies as were asked for, if its inputs fit a core so and it hears no clock."""
+    fan_in = int(np.count_nonzero(weight, axis=1).max(initial=0))
+    for tried in dict.fromkeys((copies, min(copies, MOST_COPIES))):
+        book = codebook(weight, tried)
+        threshold = np.floor((population.theta - population.bias) / book.step.astype(np.float64)).astype(np.int64) + 1
+        whole = fan_in * tried < chip.limit("core.axons")
+        if tried <= MOST_COPIES or (whole and threshold.min(initial=1) > 0):
+            break
+    return Layer(
+        name=population.name,
+        level=read_only(book.level.astype(np.int64)),
+        threshold=read_only(threshold),
+        copies=tried,
+        width=weight.shape[1] if whole else group_width(tried, chip),
+    )
+
+
+def gate_axons(groups: int, least: int = 0) -> tuple[int, int]:
+    """Axons of the clocks that lift a gated neuron to its threshold, and that pull it down.
+
+    Parameters
+    ----------
+    groups : int
+        Whose partial sums it adds up.
+    least : int
+        Lowest threshold on its core.
+
+    Examples
+    --------
+    >>> gate_axons(30)
+    (3, 9)
+    """
+    reach = MOST * groups
+    lifts = (reach - least) // LIFT + 1
+    return lifts, (2 * reach + LIFT * lifts) // -PULL + 2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Run:
+    """What a network in levels does.
+
+    Parameters
+    ----------
+    spikes : tuple of (steps, neurons) bool
+        By layer.
+    partial, saturated : tuple of int
+        Partial sums of each layer that travel in time, and those beyond what can be sent.
+    largest : tuple of int
+        Largest magnitude of one.
+    """
+
+    spikes: tuple[BoolArray, ...]
+    partial: tuple[int, ...]
+    saturated: tuple[int, ...]
+    largest: tuple[int, ...]
+
+
+def run_levels(network: LevelNetwork, events: npt.NDArray[np.uint8], *, most: int = MOST) -> Run:
+    """Run one recording (channels, steps) through a network in levels; every sum is exact.
+
+    Partial sums count `most` at the most; on the chip that is ``MOST``.
+    """
+    heard = (events > 0).T.astype(np.float64)  # whole numbers, so that the products are exact and fast
+    spikes, partial, saturated, largest = [], [], [], []
+    for layer in network.layers:
+        sums = [heard[:, group] @ layer.level[:, group].T.astype(np.float64) for group in layer.groups]
+        split = layer.is_split
+        partial.append(sum(part.size for part in sums) if split else 0)
+        saturated.append(sum(int(np.count_nonzero(np.abs(part) > most)) for part in sums) if split else 0)
+        largest.append(max(int(np.abs(part).max(initial=0)) for part in sums) if split else 0)
+        total = sum(np.clip(part, -most, most) for part in sums) if split else sums[0]
+        spikes.append(total >= layer.threshold)
+        heard = spikes[-1].astype(np.float64)
+    return Run(spikes=tuple(spikes), partial=tuple(partial), saturated=tuple(saturated), largest=tuple(largest))

@@ -1,0 +1,288 @@
+"""Place a history-free network of full fan-in on crossbar cores: sums that travel in time, one data step in 20 ticks.
+
+A network in levels (:mod:`truenorth.codebook`) has nothing that a crossbar core has not, but fan-in: partial
+sums leave a core as spikes only. So they leave it as *numbers of spikes*. In tick ``t`` of a data step, inputs in 0:
+
+========  ==============================================================================================================
+``0``     the inputs of a group arrive; one neuron holds their sum, another the sum of opposite sign, zero at the least
+``0…18``  each of these spikes as long as it holds one or more, and gives one away (linear reset): at most 19
+``1…19``  the gated neuron adds these spikes up, those for negative sums with weight -1
+``19``    a clock lifts it by as much as its threshold lies above all sums: it spikes where the sum is large enough;
+          another clock empties what the neurons of partial sums still hold
+``20``    a third clock pulls it below its negative threshold, which resets it to zero
+========  ==============================================================================================================
+
+That is exact where every partial sum lies within 19, and saturates otherwise, as the network in levels does, spike for
+spike. A layer whose inputs fit a core is added up in one tick instead. Spikes of a split layer are led on by relays,
+those of the others by copies of the neurons.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from spikeloom.compiler.errors import CapacityError, Violation
+from spikeloom.compiler.fixedpoint import IntArray
+from spikeloom.compiler.targets.base import Target
+from spikeloom.compiler.targets.truenorth.builder import RELAY, Draft, Neuron
+from spikeloom.compiler.targets.truenorth.codebook import (
+    BIN_TICKS,
+    EMPTYING,
+    LIFT,
+    MOST,
+    PULL,
+    Layer,
+    LevelNetwork,
+    gate_axons,
+    level_points,
+    type_weights,
+)
+from spikeloom.compiler.targets.truenorth.legalize import signed_range
+from spikeloom.compiler.targets.truenorth.lower import place_cores
+from spikeloom.compiler.targets.truenorth.netlist import AXON_TYPES, RESET_LINEAR, RESET_TO, CrossbarNetlist
+
+CLOCK = AXON_TYPES - 1
+"""Type of axons that clocks reach on cores that add up inputs."""
+
+RELAYED = 2
+"""Ticks that a spike of a split layer takes to the next one, by a relay or without."""
+
+
+# -- placing -----------------------------------------------------------------------------------------------------------
+
+Place = tuple[int, int]
+"""Core, and neuron or line on it."""
+
+Aim = tuple[int, int, int]
+"""Core, line, and ticks on the way."""
+
+
+def lower_in_time(
+    network: LevelNetwork, chip: Target, *, provenance: Mapping[str, Any] | None = None
+) -> CrossbarNetlist:
+    """Place a network in levels.
+
+    Raises
+    ------
+    CapacityError
+        If a threshold is too high, or a layer has more groups or targets than a core holds; cores are not counted here.
+    """
+    placing = _Placing(network=network, chip=chip, starts=_starts(network))
+    ends: list[list[Place]] | None = None
+    for depth in range(len(network.layers) - 1, -1, -1):
+        ends = placing.layer(depth, ends)
+    for channel, places in enumerate(ends or []):
+        for core, line in places:
+            placing.draft.feed(channel, core, line, tick=0)
+    place_cores(placing.draft, placing.wires, chip, "use fewer axons an input, or train with fewer features")
+    return placing.draft.netlist(
+        taxels=network.taxels,
+        polarities=network.polarities,
+        classes=network.classes,
+        bin_ticks=BIN_TICKS,
+        target=chip.name,
+        provenance=provenance,
+    )
+
+
+def _starts(network: LevelNetwork) -> list[int]:
+    """Tick in which the inputs of the first data step reach each layer."""
+    starts = [0]
+    for layer in network.layers[:-1]:
+        starts.append(starts[-1] + (MOST + RELAYED if layer.is_split else 1))
+    return starts
+
+
+def first_spikes(network: LevelNetwork) -> dict[str, int]:
+    """Tick in which each layer spikes for the first data step."""
+    starts = _starts(network)
+    return {layer.name: start + layer.is_split * MOST for layer, start in zip(network.layers, starts, strict=True)}
+
+
+@dataclass(slots=True, kw_only=True)
+class _Placing:
+    """Cores as they are made, last layer first.
+
+    Parameters
+    ----------
+    starts : list of int
+        Of the layers.
+    """
+
+    network: LevelNetwork
+    chip: Target
+    starts: list[int]
+    draft: Draft = field(default_factory=Draft)
+    wires: list[tuple[Place, Aim]] = field(default_factory=list)
+    relay_core: int | None = None
+
+    def layer(self, depth: int, ends: list[list[Place]] | None) -> list[list[Place]]:
+        """Add a layer whose neurons reach axons `ends`; return the axons that each of its inputs must reach."""
+        layer = self.network.layers[depth]
+        if layer.is_split:
+            return self._split(depth, layer, ends)
+        return self._whole(depth, layer, ends)
+
+    def _whole(self, depth: int, layer: Layer, ends: list[list[Place]] | None) -> list[list[Place]]:
+        """A layer whose inputs fit a core: a neuron for each axon that hears it, all in one tick."""
+        inputs: list[list[Place]] = [[] for _ in range(layer.level.shape[1])]
+        aims = [(n, end) for n in range(len(layer.level)) for end in ([None] if ends is None else ends[n])]
+        own, start = type_weights(layer.copies), self.starts[depth]
+        for part in self._packed(layer, aims):
+            core = self.draft.core(0, 0)
+            for n, end in part:
+                threshold = int(layer.threshold[n])
+                # one that would spike without inputs has to wait for a clock: its leak alone must not do
+                lift, leak = (own[CLOCK], -threshold) if threshold > 0 else (1 - threshold, -1)
+                self._require_leak(layer, n, max(-leak, lift))
+                weights = (*own[:CLOCK], lift)
+                made = Neuron(weights=(weights[0], weights[1], weights[2], weights[3]), leak=leak, threshold=0)
+                self._add(core, made, layer, n, end, depth)
+            chosen = np.array([n for n, _ in part])
+            self._inputs(core, layer, layer.level[chosen].T, range(layer.level.shape[1]), inputs)
+            waiting = np.flatnonzero(layer.threshold[chosen] <= 0).tolist()
+            if waiting:
+                self._clock(core, CLOCK, waiting, start)
+        return inputs
+
+    def _split(self, depth: int, layer: Layer, ends: list[list[Place]] | None) -> list[list[Place]]:
+        """A layer whose partial sums travel in time."""
+        inputs: list[list[Place]] = [[] for _ in range(layer.level.shape[1])]
+        groups, start = layer.groups, self.starts[depth]
+        sums = self._gated(depth, layer, len(groups), ends)
+        most, own = self.chip.limit("core.neurons"), type_weights(layer.copies)
+        for number, group in enumerate(groups):
+            aims = [(n, sign) for n in range(len(layer.level)) for sign in (1, -1)]
+            for first in range(0, len(aims), most):
+                core, part = self.draft.core(0, 0), aims[first : first + most]
+                for n, sign in part:
+                    weights = (*(sign * weight for weight in own[:CLOCK]), PULL)
+                    made = Neuron(
+                        weights=(weights[0], weights[1], weights[2], weights[3]),
+                        reset_mode=RESET_LINEAR,
+                        negative_saturates=True,
+                    )
+                    own_number = 2 * (number * len(layer.level) + n) + (sign < 0)
+                    added = self.draft.neuron(core, made, layer=f"{layer.name} sums", number=own_number)
+                    self.wires.append(((core, added), (*sums[n][2 * number + (sign < 0)], 1)))
+                chosen = np.array([n for n, _ in part])
+                self._inputs(core, layer, layer.level[chosen][:, group].T, range(group.start, group.stop), inputs)
+                for _ in range(EMPTYING):
+                    self._clock(core, CLOCK, range(len(part)), start + MOST)
+        return inputs
+
+    def _gated(self, depth: int, layer: Layer, groups: int, ends: list[list[Place]] | None) -> list[list[Place]]:
+        """Neurons that add up partial sums; returns for each the lines of its groups, above zero and below in turn."""
+        reach = MOST * groups
+        lifts, pulls = gate_axons(groups, int(layer.threshold.min()))
+        a_core = min((self.chip.limit("core.axons") - lifts - pulls) // (2 * groups), self.chip.limit("core.neurons"))
+        if a_core < 1:
+            raise CapacityError(
+                (
+                    Violation(
+                        owner=f"{layer.name}, a neuron",
+                        rule=f"{self.chip.name}.core.axons",
+                        used=2 * groups + lifts + pulls,
+                        allowed=self.chip.limit("core.axons"),
+                        remedy=f"partial sums of {groups} groups and the clocks beside; use fewer inputs or copies",
+                    ),
+                )
+            )
+        start, found = self.starts[depth], list[list[Place]]()
+        for first in range(0, len(layer.level), a_core):
+            core, numbers = self.draft.core(0, 0), range(first, min(first + a_core, len(layer.level)))
+            for n in numbers:
+                made = Neuron(
+                    weights=(1, -1, LIFT, PULL),
+                    threshold=int(layer.threshold[n]) + LIFT * lifts,
+                    reset_mode=RESET_TO,
+                    negative_threshold=reach,
+                )
+                self._lead(core, made, layer, n, ends, depth)
+                lines = [self.draft.axon(core, sign) for _ in range(groups) for sign in (0, 1)]
+                for line in lines:
+                    self.draft.connect(core, line, [n - first])
+                found.append([(core, line) for line in lines])
+            for _ in range(lifts):
+                self._clock(core, 2, range(len(numbers)), start + MOST)
+            for _ in range(pulls):
+                self._clock(core, 3, range(len(numbers)), start + BIN_TICKS)
+        return found
+
+    def _lead(self, core: int, made: Neuron, layer: Layer, n: int, ends: list[list[Place]] | None, depth: int) -> None:
+        """Add a gated neuron, and what leads its spikes on: a wire where it has one target, relays otherwise."""
+        number = self.draft.neuron(core, made, layer=layer.name, number=n)
+        if ends is None:
+            self.draft.vote((core, number), int(self.network.label[n]), first=self.starts[depth])
+        elif len(ends[n]) == 1:
+            self.wires.append(((core, number), (*ends[n][0], RELAYED)))
+        elif ends[n]:
+            self.wires.append(((core, number), (*self._relays(ends[n]), 1)))
+
+    def _relays(self, aims: Sequence[Place]) -> Place:
+        """An axon, and a relay for each target on its core; the last core of relays is used as long as it has room."""
+        most, lines = self.chip.limit("core.neurons"), self.chip.limit("core.axons")
+        core = self.relay_core
+        full = core is None or len(self.draft.cores[core].neurons) + len(aims) > most
+        if core is None or full or len(self.draft.cores[core].axons) == lines:
+            core = self.relay_core = self.draft.core(0, 0)
+        line = self.draft.axon(core)
+        relays = [self.draft.neuron(core, RELAY) for _ in aims]
+        self.draft.connect(core, line, relays)
+        self.wires += [((core, relay), (*aim, 1)) for relay, aim in zip(relays, aims, strict=True)]
+        return core, line
+
+    def _add(self, core: int, made: Neuron, layer: Layer, n: int, end: Place | None, depth: int) -> None:
+        """Add a neuron with one target, or a vote."""
+        number = self.draft.neuron(core, made, layer=layer.name, number=n)
+        if end is None:
+            self.draft.vote((core, number), int(self.network.label[n]), first=self.starts[depth])
+        else:
+            self.wires.append(((core, number), (*end, 1)))
+
+    def _packed(self, layer: Layer, aims: list[tuple[int, Place | None]]) -> Iterator[list[tuple[int, Place | None]]]:
+        """Neurons in their order, as many to a core as their inputs leave room for, with an axon for a clock."""
+        neurons, axons = self.chip.limit("core.neurons"), self.chip.limit("core.axons")
+        part, heard = list[tuple[int, Place | None]](), np.zeros(layer.level.shape[1], np.bool_)
+        for n, end in aims:
+            more = heard | (layer.level[n] != 0)
+            if part and (len(part) == neurons or np.count_nonzero(more) * layer.copies >= axons):
+                yield part
+                part, more = [], layer.level[n] != 0
+            part.append((n, end))
+            heard = more
+        if part:
+            yield part
+
+    def _inputs(self, core: int, layer: Layer, levels: IntArray, sources: range, inputs: list[list[Place]]) -> None:
+        """Add the axons of inputs (inputs, neurons of the core), a copy only where something is joined."""
+        points = level_points(levels, layer.copies)
+        for row, source in enumerate(sources):
+            for copy in range(layer.copies):
+                joined = np.flatnonzero(points[row, :, copy]).tolist()
+                if joined:
+                    line = self.draft.axon(core, copy)
+                    self.draft.connect(core, line, joined)
+                    inputs[source].append((core, line))
+
+    def _require_leak(self, layer: Layer, n: int, needed: int) -> None:
+        """A threshold is a leak, and a lift of a clock where it is not above zero."""
+        most = -signed_range(self.chip.limit("neuron.leak_bits"))[0] - 1
+        if needed > most:
+            broken = Violation(
+                owner=f"{layer.name}, neuron {n}",
+                rule=f"{self.chip.name}.neuron.leak_bits",
+                used=needed,
+                allowed=most,
+                remedy="its threshold in steps of its weights; use fewer axons an input",
+            )
+            raise CapacityError((broken,))
+
+    def _clock(self, core: int, kind: int, neurons: Sequence[int], phase: int) -> None:
+        line = self.draft.axon(core, kind)
+        self.draft.connect(core, line, list(neurons))
+        self.draft.clock(core, line, period=BIN_TICKS, phase=phase)

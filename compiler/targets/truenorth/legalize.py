@@ -1,0 +1,233 @@
+"""Hold a network of crossbar cores against every limit of its chip: all that is wrong, at once.
+
+Several offenders against one rule on one core share a line, which names the first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from itertools import groupby
+
+import numpy as np
+
+from spikeloom.compiler.errors import Fault, RuleError
+from spikeloom.compiler.fixedpoint import IntArray
+from spikeloom.compiler.targets.base import Target
+from spikeloom.compiler.targets.truenorth.netlist import RESET_NONE, RESET_TO, CrossbarNetlist
+
+Offender = tuple[int, str, str]
+"""Core (-1 for the chip), who on it, and what was found."""
+
+RELAYS = "copy the neuron, or split its spikes by relays"
+
+
+def faults(netlist: CrossbarNetlist, chip: Target) -> tuple[Fault, ...]:
+    """Every rule that a network breaks, in the order of cores, axons, neurons, wires, feeds and clocks."""
+    parts = (_cores, _axons, _parameters, _targets, _wires, _feeds, _clocks)
+    return tuple(fault for part in parts for fault in part(netlist, chip))
+
+
+def require_legal(netlist: CrossbarNetlist, chip: Target) -> None:
+    """Refuse a network that breaks a rule.
+
+    Raises
+    ------
+    RuleError
+        Listing every fault.
+    """
+    found = faults(netlist, chip)
+    if found:
+        raise RuleError(found)
+
+
+def signed_range(bits: int) -> tuple[int, int]:
+    """Smallest and largest number of so many bits with sign.
+
+    Examples
+    --------
+    >>> signed_range(9)
+    (-256, 255)
+    """
+    return -(1 << (bits - 1)), (1 << (bits - 1)) - 1
+
+
+def _told(offenders: Iterable[Offender], allowed: str, rule: str, remedy: str, chip: Target) -> Iterator[Fault]:
+    """A fault for each core with offenders."""
+    for core, group in groupby(offenders, key=lambda offender: offender[0]):
+        (_, who, found), *others = group
+        place = f"core {core}{', ' * bool(who)}" if core >= 0 else ""
+        more = f" (and {len(others)} more on this core)" if others else ""
+        yield Fault(
+            where=f"{place}{who}{more}", found=found, allowed=allowed, rule=f"{chip.name}.{rule}", remedy=remedy
+        )
+
+
+def _cores(netlist: CrossbarNetlist, chip: Target) -> Iterator[Fault]:
+    width, height = chip.limit("mesh.width"), chip.limit("mesh.height")
+    places = list(zip(netlist.core_x.tolist(), netlist.core_y.tolist(), strict=True))
+    on_mesh = f"x 0 … {width - 1} and y 0 … {height - 1}"
+    off = [(core, "", f"at ({x}, {y})") for core, (x, y) in enumerate(places) if not _inside(x, y, chip)]
+    yield from _told(off, on_mesh, "mesh", "place it on the mesh", chip)
+    double = [
+        (core, "", f"at ({x}, {y}) as core {places.index((x, y))}")
+        for core, (x, y) in enumerate(places)
+        if places.index((x, y)) != core
+    ]
+    yield from _told(double, "one core to a place", "mesh", "place it elsewhere", chip)
+    most = chip.limit("chip.cores")
+    if netlist.n_cores > most:
+        found = [(-1, "chip", f"{netlist.n_cores} cores")]
+        yield from _told(found, str(most), "chip.cores", "fewer neurons, inputs or copies", chip)
+    for what, bounds, remedy in (
+        ("neurons", netlist.core_neurons, "use more cores"),
+        ("axons", netlist.core_axons, "fewer inputs or copies of inputs, or more cores"),
+    ):
+        limit, held = chip.limit(f"core.{what}"), np.diff(bounds).tolist()
+        full = [(core, "", f"{count} {what}") for core, count in enumerate(held) if count > limit]
+        yield from _told(full, str(limit), f"core.{what}", remedy, chip)
+
+
+def _inside(x: int, y: int, chip: Target) -> bool:
+    return 0 <= x < chip.limit("mesh.width") and 0 <= y < chip.limit("mesh.height")
+
+
+def _axons(netlist: CrossbarNetlist, chip: Target) -> Iterator[Fault]:
+    lines, kinds = chip.limit("core.axons"), chip.limit("core.axon_types")
+    off, odd, twice, other = [], [], [], []
+    seen: dict[tuple[int, int], int] = {}
+    rows = zip(netlist.core_of_axon().tolist(), netlist.axon_line.tolist(), netlist.axon_type.tolist(), strict=True)
+    for core, line, kind in rows:
+        who = f"axon {line}"
+        if not 0 <= line < lines:
+            off.append((core, who, f"line {line}"))
+        if not 0 <= kind < kinds:
+            odd.append((core, who, f"type {kind}"))
+        if (core, line) not in seen:
+            seen[core, line] = kind
+        elif seen[core, line] == kind:
+            twice.append((core, who, "there twice"))
+        else:
+            other.append((core, who, f"types {seen[core, line]} and {kind}"))
+    yield from _told(off, f"0 … {lines - 1}", "core.axons", "use a line of the core", chip)
+    yield from _told(odd, f"0 … {kinds - 1}", "core.axon_types", "use one of the types", chip)
+    remedy = "a type belongs to an axon, for all neurons of its core: copy the input onto a second axon"
+    yield from _told(other, "one type to an axon", "core.axon_types", remedy, chip)
+    yield from _told(twice, "one axon to a line", "core.axons", "connect its neurons to one of them", chip)
+
+
+def _parameters(netlist: CrossbarNetlist, chip: Target) -> Iterator[Fault]:
+    """Numbers that do not fit their registers."""
+    unsigned = (0, (1 << chip.limit("neuron.threshold_bits")) - 1)
+    signed = {what: signed_range(chip.limit(f"neuron.{what}_bits")) for what in ("weight", "leak", "reset", "membrane")}
+    columns: list[tuple[str, IntArray, tuple[int, int], str, str]] = [
+        ("leak", netlist.leak, signed["leak"], "neuron.leak_bits", "a smaller scale"),
+        ("threshold", netlist.threshold, unsigned, "neuron.threshold_bits", "a smaller scale"),
+        ("negative threshold", netlist.negative_threshold, unsigned, "neuron.threshold_bits", "a smaller scale"),
+        ("random bits", netlist.mask_bits, (0, chip.limit("neuron.mask_bits")), "neuron.mask_bits", "fewer bits"),
+        ("reset value", netlist.reset, signed["reset"], "neuron.reset_bits", "reset nearer to zero"),
+        ("initial membrane", netlist.initial, signed["membrane"], "neuron.membrane_bits", "start nearer to zero"),
+        ("reset mode", netlist.reset_mode, (RESET_TO, RESET_NONE), "neuron.reset_mode", "use one of the modes"),
+        ("leak reversal", netlist.leak_reversal, (0, 1), "neuron.leak_reversal", "use a flag"),
+        ("saturation", netlist.negative_saturates, (0, 1), "neuron.negative_saturates", "use a flag"),
+    ]
+    kinds = range(netlist.weight.shape[1])
+    remedy = "a smaller scale, or the input on several axons"
+    weights = [
+        (f"weight of type {g}", netlist.weight[:, g], signed["weight"], "neuron.weight_bits", remedy) for g in kinds
+    ]
+    for name, values, (low, high), rule, mend in (*weights, *columns):
+        bad = np.flatnonzero((values < low) | (values > high))
+        offenders = _on_cores(netlist, bad, [f"{name} {values[neuron]}" for neuron in bad])
+        yield from _told(offenders, f"{low} … {high}", rule, mend, chip)
+
+
+def _on_cores(netlist: CrossbarNetlist, neurons: IntArray, found: list[str]) -> list[Offender]:
+    """Neurons by their core and their number on it."""
+    cores = netlist.core_of_neuron()[neurons]
+    own = neurons - netlist.core_neurons[cores]
+    return [(int(c), f"neuron {n}", what) for c, n, what in zip(cores, own, found, strict=True)]
+
+
+def _targets(netlist: CrossbarNetlist, chip: Target) -> Iterator[Fault]:
+    """Neurons with more than one target: an axon, or the way out of the chip."""
+    limit = chip.limit("neuron.targets")
+    places = sorted({*zip(netlist.wire_x.tolist(), netlist.wire_y.tolist(), strict=True)})
+    place_id = [places.index(place) for place in zip(netlist.wire_x.tolist(), netlist.wire_y.tolist(), strict=True)]
+    pairs = np.unique(np.stack([netlist.wire_neuron, np.array(place_id, np.int64)]), axis=1)
+    wires = np.bincount(netlist.wire_neuron, minlength=netlist.n_neurons)
+    cores = np.bincount(pairs[0], minlength=netlist.n_neurons)
+    fans = np.flatnonzero((wires > limit) & (cores > 1))
+    within = np.flatnonzero((wires > limit) & (cores == 1))
+    out = np.flatnonzero((wires > 0) & (netlist.readout_class >= 0))
+    for neurons, found, remedy in (
+        (fans, [f"targets on {cores[n]} cores without a splitter" for n in fans], RELAYS),
+        (within, [f"{wires[n]} targets on one core" for n in within], f"let one axon reach all neurons, {RELAYS}"),
+        (out, ["votes and has a target on the chip" for _ in out], RELAYS),
+    ):
+        yield from _told(_on_cores(netlist, neurons, found), str(limit), "neuron.targets", remedy, chip)
+
+
+def _wires(netlist: CrossbarNetlist, chip: Target) -> Iterator[Fault]:
+    longest, reach = chip.limit("neuron.delay"), chip.limit("mesh.reach")
+    source = netlist.core_of_neuron()[netlist.wire_neuron]
+    order = np.argsort(source, kind="stable")
+    aim = netlist.cores_at(netlist.wire_x, netlist.wire_y)
+    axon = netlist.axons_at(aim, netlist.wire_line)
+    far = np.maximum(np.abs(netlist.core_x[source] - netlist.wire_x), np.abs(netlist.core_y[source] - netlist.wire_y))
+    late: list[Offender] = []
+    off: list[Offender] = []
+    nowhere: list[Offender] = []
+    beyond: list[Offender] = []
+    for row in order.tolist():
+        x, y, line = (int(column[row]) for column in (netlist.wire_x, netlist.wire_y, netlist.wire_line))
+        delay = int(netlist.wire_delay[row])
+        core = int(source[row])
+        who = f"neuron {netlist.wire_neuron[row] - netlist.core_neurons[core]}"
+        if not 1 <= delay <= longest:
+            late.append((core, who, f"delay {delay}"))
+        if not _inside(x, y, chip):
+            off.append((core, who, f"target at ({x}, {y})"))
+        elif aim[row] < 0:
+            nowhere.append((core, who, f"target at ({x}, {y}), where no core is"))
+        elif axon[row] < 0:
+            nowhere.append((core, who, f"target line {line} of core {aim[row]}, which has no axon there"))
+        elif far[row] > reach:
+            beyond.append((core, who, f"{far[row]} cores away"))
+    yield from _told(late, f"1 … {longest} ticks", "neuron.delay", "add relays for longer ways", chip)
+    on_mesh = f"x 0 … {chip.limit('mesh.width') - 1} and y 0 … {chip.limit('mesh.height') - 1}"
+    yield from _told(off, on_mesh, "mesh", "aim at a core of the mesh", chip)
+    yield from _told(nowhere, "an axon of a core", "target", "add the axon, or leave the wire away", chip)
+    yield from _told(beyond, str(reach), "mesh.reach", "place the cores nearer to each other", chip)
+
+
+def _feeds(netlist: CrossbarNetlist, chip: Target) -> Iterator[Fault]:
+    axon = netlist.axons_at(netlist.feed_core, netlist.feed_line)
+    bad = np.flatnonzero(axon < 0).tolist()
+    lost = [
+        (
+            -1,
+            f"input channel {netlist.feed_channel[row]}",
+            f"line {netlist.feed_line[row]} of core {netlist.feed_core[row]}",
+        )
+        for row in bad
+    ]
+    yield from _told(lost, "an axon of a core", "target", "add the axon, or leave the feed away", chip)
+    early = [
+        (-1, f"input channel {netlist.feed_channel[row]}", f"tick {netlist.feed_tick[row]} of a data step")
+        for row in np.flatnonzero(netlist.feed_tick < 0)
+    ]
+    yield from _told(early, "0 or later", "feed", "feed it when it is there", chip)
+
+
+def _clocks(netlist: CrossbarNetlist, chip: Target) -> Iterator[Fault]:
+    axon = netlist.axons_at(netlist.clock_core, netlist.clock_line)
+    for row in range(len(axon)):
+        who, period, phase = f"clock {row}", int(netlist.clock_period[row]), int(netlist.clock_phase[row])
+        if period < 1:
+            found = [(-1, who, f"a period of {period} ticks")]
+            yield from _told(found, "1 or more", "clock", "say every how many ticks it spikes", chip)
+        if phase < 0:
+            yield from _told([(-1, who, f"phase {phase}")], "0 or later", "clock", "start it with the recording", chip)
+        if axon[row] < 0:
+            found = [(-1, who, f"line {netlist.clock_line[row]} of core {netlist.clock_core[row]}")]
+            yield from _told(found, "an axon of a core", "target", "add the axon, or leave the clock away", chip)

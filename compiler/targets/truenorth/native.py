@@ -1,0 +1,211 @@
+"""A network of whole numbers that crossbar cores hold: what is trained for TrueNorth, before it is placed.
+
+A network is one or more *towers* side by side, whose votes add up. A tower is a chain of *stages*. A stage has blocks
+of neurons; all neurons of a block hear the same inputs, each input is heard by one block, and every stage but the
+first may hear the clocks, too. With levels ``k`` of a neuron for its inputs,
+
+    ``m_t = c_{t-1} + UNIT * sum_i k_i x_i(t) + leak``,  ``s_t = m_t >= threshold``,
+    ``c_t = 0`` after a spike, ``max(m_t, -floor)`` otherwise, from ``c = 0`` on:
+
+nothing decays, so the membrane remembers; the leak is a drift, and with the floor a forgetting.
+
+*Levels.* An input that is led to m axons of a core, one of each of the types 0 … m - 1, gives every neuron the sums of
+the subsets of its m weights, by the crossing points that are set: with ``(-1, 1)`` three levels, with ``(-3, 1, 2)``
+seven, with ``(-7, 1, 2, 4)`` fifteen, each times ``UNIT``, which makes threshold and leak finer than the weights.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from spikeloom.compiler.dynamics import NO_CLOCKS, Clocks
+from spikeloom.compiler.fixedpoint import IntArray
+
+SYSTEM = "tactilesgnet-truenorth"
+"""What such a network is called among the systems."""
+
+UNIT = 32
+"""Weight of level 1; ``7 * UNIT`` is the largest weight, and fits 9 bits with sign."""
+
+BASES = {2: (-1, 1), 3: (-3, 1, 2), 4: (-7, 1, 2, 4)}
+"""Weights of the axon types by number of copies, in units."""
+
+USUAL_COPIES = 3
+
+LEAK_MOST = 255
+"""Magnitude of a leak, 9 bits with sign."""
+
+THRESHOLD_MOST = 1 << 17
+"""Threshold and floor: a membrane between them, and whatever 256 axons add, stays within 20 bits."""
+
+
+def highest_level(copies: int) -> int:
+    """Levels are the whole numbers of at most this magnitude.
+
+    Examples
+    --------
+    >>> [highest_level(copies) for copies in (2, 3, 4)]
+    [1, 3, 7]
+    """
+    return -BASES[copies][0]
+
+
+def crossing_points(levels: IntArray, copies: int) -> IntArray:
+    """Which copies of an input to join, as 0 and 1 along a new last axis, so that each level comes out.
+
+    Examples
+    --------
+    >>> crossing_points(np.array([-3, -2, -1, 0, 1, 2, 3]), 3).tolist()
+    [[1, 0, 0], [1, 1, 0], [1, 0, 1], [0, 0, 0], [0, 1, 0], [0, 0, 1], [0, 1, 1]]
+    """
+    most = highest_level(copies)
+    negative = levels < 0
+    rest = np.where(negative, levels + most, levels)[..., None]
+    bits = rest >> np.arange(copies - 1) & 1
+    found: IntArray = np.concatenate([negative[..., None], bits], axis=-1).astype(np.int64)
+    return found
+
+
+def steepest_leak(threshold: IntArray, depth: int) -> IntArray:
+    """Largest leak at a depth: one that reaches neither threshold nor floor in the ticks before the first data.
+
+    A stage at depth d hears data from tick d on. Its membranes start at ``-d * leak``, and the leak alone brings them
+    to rest by then, on a way that must touch no limit; the floor is no nearer than the threshold.
+    """
+    reach = (threshold - 1) // max(1, depth - 1)
+    found: IntArray = np.minimum(reach, LEAK_MOST)
+    return found
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Stage:
+    """Neurons of one layer of a tower; neuron ``block * size + n``.
+
+    Parameters
+    ----------
+    name : str
+        Of the layer.
+    inputs : (blocks, width) int64
+        Neurons of the stage before that each block hears; channels of the sensor in the first stage.
+    level : (blocks, width + clocks, size) int64
+        For each input of a block and for each clock, as far as the stage hears them; for each neuron.
+    threshold, floor, leak : (blocks * size,) int64
+    """
+
+    name: str
+    inputs: IntArray
+    level: IntArray
+    threshold: IntArray
+    floor: IntArray
+    leak: IntArray
+
+    @property
+    def blocks(self) -> int:
+        """Number of blocks."""
+        return len(self.level)
+
+    @property
+    def size(self) -> int:
+        """Neurons of a block."""
+        return int(self.level.shape[2])
+
+    @property
+    def neurons(self) -> int:
+        """Neurons of the stage."""
+        return self.blocks * self.size
+
+    @property
+    def clocks(self) -> int:
+        """Clocks that the stage hears."""
+        return int(self.level.shape[1] - self.inputs.shape[1])
+
+
+Tower = tuple[Stage, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class NativeNetwork:
+    """Towers over one sensor.
+
+    Parameters
+    ----------
+    taxels, polarities, classes : int
+        Neuron n of a last stage votes for class ``n % classes``.
+    copies : int
+        Axons that an input is led to, 2 to 4.
+    clocks : Clocks
+        Channels after those of the sensor.
+    towers : tuple of tuple of Stage
+    """
+
+    taxels: int
+    polarities: int
+    classes: int
+    copies: int
+    towers: tuple[Tower, ...]
+    clocks: Clocks = NO_CLOCKS
+
+    @property
+    def neurons(self) -> dict[str, int]:
+        """Neurons of each layer, over all towers."""
+        found: dict[str, int] = {}
+        for tower in self.towers:
+            for stage in tower:
+                found[stage.name] = found.get(stage.name, 0) + stage.neurons
+        return found
+
+
+def faults(network: NativeNetwork) -> list[str]:
+    """What in a network contradicts itself or the rules above; empty if it can be placed."""
+    if network.copies not in BASES:
+        return [f"{network.copies} copies of an input, allowed are {', '.join(map(str, BASES))}"]
+    found = []
+    for number, tower in enumerate(network.towers):
+        heard = network.taxels * network.polarities
+        for depth, stage in enumerate(tower):
+            found += [f"tower {number}, {stage.name}: {fault}" for fault in _stage_faults(network, stage, depth, heard)]
+            heard = stage.neurons
+        if not tower or heard % network.classes:
+            found.append(f"tower {number}: {heard} voting neurons for {network.classes} classes")
+    return found if network.towers else ["no towers"]
+
+
+def _stage_faults(network: NativeNetwork, stage: Stage, depth: int, heard: int) -> Iterator[str]:
+    if stage.clocks not in ({0} if not depth else {0, network.clocks.channels}):
+        yield f"hears {stage.clocks} clocks of {network.clocks.channels}"
+    inputs = stage.inputs.reshape(-1)
+    whole = np.array_equal(np.sort(inputs), np.arange(heard))
+    if stage.inputs.shape[0] != stage.blocks or not whole:
+        yield f"{stage.blocks} blocks do not share {heard} inputs among them"
+    for name in ("threshold", "floor", "leak"):
+        if getattr(stage, name).shape != (stage.neurons,):
+            yield f"{len(getattr(stage, name))} values of {name} for {stage.neurons} neurons"
+            return
+    if np.abs(stage.level).max(initial=0) > highest_level(network.copies):
+        yield f"levels beyond {highest_level(network.copies)}, the most of {network.copies} copies"
+    if np.any(stage.threshold < 1) or np.any(stage.floor < stage.threshold) or np.any(stage.floor > THRESHOLD_MOST):
+        yield f"thresholds and floors outside 1 <= threshold <= floor <= {THRESHOLD_MOST}"
+    elif np.any(np.abs(stage.leak) > steepest_leak(stage.threshold, depth)):
+        yield "leaks that the ticks before the first data cannot undo"
+
+
+def joined(networks: Sequence[NativeNetwork]) -> NativeNetwork:
+    """One network with the towers of all; their votes add up.
+
+    Raises
+    ------
+    ValueError
+        Naming in what they differ.
+    """
+    one = networks[0]
+    for what in ("taxels", "polarities", "classes", "copies", "clocks"):
+        found = {str(getattr(network, what)) for network in networks}
+        if len(found) > 1:
+            raise ValueError(f"differ in {what}: {', '.join(sorted(found))}")
+    layers = {", ".join(stage.name for stage in tower) for network in networks for tower in network.towers}
+    if len(layers) > 1:
+        raise ValueError(f"differ in their layers: {' and '.join(sorted(layers))}")
+    return replace(one, towers=tuple(tower for network in networks for tower in network.towers))

@@ -1,0 +1,257 @@
+"""File of a network trained for crossbar cores; an archive of :mod:`formats.archive`.
+
+Members, format version 1: the ``manifest`` (``format`` "spikeloom-native", ``version``, ``taxels``, ``polarities``,
+``classes``, ``copies``, ``clocks``, ``graph`` with ``name`` and ``edges``, ``layers``, ``towers``, ``weights``: the
+sets in the file, and ``training``: how it was made and what it reached), for every set, tower and layer
+``SET/TOWER/LAYER/PART`` with the parts of :class:`native.Stage`, and the ``sha256``. All numbers are
+whole: what is in the file is what the chip computes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from spikeloom.compiler.dynamics import MOST_CLOCKS, MOST_STEPS, Clocks
+from spikeloom.compiler.errors import FormatError, ModelError
+from spikeloom.compiler.fixedpoint import IntArray
+from spikeloom.compiler.formats.archive import (
+    Array,
+    archive_bytes,
+    read_manifest,
+    read_members,
+    require_whole,
+    stated_format,
+)
+from spikeloom.compiler.formats.atomic import write_atomically
+from spikeloom.compiler.formats.checkpoint_file import WEIGHTS
+from spikeloom.compiler.targets.loihi1.netlist import read_only
+from spikeloom.compiler.targets.truenorth.native import NativeNetwork, Stage, faults
+
+FORMAT = "spikeloom-native"
+VERSIONS = (1,)
+PARTS = ("inputs", "level", "threshold", "floor", "leak")
+"""Arrays of a stage, in file order."""
+
+MOST_TOWERS, MOST_LAYERS = 4096, 64
+"""A tower has a core at least."""
+
+_AGAIN = "copy or train it again"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Trained:
+    """What a file holds.
+
+    Parameters
+    ----------
+    network : NativeNetwork
+        Of the set that was asked for.
+    weights : str
+        Name of that set.
+    sets : tuple of str
+        All sets of the file.
+    graph : str
+        Name of the taxel graph.
+    edges : (edges, 2) int64
+        Of it, source and target.
+    training : mapping
+        JSON values: how the network was made and what it reached.
+    sha256 : str
+        Of the file.
+    """
+
+    network: NativeNetwork
+    weights: str
+    sets: tuple[str, ...]
+    graph: str
+    edges: IntArray
+    training: Mapping[str, Any]
+    sha256: str
+
+
+def trained_bytes(
+    networks: Mapping[str, NativeNetwork], *, graph: str, edges: IntArray, training: Mapping[str, Any]
+) -> bytes:
+    """File content; equal input gives equal bytes.
+
+    Parameters
+    ----------
+    networks : mapping of ``last``, ``best`` or ``clean`` to NativeNetwork
+        At least one; all of one shape.
+    graph, edges, training
+        As :class:`Trained`.
+    """
+    one = next(iter(networks.values()))
+    manifest = {
+        "format": FORMAT,
+        "version": VERSIONS[0],
+        **{name: getattr(one, name) for name in ("taxels", "polarities", "classes", "copies")},
+        "clocks": asdict(one.clocks),
+        "graph": {"name": graph, "edges": edges.tolist()},
+        "layers": [stage.name for stage in one.towers[0]],
+        "towers": len(one.towers),
+        "weights": list(networks),
+        "training": dict(training),
+    }
+    arrays = {
+        f"{which}/{number}/{stage.name}/{part}": getattr(stage, part)
+        for which, network in networks.items()
+        for number, tower in enumerate(network.towers)
+        for stage in tower
+        for part in PARTS
+    }
+    return archive_bytes(manifest, arrays)
+
+
+def write_trained(
+    path: str | os.PathLike[str],
+    networks: Mapping[str, NativeNetwork],
+    *,
+    graph: str,
+    edges: IntArray,
+    training: Mapping[str, Any],
+) -> str:
+    """Write a file, whole or not at all; return its sha256. Parameters as :func:`trained_bytes`.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written; an older file is left as it was.
+    """
+    content = trained_bytes(networks, graph=graph, edges=edges, training=training)
+    with write_atomically(path) as file:
+        file.write(content)
+    return hashlib.sha256(content).hexdigest()
+
+
+def is_trained(path: str | os.PathLike[str]) -> bool:
+    """Whether a file is an archive that says it holds such a network; whatever else it is, its own reader says."""
+    return stated_format(Path(path)) == FORMAT
+
+
+def read_trained(path: str | os.PathLike[str], *, weights: str | None = None) -> Trained:
+    """Read and check a file.
+
+    Parameters
+    ----------
+    weights : str, optional
+        Set to take; the first of ``last``, ``best`` and ``clean`` that the file holds by default.
+
+    Raises
+    ------
+    ModelError
+        If it is missing, damaged, altered, from a newer version or inconsistent, or has no such set.
+    OSError
+        If it cannot be read.
+    """
+    path = Path(path)
+    if not path.is_file():
+        found = "is not a file" if path.exists() else "no such file"
+        raise ModelError(f"{path}: {found}; make one with spikeloom train")
+    try:
+        members = read_members(path)
+        manifest = read_manifest(path, members, FORMAT, VERSIONS)
+        wrong = _kind_faults(manifest)
+        if wrong:
+            raise ModelError(f"{path}: {'; '.join(wrong)}; {_AGAIN}")
+        require_whole(path, members, tuple(_names(manifest)))
+    except FormatError as error:
+        raise ModelError(f"{path}: damaged, altered or of another version ({_core(path, error)}); {_AGAIN}") from error
+    sets = tuple(name for name in WEIGHTS if name in manifest["weights"])
+    chosen = sets[0] if weights is None else weights
+    if chosen not in sets:
+        raise ModelError(f"{path}: --weights {weights}: the file holds {', '.join(sets)}; choose one that it holds")
+    network = _network(manifest, members, chosen)
+    wrong = _shape_faults(network) or faults(network)
+    edges = np.array(manifest["graph"]["edges"], np.int64).reshape(-1, 2)
+    if edges.size and (edges.min() < 0 or edges.max() >= network.taxels):
+        wrong.append(f"the graph joins taxels outside 0..{network.taxels - 1}")
+    if wrong:
+        raise ModelError(f"{path}: {'; '.join(wrong)}; {_AGAIN}")
+    return Trained(
+        network=network,
+        weights=chosen,
+        sets=sets,
+        graph=manifest["graph"]["name"],
+        edges=read_only(edges),
+        training=manifest["training"],
+        sha256=hashlib.sha256(path.read_bytes()).hexdigest(),
+    )
+
+
+def _core(path: Path, error: FormatError) -> str:
+    """What an archive says is wrong, without its own remedy, which is for netlists."""
+    return str(error).removeprefix(f"{path}: ").rpartition("; ")[0].replace("netlist", "network")
+
+
+def _kind_faults(manifest: Mapping[str, Any]) -> list[str]:
+    """What in the manifest is missing or of another kind."""
+    layers, clocks, sets, graph = (manifest.get(name) for name in ("layers", "clocks", "weights", "graph"))
+    good = {
+        "layers": isinstance(layers, list)
+        and 0 < len(layers) <= MOST_LAYERS
+        and len(set(map(str, layers))) == len(layers)
+        and all(isinstance(name, str) and name and "/" not in name for name in layers),
+        "clocks": isinstance(clocks, dict)
+        and set(clocks) == {"channels", "steps"}
+        and _is_count(clocks["channels"], 0, MOST_CLOCKS)
+        and _is_count(clocks["steps"], 1, MOST_STEPS),
+        "weights": isinstance(sets, list) and bool(sets) and all(name in WEIGHTS for name in sets),
+        "graph": isinstance(graph, dict)
+        and isinstance(graph.get("name"), str)
+        and isinstance(graph.get("edges"), list)
+        and all(isinstance(edge, list) and len(edge) == 2 and {*map(type, edge)} == {int} for edge in graph["edges"]),
+        "towers": _is_count(manifest.get("towers"), 1, MOST_TOWERS),
+        "training": isinstance(manifest.get("training"), dict),
+    }
+    good |= {name: _is_count(manifest.get(name), 1, 2**20) for name in ("taxels", "polarities", "classes", "copies")}
+    return [f"the manifest has no usable {name}" for name, fine in good.items() if not fine]
+
+
+def _is_count(value: Any, least: int, most: int) -> bool:
+    return type(value) is int and least <= value <= most
+
+
+def _names(manifest: Mapping[str, Any]) -> list[str]:
+    """Array members, in file order."""
+    return [
+        f"{which}/{number}/{layer}/{part}"
+        for which in manifest["weights"]
+        for number in range(manifest["towers"])
+        for layer in manifest["layers"]
+        for part in PARTS
+    ]
+
+
+def _network(manifest: Mapping[str, Any], members: Mapping[str, Array], which: str) -> NativeNetwork:
+    def stage(number: int, layer: str) -> Stage:
+        parts: dict[str, Any] = {part: members[f"{which}/{number}/{layer}/{part}"] for part in PARTS}
+        return Stage(
+            name=layer,
+            **{p: read_only(a.astype(np.int64) if a.dtype.kind == "i" else a) for p, a in parts.items()},
+        )
+
+    return NativeNetwork(
+        **{name: manifest[name] for name in ("taxels", "polarities", "classes", "copies")},
+        clocks=Clocks(**manifest["clocks"]),
+        towers=tuple(tuple(stage(n, layer) for layer in manifest["layers"]) for n in range(manifest["towers"])),
+    )
+
+
+def _shape_faults(network: NativeNetwork) -> list[str]:
+    """Arrays that are not of whole numbers, or have another number of axes."""
+    axes = dict(zip(PARTS, (2, 3, 1, 1, 1), strict=True))
+    return [
+        f"{stage.name}: {part} is no array of {axes[part]} axes of whole numbers"
+        for tower in network.towers
+        for stage in tower
+        for part in PARTS
+        if getattr(stage, part).dtype.kind != "i" or getattr(stage, part).ndim != axes[part]
+    ]

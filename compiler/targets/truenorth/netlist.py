@@ -1,0 +1,222 @@
+"""A network on crossbar cores, as flat integer arrays.
+
+Ids
+---
+*Neurons* are numbered core after core; those of core ``k`` are ``core_neurons[k] … core_neurons[k+1]-1``, and the
+first of them is neuron 0 of its core. *Axons* are numbered the same way through ``core_axons``; ``axon_line`` says
+which of its core's lines an axon is. The crossing points of axon ``a`` that are set are
+``axon_synapses[a] … axon_synapses[a+1]-1``, each with a neuron of the core (0-based on it). A spike on the axon adds
+``weight[neuron, axon_type[axon]]`` to each of these neurons: the type belongs to the axon, the weights to the neuron.
+
+What leads to an axon stands in tables of rows: *wires* from neurons, *feeds* from input channels, *clocks*. The chip
+allows a neuron one wire only; the tables can hold more, so that :mod:`truenorth.legalize` can say what is wrong.
+
+Time
+----
+A data step takes ``bin_ticks`` ticks. An event of data step ``s`` reaches the axon of a feed in tick
+``s * bin_ticks + feed_tick``. A spike of tick ``t`` reaches the axon of a wire in tick ``t + wire_delay``; spikes that
+reach one axon in the same tick are one. A clock reaches its axon in the ticks ``phase, phase + period, …``. A
+recording of ``T`` data steps takes ``T * bin_ticks + drain`` ticks from the initial potentials on; the spikes of a
+neuron that votes count in the ticks ``readout_first … readout_first + T * bin_ticks - 1``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from spikeloom.compiler.dynamics import NO_CLOCKS, Clocks
+from spikeloom.compiler.fixedpoint import IntArray
+
+RESET_TO, RESET_LINEAR, RESET_NONE = 0, 1, 2
+"""What a spike leaves: the reset value, the membrane less the threshold, the membrane."""
+
+AXON_TYPES = 4
+"""Columns of ``CrossbarNetlist.weight``."""
+
+PER_NEURON = (
+    *("leak", "leak_reversal", "threshold", "mask_bits", "reset_mode", "reset", "negative_threshold"),
+    *("negative_saturates", "initial", "layer", "neuron", "readout_class", "readout_first"),
+)
+"""Arrays with one entry a neuron, beside ``weight``."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class CrossbarNetlist:
+    """A placed network of crossbar cores; see the module docstring for ids and time.
+
+    Parameters
+    ----------
+    target : str
+        Name of the chip.
+    taxels, polarities, classes : int
+        Sensor size and number of classes.
+    bin_ticks : int
+        Ticks of a data step.
+    layers : tuple of str
+        Names; relays that copy spikes have one of their own.
+    core_x, core_y : (cores,) int64
+        Places on the mesh.
+    core_neurons, core_axons : (cores + 1,) int64
+        Range bounds, see above.
+    axon_line, axon_type : (axons,) int64
+        Line on the core, and type.
+    axon_synapses : (axons + 1,) int64
+        Range bounds into the crossing points.
+    synapse_neuron : (synapses,) int64
+        Neuron on the core.
+    weight : (neurons, 4) int64
+        By axon type.
+    leak : (neurons,) int64
+        Added in every tick.
+    leak_reversal : (neurons,) int64
+        1 where the leak takes the sign of the membrane; a membrane that it would carry past zero is then zero.
+    threshold : (neurons,) int64
+        A spike needs a membrane of at least this, and the masked random number.
+    mask_bits : (neurons,) int64
+        Random bits that are added to both thresholds in every tick; 0 for none.
+    reset_mode, reset : (neurons,) int64
+        ``RESET_TO``, ``RESET_LINEAR`` or ``RESET_NONE``, and the value of the first.
+    negative_threshold : (neurons,) int64
+        Magnitude. A membrane below ``-negative_threshold`` (and the random number) is reset, too.
+    negative_saturates : (neurons,) int64
+        1 where it stays at ``-negative_threshold`` instead of being reset.
+    initial : (neurons,) int64
+        Membrane before the first tick.
+    layer, neuron : (neurons,) int64
+        Which neuron of which layer it is; copies of one share the numbers.
+    readout_class, readout_first : (neurons,) int64
+        Class that a spike votes for, -1 for none, and the tick from which on it does.
+    wire_neuron, wire_x, wire_y, wire_line, wire_delay : (wires,) int64
+        From a neuron to a line of the core at a place, ticks on the way.
+    feed_channel, feed_core, feed_line, feed_tick : (feeds,) int64
+        From an input channel (channel ``taxel * polarities + polarity``, then the clocks of `clocks`) to a line of a
+        core.
+    clock_core, clock_line, clock_period, clock_phase : (clocks,) int64
+        Periodic spikes from outside.
+    provenance : mapping
+        JSON values only.
+    clocks : Clocks
+        Input channels that tell the time, see :mod:`compiler.dynamics`.
+    """
+
+    target: str
+    taxels: int
+    polarities: int
+    classes: int
+    bin_ticks: int
+    layers: tuple[str, ...]
+    core_x: IntArray
+    core_y: IntArray
+    core_neurons: IntArray
+    core_axons: IntArray
+    axon_line: IntArray
+    axon_type: IntArray
+    axon_synapses: IntArray
+    synapse_neuron: IntArray
+    weight: IntArray
+    leak: IntArray
+    leak_reversal: IntArray
+    threshold: IntArray
+    mask_bits: IntArray
+    reset_mode: IntArray
+    reset: IntArray
+    negative_threshold: IntArray
+    negative_saturates: IntArray
+    initial: IntArray
+    layer: IntArray
+    neuron: IntArray
+    readout_class: IntArray
+    readout_first: IntArray
+    wire_neuron: IntArray
+    wire_x: IntArray
+    wire_y: IntArray
+    wire_line: IntArray
+    wire_delay: IntArray
+    feed_channel: IntArray
+    feed_core: IntArray
+    feed_line: IntArray
+    feed_tick: IntArray
+    clock_core: IntArray
+    clock_line: IntArray
+    clock_period: IntArray
+    clock_phase: IntArray
+    provenance: Mapping[str, Any]
+    clocks: Clocks = NO_CLOCKS
+
+    @property
+    def n_inputs(self) -> int:
+        """Number of input channels."""
+        return self.taxels * self.polarities + self.clocks.channels
+
+    @property
+    def n_cores(self) -> int:
+        """Number of cores in use."""
+        return len(self.core_x)
+
+    @property
+    def n_neurons(self) -> int:
+        """Number of neurons on all cores."""
+        return len(self.leak)
+
+    @property
+    def n_axons(self) -> int:
+        """Number of axons on all cores."""
+        return len(self.axon_line)
+
+    @property
+    def n_synapses(self) -> int:
+        """Number of crossing points that are set."""
+        return len(self.synapse_neuron)
+
+    @property
+    def drain(self) -> int:
+        """Ticks of a recording after those of its data: until the last vote's window ends."""
+        voters = self.readout_first[self.readout_class >= 0]
+        return int(voters.max(initial=0))
+
+    def ticks(self, steps: int) -> int:
+        """Ticks that a recording of so many data steps takes."""
+        return steps * self.bin_ticks + self.drain
+
+    def core_of_neuron(self) -> IntArray:
+        """Core of each neuron; shape (neurons,)."""
+        return np.repeat(np.arange(self.n_cores), np.diff(self.core_neurons))
+
+    def core_of_axon(self) -> IntArray:
+        """Core of each axon; shape (axons,)."""
+        return np.repeat(np.arange(self.n_cores), np.diff(self.core_axons))
+
+    def axon_of_synapse(self) -> IntArray:
+        """Axon of each crossing point; shape (synapses,)."""
+        return np.repeat(np.arange(self.n_axons), np.diff(self.axon_synapses))
+
+    def neuron_of_synapse(self) -> IntArray:
+        """Neuron id of each crossing point; shape (synapses,)."""
+        return self.synapse_neuron + self.core_neurons[self.core_of_axon()[self.axon_of_synapse()]]
+
+    def axons_at(self, core: IntArray, line: IntArray) -> IntArray:
+        """Axon on each line of a core, -1 where there is none; (n,) of (n,) cores, -1 for no core, and lines."""
+        return _places((self.core_of_axon(), self.axon_line), (core, line))
+
+    def cores_at(self, x: IntArray, y: IntArray) -> IntArray:
+        """Core at each place, -1 where there is none; (n,) of (n,) coordinates."""
+        return _places((self.core_x, self.core_y), (x, y))
+
+    def hops(self) -> IntArray:
+        """Cores that the spike of each wire passes, x first and then y; shape (wires,)."""
+        core = self.core_of_neuron()[self.wire_neuron]
+        hops: IntArray = np.abs(self.core_x[core] - self.wire_x) + np.abs(self.core_y[core] - self.wire_y)
+        return hops
+
+
+def _places(held: tuple[IntArray, IntArray], wanted: tuple[IntArray, IntArray]) -> IntArray:
+    """First index at which each wanted pair is held, -1 where it is not."""
+    index: dict[tuple[int, int], int] = {}
+    for at, pair in enumerate(zip(*(column.tolist() for column in held), strict=True)):
+        index.setdefault(pair, at)
+    pairs = zip(*(column.tolist() for column in wanted), strict=True)
+    return np.array([index.get(pair, -1) for pair in pairs], np.int64)

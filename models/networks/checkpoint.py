@@ -1,0 +1,197 @@
+"""Write our own checkpoint format; :mod:`formats.checkpoint_file` describes and reads it."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import zipfile
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from spikeloom.compiler.formats.atomic import write_atomically
+from spikeloom.compiler.dynamics import PLAIN, Dynamics
+from spikeloom.compiler.targets.loihi1.storage.weight_storage import Form
+from spikeloom.compiler.formats.checkpoint_file import FORMAT, VERSIONS, content_digest
+from spikeloom.compiler.systems import TACTILESGNET, Grid
+from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.models.graphs import Graph
+from spikeloom.models.training.protocols import Reported, data_digest
+
+_EPOCH = (1980, 1, 1, 0, 0, 0)
+
+Tensors = Mapping[str, npt.NDArray[np.float32]]
+
+
+CHOSEN_ON = {"last": "nothing", "best": "the test split", "clean": "a part of the training split"}
+"""What decided which epoch the weights of a set are from."""
+
+
+def training_record(
+    reported: Reported, training: Recordings, test: Recordings, *, command: str, seed: int
+) -> dict[str, Any]:
+    """Everything needed to repeat a training, and what it reached by both protocols; JSON values only.
+
+    The best epoch is chosen on the test split, as the published figures are; the clean one on a part of the training
+    split; the last one is not chosen at all.
+    """
+    history = reported.trained.history
+    chosen = {"last": len(history), "best": reported.trained.best_epoch, "clean": reported.clean_epoch}
+    validation = reported.validation.history[reported.clean_epoch - 1]
+    return {
+        "command": command,
+        "seed": seed,
+        "epochs": len(history),
+        "data": training.source,
+        "data_sha256": data_digest(training, test),
+        "test_samples": len(test),
+        **{
+            name: {
+                "epoch": epoch,
+                "correct": history[epoch - 1].correct,
+                "accuracy": history[epoch - 1].accuracy,
+                "chosen_on": CHOSEN_ON[name],
+            }
+            for name, epoch in chosen.items()
+        },
+        "validation": {"correct": validation.correct, "samples": validation.tested},
+        "history": [[e.training_loss, e.test_loss, e.correct] for e in history],
+        "torch": torch.__version__,
+        "numpy": np.__version__,
+    }
+
+
+def checkpoint_bytes(
+    weights: Mapping[str, Tensors],
+    graph: Graph,
+    *,
+    beta: float,
+    theta: float,
+    training: Mapping[str, Any],
+    forms: Sequence[Form] | None = None,
+    system: str = TACTILESGNET,
+    grid: Grid | None = None,
+    dynamics: Dynamics = PLAIN,
+    towers: int = 1,
+    bins: int = 1,
+) -> bytes:
+    """File content of a checkpoint; equal input gives equal bytes.
+
+    Parameters
+    ----------
+    weights : mapping of ``last``, ``best`` or ``clean`` (at least one) to tensors
+        ``conv1.hops`` (filters, features, channels), ``conv1.bias``, ``fc1.weight``, ``fc1.bias`` … float32.
+    graph : Graph
+        What it was trained on.
+    beta, theta : float
+        Decay and threshold.
+    training : mapping
+        JSON values: how it was made and what it reached.
+    forms : sequence of Form, optional
+        How the chip stores each layer, conv1 first, where the network was fine-tuned for it.
+    system : str
+        One of :data:`spikeloom.compiler.systems.SYSTEMS`.
+    grid : Grid, optional
+        Of a grid-based CNN.
+    dynamics : Dynamics
+        Decays of single layers, and clocks.
+    towers : int
+        Networks that lie side by side in the tensors, see :mod:`formats.towers`.
+    bins : int
+        Bins of the recordings that a step joins.
+    """
+    tensors_of_one = next(iter(weights.values()))
+    stages = sum(name.startswith("fc") and name.endswith(".weight") for name in tensors_of_one)
+    arrays = {
+        f"{which}/{name}": np.ascontiguousarray(array, "<f4")
+        for which, tensors in weights.items()
+        for name, array in sorted(tensors.items())
+    }
+    version = VERSIONS[2] if system != TACTILESGNET else VERSIONS[0] if forms is None else VERSIONS[1]
+    version = version if dynamics.is_plain else VERSIONS[3]
+    version = VERSIONS[5] if bins > 1 else VERSIONS[4] if towers > 1 else version
+    manifest: dict[str, Any] = {
+        "format": FORMAT,
+        "version": version,
+        "architecture": system,
+        "taxels": graph.n_taxels,
+        "classes": len(tensors_of_one[f"fc{stages}.bias"]) // towers,
+        "beta": beta,
+        "theta": theta,
+        "graph": {"name": graph.name, "edges": graph.edges.tolist()},
+        "weights": list(weights),
+        "training": dict(training),
+    }
+    if towers > 1:
+        manifest["towers"] = towers
+    if bins > 1:
+        manifest["bins"] = bins
+    if not dynamics.is_plain:
+        manifest["dynamics"] = dynamics.to_json()
+    if grid is not None:
+        manifest["grid"] = grid.to_json()
+    if forms is not None:
+        layers = ["conv1", *(f"fc{stage}" for stage in range(1, stages + 1))]
+        manifest["forms"] = [
+            {
+                "layer": layer,
+                "bits": form.bits,
+                "exponents": list(form.exponents),
+                "threshold": form.threshold.tolist(),
+            }
+            for layer, form in zip(layers, forms, strict=True)
+        ]
+    manifest["sha256"] = content_digest(manifest, arrays)
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
+        archive.writestr(
+            zipfile.ZipInfo("manifest.json", date_time=_EPOCH), json.dumps(manifest, indent=1, allow_nan=False)
+        )
+        for name, array in arrays.items():
+            content = io.BytesIO()
+            np.lib.format.write_array(content, array, version=(1, 0), allow_pickle=False)
+            archive.writestr(zipfile.ZipInfo(f"{name}.npy", date_time=_EPOCH), content.getvalue())
+    return file.getvalue()
+
+
+def save_checkpoint(
+    path: str | os.PathLike[str],
+    weights: Mapping[str, Tensors],
+    graph: Graph,
+    *,
+    beta: float,
+    theta: float,
+    training: Mapping[str, Any],
+    forms: Sequence[Form] | None = None,
+    system: str = TACTILESGNET,
+    grid: Grid | None = None,
+    dynamics: Dynamics = PLAIN,
+    towers: int = 1,
+    bins: int = 1,
+) -> None:
+    """Write a checkpoint, whole or not at all; parameters as :func:`checkpoint_bytes`.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written; an older file is left as it was.
+    """
+    content = checkpoint_bytes(
+        weights,
+        graph,
+        beta=beta,
+        theta=theta,
+        training=training,
+        forms=forms,
+        system=system,
+        grid=grid,
+        dynamics=dynamics,
+        towers=towers,
+        bins=bins,
+    )
+    with write_atomically(path) as file:
+        file.write(content)

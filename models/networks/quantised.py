@@ -1,0 +1,282 @@
+"""The network on the chip's own integers, as a torch model with gradients: what it computes is what the chip computes.
+
+Weights, biases and thresholds are rounded by :mod:`storage.weight_storage`, the compiler's own rounding. Synaptic sums are
+sums of integers in float32, exact below 2**24, which the 21-bit accumulator guarantees; the recurrence runs in
+integers. Gradients pass the rounding straight through, and a spike by the same surrogate as in training.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from spikeloom.compiler.fixedpoint import (
+    BIAS_EXPONENT_MAX,
+    BIAS_MANTISSA_MAX,
+    DECAY_BITS,
+    MEMBRANE_MAX,
+    MEMBRANE_SHIFT,
+    ONE_STEP_SUM_MAX,
+    encode_bias,
+)
+from spikeloom.compiler.targets.loihi1.storage.weight_storage import Form, decay_registers, reach, round_steps, step_units
+from spikeloom.compiler.formats.checkpoint import Checkpoint
+from spikeloom.compiler.systems import in_order
+from spikeloom.compiler.formats.towers import members, side_by_side
+from spikeloom.compiler.passes.expand import effective_weight, stack_of
+from spikeloom.models.networks.layers import differentiate, events_of, gather, scatter
+from spikeloom.models.networks.surrogate import RECTANGLE
+
+SHRINK = 0.98
+"""A neuron whose weights would overflow the accumulator has them scaled by this, until they do not."""
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Integers:
+    """One layer in chip integers, rounded once per step of the optimizer.
+
+    Parameters
+    ----------
+    units : (inputs, neurons) float32
+        Weights in weight units, whole numbers (halves of a step never occur).
+    real : (neurons, inputs) float32
+        The same in the float model's units.
+    bias, threshold : (neurons,) int64
+        In membrane units.
+    unit : (neurons,) float64
+        Membrane of the float model in one membrane unit.
+    keep : int
+        What a membrane keeps in a step, in 1/4096.
+    """
+
+    units: Array
+    real: Array
+    bias: Array
+    threshold: Array
+    unit: Array
+    keep: int
+
+
+class QuantisedNet(nn.Module):
+    """A network on chip integers.
+
+    Parameters
+    ----------
+    checkpoint : Checkpoint
+        Weights, decay and threshold.
+    adjacency : (taxels, taxels) or (filters, places, taxels) float64
+        What the first layer sees, see :func:`expand.stack_of`.
+    forms : sequence of Form
+        How the chip stores each layer, conv1 first.
+    """
+
+    def __init__(self, checkpoint: Checkpoint, adjacency: Array, forms: Sequence[Form]) -> None:
+        super().__init__()
+        self.forms = tuple(forms)
+        self.names = ("conv1", *(dense.name for dense in checkpoint.dense))
+        self.theta = checkpoint.theta
+        self.keep = (1 << DECAY_BITS) - decay_registers(checkpoint.beta)[1]
+        self.system = checkpoint.system
+        self.stack = stack_of(checkpoint, adjacency)
+        self.hops = nn.Parameter(torch.tensor(checkpoint.hops))
+        self.conv_bias = nn.Parameter(torch.tensor(checkpoint.conv_bias))
+        self.weights = nn.ParameterList(nn.Parameter(torch.tensor(dense.weight)) for dense in checkpoint.dense)
+        self.biases = nn.ParameterList(nn.Parameter(torch.tensor(dense.bias)) for dense in checkpoint.dense)
+        self.integers: tuple[Integers, ...] = ()
+        self.round()
+
+    def real_weights(self) -> list[tuple[Array, Array]]:
+        """Weights (neurons, inputs) and biases (neurons,) of each layer, float64, the convolution expanded."""
+        hops = self.hops.detach().numpy().astype(np.float64)
+        conv = in_order(self.system, effective_weight(self.stack, hops))
+        bias = np.tile(self.conv_bias.detach().numpy().astype(np.float64), (self.stack.shape[1], 1))
+        layers = [(conv.reshape(len(conv), -1), in_order(self.system, bias))]
+        for weight, bias in zip(self.weights, self.biases, strict=True):
+            layers.append((weight.detach().numpy().astype(np.float64), bias.detach().numpy().astype(np.float64)))
+        return layers
+
+    def round(self) -> None:
+        """Round all weights; to be called after every change of them.
+
+        Raises
+        ------
+        ValueError
+            If a bias has no register value; `make_legal` prevents that.
+        """
+        found = []
+        for (weight, bias), form in zip(self.real_weights(), self.forms, strict=True):
+            scale = form.threshold / self.theta
+            steps = round_steps(weight, scale[:, None], form.bits, form.exponents)
+            units = steps * step_units(form.bits, form.exponents)
+            mantissa, exponent = encode_bias(bias * scale * (1 << MEMBRANE_SHIFT))
+            found.append(
+                Integers(
+                    units=np.ascontiguousarray(units.T, np.float32),
+                    real=(units / scale[:, None]).astype(np.float32),
+                    bias=mantissa << exponent,
+                    threshold=form.threshold << MEMBRANE_SHIFT,
+                    unit=1 / (scale * (1 << MEMBRANE_SHIFT)),
+                    keep=self.keep,
+                )
+            )
+        self.integers = tuple(found)
+
+    def clip_weights(self) -> None:
+        """Keep the weights of dense layers within half a step of what their storage holds, so that none gets lost."""
+        with torch.no_grad():
+            for weight, form in zip(self.weights, self.forms[1:], strict=True):
+                step = step_units(form.bits, form.exponents) * self.theta / form.threshold
+                limit = torch.tensor((reach(form.bits, form.exponents) + 0.5) * step, dtype=torch.float32)[:, None]
+                weight.copy_(torch.clamp(weight, -limit, limit))
+
+    def make_legal(self) -> None:
+        """Shrink weights and biases until no accumulator can overflow and every bias has a register value; round."""
+        with torch.no_grad():
+            for layer, form in enumerate(self.forms):
+                bias = self.conv_bias if layer == 0 else self.biases[layer - 1]
+                most = (BIAS_MANTISSA_MAX << BIAS_EXPONENT_MAX) * self.theta / (form.threshold << MEMBRANE_SHIFT)
+                bound = torch.tensor(most.min() if layer == 0 else most, dtype=torch.float32) * SHRINK
+                bias.copy_(torch.clamp(bias, -bound, bound))
+            over = True
+            while over:
+                self.round()
+                over = False
+                for layer, integers in enumerate(self.integers):
+                    up = np.maximum(integers.units, 0).sum(axis=0, dtype=np.float64)
+                    down = np.maximum(-integers.units, 0).sum(axis=0, dtype=np.float64)
+                    wrong = np.maximum(up, down) > ONE_STEP_SUM_MAX
+                    if not wrong.any():
+                        continue
+                    over = True
+                    if layer:
+                        self.weights[layer - 1][torch.tensor(wrong)] *= SHRINK
+                    else:
+                        places, features = self.stack.shape[1], self.hops.shape[1]
+                        feature = in_order(self.system, np.tile(np.arange(features), (places, 1)))
+                        self.hops[:, torch.tensor(np.unique(feature[wrong]))] *= SHRINK
+
+    def spikes_of(self, events: Tensor) -> list[Tensor]:
+        """Spikes of every layer, (steps, samples, neurons), for events (steps, samples, channels) of zeros and ones."""
+        stack = torch.tensor(self.stack, dtype=torch.float32)
+        places, features = stack.shape[1], self.hops.shape[1]
+        # for the gradient only; the integers come from float64
+        conv = in_order(self.system, torch.einsum("kij,kfc->ifjc", stack, self.hops))
+        bias = in_order(self.system, self.conv_bias.repeat(places).view(places, features))
+        found, spikes = [], events
+        pairs = [(conv.reshape(len(conv), -1), bias), *zip(self.weights, self.biases, strict=True)]
+        for (weight, bias), integers in zip(pairs, self.integers, strict=True):
+            spikes = _ChipLayer.apply(spikes, weight, bias, integers, self.theta)  # type: ignore[no-untyped-call]
+            found.append(spikes)
+        return found
+
+    def forward(self, events: Tensor, lengths: Tensor | None = None) -> Tensor:
+        """Spikes per step of each output neuron, (samples, classes).
+
+        Parameters
+        ----------
+        events : (steps, samples, channels)
+            Zeros and ones.
+        lengths : (samples,) int64, optional
+            Steps of each recording, where some were filled up with silence.
+        """
+        spikes = self.spikes_of(events)[-1]
+        if lengths is None:
+            return spikes.mean(0)
+        inside = torch.arange(len(spikes))[:, None] < lengths
+        return torch.sum(spikes * inside[..., None], dim=0) / lengths[:, None]
+
+
+class _ChipLayer(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, spikes: Tensor, _weight: Tensor, _bias: Tensor, integers: Integers, theta: float) -> Tensor:
+        steps, samples, inputs = spikes.shape
+        source, bounds = events_of(spikes.detach().reshape(-1, inputs).contiguous().numpy())
+        sums = np.zeros((steps * samples, integers.units.shape[1]), np.float32)
+        gather(source, bounds, integers.units, sums)
+        shape = steps, sums.size // steps
+        fired, membrane = np.empty(shape, np.float32), np.empty(shape, np.float32)
+        tiled = [np.tile(a, samples) for a in (integers.bias, integers.threshold, integers.unit)]
+        _integrate_chip(sums.reshape(shape), tiled[0], tiled[1], tiled[2], integers.keep, fired, membrane)
+        ctx.kept = source, bounds, membrane, integers, theta, samples
+        return torch.from_numpy(fired).view(steps, samples, -1)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor, Tensor, None, None]:
+        source, bounds, membrane, integers, theta, samples = ctx.kept
+        above = gradients[0].contiguous().view(membrane.shape).numpy()
+        current = np.empty_like(membrane)
+        differentiate(above, membrane, integers.keep / (1 << DECAY_BITS), theta, RECTANGLE, current)
+        rows = current.reshape(len(membrane) * samples, -1)
+        weight = np.zeros_like(integers.units)
+        scatter(source, bounds, rows, weight)
+        below = None
+        if ctx.needs_input_grad[0]:
+            below = torch.from_numpy(rows @ integers.real).view(len(membrane), samples, -1)
+        return below, torch.from_numpy(weight.T), torch.from_numpy(rows.sum(0)), None, None
+
+
+@numba.njit(cache=True)
+def _chip_step(sums: Any, v: Any, bias: Any, threshold: Any, unit: Any, keep: Any, fired: Any, membrane: Any) -> None:
+    for i in range(len(v)):
+        magnitude = abs(v[i]) * keep >> DECAY_BITS
+        u = (magnitude if v[i] >= 0 else -magnitude) + (np.int64(sums[i]) << MEMBRANE_SHIFT) + bias[i]
+        u = min(max(u, -MEMBRANE_MAX), MEMBRANE_MAX)
+        spike = u > threshold[i]
+        fired[i] = spike
+        membrane[i] = u * unit[i]
+        v[i] = 0 if spike else u
+
+
+@numba.njit(cache=True)
+def _integrate_chip(sums: Any, bias: Any, threshold: Any, unit: Any, keep: Any, fired: Any, membrane: Any) -> None:
+    """Loihi's compartment without a current of its own, along the first axis; :mod:`loihi1.spec` defines it."""
+    v = np.zeros(sums.shape[1], np.int64)
+    for t in range(len(sums)):
+        _chip_step(sums[t], v, bias, threshold, unit, keep, fired[t], membrane[t])
+
+
+def quantised_spikes(
+    checkpoint: Checkpoint, adjacency: NDArray[np.float64], events: NDArray[np.uint8]
+) -> dict[str, NDArray[np.bool_]]:
+    """Spikes of every layer of a fine-tuned checkpoint as its torch model computes them.
+
+    Parameters
+    ----------
+    checkpoint : Checkpoint
+        With forms.
+    adjacency : (taxels, taxels) float64
+        Normalised propagation matrix.
+    events : (samples, taxels, channels, steps) uint8
+        Recordings.
+
+    Returns
+    -------
+    dict of str to (samples, steps, neurons) bool
+        One entry per layer, in order.
+    """
+    if checkpoint.towers > 1:
+        return side_by_side(checkpoint, [quantised_spikes(m, adjacency, events) for m in members(checkpoint)])
+    assert checkpoint.forms is not None, "only a fine-tuned checkpoint has a quantised model"
+    network = QuantisedNet(checkpoint, adjacency, checkpoint.forms)
+    found: dict[str, list[NDArray[np.bool_]]] = {name: [] for name in network.names}
+    with torch.no_grad():
+        for recording in events:
+            layers = network.spikes_of(time_first(recording[None]))
+            for name, spikes in zip(network.names, layers, strict=True):
+                found[name].append(spikes[:, 0].bool().numpy())
+    return {name: np.stack(parts) for name, parts in found.items()}
+
+
+def time_first(events: NDArray[np.uint8]) -> Tensor:
+    """(samples, taxels, channels, steps) uint8 to (steps, samples, taxels * channels) float32."""
+    flat = events.reshape(len(events), -1, events.shape[3])
+    return torch.from_numpy((flat != 0).transpose(2, 0, 1).astype(np.float32, order="C"))

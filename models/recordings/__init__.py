@@ -1,0 +1,1 @@
+"""Recordings of touch: read, written, described, made."""

@@ -1,0 +1,229 @@
+"""Files of single events: CSV or npz with ``time_s``, ``taxel``, ``polarity`` and perhaps ``label``.
+
+Times are seconds from the start of the recording, in any order. Polarity is 1 for rising and 0 or -1 for falling,
+one code per file. The label is the class of the whole recording: one constant, or part of a file name such as
+``grasp_7_label_3.csv``.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import zipfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spikeloom.compiler.errors import DataError
+from spikeloom.models.recordings import evtouch
+from spikeloom.models.recordings.csvtable import FloatArray, read_table
+from spikeloom.models.sensors import MAX_TAXELS
+
+SUFFIXES = (".csv", ".npz")
+MAX_LABEL = 999_999
+UNLABELLED = -1
+
+UNITS = (("nanoseconds", 5e5), ("microseconds", 5e2), ("milliseconds", 0.5))
+"""Units that times may have by mistake, and what half of the events then leave between them, at least."""
+
+UNIT_EVENTS, UNIT_SPAN = 8, 60.0
+"""Different times, and what lies between first and last, below which no unit is guessed."""
+
+_REQUIRED = ("time_s", "taxel", "polarity")
+_COLUMNS = "time_s, taxel, polarity[, label]"
+_LABEL = re.compile(r"_label_([0-9]{1,6})(?![0-9])")
+_NUMBERS = re.compile(r"[<>|=](f[248]|[iu][1248]|b1)")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class EventStream:
+    """The events of one recording, as they came.
+
+    Parameters
+    ----------
+    name : str
+        Of the file.
+    time_s : (events,) float64
+        Seconds from the start of the recording, 0 or more, in any order.
+    taxel : (events,) int64
+        Below `MAX_TAXELS`.
+    polarity : (events,) uint8
+        1 for rising, 0 for falling.
+    label : int
+        Class of the recording, `UNLABELLED` where nothing says it.
+    at : callable
+        Place of an event by its index, for messages.
+    """
+
+    name: str
+    time_s: FloatArray
+    taxel: NDArray[np.int64]
+    polarity: NDArray[np.uint8]
+    label: int
+    at: Callable[[int], str]
+
+
+def read_stream(path: str | os.PathLike[str], *, taxels: int | None = None, where: str | None = None) -> EventStream:
+    """Read one file of events.
+
+    Parameters
+    ----------
+    path : path
+        A ``.csv`` (see :func:`csvtable.read_table`) or a ``.npz`` of one-dimensional arrays; ``label`` may be one
+        number.
+    taxels : int, optional
+        How many the sensor has.
+    where : str, optional
+        What messages call the file; its name if left out.
+
+    Raises
+    ------
+    DataError
+        If the file cannot be read, holds no events, or an event cannot be; the message names it.
+    """
+    path = Path(path)
+    where = where or path.name
+    columns, at = _read_csv(path, where) if path.suffix.lower() == ".csv" else _read_npz(path, where)
+    time_s, taxel = columns["time_s"], columns["taxel"]
+    wrong = ~(np.isfinite(time_s) & (time_s >= 0))
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        raise DataError(
+            f"{at(row)}: time {time_s[row]:g} s, allowed are finite times from 0; count from the start of the recording"
+        )
+    most = MAX_TAXELS if taxels is None else taxels
+    wrong = ~((taxel >= 0) & (taxel < most) & (taxel == np.floor(taxel)))  # true for NaN too
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        from_one = taxel.min() == 1 and taxel.max() == taxels  # false for NaN
+        mend = "they seem to count from 1" if from_one else "use recordings of this sensor"
+        plain = f"{at(row)}: taxel {taxel[row]:g}, allowed are whole numbers 0..{most - 1}; count from 0"
+        raise DataError(f"{plain}, {mend}" if from_one else f"{plain} and {mend}")
+    return EventStream(
+        name=path.name,
+        time_s=time_s,
+        taxel=taxel.astype(np.int64),
+        polarity=_polarity(where, columns["polarity"], at),
+        label=_label(where, path.name, columns.get("label")),
+        at=at,
+    )
+
+
+def label_in_name(name: str) -> int:
+    """Class in a file name, `UNLABELLED` if there is none.
+
+    Examples
+    --------
+    >>> label_in_name("sample_12_label_3.npy"), label_in_name("run_label_7_left.csv"), label_in_name("grasp.csv")
+    (3, 7, -1)
+    """
+    match = _LABEL.search(name)
+    return UNLABELLED if match is None else int(match[1])
+
+
+def likely_unit(times: NDArray[np.float64]) -> str | None:
+    """Unit that times seem to have if it is not seconds.
+
+    A sensor that is touched sends several events a second. Times that are further apart, over a minute or more, are
+    some smaller unit: that in which they are half a millisecond to half a second apart.
+
+    Examples
+    --------
+    >>> likely_unit(np.arange(0, 3000, 7.0)), likely_unit(np.arange(0, 3, 0.007)), likely_unit(np.array([0.0, 90.0]))
+    ('milliseconds', None, None)
+    """
+    distinct = np.unique(times)
+    if len(distinct) < UNIT_EVENTS or distinct[-1] - distinct[0] < UNIT_SPAN:
+        return None
+    apart = float(np.median(np.diff(distinct)))
+    return next((unit for unit, least in UNITS if apart > least), None)
+
+
+def _polarity(where: str, values: FloatArray, at: Callable[[int], str]) -> NDArray[np.uint8]:
+    """1 for rising, 0 for falling, from either code."""
+    low, zero, high = values == -1, values == 0, values == 1
+    wrong = ~(low | zero | high)
+    codes = "allowed are 0 and 1, or -1 and 1"
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        raise DataError(f"{at(row)}: polarity {values[row]:g}, {codes}; 1 is rising")
+    if low.any() and zero.any():
+        raise DataError(f"{where}: polarities -1 and 0 in one file, {codes}; write one code")
+    rising: NDArray[np.uint8] = high.astype(np.uint8)
+    return rising
+
+
+def _label(where: str, name: str, column: FloatArray | None) -> int:
+    """Class of the recording, from its column or its name."""
+    named = label_in_name(name)
+    if column is None:
+        return named
+    first = float(column[0])
+    if not (0 <= first <= MAX_LABEL and first.is_integer()):
+        raise DataError(f"{where}: label {first:g}, allowed are whole numbers 0..{MAX_LABEL}; number the classes")
+    other = column != first
+    if other.any():
+        raise DataError(
+            f"{where}: labels {first:g} and {column[other][0]:g} in one file, allowed is one; "
+            "write one file for each recording"
+        )
+    if named not in (UNLABELLED, first):
+        raise DataError(f"{where}: label {first:g} in the file and {named} in its name; mend one of them")
+    return int(first)
+
+
+def _read_csv(path: Path, where: str) -> tuple[Mapping[str, FloatArray], Callable[[int], str]]:
+    table = read_table(path, _REQUIRED, ("label",), where=where)
+    return table.columns, table.at
+
+
+def _read_npz(path: Path, where: str) -> tuple[Mapping[str, FloatArray], Callable[[int], str]]:
+    """Columns of an npz, every size checked before memory is taken for it."""
+    try:
+        is_zip = zipfile.is_zipfile(path)
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror or error}); check the path and the disk") from error
+    if not is_zip:
+        raise DataError(f"{where}: not an npz file; save it with numpy.savez")
+    columns: dict[str, FloatArray] = {}
+    with evtouch._opened(path, set()) as (members, read):
+        missing = [name for name in _REQUIRED if f"{name}.npy" not in members]
+        if missing:
+            found = ", ".join(sorted(member.removesuffix(".npy") for member in members)) or "nothing"
+            raise DataError(f"{where}: holds {found}, expected are {_COLUMNS}; name the arrays so")
+        for name in (*_REQUIRED, "label"):
+            if f"{name}.npy" in members:
+                place = f"{where}: {name}"
+                columns[name] = _array(place, evtouch._bounded(place, read, f"{name}.npy"))
+    sizes = {name: column.size for name, column in columns.items() if name != "label"}
+    if len(set(sizes.values())) > 1 or any(columns[name].ndim != 1 for name in sizes):
+        shapes = ", ".join(f"{name} {columns[name].shape}" for name in sizes)
+        raise DataError(f"{where}: shapes {shapes}, allowed is one number per event in each; save flat arrays")
+    if not columns["time_s"].size:
+        raise DataError(f"{where}: no events, a recording needs one or more; remove the file")
+    if "label" in columns:
+        columns["label"] = columns["label"].reshape(-1)
+        if columns["label"].size not in (1, columns["time_s"].size):
+            raise DataError(
+                f"{where}: {columns['label'].size} labels for {columns['time_s'].size} events, allowed is one; "
+                "save one number"
+            )
+    return columns, lambda row: f"{where}: event {row}"
+
+
+def _array(where: str, data: bytes) -> FloatArray:
+    """Numbers of an npy file as float64."""
+    descr, _, shape, start = evtouch._header(where, data)
+    if not (isinstance(descr, str) and _NUMBERS.fullmatch(descr)):
+        raise DataError(f"{where}: dtype {descr!r}, allowed are numbers; convert it")
+    dtype = np.dtype(descr)
+    if math.prod(shape) * dtype.itemsize != len(data) - start:
+        raise DataError(
+            f"{where}: {len(data) - start} bytes of data, its header announces {math.prod(shape) * dtype.itemsize}; "
+            "truncated or damaged; copy it again"
+        )
+    return np.frombuffer(data, dtype=dtype, offset=start).reshape(shape).astype(np.float64)

@@ -1,0 +1,395 @@
+"""Recordings in any form that we read: the released layout, files of events, single recordings, or a name.
+
+Events are put into time bins of one width. Nothing is mended in silence: what came out of order, what fell on an
+event of the same taxel, polarity and bin, and long silences are counted. Each recording counts for its own length.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spikeloom.compiler.errors import DataError, OptionError
+from spikeloom.models.recordings import evtouch
+from spikeloom.models.recordings.eventfiles import (
+    SUFFIXES,
+    UNLABELLED,
+    EventStream,
+    label_in_name,
+    likely_unit,
+    read_stream,
+)
+from spikeloom.models.recordings.evtouch import Recordings, load_recordings
+from spikeloom.models.recordings.fetch import DATA_SETS, find_data
+from spikeloom.models.recordings.labels import NAME as TABLE
+from spikeloom.models.recordings.labels import is_table, labels_beside
+
+BIN_S = 0.02
+"""Width of a time bin in the released recordings, seconds."""
+
+GAP_S = 0.5
+"""A silence longer than this, between two events, counts as a gap; seconds."""
+
+MAX_STEPS = 1_000_000
+
+# Times typed in decimals fall on edges, and 0.58 / 0.02 is 28.999999999999996. Of a bin; three roundings of a
+# quotient below MAX_STEPS are off by a third of it at most.
+_EDGE = 1e-9
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EventCounts:
+    """What was found while recordings were put into bins.
+
+    Parameters
+    ----------
+    events : int
+        Events read, duplicates included.
+    out_of_order : int
+        Events with a time before that of an event that came earlier.
+    duplicates : int
+        Events whose taxel already had one of the same polarity in the same bin; they count once.
+    gaps : int
+        Silences longer than `GAP_S` between two events of a recording.
+    steps : tuple of int
+        Bins of each recording.
+    notes : tuple of str
+        What is worth a second look: times that look like another unit, taxels that seem to count from 1, a table of
+        labels.
+    """
+
+    events: int
+    out_of_order: int
+    duplicates: int
+    gaps: int
+    steps: tuple[int, ...]
+    notes: tuple[str, ...] = ()
+
+
+def load_data(
+    path: str | os.PathLike[str],
+    split: str = "test",
+    *,
+    bin_s: float = BIN_S,
+    taxels: int | None = None,
+    classes: int | None = None,
+    limit: int | None = None,
+) -> tuple[Recordings, EventCounts | None]:
+    """Read recordings, files in plain string order.
+
+    Parameters
+    ----------
+    path : path or str
+        A folder or zip in the released layout; a folder of ``.csv``, ``.npz`` and ``.npy`` recordings, flat (it
+        stands for any split) or with ``train/`` and ``test/``; one such file; or the name of a data set that was
+        fetched.
+    split : str
+        Which split to read.
+    bin_s : float
+        Width of a time bin, seconds. The released layout and ``.npy`` files have bins already: see `require_events`.
+    taxels, classes : int, optional
+        What the network expects. Without `taxels` the highest taxel with an event decides.
+    limit : int, optional
+        Read only the first so many.
+
+    Returns
+    -------
+    recordings : Recordings
+        Labels are `spikeloom.models.recordings.eventfiles.UNLABELLED` where nothing says them; see `need_labels`.
+    counts : EventCounts or None
+        None for the released layout.
+
+    Raises
+    ------
+    DataError
+        If a recording cannot be used; the message names file and place.
+    OptionError
+        If `bin_s` is not a duration, or given for what has bins already; if `limit` is below 1.
+    """
+    if not (math.isfinite(bin_s) and bin_s > 0):
+        raise OptionError(f"--bin {bin_s:g}: not a duration; give seconds above 0, for example {BIN_S:g}")
+    if limit is not None and limit < 1:
+        raise OptionError(f"--limit {limit}: at least 1 recording is needed; give a positive number")
+    path = find_data(str(path)) if str(path) in DATA_SETS else Path(path)
+    found = _event_files(path)
+    if found is None:
+        _require_released(path, split)
+        require_events(path.name or str(path), bin_s)
+        return load_recordings(path, split, limit=limit, classes=classes, taxels=taxels), None
+    source = path.name or str(path)
+    if split not in found and "" not in found:
+        raise DataError(
+            f"{source}: split {split!r} is missing or empty; splits with recordings: {', '.join(sorted(found))}"
+        )
+    files = sorted(found[split if split in found else ""], key=lambda file: file.name)[:limit]
+    table, notes = labels_beside(path, files, source)
+    grids, labels, counts, places = [], [], [], []
+    held = 0
+    for file in files:
+        where = source if file == path else f"{source}: {file.relative_to(path).as_posix()}"
+        if file.suffix.lower() == ".npy":
+            require_events(where, bin_s)
+        grid, label, count = _read(file, where, bin_s, taxels)
+        label = _merged(where, label, table.get(file))
+        if classes is not None and label >= classes:
+            raise DataError(
+                f"{where}: label {label}, the network has {classes} classes (0..{classes - 1}); "
+                "use the network that was trained on these objects"
+            )
+        grids.append(grid)
+        places.append(where)
+        labels.append(label)
+        counts.append(count)
+        held += grid.size
+        evtouch._check_total(source, held)
+    steps = tuple(grid.shape[2] for grid in grids)
+    shape = max(grid.shape[0] for grid in grids), 2, max(steps)
+    evtouch._check_total(source, len(grids) * math.prod(shape))
+    events = np.zeros((len(grids), *shape), dtype=np.uint8)
+    for index, grid in enumerate(grids):
+        events[index, : grid.shape[0], :, : grid.shape[2]] = grid
+    recordings = Recordings(
+        events=events,
+        labels=np.array(labels, dtype=np.int64),
+        files=tuple(file.name for file in files),
+        split=split,
+        source=source,
+        lengths=None if len(set(steps)) == 1 else np.array(steps, dtype=np.int64),
+    )
+    return recordings, EventCounts(
+        events=sum(count.events for count in counts),
+        out_of_order=sum(count.out_of_order for count in counts),
+        duplicates=sum(count.duplicates for count in counts),
+        gaps=sum(count.gaps for count in counts),
+        steps=steps,
+        notes=(*notes, *_unit_notes(places, counts), *(_taxel_notes(source, events) if taxels is None else ())),
+    )
+
+
+def require_events(where: str, bin_s: float) -> None:
+    """Refuse a width of bins for what has bins already.
+
+    Raises
+    ------
+    OptionError
+        If it is another one than the default.
+    """
+    if bin_s != BIN_S:
+        raise OptionError(f"--bin {bin_s:g}: {where} holds bins, not times; leave --bin away")
+
+
+def data_splits(path: str | os.PathLike[str]) -> tuple[str, ...]:
+    """Splits that a data set has; none if it is flat or one recording.
+
+    Raises
+    ------
+    DataError
+        If there are no recordings.
+    """
+    path = find_data(str(path)) if str(path) in DATA_SETS else Path(path)
+    found = _event_files(path)
+    if found is not None:
+        return tuple(sorted(filter(None, found)))
+    _require_released(path, "test")
+    with evtouch._opened(path, {"train", "test"}) as (names, _):
+        return tuple(sorted(evtouch._splits(path.name or str(path), names, {"train", "test"})))
+
+
+def need_labels(recordings: Recordings, what: str) -> Recordings:
+    """Return the recordings if all have labels.
+
+    Parameters
+    ----------
+    recordings : Recordings
+        Perhaps without some labels.
+    what : str
+        What needs them, for the message: ``training``.
+
+    Raises
+    ------
+    DataError
+        If one has none.
+    """
+    missing = recordings.labels == UNLABELLED
+    if missing.any():
+        file = recordings.files[int(np.argmax(missing))]
+        raise DataError(
+            f"{recordings.source}: {file}: no label, {what} needs one for every recording; "
+            "add a label column or name the file like grasp_7_label_3.csv"
+        )
+    return recordings
+
+
+def bin_events(
+    stream: EventStream, bin_s: float = BIN_S, *, taxels: int | None = None
+) -> tuple[NDArray[np.uint8], EventCounts]:
+    """Put the events of one recording into bins.
+
+    Parameters
+    ----------
+    stream : EventStream
+        The events; their order does not matter.
+    bin_s : float
+        Width of a bin, seconds, above 0. Bin ``k`` holds the times from ``k * bin_s`` to before the next; a time
+        less than a billionth of a bin before an edge counts as on it, so that decimals fall where they say.
+    taxels : int, optional
+        How many the sensor has; without it the highest taxel with an event decides.
+
+    Returns
+    -------
+    events : (taxels, 2, steps) uint8
+        1 where there is at least one event; the last bin holds the last event.
+    counts : EventCounts
+        For this recording.
+
+    Raises
+    ------
+    DataError
+        If an event is later than `MAX_STEPS` bins.
+    """
+    latest = int(np.argmax(stream.time_s))
+    unit = likely_unit(stream.time_s)
+    if float(stream.time_s[latest]) / bin_s >= MAX_STEPS:
+        mend = "count from the start of the recording or use wider bins"
+        if unit:
+            mend = f"the times look like {unit}, write seconds"
+        raise DataError(
+            f"{stream.at(latest)}: time {stream.time_s[latest]:g} s is past {MAX_STEPS} bins of {bin_s:g} s, the limit "
+            f"of a recording; {mend}"
+        )
+    step = np.floor(stream.time_s / bin_s + _EDGE).astype(np.int64)
+    steps = int(step.max()) + 1
+    n = int(stream.taxel.max()) + 1 if taxels is None else taxels
+    evtouch._check_total(stream.name, n * 2 * steps)
+    grid = np.zeros((n, 2, steps), dtype=np.uint8)
+    grid[stream.taxel, stream.polarity, step] = 1
+    sent = len(stream.time_s)
+    return grid, EventCounts(
+        events=sent,
+        out_of_order=int(np.count_nonzero(stream.time_s < np.maximum.accumulate(stream.time_s))),
+        duplicates=sent - int(np.count_nonzero(grid)),
+        gaps=int(np.count_nonzero(np.diff(np.sort(stream.time_s)) > GAP_S)),
+        steps=(steps,),
+        notes=(f"times up to {stream.time_s[latest]:g} look like {unit}; write seconds",) if unit else (),
+    )
+
+
+def joined_bins(recordings: Recordings, bins: int) -> Recordings:
+    """Recordings in bins as many times as long, which hold an event wherever one of theirs did.
+
+    Parameters
+    ----------
+    recordings : Recordings
+        The last bin of a recording may be a shorter one.
+    bins : int
+        How many make one, at least 1.
+    """
+    if bins == 1:
+        return recordings
+    lengths = None if recordings.lengths is None else -(-recordings.lengths // bins)
+    return replace(recordings, events=join_bins(recordings.events, bins), lengths=lengths)
+
+
+def join_bins(events: NDArray[Any], bins: int) -> NDArray[Any]:
+    """Events (..., steps) in bins as many times as long, (..., ceil(steps / bins)).
+
+    Examples
+    --------
+    >>> join_bins(np.array([[0, 1, 0, 0, 1]], np.uint8), 2).tolist()
+    [[1, 0, 1]]
+    """
+    joined: NDArray[Any] = np.maximum.reduceat(events, np.arange(0, events.shape[-1], bins), axis=-1)
+    return joined
+
+
+def _event_files(path: Path) -> dict[str, list[Path]] | None:
+    """Files by split, ``""`` for any, or None where `load_recordings` reads the data set."""
+    readable = (*SUFFIXES, ".npy")
+    if path.is_file():
+        if path.suffix.lower() in readable:
+            return {"": [path]}
+        with path.open("rb") as file:
+            if file.read(2) == b"PK":
+                return None
+        raise DataError(f"{path}: not a recording; give a folder, a released zip, or a .csv, .npz or .npy file")
+    if not path.is_dir():
+        return None
+    found = {
+        split: [file for file in (path / split).iterdir() if _counts(file, readable)]
+        for split in ("train", "test")
+        if (path / split).is_dir()
+    }
+    found = {split: files for split, files in found.items() if files}
+    if not found:
+        flat = [file for file in path.iterdir() if _counts(file, readable)]
+        return {"": flat} if flat else None
+    suffixes = {file.suffix.lower() for files in found.values() for file in files}
+    if suffixes == {".npy"}:
+        return None
+    if ".npy" in suffixes:
+        raise DataError(
+            f"{path.name or path}: .npy beside {' and '.join(sorted(suffixes - {'.npy'}))} in train/ and test/, "
+            "allowed are bins or events; keep one kind"
+        )
+    return found
+
+
+def _counts(file: Path, suffixes: tuple[str, ...]) -> bool:
+    plain = not (file.name.startswith(".") or is_table(file))
+    return file.suffix.lower() in suffixes and plain and file.is_file()
+
+
+def _require_released(path: Path, split: str) -> None:
+    """Say everything that a folder may hold if it holds nothing of it."""
+    splits = {"train", "test", split}
+    if path.is_dir() and not any(name.endswith(".npy") for name in evtouch._list_folder(path, splits)):
+        raise DataError(
+            f"{path.name or path}: no recordings; give a folder with event files (.csv, .npz) or bins (.npy), "
+            "together or in train/ and test/, or a released zip"
+        )
+
+
+def _merged(where: str, label: int, listed: int | None) -> int:
+    """Class of a recording that may stand in a table too."""
+    if listed is None:
+        return label
+    if label not in (UNLABELLED, listed):
+        raise DataError(f"{where}: label {label}, and {listed} in {TABLE}; mend one of them")
+    return listed
+
+
+def _unit_notes(places: list[str], counts: list[EventCounts]) -> list[str]:
+    """One line for all recordings whose times look wrong."""
+    odd = [(place, note) for place, count in zip(places, counts, strict=True) for note in count.notes]
+    others = f" (and {len(odd) - 1} more)" if len(odd) > 1 else ""
+    return [f"{place}{others}: {note}" for place, note in odd[:1]]
+
+
+def _taxel_notes(source: str, events: NDArray[np.uint8]) -> list[str]:
+    """Taxels that count from 1 leave the first silent, and no other."""
+    alive = np.asarray(events.any(axis=(0, 2, 3)), np.bool_)
+    if len(alive) < 4 or alive[0] or not alive[1:].all():
+        return []
+    return [f"{source}: no event at taxel 0, some at each of 1..{len(alive) - 1}: if these count from 1, count from 0"]
+
+
+def _read(file: Path, where: str, bin_s: float, taxels: int | None) -> tuple[NDArray[np.uint8], int, EventCounts]:
+    """Events in bins, label and counts of one recording."""
+    if file.suffix.lower() != ".npy":
+        stream = read_stream(file, taxels=taxels, where=where)
+        grid, count = bin_events(stream, bin_s, taxels=taxels)
+        return grid, stream.label, count
+    data = evtouch._bounded(where, lambda _: evtouch._read_file(file), file.name)
+    grid = evtouch._parse(where, data, taxels)
+    busy = np.flatnonzero(grid.any(axis=(0, 1)))
+    gaps = int(np.count_nonzero((np.diff(busy) - 1) * bin_s > GAP_S))
+    count = EventCounts(
+        events=int(np.count_nonzero(grid)), out_of_order=0, duplicates=0, gaps=gaps, steps=(grid.shape[2],)
+    )
+    return grid, label_in_name(file.name), count

@@ -1,0 +1,130 @@
+"""Write recordings in the released layout: ``SPLIT/sample_N_label_L.npy``, float32 (taxels, 2, steps).
+
+A table beside the splits says which file each of them was.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+import shutil
+import zipfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from spikeloom.compiler.errors import DataError, OptionError
+from spikeloom.compiler.formats.atomic import beside, write_atomically
+from spikeloom.models.recordings.events import need_labels
+from spikeloom.models.recordings.evtouch import Recordings
+
+SOURCES = "sources.csv"
+"""Table of split, new name and old name of every recording."""
+
+_EPOCH = (1980, 1, 1, 0, 0, 0)  # equal recordings give equal zips
+
+
+def write_released(path: str | os.PathLike[str], splits: Sequence[Recordings]) -> None:
+    """Write splits into a new folder, or a zip if the name ends so; all of it or nothing.
+
+    Parameters
+    ----------
+    path : path
+        A zip that exists is replaced, a folder must not exist.
+    splits : sequence of Recordings
+        Each goes into the folder named by its split. Numbers have leading zeros, so that the plain order of the
+        files is the order of the recordings.
+
+    Raises
+    ------
+    OptionError
+        If the folder exists, or there is none to put it in.
+    DataError
+        If a recording has no label.
+    OSError
+        If it cannot be written.
+    """
+    path = Path(path)
+    for recordings in splits:
+        need_labels(recordings, "the released layout")
+    if not path.absolute().parent.is_dir():
+        raise OptionError(f"-o {path}: the folder around it does not exist; make it first")
+    if path.suffix.lower() == ".zip":
+        with write_atomically(path) as target, zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as archive:
+            for name, content in _members(splits):
+                info = zipfile.ZipInfo(name, _EPOCH)
+                info.compress_type = zipfile.ZIP_DEFLATED
+                info.external_attr = 0o644 << 16
+                archive.writestr(info, content)
+        return
+    if path.exists():
+        raise OptionError(f"-o {path}: exists already; choose another name or remove it")
+    part = beside(path)
+    try:
+        part.mkdir()
+        for name, content in _members(splits):
+            (part / name).parent.mkdir(exist_ok=True)
+            (part / name).write_bytes(content)
+        part.rename(path)
+    except BaseException:
+        shutil.rmtree(part, ignore_errors=True)
+        raise
+
+
+def _members(splits: Sequence[Recordings]) -> Iterator[tuple[str, bytes]]:
+    """Name and content of every file."""
+    for recordings in splits:
+        for index, events in enumerate(recordings.events):
+            buffer = io.BytesIO()
+            np.lib.format.write_array(buffer, events.astype(np.float32), version=(1, 0), allow_pickle=False)
+            yield f"{recordings.split}/{_name(recordings, index)}", buffer.getvalue()
+    yield SOURCES, _sources(splits)
+
+
+def _name(recordings: Recordings, index: int) -> str:
+    width = len(str(len(recordings) - 1))
+    return f"sample_{index:0{width}}_label_{recordings.labels[index]}.npy"
+
+
+def _sources(splits: Sequence[Recordings]) -> bytes:
+    """Which file became which."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["split", "file", "source"])
+    for recordings in splits:
+        for index, file in enumerate(recordings.files):
+            writer.writerow([recordings.split, _name(recordings, index), file])
+    return text.getvalue().encode()
+
+
+def write_event_lines(path: str | os.PathLike[str], splits: Sequence[Recordings], bin_s: float) -> None:
+    """Write one recording as lines ``time_s,taxel,polarity``, each event at the middle of its bin.
+
+    Parameters
+    ----------
+    path : path
+        CSV file; replaced if it exists.
+    splits : sequence of Recordings
+        One recording in all.
+    bin_s : float
+        Seconds per step.
+
+    Raises
+    ------
+    DataError
+        If there are several recordings.
+    OSError
+        If it cannot be written.
+    """
+    count = sum(len(recordings) for recordings in splits)
+    if count != 1:
+        raise DataError(
+            f"-o {path}: {count} recordings, a .csv holds one; give one recording, or a folder or zip to -o"
+        )
+    step, taxel, polarity = np.nonzero(splits[0].events[0].transpose(2, 0, 1))
+    times = (step + 0.5) * bin_s
+    lines = [f"{t:.9g},{n},{p}\n" for t, n, p in zip(times.tolist(), taxel.tolist(), polarity.tolist(), strict=True)]
+    with write_atomically(path) as file:
+        file.write(("time_s,taxel,polarity\n" + "".join(lines)).encode())

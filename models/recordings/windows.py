@@ -1,0 +1,67 @@
+"""The first part of recordings: what is known when a share of a grasp has passed."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+
+from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.fixedpoint import IntArray
+from spikeloom.models.recordings.evtouch import Recordings
+
+WHOLE = 100
+"""Per cent of a recording."""
+
+
+def window_asked(words: str) -> int:
+    """Per cent of each recording, from the words of ``--window``.
+
+    Raises
+    ------
+    OptionError
+        If they are no whole number of per cent from 1 to 100.
+
+    Examples
+    --------
+    >>> window_asked("25%"), window_asked("100")
+    (25, 100)
+    """
+    found = re.fullmatch(r"([0-9]{1,3})%?", words.strip(), re.ASCII)
+    if found is None or not 1 <= int(found[1]) <= WHOLE:
+        raise OptionError(f"--window {words}: not a part of a recording; give whole per cent from 1% to 100%")
+    return int(found[1])
+
+
+def steps_of(lengths: IntArray, percent: int) -> IntArray:
+    """Whole steps of a part of each recording, one at least.
+
+    Examples
+    --------
+    >>> steps_of(np.array([325, 3, 1]), 50).tolist()
+    [162, 1, 1]
+    """
+    return np.maximum(lengths * percent // WHOLE, 1)
+
+
+def first_part(recordings: Recordings, percent: int) -> Recordings:
+    """The first steps of every recording; labels, names and order stay.
+
+    Parameters
+    ----------
+    recordings : Recordings
+        All of their steps.
+    percent : int
+        1 to 100 of each recording's own length.
+    """
+    if percent == WHOLE:
+        return recordings
+    own = np.full(len(recordings), recordings.steps) if recordings.lengths is None else recordings.lengths
+    kept = steps_of(own, percent)
+    longest = int(kept.max(initial=0))
+    return replace(
+        recordings,
+        events=recordings.events[..., :longest],
+        lengths=None if recordings.lengths is None else kept,
+    )

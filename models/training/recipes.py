@@ -1,0 +1,211 @@
+"""How a network is trained, as data: the released way, and one for networks that tell the time.
+
+A recipe is what ``train --recipe`` names; single values may be overridden there. It says nothing of the data, the
+system or the graph, and nothing of how a training is reported (:mod:`training.protocols`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from spikeloom.compiler.dynamics import MOST_CLOCKS, Dynamics, clocks_over
+from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.targets.loihi1.storage.weight_storage import DECAY_ONE, decay_registers
+from spikeloom.models.networks.surrogate import FAST_SIGMOID, RECTANGLE, Surrogate
+from spikeloom.models.systems import HOPS
+from spikeloom.models.training.schedule import DECAY_EPOCHS
+
+MSE, CROSS_ENTROPY = LOSSES = ("mse", "cross-entropy")
+ADAM, ADAMW = OPTIMIZERS = ("adam", "adamw")
+STEPS, COSINE = SCHEDULES = ("steps", "cosine")
+
+Decays = tuple[tuple[str, float], ...]
+"""Pairs of a layer's name and its decay."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Recipe:
+    """Everything that decides a training, beside data, system, graph and seed.
+
+    Parameters
+    ----------
+    name : str
+        Which of ``RECIPES`` it is, or came from.
+    epochs : int
+        Unless the user says otherwise.
+    batch : int
+        Recordings to a step of the optimizer.
+    loss : {"mse", "cross-entropy"}
+        Squared error of the spike rates against zeros and a one, or cross-entropy of `gain` times the rates.
+    gain, smoothing : float
+        Of the cross-entropy: factor before the softmax, and share of the label that goes to all classes alike.
+    surrogate : Surrogate
+        Derivative of a spike.
+    optimizer : {"adam", "adamw"}
+        Both with amsgrad.
+    weight_decay : float
+        Of AdamW.
+    learning_rate : float
+        At the start.
+    schedule : {"steps", "cosine"}
+        A tenth every `decay_epochs`, or half a cosine down to zero over all epochs.
+    decay_epochs : int
+        Of steps; the first epoch of each such block still has the old rate.
+    features, hops : int
+        Outputs of the first layer per place; K of a graph convolution.
+    betas, alphas : pairs of layer and decay
+        Membrane decays of single layers, all others have the common one; current decays that are not zero. With the
+        first, every layer's is rounded to what the chip holds.
+    clocks : int
+        Clock channels, see :mod:`compiler.dynamics`.
+    penalty : float
+        Added to the loss for each synapse that carries a spike in every step: this times the share of the synapses
+        behind neurons that do so, mean over steps and recordings.
+    """
+
+    name: str
+    epochs: int = 100
+    batch: int = 1
+    loss: str = MSE
+    gain: float = 1.0
+    smoothing: float = 0.0
+    surrogate: Surrogate = RECTANGLE
+    optimizer: str = ADAM
+    weight_decay: float = 0.0
+    learning_rate: float = 1e-3
+    schedule: str = STEPS
+    decay_epochs: int = DECAY_EPOCHS
+    features: int = 64
+    hops: int = HOPS
+    betas: Decays = ()
+    alphas: Decays = ()
+    clocks: int = 0
+    penalty: float = 0.0
+
+    def to_json(self) -> dict[str, Any]:
+        """JSON values; without the usual number of epochs, which a training states by itself, and a penalty of zero."""
+        values = asdict(self) | {"betas": dict(self.betas), "alphas": dict(self.alphas)}
+        del values["epochs"]
+        if not self.penalty:
+            del values["penalty"]
+        return values
+
+    def dynamics(self, layers: Iterable[str], beta: float, steps: int) -> Dynamics:
+        """Dynamics of a network with these layers, a common membrane decay and recordings of so many steps.
+
+        Decays are the nearest that the chip's registers hold: what is trained with them need not be rounded.
+        """
+        betas, alphas = dict(self.betas), dict(self.alphas)
+        return Dynamics(
+            betas=tuple(held_decays(betas.get(name, beta), 0.0)[0] for name in layers) if betas else (),
+            alphas=tuple(held_decays(beta, alphas.get(name, 0.0))[1] for name in layers) if alphas else (),
+            clocks=clocks_over(self.clocks, steps),
+        )
+
+
+RELEASED = Recipe(name="released")
+"""The released code's, see :mod:`training.train`."""
+
+TIMED = Recipe(
+    name="timed",
+    epochs=30,
+    batch=4,
+    loss=CROSS_ENTROPY,
+    gain=20.0,
+    surrogate=Surrogate(shape=FAST_SIGMOID, width=0.25, reset=False),
+    optimizer=ADAMW,
+    weight_decay=0.01,
+    schedule=COSINE,
+    features=32,
+    betas=(("conv1", 0.2), ("fc1", 0.2), ("fc2", 0.2), ("fc3", 0.2)),
+    alphas=(("fc1", 0.95), ("fc2", 0.95), ("fc3", 0.95)),
+    clocks=8,
+)
+"""For recordings that differ in when their events come: currents that last 20 steps, and clocks."""
+
+CROSSBARS = Recipe(
+    name="truenorth",
+    epochs=30,
+    batch=4,
+    loss=CROSS_ENTROPY,
+    gain=60.0,
+    surrogate=Surrogate(shape=FAST_SIGMOID, width=0.5, reset=False),
+    optimizer=ADAMW,
+    weight_decay=0.01,
+    learning_rate=3e-3,
+    schedule=COSINE,
+    features=16,
+    clocks=5,
+)
+"""For networks that TrueNorth holds, which have no other."""
+
+RECIPES = {recipe.name: recipe for recipe in (RELEASED, TIMED)}
+
+
+def held_decays(beta: float, alpha: float) -> tuple[float, float]:
+    """Decays of membrane and current that the chip's registers hold instead of these.
+
+    Examples
+    --------
+    >>> held_decays(0.5, 0.95) == (0.5, 3891 / 4096)
+    True
+    """
+    lost_u, lost_v = decay_registers(beta, alpha)
+    return (DECAY_ONE - lost_v) / DECAY_ONE, (DECAY_ONE - 1 - lost_u) / DECAY_ONE
+
+
+def decays_asked(words: str, option: str, layers: tuple[str, ...]) -> Decays:
+    """Decays by layer, from the words of an option; layers of decay zero are left out.
+
+    Examples
+    --------
+    >>> decays_asked("fc1=0.95,fc3=0.5", "--current-decay", ("conv1", "fc1", "fc2", "fc3"))
+    (('fc1', 0.95), ('fc3', 0.5))
+
+    Raises
+    ------
+    OptionError
+        If they are none.
+    """
+    found: dict[str, float] = {}
+    for word in words.split(","):
+        layer, _, number = word.strip().partition("=")
+        try:
+            decay = float(number)
+        except ValueError:
+            decay = -1.0
+        if not 0 <= decay < 1:
+            raise OptionError(
+                f"{option} {words}: {word.strip()!r} is not LAYER=DECAY with 0 <= DECAY < 1; write for example fc1=0.95"
+            )
+        if layer not in layers:
+            raise OptionError(f"{option} {words}: no layer {layer!r}; the layers are {', '.join(layers)}")
+        if layer in found:
+            raise OptionError(f"{option} {words}: names {layer} twice; give it once")
+        found[layer] = decay
+    return tuple(found.items())
+
+
+def check_recipe(recipe: Recipe) -> None:
+    """Refuse sizes that no network has.
+
+    Raises
+    ------
+    OptionError
+        Naming the option.
+    """
+    for option, value, most in (("features", recipe.features, 1024), ("batch", recipe.batch, 1024)):
+        if not 1 <= value <= most:
+            raise OptionError(f"--{option} {value}: allowed are 1 to {most}; choose another")
+    if not 0 <= recipe.penalty < math.inf:
+        raise OptionError(f"--spike-penalty {recipe.penalty:g}: allowed are numbers from 0 up; choose another")
+    if not 0 <= recipe.clocks <= MOST_CLOCKS:
+        raise OptionError(f"--clocks {recipe.clocks}: allowed are 0 to {MOST_CLOCKS}; choose another")
+    if recipe.clocks and dict(recipe.alphas).get("conv1"):
+        raise OptionError(
+            f"--clocks {recipe.clocks}: conv1 relays the clocks step for step, so its current cannot last; "
+            "leave conv1 out of --current-decay, or give --clocks 0"
+        )

@@ -1,0 +1,120 @@
+"""State of a training between two epochs, so that a killed one continues to the same weights, bit for bit."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from spikeloom.compiler.errors import ModelError, OptionError
+from spikeloom.compiler.formats.atomic import write_atomically
+
+SIZE_LIMIT = 2**30
+
+DAMAGES = (
+    *(zipfile.BadZipFile, zlib.error, RuntimeError),  # RuntimeError: encrypted, or packed in a way that is not known
+    *(ValueError, KeyError, EOFError, TypeError, RecursionError),
+    *(SyntaxError, tokenize.TokenError),  # of the header of an array
+)
+"""What reading a damaged state may raise."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TrainingState:
+    """What an epoch hands to the next.
+
+    Parameters
+    ----------
+    options : mapping
+        JSON values that must be equal to go on: digests of data and graph, architecture, epochs, seed, rates.
+    progress : mapping
+        JSON values, as the training sees fit: history, state of the order's generator, learning rate.
+    arrays : mapping of str to arrays
+        Parameters, optimizer moments, weights of epochs that are kept.
+    """
+
+    options: Mapping[str, Any]
+    progress: Mapping[str, Any]
+    arrays: Mapping[str, NDArray[Any]]
+
+
+def write_state(path: str | os.PathLike[str], state: TrainingState) -> None:
+    """Write a state, whole or not at all."""
+    header = json.dumps({"options": dict(state.options), "progress": dict(state.progress)})
+    with write_atomically(path) as file:
+        np.savez(file, allow_pickle=False, header=np.array(header), **state.arrays)
+
+
+def read_state(path: str | os.PathLike[str], options: Mapping[str, Any]) -> TrainingState:
+    """Read a state and check that it belongs to this training.
+
+    Raises
+    ------
+    ModelError
+        If the file is missing or damaged.
+    OptionError
+        If it was written with other options or data; names them.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise ModelError(f"{path}: no interrupted training to resume; leave --resume away")
+    if path.stat().st_size > SIZE_LIMIT:
+        raise ModelError(f"{path}: {path.stat().st_size} bytes, {SIZE_LIMIT} allowed; this is no training state")
+    damaged = f"{path}: is not a training state or is damaged; delete it and train anew"
+    try:
+        content = path.read_bytes()
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            if sum(member.file_size for member in archive.infolist()) > len(content):  # states are not compressed
+                raise ModelError(damaged)
+        with np.load(io.BytesIO(content), allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        header = json.loads(str(arrays.pop("header")))
+        found, progress = dict(header["options"]), dict(header["progress"])
+    except DAMAGES as error:
+        raise ModelError(damaged) from error
+    differing = sorted(name for name in {*found, *options} if found.get(name) != options.get(name))
+    if differing:
+        raise OptionError(
+            f"{path}: belongs to a training with other {', '.join(differing)}; give the same options and data, "
+            "or delete it to train anew"
+        )
+    return TrainingState(options=found, progress=progress, arrays=arrays)
+
+
+def pack(network: torch.nn.Module, optimizer: torch.optim.Optimizer) -> dict[str, NDArray[Any]]:
+    """Copy parameters and optimizer moments."""
+    arrays = {f"network/{name}": p.detach().cpu().numpy().copy() for name, p in network.named_parameters()}
+    for index, moments in optimizer.state_dict()["state"].items():
+        for name, value in moments.items():
+            arrays[f"optimizer/{index}/{name}"] = value.detach().cpu().numpy().copy()
+    return arrays
+
+
+def unpack(
+    arrays: Mapping[str, NDArray[Any]], network: torch.nn.Module, optimizer: torch.optim.Optimizer, rate: float
+) -> None:
+    """Put parameters, optimizer moments and learning rate back."""
+    with torch.no_grad():
+        for name, parameter in network.named_parameters():
+            parameter.copy_(torch.tensor(arrays[f"network/{name}"]))
+    moments: dict[int, dict[str, torch.Tensor]] = {}
+    for key, array in arrays.items():
+        if key.startswith("optimizer/"):
+            _, index, name = key.split("/")
+            moments.setdefault(int(index), {})[name] = torch.tensor(array)
+    state = optimizer.state_dict()
+    state["state"] = moments
+    optimizer.load_state_dict(state)
+    for group in optimizer.param_groups:
+        group["lr"] = rate

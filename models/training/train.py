@@ -1,0 +1,427 @@
+"""Training, by default by the released protocol: one recording at a time, Adam, the squared error of the spike rates.
+
+:mod:`training.recipes` has another way, as data.
+
+The released script reads recordings in the order that the folder lists them, unshuffled, which differs from machine
+to machine. Here each epoch shuffles them anew, from the seed.
+
+Everything runs on one thread: at one recording per step a second thread gains little, and so a seed gives the same
+weights whatever the number of cores.
+
+References
+----------
+.. [1] F. Gu et al., "TactileSGNet: A Spiking Graph Neural Network for Event-based Tactile Object Recognition",
+   IROS 2020.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from tqdm import tqdm
+
+from spikeloom.compiler.errors import DataError, OptionError
+from spikeloom.compiler.formats.checkpoint_file import arrays_digest
+from spikeloom.models.networks.networks import Architecture, SpikingNet, Weights
+from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.models.training.optimizers import course_of, optimizer_of, set_rate
+from spikeloom.models.training.recipes import CROSS_ENTROPY, RELEASED, Recipe
+from spikeloom.models.training.resume import TrainingState, pack, read_state, unpack, write_state
+from spikeloom.models.training.schedule import EPOCHS
+from spikeloom.models.truenorth.network import NativeArchitecture, NativeNet
+
+Sizes = Architecture | NativeArchitecture
+Network = SpikingNet | NativeNet
+
+DEVICES = ("cpu", "cuda")
+
+MOST_SEED = 2**63 - 1
+"""What a torch generator takes."""
+
+TEST_BATCH = 2  # larger batches outgrow the cache
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Epoch:
+    """Figures of one epoch.
+
+    Parameters
+    ----------
+    epoch : int
+        Counted from 1.
+    learning_rate : float
+        When it began.
+    training_loss, test_loss : float
+        The recipe's loss, by default the mean squared error of the spike rates against zeros and a one; mean over the
+        recordings. A penalty on spikes counts in training only.
+    correct, tested : int
+        Test recordings classified correctly after it, and all of them.
+    """
+
+    epoch: int
+    learning_rate: float
+    training_loss: float
+    test_loss: float
+    correct: int
+    tested: int
+
+    @property
+    def accuracy(self) -> float:
+        """Share of the test recordings classified correctly."""
+        return self.correct / self.tested
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Trained:
+    """What a training left.
+
+    Parameters
+    ----------
+    architecture : Architecture or NativeArchitecture
+        Of the network.
+    last, best : dict of arrays
+        Weights after the last epoch, and after the epoch with the most correct test recordings (the first such):
+        the latter is chosen on test data, as the published figures are.
+    best_epoch : int
+        Counted from 1.
+    kept : dict of arrays, or None
+        Weights after the epoch that was asked for.
+    history : tuple of Epoch
+        All epochs.
+    """
+
+    architecture: Sizes
+    last: Weights
+    best: Weights
+    best_epoch: int
+    kept: Weights | None
+    history: tuple[Epoch, ...]
+
+
+def train(
+    training: Recordings,
+    test: Recordings,
+    propagation: NDArray[np.float64],
+    architecture: Sizes,
+    *,
+    epochs: int = EPOCHS,
+    seed: int = 0,
+    recipe: Recipe = RELEASED,
+    device: str = "cpu",
+    keep_epoch: int | None = None,
+    state: Path | None = None,
+    resume: bool = False,
+    label: str = "train",
+    position: int = 0,
+    after_epoch: Callable[[Epoch], None] | None = None,
+) -> Trained:
+    """Train a network from scratch, or go on with an interrupted training.
+
+    Parameters
+    ----------
+    training, test : Recordings
+        Both splits; `test` is only looked at.
+    propagation : (taxels, taxels) or (filters, places, taxels) float64
+        What the first layer sees, see :func:`systems.propagation_of`.
+    architecture : Architecture or NativeArchitecture
+        Sizes.
+    epochs : int
+        Passes over the training recordings.
+    seed : int
+        Of the initial weights and of the order of recordings.
+    recipe : Recipe
+        Batch, loss, surrogate, optimizer and schedule; its sizes and dynamics are already in the architecture.
+    device : {"cpu", "cuda"}
+        Where the network runs.
+    keep_epoch : int, optional
+        Epoch, counted from 1, whose weights are kept too.
+    state : path, optional
+        File that holds the state after each epoch; the caller removes it when the result is safe.
+    resume : bool
+        Continue from `state` if it exists. On the CPU the final weights equal those of an uninterrupted training.
+    label, position : str, int
+        Name and row of the progress bar, where several trainings run side by side.
+    after_epoch : callable, optional
+        Called with the figures of each epoch.
+
+    Raises
+    ------
+    OptionError
+        If `epochs`, the recipe's `decay_epochs` or `seed` is too small, there is no such device, or `state` belongs to
+        another training.
+    DataError
+        If recordings and architecture disagree, or the loss is no longer a number.
+    """
+    _check_options(epochs, recipe.decay_epochs, seed, device)
+    for recordings in (training, test):
+        _check(recordings, architecture)
+    options = {
+        "architecture": repr(architecture),
+        "graph": arrays_digest({"adjacency": propagation}),
+        "training data": arrays_digest(training.identity()),
+        "test data": arrays_digest(test.identity()),
+        "epochs": epochs,
+        "seed": seed,
+        "recipe": recipe.to_json(),
+        "device": device,
+        "kept epoch": keep_epoch,
+    }
+    order = np.random.default_rng(seed)
+    history: list[Epoch] = []
+    weights: dict[str, Weights] = {}
+    with one_thread():
+        network = architecture.network(propagation, seed=seed, surrogate=recipe.surrogate).to(device)
+        optimizer = optimizer_of(recipe, network, device)
+        if resume and state is not None and state.exists():
+            found = read_state(state, options)
+            history, weights = _restore(found, network, optimizer, order)
+        bar = tqdm(total=epochs, initial=len(history), desc=label, unit="epoch", position=position, disable=None)
+        with bar as progress:
+            for index in range(len(history), epochs):
+                course = course_of(recipe, index, epochs)
+                if course is not None:
+                    set_rate(optimizer, course(0.0))
+                rate = float(optimizer.param_groups[0]["lr"])
+                shuffled = order.permutation(len(training))
+                training_loss = _train_epoch(network, optimizer, training, shuffled, recipe, course, epoch=index + 1)
+                if course is None and index % recipe.decay_epochs == 0 and index > 1:
+                    set_rate(optimizer, rate * 0.1)
+                test_loss, correct = evaluate(network, test, recipe)
+                if correct > max((epoch.correct for epoch in history), default=-1):
+                    weights["best"] = network.export_weights()
+                if index + 1 == keep_epoch:
+                    weights["kept"] = network.export_weights()
+                history.append(
+                    Epoch(
+                        epoch=index + 1,
+                        learning_rate=rate,
+                        training_loss=training_loss,
+                        test_loss=test_loss,
+                        correct=correct,
+                        tested=len(test),
+                    )
+                )
+                if state is not None:
+                    write_state(state, _state(options, network, optimizer, order, history, weights))
+                progress.set_postfix(loss=f"{training_loss:.4f}", test=f"{correct}/{len(test)}")
+                progress.update()
+                if after_epoch is not None:
+                    after_epoch(history[-1])
+        last = network.export_weights()
+    correct_by_epoch = [epoch.correct for epoch in history]
+    return Trained(
+        architecture=architecture,
+        last=last,
+        best=weights["best"],
+        best_epoch=correct_by_epoch.index(max(correct_by_epoch)) + 1,
+        kept=weights.get("kept"),
+        history=tuple(history),
+    )
+
+
+def _check_options(epochs: int, decay_epochs: int, seed: int, device: str) -> None:
+    for name, value, least in (("epochs", epochs, 1), ("decay-epochs", decay_epochs, 1), ("seed", seed, 0)):
+        if value < least:
+            raise OptionError(f"--{name} {value}: allowed are {least} or more; choose another")
+    if seed > MOST_SEED:
+        raise OptionError(f"--seed {seed}: allowed are 0 to {MOST_SEED}; choose another")
+    require_device(device)
+
+
+def require_device(device: str) -> None:
+    """Refuse a device that is unknown or not there.
+
+    Raises
+    ------
+    OptionError
+        Saying which are allowed.
+    """
+    if device not in DEVICES:
+        raise OptionError(f"--device {device}: unknown; allowed: {', '.join(DEVICES)}")
+    if device == "cuda" and not torch.cuda.is_available():
+        raise OptionError("--device cuda: this machine has no usable GPU; leave --device away")
+
+
+def require_finite(network: torch.nn.Module, loss: float, epoch: int, step: int) -> None:
+    """Stop before the weights are touched.
+
+    Spikes hide a weight that is no number, since it exceeds no threshold and leaves the loss finite; the gradients of
+    the layers before it show it.
+
+    Raises
+    ------
+    DataError
+        If the loss or a gradient is no longer a number.
+    """
+    gradients = [parameter.grad for parameter in network.parameters() if parameter.grad is not None]
+    for name, found in (("loss", loss), ("gradient", sum(float(each.sum()) for each in gradients))):
+        if not math.isfinite(found):
+            raise DataError(
+                f"epoch {epoch}, step {step}: the {name} is {found}, a finite number is needed; the state of the epoch "
+                "before is kept"
+            )
+
+
+def _restore(
+    found: TrainingState, network: Network, optimizer: torch.optim.Optimizer, order: np.random.Generator
+) -> tuple[list[Epoch], dict[str, Weights]]:
+    """Put a state back; return its history and the weights that it kept."""
+    unpack(found.arrays, network, optimizer, found.progress["rate"])
+    order.bit_generator.state = found.progress["order"]
+    weights: dict[str, Weights] = {}
+    for key, array in found.arrays.items():
+        which, _, name = key.partition("/")
+        if which in ("best", "kept"):
+            weights.setdefault(which, {})[name] = array
+    return [Epoch(**epoch) for epoch in found.progress["history"]], weights
+
+
+def _state(
+    options: Mapping[str, Any],
+    network: Network,
+    optimizer: torch.optim.Optimizer,
+    order: np.random.Generator,
+    history: list[Epoch],
+    weights: Mapping[str, Weights],
+) -> TrainingState:
+    arrays = pack(network, optimizer)
+    arrays |= {f"{which}/{name}": array for which, held in weights.items() for name, array in held.items()}
+    progress = {
+        "history": [asdict(epoch) for epoch in history],
+        "order": order.bit_generator.state,
+        "rate": float(optimizer.param_groups[0]["lr"]),
+    }
+    return TrainingState(options=options, progress=progress, arrays=arrays)
+
+
+def evaluate(network: Network, recordings: Recordings, recipe: Recipe = RELEASED) -> tuple[float, int]:
+    """Mean loss, and how many recordings are classified correctly; equal top rates count for the lowest class."""
+    loss, correct = 0.0, 0
+    with torch.no_grad():
+        for chosen, events in _batches(recordings):
+            labels = recordings.labels[chosen]
+            rates = _rates(network, events)
+            loss += float(_loss(recipe, rates, labels)) * len(labels)
+            correct += int(np.sum(rates.numpy().argmax(axis=1) == labels))
+    return loss / len(recordings), correct
+
+
+def predict(network: Network, recordings: Recordings) -> NDArray[np.int64]:
+    """Class of each recording; equal top rates count for the lowest one."""
+    found = []
+    with torch.no_grad(), one_thread():
+        for _, events in _batches(recordings):
+            found.append(_rates(network, events).numpy().argmax(axis=1))
+    return np.concatenate(found)
+
+
+def _batches(recordings: Recordings) -> Iterator[tuple[slice, NDArray[np.uint8]]]:
+    """All recordings in order, a few of one length at a time: where they stand, and their events without filling."""
+    start = 0
+    while start < len(recordings):
+        steps, stop = recordings.steps_of(start), start + 1
+        while stop < min(start + TEST_BATCH, len(recordings)) and recordings.steps_of(stop) == steps:
+            stop += 1
+        yield slice(start, stop), recordings.events[start:stop, ..., :steps]
+        start = stop
+
+
+def _train_epoch(
+    network: Network,
+    optimizer: torch.optim.Optimizer,
+    recordings: Recordings,
+    order: NDArray[np.int64],
+    recipe: Recipe,
+    course: Callable[[float], float] | None,
+    *,
+    epoch: int,
+) -> float:
+    total, device = 0.0, network.adjacency.device
+    for step, start in enumerate(range(0, len(order), recipe.batch), 1):
+        chosen = order[start : start + recipe.batch]
+        if course is not None:
+            set_rate(optimizer, course(start / len(order)))
+        optimizer.zero_grad()
+        lengths = np.array([recordings.steps_of(int(index)) for index in chosen])
+        events = recordings.events[chosen][..., : lengths.max()]
+        filled = lengths if lengths.min() < lengths.max() else None
+        inside = None if filled is None else torch.tensor(filled, device=device)
+        shown = _time_first(events).to(device)
+        if isinstance(network, SpikingNet) and recipe.penalty:
+            layers = network.layers(shown)
+            loss = _loss(recipe, network.rates(layers, inside).cpu(), recordings.labels[chosen])
+            loss = loss + recipe.penalty * network.activity(layers, inside)
+        else:
+            loss = _loss(recipe, network(shown, inside).cpu(), recordings.labels[chosen])
+        found = float(loss.detach())
+        loss.backward()  # type: ignore[no-untyped-call]
+        require_finite(network, found, epoch, step)
+        optimizer.step()
+        total += found * len(chosen)
+    return total / len(order)
+
+
+def _loss(recipe: Recipe, rates: Tensor, labels: NDArray[np.int64]) -> Tensor:
+    if recipe.loss == CROSS_ENTROPY:
+        wanted = torch.tensor(labels)
+        return torch.nn.functional.cross_entropy(recipe.gain * rates, wanted, label_smoothing=recipe.smoothing)
+    return rate_loss(rates, labels)
+
+
+def rate_loss(rates: Tensor, labels: NDArray[np.int64]) -> Tensor:
+    """Mean squared error of spike rates (samples, classes) against zeros and a one."""
+    target = torch.zeros_like(rates)
+    target[torch.arange(len(labels)), torch.tensor(labels)] = 1.0
+    return torch.nn.functional.mse_loss(rates, target)
+
+
+def _rates(network: Network, events: NDArray[np.uint8]) -> Tensor:
+    """Spike rates on the CPU, computed where the network is."""
+    rates: Tensor = network(_time_first(events).to(network.adjacency.device)).cpu()
+    return rates
+
+
+def _time_first(events: NDArray[np.uint8]) -> Tensor:
+    """(samples, taxels, channels, steps) uint8 to (steps, samples, taxels, channels) float32."""
+    return torch.from_numpy(events.transpose(3, 0, 1, 2).astype(np.float32, order="C"))
+
+
+def _check(recordings: Recordings, architecture: Sizes) -> None:
+    where = f"{recordings.source}: split {recordings.split!r}"
+    found, wanted = recordings.events.shape[1:3], (architecture.taxels, architecture.channels)
+    if found != wanted:
+        raise DataError(
+            f"{where}: {found[0]} taxels and {found[1]} polarities, the network has {wanted[0]} and {wanted[1]}; "
+            "use the graph of this sensor"
+        )
+    highest = int(recordings.labels.max())
+    if highest >= architecture.classes:
+        raise DataError(
+            f"{where}: label {highest}, the network has {architecture.classes} classes "
+            f"(0..{architecture.classes - 1}); train it with more classes"
+        )
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """One torch thread, subnormal numbers flushed to zero (beta**t decays into them); both undone at the end."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    torch.set_flush_denormal(True)
+    # glibc hands large blocks back to the system when they are freed, and each step would fault them in anew.
+    # Having freed one of 30 MB it keeps blocks up to that size, see "dynamic mmap threshold" in mallopt(3).
+    torch.empty(30 << 20, dtype=torch.uint8)
+    try:
+        yield
+    finally:
+        torch.set_flush_denormal(False)
+        torch.set_num_threads(threads)

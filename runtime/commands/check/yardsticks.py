@@ -1,0 +1,47 @@
+"""The command ``yardsticks``: what others count of the float model, beside what the chip does."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from typing import Any
+
+from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.targets.loihi1.netlist_file import is_netlist
+from spikeloom.runtime.commands.inputs import asked_checkpoint, asked_graph, propagation, recordings, shipped
+from spikeloom.runtime.commands.options import add_model, add_recordings
+from spikeloom.runtime.costs import yardsticks
+
+Json = dict[str, Any]
+
+SUMMARY = "NeuroBench's metrics of a checkpoint, and arithmetic energy on a processor"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Describe the options of the command."""
+    parser.add_argument("checkpoint")
+    add_model(parser)
+    add_recordings(parser)
+
+
+def measure(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
+    """Run the command: the report, how to print it, and the exit code."""
+    from spikeloom.models.networks.reference import float_spikes  # torch, so only here
+
+    path = shipped(arguments.checkpoint)
+    if is_netlist(path):
+        raise ModelError(f"{path}: is a netlist, estimate says what it costs; give the checkpoint it was made from")
+    checkpoint = asked_checkpoint(path, arguments)
+    graph, adjacency = propagation(checkpoint, asked_graph(arguments, checkpoint.system), arguments.checkpoint)
+    data = recordings(
+        arguments.data,
+        arguments.split,
+        limit=arguments.limit,
+        classes=checkpoint.classes,
+        taxels=checkpoint.taxels,
+        bin_s=arguments.bin,
+        bins=checkpoint.bins,
+    )
+    spikes = float_spikes(checkpoint, adjacency, data.events)
+    found = yardsticks.measure(checkpoint, adjacency, data.events, spikes, lengths=data.lengths)
+    return yardsticks.yardsticks_json(found) | {"graph": graph}, yardsticks.yardsticks_text, 0

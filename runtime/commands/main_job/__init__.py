@@ -1,0 +1,1 @@
+"""Commands of the main job: compile, run, verify, estimate, report."""

@@ -1,0 +1,194 @@
+"""The command ``compile``: a checkpoint or a file of another format becomes a netlist."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from dataclasses import asdict
+from typing import Any
+
+from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.formats.checkpoint import Checkpoint
+from spikeloom.compiler.targets.base import CROSSBARS, known_targets, load_target, require_target
+from spikeloom.compiler.targets.loihi1.compare import WeightDifference, compare
+from spikeloom.compiler.targets.loihi1.compilation import compile_network
+from spikeloom.compiler.targets.loihi1.layout.choose import require_goal
+from spikeloom.compiler.targets.loihi1.lift import lift
+from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist, write_netlist
+from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe
+from spikeloom.compiler.text import text
+from spikeloom.runtime.commands.inputs import progress, recordings, require_place, version
+from spikeloom.runtime.commands.load_network import Asked, asked_network
+from spikeloom.runtime.commands.main_job.restore import is_whole, take
+from spikeloom.runtime.commands.options import MARGIN, cores_asked
+from spikeloom.runtime.machines.truenorth import in_time, native
+from spikeloom.runtime.machines.truenorth.refusal import refuse
+from spikeloom.runtime.report import render
+
+Json = dict[str, Any]
+
+LISTED = 20
+"""Weights that differ from another netlist's which the text names; JSON has them all."""
+
+
+def compile_netlist(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
+    """Run the command: the report, how to print it, and the exit code."""
+    require_place(arguments.output, "-o", arguments)
+    require_target(arguments.target)
+    if is_whole(arguments):
+        return take(arguments)
+    if native.is_named(arguments.checkpoint):
+        return native.compile_network(arguments)
+    if arguments.target in known_targets(CROSSBARS):
+        return refuse(arguments) if arguments.in_time is None else in_time.compile_network(arguments)
+    if arguments.in_time is not None:
+        raise OptionError(f"--in-time {arguments.in_time}: is for truenorth; give --target truenorth, or leave it away")
+    if arguments.margin is not None and arguments.ranges != "observed":
+        raise OptionError(
+            f"--margin {arguments.margin:g}: only observed ranges have one; add --ranges observed or leave it away"
+        )
+    chip = load_target(arguments.target)
+    recipes = recipes_asked(arguments)
+    cores_for = cores_asked(arguments.cores_for)
+    require_goal(arguments.optimize, cores_for, chip, calibrated=arguments.calibrate is not None, chips=arguments.chips)
+    other = None if arguments.against is None else lift(read_netlist(arguments.against))
+    asked = asked_network(arguments.checkpoint, arguments)
+    checkpoint = asked.checkpoint
+    training = None
+    if arguments.calibrate is not None:
+        progress("reading the recordings")
+        training = recordings(
+            arguments.calibrate,
+            "train",
+            classes=asked.network.classes,
+            taxels=asked.network.input.taxels,
+            bin_s=arguments.bin,
+            bins=asked.network.input.bins,
+        ).events
+    progress("compiling")
+
+    def dump(stage: str, artefact: Any) -> None:
+        if stage in arguments.dump_after:
+            sys.stderr.write(text(artefact))
+
+    compilation = compile_network(
+        asked.network,
+        forms=None if checkpoint is None else checkpoint.forms,
+        target=arguments.target,
+        recipes=recipes,
+        spike_exact=arguments.spike_exact,
+        keep_all=arguments.keep_all,
+        prune_unused=arguments.prune_unused,
+        training_events=training,
+        ranges=arguments.ranges,
+        margin=_margin(arguments),
+        cores_for=cores_for,
+        chips=arguments.chips,
+        optimize=arguments.optimize,
+        provenance=provenance(arguments, asked, calibrated=training is not None),
+        after=dump,
+    )
+    report = render.compilation_json(compilation, write_netlist(compilation.netlist, arguments.output))
+    report |= {"facts": list(asked.facts)} if asked.facts else {}
+    if other is not None:
+        found = compare(lift(compilation.netlist), other)
+        report["against"] = {
+            "synapses": found.synapses,
+            "weights": [asdict(weight) for weight in found.weights],
+            "registers": list(found.registers),
+        }
+    return report, _text, 0
+
+
+def provenance(arguments: argparse.Namespace, asked: Asked, *, calibrated: bool) -> Json:
+    """What a netlist remembers of its compilation.
+
+    Parameters
+    ----------
+    arguments : Namespace
+        Options of ``compile``.
+    asked : Asked
+        The network.
+    calibrated : bool
+        Whether recordings chose its scales.
+    """
+    checkpoint, cores_for = asked.checkpoint, cores_asked(arguments.cores_for)
+    return {
+        "spikeloom": version(),
+        "checkpoint_sha256": asked.sha256,
+        **asked.origin(arguments.run),
+        **({"towers": checkpoint.towers} if checkpoint is not None and checkpoint.towers > 1 else {}),
+        **storage(recipes_asked(arguments), checkpoint),
+        "spike_exact": arguments.spike_exact,
+        "keep_all": arguments.keep_all,
+        "prune_unused": arguments.prune_unused,
+        "ranges": arguments.ranges,
+        "margin": _margin(arguments),
+        "calibrated": calibrated,
+        **({"cores_for": cores_for} if cores_for else {}),
+        **({"chips": arguments.chips} if arguments.chips != 1 else {}),
+        **({"optimize": arguments.optimize} if arguments.optimize != "cores" else {}),
+    }
+
+
+def _margin(arguments: argparse.Namespace) -> float:
+    return float(MARGIN if arguments.margin is None else arguments.margin)
+
+
+def _text(report: Json) -> str:
+    """A compilation for people, with what was read from another format and what differs from another netlist."""
+    lines = [*report.get("facts", ()), *([""] if "facts" in report else []), render.compilation_text(report)]
+    if "against" in report:
+        weights, registers = report["against"]["weights"], report["against"]["registers"]
+        lines.append(f"against the other netlist: {len(weights)} of {report['against']['synapses']:,} weights differ")
+        lines += [f"  {WeightDifference(**weight)}" for weight in weights[:LISTED]]
+        lines += [f"  … and {len(weights) - LISTED} more, see --json"] if len(weights) > LISTED else []
+        lines += [f"  other registers in {layer}" for layer in registers]
+    return "\n".join(lines)
+
+
+def _numbers(text: str, option: str) -> list[int]:
+    try:
+        return [int(part) for part in text.split(",")]
+    except ValueError:
+        raise OptionError(f"{option} {text}: not a number; give one, or one for each layer as in 8,4,4,8") from None
+
+
+def recipes_asked(arguments: argparse.Namespace) -> tuple[Recipe, ...] | None:
+    """Storage that the options of ``compile`` ask for, or None where they do not.
+
+    Raises
+    ------
+    OptionError
+        If they are no numbers, or disagree about the number of layers.
+    """
+    if not (arguments.weight_bits or arguments.planes or arguments.scale_groups):
+        return None
+    asked = {
+        "--weight-bits": _numbers(arguments.weight_bits or "8", "--weight-bits"),
+        "--planes": _numbers(arguments.planes or "1", "--planes"),
+        "--scale-groups": _numbers(arguments.scale_groups or "1", "--scale-groups"),
+    }
+    layers = max(len(values) for values in asked.values())
+    for option, values in asked.items():
+        if len(values) not in (1, layers):
+            raise OptionError(f"{option}: {len(values)} numbers, another option gives {layers}; give as many, or one")
+    columns = [values if len(values) == layers else values * layers for values in asked.values()]
+    return tuple(Recipe(bits=b, planes=p, groups=g) for b, p, g in zip(*columns, strict=True))
+
+
+def storage(recipes: tuple[Recipe, ...] | None, checkpoint: Checkpoint | None) -> Json:
+    """The same for the provenance of a netlist."""
+    if checkpoint is not None and checkpoint.forms is not None:
+        return {"weight_bits": _one_or_list([form.bits for form in checkpoint.forms]), "fine_tuned": True}
+    known = recipes or (Recipe(),)
+    return {
+        "weight_bits": _one_or_list([recipe.bits for recipe in known]),
+        "planes": _one_or_list([recipe.planes for recipe in known]),
+        "scale_groups": _one_or_list([recipe.groups for recipe in known]),
+    }
+
+
+def _one_or_list(values: list[int]) -> int | list[int]:
+    return values[0] if len(set(values)) == 1 else values

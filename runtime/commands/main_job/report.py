@@ -1,0 +1,179 @@
+"""The command ``report``: everything about one netlist on one page, and the same as tables on the terminal."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+from collections.abc import Callable
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+from spikeloom.compiler.dynamics import with_clocks
+from spikeloom.compiler.errors import DataError, ModelError, OptionError
+from spikeloom.compiler.formats.atomic import write_atomically
+from spikeloom.compiler.targets.base import load_target
+from spikeloom.compiler.targets.loihi1.legalize import measure
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
+from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.runtime.commands.inputs import asked_recordings, require_place
+from spikeloom.runtime.commands.load_network import Asked, asked_network
+from spikeloom.runtime.commands.options import add_explain_cost, add_network, add_recordings
+from spikeloom.runtime.costs.spent import Account, explained
+from spikeloom.runtime.equivalence.levels import levels_of, unmet
+from spikeloom.runtime.equivalence.verdicts import verify_json
+from spikeloom.runtime.machines.loihi1.trace import check_channels
+from spikeloom.runtime.report.page.text import report_text
+from spikeloom.runtime.report.render import netlist_json
+from spikeloom.runtime.studies.chart.file import read_chart
+
+Json = dict[str, Any]
+
+SUMMARY = "one self-contained page: verdict, accuracy, cores, taxels, spikes, membranes, energy, time, provenance"
+NOTES = """\
+The page opens from disk and loads nothing; its figures are inline SVG, each with its numbers as a table. What is
+printed is the same for people who open no page; --json prints the data behind both. The exit code is 1 if specification
+and engine differ.
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Describe the options of the command."""
+    parser.add_argument("netlist", metavar="NET.loom")
+    parser.add_argument("--checkpoint", required=True, metavar="CKPT|NET.onnx")
+    add_network(parser)
+    add_recordings(parser)
+    parser.add_argument(
+        "--recording", metavar="NAME|N", help="recording to draw, by name or from 0 (default: the first that differs)"
+    )
+    parser.add_argument(
+        "--spec-samples", type=int, default=3, metavar="N", help="recordings for spec = engine (default: 3)"
+    )
+    parser.add_argument("--stress", metavar="STRESS.json", help="show what stress -o wrote about this netlist")
+    parser.add_argument("--chart", metavar="FOLDER", help="show what spikeloom chart found of this network, too")
+    parser.add_argument("-o", "--output", required=True, metavar="OUT.html")
+    add_explain_cost(parser)
+    parser.epilog = NOTES
+
+
+def report(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
+    """Run the command; nothing is written before everything is known.
+
+    Raises
+    ------
+    SpikeloomError
+        If an option, the netlist, the checkpoint or the recordings cannot be used, or do not belong together.
+    """
+    from spikeloom.runtime.report.page.page import page
+
+    require_place(arguments.output, "-o", arguments)
+    netlist = read_netlist(arguments.netlist)
+    stability: Json = {}
+    if arguments.stress is not None:
+        from spikeloom.runtime.report.page.stress import read_stress
+
+        sha256 = hashlib.sha256(Path(arguments.netlist).read_bytes()).hexdigest()
+        stability = {"stress": read_stress(arguments.stress, arguments.netlist, sha256)}
+    asked = asked_network(arguments.checkpoint, arguments, netlist)
+    _require_origin(arguments, netlist, asked)
+    chart = None if arguments.chart is None else read_chart(arguments.chart, asked.sha256, arguments.checkpoint)
+    data = asked_recordings(arguments, netlist, labels_for="report")
+    check_channels(netlist, data.events.shape[1] * data.events.shape[2] + netlist.clocks.channels)
+    chosen = None if arguments.recording is None else find_recording(data, arguments.recording)
+    found, code = _facts(arguments, netlist, asked, data, chosen)
+    found |= stability
+    found |= {} if chart is None else {"chart": chart}
+    with write_atomically(arguments.output) as file:
+        file.write(page(found).encode())
+    return found | {"output": arguments.output}, report_text, code
+
+
+def _require_origin(arguments: argparse.Namespace, netlist: Netlist, asked: Asked) -> None:
+    """Refuse a netlist that says that it is from another network; the page would blame the chip for it.
+
+    Raises
+    ------
+    ModelError
+        Naming what differs.
+    """
+    from spikeloom.runtime.equivalence.verify import require_match
+
+    require_match(netlist, asked.model)
+    made, where = netlist.provenance, arguments.netlist
+    own = asked.sha256
+    if made.get("checkpoint_sha256", own) != own:
+        raise ModelError(
+            f"{where}: compiled from a checkpoint of sha256 {made['checkpoint_sha256'][:12]}…, {arguments.checkpoint} "
+            f"has {own[:12]}…; give the one that it was compiled from"
+        )
+    if asked.checkpoint is None:
+        return
+    told = {"graph": asked.graph, "weights": asked.checkpoint.weights, "run": arguments.run}
+    for name, value in told.items():
+        if made.get(name, value) != value:
+            raise ModelError(f"{where}: compiled for {name} {made[name]}, this is {value}; give --{name} {made[name]}")
+
+
+def find_recording(data: Recordings, asked: str) -> int:
+    """Index of a recording by name or number.
+
+    Raises
+    ------
+    DataError, OptionError
+        If there is none.
+    """
+    if asked in data.files:
+        return data.files.index(asked)
+    if asked.isascii() and asked.isdecimal():
+        if int(asked) >= len(data):
+            raise OptionError(f"--recording {asked}: there are {len(data)}; give a number from 0 to {len(data) - 1}")
+        return int(asked)
+    near = get_close_matches(asked, data.files, n=3, cutoff=0.5) or data.files[:3]
+    raise DataError(
+        f"--recording {asked}: no such recording among {len(data)} of split {data.split}; near are {', '.join(near)}"
+    )
+
+
+def _facts(
+    arguments: argparse.Namespace, netlist: Netlist, asked: Asked, data: Recordings, chosen: int | None
+) -> tuple[Json, int]:
+    """All that the page shows, as JSON values, and the exit code."""
+    from spikeloom.runtime.costs.estimate import estimate
+    from spikeloom.runtime.costs.estimates import estimate_json
+    from spikeloom.runtime.equivalence.verify import verify
+    from spikeloom.runtime.report.page import facts as report_facts
+    from spikeloom.runtime.report.page.recording import recording_json
+
+    account = Account(netlist, data, checked=arguments.spec_samples)
+    target = load_target(netlist.target)
+    verdict = verify(
+        netlist,
+        asked.model,
+        asked.adjacency,
+        data.events,
+        data.labels,
+        data.files,
+        sha256=asked.sha256,
+        spec_samples=arguments.spec_samples,
+        lengths=data.lengths,
+        progress=account.begin,
+    )
+    levels = levels_of(verdict)
+    if chosen is None:
+        chosen = 0 if verdict.first_divergence is None else data.files.index(verdict.first_divergence.file)
+    account.begin("costs")
+    counts, costs = estimate(netlist, target, with_clocks(data.events, netlist.clocks), lengths=data.lengths)
+    account.begin("the recording")
+    provenance = report_facts.provenance_json(arguments, netlist, target, asked, data, data.files[chosen])
+    found = {
+        "verify": verify_json(verdict, levels, unmet(levels, {"E0": 1.0})),
+        "decisions": report_facts.decisions_json(verdict, netlist.classes),
+        "netlist": netlist_json(netlist, measure(netlist, target), provenance["netlist"]["sha256"]),
+        "cores": report_facts.cores_json(netlist, target, counts),
+        "taxels": report_facts.taxels_json(netlist, asked, data, counts, arguments.taxels),
+        "recording": recording_json(netlist, target, asked, data, chosen, costs, bin_s=arguments.bin * netlist.bins),
+        "costs": estimate_json(netlist, target, costs, bin_s=arguments.bin * netlist.bins),
+        "provenance": provenance,
+    }
+    return found | explained(arguments, account), 1 if found["verify"]["missed"] else 0

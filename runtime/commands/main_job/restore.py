@@ -1,0 +1,99 @@
+"""Ways of ``compile`` that round nothing: a netlist from the side-car of a NIR file, and integers as they stand."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from typing import Any
+
+from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.formats.netx.layout import SUFFIX as NETX
+from spikeloom.compiler.formats.netx.reader import read_netx
+from spikeloom.compiler.formats.nir.neurons import CONVENTIONS
+from spikeloom.compiler.formats.nir.reader import SUFFIX as NIR
+from spikeloom.compiler.formats.nir.sidecar import restore, sidecar_of
+from spikeloom.compiler.invariants import verify
+from spikeloom.compiler.passes.prune import nobody
+from spikeloom.compiler.targets.base import load_target
+from spikeloom.compiler.targets.loihi1.legalize import measure
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist
+from spikeloom.compiler.targets.loihi1.placing import place_integers
+from spikeloom.runtime.commands.inputs import progress, version
+from spikeloom.runtime.commands.options import MODEL, PLACING, ROUNDING, cores_asked
+from spikeloom.runtime.report import render
+
+Json = dict[str, Any]
+Outcome = tuple[Json, Callable[[Json], str], int]
+
+READING: Json = {"polarities": None, "polarities_first": None}
+"""Options that say how inputs are laid out, and what they are where they are not given."""
+
+FLOATS: Json = {"dt": None, "convention": None, **ROUNDING, "calibrate": None}
+"""Options that say how a float network is read and rounded, likewise."""
+
+
+def is_whole(arguments: argparse.Namespace) -> bool:
+    """Whether what is to be compiled brings its integers: netx, or NIR with a side-car and no ``--dt``."""
+    path = arguments.checkpoint
+    if path.endswith(NETX):
+        return True
+    return bool(path.endswith(NIR) and arguments.dt is None and sidecar_of(path).is_file())
+
+
+def take(arguments: argparse.Namespace) -> Outcome:
+    """Run the command for such a file: the report, how to print it, and the exit code."""
+    path = arguments.checkpoint
+    netlist, facts = _from_netx(arguments) if path.endswith(NETX) else _restored(arguments)
+    sha256 = write_netlist(netlist, arguments.output)
+    report = render.netlist_json(netlist, measure(netlist, load_target(netlist.target)), sha256)
+    return report | {"path": arguments.output, "facts": facts}, _text, 0
+
+
+def _refuse(arguments: argparse.Namespace, options: Json, why: str) -> None:
+    for name, absent in options.items():
+        if getattr(arguments, name) != absent:
+            shown = "polarities-first or -last" if name == "polarities_first" else name.replace("_", "-")
+            raise OptionError(f"--{shown}: {why}")
+
+
+def _restored(arguments: argparse.Namespace) -> tuple[Netlist, list[str]]:
+    beside = sidecar_of(arguments.checkpoint)
+    why = f"{beside} restores the netlist as it was; leave it away, or add --dt SECONDS to compile the network anew"
+    _refuse(arguments, {"target": "loihi1"} | PLACING | READING | FLOATS | MODEL, why)
+    progress("reading the netlist")
+    return restore(arguments.checkpoint, CONVENTIONS), [f"restored from {beside}: the netlist as it was"]
+
+
+def _from_netx(arguments: argparse.Namespace) -> tuple[Netlist, list[str]]:
+    path = arguments.checkpoint
+    _refuse(arguments, FLOATS, f"is for float networks, {path} holds integers; leave it away")
+    _refuse(arguments, MODEL, f"is for checkpoints, the netx file {path} holds all it needs; leave it away")
+    why = f"weighs layouts by what a float network does on recordings, {path} holds integers; leave it away"
+    _refuse(arguments, {"optimize": "cores"}, f"{why}, or give --cores-for")
+    progress("reading the network")
+    found = read_netx(path, polarities=arguments.polarities, polarities_first=arguments.polarities_first)
+    verify(found.network)
+    progress("compiling")
+    cores_for = cores_asked(arguments.cores_for)
+    placed = place_integers(
+        found.network,
+        removed=(nobody(found.network), nobody(found.network)) if arguments.keep_all else None,
+        target=arguments.target,
+        cores_for=cores_for,
+        chips=arguments.chips,
+        optimize=arguments.optimize,
+        provenance={
+            "spikeloom": version(),
+            "checkpoint_sha256": found.sha256,
+            "format": "netx",
+            "keep_all": arguments.keep_all,
+            **({"cores_for": cores_for} if cores_for else {}),
+            **({"chips": arguments.chips} if arguments.chips != 1 else {}),
+        },
+    )
+    return placed.netlist, list(found.facts)
+
+
+def _text(report: Json) -> str:
+    return "\n".join([*report["facts"], "", render.netlist_text(report), f"sha256 {report['sha256']}"])

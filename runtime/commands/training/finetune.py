@@ -1,0 +1,226 @@
+"""The ``finetune`` command: train a network on, on the integers of the chip."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from spikeloom.compiler.errors import ModelError, OptionError
+from spikeloom.compiler.formats.atomic import remove_leftovers
+from spikeloom.compiler.formats.checkpoint import Checkpoint, read_checkpoint
+from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.systems import GRAPH_SYSTEMS
+from spikeloom.compiler.targets.base import load_target
+from spikeloom.compiler.targets.loihi1.netlist_file import is_netlist
+from spikeloom.compiler.targets.loihi1.storage.quantize import round_to_forms
+from spikeloom.models.graphs import Graph
+from spikeloom.models.recordings.events import joined_bins
+from spikeloom.models.recordings.grasps import SYNTHETIC
+from spikeloom.runtime.commands.exchange.data import add_bin_option
+from spikeloom.runtime.commands.inputs import (
+    asked_checkpoint,
+    asked_graph,
+    bin_words,
+    graph_words,
+    propagation,
+    recordings,
+    require_place,
+    shipped,
+)
+from spikeloom.runtime.commands.options import DATA_HELP, add_model
+from spikeloom.runtime.report.tables import percent, table
+from spikeloom.runtime.studies.jobs.locks import only_one
+
+SUMMARY = "train a network on, on the very integers of the chip, down to ternary weights"
+
+Report = dict[str, Any]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    parser.add_argument("checkpoint")
+    add_model(parser)
+    parser.add_argument("--data", required=True, metavar="PATH", help=DATA_HELP)
+    add_bin_option(parser)
+    parser.add_argument("--target", default="loihi1", help="chip (default: loihi1)")
+    parser.add_argument(
+        "--weight-bits", required=True, metavar="N[,N]", help="storage width, one or one a layer: 2 to 6 or 8"
+    )
+    parser.add_argument("--scale-groups", type=int, default=8, metavar="N", help="scales in a layer (default: 8)")
+    parser.add_argument("--epochs", type=int, default=40, metavar="N", help="default: 40")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of the order of recordings (default: 0)")
+    parser.add_argument("--resume", action="store_true", help="go on with an interrupted one of the same options")
+    parser.add_argument("-o", "--output", required=True, metavar="OUT.pt")
+
+
+def _widths(words: str) -> list[int]:
+    try:
+        return [int(word) for word in words.split(",")]
+    except ValueError:
+        raise OptionError(
+            f"--weight-bits {words}: not a number; give one, or one for each layer as in 8,4,4,8"
+        ) from None
+
+
+def stored_graph(checkpoint: Checkpoint, asked: Graph | None, name: str) -> Graph:
+    """Graph to store: the one in the checkpoint, or the one that was asked for; `propagation` has compared them."""
+    if checkpoint.edges is None and checkpoint.system in GRAPH_SYSTEMS:
+        assert asked is not None, "propagation needs a graph"
+        return asked
+    edges = np.zeros((0, 2), np.int64) if checkpoint.edges is None else checkpoint.edges
+    coordinates = [[float(taxel), 0.0] for taxel in range(checkpoint.taxels)]  # only edges are stored
+    return Graph(name=name, coordinates=coordinates, edges=edges)  # type: ignore[arg-type]
+
+
+def _state(output: Path, *, resume: bool) -> Path:
+    """File of the epochs so far, of which neither an old one may be lost nor a missing one begun anew in silence."""
+    state = output.with_name(f"{output.name}.state")
+    if state.exists() and not resume:
+        raise OptionError(
+            f"{state}: an interrupted fine-tuning is kept there; go on with --resume, or delete the file to start anew"
+        )
+    if resume and not state.exists():
+        raise OptionError(f"--resume: {state} does not exist, so nothing was interrupted; leave --resume away")
+    for file in (output, state):
+        remove_leftovers(file)
+    return state
+
+
+def finetune(arguments: argparse.Namespace) -> tuple[Report, Callable[[Report], str], int]:
+    """Fine-tune, write the checkpoint, report.
+
+    Raises
+    ------
+    SpikeloomError
+        If network, recordings or options cannot be used.
+    KeyboardInterrupt
+        On an interrupt; its text says what is kept.
+    """
+    require_place(arguments.output, "-o", arguments)
+    with only_one(Path(arguments.output)):
+        return _finetuned(arguments, Path(arguments.output)), finetune_text, 0
+
+
+def _finetuned(arguments: argparse.Namespace, output: Path) -> Report:
+    """Fine-tune and write the checkpoint; return the report."""
+    state = _state(output, resume=arguments.resume)
+    target = load_target(arguments.target)
+    widths = _widths(arguments.weight_bits)
+    path = shipped(arguments.checkpoint)
+    if Path(path).is_file() and is_netlist(path):
+        raise ModelError(f"{path}: is a netlist, its weights are rounded already; give the checkpoint it was made from")
+    checkpoint = asked_checkpoint(path, arguments)
+    if checkpoint.forms is not None:
+        raise ModelError(f"{path}: was fine-tuned already; give the network that it was made from")
+    if not checkpoint.dynamics.is_plain:
+        raise ModelError(
+            f"{path}: has clocks, or decays of single layers, which fine-tuning does not know; compile it as it is"
+        )
+    if checkpoint.towers > 1:
+        raise ModelError(
+            f"{path}: has {checkpoint.towers} towers, which fine-tuning takes one by one; fine-tune what it was joined "
+            "from, then join that"
+        )
+    asked = asked_graph(arguments, checkpoint.system)
+    name, adjacency = propagation(checkpoint, asked, arguments.checkpoint)
+    found = [
+        recordings(
+            arguments.data,
+            split,
+            classes=checkpoint.classes,
+            taxels=checkpoint.taxels,
+            bin_s=arguments.bin,
+            labels_for="fine-tuning",
+        )
+        for split in ("train", "test")
+    ]
+    training, test = (joined_bins(each, checkpoint.bins) for each in found)
+    from spikeloom.models.networks.checkpoint import CHOSEN_ON, save_checkpoint
+    from spikeloom.models.training.finetune import finetune as tune
+    from spikeloom.models.training.protocols import data_digest
+
+    try:
+        tuned = tune(
+            checkpoint,
+            adjacency,
+            training,
+            test,
+            target,
+            bits=widths,
+            groups=arguments.scale_groups,
+            epochs=arguments.epochs,
+            seed=arguments.seed,
+            state=state,
+            resume=arguments.resume,
+        )
+    except KeyboardInterrupt:
+        kept = f"the epochs so far are kept in {state}; go on with the same command and --resume"
+        raise KeyboardInterrupt(kept if state.exists() else "") from None
+    record = {
+        "command": " ".join(_words(arguments, SYNTHETIC if arguments.data == SYNTHETIC else training.source)),
+        "fine_tuned_from": checkpoint.sha256,
+        "fine_tuned_weights": checkpoint.weights,
+        "weight_bits": widths,
+        "seed": arguments.seed,
+        "epochs": arguments.epochs,
+        "data": training.source,
+        "data_sha256": data_digest(*found),
+        "test_samples": len(test),
+        "before": {"correct": tuned.before, "accuracy": tuned.before / len(test)},
+        "last": {
+            "correct": tuned.after,
+            "accuracy": tuned.after / len(test),
+            "chosen_on": CHOSEN_ON[checkpoint.weights],
+        },
+        "history": [[epoch.loss, epoch.correct] for epoch in tuned.history],
+    }
+    save_checkpoint(
+        output,
+        {"last": tuned.weights},
+        stored_graph(checkpoint, asked, name),
+        beta=checkpoint.beta,
+        theta=checkpoint.theta,
+        training=record,
+        forms=tuned.forms,
+        system=checkpoint.system,
+        grid=checkpoint.grid,
+        bins=checkpoint.bins,
+    )
+    round_to_forms(expand(read_checkpoint(output), adjacency), tuned.forms)  # it compiles, or says why not
+    state.unlink(missing_ok=True)
+    sha256 = hashlib.sha256(output.read_bytes()).hexdigest()
+    return record | {"file": output.name, "sha256": sha256}
+
+
+def _words(arguments: argparse.Namespace, source: str) -> list[str]:
+    """The words that ask for the same fine-tuning."""
+    words = ["spikeloom", "finetune", Path(arguments.checkpoint).name, *graph_words(arguments).split()]
+    given = {
+        "--run": arguments.run or None,
+        "--weights": arguments.weights,
+        "--beta": arguments.beta,
+        "--theta": arguments.theta,
+        "--target": None if arguments.target == "loihi1" else arguments.target,
+    }
+    words += [word for option, value in given.items() if value is not None for word in (option, str(value))]
+    words += ["--data", source, *bin_words(arguments.bin), "--weight-bits", arguments.weight_bits]
+    words += ["--scale-groups", str(arguments.scale_groups), "--epochs", str(arguments.epochs)]
+    return [*words, "--seed", str(arguments.seed)]
+
+
+def finetune_text(report: Report) -> str:
+    """A finished fine-tuning for people."""
+    total = report["test_samples"]
+    first, last = report["history"][0], report["history"][-1]
+    rows = [
+        ["rounded", "", "", percent(report["before"]["correct"], total)],
+        ["epoch 1", f"{first[0]:.5f}", f"{first[1]:,}", ""],
+        [f"epoch {report['epochs']}", f"{last[0]:.5f}", f"{last[1]:,}", percent(report["last"]["correct"], total)],
+    ]
+    head = ["on chip integers", "loss", "training right", "test"]
+    return f"{report['command']}\n{table(head, rows)}\n  written: {report['file']}"

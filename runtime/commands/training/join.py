@@ -1,0 +1,132 @@
+"""The command ``join``: several trained networks as one whose votes add up."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+from argparse import Namespace
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from spikeloom.compiler.errors import ModelError, OptionError
+from spikeloom.compiler.formats.atomic import remove_leftovers
+from spikeloom.compiler.formats.checkpoint import Checkpoint, read_checkpoint
+from spikeloom.compiler.formats.checkpoint_file import WEIGHTS
+from spikeloom.compiler.formats.towers import arrays_of
+from spikeloom.compiler.formats.towers import join as join_networks
+from spikeloom.compiler.targets.loihi1.netlist_file import is_netlist
+from spikeloom.compiler.targets.truenorth.native import SYSTEM as NATIVE
+from spikeloom.runtime.commands.inputs import require_place, shipped
+from spikeloom.runtime.commands.training.finetune import stored_graph
+from spikeloom.runtime.machines.truenorth import joining, native
+from spikeloom.runtime.report.render import tower_line
+from spikeloom.runtime.report.tables import percent
+
+SUMMARY = "put several trained networks side by side in one, whose votes add up"
+
+Report = dict[str, Any]
+
+KEPT = ("command", "seed", "epochs", "recipe", "data", "data_sha256", "test_samples", "fine_tuned_from")
+"""Parts of a network's training record that the joined one keeps, beside what the chosen weights reached."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    parser.add_argument("checkpoints", nargs="+", metavar="CKPT", help="networks of one system, graph and timing")
+    parser.add_argument(
+        "--weights", choices=WEIGHTS, help="epoch to take from each (default: the first of these that it holds)"
+    )
+    parser.add_argument(
+        "--data", metavar="PATH", help=f"measure the joined network on its test split and keep that ({NATIVE} only)"
+    )
+    parser.add_argument("-o", "--output", required=True, metavar="OUT.pt")
+
+
+def join(arguments: Namespace) -> tuple[Report, Callable[[Report], str], int]:
+    """Join, write the checkpoint, report.
+
+    Raises
+    ------
+    SpikeloomError
+        If a network cannot be used, or they do not fit together.
+    """
+    if any(native.is_named(name) for name in arguments.checkpoints):
+        return joining.join(arguments, join_text)
+    if arguments.data is not None:
+        raise OptionError(f"--data {arguments.data}: is for {NATIVE}; leave it away, and measure with spikeloom run")
+    for name in arguments.checkpoints:
+        require_place(arguments.output, "-o", Namespace(checkpoint=name))
+    found = [_network(name, arguments.weights) for name in arguments.checkpoints]
+    towers = [record for name, checkpoint in zip(arguments.checkpoints, found, strict=True)
+              for record in _records(name, checkpoint)]  # fmt: skip
+    if len(towers) < 2:
+        raise OptionError(f"join: {arguments.checkpoints[0]} is one network already; give two or more")
+    joined = join_networks(found, arguments.checkpoints)
+    words = [_shown(name) for name in arguments.checkpoints]
+    words += [f"--weights {arguments.weights}"] if arguments.weights else []
+    record = {"command": f"spikeloom join {' '.join(words)}", "towers": towers}
+    from spikeloom.models.networks.checkpoint import save_checkpoint  # torch, so only here
+
+    output = Path(arguments.output)
+    remove_leftovers(output)
+    save_checkpoint(
+        output,
+        {"last": arrays_of(joined)},
+        stored_graph(joined, None, str(joined.graph)),
+        beta=joined.beta,
+        theta=joined.theta,
+        training=record,
+        forms=joined.forms,
+        system=joined.system,
+        grid=joined.grid,
+        dynamics=joined.dynamics,
+        towers=joined.towers,
+        bins=joined.bins,
+    )
+    report = {
+        **record,
+        "system": joined.system,
+        "graph": joined.graph,
+        "classes": joined.classes,
+        "layers": [{"name": name, "neurons": neurons} for name, neurons in joined.neurons.items()],
+        "file": output.name,
+        "sha256": hashlib.sha256(output.read_bytes()).hexdigest(),
+    }
+    return report, join_text, 0
+
+
+def _network(name: str, weights: str | None) -> Checkpoint:
+    path = shipped(name)
+    if Path(path).is_file() and is_netlist(path):
+        raise ModelError(f"{name}: is a netlist, its weights are rounded already; give the checkpoint it was made from")
+    checkpoint = read_checkpoint(path, weights=weights)
+    if checkpoint.layout != "spikeloom":
+        raise ModelError(f"{name}: does not say its graph and constants; give checkpoints that spikeloom train wrote")
+    return checkpoint
+
+
+def _shown(name: str) -> str:
+    """Name of a file without its folder, or of a shipped checkpoint."""
+    return name if shipped(name) != name else Path(name).name
+
+
+def _records(name: str, checkpoint: Checkpoint) -> list[Report]:
+    """Where each tower of a checkpoint is from."""
+    training = checkpoint.training or {}
+    held = training.get("towers")
+    if checkpoint.towers > 1 and isinstance(held, list) and len(held) == checkpoint.towers:
+        return held
+    kept = [key for key in (*KEPT, checkpoint.weights) if key in training]
+    origin = {"file": _shown(name), "sha256": checkpoint.sha256, "weights": checkpoint.weights}
+    return [origin | {key: training[key] for key in kept}] * checkpoint.towers
+
+
+def join_text(report: Report) -> str:
+    """A finished join for people."""
+    layers = ", ".join(f"{layer['name']} {layer['neurons']:,}" for layer in report["layers"])
+    lines = [f"{report['command']}", f"  {len(report['towers'])} towers: {layers}, {report['classes']} classes"]
+    lines += [f"    {index}: {tower_line(tower)}" for index, tower in enumerate(report["towers"])]
+    if "test" in report:
+        lines.append(f"  test: {percent(report['test']['correct'], report['test']['samples'])}")
+    return "\n".join([*lines, f"  written: {report['file']}"])

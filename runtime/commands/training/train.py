@@ -1,0 +1,224 @@
+"""The command ``train``: one system, any number of seeds, reported by both protocols."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from spikeloom.compiler.errors import DataError, OptionError
+from spikeloom.compiler.formats.checkpoint_file import WEIGHTS
+from spikeloom.compiler.systems import GRAPH_SYSTEMS, GRID_CNN, TACTILESGNET, TITLES, Grid
+from spikeloom.compiler.targets.truenorth.native import SYSTEM as NATIVE
+from spikeloom.compiler.targets.truenorth.native import USUAL_COPIES
+from spikeloom.models.graphs import CHOICES, Graph
+from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.models.recordings.grasps import SYNTHETIC
+from spikeloom.models.systems import PADDINGS, sensor_grid, taxels_alone
+from spikeloom.models.training.recipes import CROSSBARS, RECIPES, RELEASED, STEPS, Recipe, check_recipe, decays_asked
+from spikeloom.runtime.commands.inputs import (
+    asked_graph,
+    asked_places,
+    bin_words,
+    graph_words,
+    progress,
+    recordings,
+    require_bins,
+    require_place,
+    version,
+)
+from spikeloom.runtime.studies.training.picture import PICTURES, draw_training
+from spikeloom.runtime.studies.training.training import LAYERS, Job, check_seeds, output_of, summary, training_text
+
+Json = dict[str, Any]
+
+
+def train(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
+    """Run the command: the report, how to print it, and the exit code."""
+    from spikeloom.runtime.studies.training.seeds import train_seeds  # processes, so only here
+
+    check_seeds(arguments.seeds)
+    require_bins(arguments.join)
+    require_place(arguments.output, "-o", arguments)
+    if arguments.picture is not None:
+        require_place(arguments.picture, "--picture", arguments)
+        if Path(arguments.picture).suffix not in PICTURES:
+            raise OptionError(f"--picture {arguments.picture}: allowed are {', '.join(PICTURES)}; name one of these")
+        for seed in range(arguments.seed, arguments.seed + arguments.seeds):
+            if output_of(arguments.output, seed, arguments.seeds).absolute() == Path(arguments.picture).absolute():
+                raise OptionError(f"--picture {arguments.picture}: is a network that -o names; give another name")
+    sensor = _sensor(arguments)
+    training, test = both_splits(arguments.data, sensor[0].n_taxels, arguments.bin)
+    jobs = _jobs(arguments, sensor, training, test)
+    results = train_seeds(jobs, resume=arguments.resume)
+    records = [record for record, _ in results]
+    if arguments.picture is not None:
+        decided = [predicted for _, predicted in results if predicted is not None]
+        draw_training(arguments.picture, records, test.labels, decided)
+    return {"runs": records, "protocols": summary(records)}, training_text, 0
+
+
+def both_splits(data: str, taxels: int, bin_s: float) -> tuple[Recordings, Recordings]:
+    """Training and test recordings of a sensor, every one with its label.
+
+    Raises
+    ------
+    DataError, OptionError
+        If they cannot be used.
+    """
+    progress("reading the recordings")
+    shared: dict[str, Any] = {"taxels": taxels, "bin_s": bin_s, "labels_for": "training", "classes": None}
+    training, test = (recordings(data, split, **shared) for split in ("train", "test"))
+    progress("")
+    known = int(training.labels.max())
+    if test.labels.max() > known:
+        first = int((test.labels > known).argmax())
+        where = f"{test.source}: {test.split}/{test.files[first]}"
+        raise DataError(
+            f"{where}: label {test.labels[first]}, the training recordings have 0..{known}; add some of it to them, or "
+            "leave it out of the test split"
+        )
+    return training, test
+
+
+def planned(arguments: argparse.Namespace, training: Recordings, test: Recordings) -> list[Job]:
+    """What the command would train, for whoever has read the recordings already.
+
+    Parameters
+    ----------
+    arguments : Namespace
+        Parsed options of ``train``.
+    training, test : Recordings
+        Both splits of its data.
+    """
+    return _jobs(arguments, _sensor(arguments), training, test)
+
+
+def _jobs(
+    arguments: argparse.Namespace, sensor: tuple[Graph, Grid | None], training: Recordings, test: Recordings
+) -> list[Job]:
+    """One job for each seed."""
+    graph, grid = sensor
+    system = arguments.system or TACTILESGNET
+    data = arguments.data if arguments.data == SYNTHETIC else training.source
+    words = [
+        f"spikeloom train --data {data}",
+        " ".join(bin_words(arguments.bin)),
+        f"--join {arguments.join}" if arguments.join > 1 else "",
+    ]
+    words += [_system_words(arguments, system), graph_words(arguments)]
+    recipe = _recipe(arguments)
+    epochs = recipe.epochs if arguments.epochs is None else arguments.epochs
+    command = " ".join(filter(None, [*words, _recipe_words(arguments), f"--epochs {epochs}"]))
+    keep = tuple(dict.fromkeys(arguments.keep or WEIGHTS))
+    return [
+        Job(
+            training=training,
+            test=test,
+            graph=graph,
+            epochs=epochs,
+            seed=seed,
+            device=arguments.device,
+            resume=arguments.resume,
+            output=output_of(arguments.output, seed, arguments.seeds),
+            keep=keep,
+            command=f"{command} --seed {seed}",
+            facts={"spikeloom": version(), "device": arguments.device},
+            draws=arguments.picture is not None,
+            position=position,
+            system=system,
+            grid=grid,
+            recipe=recipe,
+            copies=arguments.copies or USUAL_COPIES,
+            bins=arguments.join,
+        )
+        for position, seed in enumerate(range(arguments.seed, arguments.seed + arguments.seeds))
+    ]
+
+
+OVERRIDES = ("current_decay", "membrane_decay", "clocks", "features", "batch", "decay_epochs", "spike_penalty")
+"""Options that change single values of a recipe."""
+
+
+def _recipe(arguments: argparse.Namespace) -> Recipe:
+    """The recipe that was named, with the values that were given beside it."""
+    recipe = _named_recipe(arguments)
+    whole = {name: getattr(arguments, name) for name in ("clocks", "features", "batch", "decay_epochs")}
+    recipe = replace(recipe, **{name: value for name, value in whole.items() if value is not None})
+    if arguments.decay_epochs is not None and recipe.schedule != STEPS:
+        raise OptionError(
+            f"--decay-epochs {arguments.decay_epochs}: the recipe {recipe.name} lowers its learning rate all along; "
+            "leave it away"
+        )
+    if arguments.spike_penalty is not None:
+        recipe = replace(recipe, penalty=arguments.spike_penalty)
+    if arguments.current_decay is not None:
+        recipe = replace(recipe, alphas=decays_asked(arguments.current_decay, "--current-decay", LAYERS))
+    if arguments.membrane_decay is not None:
+        recipe = replace(recipe, betas=decays_asked(arguments.membrane_decay, "--membrane-decay", LAYERS))
+    check_recipe(recipe)
+    return recipe
+
+
+def _named_recipe(arguments: argparse.Namespace) -> Recipe:
+    """What was named, or the only one that a network for TrueNorth has."""
+    if arguments.system != NATIVE:
+        if arguments.copies is not None:
+            raise OptionError(f"--copies {arguments.copies}: is for --system {NATIVE}; leave it away")
+        return RECIPES[arguments.recipe]
+    for name, usual in (("recipe", RELEASED.name), ("current_decay", None), ("membrane_decay", None)):
+        if getattr(arguments, name) != usual:
+            raise OptionError(
+                f"--{name.replace('_', '-')} {getattr(arguments, name)}: a network for TrueNorth has a recipe of its "
+                "own, and nothing in it decays; leave it away"
+            )
+    if arguments.join != 1:
+        raise OptionError(
+            f"--join {arguments.join}: {NATIVE} hears bins as they are; leave it away, or train on what spikeloom data "
+            "convert --join makes"
+        )
+    if arguments.device != "cpu":
+        raise OptionError(f"--device {arguments.device}: {NATIVE} is trained on the CPU; leave it away")
+    if arguments.spike_penalty is not None:
+        raise OptionError(f"--spike-penalty {arguments.spike_penalty:g}: {NATIVE} is trained without; leave it away")
+    return CROSSBARS
+
+
+def _recipe_words(arguments: argparse.Namespace) -> str:
+    """Options that name the recipe, as they would be typed; none for the released one."""
+    words = [] if arguments.recipe == RELEASED.name else [f"--recipe {arguments.recipe}"]
+    given = {name: getattr(arguments, name) for name in OVERRIDES}
+    usual = _named_recipe(arguments)
+    words += [
+        f"--{name.replace('_', '-')} {value}"
+        for name, value in given.items()
+        if value is not None and value != getattr(usual, name, None)
+    ]
+    return " ".join(words)
+
+
+def _sensor(arguments: argparse.Namespace) -> tuple[Graph, Grid | None]:
+    """Taxels, their graph, and the grid over them, as far as the system has these."""
+    system = arguments.system or TACTILESGNET
+    if system == NATIVE:
+        system = TACTILESGNET  # and the same graphs
+    if arguments.padding is not None and system != GRID_CNN:
+        raise OptionError(f"--padding: is for grid-cnn, {TITLES[system]} has no window; leave it away")
+    graph = asked_graph(arguments, system)
+    if system not in GRAPH_SYSTEMS:
+        places = asked_places(arguments.taxels)
+        grid = sensor_grid(places, arguments.padding or PADDINGS[0]) if system == GRID_CNN else None
+        return taxels_alone(places), grid
+    if graph is None:
+        raise OptionError(f"train: no graph; name it with --graph: {CHOICES}, or give --edges")
+    return graph, None
+
+
+def _system_words(arguments: argparse.Namespace, system: str) -> str:
+    """Options that name the system, as they would be typed; none for the usual one."""
+    words = [] if system == TACTILESGNET else [f"--system {system}"]
+    words += [f"--padding {arguments.padding}"] if arguments.padding else []
+    words += [f"--copies {arguments.copies}"] if arguments.copies not in (None, USUAL_COPIES) else []
+    return " ".join(words)

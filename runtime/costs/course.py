@@ -1,0 +1,159 @@
+"""How votes, operations, energy and time of recordings add up step by step, from one run.
+
+Whatever is linear in events is added up by the engine itself (:class:`trace.Charges`): no spike is kept, and no
+window is run for itself. A chip that is stopped after so many steps has done, and cost, what stands there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from spikeloom.compiler.fixedpoint import FloatArray, IntArray
+from spikeloom.compiler.interpret import BoolArray
+from spikeloom.compiler.ir import Readout
+from spikeloom.compiler.targets.base import Target
+from spikeloom.compiler.targets.loihi1.layout.chips import chip_count
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.runtime.costs import charges, cost
+from spikeloom.runtime.machines.loihi1 import engine, timing
+from spikeloom.runtime.machines.loihi1.trace import Charges
+from spikeloom.runtime.studies.anytime.exits import read_out_depth
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Course:
+    """Sums over chip steps up to and with each; after a recording's end they stay as they are.
+
+    Parameters
+    ----------
+    votes : (samples, steps, classes) int64
+        After each step of the read-out, which lags `depth` chip steps behind the data.
+    depth : int
+        Of the layer that votes.
+    lengths : (samples,) int64
+        Data steps of each recording.
+    chip_steps : (samples,) int64
+        Chip steps of each recording.
+    operations : (samples, chip steps) float64
+        Synaptic operations.
+    energy : mapping of energy table to (samples, chip steps) float64
+        Joules; without tables that cannot price the run.
+    time : mapping of time table to (samples, chip steps) float64
+        Seconds by the simple model; empty for several chips.
+    """
+
+    votes: IntArray
+    depth: int
+    lengths: IntArray
+    chip_steps: IntArray
+    operations: FloatArray
+    energy: Mapping[str, FloatArray]
+    time: Mapping[str, FloatArray]
+
+
+def vote_charges(netlist: Netlist) -> Charges:
+    """What a spike adds to the votes of each class."""
+    spikes = np.zeros((netlist.n_compartments, netlist.classes), np.int64)
+    voters = np.flatnonzero(netlist.readout_class >= 0)
+    spikes[voters, netlist.readout_class[voters]] = 1
+    return Charges(
+        channels=np.zeros((netlist.n_inputs, netlist.classes), np.int64), spikes=spikes, updates=np.zeros_like(spikes)
+    )
+
+
+def votes_of(netlist: Netlist, events: engine.EventArray, lengths: IntArray) -> IntArray:
+    """Votes so far after each step of the read-out: ``Course.votes`` alone.
+
+    Parameters
+    ----------
+    netlist : Netlist
+        What runs.
+    events : (samples, n_inputs, T) uint8 or bool
+        Recordings.
+    lengths : (samples,) int64
+        Data steps of each.
+    """
+    prepared = engine.prepare(netlist, charges=vote_charges(netlist))
+    trace = engine.simulate(prepared, events, lengths=lengths)
+    assert trace.charged is not None, "votes were asked for"
+    return _aligned(netlist, np.cumsum(trace.charged, axis=1), events.shape[2])
+
+
+def float_votes(readout: Readout, classes: int, spikes: BoolArray) -> IntArray:
+    """Votes so far after each step, from the spikes of the population that votes (samples, steps, neurons)."""
+    votes = np.zeros((*spikes.shape[:2], classes), np.int64)
+    np.add.at(np.moveaxis(votes, 2, 0), readout.label, np.moveaxis(spikes, 2, 0))
+    return np.cumsum(votes, axis=1)
+
+
+def run(netlist: Netlist, target: Target, events: engine.EventArray, lengths: IntArray) -> Course:
+    """Run recordings once.
+
+    Parameters
+    ----------
+    netlist : Netlist
+        What runs.
+    target : Target
+        Its chip.
+    events : (samples, n_inputs, T) uint8 or bool
+        Recordings.
+    lengths : (samples,) int64
+        Data steps of each.
+
+    Raises
+    ------
+    DataError, NumericRangeError
+        As the engine says.
+    """
+    timed = target.time if chip_count(netlist.core_tile, target) == 1 else ()
+    clocks = [timing.prepare(netlist, target, table) for table in timed]
+    meter = cost.prepare(netlist, target)
+    parts = [vote_charges(netlist), _event_charges(meter), *(charges.charges(clock) for clock in clocks)]
+    prepared = engine.prepare(netlist, charges=charges.side_by_side(parts))
+    trace = engine.simulate(prepared, events, lengths=lengths)
+    assert trace.charged is not None, "sums were asked for"
+    ends = np.cumsum([part.spikes.shape[1] for part in parts])[:-1]
+    votes, happened, *times = np.split(trace.charged, ends, axis=2)
+    chip_steps = lengths + netlist.max_depth
+    runs = np.arange(trace.charged.shape[1]) < chip_steps[:, None]
+    events_by_step = _events(meter, happened, runs)
+    found = {table.name: cost.price(table, events_by_step) for table in target.energy}
+    operations = events_by_step["synaptic_operation_dense"] + events_by_step["synaptic_operation_sparse"]
+    return Course(
+        votes=_aligned(netlist, np.cumsum(votes, axis=1), events.shape[2]),
+        depth=read_out_depth(netlist),
+        lengths=lengths,
+        chip_steps=chip_steps,
+        operations=np.cumsum(operations, axis=1),
+        energy={name: np.cumsum(each, axis=1) for name, each in found.items() if not isinstance(each, tuple)},
+        time={
+            table.name: np.cumsum(charges.simple_from(clock, own, chip_steps).duration_ns, axis=1) * 1e-9
+            for table, clock, own in zip(timed, clocks, times, strict=True)
+        },
+    )
+
+
+def _event_charges(meter: cost.Meter) -> Charges:
+    """What events add to the amounts that a meter knows, layers taken together, and to neuron updates."""
+    netlist = meter.netlist
+    caused = meter.caused.reshape(len(meter.caused), len(meter.names), -1).sum(axis=2).astype(np.int64)
+    caused = np.concatenate([caused, np.zeros((len(caused), 1), np.int64)], axis=1)
+    updates = np.zeros((netlist.n_compartments, caused.shape[1]), np.int64)
+    updates[:, -1] = 1
+    return Charges(channels=caused[: netlist.n_inputs], spikes=caused[netlist.n_inputs :], updates=updates)
+
+
+def _events(meter: cost.Meter, happened: IntArray, runs: BoolArray) -> dict[str, FloatArray]:
+    """Amount of each priced event in each chip step; (samples, chip steps)."""
+    amounts = dict(zip((*meter.names, "neuron_active"), np.moveaxis(happened.astype(np.float64), 2, 0), strict=True))
+    amounts["neuron_idle"] = runs * meter.neurons.sum() - amounts["neuron_active"]
+    return {event: amounts[event] for event in cost.EVENTS}
+
+
+def _aligned(netlist: Netlist, votes: IntArray, steps: int) -> IntArray:
+    """Votes after each step of the read-out, from those after each chip step."""
+    depth = read_out_depth(netlist)
+    return votes[:, depth : depth + steps]

@@ -1,0 +1,184 @@
+"""What a run costs, as deep as it was asked for: spikes alone, events and simple times, or every message of every step.
+
+==========  ==========================================================================================================
+``spikes``  decisions only
+``counts``  events, energy by table, part and layer, and the simple time model: next to no work more
+``cycle``   the detailed time model too, and energy by core
+==========  ==========================================================================================================
+
+Spikes are the same in all three.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from spikeloom.compiler.fixedpoint import FloatArray, IntArray
+from spikeloom.compiler.targets.base import Target
+from spikeloom.compiler.targets.loihi1.layout.chips import chip_count, require_one_chip
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.runtime.costs import charges, cost, energy
+from spikeloom.runtime.costs.cost import Costs
+from spikeloom.runtime.machines.loihi1 import engine, timing
+from spikeloom.runtime.machines.loihi1.timing import DetailedTimes, SimpleTimes
+from spikeloom.runtime.machines.loihi1.trace import BoolArray, Counts
+
+DETAILS = ("spikes", "counts", "cycle")
+
+PART = 16
+"""Recordings whose spikes are kept at a time in detail ``cycle``."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Estimate:
+    """Costs of a batch of recordings.
+
+    Parameters
+    ----------
+    costs : Costs
+        Events and energies by layer.
+    parts : mapping of table to mapping of part to (samples, layers) float64
+        Joules.
+    steps : (samples,) int64
+        Data steps of each recording.
+    simple : mapping of time table to SimpleTimes
+    detailed : mapping of time table to DetailedTimes
+        Empty unless the detail is ``cycle``.
+    cores : mapping of energy table to (samples, cores) float64
+        Joules; empty unless the detail is ``cycle``.
+    """
+
+    costs: Costs
+    parts: Mapping[str, Mapping[str, FloatArray]]
+    steps: IntArray
+    simple: Mapping[str, SimpleTimes]
+    detailed: Mapping[str, DetailedTimes]
+    cores: Mapping[str, FloatArray]
+
+
+def estimate(
+    netlist: Netlist,
+    target: Target,
+    events: engine.EventArray,
+    *,
+    lengths: IntArray | None = None,
+    detail: str = "counts",
+    spikes: BoolArray | None = None,
+    progress: Callable[[int], object] | None = None,
+) -> tuple[Counts, Estimate]:
+    """Run recordings and say what they cost.
+
+    Parameters
+    ----------
+    netlist : Netlist
+        What runs.
+    target : Target
+        Its chip, with energy and time tables.
+    events : (samples, n_inputs, T) uint8 or bool
+        Recordings.
+    lengths : (samples,) int64, optional
+        Data steps of each where some are shorter than T.
+    detail : {"counts", "cycle"}
+        How deep.
+    spikes : (samples, chip steps, compartments) bool, optional
+        Array to fill, see :class:`trace.Trace`.
+    progress : callable, optional
+        Told the number of recordings that are done.
+
+    Raises
+    ------
+    DataError, NumericRangeError
+        As the engine says.
+    OptionError
+        If several chips shall be simulated by the cycle.
+
+    Notes
+    -----
+    Of several chips events are counted and priced but not timed: links between chips have no public latency.
+    """
+    if detail == "cycle":
+        require_one_chip(netlist.core_tile, target, "--detail cycle")
+    timed = target.time if chip_count(netlist.core_tile, target) == 1 else ()
+    clocks = {times.name: timing.prepare(netlist, target, times) for times in timed}
+    prepared = _charged(netlist, clocks)
+    steps = np.full(len(events), events.shape[2]) if lengths is None else np.asarray(lengths, np.int64)
+    detailed: dict[str, DetailedTimes] = {}
+    if detail == "cycle":
+        counts, charged, detailed, updates = _deep(prepared, clocks, events, steps, spikes, progress)
+    else:
+        trace = engine.simulate(prepared, events, lengths=steps, spikes=spikes is not None)
+        counts, charged = trace.counts, trace.charged
+        if spikes is not None:
+            spikes[:] = trace.spikes
+    simple = {}
+    if charged is not None:
+        sums = np.split(charged, len(clocks), axis=2)
+        simple = {
+            name: charges.simple_from(clock, own, steps + prepared.drain)
+            for (name, clock), own in zip(clocks.items(), sums, strict=True)
+        }
+    costs = cost.estimate(cost.prepare(netlist, target), counts, steps)
+    parts = {prices.name: energy.by_part(prices, costs.events) for prices in target.energy}
+    cores: dict[str, FloatArray] = {}
+    if detail == "cycle":
+        by_core = energy.count_by_core(netlist, target, counts, updates, steps + netlist.max_depth)
+        for prices in target.energy:
+            found = cost.price(prices, by_core)
+            if not isinstance(found, tuple):
+                cores[prices.name] = found
+    return counts, Estimate(
+        costs=costs,
+        parts={name: found for name, found in parts.items() if not isinstance(found, tuple)},
+        steps=steps,
+        simple=simple,
+        detailed=detailed,
+        cores=cores,
+    )
+
+
+def _charged(netlist: Netlist, clocks: Mapping[str, timing.Clock]) -> engine.Engine:
+    """An engine that adds up the times of the simple model, one table's after the other's."""
+    if not clocks:
+        return engine.prepare(netlist)
+    wanted = charges.side_by_side([charges.charges(clock) for clock in clocks.values()])
+    return engine.prepare(netlist, charges=wanted)
+
+
+def _deep(
+    prepared: engine.Engine,
+    clocks: Mapping[str, timing.Clock],
+    events: engine.EventArray,
+    steps: IntArray,
+    spikes: BoolArray | None,
+    progress: Callable[[int], object] | None,
+) -> tuple[Counts, IntArray | None, dict[str, DetailedTimes], IntArray]:
+    """Counts, charges, detailed times and updates of each core; some recordings at a time, as their spikes are kept."""
+    found: dict[str, list[DetailedTimes]] = {name: [] for name in clocks}
+    counts, charged, updates = [], [], []
+    for first in range(0, len(events), PART):
+        part = slice(first, first + PART)
+        trace = engine.simulate(prepared, events[part], lengths=steps[part], spikes=True, updated=True)
+        assert trace.spikes is not None, "spikes were asked for"
+        assert trace.updated is not None, "updates were asked for"
+        counts.append(trace.counts)
+        charged += [] if trace.charged is None else [trace.charged]
+        updates.append(energy.updates_by_core(prepared.netlist, trace.updated))
+        own = steps[part] + prepared.drain
+        heard = events[part] * (np.arange(events.shape[2]) < steps[part, None, None])  # nothing after a recording's end
+        for name, clock in clocks.items():
+            found[name].append(timing.detailed(clock, trace.spikes, trace.updated, heard, steps=own))
+        if spikes is not None:
+            spikes[part] = trace.spikes
+        if progress is not None:
+            progress(min(first + PART, len(events)))
+    joined = {
+        name: DetailedTimes(
+            **{f.name: np.concatenate([getattr(t, f.name) for t in times]) for f in fields(DetailedTimes)}
+        )
+        for name, times in found.items()
+    }
+    whole = Counts(**{f.name: np.concatenate([getattr(c, f.name) for c in counts]) for f in fields(Counts)})
+    return whole, np.concatenate(charged) if charged else None, joined, np.concatenate(updates)

@@ -1,0 +1,157 @@
+"""What a command simulated, and why not less: the option ``--explain-cost``.
+
+A command names each part as it begins; what is known about parts stands here, once. Nothing is measured but the time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.runtime.commands.inputs import progress
+
+Json = dict[str, Any]
+
+CHIP, FLOAT = "chip integers", "float"
+
+
+class Kind(NamedTuple):
+    """A part of a command.
+
+    Parameters
+    ----------
+    arithmetic : str
+        What it computes in; parts in ``CHIP`` run on the engine.
+    over : {"all", "checked", "one", "none"}
+        Recordings: all, those that the specification runs, one of them, or none since it was not needed.
+    why : str
+        What it is for.
+    """
+
+    arithmetic: str
+    over: str
+    why: str
+
+
+RUNS = {
+    "spikes": Kind(CHIP, "all", "decisions need counts of spikes alone: none is kept, nothing is priced"),
+    "spikes kept": Kind(CHIP, "all", "--spikes wants every spike: they are kept, nothing is priced"),
+    "counts": Kind(
+        CHIP, "all", "energies and simple times are sums over events: added up in the same run, no spike kept"
+    ),
+    "cycle": Kind(CHIP, "all", "every message of every step is scheduled: spikes and updates kept, in the same run"),
+    "no float": Kind(FLOAT, "none", "the float model says nothing about the chip's decisions or costs"),
+}
+"""Parts of ``run`` and ``estimate``."""
+
+CHECKS = {
+    "float32 reference": Kind("float32, released operator order", "all", "what the chip's spikes are held against"),
+    "float64 beside it": Kind("float64, released operator order", "all", "tells spikes that rounding of sums decides"),
+    "chip": Kind(CHIP, "all", "every spike kept, since every one is compared"),
+    "fine-tuned model": Kind("chip integers in torch", "all", "E1: the fine-tuned model has to be the chip"),
+    "specification": Kind(
+        "Python integers, and the engine again with membranes", "checked", "E0; --spec-samples says how many"
+    ),
+    "ladder: beta": Kind("float64 sums", "all", "spikes that differ by the decay registers alone"),
+    "ladder: weights": Kind("float64 sums", "all", "and by rounded weights"),
+    "ladder: bias_threshold": Kind("float64 sums", "all", "and by rounded biases and thresholds"),
+    "ladder: rounding": Kind(
+        "integer sums, no limits of registers", "all", "a membrane might saturate: what that does"
+    ),
+    "ladder: proven": Kind(
+        "integer sums, no limits of registers", "none", "no register can leave its range, so that rung is the chip"
+    ),
+    "first divergence": Kind("membranes in float32 and on the chip", "one", "the recording that differs first"),
+    "certificate": Kind("float64 intervals", "all", "which spikes no order of summation changes"),
+}
+"""Parts of ``verify``."""
+
+PAGE = {
+    "costs": RUNS["counts"],
+    "the recording": Kind(CHIP, "one", "spikes, membranes and every message of the recording that is drawn"),
+}
+"""What ``report`` adds to ``verify``."""
+
+KINDS = RUNS | CHECKS | PAGE
+
+
+class Account:
+    """Parts of a command as they go by.
+
+    Parameters
+    ----------
+    netlist : Netlist
+        What is simulated.
+    data : Recordings
+        On what.
+    checked : int
+        Recordings that the specification runs.
+    """
+
+    def __init__(self, netlist: Netlist, data: Recordings, *, checked: int = 0) -> None:
+        self._netlist, self._checked = netlist, min(checked, len(data))
+        self._steps = np.full(len(data), data.steps) if data.lengths is None else data.lengths
+        self._parts: list[tuple[str, float]] = []
+
+    def begin(self, part: str) -> None:
+        """A part begins, and the one before it has ended."""
+        self._parts.append((part, time.perf_counter()))
+        if KINDS[part].over != "none":
+            progress(part)
+
+    def entries(self) -> list[Json]:
+        """All parts that are known, in their order; the last one ends now."""
+        ends = [begun for _, begun in self._parts[1:]] + [time.perf_counter()]
+        found = []
+        for (part, begun), end in zip(self._parts, ends, strict=True):
+            kind = KINDS[part]
+            among = {"all": len(self._steps), "checked": self._checked, "one": 1, "none": 0}[kind.over]
+            steps = self._steps[:among]
+            ran = bool(among)
+            found.append(
+                {
+                    "part": part,
+                    "ran": ran,
+                    "arithmetic": kind.arithmetic,
+                    "recordings": among,
+                    "data_steps": int(steps.sum()) if kind.over != "one" else int(self._steps.max(initial=0)),
+                    "layers": [layer.name for layer in self._netlist.layers] if ran else [],
+                    "kernel": self._kernel() if ran and kind.arithmetic == CHIP else None,
+                    "why": kind.why,
+                    "seconds": end - begun if ran else 0.0,
+                }
+            )
+        return found
+
+    def _kernel(self) -> str:
+        """Which kernel the engine takes."""
+        from spikeloom.runtime.machines.loihi1.blocks import obstacle
+
+        found = obstacle(self._netlist)
+        return "layer by layer, 64 neurons at a time" if found is None else f"step by step: {found}"
+
+
+def explained(arguments: argparse.Namespace, account: Account) -> Json:
+    """Say what was simulated where that was asked for; the same for a report, else nothing."""
+    if not arguments.explain_cost:
+        return {}
+    entries = account.entries()
+    progress("")
+    sys.stderr.writelines(f"spikeloom: {line}\n" for line in map(_line, entries))
+    return {"explained_cost": entries}
+
+
+def _line(entry: Json) -> str:
+    if not entry["ran"]:
+        return f"not simulated, {entry['arithmetic']}: {entry['why']}"
+    noun = "recording" if entry["recordings"] == 1 else "recordings"
+    layers = len(entry["layers"])
+    parts = [f"{entry['recordings']} {noun}, {entry['data_steps']:,} steps", f"{layers} layers", entry["arithmetic"]]
+    parts += [entry["kernel"]] if entry["kernel"] else []
+    return f"simulated {entry['part']} ({', '.join(parts)}), {entry['seconds']:.2f} s: {entry['why']}"

@@ -1,0 +1,291 @@
+"""Yardsticks of others, apart from the chip's own: NeuroBench's counts, and arithmetic energy after Horowitz.
+
+Both are computed from spike trains on the network as :func:`expand.expand` writes it down, that is on
+the *effective* matrix of the graph convolution. Counted on its factors (K + 1 small maps and K propagations a step)
+the convolution of the float model is cheaper than dense; that is said apart, because a processor would use it.
+
+Arithmetic energy is a lower bound for a processor: no memory, no instructions, no clock. It is no energy of the chip
+and is not to be set against one table of the chip's events without saying so.
+
+References
+----------
+.. [1] J. Yik et al., "The NeuroBench framework for benchmarking neuromorphic computing algorithms and systems",
+   Nature Communications 16, 1545, 2025; definitions as in the package neurobench 2.3.0.
+.. [2] M. Horowitz, "Computing's energy problem (and what we can do about it)", ISSCC 2014, figure 1.1.9 (45 nm, 0.9 V).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from spikeloom.compiler.dynamics import with_clocks
+from spikeloom.compiler.errors import DataError
+from spikeloom.compiler.fixedpoint import FloatArray
+from spikeloom.compiler.formats.checkpoint import Checkpoint
+from spikeloom.compiler.ir import INPUT, Network
+from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.systems import GCN, TACTILESGNET
+from spikeloom.compiler.targets.base import Quantity
+from spikeloom.runtime.report.tables import si, table
+
+Json = dict[str, Any]
+SpikeTrain = npt.NDArray[np.bool_]
+
+FLOAT_BYTES = 4
+"""Bytes of a float32 parameter."""
+
+_SOURCE = "Horowitz, ISSCC 2014, figure 1.1.9 (45 nm, 0.9 V)"
+HOROWITZ: Mapping[str, Quantity] = {
+    "float32_add": Quantity(value=0.9, unit="pJ", source=_SOURCE),
+    "float32_multiply": Quantity(value=3.7, unit="pJ", source=_SOURCE),
+    "int8_multiply": Quantity(value=0.2, unit="pJ", source=_SOURCE),
+    "int32_add": Quantity(value=0.1, unit="pJ", source=_SOURCE),
+}
+"""Energy of one operation."""
+
+MULTIPLY_ACCUMULATE = {
+    "float32": ("float32_multiply", "float32_add"),
+    "int8": ("int8_multiply", "int32_add"),
+}
+"""Parts of a multiply-accumulate; products of 8-bit numbers are summed in 32 bits. The last one is the accumulation
+alone, all that a spike needs."""
+
+NOT_COUNTED = "memory, instructions, clock and leakage (arithmetic alone; a lower bound for any processor)"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NeuroBench:
+    """NeuroBench's metrics, means over recordings as its harness gives them for batches of one.
+
+    Parameters
+    ----------
+    footprint : int
+        Bytes of weights and biases in float32, the matrix of the convolution and its zeros included; no state.
+    connection_sparsity : float
+        Share of weights that are zero, rounded to four digits as the package does.
+    activation_sparsity : float
+        Share of neurons and steps without a spike.
+    effective_macs, effective_acs : float
+        Non-zero weights that meet a non-zero input, per recording: multiply-accumulates where a step's input is not
+        in {-1, 0, 1}, else accumulations.
+    dense : float
+        The same with all inputs and weights set to one.
+    """
+
+    footprint: int
+    connection_sparsity: float
+    activation_sparsity: float
+    effective_macs: float
+    effective_acs: float
+    dense: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Arithmetic:
+    """Operations per recording and their energy in one number format.
+
+    Parameters
+    ----------
+    what : str
+        What computes.
+    numbers : {"float32", "int8"}
+        Format; products of int8 are summed in 32 bits.
+    macs, acs : float
+        Multiply-accumulates and accumulations per recording, decays of membranes among the former.
+    """
+
+    what: str
+    numbers: str
+    macs: float
+    acs: float
+
+    @property
+    def joule(self) -> float:
+        """Energy per recording."""
+        parts = [HOROWITZ[part].value for part in MULTIPLY_ACCUMULATE[self.numbers]]
+        return (self.macs * sum(parts) + self.acs * parts[-1]) * 1e-12
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Yardsticks:
+    """Both yardsticks of a network on some recordings.
+
+    Parameters
+    ----------
+    samples : int
+        Recordings.
+    neurobench : NeuroBench
+        Counts.
+    arithmetic : tuple of Arithmetic
+        Dense, with the convolution in its factors, and effective; each in float32 and int8.
+    """
+
+    samples: int
+    neurobench: NeuroBench
+    arithmetic: tuple[Arithmetic, ...]
+
+
+def measure(
+    checkpoint: Checkpoint,
+    adjacency: FloatArray,
+    events: npt.NDArray[np.uint8],
+    spikes: Mapping[str, SpikeTrain] | Sequence[SpikeTrain],
+    *,
+    lengths: npt.NDArray[np.int64] | None = None,
+) -> Yardsticks:
+    """Count a checkpoint's operations on recordings.
+
+    Parameters
+    ----------
+    checkpoint : Checkpoint
+        Trained weights.
+    adjacency : (taxels, taxels) float64
+        Normalised propagation matrix of its graph.
+    events : (samples, taxels, channels, steps) uint8
+        Recordings.
+    spikes : mapping or sequence of (samples, steps, neurons) bool
+        Spike trains of every layer in order, of the float model or of the chip (aligned with the data).
+    lengths : (samples,) int64, optional
+        Steps of each recording where some are shorter; what comes after them is not counted.
+
+    Raises
+    ------
+    DataError
+        If spikes and recordings do not belong to this network.
+    """
+    network = expand(checkpoint, adjacency)
+    samples, steps = len(events), events.shape[-1]
+    given = list(spikes.values() if isinstance(spikes, Mapping) else spikes)
+    _check(network, events, given)
+    last = np.full(samples, steps) if lengths is None else lengths
+    counted = np.arange(steps) < last[:, None]
+    trains = [train & counted[:, :, None] for train in given]
+    inputs = with_clocks(events, checkpoint.dynamics.clocks).transpose(0, 2, 1) * counted[:, :, None]
+
+    bench = _neurobench(network, inputs, trains, last)
+    mean_steps = float(last.mean())
+    decays = sum(train.shape[2] for train in trains) * mean_steps
+    saved = network.populations[0].size * network.input.size - _factored(checkpoint, adjacency)
+    forms = (
+        ("dense", bench.dense + decays, 0.0),
+        ("dense, convolution in factors", bench.dense + decays - saved * mean_steps, 0.0),
+        ("effective", bench.effective_macs + decays, bench.effective_acs),
+    )
+    return Yardsticks(
+        samples=samples,
+        neurobench=bench,
+        arithmetic=tuple(
+            Arithmetic(what=what, numbers=numbers, macs=macs, acs=acs)
+            for what, macs, acs in forms
+            for numbers in MULTIPLY_ACCUMULATE
+        ),
+    )
+
+
+def _check(network: Network, events: npt.NDArray[np.uint8], spikes: Sequence[SpikeTrain]) -> None:
+    samples, steps = len(events), events.shape[-1]
+    wanted = [(samples, steps, population.size) for population in network.populations]
+    found = [train.shape for train in spikes]
+    if found != wanted or samples == 0:
+        raise DataError(
+            f"yardsticks: spikes of shapes {found} found, {wanted} allowed for these {samples} recordings; "
+            "give the spikes of every layer of this network on these recordings"
+        )
+
+
+def _neurobench(
+    network: Network, inputs: npt.NDArray[np.uint8], trains: Sequence[SpikeTrain], last: npt.NDArray[np.int64]
+) -> NeuroBench:
+    macs = acs = 0.0
+    zeros = weights = parameters = 0
+    for projection in network.projections:
+        source = inputs if projection.pre == INPUT else trains[projection.pre]
+        post, pre = projection.weight.shape
+        # towers have no weights from one another; the convolution is its effective matrix, with its zeros
+        held = post * pre if projection.pre == INPUT else projection.weight.nnz
+        fan_out = np.count_nonzero(projection.weight.toarray(), axis=0)
+        # one recording at a time: the product would make float64 of all spikes
+        visited = np.stack([(recording != 0) @ fan_out.astype(np.float64) for recording in source])
+        binary = np.all(source <= 1, axis=2)
+        acs += float(visited[binary].sum())
+        macs += float(visited[~binary].sum())
+        zeros += held - int(fan_out.sum())
+        weights += held
+        parameters += held + post
+    neurons = sum(train.shape[2] for train in trains)
+    # a mean of the recordings' shares, not a share of all: they differ where lengths do
+    fired = sum(train.sum(axis=(1, 2)) for train in trains)
+    return NeuroBench(
+        footprint=parameters * FLOAT_BYTES,
+        connection_sparsity=round(float(np.float32(zeros) / np.float32(weights)), 4),
+        activation_sparsity=float(np.mean(1 - fired / (neurons * last))),
+        effective_macs=macs / len(inputs),
+        effective_acs=acs / len(inputs),
+        dense=weights * float(last.mean()),
+    )
+
+
+def _factored(checkpoint: Checkpoint, adjacency: FloatArray) -> int:
+    """Multiply-accumulates of the first layer in one step: its maps, of a graph its hops over the edges, its relays."""
+    hops, _, channels = checkpoint.hops.shape
+    maps = checkpoint.places * int(checkpoint.hops.size)
+    times = {TACTILESGNET: int(hops) - 1, GCN: 1}.get(checkpoint.system, 0)
+    return maps + times * int(np.count_nonzero(adjacency)) * int(channels) + checkpoint.dynamics.clocks.channels
+
+
+def yardsticks_json(found: Yardsticks) -> Json:
+    """Both yardsticks; ``neurobench`` under the key names of that package."""
+    bench = found.neurobench
+    return {
+        "samples": found.samples,
+        "neurobench": {
+            "footprint": bench.footprint,
+            "connection_sparsity": bench.connection_sparsity,
+            "activation_sparsity": bench.activation_sparsity,
+            "synaptic_operations": {
+                "Effective_MACs": bench.effective_macs,
+                "Effective_ACs": bench.effective_acs,
+                "Dense": bench.dense,
+            },
+        },
+        "arithmetic": [
+            {"what": row.what, "numbers": row.numbers, "macs": row.macs, "acs": row.acs, "energy_j": row.joule}
+            for row in found.arithmetic
+        ],
+        "prices_pj": {name: price.value for name, price in HOROWITZ.items()},
+        "source": _SOURCE,
+        "not_counted": NOT_COUNTED,
+    }
+
+
+def yardsticks_text(report: Json) -> str:
+    """Both yardsticks for people."""
+    bench = report["neurobench"]
+    operations = bench["synaptic_operations"]
+    counts = [
+        ["synaptic operations, dense", f"{operations['Dense']:,.0f}"],
+        ["effective accumulations", f"{operations['Effective_ACs']:,.0f}"],
+        ["effective multiply-accumulates", f"{operations['Effective_MACs']:,.0f}"],
+        ["activation sparsity", f"{bench['activation_sparsity']:.4f}"],
+        ["connection sparsity", f"{bench['connection_sparsity']:.4f}"],
+        ["footprint in float32, bytes", f"{bench['footprint']:,}"],
+    ]
+    energy = [
+        [f"{row['what']}, {row['numbers']}", f"{row['macs']:,.0f}", f"{row['acs']:,.0f}", si(row["energy_j"], "J")]
+        for row in report["arithmetic"]
+    ]
+    return "\n".join(
+        [
+            f"NeuroBench's metrics per recording, over {report['samples']}, on the convolution's effective matrix:",
+            table(["", "value"], counts),
+            "",
+            f"arithmetic energy per recording, prices of {report['source']}:",
+            table(["", "multiply-accumulates", "accumulations", "energy"], energy),
+            f"not counted: {report['not_counted']}",
+        ]
+    )

@@ -1,0 +1,1 @@
+"""Float model against chip: how equal they are, and why not."""

@@ -1,0 +1,144 @@
+"""Ways in which a quantised network is known to fail at once, looked for by name.
+
+Shares of equal spikes hide them: a silent layer agrees with a quiet one, and one class for every recording is right now
+and then.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from spikeloom.compiler.fixedpoint import IntArray
+from spikeloom.compiler.interpret import BoolArray, vote
+
+OFTEN = 10
+"""Spikes from which on a neuron that falls silent, or that wakes up, is worth a line."""
+
+NEARLY_EMPTY = 0.001
+"""A recording in which a smaller share of all entries (taxel, polarity, step) holds an event is nearly empty."""
+
+LISTED = 3
+"""Neurons or recordings that a line names at most."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Breakdown:
+    """A failure that was found.
+
+    Parameters
+    ----------
+    kind : str
+        ``silent layer``, ``silenced neurons``, ``woken neurons``, ``one class``, ``no vote``, ``tied votes`` or
+        ``nearly empty``.
+    layer : str or None
+        Where it is in one layer.
+    count : int
+        Spikes of the float model, neurons or recordings that it concerns.
+    text : str
+        One line for people.
+    """
+
+    kind: str
+    layer: str | None
+    count: int
+    text: str
+
+
+def breakdowns(
+    names: Sequence[str],
+    reference: Sequence[BoolArray],
+    chip: Sequence[BoolArray],
+    neurons: Sequence[IntArray],
+    votes: tuple[IntArray, IntArray],
+    events: npt.NDArray[np.uint8],
+    files: Sequence[str],
+    lengths: IntArray | None = None,
+) -> tuple[Breakdown, ...]:
+    """Look for all of them.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Layers.
+    reference, chip : sequence of (samples, steps, compared) bool
+        Spikes of each layer, of the neurons that can be compared.
+    neurons : sequence of (compared,) int64
+        Which neurons of the layer these are.
+    votes : pair of (samples, classes) int64
+        Spikes for each class, of the float model and of the chip.
+    events : (samples, channels, steps) uint8
+        Recordings.
+    files : sequence of str
+        Their names.
+    lengths : (samples,) int64, optional
+        Steps of each that count; all of them by default.
+    """
+    found: list[Breakdown] = []
+    for name, ours, theirs, ids in zip(names, reference, chip, neurons, strict=True):
+        found += _fallen(name, ours.sum(axis=(0, 1)), theirs.sum(axis=(0, 1)), ids)
+    return (*found, *undecided(*votes, files), *_empty(votes, events, files, lengths))
+
+
+def _fallen(name: str, before: IntArray, after: IntArray, ids: IntArray) -> list[Breakdown]:
+    """Layers and neurons that only one side hears from."""
+    total = int(before.sum())
+    if total >= OFTEN and not after.any():
+        text = f"{name} never fires on the chip; it fires {total:,} times in the float model"
+        return [Breakdown(kind="silent layer", layer=name, count=total, text=text)]
+    found = []
+    for kind, one, other, where, beside in (
+        ("silenced neurons", before, after, "in the float model", "never on the chip"),
+        ("woken neurons", after, before, "on the chip", "never in the float model"),
+    ):
+        lost = np.flatnonzero((one >= OFTEN) & (other == 0))
+        lost = lost[np.argsort(-one[lost], kind="stable")]
+        if len(lost):
+            worst = ", ".join(f"{ids[i]} ({one[i]:,} times)" for i in lost[:LISTED])
+            more = f" and {len(lost) - LISTED} more" if len(lost) > LISTED else ""
+            text = f"{name} neurons that fire {where} and {beside}: {worst}{more}"
+            found.append(Breakdown(kind=kind, layer=name, count=len(lost), text=text))
+    return found
+
+
+def undecided(before: IntArray, after: IntArray, files: Sequence[str]) -> list[Breakdown]:
+    """Decisions that say nothing about the recording; votes (samples, classes) of the reference and of the chip."""
+    found = []
+    decided, wanted = vote(after), vote(before)
+    if len(set(decided)) == 1 and len(set(wanted)) > 1:
+        text = f"the chip decides class {decided[0]} for every recording, the float model {len(set(wanted))} classes"
+        found.append(Breakdown(kind="one class", layer=None, count=len(decided), text=text))
+    most = after.max(axis=1, initial=0)
+    without = np.flatnonzero(most == 0)
+    if len(without):
+        text = f"without a single vote, so class {vote(after[without])[0]} by rule: {_listed(without, files)}"
+        found.append(Breakdown(kind="no vote", layer=None, count=len(without), text=text))
+    tied = np.flatnonzero((most > 0) & (np.count_nonzero(after == most[:, None], axis=1) > 1))
+    if len(tied):
+        text = f"decided among equal votes, the first class taken: {_listed(tied, files)}"
+        found.append(Breakdown(kind="tied votes", layer=None, count=len(tied), text=text))
+    return found
+
+
+def _empty(
+    votes: tuple[IntArray, IntArray], events: npt.NDArray[np.uint8], files: Sequence[str], lengths: IntArray | None
+) -> list[Breakdown]:
+    steps = np.full(len(events), events.shape[2]) if lengths is None else lengths
+    density = np.count_nonzero(events, axis=(1, 2)) / (events.shape[1] * steps)
+    empty = np.flatnonzero(density < NEARLY_EMPTY)
+    if not len(empty):
+        return []
+    equal = int(np.count_nonzero(vote(votes[0][empty]) == vote(votes[1][empty])))
+    text = (
+        f"events in less than {100 * NEARLY_EMPTY:g} % of all entries, decided equally {equal} times: "
+        f"{_listed(empty, files)}"
+    )
+    return [Breakdown(kind="nearly empty", layer=None, count=len(empty), text=text)]
+
+
+def _listed(places: IntArray, files: Sequence[str]) -> str:
+    more = f" and {len(places) - LISTED} more" if len(places) > LISTED else ""
+    return f"{len(places)} of {len(files)} recordings ({', '.join(files[i] for i in places[:LISTED])}{more})"

@@ -1,0 +1,190 @@
+"""How much of what the float model does in any order of summation the chip does, too.
+
+An entry (recording, step, neuron) that :mod:`equivalence.certainty` finds certain is certified to be equal to the float
+model's, or to be different. Registers of the chip are bounded by :func:`range_proof.prove_ranges`, for any
+input.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from spikeloom.compiler.fixedpoint import FloatArray, IntArray
+from spikeloom.compiler.formats.checkpoint import Checkpoint
+from spikeloom.compiler.interpret import BoolArray, cut
+from spikeloom.compiler.ir import IntegerNetwork, Network
+from spikeloom.compiler.targets.loihi1.storage.range_proof import prove_ranges
+from spikeloom.runtime.equivalence.certainty import float_certainty
+from spikeloom.runtime.machines.votes import readout_counts
+from spikeloom.runtime.report.tables import table
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LayerCertificate:
+    """Entries (recording, step, neuron) of one layer.
+
+    Parameters
+    ----------
+    entries : int
+        All of them.
+    equal : int
+        Chip and float model have the same spike, or the same silence, in whatever order the float model adds.
+    different : int
+        They differ in whatever order. The rest is undecided.
+    """
+
+    entries: int
+    equal: int
+    different: int
+
+    @property
+    def undecided(self) -> int:
+        """Entries in which rounding, or an uncertain spike before it, may decide."""
+        return self.entries - self.equal - self.different
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Certificate:
+    """What is proven, of the recordings and of any input.
+
+    Parameters
+    ----------
+    layers : mapping of str to LayerCertificate
+        Spikes of each layer on the recordings.
+    samples : int
+        Recordings.
+    decisions : int
+        Of these, how many float decisions are the chip's in whatever order the float model adds.
+    unproven : tuple of str
+        Layers that may bring a register out of its range on some input; empty if none can.
+    """
+
+    layers: Mapping[str, LayerCertificate]
+    samples: int
+    decisions: int
+    unproven: tuple[str, ...]
+
+
+def wins(decisions: IntArray, least: IntArray, most: IntArray) -> BoolArray:
+    """Whether a class wins the vote whatever the counts between their bounds; ties go to the lowest class.
+
+    Parameters
+    ----------
+    decisions : (samples,) int64
+        The class in question.
+    least, most : (samples, classes) int64
+        Bounds of the votes.
+
+    Examples
+    --------
+    >>> least, most = np.array([[3, 3], [3, 3], [2, 1]]), np.array([[3, 3], [3, 4], [4, 2]])
+    >>> wins(np.array([0, 0, 0]), least, most).tolist()
+    [True, False, True]
+    """
+    rows = np.arange(len(decisions))
+    own = least[rows, decisions][:, None]
+    classes = np.arange(least.shape[1])
+    beaten = np.where(classes < decisions[:, None], most < own, most <= own)
+    beaten[rows, decisions] = True
+    sure: BoolArray = np.logical_and.reduce(beaten, axis=1)
+    return sure
+
+
+def certify(
+    model: Checkpoint | Network,
+    adjacency: FloatArray | None,
+    integer: IntegerNetwork,
+    events: npt.NDArray[np.uint8],
+    chip: Sequence[BoolArray],
+    decisions: IntArray,
+    *,
+    kept: Sequence[slice | IntArray] | None = None,
+    lengths: IntArray | None = None,
+) -> Certificate:
+    """Certify spikes and decisions of the chip on recordings, and its registers on any input.
+
+    Parameters
+    ----------
+    model : Checkpoint or Network
+        Float model; a network sums over its synapses.
+    adjacency : (taxels, taxels) float64, or None
+        Normalised propagation matrix of a checkpoint.
+    integer : IntegerNetwork
+        The chip's network.
+    events : (samples, taxels, polarities, steps) uint8
+        Recordings.
+    chip : sequence of (samples, steps, kept neurons) bool
+        The chip's spikes on them, per layer, aligned with the data and cut to `lengths`.
+    decisions : (samples,) int64
+        Its classes.
+    kept : sequence of slice or int64 array, optional
+        Neurons of each layer that `chip` holds; by default all of them. The last layer must be whole.
+    lengths : (samples,) int64, optional
+        Steps of each recording; by default all of them.
+    """
+    neurons = [slice(None)] * len(chip) if kept is None else kept
+    float_model = [
+        (cut(certain[..., part], lengths), cut(doubt[..., part], lengths))
+        for part, (certain, doubt) in zip(neurons, float_certainty(model, adjacency, events), strict=True)
+    ]
+    steps = events.shape[3] * len(events) if lengths is None else int(lengths.sum())
+    layers = {}
+    for population, (certain, doubt), spikes in zip(integer.populations, float_model, chip, strict=True):
+        entries, unknown = steps * spikes.shape[2], int(np.count_nonzero(doubt))
+        different = int(np.count_nonzero((certain != spikes) & ~doubt))
+        layers[population.name] = LayerCertificate(
+            entries=entries, equal=entries - unknown - different, different=different
+        )
+    votes = [readout_counts(integer.readout, integer.classes, each) for each in float_model[integer.readout.population]]
+    least, most = votes[0], votes[0] + votes[1]
+    return Certificate(
+        layers=layers,
+        samples=len(events),
+        decisions=int(np.count_nonzero(wins(decisions, least, most))),
+        unproven=tuple(proof.layer for proof in prove_ranges(integer) if not proof.holds),
+    )
+
+
+def certificate_json(certificate: Certificate) -> dict[str, Any]:
+    """A certificate under the keys that scripts rely on."""
+    return {
+        "samples": certificate.samples,
+        "decisions": certificate.decisions,
+        "unproven": list(certificate.unproven),
+        "layers": {
+            name: {
+                "entries": layer.entries,
+                "equal": layer.equal,
+                "different": layer.different,
+                "undecided": layer.undecided,
+            }
+            for name, layer in certificate.layers.items()
+        },
+    }
+
+
+def certificate_text(report: dict[str, Any]) -> str:
+    """A certificate for people."""
+    rows = [
+        [
+            name,
+            f"{layer['entries']:,}",
+            f"{100 * layer['equal'] / max(layer['entries'], 1):.4f} %",
+            *(f"{layer[key]:,}" for key in ("different", "undecided")),
+        ]
+        for name, layer in report["layers"].items()
+    ]
+    proof = "no register overflows for any input"
+    if report["unproven"]:
+        proof = f"some input may overflow a register of {', '.join(report['unproven'])}: no proof of range"
+    return "\n".join(
+        [
+            table(["certified in any order of sums", "entries", "equal", "different", "undecided"], rows),
+            f"{report['decisions']} of {report['samples']} decisions certified equal; {proof}",
+        ]
+    )

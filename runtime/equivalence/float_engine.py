@@ -1,0 +1,375 @@
+"""The float network driven by its events: as fast as the chip's engine, for runs by the thousand.
+
+What :func:`interpret.run_float` means, in float32, without a dense product: a spike adds the weights that it
+has to others, source by source, those of the layer itself after all others, and the bias comes last. Sums are taken in
+another order than in the released code, so
+that a spike decided by the last bit of a sum may differ from :mod:`reference`; ``verify`` counts such spikes as
+ill-posed, and the released network has none on the released recordings.
+
+Spikes are handed back at a bit each, at the place and in the chip step in which the chip would fire them: a trace of
+the chip (``Trace.packed``) is compared word by word.
+"""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+from spikeloom.compiler.fixedpoint import IntArray
+from spikeloom.compiler.interpret import DENORMAL
+from spikeloom.compiler.ir import INPUT, Network, Projection
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
+
+Floats = npt.NDArray[np.float32]
+Words = npt.NDArray[np.uint64]
+AnyArray = npt.NDArray[Any]
+
+NOWHERE = -1
+"""Seat of a neuron that the chip does not hold."""
+
+
+class Runs(NamedTuple):
+    """Weights by source, as stretches of neighbouring targets.
+
+    Parameters
+    ----------
+    run : (sources + 1,) int64
+        Bounds of each source's runs; a run is a stretch of neighbouring targets.
+    target, offset : (runs,) int64, (runs + 1,) int64
+        First target of each run, and where its weights begin; a run is as long as its weights.
+    weight : (synapses,) float32
+    """
+
+    run: IntArray
+    target: IntArray
+    offset: IntArray
+    weight: Floats
+
+
+_NONE = np.zeros(0, np.int64)
+NO_RUNS = Runs(_NONE, _NONE, _NONE, _NONE.astype(np.float32))
+"""Of no source."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Layer:
+    """One population, prepared.
+
+    Parameters
+    ----------
+    pres : tuple of int
+        Other populations that it hears, ``INPUT`` for the input; their neurons are numbered one after the other.
+    runs, own : Runs
+        Weights from these, and from itself; the latter without a source if it does not hear itself.
+    bias : (neurons,) float32
+    beta, theta, alpha : float
+    depth, late : int
+        Chip steps that it lags behind the data; how many of them beyond the one that follows the layer before, which
+        cost it as many steps of its input.
+    seat : (neurons,) int64
+        Compartment of each neuron, or ``NOWHERE``.
+    heard : (neurons,) bool
+        Neurons that are compared with the chip's: all but those left out because nobody hears them.
+    """
+
+    pres: tuple[int, ...]
+    runs: Runs
+    own: Runs
+    bias: Floats
+    beta: float
+    theta: float
+    alpha: float
+    depth: int
+    late: int
+    seat: IntArray
+    heard: npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FloatEngine:
+    """A float network prepared by :func:`prepare`; holds no state and can be shared by threads."""
+
+    layers: tuple[Layer, ...]
+    voters: int
+    label: IntArray
+    classes: int
+    inputs: int
+    compartments: int
+    drain: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FloatRun:
+    """What recordings brought.
+
+    Parameters
+    ----------
+    votes : (recordings, classes) int64
+    spikes, elsewhere : (recordings, layers) int64
+        Spikes that are compared with the chip's; those of them by neurons that it does not hold.
+    packed : (recordings, chip steps, words) uint64
+        Spikes, laid out as ``Trace.packed``.
+    """
+
+    votes: IntArray
+    spikes: IntArray
+    elsewhere: IntArray
+    packed: Words
+
+
+def prepare(network: Network, netlist: Netlist) -> FloatEngine:
+    """Lay a float network out for runs beside a netlist of the same populations."""
+    depth = [layer.depth for layer in netlist.layers]
+    layers = []
+    for post, population in enumerate(network.populations):
+        into = [p for p in network.projections if p.post == post != p.pre]
+        itself = [p for p in network.projections if p.post == post == p.pre]
+        pres = tuple(dict.fromkeys(projection.pre for projection in into))
+        sizes = {pre: network.input.size if pre == INPUT else network.populations[pre].size for pre in pres}
+        seat, heard = np.full(population.size, NOWHERE), np.ones(population.size, np.bool_)
+        ids = netlist.compartments_of(post)
+        seat[netlist.neuron[ids]] = ids
+        heard[list(netlist.layers[post].unheard)] = False
+        before = max((-1 if pre == INPUT else depth[pre] for pre in pres), default=-1)
+        layers.append(
+            Layer(
+                pres=pres,
+                runs=_runs(into, sizes),
+                own=_runs(itself, {post: population.size}) if itself else NO_RUNS,
+                bias=population.bias.astype(np.float32),
+                beta=population.beta,
+                theta=population.theta,
+                alpha=population.alpha,
+                depth=depth[post],
+                late=depth[post] - before - 1,
+                seat=seat,
+                heard=heard,
+            )
+        )
+    return FloatEngine(
+        layers=tuple(layers),
+        voters=network.readout.population,
+        label=network.readout.label,
+        classes=network.classes,
+        inputs=network.input.size,
+        compartments=netlist.n_compartments,
+        drain=netlist.max_depth,
+    )
+
+
+def _runs(into: list[Projection], sizes: dict[int, int]) -> Runs:
+    """Weights of all projections by source."""
+    first = dict(zip(sizes, np.cumsum([0, *sizes.values()]).tolist(), strict=False))
+    row = np.concatenate([np.repeat(np.arange(p.weight.shape[0]), np.diff(p.weight.indptr)) for p in into])
+    column = np.concatenate([p.weight.indices + first[p.pre] for p in into])
+    data = np.concatenate([p.weight.data for p in into]).astype(np.float32)
+    # a stable order by source keeps targets ascending within one projection
+    order = np.argsort(column, kind="stable")
+    row, column, data = row[order], column[order], data[order]
+    begins = np.ones(len(row), np.bool_)
+    begins[1:] = (np.diff(column) != 0) | (np.diff(row) != 1)
+    offset = np.flatnonzero(begins)
+    run = np.searchsorted(column[offset], np.arange(sum(sizes.values()) + 1))
+    return Runs(run, row[offset].astype(np.int64), np.append(offset, len(row)), data)
+
+
+def run(
+    engine: FloatEngine,
+    inputs: npt.NDArray[np.uint8],
+    *,
+    lengths: IntArray | None = None,
+    begin: IntArray | None = None,
+    threads: int | None = None,
+) -> FloatRun:
+    """Run a batch of recordings, each from rest.
+
+    Parameters
+    ----------
+    engine : FloatEngine
+        The network.
+    inputs : (recordings, channels, T) uint8
+        Events of all input channels, clocks among them.
+    lengths : (recordings,) int64, optional
+        Steps of each recording where some are shorter than T.
+    begin : (recordings,) int64, optional
+        Data step of each from which on spikes count; the first by default. ``packed`` holds all of them.
+    threads : int, optional
+        Recordings that run at the same time, by default one per processor.
+    """
+    n, _, steps = inputs.shape
+    ends = np.full(n, steps) if lengths is None else lengths
+    begins = np.zeros(n, np.int64) if begin is None else begin
+    layers = len(engine.layers)
+    found = FloatRun(
+        votes=np.zeros((n, engine.classes), np.int64),
+        spikes=np.zeros((n, layers), np.int64),
+        elsewhere=np.zeros((n, layers), np.int64),
+        packed=np.zeros((n, steps + engine.drain, -(-engine.compartments // 64)), np.uint64),
+    )
+
+    def one(index: int) -> None:
+        _one(engine, inputs[index, :, : ends[index]], int(begins[index]), found, index)
+
+    workers = min(threads or os.cpu_count() or 1, n)
+    with ThreadPoolExecutor(workers) if workers > 1 else nullcontext() as pool:
+        for _ in pool.map(one, range(n)) if pool else map(one, range(n)):
+            pass
+    return found
+
+
+def _one(engine: FloatEngine, inputs: npt.NDArray[np.uint8], begin: int, found: FloatRun, index: int) -> None:
+    """Run one recording; `index` is its place in what is found."""
+    steps = inputs.shape[1]
+    sent = {INPUT: _events(inputs)}
+    widths = [len(layer.bias) for layer in engine.layers]
+    for number, layer in enumerate(engine.layers):
+        source, bounds = _heard(layer.pres, sent, {INPUT: engine.inputs} | dict(enumerate(widths)))
+        counts = np.zeros(widths[number], np.int64)
+        sent[number] = _integrate_layer(
+            source,
+            bounds,
+            layer.late,
+            layer.runs,
+            layer.own,
+            layer.bias,
+            np.float32(layer.beta),
+            np.float32(layer.theta),
+            np.float32(layer.alpha),
+            layer.seat,
+            found.packed[index, layer.depth : layer.depth + steps],
+            begin,
+            counts,
+        )
+        found.spikes[index, number] = counts[layer.heard].sum()
+        found.elsewhere[index, number] = counts[layer.heard & (layer.seat == NOWHERE)].sum()
+        if number == engine.voters:
+            np.add.at(found.votes[index], engine.label, counts)
+
+
+def _heard(
+    pres: tuple[int, ...], sent: dict[int, tuple[AnyArray, IntArray]], sizes: dict[int, int]
+) -> tuple[AnyArray, IntArray]:
+    """What a layer hears, step after step; of several populations, one after the other."""
+    if len(pres) == 1:
+        return sent[pres[0]]
+    firsts = np.cumsum([0, *(sizes[pre] for pre in pres)]).tolist()
+    lengths = [np.diff(sent[pre][1]) for pre in pres]
+    step = np.concatenate([np.repeat(np.arange(len(length)), length) for length in lengths])
+    source = np.concatenate([sent[pre][0] + first for pre, first in zip(pres, firsts, strict=False)])
+    return source[np.argsort(step, kind="stable")], np.append(0, np.cumsum(np.sum(lengths, axis=0)))
+
+
+# Each step is a function of its own on one-dimensional arrays: only so does the compiler vectorise the loops.
+
+
+@numba.njit(cache=True, nogil=True)
+def _events(inputs: Any) -> Any:
+    """Channels (channels, steps) with an event, step after step: int32 (events,), int64 (steps + 1,)."""
+    channels, steps = inputs.shape
+    bounds = np.zeros(steps + 1, np.int64)
+    for channel in range(channels):
+        for t in range(steps):
+            bounds[t + 1] += inputs[channel, t] != 0
+    for t in range(steps):
+        bounds[t + 1] += bounds[t]
+    place = bounds[:steps].copy()
+    source = np.empty(bounds[steps], np.int32)
+    for channel in range(channels):
+        for t in range(steps):
+            if inputs[channel, t] != 0:
+                source[place[t]] = channel
+                place[t] += 1
+    return source, bounds
+
+
+@numba.njit(cache=True, nogil=True)
+def _add(total: Any, first: Any, weight: Any, begin: Any, length: Any) -> None:
+    # unsigned, so that no index may count from the end: only then is the loop vectorised
+    for i in range(np.uint64(length)):
+        total[np.uint64(first) + i] += weight[np.uint64(begin) + i]
+
+
+@numba.njit(cache=True, nogil=True)
+def _arrive(total: Any, runs: Any, source: Any, begin: Any, end: Any) -> None:
+    for event in range(begin, end):
+        for r in range(runs.run[source[event]], runs.run[source[event] + 1]):
+            _add(total, runs.target[r], runs.weight, runs.offset[r], runs.offset[r + 1] - runs.offset[r])
+
+
+@numba.njit(cache=True, nogil=True)
+def _keep(current: Any, alpha: Any) -> None:
+    for i in range(len(current)):
+        current[i] *= alpha
+
+
+@numba.njit(cache=True, nogil=True)
+def _integrate(membrane: Any, current: Any, bias: Any, beta: Any, theta: Any, fired: Any) -> None:
+    zero = membrane.dtype.type(0)
+    for i in range(len(bias)):
+        u = (zero if membrane[i] > theta else membrane[i] * beta) + (current[i] + bias[i])
+        membrane[i] = u
+        fired[i] = u > theta
+
+
+@numba.njit(cache=True, nogil=True)
+def _flush(values: Any, least: Any) -> None:
+    zero = values.dtype.type(0)
+    for i in range(len(values)):
+        values[i] = zero if abs(values[i]) < least else values[i]
+
+
+@numba.njit(cache=True, nogil=True)
+def _integrate_layer(
+    source: Any,
+    bounds: Any,
+    late: Any,
+    runs: Any,
+    own: Any,
+    bias: Any,
+    beta: Any,
+    theta: Any,
+    alpha: Any,
+    seat: Any,
+    packed: Any,
+    begin: Any,
+    counts: Any,
+) -> Any:
+    """All steps of one layer: neurons that fired, step after step, and where each step's begin."""
+    steps, size = len(bounds) - 1, len(bias)
+    membrane, current = np.zeros(size, np.float32), np.zeros(size, np.float32)
+    fired = np.zeros(-(-size // 8) * 8, np.uint8)
+    eight = fired.view(np.uint64)
+    out, out_bounds = np.empty(steps * size, np.int32), np.zeros(steps + 1, np.int64)
+    found, least = 0, np.float32(DENORMAL)
+    for t in range(steps):
+        if alpha:
+            _keep(current, alpha)
+        else:
+            current[:] = 0
+        if t + late < steps:
+            _arrive(current, runs, source, bounds[t + late], bounds[t + late + 1])
+        if len(own.run) and t:
+            _arrive(current, own, out, out_bounds[t - 1], out_bounds[t])
+        _integrate(membrane, current, bias, beta, theta, fired)
+        if t % 16 == 15:  # decaying values end in denormals, which cost a hundred times a normal operation
+            _flush(membrane, least)
+            _flush(current, least)
+        for word in range(len(eight)):
+            if eight[word]:
+                for neuron in range(word * 8, word * 8 + 8):
+                    if fired[neuron]:
+                        out[found] = neuron
+                        found += 1
+                        counts[neuron] += t >= begin
+                        place = seat[neuron]
+                        if place >= 0:
+                            packed[t, place >> 6] |= np.uint64(1) << np.uint64(place & 63)
+        out_bounds[t + 1] = found
+    return out[:found].copy(), out_bounds

@@ -1,0 +1,196 @@
+"""Float network and chip on the same recordings, both at the engines' pace, compared spike by spike.
+
+What is counted is what spikes after `begin`, so that recordings may follow others without a reset.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+from spikeloom.compiler.errors import NumericRangeError
+from spikeloom.compiler.fixedpoint import IntArray
+from spikeloom.compiler.interpret import vote
+from spikeloom.runtime.equivalence import float_engine
+from spikeloom.runtime.machines.loihi1 import engine
+from spikeloom.runtime.studies.stress.damages import Pair
+
+Words = npt.NDArray[np.uint64]
+
+SIDES = ("float", "chip")
+
+STOPPED = -1
+"""Decision where a register of the chip overflows and the simulator stops."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Ready:
+    """A pair, prepared to run.
+
+    Parameters
+    ----------
+    chip : Engine
+    model : FloatEngine
+    masks : (layers, words) uint64
+        Bits of each layer's compartments in ``Trace.packed``.
+    voters, label : (voters,) int64
+        Compartments that vote, and for which class.
+    """
+
+    chip: engine.Engine
+    model: float_engine.FloatEngine
+    masks: Words
+    voters: IntArray
+    label: IntArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Inputs:
+    """Recordings as channels of a network.
+
+    Parameters
+    ----------
+    events : (recordings, channels, T) uint8
+    lengths, begin : (recordings,) int64
+        Steps of each, and the first that counts.
+    """
+
+    events: npt.NDArray[np.uint8]
+    lengths: IntArray
+    begin: IntArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Outcome:
+    """What both sides did.
+
+    Parameters
+    ----------
+    votes : dict of str to (recordings, classes) int64
+        By side.
+    spikes : (recordings, layers, 3) int64
+        Of the float network, of the chip, and those in which they differ.
+    stopped : (recordings,) bool
+        Where a register of the chip would overflow.
+    saturated : (recordings,) int64
+        Membranes that were clipped.
+    """
+
+    votes: dict[str, IntArray]
+    spikes: IntArray
+    stopped: npt.NDArray[np.bool_]
+    saturated: IntArray
+
+    def decisions(self, side: str) -> IntArray:
+        """Class of each recording."""
+        found = vote(self.votes[side])
+        return np.where(self.stopped, STOPPED, found) if side == "chip" else found
+
+
+def ready(pair: Pair) -> Ready:
+    """Prepare a pair for runs."""
+    netlist = pair.netlist
+    masks = np.zeros((len(netlist.layers), -(-netlist.n_compartments // 64)), np.uint64)
+    seat = np.arange(netlist.n_compartments)
+    np.bitwise_or.at(masks, (netlist.layer, seat // 64), np.left_shift(np.uint64(1), (seat % 64).astype(np.uint64)))
+    voters = np.flatnonzero(netlist.readout_class >= 0)
+    return Ready(
+        chip=engine.prepare(netlist),
+        model=float_engine.prepare(pair.network, netlist),
+        masks=masks,
+        voters=voters,
+        label=netlist.readout_class[voters],
+    )
+
+
+def evaluate(prepared: Ready, inputs: Inputs, *, threads: int = 1) -> Outcome:
+    """Run both sides from rest."""
+    netlist = prepared.chip.netlist
+    model = float_engine.run(prepared.model, inputs.events, lengths=inputs.lengths, begin=inputs.begin, threads=threads)
+    packed, stopped, saturated = _chip(prepared.chip, inputs, threads)
+    spikes = np.zeros((len(inputs.events), len(netlist.layers), 3), np.int64)
+    votes = np.zeros((len(inputs.events), netlist.classes), np.int64)
+    depth = np.array([layer.depth for layer in netlist.layers])
+    _tally(
+        packed,
+        model.packed,
+        prepared.masks,
+        depth,
+        inputs.begin,
+        inputs.lengths,
+        prepared.voters,
+        depth[netlist.layer[prepared.voters]],
+        prepared.label,
+        spikes,
+        votes,
+    )
+    spikes[:, :, 0] = model.spikes
+    spikes[:, :, 2] += model.elsewhere
+    return Outcome(votes={"float": model.votes, "chip": votes}, spikes=spikes, stopped=stopped, saturated=saturated)
+
+
+def _chip(prepared: engine.Engine, inputs: Inputs, threads: int) -> tuple[Words, npt.NDArray[np.bool_], IntArray]:
+    """Packed spikes, which recordings stopped the simulator, and clipped membranes."""
+
+    def simulate(part: slice) -> tuple[Words, IntArray]:
+        trace = engine.simulate(
+            prepared, inputs.events[part], lengths=inputs.lengths[part], packed=True, threads=threads
+        )
+        assert trace.packed is not None, "spikes were asked for"
+        return trace.packed, trace.counts.saturations.sum(axis=1)
+
+    stopped = np.zeros(len(inputs.events), np.bool_)
+    try:
+        packed, saturated = simulate(slice(None))
+    except NumericRangeError:  # by one recording at least: run them one by one
+        steps = inputs.events.shape[2] + prepared.drain
+        packed = np.zeros((len(inputs.events), steps, -(-prepared.netlist.n_compartments // 64)), np.uint64)
+        saturated = np.zeros(len(inputs.events), np.int64)
+        for index in range(len(inputs.events)):
+            try:
+                packed[index : index + 1], saturated[index : index + 1] = simulate(slice(index, index + 1))
+            except NumericRangeError:
+                stopped[index] = True
+    return packed, stopped, saturated
+
+
+@numba.njit(cache=True, nogil=True)
+def _ones(word: Any) -> Any:
+    """Bits of a word that are set."""
+    word -= (word >> np.uint64(1)) & np.uint64(0x5555555555555555)
+    word = (word & np.uint64(0x3333333333333333)) + ((word >> np.uint64(2)) & np.uint64(0x3333333333333333))
+    word = (word + (word >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
+    return np.int64((word * np.uint64(0x0101010101010101)) >> np.uint64(56))
+
+
+@numba.njit(cache=True, nogil=True)
+def _tally(
+    chip: Any,
+    model: Any,
+    masks: Any,
+    depth: Any,
+    begin: Any,
+    end: Any,
+    voters: Any,
+    lag: Any,
+    label: Any,
+    spikes: Any,
+    votes: Any,
+) -> None:
+    """Count spikes of the chip and those that differ, (recordings, layers, 3), and its votes, where steps count."""
+    for i in range(len(chip)):
+        for layer in range(len(masks)):
+            for word in range(masks.shape[1]):
+                mask = masks[layer, word]
+                if mask:
+                    for t in range(begin[i] + depth[layer], end[i] + depth[layer]):
+                        spikes[i, layer, 1] += _ones(chip[i, t, word] & mask)
+                        spikes[i, layer, 2] += _ones((chip[i, t, word] ^ model[i, t, word]) & mask)
+        for v in range(len(voters)):
+            word, bit = voters[v] >> 6, np.uint64(voters[v] & 63)
+            for t in range(begin[i] + lag[v], end[i] + lag[v]):
+                votes[i, label[v]] += np.int64((chip[i, t, word] >> bit) & np.uint64(1))

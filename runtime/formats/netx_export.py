@@ -1,0 +1,233 @@
+"""A netlist as a lava-dl ``.net`` file, whose limits are narrower than the chip's, and what they change.
+
+The format keeps one threshold for a layer, weights of 8 bits without an exponent, and biases in whole weight steps,
+where the chip counts 64ths of them. Layers follow each other and may hear themselves; convolutions are written out as
+dense layers. A layer whose weights are stored with an exponent is rescaled by a power of two, its threshold with it.
+
+What netx does not read, but our own reader does, is in a group of its own: sensor, clocks and the classes that neurons
+vote for.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.fixedpoint import (
+    BIAS_MANTISSA_MAX,
+    MEMBRANE_SHIFT,
+    THRESHOLD_MANTISSA_MAX,
+    IntArray,
+    round_half_even,
+)
+from spikeloom.compiler.formats.hdf5 import Tree
+from spikeloom.compiler.formats.netx.layout import blocks_of
+from spikeloom.compiler.formats.netx.reader import OWN, integers_of
+from spikeloom.compiler.interpret import BoolArray, run_integer
+from spikeloom.compiler.ir import INPUT, IntegerNetwork, IntegerPopulation
+
+MOST_SHIFT = 8
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Block:
+    """One dense layer of the file, ``dense_rec`` if it hears itself.
+
+    Parameters
+    ----------
+    name : str
+        Layer of the netlist.
+    weight : (neurons, inputs) int64
+        Whole weight steps.
+    own : (neurons, neurons) int64, or None
+        Likewise, from itself.
+    bias : (neurons,) int64
+        Whole weight steps, rounded.
+    threshold, decay_u, decay_v : int
+        Registers.
+    shift : int
+        Power of two that everything was multiplied by.
+    rounded : int
+        Biases that are no whole steps.
+    threshold_rounded : bool
+        Whether the threshold is none.
+    furthest : float
+        Largest change of a bias, in weight steps of the netlist.
+    """
+
+    name: str
+    weight: IntArray
+    own: IntArray | None
+    bias: IntArray
+    threshold: int
+    decay_u: int
+    decay_v: int
+    shift: int
+    rounded: int
+    threshold_rounded: bool
+    furthest: float
+
+    @property
+    def synapses(self) -> int:
+        """Weights that are not zero."""
+        return int(np.count_nonzero(self.weight)) + (0 if self.own is None else int(np.count_nonzero(self.own)))
+
+
+def blocks_for(network: IntegerNetwork) -> tuple[Block, ...]:
+    """Layers of the file.
+
+    Raises
+    ------
+    ModelError
+        If the format cannot hold the network.
+    """
+    found = []
+    for post, population in enumerate(network.populations):
+        into = [projection for projection in network.projections if projection.post == post]
+        before = INPUT if not post else post - 1
+        if any(projection.pre not in (before, post) for projection in into) or network.readout.population + 1 != len(
+            network.populations
+        ):
+            raise ModelError(f"{population.name}: hears more than the layer before it; netx has layers in a row only")
+        # side by side from the layer before and, where it hears itself, from its own neurons
+        sources = {before: network.input.size if before == INPUT else network.populations[before].size}
+        sources |= {post: population.size} if any(projection.pre == post for projection in into) else {}
+        parts = {pre: np.zeros((population.size, size), np.int64) for pre, size in sources.items()}
+        for projection in into:
+            parts[projection.pre] += projection.effective().toarray()
+        weight = np.concatenate(list(parts.values()), axis=1)
+        # Neurons that the chip leaves out have no synapses and no bias, and fire at no threshold.
+        heard = np.any(weight, axis=1) | (population.bias != 0)
+        thresholds = np.unique(population.threshold[heard])
+        if len(thresholds) > 1:
+            raise ModelError(
+                f"{population.name}: has {len(thresholds)} thresholds, netx has one for a layer; compile with "
+                "--scale-groups 1"
+            )
+        threshold = int(thresholds[0]) if len(thresholds) else int(population.threshold[0])
+        found.append(_block(population, weight, sources[before], threshold))
+    return tuple(found)
+
+
+def _block(population: IntegerPopulation, weight: IntArray, inputs: int, threshold: int) -> Block:
+    """A layer with these weights, those of its `inputs` first, then its own."""
+    name = population.name
+    shift = _shift(name, weight, threshold)
+    shifted = np.ldexp(weight.astype(np.float64), shift).astype(np.int64)
+    steps = np.ldexp(population.bias.astype(np.float64), shift - MEMBRANE_SHIFT)
+    whole = round_half_even(steps)
+    scaled = np.ldexp(float(threshold), shift)
+    if np.abs(whole).max(initial=0) > BIAS_MANTISSA_MAX:
+        raise ModelError(
+            f"{name}: has a bias of {np.abs(whole).max()} weight steps, netx holds {BIAS_MANTISSA_MAX}; train with "
+            "smaller biases"
+        )
+    return Block(
+        name=name,
+        weight=shifted[:, :inputs],
+        own=shifted[:, inputs:] if weight.shape[1] > inputs else None,
+        bias=whole,
+        threshold=max(1, int(np.rint(scaled))),
+        decay_u=population.decay_u,
+        decay_v=population.decay_v,
+        shift=shift,
+        rounded=int(np.count_nonzero(whole != steps)),
+        threshold_rounded=bool(scaled != np.rint(scaled)),
+        furthest=float(np.ldexp(np.abs(whole - steps).max(initial=0), -shift)),
+    )
+
+
+def _shift(name: str, weight: IntArray, threshold: int) -> int:
+    """The smallest power of two by which weights become even and fit 8 bits."""
+    for size in range(MOST_SHIFT + 1):
+        for shift in {size, -size}:
+            scaled = np.ldexp(weight.astype(np.float64), shift)
+            fits = -256 <= scaled.min(initial=0) and scaled.max(initial=0) <= 254
+            if fits and not np.any(scaled % 2) and np.ldexp(float(threshold), shift) <= THRESHOLD_MANTISSA_MAX:
+                return shift
+    raise ModelError(
+        f"{name}: has weights from {weight.min()} to {weight.max()}, netx holds 8 bits without an exponent; compile "
+        "with --planes 1 --weight-bits 8"
+    )
+
+
+def tree_of(network: IntegerNetwork, blocks: Sequence[Block]) -> Tree:
+    """Content of the file."""
+    layers: Tree = {"0": {"type": "input", "shape": np.array([network.input.size])}}
+    for number, block in enumerate(blocks, 1):
+        neurons, inputs = block.weight.shape
+        layers[str(number)] = {
+            "type": "dense" if block.own is None else "dense_rec",
+            "shape": np.array([neurons]),
+            "inFeatures": np.array(inputs),
+            "outFeatures": np.array(neurons),
+            "weight": block.weight,
+            **({} if block.own is None else {"weight_rec": block.own}),
+            "bias": block.bias,
+            "neuron": {
+                "type": "CUBA",
+                "iDecay": np.array(block.decay_u + 1),
+                "vDecay": np.array(block.decay_v),
+                "vThMant": np.array(block.threshold),
+                "refDelay": np.array(1),
+                "gradedSpike": np.array(False),
+            },
+        }
+    own = {
+        "taxels": np.array(network.input.taxels),
+        "polarities": np.array(network.input.polarities),
+        "clocks": np.array(network.input.clocks.channels),
+        "clock_steps": np.array(network.input.clocks.steps),
+        **({"bins": np.array(network.input.bins)} if network.input.bins > 1 else {}),
+        "label": network.readout.label,
+    }
+    return {"layer": layers, OWN: own}
+
+
+def file_bytes(tree: Tree) -> bytes:
+    """HDF5 of a tree; equal trees give equal bytes."""
+    import h5py  # slow to load, so only where it is used
+
+    content = io.BytesIO()
+    with h5py.File(content, "w") as file:
+        _fill(file, tree)
+    return content.getvalue()
+
+
+def _fill(group: Any, tree: Tree) -> None:
+    for name, value in tree.items():
+        if isinstance(value, dict):
+            _fill(group.create_group(name), value)
+        elif isinstance(value, str):
+            # neurons name their type by a single string, layers by a list of one
+            text = value.encode("ascii")
+            group.create_dataset(name, data=np.array(text if value == "CUBA" else [text], dtype="S10"))
+        else:
+            kind = np.int16 if name in ("weight", "weight_rec") else value.dtype
+            group.create_dataset(name, data=value.astype(kind), compression="gzip" if value.size > 1024 else None)
+
+
+def moved_spikes(network: IntegerNetwork, blocks: Sequence[Block], events: BoolArray) -> dict[str, tuple[int, int]]:
+    """Spikes of each layer that the rounding moves, and how many the netlist has.
+
+    Parameters
+    ----------
+    network : IntegerNetwork
+        Of the netlist.
+    blocks : sequence of Block
+        What is written.
+    events : (samples, steps, channels) bool
+        Recordings.
+    """
+    tree = tree_of(network, blocks)
+    written, _ = integers_of(blocks_of(tree), tree)
+    before, after = (run_integer(one, events).spikes for one in (network, written))
+    return {
+        block.name: (int(np.count_nonzero(a != b)), int(np.count_nonzero(a)))
+        for block, a, b in zip(blocks, before, after, strict=True)
+    }

@@ -1,0 +1,170 @@
+"""A netlist as a NIR file: the float network that comes closest to what the chip does.
+
+Numbers are in weight units, so that weights and thresholds are the chip's integers and sums of them exact in float32;
+decays are the registers' own. What remains different is rounding: a register is cut to a whole number in every step, a
+float is not.
+
+* A layer is an Affine or Linear for each layer that it hears, and a LIF; an IF where it keeps its whole membrane, a
+  CubaLIF where its current outlasts a step. A CubaLIF's bias, which the chip adds past the current, is a leak voltage.
+* Time constants are those of the forward Euler method for the step given: ``1 - dt / tau`` is what a step keeps, and
+  ``r = tau / dt`` makes a step add its input as it is.
+* Inputs are one flat axis, ``taxel * polarities + polarity``, then the clocks. A vote of several neurons is a Linear.
+
+Neurons that the chip leaves out are there and hear nothing.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from spikeloom.compiler.errors import ModelError, OptionError
+from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT
+from spikeloom.compiler.ir import INPUT, IntegerNetwork, IntegerPopulation, Sparse
+from spikeloom.compiler.targets.loihi1.lift import lift
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.targets.loihi1.storage.weight_storage import FORGETS
+
+VERSION = "1.0.8"
+"""Of the layout."""
+
+DENSE_LIMIT = 2**28
+"""Weights of a matrix: NIR writes zeros out."""
+
+Float32 = npt.NDArray[np.float32]
+Params = dict[str, Any]
+
+
+def node_names(network: IntegerNetwork) -> tuple[str, ...]:
+    """Names of the layers' neurons; what separates names in a file becomes an underscore."""
+    names = [re.sub(r"\W", "_", population.name, flags=re.ASCII) for population in network.populations]
+    taken = ("input", "output", "votes")
+    return tuple(
+        name if names.count(name) == 1 and name not in taken else f"{name}_{i}" for i, name in enumerate(names)
+    )
+
+
+def export(netlist: Netlist, dt: float) -> bytes:
+    """Content of the file; equal netlists give equal bytes.
+
+    Parameters
+    ----------
+    netlist : Netlist
+        Compiled network.
+    dt : float
+        Seconds of a step.
+
+    Raises
+    ------
+    ModelError
+        If NIR cannot say what the netlist does.
+    OptionError
+        If there is no such time step.
+    """
+    if not 0 < dt < np.inf:
+        raise OptionError(f"--dt {dt:g}: is no time step; give seconds above 0")
+    network = lift(netlist)
+    names = node_names(network)
+    nodes: dict[str, Params] = {"input": {"type": "Input", "shape": np.array([network.input.size])}}
+    edges: list[tuple[str, str]] = []
+    for post, (population, name) in enumerate(zip(network.populations, names, strict=True)):
+        _layer(network, post, population, name, names, dt, nodes, edges)
+    voters, label = names[network.readout.population], network.readout.label
+    if np.array_equal(label, np.arange(network.classes)):
+        edges.append((voters, "output"))
+    else:
+        votes = np.zeros((network.classes, len(label)), np.float32)
+        votes[label, np.arange(len(label))] = 1
+        nodes["votes"] = {"type": "Linear", "weight": votes}
+        edges += [(voters, "votes"), ("votes", "output")]
+    nodes["output"] = {"type": "Output", "shape": np.array([network.classes])}
+    return _file(nodes, edges, dt)
+
+
+def _layer(
+    network: IntegerNetwork,
+    post: int,
+    population: IntegerPopulation,
+    name: str,
+    names: tuple[str, ...],
+    dt: float,
+    nodes: dict[str, Params],
+    edges: list[tuple[str, str]],
+) -> None:
+    """Nodes and edges of one layer: its synapses from each source, its neurons."""
+    lasting = population.decay_u != FORGETS
+    bias = population.bias / (1 << MEMBRANE_SHIFT)
+    sources: dict[int, Sparse] = {}
+    for projection in network.projections:
+        if projection.post == post:
+            weight = projection.effective()
+            sources[projection.pre] = sources[projection.pre] + weight if projection.pre in sources else weight
+    for number, (pre, weight) in enumerate(sorted(sources.items())):
+        if weight.shape[0] * weight.shape[1] > DENSE_LIMIT:
+            raise ModelError(
+                f"{population.name}: has {weight.shape[0]} x {weight.shape[1]} weights, zeros among them, "
+                f"{DENSE_LIMIT} are allowed; NIR keeps whole matrices"
+            )
+        source = "input" if pre == INPUT else names[pre]
+        synapses = f"{source}_to_{name}"
+        dense = weight.toarray().astype(np.float32)
+        nodes[synapses] = {"type": "Linear", "weight": dense}
+        if not lasting and not number:
+            nodes[synapses] = {"type": "Affine", "weight": dense, "bias": bias.astype(np.float32)}
+        edges += [(source, synapses), (synapses, name)]
+    nodes[name] = _neurons(population, bias, dt)
+
+
+def _neurons(population: IntegerPopulation, bias: npt.NDArray[np.float64], dt: float) -> Params:
+    def each(value: float) -> Float32:
+        return np.full(population.size, value, np.float32)
+
+    lost = population.decay_v / 4096
+    common = {"v_threshold": population.threshold.astype(np.float32), "v_reset": each(0)}
+    if population.decay_u != FORGETS:
+        if not lost:
+            raise ModelError(
+                f"{population.name}: keeps its whole membrane and has a current that outlasts its step, NIR's CubaLIF "
+                "always leaks; train with a decay below 1"
+            )
+        drained = (population.decay_u + 1) / 4096
+        return {
+            "type": "CubaLIF",
+            "tau_syn": each(dt / drained),
+            "tau_mem": each(dt / lost),
+            "r": each(1 / lost),
+            "w_in": each(1 / drained),
+            "v_leak": (bias / lost).astype(np.float32),
+            **common,
+        }
+    if not lost:
+        return {"type": "IF", "r": each(1 / dt), **common}
+    return {"type": "LIF", "tau": each(dt / lost), "r": each(1 / lost), "v_leak": each(0), **common}
+
+
+def _file(nodes: dict[str, Params], edges: list[tuple[str, str]], dt: float) -> bytes:
+    import h5py  # slow to load, so only where it is used
+
+    content = io.BytesIO()
+    words = h5py.string_dtype()
+    with h5py.File(content, "w") as file:
+        file.create_dataset("version", data=VERSION, dtype=words)
+        graph = file.create_group("node")
+        graph.create_dataset("type", data="NIRGraph", dtype=words)
+        graph.create_dataset("edges", data=np.array(edges, dtype=object), dtype=words)
+        said = graph.create_group("metadata")
+        said.create_dataset("dt", data=dt)
+        said.create_dataset("writer", data="spikeloom", dtype=words)
+        group = graph.create_group("nodes")
+        for name, params in nodes.items():
+            node = group.create_group(name)
+            for key, value in params.items():
+                if isinstance(value, str):
+                    node.create_dataset(key, data=value, dtype=words)
+                else:
+                    node.create_dataset(key, data=value, compression="gzip" if value.size > 1024 else None)
+    return content.getvalue()

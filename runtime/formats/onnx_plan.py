@@ -1,0 +1,245 @@
+"""What an integer ONNX graph needs to know of a netlist: layers, digits of weights, and how wide its numbers get.
+
+Weights become matrices of int8 digits: ``weight = unit * sum_k digit_k * 256**k`` with digits from -128 to 127, one
+unit for the matrix or one for each neuron. A product of spikes (0 and 1) with digits is ``MatMulInteger``, exact in its
+int32 sums and faster than float32: most netlists need a single digit. Weights that several synapses of a pair store
+(planes) are added up first.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from spikeloom.compiler.fixedpoint import (
+    ACCUMULATOR_MAX,
+    CURRENT_MAX,
+    DECAY_BITS,
+    MEMBRANE_MAX,
+    MEMBRANE_SHIFT,
+    IntArray,
+)
+from spikeloom.compiler.ir import INPUT
+from spikeloom.compiler.targets.loihi1.netlist import Netlist, one_step_bounds
+from spikeloom.runtime.formats.onnx_nodes import require_room
+from spikeloom.runtime.formats.sanafe import group_names
+
+ONE = 2**DECAY_BITS
+NARROW = 2**31 - 1
+"""Largest number of an int32 layer."""
+
+Digit = tuple[npt.NDArray[np.int8], IntArray]
+"""Matrix (sources, neurons) of a digit, and what a one in it adds to each neuron, in weight units."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Source:
+    """What a layer hears from another one, or from the input.
+
+    Parameters
+    ----------
+    pre : int
+        Index into ``netlist.layers``, or ``INPUT``.
+    positive, negative : (neurons of the source, neurons) int64
+        Sums of its positive and of its negative effective weights, as magnitudes.
+    """
+
+    pre: int
+    positive: IntArray
+    negative: IntArray
+
+    def weight(self, sign: int = 0) -> IntArray:
+        """All weights (0), or magnitudes of the positive (1) or the negative ones (-1)."""
+        return {0: self.positive - self.negative, 1: self.positive, -1: self.negative}[sign]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Layer:
+    """One population as the graph computes it; arrays have an entry per compartment, ordered by neuron.
+
+    Parameters
+    ----------
+    index : int
+        Index into ``netlist.layers``.
+    name : str
+        Unique, without dots.
+    ids : (n,) int64
+        Compartments.
+    depth : int
+        Steps that it lags behind the data.
+    sources : tuple of Source
+        What it hears.
+    decay_u, decay_v, threshold, bias : (n,) int64
+        Registers; thresholds and biases in membrane units.
+    label : (n,) int64
+        Class of a vote, -1 for none.
+    remembers : bool
+        Whether a current outlasts its step.
+    checked : bool
+        Whether some input could make the synaptic sum or the current overflow.
+    saturates : bool
+        Whether some input could bring the membrane to the end of its register.
+    kind : type
+        int32 where no input brings any product or sum beyond it, int64 otherwise.
+    """
+
+    index: int
+    name: str
+    ids: IntArray
+    depth: int
+    sources: tuple[Source, ...]
+    decay_u: IntArray
+    decay_v: IntArray
+    threshold: IntArray
+    bias: IntArray
+    label: IntArray
+    remembers: bool
+    checked: bool
+    saturates: bool
+    kind: type[np.int32] | type[np.int64]
+
+    @property
+    def size(self) -> int:
+        """Number of compartments."""
+        return len(self.ids)
+
+
+def digits(weight: IntArray) -> tuple[Digit, ...]:
+    """Write a matrix of integers in int8 digits.
+
+    Examples
+    --------
+    >>> [(digit.tolist(), factor.tolist()) for digit, factor in digits(np.array([[508, -254]]))]
+    [([[127, -127]], [4, 2])]
+    >>> [(digit.tolist(), factor.tolist()) for digit, factor in digits(np.array([[300, 1]]))]
+    [([[75, 1]], [4, 1])]
+    >>> [(digit.tolist(), factor.tolist()) for digit, factor in digits(np.array([[301, 128]]))]
+    [([[45, -128]], [1, 1]), ([[1, 1]], [256, 256])]
+    """
+    common = np.bitwise_or.reduce(np.abs(weight), axis=0)
+    units = np.where(common == 0, 1, common & -common)
+    whole = np.bitwise_or.reduce(common)
+    single = np.full_like(units, max(int(whole & -whole), 1))
+    return min((_digits(weight, unit) for unit in (single, units)), key=len)
+
+
+def _digits(weight: IntArray, unit: IntArray) -> tuple[Digit, ...]:
+    found: list[Digit] = []
+    rest, factor = weight // unit, unit
+    while not found or rest.any():
+        low = ((rest + 128) & 255) - 128
+        found.append((low.astype(np.int8), factor))
+        rest, factor = (rest - low) >> 8, factor << 8
+    return tuple(found)
+
+
+def plan(netlist: Netlist) -> tuple[Layer, ...]:
+    """Layers that have compartments, in the order of their depth.
+
+    Raises
+    ------
+    ModelError
+        If their weights as dense matrices are more than a file holds.
+    """
+    names = group_names(netlist)
+    inner = netlist.axon_source >= netlist.n_inputs
+    pre_of_axon = np.where(inner, netlist.layer[np.where(inner, netlist.axon_source - netlist.n_inputs, 0)], INPUT)
+    # zeros of dense lists are no synapses
+    weight = netlist.effective_weight()
+    real = weight != 0
+    weight, axon, target = weight[real], netlist.axon_of_synapse()[real], netlist.synapse_compartment()[real]
+    pre, post = pre_of_axon[axon], netlist.layer[target]
+    pairs = np.unique(np.stack([post, pre], axis=1), axis=0)
+    place = np.zeros(netlist.n_compartments, np.int64)
+    counts = {INPUT: netlist.n_inputs}
+    for index in range(len(netlist.layers)):
+        ids = netlist.compartments_of(index)
+        place[ids] = np.arange(len(ids))
+        counts[index] = len(ids)
+    require_room(sum(counts[a] * counts[b] for b, a in pairs.tolist()))
+    row = np.append(np.arange(netlist.n_inputs), place)[netlist.axon_source[axon]]
+
+    def source(a: int, b: int) -> Source:
+        sides = []
+        for side in (weight > 0, weight < 0):
+            found, dense = (pre == a) & (post == b) & side, np.zeros((counts[a], counts[b]), np.int64)
+            np.add.at(dense, (row[found], place[target[found]]), np.abs(weight[found]))
+            sides.append(dense)
+        return Source(pre=a, positive=sides[0], negative=sides[1])
+
+    bounds = one_step_bounds(netlist)
+    layers = [
+        _layer(netlist, index, name, tuple(source(a, b) for b, a in pairs.tolist() if b == index), bounds)
+        for index, name in enumerate(names)
+        if counts[index]
+    ]
+    return tuple(sorted(layers, key=lambda layer: layer.depth))
+
+
+def _layer(
+    netlist: Netlist,
+    index: int,
+    name: str,
+    sources: tuple[Source, ...],
+    bounds: tuple[IntArray, IntArray],
+) -> Layer:
+    ids = netlist.compartments_of(index)
+    up, down = (bound[ids] << MEMBRANE_SHIFT for bound in bounds)
+    lost_u, lost_v = netlist.decay_u[ids] + 1, netlist.decay_v[ids]
+    threshold = netlist.threshold[ids] << MEMBRANE_SHIFT
+    bias = netlist.bias_mantissa[ids] << netlist.bias_exponent[ids]
+    # what loses lost/4096 a step and gains `worst` cannot climb beyond worst * 4096 / lost
+    lasting_up, lasting_down = (worst * ONE // lost_u for worst in (up, down))
+    highest = np.maximum(lasting_up, lasting_down)
+    checked = bool(np.any(np.maximum(up, down) > ACCUMULATOR_MAX) or np.any(highest > CURRENT_MAX))
+    fall = lasting_down + np.maximum(-bias, 0)
+    lowest = np.where(lost_v > 0, fall * ONE // np.maximum(lost_v, 1), np.where(fall > 0, MEMBRANE_MAX + 1, 0))
+    rise = (threshold * (ONE - lost_v) >> DECAY_BITS) + lasting_up + np.maximum(bias, 0)
+    stored = np.minimum(np.maximum(threshold, lowest), MEMBRANE_MAX)
+    gathered = _gathered(sources)
+    current = np.minimum(highest, CURRENT_MAX) + gathered
+    widest = max(
+        int((stored * (ONE - lost_v)).max()),
+        int((np.minimum(highest, CURRENT_MAX) * (ONE - lost_u)).max()),
+        int((stored + current + np.abs(bias)).max()),
+    )
+    return Layer(
+        index=index,
+        name=name,
+        ids=ids,
+        depth=netlist.layers[index].depth,
+        sources=sources,
+        decay_u=netlist.decay_u[ids],
+        decay_v=lost_v,
+        threshold=threshold,
+        bias=bias,
+        label=netlist.readout_class[ids],
+        remembers=bool(np.any(lost_u != ONE)),
+        checked=checked,
+        saturates=bool(np.any(rise > MEMBRANE_MAX) or np.any(lowest > MEMBRANE_MAX)),
+        kind=np.int32 if widest <= NARROW else np.int64,
+    )
+
+
+def _gathered(sources: tuple[Source, ...]) -> int:
+    """Bound of any partial result while products with digits are added up, membrane units."""
+    total = 0
+    for source in sources:
+        for sign in (0, 1, -1):
+            for digit, factor in digits(source.weight(sign)):
+                total += int((np.abs(digit.astype(np.int64)).sum(axis=0) * factor).max(initial=0)) << MEMBRANE_SHIFT
+    return total
+
+
+def is_pipeline(netlist: Netlist, layers: tuple[Layer, ...]) -> bool:
+    """Whether every layer hears layers of the depth before it, the first ones the input, and nobody else.
+
+    Then none has to wait for another: each runs over the whole recording, aligned with the data.
+    """
+    heard = [
+        {-1 if source.pre == INPUT else netlist.layers[source.pre].depth for source in layer.sources}
+        for layer in layers
+    ]
+    return all(depths == {layer.depth - 1} for layer, depths in zip(layers, heard, strict=True))

@@ -1,0 +1,218 @@
+"""Netlists for SANA-FE: network and mapping in its YAML, to be loaded with the ``loihi.yaml`` that it ships.
+
+What the file says and what the chip does differ in a few points:
+
+* SANA-FE knows no windows: biases act from its first step on. :func:`engine.prepare` runs the same with
+  ``gated=False``.
+* Input channels are neurons: they fire in one step and act in the next. They sit on cores of their own, cost nothing
+  but their messages, and are silent until they are given ``spikes``.
+* A neuron names one unit for all of its synapses. A neuron that both dense and sparse lists reach names the one with
+  more of its synapses; :func:`dense_synapses` tells our models the same.
+* A neuron sends one message to a core, however many lists there listen to it.
+* A current that the step before left is no work to a neuron; :func:`updates` counts without it.
+* A current that outlasts its step is a float there, cut to nothing; the chip cuts it to a whole 64th of a weight unit
+  in every step. Spikes of such layers may differ, and of no others: :func:`floating_layers` names them.
+* Registers have no ends. No register of a compiled netlist reaches its own.
+
+Groups are called ``input`` and by the layers; neuron ``k`` of a group is the channel or the layer's ``k``-th
+compartment in the order of neurons (neurons that were left out have none).
+
+References
+----------
+.. [1] J. Boyle et al., "SANA-FE", IEEE TCAD 44(8), 3165-3178, 2025; format of version 2.2.9.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from itertools import pairwise
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from spikeloom.compiler.fixedpoint import DECAY_BITS, MEMBRANE_SHIFT, IntArray
+from spikeloom.compiler.targets.base import Target
+from spikeloom.compiler.targets.loihi1.layout.chips import require_one_chip
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.runtime.machines.loihi1.engine import EventArray
+from spikeloom.runtime.machines.loihi1.timing import input_tiles
+from spikeloom.runtime.machines.loihi1.trace import BoolArray, MembraneArray
+
+INPUT = "input"
+VERSION = "2.2.9"
+
+UNITS = {True: "loihi_dense_synapse", False: "loihi_sparse_synapse"}
+
+
+def group_names(netlist: Netlist) -> tuple[str, ...]:
+    """Names of the layers' groups; dots, which separate names from numbers, and the like become underscores."""
+    names = [re.sub(r"\W", "_", layer.name, flags=re.ASCII) for layer in netlist.layers]
+    return tuple(name if names.count(name) == 1 and name != INPUT else f"{name}_{i}" for i, name in enumerate(names))
+
+
+def floating_layers(netlist: Netlist) -> tuple[str, ...]:
+    """Names of the groups whose currents outlast their step."""
+    lasting = np.unique(netlist.layer[netlist.decay_u != 2**DECAY_BITS - 1])
+    return tuple(group_names(netlist)[layer] for layer in lasting)
+
+
+def members(netlist: Netlist) -> IntArray:
+    """Number of each compartment in its group; shape (compartments,)."""
+    number = np.empty(netlist.n_compartments, np.int64)
+    for layer in range(len(netlist.layers)):
+        ids = netlist.compartments_of(layer)
+        number[ids] = np.arange(len(ids))
+    return number
+
+
+def _in_dense_list(netlist: Netlist) -> BoolArray:
+    found: BoolArray = netlist.format_index_bits[netlist.axon_format[netlist.axon_of_synapse()]] == 0
+    return found
+
+
+def _dense_neurons(netlist: Netlist) -> BoolArray:
+    """Which compartments name the unit of dense synapses."""
+    balance = np.where(_in_dense_list(netlist), 1.0, -1.0)
+    found: BoolArray = np.bincount(netlist.synapse_compartment(), balance, netlist.n_compartments) >= 0
+    return found
+
+
+def dense_synapses(netlist: Netlist) -> BoolArray:
+    """Which synapses the file has priced as dense; shape (synapses,)."""
+    return _dense_neurons(netlist)[netlist.synapse_compartment()]
+
+
+def updates(netlist: Netlist, events: EventArray, spikes: BoolArray, membranes: MembraneArray) -> BoolArray:
+    """Neuron updates as SANA-FE counts them; shape of `spikes`.
+
+    A current that the step before left is no work to it. Only a neuron at rest, without bias, that nothing reaches
+    can have no other work; the other updates are those of :class:`trace.Trace`.
+
+    Parameters
+    ----------
+    netlist : Netlist
+        What ran, without windows.
+    events : (samples, n_inputs, T) uint8 or bool
+        What it was given.
+    spikes, membranes : (samples, chip steps, compartments)
+        What it did.
+    """
+    samples, steps, size = spikes.shape
+    works: BoolArray = np.zeros(spikes.shape, np.bool_)
+    works[:, 1:] = (membranes[:, :-1] != 0) & ~spikes[:, :-1]
+    works[:, :, netlist.bias_mantissa != 0] = True
+    sources = np.zeros((samples, steps, netlist.n_inputs + size), np.int32)
+    given = events[:, :, :steps] != 0
+    sources[:, : given.shape[2], : netlist.n_inputs] = given.transpose(0, 2, 1)
+    sources[:, 1:, netlist.n_inputs :] = spikes[:, :-1]
+    resting = np.flatnonzero(netlist.bias_mantissa == 0)
+    source, target = netlist.axon_source[netlist.axon_of_synapse()], netlist.synapse_compartment()
+    own = np.isin(target, resting)
+    shape = (netlist.n_inputs + size, size)
+    reach = csr_array((np.ones(int(own.sum()), np.int32), (source[own], target[own])), shape)[:, resting]
+    for i in range(samples):
+        works[i][:, resting] |= (sources[i] @ reach) > 0
+    return works
+
+
+def cores(netlist: Netlist, target: Target) -> tuple[str, ...]:
+    """``tile.core`` of the netlist's cores, then of those that hold the input channels.
+
+    SANA-FE counts tiles column by column.
+
+    Raises
+    ------
+    OptionError
+        If the netlist takes several chips.
+    """
+    require_one_chip(netlist.core_tile, target, "--to sanafe")
+    width, height = target.limit("mesh.width"), target.limit("mesh.height")
+    tiles = [*netlist.core_tile.tolist(), *input_tiles(netlist, target)]
+    return tuple(
+        f"{tile % width * height + tile // width}.{tiles[:core].count(tile)}" for core, tile in enumerate(tiles)
+    )
+
+
+def export(netlist: Netlist, target: Target) -> Iterator[str]:
+    """Lines of the file.
+
+    Raises
+    ------
+    OptionError
+        If the netlist takes several chips.
+    """
+    room = target.limit("core.compartments")
+    names, number, places = group_names(netlist), members(netlist), cores(netlist, target)
+    yield f"# spikeloom netlist for SANA-FE {VERSION} and its loihi.yaml; give the neurons of group {INPUT} 'spikes'"
+    if netlist.clocks.channels:
+        length, first = netlist.clocks.steps, netlist.n_inputs - netlist.clocks.channels
+        yield f"# from neuron {first} on they are clocks: each spikes in {length} steps, one after the other"
+    if netlist.bins > 1:
+        yield f"# a step joins {netlist.bins} bins of the recordings"
+    if floating := floating_layers(netlist):
+        yield f"# currents of {', '.join(floating)} outlast a step: floats here, whole 64ths on the chip"
+    yield "network:"
+    yield "  name: spikeloom"
+    yield "  groups:"
+    yield f"    - name: {INPUT}"
+    yield "      attributes: {log_spikes: false}"
+    yield "      neurons:"
+    for channel in range(netlist.n_inputs):
+        yield f"        - {channel}: {{soma_hw_name: 'loihi_inputs[{channel % room}]'}}"
+    yield from _groups(netlist, names)
+    yield "  edges:"
+    yield from _edges(netlist, names, number)
+    yield "mappings:"
+    for core, place in enumerate(places[netlist.n_cores :]):
+        last = min((core + 1) * room, netlist.n_inputs) - 1
+        yield f"  - {INPUT}.{core * room}..{last}: {{core: '{place}'}}"
+    for core, place in enumerate(places[: netlist.n_cores]):
+        begin, end = netlist.core_compartments[core : core + 2]
+        # a core sweeps its neurons in the order in which they are mapped
+        breaks = np.diff(netlist.layer[begin:end]) != 0
+        breaks |= np.diff(number[begin:end]) != 1
+        runs = [begin, *(begin + 1 + np.flatnonzero(breaks)), end] if end > begin else []
+        for first, after in pairwise(runs):
+            group = names[netlist.layer[first]]
+            yield f"  - {group}.{number[first]}..{number[after - 1]}: {{core: '{place}'}}"
+
+
+def _groups(netlist: Netlist, names: tuple[str, ...]) -> Iterator[str]:
+    """Neurons of each layer; membranes count weight units."""
+    dense = _dense_neurons(netlist)
+    bias = netlist.bias_mantissa * 2.0**netlist.bias_exponent / 2**MEMBRANE_SHIFT
+    leak = (2**DECAY_BITS - netlist.decay_v) / 2**DECAY_BITS
+    kept = (2**DECAY_BITS - 1 - netlist.decay_u) / 2**DECAY_BITS
+    for layer, name in enumerate(names):
+        yield f"    - name: {name}"
+        yield "      attributes: {soma_hw_name: loihi_lif, reset: 0.0, input_decay: 0.0, log_spikes: true}"
+        yield "      neurons:"
+        for k, c in enumerate(netlist.compartments_of(layer).tolist()):
+            unit = UNITS[bool(dense[c])]
+            lasts = f"input_decay: {float(kept[c])!r}, " if kept[c] else ""
+            yield (
+                f"        - {k}: {{threshold: {netlist.threshold[c]}.0, leak_decay: {float(leak[c])!r}, {lasts}"
+                f"bias: {float(bias[c])!r}, synapse_hw_name: {unit}}}"
+            )
+
+
+def _edges(netlist: Netlist, names: tuple[str, ...], number: IntArray) -> Iterator[str]:
+    """One edge for each two groups, with all synapses between them, zeros that dense lists store included."""
+    inputs = netlist.n_inputs
+    axon_pre = np.append(np.full(inputs, -1), netlist.layer)[netlist.axon_source]
+    axon_number = np.append(np.arange(inputs), number)[netlist.axon_source]
+    axon = netlist.axon_of_synapse()
+    pre, source = axon_pre[axon], axon_number[axon]
+    target = netlist.synapse_compartment()
+    post, weight = netlist.layer[target], netlist.effective_weight()
+    for a, pre_name in enumerate((INPUT, *names), start=-1):
+        for b, post_name in enumerate(names):
+            found = np.flatnonzero((pre == a) & (post == b))
+            if not len(found):
+                continue
+            pairs = zip(source[found].tolist(), number[target[found]].tolist(), strict=True)
+            yield f"    - {pre_name} -> {post_name}:"
+            yield "        type: sparse"
+            yield f"        source_target_pairs: [{', '.join(f'[{i}, {j}]' for i, j in pairs)}]"
+            yield f"        weight: [{', '.join(f'{w}.0' for w in weight[found].tolist())}]"

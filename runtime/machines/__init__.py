@@ -1,0 +1,1 @@
+"""Simulated chips: a definition and a fast engine each."""

@@ -1,0 +1,1 @@
+"""Loihi 1, step by step."""

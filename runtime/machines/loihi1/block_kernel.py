@@ -1,0 +1,859 @@
+"""The chip step of :mod:`loihi1.spec` for 64 compartments at once; :mod:`loihi1.blocks` prepares what it reads.
+
+A *block* is 64 neurons of one layer; who spiked in it is one 64-bit word. Its synapses are
+rows of 64 weights, one for each source that reaches it. In each step the rows of the sources that are active are added
+up in registers, and the 64 neurons integrate, compare and reset. A block runs through the whole recording before the
+next one starts, so that its rows and membranes stay in cache: no layer hears a later one.
+
+*Sixteen bits.* :mod:`loihi1.blocks` proves that the positive and the negative weights of a step each add up to 32,767
+at most (the accumulator's 21 bits hold them shifted left by six). A sum of some of both lies in between, in whatever
+order they come.
+
+*Decay in 32 bits.* It also proves that no membrane leaves its register and that none times its factor reaches 2**32; so
+the magnitude is multiplied without a sign, and nothing saturates.
+
+*Currents.* Most layers have none beyond a step. Where the current outlasts its step it is one more register of 32 bits;
+a product of two wide factors is then taken in two parts, as :mod:`loihi1.kernel` does.
+
+*Idle neurons.* A compartment has nothing to do in a step if its membrane, its current, its bias and the number of
+synapses that reach it are all zero. Only those without a bias can be idle, the others are not looked at.
+
+*Vectors.* They are written in LLVM's own terms, as numba leaves no other way to hold 16-bit sums in registers and to
+turn 64 comparisons into one word. LLVM makes of them what the machine has. All of it stands in one file because the
+machine code is cached by the stamp of the file that it was made from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+import numpy.typing as npt
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
+
+from spikeloom.compiler.fixedpoint import DECAY_BITS, IntArray
+from spikeloom.runtime.machines.loihi1.kernel import compiled, compiled_and_cached
+
+AnyArray = npt.NDArray[Any]
+Function = Callable[..., Any]
+
+LANES = 64
+"""Compartments of a block."""
+
+CHARGES = 16
+"""Charges of a source are padded to a multiple of this."""
+
+LISTED = 4
+"""Bits of a word that are listed at a time."""
+
+UNROLLED = 4
+"""Rows that are added up without a look at how many are left."""
+
+_BIT, _SUM, _STATE, _WORD = (ir.IntType(bits) for bits in (1, 16, 32, 64))
+_SUMS, _STATES = ir.VectorType(_SUM, LANES), ir.VectorType(_STATE, LANES)
+
+
+class Blocks(NamedTuple):
+    """A netlist as the kernel reads it; nothing in here changes.
+
+    Parameters
+    ----------
+    stage : (stages + 1,) int64
+        Bounds of each stage, the layers of one depth, in the blocks.
+    dense : (stages,) bool
+        Whether every block of a stage has a row for every source; then its sources are listed.
+    first : (blocks + 1,) int64
+        Bounds of each block in the links.
+    word, linked, row : (links,) int64, uint64, int64
+        A word of sources that reach a block, which of them do, and the row of the first of these.
+    weight : (rows * 64,) int8 or int16
+        Net weight of a source for each position of a block, shifted right by what all weights of the block have in
+        common.
+    shift : (blocks,) uint32
+        From a sum of these to membrane units.
+    reached : (rows,) uint64
+        Positions that a source has a synapse to, whatever its weight.
+    restful : (blocks,) uint64
+        Positions without a bias.
+    held : (blocks,) uint64
+        Positions that hold a compartment.
+    bias, threshold : (blocks * 64,) int32
+        In membrane units; a position without a compartment has a threshold that nothing reaches.
+    keep, keep_u : (blocks,) uint32
+        What a membrane and a current keep in a step, in 1/4096.
+    depth, layer : (blocks,) int64
+        Depth and layer of each block.
+    compartment : (blocks * 64,) int64
+        Compartment of each position, -1 for none.
+    whole : (blocks,) int64
+        Compartment of the first position where the block holds 64 consecutive ones, else -1.
+    """
+
+    stage: IntArray
+    dense: AnyArray
+    first: IntArray
+    word: IntArray
+    linked: AnyArray
+    row: IntArray
+    weight: AnyArray
+    shift: AnyArray
+    reached: AnyArray
+    restful: AnyArray
+    held: AnyArray
+    bias: AnyArray
+    threshold: AnyArray
+    keep: AnyArray
+    keep_u: AnyArray
+    depth: IntArray
+    layer: IntArray
+    compartment: IntArray
+    whole: IntArray
+
+
+class ChargeRows(NamedTuple):
+    """What events add to sums of each chip step; see :class:`trace.Charges`.
+
+    Parameters
+    ----------
+    width : int
+        Sums, padded to a multiple of `CHARGES`; 0 if there are none.
+    narrow : bool
+        Whether all events that a stage can hear in a step add up to less than 2**31 in each sum.
+    source : ((words of the inputs + blocks) * 64 * width,) int32
+        What an event of each channel, then a spike of each position adds.
+    everyone : (stages * width,) int64
+        What an update of all compartments of each stage adds.
+    update : (kinds * width,) int64
+        What an update adds; few compartments differ in that.
+    first : (blocks + 1,) int64
+        Bounds of each block in the groups.
+    group, member : (groups,) int64, uint64
+        Kind of each group, and which positions of the block are of it.
+    """
+
+    width: int
+    narrow: bool
+    source: AnyArray
+    everyone: IntArray
+    update: IntArray
+    first: IntArray
+    group: IntArray
+    member: AnyArray
+
+
+class Scratch(NamedTuple):
+    """What a recording leaves behind; made anew for each.
+
+    Parameters
+    ----------
+    words : (steps * words of the inputs,) uint64
+        Channels with an event in each step.
+    raster, idle : (steps * blocks,) uint64
+        Who spiked and who was idle, stage after stage; within a stage step after step.
+    inputs : (words of the inputs * 64,) int64
+        Events of each channel.
+    spikes : (blocks * 64,) int64
+        Spikes of each position.
+    membrane : (blocks * 64,) int32
+        Last membranes.
+    before : (blocks * 64,) int16
+        Synaptic sums of the last step: what the current register still holds.
+    membranes : (steps * blocks * 64,) int32, or empty
+        Membranes before a reset, in the order of `raster`.
+    """
+
+    words: AnyArray
+    raster: AnyArray
+    idle: AnyArray
+    inputs: AnyArray
+    spikes: AnyArray
+    membrane: AnyArray
+    before: AnyArray
+    membranes: AnyArray
+
+
+class Lasting(NamedTuple):
+    """Currents that outlast their step, in a recording.
+
+    Parameters
+    ----------
+    keep_u : (blocks,) uint32
+        As in :class:`Blocks`; 0 where there is no such current.
+    current : (blocks * 64,) int32
+        Last currents.
+    """
+
+    keep_u: AnyArray
+    current: AnyArray
+
+
+# -- vectors -----------------------------------------------------------------------------------------------------------
+
+
+def _intrinsic(function: Function) -> Function:
+    """Let compiled functions call what `function` emits, without the typing context that it takes first."""
+    return cast(Function, intrinsic(function))
+
+
+def _number(value: int) -> Any:
+    return ir.Constant(_WORD, value)
+
+
+def _all(kind: Any, value: int) -> Any:
+    return ir.Constant(kind, [value] * LANES)
+
+
+def _arrays(context: Any, builder: Any, kind: Any, value: Any) -> dict[str, Any]:
+    """Where the arrays of a named tuple begin."""
+    return {
+        name: context.make_array(part)(context, builder, builder.extract_value(value, i)).data
+        for i, (name, part) in enumerate(zip(kind.fields, kind.types, strict=True))
+    }
+
+
+def _element(builder: Any, array: Any, index: Any) -> Any:
+    return builder.load(builder.gep(array, [index]))
+
+
+def _vector(builder: Any, array: Any, index: Any, kind: Any) -> tuple[Any, Any]:
+    """Load 64 elements; also returns where they are, to store them again."""
+    place = builder.bitcast(builder.gep(array, [index]), kind.as_pointer())
+    return builder.load(place, align=kind.element.width // 8, typ=kind), place
+
+
+def _row(builder: Any, tables: Any, row: Any) -> Any:
+    """Weights of a row, 8 or 16 bits each, as 16 bits."""
+    array = tables["weight"]
+    kind = ir.VectorType(array.type.pointee, LANES)
+    return builder.sext(_vector(builder, array, builder.mul(row, _number(LANES)), kind)[0], _SUMS)
+
+
+def _store(builder: Any, vector: Any, place: Any) -> None:
+    builder.store(vector, place, align=vector.type.element.width // 8)
+
+
+def _lanes(builder: Any, value: Any) -> Any:
+    """All lanes the same."""
+    nothing = ir.Constant(_STATES, ir.Undefined)
+    one = builder.insert_element(nothing, value, ir.Constant(_STATE, 0))
+    return builder.shuffle_vector(one, nothing, _all(_STATES, 0))
+
+
+def _sum_rows(builder: Any, tables: Any, active: Any, at: Any, block: Any, *, marks: bool) -> tuple[Any, Any]:
+    """Emit the loop over a block's links and, within, over active sources; returns sums and who was reached."""
+    before = builder.block
+    names = ("links", "link", "sources", "source", "link.end", "done")
+    links, link, sources, source, link_end, done = map(builder.append_basic_block, names)
+    begin, end = (_element(builder, tables["first"], builder.add(block, _number(i))) for i in (0, 1))
+    builder.branch(links)
+
+    builder.position_at_end(links)
+    e, total, arrived = builder.phi(_WORD), builder.phi(_SUMS), builder.phi(_WORD)
+    for phi, value in ((e, begin), (total, _all(_SUMS, 0)), (arrived, _number(0))):
+        phi.add_incoming(value, before)
+    builder.cbranch(builder.icmp_signed("<", e, end), link, done)
+
+    builder.position_at_end(link)
+    linked = _element(builder, tables["linked"], e)
+    word = _element(builder, active, builder.add(at, _element(builder, tables["word"], e)))
+    first_row = _element(builder, tables["row"], e)
+    both = builder.and_(word, linked)
+    builder.branch(sources)
+
+    builder.position_at_end(sources)
+    left, part, marked = builder.phi(_WORD), builder.phi(_SUMS), builder.phi(_WORD)
+    for phi, value in ((left, both), (part, total), (marked, arrived)):
+        phi.add_incoming(value, link)
+    builder.cbranch(builder.icmp_unsigned("!=", left, _number(0)), source, link_end)
+
+    builder.position_at_end(source)
+    lowest = builder.and_(left, builder.neg(left))
+    rank = builder.ctpop(builder.and_(linked, builder.sub(lowest, _number(1))))
+    row = builder.add(first_row, rank)
+    part.add_incoming(builder.add(part, _row(builder, tables, row)), source)
+    left.add_incoming(builder.xor(left, lowest), source)
+    marked.add_incoming(builder.or_(marked, _element(builder, tables["reached"], row)) if marks else marked, source)
+    builder.branch(sources)
+
+    builder.position_at_end(link_end)
+    for phi, value in ((e, builder.add(e, _number(1))), (total, part), (arrived, marked)):
+        phi.add_incoming(value, link_end)
+    builder.branch(links)
+
+    builder.position_at_end(done)
+    return total, arrived
+
+
+def _each_listed(builder: Any, sources: Any, bounds: Any, values: Any, add: Function) -> Any:
+    """Emit a loop over listed sources, four at a time, then one; `add` emits what each does to the values."""
+    k = bounds[0]
+    for stride in (UNROLLED, 1):
+        before = builder.block
+        head, body, done = map(builder.append_basic_block, ("head", "body", "done"))
+        builder.branch(head)
+        builder.position_at_end(head)
+        phis = [builder.phi(value.type) for value in (k, *values)]
+        for phi, value in zip(phis, (k, *values), strict=True):
+            phi.add_incoming(value, before)
+        k, *values = phis
+        builder.cbranch(builder.icmp_signed("<=", builder.add(k, _number(stride)), bounds[1]), body, done)
+        builder.position_at_end(body)
+        added = values
+        for i in range(stride):
+            added = add(builder.sext(_element(builder, sources, builder.add(k, _number(i))), _WORD), added)
+        for phi, value in zip(phis, (builder.add(k, _number(stride)), *added), strict=True):
+            phi.add_incoming(value, body)
+        builder.branch(head)
+        builder.position_at_end(done)
+    return values
+
+
+def _sum_listed(builder: Any, tables: Any, sources: Any, bounds: Any, block: Any, *, marks: bool) -> tuple[Any, Any]:
+    """Emit the same for a block that every source reaches, on listed sources."""
+    base = _element(builder, tables["row"], _element(builder, tables["first"], block))
+
+    def add(source: Any, values: Any) -> Any:
+        row = builder.add(base, source)
+        total, arrived = values
+        total = builder.add(total, _row(builder, tables, row))
+        return total, builder.or_(arrived, _element(builder, tables["reached"], row)) if marks else arrived
+
+    total, arrived = _each_listed(builder, sources, bounds, (_all(_SUMS, 0), _number(0)), add)
+    return total, arrived
+
+
+def _decayed(builder: Any, old: Any, keep: Any, *, wide: bool) -> Any:
+    """Emit the decay of 64 registers, rounding toward zero; `wide` where a product may leave 32 bits."""
+    zero, bits = _all(_STATES, 0), _all(_STATES, DECAY_BITS)
+    below = builder.icmp_signed("<", old, zero)
+    magnitude = builder.select(below, builder.sub(zero, old), old)
+    if wide:
+        low = builder.and_(magnitude, _all(_STATES, 2**DECAY_BITS - 1))
+        low = builder.lshr(builder.mul(low, keep), bits)
+        magnitude = builder.add(builder.mul(builder.lshr(magnitude, bits), keep), low)
+    else:
+        magnitude = builder.lshr(builder.mul(magnitude, keep), bits)
+    return builder.select(below, builder.sub(zero, magnitude), magnitude)
+
+
+def _integrate(
+    builder: Any, tables: Any, scratch: Any, sums: Any, block: Any, kept_at: Any, lasting: Any
+) -> tuple[Any, Any, Any]:
+    """Emit one step of the 64 neurons; returns their membranes and lasting currents before it, and who fired."""
+    position = builder.mul(block, _number(LANES))
+    zero = _all(_STATES, 0)
+
+    # decay membrane
+    old, place = _vector(builder, scratch["membrane"], position, _STATES)
+    keep = _lanes(builder, _element(builder, tables["keep"], block))
+    v = _decayed(builder, old, keep, wide=lasting is not None)
+    # add input and bias
+    arrived = builder.shl(builder.sext(sums, _STATES), _lanes(builder, _element(builder, tables["shift"], block)))
+    before = None
+    if lasting is not None:
+        before, current_place = _vector(builder, lasting["current"], position, _STATES)
+        keep_u = _lanes(builder, _element(builder, lasting["keep_u"], block))
+        arrived = builder.add(_decayed(builder, before, keep_u, wide=True), arrived)
+        _store(builder, arrived, current_place)
+    v = builder.add(v, arrived)
+    v = builder.add(v, _vector(builder, tables["bias"], position, _STATES)[0])
+    # compare
+    fired = builder.icmp_signed(">", v, _vector(builder, tables["threshold"], position, _STATES)[0])
+    with builder.if_then(builder.icmp_signed(">=", kept_at, _number(0))):
+        _store(builder, v, _vector(builder, scratch["membranes"], kept_at, _STATES)[1])
+    # reset
+    _store(builder, builder.select(fired, zero, v), place)
+    return old, before, fired
+
+
+def _block_step(*, listed: bool, rests: bool, lasts: bool) -> Function:
+    """Make one step of one block.
+
+    Sources come as words, or listed where every source reaches the block; it `rests` where compartments can be idle,
+    and `lasts` where their currents outlast a step.
+    """
+
+    @_intrinsic
+    def step(
+        typing: Any,
+        tables: Any,
+        active: Any,
+        at: Any,
+        end: Any,
+        block: Any,
+        scratch: Any,
+        lasting: Any,
+        place: Any,
+        kept_at: Any,
+    ) -> Any:
+        signature = types.uint64(tables, active, *[types.int64] * 3, scratch, lasting, *[types.int64] * 2)
+
+        def emit(context: Any, builder: Any, _signature: Any, values: Any) -> Any:
+            table = _arrays(context, builder, tables, values[0])
+            own = _arrays(context, builder, scratch, values[5])
+            currents = _arrays(context, builder, lasting, values[6]) if lasts else None
+            sources = context.make_array(active)(context, builder, values[1]).data
+            (at, end, block), (place, kept_at) = values[2:5], values[7:9]
+            if listed:
+                sums, arrived = _sum_listed(builder, table, sources, (at, end), block, marks=rests)
+            else:
+                sums, arrived = _sum_rows(builder, table, sources, at, block, marks=rests)
+            old, last, fired = _integrate(builder, table, own, sums, block, kept_at, currents)
+            if rests:
+                if last is None:
+                    last, last_at = _vector(builder, own["before"], builder.mul(block, _number(LANES)), _SUMS)
+                    _store(builder, sums, last_at)
+                silent = builder.and_(
+                    builder.icmp_signed("==", old, _all(_STATES, 0)),
+                    builder.icmp_signed("==", last, _all(last.type, 0)),
+                )
+                idle = builder.and_(builder.bitcast(silent, _WORD), builder.not_(arrived))
+                idle = builder.and_(idle, _element(builder, table["restful"], block))
+                builder.store(idle, builder.gep(own["idle"], [place]))
+            return builder.bitcast(fired, _WORD)
+
+        return signature, emit
+
+    return step
+
+
+def _steps(*, lasts: bool) -> tuple[Function, ...]:
+    """By words, at rest or not, then listed, at rest or not."""
+    return tuple(
+        _block_step(listed=listed, rests=rests, lasts=lasts) for listed in (False, True) for rests in (True, False)
+    )
+
+
+_restful_step, _busy_step, _restful_listed_step, _busy_listed_step = _steps(lasts=False)
+_restful_lasting_step, _busy_lasting_step, _restful_listed_lasting_step, _busy_listed_lasting_step = _steps(lasts=True)
+
+
+def _charging(*, narrow: bool) -> Function:
+    """Make the sum of charges; `narrow` where it fits the 32 bits of a charge."""
+    each, wide = ir.VectorType(_STATE, CHARGES), ir.VectorType(_WORD, CHARGES)
+    held = each if narrow else wide
+
+    @_intrinsic
+    def charge(
+        typing: Any, listed: Any, begin: Any, end: Any, charges: Any, at: Any, width: Any, out: Any, to: Any
+    ) -> Any:
+        """Add up some charges of all sources that are listed from `begin` to `end`; `at` is that of source 0."""
+        signature = types.void(listed, types.int64, types.int64, charges, *[types.int64] * 2, out, types.int64)
+
+        def emit(context: Any, builder: Any, _signature: Any, values: Any) -> Any:
+            sources, rows, sums = (
+                context.make_array(kind)(context, builder, value).data
+                for kind, value in ((listed, values[0]), (charges, values[3]), (out, values[6]))
+            )
+
+            def add(source: Any, totals: Any) -> Any:
+                row = builder.add(values[4], builder.mul(source, values[5]))
+                charged = _vector(builder, rows, row, each)[0]
+                return (builder.add(totals[0], charged if narrow else builder.sext(charged, wide)),)
+
+            (total,) = _each_listed(builder, sources, values[1:3], (ir.Constant(held, [0] * CHARGES),), add)
+            before, place = _vector(builder, sums, values[7], wide)
+            _store(builder, builder.add(before, builder.sext(total, wide) if narrow else total), place)
+            return context.get_dummy_value()
+
+        return signature, emit
+
+    return charge
+
+
+_charge, _charge_narrow = (_charging(narrow=narrow) for narrow in (False, True))
+
+
+@_intrinsic
+def _lowest(typing: Any, word: Any) -> Any:
+    """Index of the lowest bit of a word, 64 of zero."""
+
+    def emit(_context: Any, builder: Any, _signature: Any, values: Any) -> Any:
+        return builder.cttz(values[0], ir.Constant(_BIT, 0))
+
+    return types.int64(types.uint64), emit
+
+
+@_intrinsic
+def _spread(typing: Any, word: Any, out: Any, at: Any) -> Any:
+    """Write the bits of a word as 64 bytes."""
+    bits, flags = ir.VectorType(_BIT, LANES), ir.VectorType(ir.IntType(8), LANES)
+
+    def emit(context: Any, builder: Any, _signature: Any, values: Any) -> Any:
+        array = context.make_array(out)(context, builder, values[1]).data
+        place = builder.bitcast(builder.gep(array, [values[2]]), flags.as_pointer())
+        builder.store(builder.zext(builder.bitcast(values[0], bits), flags), place, align=1)
+        return context.get_dummy_value()
+
+    return types.void(types.uint64, out, types.int64), emit
+
+
+@_intrinsic
+def _gathered(typing: Any, flags: Any, at: Any) -> Any:
+    """One word of 64 bytes: which are not zero."""
+    kind = ir.VectorType(ir.IntType(8), LANES)
+
+    def emit(context: Any, builder: Any, _signature: Any, values: Any) -> Any:
+        array = context.make_array(flags)(context, builder, values[0]).data
+        found = builder.icmp_unsigned("!=", _vector(builder, array, values[1], kind)[0], _all(kind, 0))
+        return builder.bitcast(found, _WORD)
+
+    return types.uint64(flags, types.int64), emit
+
+
+@_intrinsic
+def _bits(typing: Any, word: Any) -> Any:
+    """Bits of a word that are set."""
+
+    def emit(_context: Any, builder: Any, _signature: Any, values: Any) -> Any:
+        return builder.ctpop(values[0])
+
+    return types.int64(types.uint64), emit
+
+
+# -- recordings --------------------------------------------------------------------------------------------------------
+
+
+@compiled
+def _pack(events: AnyArray, steps: int, words: AnyArray) -> None:
+    """Turn the events of a recording into words, channel after channel."""
+    n_words = (events.shape[0] + LANES - 1) // LANES
+    flat, columns = events.reshape(-1), events.shape[1]
+    for channel in range(events.shape[0]):
+        place, bit = channel >> 6, np.uint64(channel & 63)
+        whole = steps - steps % LANES
+        for begin in range(0, whole, LANES):
+            left = _gathered(flat, channel * columns + begin)
+            while left:
+                words[(begin + _lowest(left)) * n_words + place] |= np.uint64(1) << bit
+                left &= left - np.uint64(1)
+        for t in range(whole, steps):
+            words[t * n_words + place] |= np.uint64(events[channel, t] != 0) << bit
+
+
+@compiled
+def _list(words: AnyArray, start: int, width: int, steps: int, bounds: AnyArray, count: AnyArray) -> AnyArray:
+    """List the bits that are set in each step, and count them; fills the bounds of the steps."""
+    total = 0
+    for w in range(start, start + steps * width):
+        total += _bits(words[w])
+    listed = np.empty(total + LISTED, np.int32)
+    n = 0
+    for t in range(steps):
+        bounds[t] = n
+        for w in range(width):
+            left = words[start + t * width + w]
+            end = n + _bits(left)
+            # some at a time, as if they were there: guessing how many bits a word has left costs more
+            while n < end:
+                for i in range(LISTED):
+                    listed[n + i] = w * LANES + _lowest(left)
+                    left &= left - np.uint64(1)
+                n += LISTED
+            n = end
+    bounds[steps] = n
+    for i in range(n):
+        count[listed[i]] += 1
+    return listed
+
+
+@compiled
+def _run_block(
+    blocks: Blocks,
+    s: int,
+    block: int,
+    steps: int,
+    words: AnyArray,
+    start: int,
+    width: int,
+    listed: AnyArray,
+    bounds: IntArray,
+    scratch: Scratch,
+) -> None:
+    """Run a block of a stage through a recording, on its sources as words and listed."""
+    begin, end = blocks.stage[s], blocks.stage[s + 1]
+    rests = blocks.restful[block] != 0
+    for t in range(steps):
+        place = steps * begin + t * (end - begin) + block - begin
+        kept = place * LANES if scratch.membranes.size else -1
+        if not blocks.dense[s]:
+            at = start + t * width
+            if rests:
+                fired = _restful_step(blocks, words, at, 0, block, scratch, None, place, kept)
+            else:
+                fired = _busy_step(blocks, words, at, 0, block, scratch, None, place, kept)
+        elif rests:
+            fired = _restful_listed_step(blocks, listed, bounds[t], bounds[t + 1], block, scratch, None, place, kept)
+        else:
+            fired = _busy_listed_step(blocks, listed, bounds[t], bounds[t + 1], block, scratch, None, place, kept)
+        scratch.raster[place] = fired
+
+
+@compiled
+def _run_lasting_block(
+    blocks: Blocks,
+    s: int,
+    block: int,
+    steps: int,
+    words: AnyArray,
+    start: int,
+    width: int,
+    listed: AnyArray,
+    bounds: IntArray,
+    scratch: Scratch,
+    lasting: Lasting,
+) -> None:
+    """The same where currents outlast a step."""
+    begin, end = blocks.stage[s], blocks.stage[s + 1]
+    rests = blocks.restful[block] != 0
+    for t in range(steps):
+        place = steps * begin + t * (end - begin) + block - begin
+        kept = place * LANES if scratch.membranes.size else -1
+        if not blocks.dense[s]:
+            at = start + t * width
+            if rests:
+                fired = _restful_lasting_step(blocks, words, at, 0, block, scratch, lasting, place, kept)
+            else:
+                fired = _busy_lasting_step(blocks, words, at, 0, block, scratch, lasting, place, kept)
+        elif rests:
+            fired = _restful_listed_lasting_step(
+                blocks, listed, bounds[t], bounds[t + 1], block, scratch, lasting, place, kept
+            )
+        else:
+            fired = _busy_listed_lasting_step(
+                blocks, listed, bounds[t], bounds[t + 1], block, scratch, lasting, place, kept
+            )
+        scratch.raster[place] = fired
+
+
+@compiled
+def _run_stage(
+    blocks: Blocks,
+    s: int,
+    steps: int,
+    words: AnyArray,
+    start: int,
+    width: int,
+    listed: AnyArray,
+    bounds: IntArray,
+    scratch: Scratch,
+    lasting: Lasting | None,
+) -> None:
+    """Let a stage integrate, block by block: its rows and membranes stay in cache."""
+    for block in range(blocks.stage[s], blocks.stage[s + 1]):
+        if lasting is not None and lasting.keep_u[block] != 0:
+            _run_lasting_block(blocks, s, block, steps, words, start, width, listed, bounds, scratch, lasting)
+        else:
+            _run_block(blocks, s, block, steps, words, start, width, listed, bounds, scratch)
+
+
+@compiled
+def _charge_all(
+    listed: AnyArray, bounds: IntArray, steps: int, charges: ChargeRows, at: int, delay: int, sums: IntArray
+) -> None:
+    """Add what listed sources, the first of them with its charges at `at`, bring to the sums of each chip step."""
+    for t in range(steps):
+        for part in range(0, charges.width, CHARGES):
+            to = (t + delay) * charges.width + part
+            if charges.narrow:
+                _charge_narrow(listed, bounds[t], bounds[t + 1], charges.source, at + part, charges.width, sums, to)
+            else:
+                _charge(listed, bounds[t], bounds[t + 1], charges.source, at + part, charges.width, sums, to)
+
+
+@compiled
+def _charge_updates(blocks: Blocks, steps: int, idle: AnyArray, charges: ChargeRows, sums: IntArray) -> None:
+    """Add what updates bring: those of all compartments, less those that are idle."""
+    width = charges.width
+    resting = np.empty(charges.update.size // width, np.int64)
+    for s in range(blocks.stage.size - 1):
+        begin, end = blocks.stage[s], blocks.stage[s + 1]
+        for t in range(steps):
+            at = (t + s) * width
+            for i in range(width):
+                sums[at + i] += charges.everyone[s * width + i]
+            resting[:] = 0
+            for block in range(begin, end):
+                if blocks.restful[block]:
+                    word = idle[steps * begin + t * (end - begin) + block - begin]
+                    for g in range(charges.first[block], charges.first[block + 1]):
+                        resting[charges.group[g]] += _bits(word & charges.member[g])
+            for kind in range(resting.size):
+                if resting[kind]:
+                    for i in range(width):
+                        sums[at + i] -= resting[kind] * charges.update[kind * width + i]
+
+
+@compiled
+def _run_stages(
+    blocks: Blocks,
+    n_words: int,
+    steps: int,
+    scratch: Scratch,
+    charges: ChargeRows,
+    sums: IntArray,
+    lasting: Lasting | None,
+) -> None:
+    """Let all stages integrate, one after the other, and count spikes and events."""
+    bounds = np.empty(steps + 1, np.int64)
+    active, start, width, count = scratch.words, 0, n_words, scratch.inputs
+    at, delay = 0, 0  # of the charges of the sources; of their steps
+    for s in range(blocks.stage.size - 1):
+        listed = _list(active, start, width, steps, bounds, count)
+        _charge_all(listed, bounds, steps, charges, at * LANES * charges.width, delay, sums)
+        _run_stage(blocks, s, steps, active, start, width, listed, bounds, scratch, lasting)
+        begin, end = blocks.stage[s], blocks.stage[s + 1]
+        active, start, width, count = scratch.raster, steps * begin, end - begin, scratch.spikes[begin * LANES :]
+        at, delay = n_words + begin, s
+    listed = _list(active, start, width, steps, bounds, count)
+    _charge_all(listed, bounds, steps, charges, at * LANES * charges.width, delay, sums)
+    if charges.width:
+        _charge_updates(blocks, steps, scratch.idle, charges, sums)
+
+
+@compiled
+def _unpack(blocks: Blocks, steps: int, words: AnyArray, out: AnyArray, inverse: Any) -> None:
+    """Write bits into a (chip steps, compartments) array; inverted, those of positions that hold a compartment."""
+    flat, row = out.reshape(-1), out.shape[1]
+    for s in range(blocks.stage.size - 1):
+        begin, end = blocks.stage[s], blocks.stage[s + 1]
+        for t in range(steps):
+            for block in range(begin, end):
+                left = words[steps * begin + t * (end - begin) + block - begin]
+                if inverse:
+                    left = ~left & blocks.held[block]
+                if blocks.whole[block] >= 0:
+                    _spread(left, flat, (t + blocks.depth[block]) * row + blocks.whole[block])
+                    continue
+                while left:
+                    position = block * LANES + _lowest(left)
+                    out[t + blocks.depth[block], blocks.compartment[position]] = True
+                    left &= left - np.uint64(1)
+
+
+@compiled
+def _pack_spikes(blocks: Blocks, steps: int, words: AnyArray, out: AnyArray) -> None:
+    """Write bits into a (chip steps, words) array, compartment c at bit c % 64 of word c // 64."""
+    n_words = out.shape[1]
+    flat = out.reshape(-1)
+    for s in range(blocks.stage.size - 1):
+        begin, end = blocks.stage[s], blocks.stage[s + 1]
+        for t in range(steps):
+            for block in range(begin, end):
+                left = words[steps * begin + t * (end - begin) + block - begin]
+                row = (t + blocks.depth[block]) * n_words
+                if blocks.whole[block] >= 0:
+                    to, by = row + (blocks.whole[block] >> 6), np.uint64(blocks.whole[block] & 63)
+                    flat[to] |= left << by
+                    if by:
+                        flat[to + 1] |= left >> (np.uint64(LANES) - by)
+                    continue
+                while left:
+                    compartment = blocks.compartment[block * LANES + _lowest(left)]
+                    flat[row + (compartment >> 6)] |= np.uint64(1) << np.uint64(compartment & 63)
+                    left &= left - np.uint64(1)
+
+
+@compiled
+def _count_idle(blocks: Blocks, block: int, s: int, steps: int, idle: AnyArray) -> int:
+    """Idle compartment-steps of a block of a stage."""
+    begin, width = blocks.stage[s], blocks.stage[s + 1] - blocks.stage[s]
+    total = 0
+    for t in range(steps):
+        total += _bits(idle[steps * begin + t * width + block - begin])
+    return total
+
+
+@compiled
+def _copy_membranes(blocks: Blocks, steps: int, kept: AnyArray, out: AnyArray) -> None:
+    """Write membranes into a (chip steps, compartments) array."""
+    place = 0
+    for s in range(blocks.stage.size - 1):
+        for t in range(steps):
+            for block in range(blocks.stage[s], blocks.stage[s + 1]):
+                for position in range(block * LANES, (block + 1) * LANES):
+                    if blocks.compartment[position] >= 0:
+                        out[t + blocks.depth[block], blocks.compartment[position]] = kept[place]
+                    place += 1
+
+
+@compiled_and_cached
+def run_recordings(
+    blocks: Blocks,
+    events: AnyArray,
+    lengths: IntArray,
+    inputs: IntArray,
+    spikes: IntArray,
+    updates: IntArray,
+    fired: AnyArray,
+    membranes: AnyArray,
+    updated: AnyArray,
+    charges: ChargeRows,
+    charged: IntArray,
+    packed: AnyArray,
+    keep_u: AnyArray | None,
+) -> None:
+    """Run some recordings.
+
+    Parameters
+    ----------
+    blocks : Blocks
+        The network.
+    events : (recordings, channels, columns) uint8
+        Any value but zero is an event.
+    lengths : (recordings,) int64
+        Data steps of each.
+    inputs, spikes, updates : (recordings, channels or compartments or layers) int64
+        Zeros; filled with counts, see :class:`trace.Counts`.
+    fired, membranes, updated : (recordings, chip steps, compartments) bool, int32, bool
+        Zeros; filled, see :class:`trace.Trace`. No recordings where it is not wanted.
+    charges : ChargeRows
+        What events add to the sums of each chip step.
+    charged : (recordings, chip steps * sums) int64
+        Zeros; filled with these sums.
+    packed : (recordings, chip steps, words) uint64
+        Zeros; filled, see :class:`trace.Trace`. No recordings where it is not wanted.
+    keep_u : (blocks,) uint32, or None
+        That of the blocks, where some current outlasts its step: other networks do without the code for it.
+    """
+    n_words, n_blocks = (events.shape[1] + LANES - 1) // LANES, blocks.keep.size
+    for r in range(events.shape[0]):
+        steps = lengths[r]
+        scratch = Scratch(
+            np.zeros(steps * n_words, np.uint64),
+            np.empty(steps * n_blocks, np.uint64),
+            np.zeros(steps * n_blocks, np.uint64),
+            np.zeros(n_words * LANES, np.int64),
+            np.zeros(n_blocks * LANES, np.int64),
+            np.zeros(n_blocks * LANES, np.int32),
+            np.zeros(n_blocks * LANES, np.int16),
+            np.empty(steps * n_blocks * LANES if membranes.shape[0] else 0, np.int32),
+        )
+        _pack(events[r], steps, scratch.words)
+        if keep_u is None:
+            _run_stages(blocks, n_words, steps, scratch, charges, charged[r], None)
+        else:
+            lasting = Lasting(keep_u, np.zeros(n_blocks * LANES, np.int32))
+            _run_stages(blocks, n_words, steps, scratch, charges, charged[r], lasting)
+
+        inputs[r] = scratch.inputs[: events.shape[1]]
+        for position in range(n_blocks * LANES):
+            if blocks.compartment[position] >= 0:
+                spikes[r, blocks.compartment[position]] = scratch.spikes[position]
+        for s in range(blocks.stage.size - 1):
+            for block in range(blocks.stage[s], blocks.stage[s + 1]):
+                worked = steps * _bits(blocks.held[block])
+                if blocks.restful[block]:
+                    worked -= _count_idle(blocks, block, s, steps, scratch.idle)
+                updates[r, blocks.layer[block]] += worked
+        if packed.shape[0]:
+            _pack_spikes(blocks, steps, scratch.raster, packed[r])
+        if fired.shape[0]:
+            _unpack(blocks, steps, scratch.raster, fired[r], False)
+        if updated.shape[0]:
+            _unpack(blocks, steps, scratch.idle, updated[r], True)
+        if membranes.shape[0]:
+            _copy_membranes(blocks, steps, scratch.membranes, membranes[r])

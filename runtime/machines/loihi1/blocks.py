@@ -1,0 +1,269 @@
+"""Lay a netlist out for :mod:`loihi1.block_kernel`, where that is proven to compute what the chip does."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from spikeloom.compiler.fixedpoint import CURRENT_MAX, DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT, IntArray
+from spikeloom.compiler.targets.loihi1.netlist import Netlist, one_step_bounds
+from spikeloom.runtime.machines.loihi1.block_kernel import CHARGES, LANES, Blocks, ChargeRows
+from spikeloom.runtime.machines.loihi1.trace import BoolArray, Charges
+
+SUM_MAX = 2**15 - 1
+"""Largest sum that the kernel holds."""
+
+SPARE = 2**23
+"""Bytes that rows may take in any case; beyond that they may take ``BYTES_A_SYNAPSE``."""
+
+BYTES_A_SYNAPSE = 32
+
+DENSE = 0.5
+"""Share of all pairs of block and source from which on every pair gets a row."""
+
+NEVER = 2**31 - 1
+"""Threshold of a position without a compartment."""
+
+
+def _in_range(netlist: Netlist) -> bool:
+    """Whether no input whatever brings a sum, a membrane or a product that the kernel cannot hold."""
+    positive, negative = one_step_bounds(netlist)
+    if max(int(positive.max(initial=0)), int(negative.max(initial=0))) > SUM_MAX:
+        return False
+    bias = netlist.bias_mantissa << netlist.bias_exponent
+    keep, lost_u = 2**DECAY_BITS - netlist.decay_v, netlist.decay_u + 1
+    lasts = lost_u != 2**DECAY_BITS
+    # a current that loses lost_u/4096 a step and gains x cannot climb beyond x * 4096 / lost_u
+    up, down = ((sums << MEMBRANE_SHIFT + DECAY_BITS) // lost_u for sums in (positive, negative))
+    if np.any(np.maximum(up, down) > CURRENT_MAX):
+        return False
+    # a membrane is left at the threshold at most; below zero it loses as much as it can gain at the far end
+    above = np.maximum(netlist.threshold << MEMBRANE_SHIFT, 0)
+    gained = down + np.maximum(-bias, 0)
+    if np.any((keep == 2**DECAY_BITS) & (gained > 0)):
+        return False
+    below = (gained << DECAY_BITS) // np.maximum(2**DECAY_BITS - keep, 1) + 1
+    highest = (above * keep >> DECAY_BITS) + up + np.maximum(bias, 0)
+    stored = np.maximum(above, below)
+    narrow = np.all((stored * keep < 2**32) | lasts)  # beside a lasting current products are taken in two parts
+    return bool(np.all(highest <= MEMBRANE_MAX) and np.all(stored <= MEMBRANE_MAX) and narrow)
+
+
+def _is_pipeline(netlist: Netlist) -> bool:
+    """Whether every layer hears the layers of the depth before it only, so that none has to wait for another."""
+    depth = np.array([layer.depth for layer in netlist.layers])[netlist.layer]
+    sent = np.append(np.full(netlist.n_inputs, -1), depth)
+    for core in range(netlist.n_cores):
+        source, compartment, _ = netlist.synapses_of(core)
+        if np.any(sent[source] != depth[compartment] - 1):
+            return False
+    return True
+
+
+def lay_out_blocks(netlist: Netlist) -> Blocks | None:
+    """Make blocks of a netlist.
+
+    Returns
+    -------
+    Blocks or None
+        None where a register could overflow or saturate, a layer hears itself or others than the one before it, or
+        synapses are so scattered that rows of 64 would waste memory.
+    """
+    if not _is_pipeline(netlist) or not _in_range(netlist):
+        return None
+    seats = _seats(netlist)
+
+    # rows: one for each block and each source that reaches it
+    first_source = np.append(0, netlist.n_inputs + seats.stage[:-1] * LANES)  # by depth
+    number = np.append(np.arange(netlist.n_inputs), netlist.n_inputs + seats.position)
+    width = LANES * max(-(-netlist.n_inputs // LANES), len(seats.layer))
+
+    def places(core: int) -> tuple[IntArray, IntArray, IntArray]:
+        """Row, by its pair, lane and weight of each synapse of a core."""
+        source, compartment, weight = netlist.synapses_of(core)
+        block, lane = np.divmod(seats.position[compartment], LANES)
+        local = number[source] - first_source[seats.depth[netlist.layer[compartment]]]
+        return block * width + local, lane, weight
+
+    rows, dense = _rows(netlist, seats, [np.unique(places(core)[0]) for core in range(netlist.n_cores)], width)
+    if len(rows) * LANES * 2 > SPARE + BYTES_A_SYNAPSE * netlist.n_synapses:
+        return None
+    row_block, row_source = np.divmod(rows, width)
+    net, reached = np.zeros(len(rows) * LANES, np.int16), np.zeros(len(rows), np.uint64)
+    for core in range(netlist.n_cores):
+        pair, lane, units = places(core)
+        row = np.searchsorted(rows, pair)
+        # of several synapses of one entry, what leaves 16 bits on the way comes back into them
+        np.add.at(net, row * LANES + lane, units.astype(np.int16))
+        np.bitwise_or.at(reached, row, _bit(lane))
+    shift, weight = _narrowed(net, row_block, len(seats.layer))
+
+    # links: the rows of a block by words of sources
+    words = width // LANES
+    links, first_row, link = np.unique(row_block * words + row_source // LANES, return_index=True, return_inverse=True)
+    linked = np.zeros(len(links), np.uint64)
+    np.bitwise_or.at(linked, link, _bit(row_source % LANES))
+
+    size = len(seats.layer) * LANES
+    bias, threshold = np.zeros(size, np.int32), np.full(size, NEVER, np.int32)
+    bias[seats.position] = netlist.bias_mantissa << netlist.bias_exponent
+    threshold[seats.position] = netlist.threshold << MEMBRANE_SHIFT
+    compartment = np.full(size, -1)
+    compartment[seats.position] = np.arange(netlist.n_compartments)
+    return Blocks(
+        stage=seats.stage,
+        dense=dense,
+        first=np.searchsorted(links // words, np.arange(len(seats.layer) + 1)),
+        word=links % words,
+        linked=linked,
+        row=first_row,
+        weight=weight,
+        shift=shift + np.uint32(MEMBRANE_SHIFT),
+        reached=reached,
+        restful=_word((compartment >= 0) & (bias == 0)),
+        held=_word(compartment >= 0),
+        bias=bias,
+        threshold=threshold,
+        keep=seats.keep.astype(np.uint32),
+        keep_u=seats.keep_u.astype(np.uint32),
+        depth=seats.depth[seats.layer],
+        layer=seats.layer,
+        compartment=compartment,
+        whole=_whole(compartment.reshape(-1, LANES)),
+    )
+
+
+def obstacle(netlist: Netlist) -> str | None:
+    """Why there are no blocks of a netlist; None if there are."""
+    if not _is_pipeline(netlist):
+        return "a layer hears itself or others than the one before it"
+    if not _in_range(netlist):
+        return "a sum may leave 16 bits, or a membrane or current its register"
+    if lay_out_blocks(netlist) is None:
+        return "synapses too scattered for rows of 64"
+    return None
+
+
+def charge_rows(netlist: Netlist, blocks: Blocks, charges: Charges | None) -> ChargeRows:
+    """Lay charges out for the kernel: padded, by channel and position."""
+    if charges is None:
+        none = np.zeros(0, np.int64)
+        return ChargeRows(0, False, none.astype(np.int32), none, none, none, none, none.astype(np.uint64))
+    sums = charges.spikes.shape[1]
+    width = -(-sums // CHARGES) * CHARGES
+    channels = -(-netlist.n_inputs // LANES) * LANES
+    seated = np.flatnonzero(blocks.compartment >= 0)
+    source = np.zeros((channels + len(blocks.compartment), width), np.int32)
+    update = np.zeros((len(blocks.compartment), width), np.int64)
+    source[: netlist.n_inputs, :sums] = charges.channels
+    source[channels + seated, :sums] = charges.spikes[blocks.compartment[seated]]
+    update[seated, :sums] = charges.updates[blocks.compartment[seated]]
+    begins = np.append(0, channels + blocks.stage * LANES)  # of the channels, then of the positions of each stage
+    most = _sums_between(np.abs(source.astype(np.int64)), begins).max(initial=0)
+    kinds, kind = np.unique(update, axis=0, return_inverse=True)
+    groups, member = np.unique(np.arange(len(update)) // LANES * len(kinds) + kind.reshape(-1), return_inverse=True)
+    words = np.zeros(len(groups), np.uint64)
+    np.bitwise_or.at(words, member.reshape(-1), _bit(np.arange(len(update)) % LANES))
+    block, group = np.divmod(groups, len(kinds))
+    return ChargeRows(
+        width=width,
+        narrow=bool(most < 2**31),
+        source=source.reshape(-1),
+        everyone=_sums_between(update, blocks.stage * LANES).reshape(-1),
+        update=kinds.reshape(-1),
+        first=np.searchsorted(block, np.arange(len(blocks.layer) + 1)),
+        group=group,
+        member=words,
+    )
+
+
+def _sums_between(rows: IntArray, bounds: IntArray) -> IntArray:
+    """Sums of the rows from each bound to the next, zero where there are none; ``np.add.reduceat`` has one there."""
+    below = np.concatenate([np.zeros((1, rows.shape[1]), np.int64), np.cumsum(rows, axis=0)])
+    sums: IntArray = below[bounds[1:]] - below[bounds[:-1]]
+    return sums
+
+
+class _Seats(NamedTuple):
+    """Where compartments sit.
+
+    Parameters
+    ----------
+    position : (compartments,) int64
+        Block and lane of each.
+    layer, keep, keep_u : (blocks,) int64
+        Layer of each block, and what its membranes and currents keep, in 1/4096.
+    stage : (stages + 1,) int64
+        Bounds of the stages in the blocks.
+    depth : (layers,) int64
+        Depth of each layer, the number of its stage.
+    """
+
+    position: IntArray
+    layer: IntArray
+    keep: IntArray
+    keep_u: IntArray
+    stage: IntArray
+    depth: IntArray
+
+
+def _seats(netlist: Netlist) -> _Seats:
+    """Seat compartments by depth, layer and neuron; a layer begins a block, and so does another decay within it."""
+    depth = np.array([layer.depth for layer in netlist.layers])
+    keep, keep_u = 2**DECAY_BITS - netlist.decay_v, 2**DECAY_BITS - 1 - netlist.decay_u
+    order = np.lexsort((netlist.neuron, keep_u, keep, netlist.layer, depth[netlist.layer]))
+    groups = np.stack([netlist.layer, keep, keep_u])[:, order]
+    begins = np.flatnonzero(np.append(True, np.any(np.diff(groups) != 0, axis=0))[: len(order)])
+    sizes = np.diff(np.append(begins, len(order)))
+    blocks = -(-sizes // LANES)
+    first = np.repeat((np.cumsum(blocks) - blocks) * LANES - begins, sizes)
+    position = np.empty(len(order), np.int64)
+    position[order] = first + np.arange(len(order))
+    layer, keep_of_block, keep_u_of_block = np.repeat(groups[:, begins], blocks, axis=1)
+    stage = np.searchsorted(depth[layer], np.arange(netlist.max_depth + 2))
+    return _Seats(position=position, layer=layer, keep=keep_of_block, keep_u=keep_u_of_block, stage=stage, depth=depth)
+
+
+def _rows(netlist: Netlist, seats: _Seats, pairs: list[IntArray], width: int) -> tuple[IntArray, BoolArray]:
+    """Pairs of block and source that get a row, sorted, and whether those of a stage are all that there can be."""
+    rows = np.unique(np.concatenate(pairs))
+    blocks = np.diff(seats.stage)
+    heard = np.append(netlist.n_inputs, np.bincount(seats.depth[netlist.layer], minlength=len(blocks))[:-1])
+    places = np.append(netlist.n_inputs, blocks[:-1] * LANES)
+    dense = np.diff(np.searchsorted(rows, seats.stage * width)) >= DENSE * blocks * heard
+    filled = [
+        (np.arange(seats.stage[s], seats.stage[s + 1])[:, None] * width + np.arange(places[s])).ravel()
+        for s in np.flatnonzero(dense)
+    ]
+    return np.unique(np.concatenate([rows, *filled])), dense
+
+
+def _narrowed(
+    weight: npt.NDArray[np.int16], row_block: IntArray, n_blocks: int
+) -> tuple[npt.NDArray[np.uint32], npt.NDArray[np.int8 | np.int16]]:
+    """Shift out the zeros that all weights of a block end with; eight bits for each if that is enough for all."""
+    used = np.zeros(n_blocks, np.int64)
+    np.bitwise_or.at(used, row_block, np.bitwise_or.reduce(weight.reshape(-1, LANES), axis=1))
+    lowest = used & -used
+    shift = np.where(used == 0, 0, np.log2(np.maximum(lowest, 1))).astype(np.uint32)
+    shifted = weight.reshape(-1, LANES) >> shift[row_block][:, None].astype(np.int16)
+    narrow = shifted.astype(np.int8)
+    return shift, (narrow if np.array_equal(narrow, shifted) else shifted).reshape(-1)
+
+
+def _whole(compartment: IntArray) -> IntArray:
+    """First compartment of each block (blocks, 64) that holds consecutive ones, -1 of the others."""
+    consecutive = (compartment[:, 0] >= 0) & np.all(np.diff(compartment, axis=1) == 1, axis=1)
+    return np.where(consecutive, compartment[:, 0], -1)
+
+
+def _bit(lane: IntArray) -> npt.NDArray[np.uint64]:
+    """Words with one bit set."""
+    return np.left_shift(np.uint64(1), lane.astype(np.uint64))
+
+
+def _word(flags: BoolArray) -> npt.NDArray[np.uint64]:
+    """Words of 64 flags each."""
+    return np.packbits(flags, bitorder="little").view("<u8").astype(np.uint64)

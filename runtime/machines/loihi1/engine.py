@@ -1,0 +1,337 @@
+"""The fast twin of :mod:`loihi1.spec`: the same spikes, membranes and counts, bit for bit.
+
+There are two kernels. A network of layers that each hear the one before, in which no register can overflow or saturate,
+is run layer after layer in :mod:`loihi1.block_kernel`; whole recordings only.
+
+Any other network is run step after step in :mod:`loihi1.kernel`, which knows no recordings: :func:`advance` moves a
+state by any number of chip steps.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from spikeloom.compiler.errors import NumericRangeError
+from spikeloom.compiler.fixedpoint import IntArray
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.runtime.machines.loihi1.block_kernel import Blocks, ChargeRows, run_recordings
+from spikeloom.runtime.machines.loihi1.blocks import charge_rows, lay_out_blocks
+from spikeloom.runtime.machines.loihi1.kernel import State, Tables, chip_steps
+from spikeloom.runtime.machines.loihi1.segments import lay_out_segments, padded
+from spikeloom.runtime.machines.loihi1.trace import (
+    REGISTER_LIMITS,
+    BoolArray,
+    Charges,
+    Counts,
+    MembraneArray,
+    Trace,
+    check_channels,
+    pack,
+    range_error,
+)
+
+EventArray = npt.NDArray[np.uint8 | np.bool_]
+
+PART = 4
+"""Recordings that a thread takes at a time."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Engine:
+    """A netlist prepared for the kernel by :func:`prepare`; holds no state and can be shared by threads.
+
+    Parameters
+    ----------
+    netlist : Netlist
+        What it was made from.
+    blocks : Blocks or None
+        What the kernel of layers reads.
+    tables : Tables or None
+        What the kernel of steps reads; None where the other one does.
+    negative : (entries,) like the tables' weights, or None
+        Packed magnitudes of negative weights; None where no register can overflow, whatever the input.
+    drain : int
+        Chip steps that a recording takes beyond its data steps.
+    charges : Charges or None
+        What events add to sums of each chip step.
+    rows : ChargeRows or None
+        The same for the kernel of layers.
+    """
+
+    netlist: Netlist
+    blocks: Blocks | None
+    tables: Tables | None
+    negative: npt.NDArray[Any] | None
+    drain: int
+    charges: Charges | None
+    rows: ChargeRows | None
+
+
+def prepare(
+    netlist: Netlist,
+    *,
+    stepwise: bool = False,
+    checked: bool = False,
+    gated: bool = True,
+    charges: Charges | None = None,
+) -> Engine:
+    """Lay a netlist out for a kernel.
+
+    Parameters
+    ----------
+    netlist : Netlist
+        The placed network.
+    stepwise : bool
+        For :func:`advance`: use the kernel of steps even where that of layers would do.
+    checked : bool
+        Check registers in every step even where it is proven that they hold any input; so in steps.
+    gated : bool
+        Whether a layer integrates in its window only, see :func:`spec.simulate`; in steps if not.
+    charges : Charges, optional
+        What events add to the sums of each chip step that a trace shall hold.
+    """
+    blocks = lay_out_blocks(netlist) if gated and not checked and not stepwise else None
+    drain = netlist.max_depth if gated else 0
+    tables, negative, rows = None, None, None
+    if blocks is None:
+        tables, negative = lay_out_segments(netlist, checked=checked, gated=gated)
+    else:
+        rows = charge_rows(netlist, blocks, charges)
+    return Engine(
+        netlist=netlist, blocks=blocks, tables=tables, negative=negative, drain=drain, charges=charges, rows=rows
+    )
+
+
+def tables_of(engine: Engine) -> Tables:
+    """Tables of an engine that was prepared for single steps."""
+    assert engine.tables is not None, "single steps need prepare(netlist, stepwise=True)"
+    return engine.tables
+
+
+def start(engine: Engine) -> State:
+    """State of a chip before the first chip step of a recording."""
+    netlist = engine.netlist
+    size = padded(netlist.n_compartments)
+    scratch = 0 if engine.negative is None else size
+    return State(
+        clock=np.zeros(2, np.int64),
+        fired=np.zeros(size + 1, np.int64),
+        current=np.zeros(size, np.int32),
+        membrane=np.zeros(size, np.int32),
+        total=np.zeros(size, np.int32),
+        positive=np.zeros(scratch, tables_of(engine).weight.dtype),
+        negative=np.zeros(scratch, tables_of(engine).weight.dtype),
+        flags=np.zeros(size, np.uint8),
+        worked=np.zeros(size, np.uint8),
+        active=np.zeros(netlist.n_inputs + size + 1, np.int64),
+        inputs=np.zeros(netlist.n_inputs, np.int64),
+        spikes=np.zeros(netlist.n_compartments, np.int64),
+        updates=np.zeros(len(netlist.layers), np.int64),
+        saturations=np.zeros(len(netlist.layers), np.int64),
+    )
+
+
+def advance(
+    engine: Engine,
+    state: State,
+    events: EventArray,
+    *,
+    length: int,
+    steps: int | None = None,
+    spikes: BoolArray | None = None,
+    membranes: MembraneArray | None = None,
+    updated: BoolArray | None = None,
+) -> None:
+    """Run some chip steps; any split of a recording into calls gives the same result.
+
+    Parameters
+    ----------
+    engine : Engine
+        The network, prepared for single steps.
+    state : State
+        Changed in place. After an error it is of no further use.
+    events : (n_inputs, columns) uint8 or bool
+        Events of the data steps from ``state.clock[0]`` on; steps beyond the last column have none.
+    length : int
+        Data steps of the whole recording, which close each layer's window; any large number if it has no end.
+    steps : int, optional
+        How many chip steps to run; by default one per column.
+    spikes, membranes, updated : (steps, compartments), optional
+        Zeroed arrays to fill, see :class:`trace.Trace`.
+
+    Raises
+    ------
+    DataError
+        If the events have another number of input channels than the network.
+    NumericRangeError
+        As :func:`spec.simulate` does, with the same message.
+    """
+    check_channels(engine.netlist, events.shape[0])
+    steps = events.shape[1] if steps is None else steps
+    n = engine.netlist.n_compartments
+    step, compartment, register, value = chip_steps(
+        tables_of(engine),
+        engine.negative,
+        state,
+        np.ascontiguousarray(events != 0).view(np.uint8),
+        steps,
+        length,
+        np.zeros((0, n), np.bool_) if spikes is None else spikes,
+        np.zeros((0, n), np.int32) if membranes is None else membranes,
+        np.zeros((0, n), np.bool_) if updated is None else updated,
+    )
+    if step >= 0:
+        raise range_error(engine.netlist, tuple(REGISTER_LIMITS)[register], compartment, step, value)
+
+
+def simulate(
+    netlist: Netlist | Engine,
+    events: EventArray,
+    *,
+    lengths: IntArray | None = None,
+    spikes: bool = False,
+    membranes: bool = False,
+    updated: bool = False,
+    packed: bool = False,
+    threads: int | None = None,
+    progress: Callable[[int], object] | None = None,
+) -> Trace:
+    """Run a batch of recordings through the chip, each from rest.
+
+    Parameters
+    ----------
+    netlist : Netlist or Engine
+        The placed network; :func:`prepare` it once to run several batches.
+    events : (recordings, n_inputs, T) uint8 or bool
+        Input events; any value but zero is an event.
+    lengths : (recordings,) int64, optional
+        Steps of each recording where some are shorter than T. What comes after them is not run: zeros in the trace.
+    spikes, membranes, updated : bool
+        Whether to keep these per chip step: one, four and one bytes for each recording, chip step and compartment.
+    packed : bool
+        Whether to keep spikes at a bit each.
+    threads : int, optional
+        Recordings that run at the same time, by default one per processor. Results do not depend on it.
+    progress : callable, optional
+        Called in the calling thread with the number of recordings finished so far.
+
+    Returns
+    -------
+    Trace
+        With one leading axis for the recordings.
+
+    Raises
+    ------
+    DataError
+        If the recordings have another number of input channels than the network.
+    NumericRangeError
+        As :func:`spec.simulate` does, with the same message, for the first recording that overflows; a note
+        on the exception says which.
+    """
+    engine = netlist if isinstance(netlist, Engine) else prepare(netlist)
+    netlist = engine.netlist
+    check_channels(netlist, events.shape[1])
+    recordings, _, length = events.shape
+    shape = (recordings, length + engine.drain, netlist.n_compartments)
+    rows, charges = engine.rows, engine.charges
+    sums = 0 if charges is None else charges.spikes.shape[1]
+    charged = np.zeros((*shape[:2], sums if rows is None else rows.width), np.int64)
+    trace = Trace(
+        counts=Counts(
+            inputs=np.zeros((recordings, netlist.n_inputs), np.int64),
+            spikes=np.zeros((recordings, netlist.n_compartments), np.int64),
+            updates=np.zeros((recordings, len(netlist.layers)), np.int64),
+            saturations=np.zeros((recordings, len(netlist.layers)), np.int64),
+        ),
+        spikes=np.zeros(shape, np.bool_) if spikes else None,
+        membranes=np.zeros(shape, np.int32) if membranes else None,
+        updated=np.zeros(shape, np.bool_) if updated else None,
+        charged=None if charges is None else charged[..., :sums],
+        packed=np.zeros((*shape[:2], -(-shape[2] // 64)), np.uint64) if packed else None,
+    )
+    ends = np.full(recordings, length) if lengths is None else np.asarray(lengths, np.int64)
+
+    def run(part: slice) -> None:
+        if engine.blocks is not None and rows is not None:
+            _run_layers(engine.blocks, rows, events[part], ends[part], trace, charged, part)
+        else:
+            for index in range(part.start, part.stop):
+                _run_steps(engine, events[index], int(ends[index]), trace, index)
+
+    if engine.blocks is not None:
+        events = np.ascontiguousarray(events)
+    size = 1 if engine.blocks is None else PART
+    parts = [slice(i, min(i + size, recordings)) for i in range(0, recordings, size)]
+    workers = min(threads or os.cpu_count() or 1, len(parts))
+    with ThreadPoolExecutor(workers) if workers > 1 else nullcontext() as pool:
+        for part, _ in zip(parts, pool.map(run, parts) if pool else map(run, parts), strict=True):
+            if progress is not None:
+                progress(part.stop)
+    return trace
+
+
+def _run_layers(
+    blocks: Blocks, rows: ChargeRows, events: EventArray, ends: IntArray, trace: Trace, charged: IntArray, part: slice
+) -> None:
+    """Run some recordings layer after layer; `part` is where they belong in the trace."""
+    nothing = (0, 0, 0)
+    run_recordings(
+        blocks,
+        events.view(np.uint8),
+        ends,
+        trace.counts.inputs[part],
+        trace.counts.spikes[part],
+        trace.counts.updates[part],
+        np.zeros(nothing, np.bool_) if trace.spikes is None else trace.spikes[part],
+        np.zeros(nothing, np.int32) if trace.membranes is None else trace.membranes[part],
+        np.zeros(nothing, np.bool_) if trace.updated is None else trace.updated[part],
+        rows,
+        charged[part].reshape(len(events), -1),
+        np.zeros(nothing, np.uint64) if trace.packed is None else trace.packed[part],
+        blocks.keep_u if blocks.keep_u.any() else None,
+    )
+
+
+def _run_steps(engine: Engine, events: EventArray, length: int, trace: Trace, index: int) -> None:
+    """Run one recording step after step; `index` is its place in the trace."""
+    state, window, charges = start(engine), length + engine.drain, engine.charges
+    fired = None if trace.spikes is None else trace.spikes[index, :window]
+    worked = None if trace.updated is None else trace.updated[index, :window]
+    size = (window, engine.netlist.n_compartments)
+    if fired is None and (charges is not None or trace.packed is not None):
+        fired = np.zeros(size, np.bool_)
+    if worked is None and charges is not None:
+        worked = np.zeros(size, np.bool_)
+    try:
+        advance(
+            engine,
+            state,
+            events[:, :length],
+            length=length,
+            steps=window,
+            spikes=fired,
+            membranes=None if trace.membranes is None else trace.membranes[index, :window],
+            updated=worked,
+        )
+    except NumericRangeError as error:
+        error.add_note(f"recording {index} of {len(trace.counts.inputs)}, counted from 0")
+        raise
+    trace.counts.inputs[index] = state.inputs
+    trace.counts.spikes[index] = state.spikes
+    trace.counts.updates[index] = state.updates
+    trace.counts.saturations[index] = state.saturations
+    if trace.packed is not None and fired is not None:
+        trace.packed[index, :window] = pack(fired)
+    if charges is not None and trace.charged is not None and fired is not None and worked is not None:
+        # float64 products of integers below 2**53 are exact
+        found = fired.astype(np.float64) @ charges.spikes + worked.astype(np.float64) @ charges.updates
+        found[:length] += (events[:, :length] != 0).T.astype(np.float64) @ charges.channels
+        trace.charged[index, :window] = np.rint(found).astype(np.int64)

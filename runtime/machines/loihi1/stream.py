@@ -1,0 +1,233 @@
+"""Live use: one bin of events in, the spikes of one chip step and the votes so far out.
+
+    netlist = load("net.loom")
+    stream = netlist.stream()
+    for events in bins:                     # each (taxels, polarities), values 0 and 1
+        step = stream.step(events)
+        print(step.decision, step.margin)
+    total = stream.finish()[-1]             # the counts that `spikeloom run` prints
+    stream.reset()                          # the next grasp
+
+The bins are steps of the network: where these join several bins of the recordings, an event in any of them counts.
+
+*Lag.* A layer of depth ``d`` integrates data step ``t`` in chip step ``t + d``. So the votes after the bin ``t`` rest
+on the bins up to ``t - d`` of the layer that is read out; :meth:`Stream.finish` runs the steps that are missing. Step
+by step, all spikes and counts equal those of :func:`engine.simulate` on the whole recording, bit for bit.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from spikeloom.compiler.errors import DataError, NumericRangeError
+from spikeloom.compiler.fixedpoint import IntArray
+from spikeloom.compiler.interpret import vote
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
+from spikeloom.runtime.machines.loihi1.engine import Engine, advance, prepare, start, tables_of
+from spikeloom.runtime.machines.loihi1.trace import BoolArray
+from spikeloom.runtime.machines.votes import class_counts
+
+NO_END = 2**62
+"""Length of a recording of which nobody knows yet where it ends."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Step:
+    """What one chip step brought.
+
+    Parameters
+    ----------
+    index : int
+        Chip step, from 0; while events come in, also the index of the bin.
+    spikes : tuple of (neurons,) bool
+        Who spiked in this chip step: one array for each of ``netlist.layers``, ordered by neuron; read-only.
+    counts : (classes,) int64
+        Votes for each class since the grasp began; read-only.
+    """
+
+    index: int
+    spikes: tuple[BoolArray, ...]
+    counts: IntArray
+
+    @property
+    def decision(self) -> int:
+        """Class with the most votes so far, the lowest on a tie; 0 before the first vote."""
+        return int(vote(self.counts[None])[0])
+
+    @property
+    def margin(self) -> int:
+        """Votes by which the decision is ahead of the next class; all its votes if there is no other class."""
+        if len(self.counts) == 1:
+            return int(self.counts[0])
+        second, first = np.partition(self.counts, -2)[-2:]
+        return int(first - second)
+
+
+class Stream:
+    """State of one grasp on one sensor; made by :func:`open_stream`.
+
+    Streams of one engine share nothing that changes: several may take turns, or run in a thread each.
+
+    Parameters
+    ----------
+    engine : Engine
+        The prepared network.
+    """
+
+    __slots__ = ("_bounds", "_column", "_ended", "_engine", "_place", "_state")
+
+    def __init__(self, engine: Engine) -> None:
+        self._engine = engine
+        netlist = engine.netlist
+        ends = np.cumsum([layer.neurons for layer in netlist.layers]).tolist()
+        # the engine orders compartments by layer and neuron; a chip may hold fewer of them than the layer has neurons
+        compartment = tables_of(engine).compartment
+        self._place = np.array([0, *ends[:-1]])[netlist.layer[compartment]] + netlist.neuron[compartment]
+        self._bounds = tuple(zip([0, *ends[:-1]], ends, strict=True))
+        self._column = np.zeros((engine.netlist.n_inputs, 1), np.uint8)
+        self._state = start(engine)
+        self._ended = False
+        # loads or compiles the kernel now, not within the first bin
+        advance(engine, self._state, self._column, length=NO_END, steps=0)
+
+    @property
+    def index(self) -> int:
+        """Chip steps run so far in this grasp."""
+        return int(self._state.clock[0])
+
+    def step(self, events: npt.ArrayLike) -> Step:
+        """Run the chip step of one bin.
+
+        Parameters
+        ----------
+        events : (taxels, polarities) or (taxels * polarities,)
+            1 where a taxel sent an event of that polarity within the bin, 0 elsewhere, of any number type or bool;
+            channel ``taxel * polarities + polarity`` in the flat form. Clocks of the network tick by themselves.
+
+        Raises
+        ------
+        DataError
+            If the events have another shape or other values, or the stream has ended.
+        NumericRangeError
+            If a register would overflow; that ends the stream.
+        """
+        if self._ended:
+            raise DataError(
+                "stream: a step after the end found, finish() or an overflow ends a stream; "
+                "call reset() to begin the next grasp"
+            )
+        netlist = self._engine.netlist
+        bin_ = _one_bin(netlist, events)
+        self._column[: len(bin_), 0] = bin_
+        self._column[len(bin_) :] = netlist.clocks.events(1, first=self.index)
+        return self._advance(NO_END)
+
+    def finish(self) -> tuple[Step, ...]:
+        """End the grasp: run the chip steps by which the slowest layer lags behind the data.
+
+        Returns
+        -------
+        tuple of Step
+            ``netlist.max_depth`` of them, the last one with the final counts; none for a network without lag, whose
+            last step was final.
+
+        Raises
+        ------
+        DataError
+            If the stream has ended already.
+        NumericRangeError
+            If a register would overflow.
+        """
+        if self._ended:
+            raise DataError("stream: a second end found, a grasp has one; call reset() to begin the next grasp")
+        self._ended = True
+        self._column[:] = 0
+        length = self.index
+        return tuple(self._advance(length) for _ in range(self._engine.netlist.max_depth))
+
+    def reset(self) -> None:
+        """Begin the next grasp, from rest; whatever was left of the last one is dropped."""
+        self._state = start(self._engine)
+        self._ended = False
+
+    def _advance(self, length: int) -> Step:
+        """Run one chip step on the events in the column."""
+        netlist, state = self._engine.netlist, self._state
+        index = self.index
+        try:
+            advance(self._engine, state, self._column, length=length)
+        except NumericRangeError:
+            self._ended = True
+            raise
+        spikes = np.zeros(self._bounds[-1][1], np.bool_)
+        spikes[self._place[state.fired[: state.clock[1]] - netlist.n_inputs]] = True
+        counts = class_counts(netlist, state.spikes[None])[0]
+        spikes.flags.writeable = counts.flags.writeable = False
+        return Step(index=index, spikes=tuple([spikes[begin:end] for begin, end in self._bounds]), counts=counts)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LiveNetlist:
+    """A netlist that is ready to be stepped; made by :func:`load`.
+
+    Parameters
+    ----------
+    engine : Engine
+        The prepared network, shared by all streams.
+    """
+
+    engine: Engine
+
+    @property
+    def netlist(self) -> Netlist:
+        """The placed network."""
+        return self.engine.netlist
+
+    def stream(self) -> Stream:
+        """Open one more stream, at rest."""
+        return Stream(self.engine)
+
+
+def load(path: str | os.PathLike[str]) -> LiveNetlist:
+    """Read a netlist file and prepare it.
+
+    Raises
+    ------
+    FormatError
+        As :func:`netlist_file.read_netlist` does.
+    """
+    return LiveNetlist(engine=prepare(read_netlist(path), stepwise=True))
+
+
+def open_stream(netlist: Netlist | Engine) -> Stream:
+    """Open a stream on a netlist in memory; :func:`engine.prepare` it once to open several."""
+    return Stream(netlist if isinstance(netlist, Engine) else prepare(netlist, stepwise=True))
+
+
+def _one_bin(netlist: Netlist, events: npt.ArrayLike) -> npt.NDArray[np.generic]:
+    """Check the events of one bin; return them by channel."""
+    try:
+        array = np.asarray(events)
+    except ValueError as error:
+        raise DataError("stream: a bin with rows of unequal length found; give one row per taxel") from error
+    sensor = netlist.taxels, netlist.polarities
+    n_inputs = netlist.taxels * netlist.polarities  # the stream itself lets the clocks tick
+    if array.shape not in ((n_inputs,), sensor):
+        raise DataError(
+            f"stream: a bin of shape {array.shape} found, allowed are {sensor} (taxels, polarities) and ({n_inputs},); "
+            "give the events of one bin of this network's sensor"
+        )
+    if array.dtype.kind not in "biuf":
+        raise DataError(f"stream: a bin of type {array.dtype} found, allowed are numbers and bool; give 0 and 1")
+    outside = (array != 0) & (array != 1)
+    if outside.any():
+        raise DataError(
+            f"stream: a bin with the value {array[outside][0]} found, allowed are 0 and 1; "
+            "give 1 for any number of events of a channel"
+        )
+    return array.reshape(-1)

@@ -1,0 +1,358 @@
+"""How long each chip step takes: a simple model from sums alone, and a detailed one that schedules every message.
+
+*Simple.* The cores sweep their neurons and send, and they receive, both at once; a step lasts as long as the longest
+of these, then the barrier.
+
+*Detailed.* Every message is sent when the sweep reaches its neuron, crosses the mesh along x, then along y, slower
+where others are under way and blocked where the links are full, and waits until the receiving core is free. A step
+lasts until the last neuron is swept and the last message processed, then the barrier. :mod:`loihi1.timing_spec` is
+the definition.
+
+Spikes of a step are sent and processed within that step and act in the next. *Input events* act in the step in which
+they arrive: the receiving cores process them from its start, and nobody pays for their injection. Other simulators
+let channels be neurons of a core that cost nothing but their messages; `input_tiles` says so. An event that acts in
+step ``t`` is then sent in step ``t - 1``.
+
+References
+----------
+.. [1] J. Boyle et al., "SANA-FE", IEEE TCAD 44(8), 3165-3178, 2025: the equations, and the fit to silicon (within
+   25 % of the latency of three applications).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from math import lcm
+
+import numpy as np
+import numpy.typing as npt
+
+from spikeloom.compiler.errors import DataError, ModelError
+from spikeloom.compiler.fixedpoint import FloatArray, IntArray
+from spikeloom.compiler.targets.base import PICOSECONDS, Target, TimeTable
+from spikeloom.compiler.targets.loihi1.layout.chips import require_one_chip
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.runtime.machines.loihi1.engine import EventArray
+from spikeloom.runtime.machines.loihi1.timing_kernel import Steps, Tables, conclude, loads, schedule
+from spikeloom.runtime.machines.loihi1.trace import BoolArray
+
+EAST, WEST, NORTH, SOUTH, PORTS = range(5)
+"""Links of a tile: one that messages enter by for each direction in which they travel, then its cores' own ports."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Clock:
+    """A netlist prepared for the time models by :func:`prepare`.
+
+    Parameters
+    ----------
+    netlist : Netlist
+        What it was made from.
+    tables : Tables
+        What the kernels read.
+    core_tile : (cores,) int64
+        Tiles of the netlist's cores, then of those that hold input channels.
+    barrier : int
+        Picoseconds that end each step.
+    """
+
+    netlist: Netlist
+    tables: Tables
+    core_tile: IntArray
+    barrier: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SimpleTimes:
+    """What the simple model says of a batch of recordings; nothing happens after a recording's own steps.
+
+    Parameters
+    ----------
+    duration_ns : (samples, steps) float64
+        Of each chip step, barrier included.
+    generation_ns, processing_ns : (samples, cores) float64
+        Time that each core spends on its sweep and on sending, and on receiving, over all steps.
+    critical_core : (samples, steps) int64
+        Core that took longest; the lowest of several, -1 after the end.
+    receiving : (samples, steps) bool
+        Whether it took longest to receive.
+    """
+
+    duration_ns: FloatArray
+    generation_ns: FloatArray
+    processing_ns: FloatArray
+    critical_core: IntArray
+    receiving: BoolArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DetailedTimes:
+    """What the detailed model says of a batch of recordings; nothing happens after a recording's own steps.
+
+    Parameters
+    ----------
+    duration_ns : (samples, steps) float64
+        Of each chip step, barrier included.
+    sent_ns, processed_ns : (samples, steps) float64
+        When the last core ended its sweep and sending, and when the last message was processed.
+    blocked_ns : (samples, steps) float64
+        Time for which cores could not send because the links were full, summed over the cores.
+    critical_core : (samples, steps) int64
+        Core that was last; the lowest of several, -1 after the end.
+    receiving : (samples, steps) bool
+        Whether it was last in receiving.
+    peak_load : (samples, steps) float64
+        Most messages on any link at any time; one on its way counts as one spread evenly over its links and its end.
+    """
+
+    duration_ns: FloatArray
+    sent_ns: FloatArray
+    processed_ns: FloatArray
+    blocked_ns: FloatArray
+    critical_core: IntArray
+    receiving: BoolArray
+    peak_load: FloatArray
+
+
+def input_tiles(netlist: Netlist, target: Target) -> tuple[int, ...]:
+    """Tiles for cores that hold nothing but input channels: those in use that have room, then the others.
+
+    Raises
+    ------
+    ModelError
+        If the chip has no room for them.
+    """
+    room = target.limit("mesh.tile_cores")
+    tiles = np.arange(target.limit("mesh.width") * target.limit("mesh.height"))
+    used = np.bincount(netlist.core_tile, minlength=len(tiles))
+    order = tiles[np.argsort(used == 0, kind="stable")]
+    free = np.repeat(order, np.maximum(room - used[order], 0))
+    wanted = -(-netlist.n_inputs // target.limit("core.compartments"))
+    if wanted > len(free):
+        raise ModelError(
+            f"input channels: {wanted} cores needed, the chip has {len(free)} left; compile for fewer cores"
+        )
+    return tuple(int(tile) for tile in free[:wanted])
+
+
+def _way(start: int, end: int, port: int, width: int, tile_links: int) -> list[int]:
+    """Links from a core to a tile, along x first: the core's port, then the link by which each further tile is entered.
+
+    Examples
+    --------
+    >>> _way(0, 9, 2, 8, 8)
+    [6, 8, 74]
+    """
+    links = [start * tile_links + PORTS + port]
+    y, x = divmod(start, width)
+    to_y, to_x = divmod(end, width)
+    while (x, y) != (to_x, to_y):
+        if x != to_x:
+            direction = EAST if x < to_x else WEST
+            x += 1 if x < to_x else -1
+        else:
+            direction = NORTH if y < to_y else SOUTH
+            y += 1 if y < to_y else -1
+        links.append((y * width + x) * tile_links + direction)
+    return links
+
+
+def prepare(
+    netlist: Netlist,
+    target: Target,
+    table: TimeTable,
+    *,
+    input_tiles: tuple[int, ...] = (),
+    dense: BoolArray | None = None,
+) -> Clock:
+    """Lay a netlist out for the time models.
+
+    Parameters
+    ----------
+    netlist : Netlist
+        The placed network.
+    target : Target
+        Its chip.
+    table : TimeTable
+        One of the chip's time tables.
+    input_tiles : tuple of int
+        Tiles of cores that hold the input channels, as many on each as it has room for; empty if no core holds them.
+    dense : (synapses,) bool, optional
+        Which synapses take the time of a dense list; by default those that are stored in one.
+
+    Raises
+    ------
+    OptionError
+        If the netlist takes several chips.
+    """
+    require_one_chip(netlist.core_tile, target, "time")
+    size, n_inputs = netlist.n_compartments, netlist.n_inputs
+    core_tile = np.append(netlist.core_tile, np.array(input_tiles, np.int64))
+    extra = [min(i * target.limit("core.compartments"), n_inputs) for i in range(1, len(input_tiles) + 1)]
+    inner = np.arange(len(core_tile)) < netlist.n_cores
+    latency = {event: table.picoseconds(event) for event in table.latencies}
+
+    entries = np.diff(netlist.axon_synapses)
+    if dense is None:
+        in_dense = np.where(netlist.format_index_bits[netlist.axon_format] == 0, entries, 0)
+    else:
+        in_dense = np.bincount(netlist.axon_of_synapse()[dense], minlength=netlist.n_axons)
+    processing = latency["axon_in"] + in_dense * latency["synaptic_operation_dense"]
+    processing += (entries - in_dense) * latency["synaptic_operation_sparse"]
+    destination = netlist.core_of_axon()
+    width, tile_cores = target.limit("mesh.width"), target.limit("mesh.tile_cores")
+    port = np.array([np.sum(core_tile[:core] == tile) for core, tile in enumerate(core_tile)])
+    is_input = netlist.axon_source < n_inputs
+    slot = np.where(is_input, netlist.axon_source + size, netlist.axon_source - n_inputs)
+    slots = size + n_inputs if input_tiles else size
+    # the messages of a spike go out in the order of columns, rows and cores of a tile, as the reference has it
+    rank = np.lexsort((port, core_tile // width, core_tile % width)).argsort()
+    order = np.lexsort((rank[destination], slot))
+    on_core, alone = order[slot[order] < slots], order[slot[order] >= slots]
+
+    start = np.append(netlist.core_compartments, size + np.array(extra, np.int64))
+    sender = np.repeat(np.arange(len(core_tile)), np.diff(start))
+    first = np.searchsorted(slot[on_core], np.arange(slots + 1))
+    spike = np.where(inner, latency["spike"], 0)
+    pairs, route = np.unique(sender[slot[on_core]] * len(core_tile) + destination[on_core], return_inverse=True)
+    ways = [
+        _way(int(core_tile[a]), int(core_tile[b]), int(port[a]), width, PORTS + tile_cores)
+        for a, b in (divmod(int(pair), len(core_tile)) for pair in pairs)
+    ]
+    tiles = [[link // (PORTS + tile_cores) for link in way] for way in ways]
+    hop = {True: latency["hop_east_west"], False: latency["hop_north_south"]}
+    unit = lcm(*(len(way) + 1 for way in ways))
+    tables = Tables(
+        start=start,
+        access=np.where(inner, latency["neuron_access"], 0),
+        update=np.where(inner, latency["neuron_update"], 0),
+        spike=spike,
+        axon_out=latency["axon_out"],
+        sender=sender,
+        sending=spike[sender] + np.diff(first) * latency["axon_out"],
+        first=first,
+        destination=destination[on_core],
+        processing=processing[on_core],
+        route=route.reshape(-1),
+        channel_first=np.searchsorted(slot[alone], np.arange(size, size + n_inputs + 1)),
+        channel_destination=destination[alone],
+        channel_processing=processing[alone],
+        route_first=np.cumsum([0, *map(len, ways)]),
+        route_link=np.array([link for way in ways for link in way], np.int64),
+        route_hops=np.array([sum(hop[abs(a - b) == 1] for a, b in pairwise(way)) for way in tiles], np.float64),
+        route_share=np.array([unit // (len(way) + 1) for way in ways], np.int64),
+        unit=unit,
+        capacity=int(table.link_buffer.value),
+    )
+    used = len(np.unique(core_tile))
+    return Clock(netlist=netlist, tables=tables, core_tile=core_tile, barrier=table.barrier(used))
+
+
+def _slots(
+    clock: Clock, spikes: BoolArray, updated: BoolArray, events: EventArray
+) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8], npt.NDArray[np.uint8]]:
+    """Firing slots, working slots and events that nobody sends, as the kernels want them; refuses another's trace."""
+    netlist = clock.netlist
+    if (
+        spikes.ndim != 3
+        or spikes.shape[2] != netlist.n_compartments
+        or updated.shape != spikes.shape
+        or events.shape[:2] != (len(spikes), netlist.n_inputs)
+    ):
+        raise DataError(
+            f"trace: spikes {spikes.shape}, updates {updated.shape} and events {events.shape} found, the netlist has "
+            f"{netlist.n_compartments} compartments and {netlist.n_inputs} input channels; give (recordings, chip "
+            "steps, compartments) twice and (recordings, channels, steps) of one run of this netlist"
+        )
+    fired, worked, seen = (np.ascontiguousarray(bits).view(np.uint8) for bits in (spikes, updated, events != 0))
+    if len(clock.core_tile) == clock.netlist.n_cores:
+        return fired, worked, seen
+    sent = np.zeros((*spikes.shape[:2], clock.netlist.n_inputs), np.uint8)
+    ahead = seen[:, :, 1 : spikes.shape[1] + 1]
+    sent[:, : ahead.shape[2]] = ahead.transpose(0, 2, 1)
+    return np.concatenate([fired, sent], 2), np.concatenate([worked, sent], 2), seen[:, :, :0]
+
+
+def simple(
+    clock: Clock, spikes: BoolArray, updated: BoolArray, events: EventArray, *, steps: IntArray | None = None
+) -> SimpleTimes:
+    """Time a batch of recordings by the simple model.
+
+    Parameters
+    ----------
+    clock : Clock
+        The prepared netlist.
+    spikes, updated : (samples, chip steps, compartments) bool
+        What a simulator found, see :class:`trace.Trace`.
+    events : (samples, n_inputs, T) uint8 or bool
+        What it was given.
+    steps : (samples,) int64, optional
+        Chip steps of each recording, by default all.
+
+    Raises
+    ------
+    DataError
+        If the trace is of another netlist.
+    """
+    fired, worked, events = _slots(clock, spikes, updated, events)
+    samples, length = spikes.shape[:2]
+    cores = len(clock.core_tile)
+    generation, processing = np.zeros((2, samples, length, cores), np.int64)
+    own = np.full(samples, length) if steps is None else steps
+    for i in range(samples):
+        loads(clock.tables, fired[i], worked[i], events[i], int(own[i]), generation[i], processing[i])
+    return simple_times(clock, np.concatenate([generation, processing], axis=2), np.zeros(cores, np.int64), own)
+
+
+def simple_times(clock: Clock, sums: IntArray, sweep: IntArray, steps: IntArray) -> SimpleTimes:
+    """Times of the simple model from what each core does in each step.
+
+    Parameters
+    ----------
+    clock : Clock
+        The prepared netlist.
+    sums : (samples, chip steps, 2 * cores) int64
+        Picoseconds of each core's sweep and sending, then of its receiving.
+    sweep : (cores,) int64
+        Picoseconds that each sweep takes beyond that.
+    steps : (samples,) int64
+        Chip steps of each recording.
+    """
+    samples, length = sums.shape[:2]
+    cores = len(sweep)
+    duration, critical = np.zeros((samples, length)), np.full((samples, length), -1)
+    each, receiving = np.zeros((samples, 2 * cores), np.int64), np.zeros((samples, length), np.bool_)
+    conclude(sums, sweep, steps, clock.barrier, duration, each, critical, receiving)
+    return SimpleTimes(
+        duration_ns=duration / PICOSECONDS,
+        generation_ns=each[:, :cores] / PICOSECONDS,
+        processing_ns=each[:, cores:] / PICOSECONDS,
+        critical_core=critical,
+        receiving=receiving,
+    )
+
+
+def detailed(
+    clock: Clock, spikes: BoolArray, updated: BoolArray, events: EventArray, *, steps: IntArray | None = None
+) -> DetailedTimes:
+    """Time a batch of recordings by the detailed model; parameters and errors as those of :func:`simple`."""
+    fired, worked, events = _slots(clock, spikes, updated, events)
+    samples, length = spikes.shape[:2]
+    own = np.full(samples, length) if steps is None else steps
+    sent, processed, blocked, peak = np.zeros((4, samples, length))
+    core = np.full((samples, length), -1)
+    receives = np.zeros((samples, length), np.bool_)
+    for i in range(samples):
+        found = Steps(sent[i], processed[i], blocked[i], core[i], receives[i], peak[i])
+        schedule(clock.tables, fired[i], worked[i], events[i], int(own[i]), found)
+    runs = np.arange(length) < own[:, None]
+    return DetailedTimes(
+        duration_ns=np.where(runs, np.maximum(sent, processed) + clock.barrier, 0) / PICOSECONDS,
+        sent_ns=sent / PICOSECONDS,
+        processed_ns=processed / PICOSECONDS,
+        blocked_ns=blocked / PICOSECONDS,
+        critical_core=core,
+        receiving=receives,
+        peak_load=peak,
+    )

@@ -1,0 +1,380 @@
+"""Loops of :mod:`loihi1.timing`, compiled with numba.
+
+Latencies are whole picoseconds and link loads are whole multiples of one over ``Tables.unit``, so sums neither round
+nor depend on their order. Only what congestion and blocking add is fractional.
+
+*Who is next.* Two winner trees hold the cores, one by the time of their next message, one by the time at which their
+earliest message under way arrives. Messages to one core arrive in the order in which they are sent, so each core
+needs only a queue, and a message costs a few steps of a tree whatever the number of cores. Of equal times the lower
+core comes first.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from spikeloom.compiler.fixedpoint import FloatArray, IntArray
+from spikeloom.runtime.machines.loihi1.kernel import compiled, compiled_and_cached
+
+AnyArray = npt.NDArray[Any]
+
+
+class Tables(NamedTuple):
+    """A placed netlist as the time models see it; nothing in here changes.
+
+    *Slots* are what a core sweeps: compartments in the order of their ids, then, where they are on a core, the input
+    channels.
+
+    Parameters
+    ----------
+    start : (cores + 1,) int64
+        Bounds of each core in the slots.
+    access, update, spike : (cores,) int64
+        Picoseconds of a slot on each core.
+    axon_out : int
+        Picoseconds of a message at its sender.
+    sender, sending : (slots,) int64
+        Core of each slot, and picoseconds of a spike there, messages included.
+    first : (slots + 1,) int64
+        Bounds of each slot in the deliveries.
+    destination, processing, route : (deliveries,) int64
+        Core that receives it, picoseconds that it takes there, and way that it goes.
+    channel_first, channel_destination, channel_processing
+        The same for input channels that are on no core; they go no way.
+    route_first, route_link : int64
+        Bounds of each way in the links, and the links, the sender's own port first.
+    route_hops : (ways,) float64
+        Picoseconds of the hops.
+    route_share : (ways,) int64
+        What one message adds to each link of its way, ``unit / (links + 1)``, a whole number.
+    unit : int
+        What a load of one message is counted as.
+    capacity : int
+        Messages that a link holds.
+    """
+
+    start: IntArray
+    access: IntArray
+    update: IntArray
+    spike: IntArray
+    axon_out: int
+    sender: IntArray
+    sending: IntArray
+    first: IntArray
+    destination: IntArray
+    processing: IntArray
+    route: IntArray
+    channel_first: IntArray
+    channel_destination: IntArray
+    channel_processing: IntArray
+    route_first: IntArray
+    route_link: IntArray
+    route_hops: FloatArray
+    route_share: IntArray
+    unit: int
+    capacity: int
+
+
+class Steps(NamedTuple):
+    """What :func:`schedule` finds about each step of a recording; all arrays are (steps,), times in picoseconds."""
+
+    sent: FloatArray
+    processed: FloatArray
+    blocked: FloatArray
+    core: IntArray
+    receives: AnyArray
+    peak: FloatArray
+
+
+@compiled
+def _inject(first: IntArray, destination: IntArray, cost: IntArray, events: AnyArray, t: int, busy: Any) -> None:
+    """Let each core process the input events of a step that nobody sends."""
+    if t < events.shape[1]:
+        for channel in range(first.size - 1):
+            if events[channel, t]:
+                for a in range(first[channel], first[channel + 1]):
+                    busy[destination[a]] += cost[a]
+
+
+@compiled
+def _works(row: AnyArray) -> int:
+    """Number of ones; in 32 bits, for wider numbers would halve the speed."""
+    works = np.int32(0)
+    for i in range(row.size):
+        works = np.int32(works + np.int32(row[i]))
+    return int(works)
+
+
+@compiled
+def _list_fired(row: AnyArray, fired: IntArray) -> int:
+    """List the slots of a row that are not zero; `fired` has room for one more than the row. Return how many."""
+    n = 0
+    whole = row.size // 8
+    words = row[: 8 * whole].view(np.uint64)
+    for w in range(whole):
+        if words[w]:  # most groups of eight are silent
+            for i in range(8 * w, 8 * w + 8):
+                fired[n] = i
+                n += row[i]
+    for i in range(8 * whole, row.size):
+        fired[n] = i
+        n += row[i]
+    return n
+
+
+@compiled
+def charge(tables: Tables, fired: IntArray, generation: IntArray, processing: IntArray) -> None:
+    """Add what the spikes of a step cost: sending on their own cores, and receiving; both (cores,) picoseconds."""
+    # an array taken out of a tuple costs more than a message: take them out once
+    sender, sending, first = tables.sender, tables.sending, tables.first
+    destination, cost = tables.destination, tables.processing
+    for k in range(fired.size):
+        slot = fired[k]
+        generation[sender[slot]] += sending[slot]
+        for a in range(first[slot], first[slot + 1]):
+            processing[destination[a]] += cost[a]
+
+
+@compiled_and_cached
+def loads(
+    tables: Tables,
+    fired: AnyArray,
+    updated: AnyArray,
+    events: AnyArray,
+    steps: int,
+    generation: IntArray,
+    processing: IntArray,
+) -> None:
+    """Picoseconds that each core spends on sweep and sending, and on receiving; both (steps, cores), zeroed."""
+    first, destination, cost = tables.channel_first, tables.channel_destination, tables.channel_processing
+    slots = np.empty(fired.shape[1] + 1, np.int64)
+    for t in range(steps):
+        n = _list_fired(fired[t], slots)
+        charge(tables, slots[:n], generation[t], processing[t])
+        _inject(first, destination, cost, events, t, processing[t])
+        for core in range(tables.access.size):
+            begin, end = tables.start[core], tables.start[core + 1]
+            generation[t, core] += (end - begin) * tables.access[core]
+            generation[t, core] += _works(updated[t, begin:end]) * tables.update[core]
+
+
+@compiled_and_cached
+def conclude(
+    sums: AnyArray,
+    sweep: IntArray,
+    steps: IntArray,
+    barrier: int,
+    duration: FloatArray,
+    each: IntArray,
+    critical: IntArray,
+    receiving: AnyArray,
+) -> None:
+    """Find the slowest core of each step, the sum of all steps, and how long each step takes.
+
+    Parameters
+    ----------
+    sums : (samples, chip steps, 2 * cores) int64
+        Picoseconds that events cost each core's sweep and sending, then its receiving.
+    sweep : (cores,) int64
+        Picoseconds that a sweep takes in any case.
+    steps : (samples,) int64
+        Chip steps of each recording; nothing happens after them.
+    barrier : int
+        Picoseconds that end a step.
+    duration, critical, receiving : (samples, chip steps) float64, int64, bool
+        Filled for the steps of each recording; picoseconds.
+    each : (samples, 2 * cores) int64
+        Zeros; filled with the sum of all steps.
+    """
+    cores = sweep.size
+    for r in range(sums.shape[0]):
+        for t in range(steps[r]):
+            longest, which = np.int64(-1), 0
+            for i in range(2 * cores):
+                spent = sums[r, t, i] + (sweep[i] if i < cores else 0)
+                each[r, i] += spent
+                if spent > longest:
+                    longest, which = spent, i
+            duration[r, t] = longest + barrier
+            critical[r, t] = which % cores
+            receiving[r, t] = which >= cores
+
+
+@compiled
+def _replay(tree: IntArray, key: FloatArray, leaf: int) -> None:
+    """Mend a winner tree after the key of one leaf changed; the left of two equal keys wins."""
+    node = (key.size + leaf) >> 1
+    while node:
+        left, right = tree[2 * node], tree[2 * node + 1]
+        tree[node] = right if key[right] < key[left] else left
+        node >>= 1
+
+
+@compiled
+def _fill(tree: IntArray, key: FloatArray) -> None:
+    """Build a winner tree."""
+    for leaf in range(key.size):
+        tree[key.size + leaf] = leaf
+    for node in range(key.size - 1, 0, -1):
+        left, right = tree[2 * node], tree[2 * node + 1]
+        tree[node] = right if key[right] < key[left] else left
+
+
+@compiled
+def _list_messages(
+    tables: Tables, row: AnyArray, worked: AnyArray, delivery: IntArray, generation: IntArray, queue: IntArray
+) -> None:
+    """List what each core sends in a step: delivery (-1 for work after its last message) and time it takes."""
+    start, first, axon_out = tables.start, tables.first, tables.axon_out
+    n = 0
+    for core in range(start.size - 1):
+        access, update, spike = tables.access[core], tables.update[core], tables.spike[core]
+        queue[core] = n
+        spent = 0
+        for i in range(start[core], start[core + 1]):
+            spent += access + (update if worked[i] else 0)
+            if row[i]:
+                spent += spike
+                for a in range(first[i], first[i + 1]):
+                    delivery[n] = a
+                    generation[n] = spent + axon_out
+                    spent = 0
+                    n += 1
+        if spent:
+            delivery[n] = -1
+            generation[n] = spent
+            n += 1
+    queue[start.size - 1] = n
+
+
+@compiled
+def _wait(first: int, end: int, route_link: IntArray, load: IntArray, unit: int) -> float:
+    """Messages along a way."""
+    total = 0
+    for i in range(first, end):
+        total += load[route_link[i]]
+    return float(total / unit)
+
+
+@compiled
+def _occupy(first: int, end: int, route_link: IntArray, load: IntArray, share: int) -> int:
+    """Add to the links of a way; return the highest load on it."""
+    highest = 0
+    for i in range(first, end):
+        link = route_link[i]
+        load[link] += share
+        highest = max(highest, load[link])
+    return highest
+
+
+@compiled
+def _send_all(  # noqa: PLR0915 - one loop over local state, which numba passes to parts of it only at a price
+    tables: Tables,
+    delivery: IntArray,
+    generation: IntArray,
+    queue: IntArray,
+    received: FloatArray,
+    later: IntArray,
+    load: IntArray,
+    done: FloatArray,
+    free: FloatArray,
+) -> tuple[float, float]:
+    """Send the messages of a step; return for how long cores were blocked and the highest load of a link.
+
+    `done` and `free` become the times at which each core has sent and processed everything.
+    """
+    # an array taken out of a tuple costs more than a message: take them out once
+    destination, processing, route = tables.destination, tables.processing, tables.route
+    route_first, route_link, route_share = tables.route_first, tables.route_link, tables.route_share
+    route_hops, unit = tables.route_hops, tables.unit
+    cores = done.size
+    leaves = 1
+    while leaves < cores:
+        leaves *= 2
+    senders, due = np.empty(2 * leaves, np.int64), np.full(leaves, np.inf)
+    winners, arrives = np.empty(2 * leaves, np.int64), np.full(leaves, np.inf)
+    cursor, front, back = queue[:cores].copy(), np.full(cores, -1), np.empty(cores, np.int64)
+    for core in range(cores):
+        if queue[core] < queue[core + 1]:
+            due[core] = generation[queue[core]]
+    _fill(senders, due)
+    _fill(winners, arrives)
+    under_way, work_under_way = 0, 0
+    blocked, peak = 0.0, 0
+    while due[senders[1]] < np.inf:
+        core = senders[1]
+        m = cursor[core]
+        sent = due[core]
+        a = delivery[m]
+        if a >= 0:
+            # what has arrived leaves the mesh
+            while arrives[winners[1]] <= sent:
+                to = winners[1]
+                gone = front[to]
+                other = delivery[gone]
+                way = route[other]
+                _occupy(route_first[way], route_first[way + 1], route_link, load, -route_share[way])
+                under_way -= 1
+                work_under_way -= processing[other]
+                front[to] = later[gone]
+                arrives[to] = np.inf if later[gone] < 0 else received[later[gone]]
+                _replay(winners, arrives, to)
+            # what is under way slows or blocks the message
+            way = route[a]
+            begin, end = route_first[way], route_first[way + 1]
+            links = end - begin
+            along = _wait(begin, end, route_link, load, unit)
+            mean = work_under_way / under_way if under_way else 0.0
+            if along > links * tables.capacity:
+                block = (along - links * tables.capacity) * mean
+                blocked += block
+                sent += block
+            to = destination[a]
+            received[m] = max(free[to], sent + max(route_hops[way], along * mean / links))
+            free[to] = received[m] + processing[a]
+            # it enters the mesh
+            peak = max(peak, _occupy(begin, end, route_link, load, route_share[way]))
+            under_way += 1
+            work_under_way += processing[a]
+            later[m] = -1
+            if front[to] < 0:
+                front[to] = m
+                arrives[to] = received[m]
+                _replay(winners, arrives, to)
+            else:
+                later[back[to]] = m
+            back[to] = m
+        done[core] = sent
+        cursor[core] = m + 1
+        due[core] = sent + generation[m + 1] if m + 1 < queue[core + 1] else np.inf
+        _replay(senders, due, core)
+    return blocked, peak / unit
+
+
+@compiled_and_cached
+def schedule(tables: Tables, fired: AnyArray, updated: AnyArray, events: AnyArray, steps: int, found: Steps) -> None:
+    """Send the messages of each step in the order of time; :mod:`loihi1.timing_spec` is the definition."""
+    cores = tables.access.size
+    most = tables.destination.size + cores
+    delivery, generation, later = np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most, np.int64)
+    received, queue = np.empty(most, np.float64), np.empty(cores + 1, np.int64)
+    load = np.zeros(tables.route_link.max() + 1 if tables.route_link.size else 0, np.int64)
+    done, free = np.empty(cores, np.float64), np.empty(cores, np.float64)
+    first, destination, cost = tables.channel_first, tables.channel_destination, tables.channel_processing
+    for t in range(steps):
+        load[:] = 0
+        done[:] = 0
+        free[:] = 0
+        _inject(first, destination, cost, events, t, free)
+        _list_messages(tables, fired[t], updated[t], delivery, generation, queue)
+        found.blocked[t], found.peak[t] = _send_all(
+            tables, delivery, generation, queue, received, later, load, done, free
+        )
+        sender, receiver = np.argmax(done), np.argmax(free)
+        found.sent[t] = done[sender]
+        found.processed[t] = free[receiver]
+        found.receives[t] = free[receiver] > done[sender]
+        found.core[t] = receiver if free[receiver] > done[sender] else sender

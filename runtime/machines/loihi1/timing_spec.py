@@ -1,0 +1,217 @@
+"""The definition of the two time models of :mod:`loihi1.timing`: plain Python, one message at a time, to be read.
+
+Both must agree on every figure, exactly. All times are picoseconds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fractions import Fraction
+
+import numpy as np
+
+from spikeloom.compiler.targets.base import Target, TimeTable
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.runtime.machines.loihi1.engine import EventArray
+from spikeloom.runtime.machines.loihi1.trace import BoolArray
+
+Link = tuple[int, int, str]
+
+
+@dataclass(slots=True, kw_only=True)
+class Message:
+    """What a core does up to the end of one message, or after its last one; that has no destination.
+
+    Parameters
+    ----------
+    source, destination : int
+        Cores; the destination is -1 where nothing is sent.
+    generation : int
+        Work of the sender since its message before.
+    processing : int
+        Work of the receiver.
+    sent, received : float
+        Times within the step.
+    """
+
+    source: int
+    destination: int
+    generation: int
+    processing: int
+    sent: float = 0.0
+    received: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StepTimes:
+    """One step of a recording; see :class:`timing.DetailedTimes` for the meaning of the fields."""
+
+    generation: list[int]
+    processing: list[int]
+    simple: int
+    detailed: float
+    sent: float
+    processed: float
+    blocked: float
+    critical_core: int
+    receiving: bool
+    peak_load: float
+
+
+class Chip:
+    """Where everything is and what it takes."""
+
+    def __init__(self, netlist: Netlist, target: Target, table: TimeTable, input_tiles: tuple[int, ...] = ()) -> None:
+        self.netlist = netlist
+        self.table = table
+        self.inputs_on_core = bool(input_tiles)
+        self.tile = [*netlist.core_tile.tolist(), *input_tiles]
+        self.width = target.limit("mesh.width")
+        room = target.limit("core.compartments")
+        bounds = netlist.core_compartments.tolist()
+        # sources in the order in which each core sweeps them
+        self.sweep = [
+            [netlist.n_inputs + c for c in range(bounds[k], bounds[k + 1])] for k in range(netlist.n_cores)
+        ] + [list(range(netlist.n_inputs))[i * room : (i + 1) * room] for i in range(len(input_tiles))]
+        core_of_axon = netlist.core_of_axon().tolist()
+        self.deliveries: dict[int, list[tuple[int, int]]] = {}
+        for axon, source in enumerate(netlist.axon_source.tolist()):
+            dense = netlist.format_index_bits[netlist.axon_format[axon]] == 0
+            synapses = int(netlist.axon_synapses[axon + 1] - netlist.axon_synapses[axon])
+            work = table.picoseconds("axon_in") + synapses * table.picoseconds(
+                "synaptic_operation_dense" if dense else "synaptic_operation_sparse"
+            )
+            self.deliveries.setdefault(source, []).append((core_of_axon[axon], work))
+        for deliveries in self.deliveries.values():
+            # messages of one spike go out in the order of columns, rows and cores of a tile
+            deliveries.sort(key=lambda delivery: (*self.place(delivery[0]), delivery[0]))
+
+    def place(self, core: int) -> tuple[int, int]:
+        """Column and row of a core's tile."""
+        return self.tile[core] % self.width, self.tile[core] // self.width
+
+    def way(self, source: int, destination: int) -> list[Link]:
+        """Links from core to core: the sender's own port, then the one by which each further tile is entered."""
+        (x, y), (to_x, to_y) = self.place(source), self.place(destination)
+        links: list[Link] = [(x, y, f"core {source}")]
+        while x != to_x:
+            step = 1 if to_x > x else -1
+            x += step
+            links.append((x, y, f"x {step}"))
+        while y != to_y:
+            step = 1 if to_y > y else -1
+            y += step
+            links.append((x, y, f"y {step}"))
+        return links
+
+    def flight(self, source: int, destination: int) -> int:
+        """Least time from core to core."""
+        (x, y), (to_x, to_y) = self.place(source), self.place(destination)
+        return abs(x - to_x) * self.table.picoseconds("hop_east_west") + abs(y - to_y) * self.table.picoseconds(
+            "hop_north_south"
+        )
+
+    def messages(self, core: int, fired: set[int], worked: set[int]) -> list[Message]:
+        """What one core sends in a step, in order."""
+        is_input = core >= self.netlist.n_cores
+        access, update, spike = (
+            0 if is_input else self.table.picoseconds(event) for event in ("neuron_access", "neuron_update", "spike")
+        )
+        messages = []
+        spent = 0
+        for source in self.sweep[core]:
+            spent += access
+            if source in worked:
+                spent += update
+            if source in fired:
+                spent += spike
+                for destination, work in self.deliveries.get(source, []):
+                    spent += self.table.picoseconds("axon_out")
+                    messages.append(Message(source=core, destination=destination, generation=spent, processing=work))
+                    spent = 0
+        if spent:
+            messages.append(Message(source=core, destination=-1, generation=spent, processing=0))
+        return messages
+
+    def step(self, fired: set[int], worked: set[int], injected: set[int]) -> StepTimes:
+        """Time one step.
+
+        Parameters
+        ----------
+        fired, worked : set of int
+            Sources on cores that fire and that have work to do.
+        injected : set of int
+            Input channels on no core that have an event.
+        """
+        cores = range(len(self.tile))
+        waiting = [self.messages(core, fired, worked) for core in cores]
+        barrier = self.table.barrier(len(set(self.tile)))
+        given = [0 for _ in cores]
+        for channel in injected:
+            for destination, work in self.deliveries.get(channel, []):
+                given[destination] += work
+
+        generation = [sum(message.generation for message in waiting[core]) for core in cores]
+        processing = [
+            given[core] + sum(m.processing for queue in waiting for m in queue if m.destination == core)
+            for core in cores
+        ]
+
+        free = [float(work) for work in given]  # when each core has processed what it received
+        done = [0.0 for _ in cores]  # when each core ended what it sends
+        mesh: list[Message] = []
+        blocked, peak = 0.0, Fraction(0)
+        while any(waiting):
+            # the earliest message of all cores; of several at one time that of the lowest core
+            core = min((c for c in cores if waiting[c]), key=lambda c: (done[c] + waiting[c][0].generation, c))
+            message = waiting[core].pop(0)
+            message.sent = done[core] + message.generation
+            if message.destination >= 0:
+                mesh = [other for other in mesh if other.received > message.sent]
+                way = self.way(core, message.destination)
+                along = float(sum((self.load(mesh, link) for link in way), Fraction(0)))
+                mean = sum(other.processing for other in mesh) / len(mesh) if mesh else 0.0
+                capacity = len(way) * int(self.table.link_buffer.value)
+                if along > capacity:
+                    block = (along - capacity) * mean
+                    blocked += block
+                    message.sent += block
+                arrival = message.sent + max(self.flight(core, message.destination), along * mean / len(way))
+                message.received = max(free[message.destination], arrival)
+                free[message.destination] = message.received + message.processing
+                mesh.append(message)
+                peak = max(peak, *(self.load(mesh, link) for link in way))
+            done[core] = message.sent
+
+        sent, processed = max(done), max(free)
+        return StepTimes(
+            generation=generation,
+            processing=processing,
+            simple=max(generation + processing) + barrier,
+            detailed=max(sent, processed) + barrier,
+            sent=sent,
+            processed=processed,
+            blocked=blocked,
+            critical_core=free.index(processed) if processed > sent else done.index(sent),
+            receiving=processed > sent,
+            peak_load=float(peak),
+        )
+
+    def load(self, mesh: list[Message], link: Link) -> Fraction:
+        """Messages on a link: each is spread evenly over the links of its way and its end."""
+        ways = [self.way(message.source, message.destination) for message in mesh]
+        return sum((Fraction(1, len(way) + 1) for way in ways if link in way), Fraction(0))
+
+    def run(self, spikes: BoolArray, updated: BoolArray, events: EventArray) -> list[StepTimes]:
+        """Time one recording: `spikes` and `updated` (chip steps, compartments), `events` (n_inputs, T)."""
+        times = []
+        for t in range(len(spikes)):
+            fired = {self.netlist.n_inputs + int(c) for c in np.flatnonzero(spikes[t])}
+            worked = {self.netlist.n_inputs + int(c) for c in np.flatnonzero(updated[t])}
+            step = t + 1 if self.inputs_on_core else t  # a channel on a core sends in the step before
+            channels = {int(c) for c in np.flatnonzero(events[:, step])} if step < events.shape[1] else set()
+            if self.inputs_on_core:
+                times.append(self.step(fired | channels, worked, set()))
+            else:
+                times.append(self.step(fired, worked, channels))
+        return times

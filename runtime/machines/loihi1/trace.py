@@ -1,0 +1,175 @@
+"""What a simulation hands back: spikes, membranes, counts. Shared by both simulators; nobody else counts.
+
+Chip steps run from 0 to ``T + netlist.max_depth - 1`` for a recording of ``T`` data steps. Compartments are in the
+order of the netlist's ids. A batch of recordings adds one leading axis to every array.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from spikeloom.compiler.errors import DataError, NumericRangeError
+from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, IntArray
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
+
+BoolArray = npt.NDArray[np.bool_]
+MembraneArray = npt.NDArray[np.int32]
+
+REGISTER_LIMITS = {"synaptic sum": ACCUMULATOR_MAX, "current": CURRENT_MAX}
+"""Registers that may not overflow, in the order in which a step fills them, and their largest magnitude."""
+
+ENGINES = ("spikeloom", "onnx")
+"""What can be held against the specification: our engine, or onnxruntime beside it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Counts:
+    """Events of a whole run; every array is int64.
+
+    Parameters
+    ----------
+    inputs : (…, n_inputs) int64
+        Input events per channel.
+    spikes : (…, compartments) int64
+        Spikes per compartment.
+    updates : (…, layers) int64
+        Neuron updates: compartment-steps inside the layer's window in which the compartment had work to do, that is
+        its membrane or its current was not zero before the step, or an active axon held a synapse to it (whatever
+        the weight), or its bias is not zero.
+    saturations : (…, layers) int64
+        Compartment-steps whose membrane was clipped to its register.
+    """
+
+    inputs: IntArray
+    spikes: IntArray
+    updates: IntArray
+    saturations: IntArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Charges:
+    """What events add to some sums of each chip step: times, energies, anything that is linear in them.
+
+    Parameters
+    ----------
+    channels : (n_inputs, sums) int64
+        By an input event of each channel.
+    spikes : (compartments, sums) int64
+        By a spike of each compartment.
+    updates : (compartments, sums) int64
+        By an update of each compartment. All three are below 2**31 in magnitude.
+    """
+
+    channels: IntArray
+    spikes: IntArray
+    updates: IntArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Trace:
+    """Result of a simulation.
+
+    Parameters
+    ----------
+    counts : Counts
+        What happened, summed over chip steps.
+    spikes : (…, chip steps, compartments) bool, or None
+        Whether a compartment spiked in a chip step; None where it was not asked for.
+    membranes : (…, chip steps, compartments) int32, or None
+        The saturated membrane that was compared with the threshold, before a spike resets it, in 1/64 of a weight
+        unit; zero outside the layer's window. None where it was not asked for.
+    updated : (…, chip steps, compartments) bool, or None
+        Whether a compartment had work to do in a chip step, as ``Counts.updates`` counts it; None where it was not
+        asked for.
+    charged : (…, chip steps, sums) int64, or None
+        What the events of each chip step add up to under the charges that the engine was prepared with.
+    packed : (…, chip steps, ceil(compartments / 64)) uint64, or None
+        The spikes at a bit each: that of compartment c is bit ``c % 64`` of word ``c // 64``; see :func:`unpack`. None
+        where it was not asked for.
+    """
+
+    counts: Counts
+    spikes: BoolArray | None
+    membranes: MembraneArray | None
+    updated: BoolArray | None = None
+    charged: IntArray | None = None
+    packed: npt.NDArray[np.uint64] | None = None
+
+
+def pack(spikes: BoolArray) -> npt.NDArray[np.uint64]:
+    """Spikes (…, compartments) at a bit each; the layout of ``Trace.packed``."""
+    bits = np.zeros((*spikes.shape[:-1], -(-spikes.shape[-1] // 64) * 8), np.uint8)
+    bits[..., : -(-spikes.shape[-1] // 8)] = np.packbits(spikes, axis=-1, bitorder="little")
+    return bits.view("<u8").astype(np.uint64)
+
+
+def unpack(packed: npt.NDArray[np.uint64], compartments: int) -> BoolArray:
+    """Spikes (…, compartments) of ``Trace.packed``.
+
+    Examples
+    --------
+    >>> unpack(np.array([[5]], np.uint64), 4).tolist()
+    [[True, False, True, False]]
+    """
+    flags = packed.astype("<u8").view(np.uint8)
+    return np.unpackbits(flags, axis=-1, count=compartments, bitorder="little").view(np.bool_)
+
+
+def aligned(netlist: Netlist, array: npt.NDArray[Any], layer: int) -> npt.NDArray[Any]:
+    """Cut one layer out of a trace and shift it back by its depth, as the float model counts time.
+
+    Parameters
+    ----------
+    netlist : Netlist
+        The network that was simulated.
+    array : (…, chip steps, compartments)
+        Spikes or membranes of a :class:`Trace`.
+    layer : int
+        Index into ``netlist.layers``.
+
+    Returns
+    -------
+    (…, T, neurons)
+        Ordered by neuron; zero for neurons that the chip does not hold.
+    """
+    depth = netlist.layers[layer].depth
+    length = array.shape[-2] - netlist.max_depth
+    ids = netlist.compartments_of(layer)
+    held = array[..., depth : depth + length, ids]
+    if len(ids) == netlist.layers[layer].neurons:
+        return held
+    whole = np.zeros((*held.shape[:-1], netlist.layers[layer].neurons), held.dtype)
+    whole[..., netlist.neuron[ids]] = held
+    return whole
+
+
+def heard(netlist: Netlist, layer: int) -> slice | IntArray:
+    """Neurons of a layer whose spikes can be compared: all but those left out because nobody hears them."""
+    unheard = netlist.layers[layer].unheard
+    return np.setdiff1d(np.arange(netlist.layers[layer].neurons), unheard) if unheard else slice(None)
+
+
+def check_channels(netlist: Netlist, channels: int) -> None:
+    """Raise DataError unless recordings of so many input channels fit the network."""
+    if channels != netlist.n_inputs:
+        ticking = netlist.clocks.channels
+        clocks = f", {ticking} of them clocks (spikeloom.compiler.dynamics.with_clocks)" if ticking else ""
+        raise DataError(
+            f"recordings: {channels} input channels found, the netlist has {netlist.n_inputs}{clocks}; "
+            "use recordings of the sensor that the network was compiled for"
+        )
+
+
+def range_error(netlist: Netlist, register: str, compartment: int, chip_step: int, value: int) -> NumericRangeError:
+    """Error of a register that would overflow; `register` is a key of `REGISTER_LIMITS`."""
+    layer = netlist.layers[netlist.layer[compartment]].name
+    neuron = netlist.neuron[compartment]
+    core = int(np.searchsorted(netlist.core_compartments, compartment, side="right")) - 1
+    return NumericRangeError(
+        f"{layer} neuron {neuron} on core {core}, chip step {chip_step}: {register} {value} found, "
+        f"magnitudes up to {REGISTER_LIMITS[register]} allowed; compile with a smaller scale for {layer}"
+    )

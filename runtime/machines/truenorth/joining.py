@@ -1,0 +1,94 @@
+"""``join`` of networks that were trained for TrueNorth."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from spikeloom.compiler.errors import ModelError, OptionError
+from spikeloom.compiler.targets.truenorth.native import SYSTEM, NativeNetwork, joined
+from spikeloom.compiler.targets.truenorth.native_file import Trained, read_trained, write_trained
+from spikeloom.runtime.commands.inputs import progress, recordings, require_place, shipped
+
+Report = dict[str, Any]
+Outcome = tuple[Report, Callable[[Report], str], int]
+
+KEPT = ("command", "seed", "epochs", "recipe", "data", "data_sha256", "test_samples")
+"""Parts of a network's training record that the joined one keeps, beside what the chosen weights reached."""
+
+
+def join(arguments: argparse.Namespace, as_text: Callable[[Report], str]) -> Outcome:
+    """Put the towers of several networks into one file.
+
+    Raises
+    ------
+    ModelError, OptionError
+        If a network cannot be used, or they do not fit together.
+    """
+    for name in arguments.checkpoints:
+        require_place(arguments.output, "-o", argparse.Namespace(checkpoint=name))
+    found = [read_trained(shipped(name), weights=arguments.weights) for name in arguments.checkpoints]
+    towers = [
+        record for name, trained in zip(arguments.checkpoints, found, strict=True) for record in _records(name, trained)
+    ]
+    if len(towers) < 2:
+        raise OptionError(f"join: {arguments.checkpoints[0]} is one network already; give two or more")
+    graphs = {(trained.graph, trained.edges.tobytes()) for trained in found}
+    if len(graphs) > 1:
+        names = ", ".join(trained.graph for trained in found)
+        raise ModelError(f"join: the networks have other graphs: {names}; give networks of one kind")
+    try:
+        network = joined([trained.network for trained in found])
+    except ValueError as error:
+        raise ModelError(f"join: {', '.join(arguments.checkpoints)} {error}; give networks of one kind") from error
+    words = [name if shipped(name) != name else Path(name).name for name in arguments.checkpoints]
+    words += [f"--weights {arguments.weights}"] if arguments.weights else []
+    words += ["--data", Path(arguments.data).name] if arguments.data is not None else []
+    record: Report = {"command": f"spikeloom join {' '.join(words)}", "towers": towers}
+    if arguments.data is not None:
+        record["test"] = _measured(arguments.data, network, {tower.get("data_sha256") for tower in towers})
+    sha256 = write_trained(
+        arguments.output, {"last": network}, graph=found[0].graph, edges=found[0].edges, training=record
+    )
+    report = {
+        **record,
+        "system": SYSTEM,
+        "graph": found[0].graph,
+        "classes": network.classes,
+        "layers": [{"name": name, "neurons": neurons} for name, neurons in network.neurons.items()],
+        "file": Path(arguments.output).name,
+        "sha256": sha256,
+    }
+    return report, as_text, 0
+
+
+def _measured(path: str, network: NativeNetwork, trained_on: set[str | None]) -> Report:
+    """What the joined network reaches on the test split of the data that all its towers were trained on."""
+    from spikeloom.models.training.protocols import data_digest  # torch, so only here
+    from spikeloom.models.truenorth.network import predict
+
+    progress("reading the recordings")
+    training, test = (
+        recordings(path, split, classes=network.classes, taxels=network.taxels, labels_for="join")
+        for split in ("train", "test")
+    )
+    if trained_on != {data_digest(training, test)}:
+        raise OptionError(f"--data {path}: the networks were trained on other recordings; give those")
+    progress("measuring")
+    correct = int(np.count_nonzero(predict(network, test) == test.labels))
+    return {"correct": correct, "samples": len(test), "accuracy": correct / len(test), "data": Path(path).name}
+
+
+def _records(name: str, trained: Trained) -> list[Report]:
+    """Where each tower of a file is from."""
+    training, count = trained.training, len(trained.network.towers)
+    held = training.get("towers")
+    if count > 1 and isinstance(held, list) and len(held) == count:
+        return held
+    kept = [key for key in (*KEPT, trained.weights) if key in training]
+    origin = {"file": Path(name).name, "sha256": trained.sha256, "weights": trained.weights}
+    return [origin | {key: training[key] for key in kept}] * count

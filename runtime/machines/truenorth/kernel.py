@@ -1,0 +1,402 @@
+"""Machine code of the engine: one recording, all its ticks; :mod:`truenorth.engine` makes the arrays.
+
+Work follows events: a tick visits the axons that have a spike and the neurons that are reached or awake. A neuron
+sleeps while a tick without arrivals would change nothing about it. *Steady* neurons, the first ones, live through every
+tick, all at once, and what an axon brings them is added in rows of neighbours. Those before `plain` are reset to a
+value and held at their negative threshold; the others are reset to values on both sides, or by their threshold. None of
+them can leave its register in a tick that it begins at its cap or below; all but those that are reset by their
+threshold provably do. Where one of these does not, the run is broken off.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from spikeloom.compiler.fixedpoint import IntArray
+from spikeloom.compiler.targets.truenorth.netlist import RESET_LINEAR, RESET_TO
+from spikeloom.runtime.machines.loihi1.kernel import compiled, compiled_and_cached
+from spikeloom.runtime.machines.truenorth.trace import MIX_1, MIX_2, STEP_NEURON, STEP_TICK
+
+Int32 = npt.NDArray[np.int32]
+
+(
+    LEAK,
+    REVERSAL,
+    THRESHOLD,
+    MASK_BITS,
+    RESET_MODE,
+    RESET,
+    NEGATIVE,
+    SATURATES,
+    REST,
+    WIRE_AXON,
+    WIRE_DELAY,
+    VOTES_FROM,
+) = range(12)
+"""Columns of the parameters of a neuron. ``REST`` is a membrane that stays as it is without arrivals, or ``NO_REST``;
+``VOTES_FROM`` the tick from which on its spikes count, -1 for never; ``WIRE_AXON`` -1 where it has no target."""
+
+NO_REST = -(2**31)
+
+HALF, LOWER = 32, 2**32 - 1
+"""Positive and negative weights are added up in one number: in its upper half, and as magnitudes in its lower."""
+
+WORD = 8
+"""Spikes of steady neurons that are looked at together."""
+
+BROKEN_OFF = -1
+
+_STEP_NEURON, _STEP_TICK = np.uint64(STEP_NEURON), np.uint64(STEP_TICK)
+_MIX_1, _MIX_2 = np.uint64(MIX_1), np.uint64(MIX_2)
+_30, _27, _31, _64, _ONE = np.uint64(30), np.uint64(27), np.uint64(31), np.uint64(64), np.uint64(1)
+
+
+class Wiring(NamedTuple):
+    """What does not change while a recording runs.
+
+    Parameters
+    ----------
+    offsets : (offsets,) int64
+        Ticks of a data step in which channels are fed.
+    feed_bounds : (offsets, channels + 1) int64
+        Rows of `feed_axon` that a channel feeds at an offset.
+    feed_axon : (feeds,) int32
+    clocks : (clocks, 3) int64
+        Axon, period, phase.
+    segment_bounds : (axons + 1,) int64
+        Segments of each axon.
+    segments : (segments, 3) int64
+        First steady neuron, the one after the last, and where in `row` the weights for them begin.
+    row : (…) int32
+        Weights of segments, zero where nothing is joined.
+    plain : int
+        Number of plain steady neurons, the first ones.
+    steady : (7, steady) int32
+        Leak, threshold, reset, the negative threshold below zero, what a membrane below that becomes, 1 for a reset by
+        the threshold, and the cap.
+    axon_synapses : (axons + 1,) int64
+        Crossing points with all other neurons.
+    synapse_neuron : (synapses,) int32
+    synapse_weight : (synapses,) int64
+        In halves.
+    number : (neurons,) int64
+        Which neuron of the network it is, whose random numbers it draws.
+    parameters : (neurons, 12) int32
+    direct : (neurons,) bool
+        Whether a spike reaches steady neurons alone, in the next tick, on an axon that nothing else leads to.
+    instant : (neurons,) int32
+        The leak, below zero, of neurons that start each tick at zero and spike where they do not end it below zero;
+        0 for all others.
+    initial : (neurons,) int32
+    """
+
+    offsets: IntArray
+    feed_bounds: IntArray
+    feed_axon: Int32
+    clocks: IntArray
+    segment_bounds: IntArray
+    segments: IntArray
+    row: Int32
+    plain: int
+    steady: Int32
+    axon_synapses: IntArray
+    synapse_neuron: Int32
+    synapse_weight: IntArray
+    number: IntArray
+    parameters: Int32
+    direct: npt.NDArray[np.bool_]
+    instant: Int32
+    initial: Int32
+
+
+class State(NamedTuple):
+    """What changes: membranes, arrivals, who works this tick, and spikes on their way by the slot of their tick."""
+
+    membrane: Int32
+    steady_sum: Int32
+    steady_spike: npt.NDArray[np.uint8]
+    arrived: IntArray
+    listed: npt.NDArray[np.bool_]
+    work: Int32
+    due: Int32
+    dues: IntArray
+    flagged: npt.NDArray[np.bool_]
+
+
+class Tallies(NamedTuple):
+    """Counts of a recording, and its traces, empty where they are not wanted."""
+
+    axons: IntArray
+    spikes: IntArray
+    votes: IntArray
+    overflows: IntArray
+    raster: npt.NDArray[np.bool_]
+    membranes: Int32
+
+
+@compiled
+def draw(seed: Any, neuron: Any, tick: Any, bits: Any) -> Any:
+    """As :func:`trace.random_bits`, of at least one bit."""
+    x = seed + (np.uint64(neuron) + _ONE) * _STEP_NEURON + (np.uint64(tick) + _ONE) * _STEP_TICK
+    x = (x ^ (x >> _30)) * _MIX_1
+    x = (x ^ (x >> _27)) * _MIX_2
+    return np.int64((x ^ (x >> _31)) >> (_64 - np.uint64(bits)))
+
+
+@compiled
+def leaked(v: Any, leak: Any, reversal: Any) -> Any:
+    """Membrane with its leak, which with reversal takes the membrane's sign and stops at zero."""
+    if not reversal:
+        return v + leak
+    if v == 0:
+        return v
+    return min(v - leak, 0) if v < 0 else max(v + leak, 0)
+
+
+@compiled
+def after(v: Any, spiked: Any, threshold: Any, random: Any, mode: Any, reset: Any, below: Any, saturates: Any) -> Any:
+    """Membrane after the resets; the threshold holds the random number already."""
+    if spiked:
+        if mode == RESET_TO:
+            return reset
+        return v - threshold if mode == RESET_LINEAR else v
+    if saturates:
+        return max(v, -below)
+    if v < -(below + random):
+        if mode == RESET_TO:
+            return -reset
+        return v + below + random if mode == RESET_LINEAR else v
+    return v
+
+
+@compiled
+def _reach(state: Any, n: Any, weight: Any, working: Any) -> Any:
+    """Let a weight arrive at a neuron, which works then; returns the neurons that do."""
+    state.arrived[n] += weight
+    if not state.listed[n]:
+        state.listed[n] = True
+        state.work[working] = n
+        return working + 1
+    return working
+
+
+@compiled
+def _queue(state: Any, slot: Any, axon: Any) -> Any:
+    """Let an axon have a spike in the tick of a slot; 1 where it has one already."""
+    if state.flagged[slot, axon]:
+        return 1
+    state.flagged[slot, axon] = True
+    state.due[slot, state.dues[slot]] = axon
+    state.dues[slot] += 1
+    return 0
+
+
+@compiled
+def _inject(events: Any, bin_ticks: Any, tick: Any, slot: Any, wiring: Any, state: Any) -> Any:
+    """Events and clocks of this tick; returns the merged spikes."""
+    merged = 0
+    for k in range(len(wiring.offsets)):
+        since = tick - wiring.offsets[k]
+        if since < 0 or since % bin_ticks != 0 or since // bin_ticks >= len(events):
+            continue
+        for channel in np.flatnonzero(events[since // bin_ticks]):
+            for row in range(wiring.feed_bounds[k, channel], wiring.feed_bounds[k, channel + 1]):
+                merged += _queue(state, slot, wiring.feed_axon[row])
+    for k in range(len(wiring.clocks)):
+        axon, period, phase = wiring.clocks[k]
+        if tick >= phase and (tick - phase) % period == 0:
+            merged += _queue(state, slot, axon)
+    return merged
+
+
+@compiled
+def _add(total: Any, term: Any) -> None:
+    for i in range(len(total)):
+        total[i] += term[i]
+
+
+@compiled
+def _integrate(slot: Any, wiring: Any, state: Any, axons: Any, working: Any) -> Any:
+    """Visit the crossing points of all axons with a spike; returns the neurons that work."""
+    for k in range(state.dues[slot]):
+        axon = state.due[slot, k]
+        state.flagged[slot, axon] = False
+        axons[axon] += 1
+        for s in range(wiring.segment_bounds[axon], wiring.segment_bounds[axon + 1]):
+            first, end, at = wiring.segments[s, 0], wiring.segments[s, 1], wiring.segments[s, 2]
+            _add(state.steady_sum[first:end], wiring.row[at : at + end - first])
+        for s in range(wiring.axon_synapses[axon], wiring.axon_synapses[axon + 1]):
+            working = _reach(state, wiring.synapse_neuron[s], wiring.synapse_weight[s], working)
+    state.dues[slot] = 0
+    return working
+
+
+@compiled
+def _update(n: Any, tick: Any, seed: Any, low: Any, high: Any, sums: Any, wiring: Any, state: Any, tallies: Any) -> Any:
+    """A tick of a neuron that remembers: whether it spiked, and whether it may sleep."""
+    p = wiring.parameters
+    leak, threshold, below = np.int64(p[n, LEAK]), np.int64(p[n, THRESHOLD]), np.int64(p[n, NEGATIVE])
+    random = draw(seed, wiring.number[n], tick, p[n, MASK_BITS]) if p[n, MASK_BITS] else np.int64(0)
+    before, positive, negative = np.int64(state.membrane[n]), sums >> HALF, sums & LOWER
+    summed = min(max(before + positive - negative, low), high)
+    wanted = leaked(summed, leak, p[n, REVERSAL])
+    v = min(max(wanted, low), high)
+    spiked = v >= threshold + random
+    left = after(v, spiked, threshold + random, random, p[n, RESET_MODE], np.int64(p[n, RESET]), below, p[n, SATURATES])
+    v = min(max(left, low), high)
+    state.membrane[n] = v
+    if before + positive > high or before - negative < low or wanted < low or wanted > high or left != v:
+        tallies.overflows[n] += 1
+    sleeps = v == p[n, REST] or (leak == 0 and -below <= v < threshold)
+    return spiked, sleeps and p[n, MASK_BITS] == 0
+
+
+@compiled
+def _update_steady(membrane: Any, sums: Any, leak: Any, threshold: Any, reset: Any, lowest: Any, spikes: Any) -> None:
+    """A tick of all steady neurons; one-dimensional arrays, so that the compiler vectorises the loop."""
+    for n in range(len(sums)):
+        v = np.int32(membrane[n] + sums[n] + leak[n])
+        sums[n] = 0
+        spiked = v >= threshold[n]
+        spikes[n] = spiked
+        membrane[n] = reset[n] if spiked else max(v, lowest[n])
+
+
+@compiled
+def _update_others(
+    membrane: Any, sums: Any, leak: Any, threshold: Any, reset: Any, lowest: Any, under: Any, linear: Any, cap: Any,
+    spikes: Any,
+) -> Any:  # fmt: skip
+    """A tick of the steady neurons that are not plain; whether one is above its cap."""
+    above = np.int32(0)
+    for n in range(len(sums)):
+        v = np.int32(membrane[n] + sums[n] + leak[n])
+        sums[n] = 0
+        spiked = v >= threshold[n]
+        spikes[n] = spiked
+        high = np.int32(reset[n] + linear[n] * (v - threshold[n]))
+        low = under[n] if v < lowest[n] else v
+        left = high if spiked else low
+        membrane[n] = left
+        above |= np.int32(left > cap[n])
+    return above
+
+
+@compiled
+def _send(n: Any, tick: Any, ticks: Any, window: Any, slots: Any, wiring: Any, state: Any, tallies: Any) -> Any:
+    """Count a spike and lead it on; 1 where it merges with another before the last tick."""
+    tallies.spikes[n] += 1
+    if len(tallies.raster):
+        tallies.raster[tick, n] = True
+    first = wiring.parameters[n, VOTES_FROM]
+    tallies.votes[n] += 0 <= first <= tick < first + window
+    if wiring.parameters[n, WIRE_AXON] < 0:
+        return 0
+    later = tick + wiring.parameters[n, WIRE_DELAY]
+    twice = _queue(state, later & (slots - 1), wiring.parameters[n, WIRE_AXON])
+    return twice * (later < ticks)
+
+
+@compiled
+def _send_steady(
+    steady: Any, tick: Any, ticks: Any, window: Any, slots: Any, wiring: Any, state: Any, tallies: Any
+) -> Any:
+    """Lead on all spikes of steady neurons; returns those that merge."""
+    merged, last, traced = 0, tick + 1 >= ticks, len(tallies.raster) > 0
+    direct, axon_of, sums, row = wiring.direct, wiring.parameters[:, WIRE_AXON], state.steady_sum, wiring.row
+    bounds, segments, spikes, axons = wiring.segment_bounds, wiring.segments, tallies.spikes, tallies.axons
+    words = state.steady_spike.view(np.uint64)
+    for word in range(len(words)):
+        if words[word]:
+            for n in range(WORD * word, min(WORD * word + WORD, steady)):
+                if not state.steady_spike[n]:
+                    continue
+                if not direct[n]:
+                    merged += _send(n, tick, ticks, window, slots, wiring, state, tallies)
+                    continue
+                spikes[n] += 1
+                if traced:
+                    tallies.raster[tick, n] = True
+                if last:
+                    continue
+                axon = axon_of[n]
+                axons[axon] += 1
+                for s in range(bounds[axon], bounds[axon + 1]):  # the sums of this tick are taken already
+                    first, end, at = segments[s, 0], segments[s, 1], segments[s, 2]
+                    if end - first == 1:
+                        sums[first] += row[at]
+                    else:
+                        _add(sums[first:end], row[at : at + end - first])
+    return merged
+
+
+@compiled_and_cached
+def run(
+    events: Any, bin_ticks: int, ticks: int, seed: Any, low: int, high: int, slots: int, wiring: Any, tallies: Any
+) -> int:
+    """Run one recording; fills the tallies and returns the merged spikes, or ``BROKEN_OFF``.
+
+    `events` is (steps, channels); `slots` is a power of two above every delay: spikes that are due in a tick wait in
+    the slot of its lowest bits.
+    """
+    neurons, axons, window = len(wiring.initial), len(tallies.axons), len(events) * bin_ticks
+    leak, threshold, reset, lowest = wiring.steady[0], wiring.steady[1], wiring.steady[2], wiring.steady[3]
+    under, linear, cap = wiring.steady[4], wiring.steady[5], wiring.steady[6]
+    steady, plain = len(leak), wiring.plain
+    state = State(
+        wiring.initial.copy(),
+        np.zeros(steady, np.int32),
+        np.zeros((steady + WORD - 1) // WORD * WORD, np.uint8),
+        np.zeros(neurons, np.int64),
+        np.ones(neurons, np.bool_),
+        np.empty(neurons, np.int32),
+        np.empty((slots, axons), np.int32),
+        np.zeros(slots, np.int64),
+        np.zeros((slots, axons), np.bool_),
+    )
+    working, merged = neurons - steady, 0  # all are awake at first
+    for k in range(working):
+        state.work[k] = steady + k
+    for tick in range(ticks):
+        slot = tick & (slots - 1)
+        merged += _inject(events, bin_ticks, tick, slot, wiring, state)
+        working = _integrate(slot, wiring, state, tallies.axons, working)
+        held, sums_in, spiking = state.membrane[:plain], state.steady_sum[:plain], state.steady_spike[:plain]
+        _update_steady(held, sums_in, leak[:plain], threshold[:plain], reset[:plain], lowest[:plain], spiking)
+        if steady > plain and _update_others(
+            state.membrane[plain:steady],
+            state.steady_sum[plain:],
+            leak[plain:],
+            threshold[plain:],
+            reset[plain:],
+            lowest[plain:],
+            under[plain:],
+            linear[plain:],
+            cap[plain:],
+            state.steady_spike[plain:steady],
+        ):
+            return BROKEN_OFF
+        merged += _send_steady(steady, tick, ticks, window, slots, wiring, state, tallies)
+        awake = 0
+        for k in range(working):
+            n = state.work[k]
+            sums = state.arrived[n]
+            state.arrived[n] = 0
+            if wiring.instant[n]:
+                spiked, sleeps = (sums >> HALF) - (sums & LOWER) + wiring.instant[n] >= 0, True
+            else:
+                spiked, sleeps = _update(n, tick, seed, low, high, sums, wiring, state, tallies)
+            if sleeps:
+                state.listed[n] = False
+            else:
+                state.work[awake] = n  # never ahead of k
+                awake += 1
+            if spiked:
+                merged += _send(n, tick, ticks, window, slots, wiring, state, tallies)
+        working = awake
+        if len(tallies.membranes):
+            tallies.membranes[tick] = state.membrane
+    return merged

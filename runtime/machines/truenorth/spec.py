@@ -1,0 +1,242 @@
+"""The definition: one tick of crossbar cores in plain Python integers, one neuron at a time, written to be read.
+
+:mod:`truenorth.engine` is the fast twin and must agree with this module on every spike, membrane and count.
+
+A tick
+------
+1. *Arrivals.* An axon has a spike if an input event, a clock or a spike of an earlier tick is due on it; several of
+   them are one.
+2. *Integrate.* The weight of the axon's type, for each axon with a spike and a crossing point. Positive and negative
+   weights are added up apart, for the order in which the chip visits its axons is not ours to rely on: a tick in
+   which *some* order would leave the register of 20 bits with sign is counted. The register saturates.
+3. *Leak.* Added, or with reversal added times the sign of the membrane; what such a leak carries past zero is zero.
+4. *Threshold.* A spike where the membrane is at least the threshold and this tick's random number.
+5. *Reset.* To a value, by the threshold, or not at all. Without a spike a membrane below the negative threshold is
+   set to it, or reset the same way.
+
+All neurons of all cores do this in every tick; a spike is on its way for 1 to 15 ticks.
+
+References
+----------
+.. [1] A. Cassidy et al., "Cognitive computing building block", IJCNN 2013: the neuron.
+.. [2] P. Merolla et al., Science 345, 2014, supplement, table S2: the order within a tick.
+.. [3] RANC (UA-RCL), ``simulator/src/neuronblock.cpp`` and ``NeuronBlock.v``: the same order, and ``>=``.
+.. [4] NeMo (markplagge), ``tn_neuron.c``: leak reversal and negative threshold.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass
+
+import numpy as np
+
+from spikeloom.compiler.targets.base import CROSSBARS, load_target
+from spikeloom.compiler.targets.truenorth.legalize import signed_range
+from spikeloom.compiler.targets.truenorth.netlist import RESET_LINEAR, RESET_TO, CrossbarNetlist
+from spikeloom.runtime.machines.truenorth.trace import Counts, EventArray, Trace, check_channels, random_bits
+
+
+@dataclass(slots=True)
+class Neuron:
+    """Parameters and membrane of one neuron; the names are those of the netlist."""
+
+    leak: int
+    leak_reversal: bool
+    threshold: int
+    mask_bits: int
+    reset_mode: int
+    reset: int
+    negative_threshold: int
+    negative_saturates: bool
+    membrane: int
+
+
+def saturated(value: int, bits: int) -> int:
+    """The nearest number that a register of so many bits with sign holds.
+
+    Examples
+    --------
+    >>> saturated(524288, 20), saturated(-524289, 20), saturated(7, 20)
+    (524287, -524288, 7)
+    """
+    low, high = signed_range(bits)
+    return max(low, min(high, value))
+
+
+def neuron_tick(neuron: Neuron, positive: int, negative: int, random: int, bits: int) -> tuple[bool, bool]:
+    """Let one neuron live through a tick.
+
+    Parameters
+    ----------
+    neuron : Neuron
+        Its membrane is replaced.
+    positive, negative : int
+        Sums of the weights that arrived, as magnitudes.
+    random : int
+        This tick's random number under the neuron's mask.
+    bits : int
+        Of the membrane register.
+
+    Returns
+    -------
+    spiked : bool
+    left : bool
+        Whether the register was left, or would have been in some order of arrivals.
+
+    Examples
+    --------
+    A threshold of 3 reached exactly is a spike; a linear reset keeps what is above it.
+
+    >>> neuron = Neuron(0, False, 3, 0, RESET_LINEAR, 0, 0, False, 2)
+    >>> neuron_tick(neuron, 5, 1, 0, 20), neuron.membrane
+    ((True, False), 3)
+    """
+    low, high = signed_range(bits)
+
+    # integrate
+    left = neuron.membrane + positive > high or neuron.membrane - negative < low
+    v = saturated(neuron.membrane + positive - negative, bits)
+
+    # leak
+    if neuron.leak_reversal:
+        sign = (v > 0) - (v < 0)
+        leaked = v + sign * neuron.leak
+        if leaked * sign < 0:  # carried past zero
+            leaked = 0
+    else:
+        leaked = v + neuron.leak
+    v = saturated(leaked, bits)
+    left = left or v != leaked
+
+    # threshold
+    threshold = neuron.threshold + random
+    spiked = v >= threshold
+
+    # reset
+    below = neuron.negative_threshold + (0 if neuron.negative_saturates else random)
+    if spiked:
+        if neuron.reset_mode == RESET_TO:
+            v = neuron.reset
+        elif neuron.reset_mode == RESET_LINEAR:
+            v -= threshold
+    elif v < -below:
+        if neuron.negative_saturates:
+            v = -neuron.negative_threshold
+        elif neuron.reset_mode == RESET_TO:
+            v = -neuron.reset
+        elif neuron.reset_mode == RESET_LINEAR:
+            v += below
+    neuron.membrane = saturated(v, bits)
+    return spiked, left or neuron.membrane != v
+
+
+def injected(netlist: CrossbarNetlist, events: EventArray) -> defaultdict[int, list[int]]:
+    """Axons that input events and clocks reach in each tick of a recording (n_inputs, T), once for each of them."""
+    due: defaultdict[int, list[int]] = defaultdict(list)
+    fed = netlist.axons_at(netlist.feed_core, netlist.feed_line).tolist()
+    for channel, axon, offset in zip(netlist.feed_channel.tolist(), fed, netlist.feed_tick.tolist(), strict=True):
+        for step in np.flatnonzero(events[channel]).tolist():
+            due[step * netlist.bin_ticks + offset].append(axon)
+    clocked = netlist.axons_at(netlist.clock_core, netlist.clock_line).tolist()
+    periods, phases = netlist.clock_period.tolist(), netlist.clock_phase.tolist()
+    for axon, period, phase in zip(clocked, periods, phases, strict=True):
+        for tick in range(phase, netlist.ticks(events.shape[1]), period):
+            due[tick].append(axon)
+    return due
+
+
+def simulate(netlist: CrossbarNetlist, events: EventArray, *, seed: int = 0) -> Trace:
+    """Run one recording through the cores.
+
+    Parameters
+    ----------
+    netlist : CrossbarNetlist
+        A network that breaks no rule of its chip.
+    events : (n_inputs, T) uint8 or bool
+        Input events; any value but zero is an event.
+    seed : int
+        Of the random numbers, from 0.
+
+    Returns
+    -------
+    Trace
+        With spikes and membranes, no leading axis.
+
+    Raises
+    ------
+    DataError
+        If the recording has another number of input channels than the network.
+    """
+    check_channels(netlist, events.shape[0])
+    bits = load_target(netlist.target, CROSSBARS).limit("neuron.membrane_bits")
+    steps = events.shape[1]
+    ticks = netlist.ticks(steps)
+    neurons = [
+        Neuron(
+            leak=int(netlist.leak[n]),
+            leak_reversal=bool(netlist.leak_reversal[n]),
+            threshold=int(netlist.threshold[n]),
+            mask_bits=int(netlist.mask_bits[n]),
+            reset_mode=int(netlist.reset_mode[n]),
+            reset=int(netlist.reset[n]),
+            negative_threshold=int(netlist.negative_threshold[n]),
+            negative_saturates=bool(netlist.negative_saturates[n]),
+            membrane=int(netlist.initial[n]),
+        )
+        for n in range(netlist.n_neurons)
+    ]
+
+    # the crossing points of each axon, as pairs of neuron and weight
+    points: list[list[tuple[int, int]]] = [[] for _ in range(netlist.n_axons)]
+    for axon, neuron in zip(netlist.axon_of_synapse().tolist(), netlist.neuron_of_synapse().tolist(), strict=True):
+        points[axon].append((neuron, int(netlist.weight[neuron, netlist.axon_type[axon]])))
+
+    # what leads to the axons: from outside by tick, from neurons by their wires
+    due = injected(netlist, events)
+    wired = netlist.axons_at(netlist.cores_at(netlist.wire_x, netlist.wire_y), netlist.wire_line).tolist()
+    wires: list[list[tuple[int, int]]] = [[] for _ in neurons]
+    for source, axon, delay in zip(netlist.wire_neuron.tolist(), wired, netlist.wire_delay.tolist(), strict=True):
+        wires[source].append((axon, delay))
+
+    spikes = np.zeros((ticks, len(neurons)), np.bool_)
+    membranes = np.zeros((ticks, len(neurons)), np.int32)
+    axons = [0] * netlist.n_axons
+    overflows = [0] * len(neurons)
+    merged = 0
+    for tick in range(ticks):
+        # arrivals
+        active = sorted(set(due[tick]))
+        merged += len(due[tick]) - len(active)
+        positive = [0] * len(neurons)
+        negative = [0] * len(neurons)
+        for axon in active:
+            axons[axon] += 1
+            for n, weight in points[axon]:
+                if weight > 0:
+                    positive[n] += weight
+                else:
+                    negative[n] -= weight
+
+        for n, neuron in enumerate(neurons):
+            random = random_bits(seed, n, tick, neuron.mask_bits)
+            spiked, left = neuron_tick(neuron, positive[n], negative[n], random, bits)
+            membranes[tick, n] = neuron.membrane
+            overflows[n] += left
+            if spiked:
+                spikes[tick, n] = True
+                for axon, delay in wires[n]:
+                    due[tick + delay].append(axon)
+
+    tick_of = np.arange(ticks)[:, None]
+    window = (tick_of >= netlist.readout_first) & (tick_of < netlist.readout_first + steps * netlist.bin_ticks)
+    counts = Counts(
+        ticks=np.array(ticks, np.int64),
+        inputs=np.count_nonzero(events, axis=1).astype(np.int64),
+        spikes=spikes.sum(axis=0, dtype=np.int64),
+        votes=(spikes & window & (netlist.readout_class >= 0)).sum(axis=0, dtype=np.int64),
+        axons=np.array(axons, np.int64),
+        merged=np.array(merged, np.int64),
+        overflows=np.array(overflows, np.int64),
+    )
+    return Trace(counts=counts, spikes=spikes, membranes=membranes)

@@ -1,0 +1,105 @@
+"""What a simulation of crossbar cores hands back; shared by specification and engine."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from spikeloom.compiler.errors import DataError
+from spikeloom.compiler.fixedpoint import IntArray
+from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
+
+BoolArray = npt.NDArray[np.bool_]
+MembraneArray = npt.NDArray[np.int32]
+EventArray = npt.NDArray[np.uint8 | np.bool_]
+
+MASK64 = (1 << 64) - 1
+STEP_NEURON, STEP_TICK = 0x9E3779B97F4A7C15, 0xD1B54A32D192ED03
+MIX_1, MIX_2 = 0xBF58476D1CE4E5B9, 0x94D049BB133111EB
+"""Constants of the random numbers, see :func:`random_bits`."""
+
+
+def random_bits(seed: int, neuron: int, tick: int, bits: int) -> int:
+    """Random number of so many bits that a neuron draws in a tick, in plain integers.
+
+    A finaliser of splitmix64 over seed, neuron and tick: the same whoever draws first, so that an engine may leave out
+    neurons at rest. The chip's own generator is not public; no network that shall be exact should use it.
+
+    Examples
+    --------
+    >>> random_bits(0, 5, 7, 0), random_bits(0, 5, 7, 8), random_bits(1, 5, 7, 8)
+    (0, 211, 201)
+    """
+    if not bits:
+        return 0
+    x = (seed + (neuron + 1) * STEP_NEURON + (tick + 1) * STEP_TICK) & MASK64
+    x = ((x ^ (x >> 30)) * MIX_1) & MASK64
+    x = ((x ^ (x >> 27)) * MIX_2) & MASK64
+    return (x ^ (x >> 31)) >> (64 - bits)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Counts:
+    """Events of whole runs; every array is int64, a batch adds one leading axis.
+
+    Parameters
+    ----------
+    ticks : (…) int64
+        Ticks that were run.
+    inputs : (…, n_inputs) int64
+        Input events per channel.
+    spikes : (…, neurons) int64
+        Spikes per neuron in all ticks.
+    votes : (…, neurons) int64
+        Spikes per neuron in the ticks in which it votes; zero for neurons that do not.
+    axons : (…, axons) int64
+        Ticks in which an axon had a spike.
+    merged : (…) int64
+        Spikes that reached an axon in a tick in which it had one already, and were lost.
+    overflows : (…, neurons) int64
+        Ticks in which the membrane left its register, or would have in some order of arrivals; it saturates.
+    """
+
+    ticks: IntArray
+    inputs: IntArray
+    spikes: IntArray
+    votes: IntArray
+    axons: IntArray
+    merged: IntArray
+    overflows: IntArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Trace:
+    """Result of a simulation.
+
+    Parameters
+    ----------
+    counts : Counts
+    spikes : (…, ticks, neurons) bool, or None
+        Whether a neuron spiked in a tick; None where it was not asked for.
+    membranes : (…, ticks, neurons) int32, or None
+        Membranes at the end of each tick, after resets; None where they were not asked for. In a batch a shorter
+        recording is filled up with zeros after its last tick.
+    """
+
+    counts: Counts
+    spikes: BoolArray | None
+    membranes: MembraneArray | None
+
+
+def check_channels(netlist: CrossbarNetlist, channels: int) -> None:
+    """Refuse recordings of another sensor.
+
+    Raises
+    ------
+    DataError
+        If their number of channels is not the network's.
+    """
+    if channels != netlist.n_inputs:
+        raise DataError(
+            f"recordings have {channels} input channels, the network has {netlist.n_inputs}; "
+            "use recordings of its sensor"
+        )

@@ -1,0 +1,30 @@
+"""Read-out of a simulated netlist: spike counts to classes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from spikeloom.compiler.fixedpoint import IntArray
+from spikeloom.compiler.interpret import BoolArray, vote
+from spikeloom.compiler.ir import Readout
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
+
+
+def class_counts(netlist: Netlist, spikes: IntArray) -> IntArray:
+    """Votes per class from spike counts per compartment (samples, compartments); shape (samples, classes)."""
+    voters = np.flatnonzero(netlist.readout_class >= 0)
+    counts = np.zeros((len(spikes), netlist.classes), np.int64)
+    np.add.at(counts.T, netlist.readout_class[voters], spikes[:, voters].T)
+    return counts
+
+
+def readout_counts(readout: Readout, classes: int, spikes: BoolArray) -> IntArray:
+    """Votes per class from the spikes of the population that votes (samples, steps, neurons); (samples, classes)."""
+    counts = np.zeros((len(spikes), classes), np.int64)
+    np.add.at(counts.T, readout.label, spikes.sum(axis=1, dtype=np.int64).T)
+    return counts
+
+
+def predictions(netlist: Netlist, spikes: IntArray) -> IntArray:
+    """Class of each recording from spike counts per compartment; ties go to the lowest class."""
+    return vote(class_counts(netlist, spikes))

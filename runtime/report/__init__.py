@@ -1,0 +1,1 @@
+"""Results as sections, and their renderers."""

@@ -1,0 +1,1 @@
+"""How early a decision is sure."""

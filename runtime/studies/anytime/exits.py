@@ -1,0 +1,271 @@
+"""When a vote is decided: by proof, or as sure as other recordings say.
+
+Votes only ever add up, and the network is causal, so the decision after any step is known without running anything
+twice. A vote ends early
+
+* *by proof*, when no spikes whatever can change it: every rival is behind by more than it can still gain while the
+  leader gets nothing more. An output neuron gains at most one vote a step, or fewer where even its largest input takes
+  several steps to lift it over its threshold (:func:`most_votes`);
+* *by calibration*, when the leader is ahead by more than ``a * sqrt(steps left)``: the lead of one neuron over another
+  strays from its course about as the root of the steps. The factor comes from other recordings.
+
+*Calibration.* A network knows the recordings that it was trained on: their class leads from the start by far, which
+says nothing about others. What remains when the votes of the winner are taken away is a race for second place among
+classes that nobody trained to win here, with leads as narrow and as fickle as those of unknown recordings. Its outcome
+must not change in more than a given share of these races.
+
+References
+----------
+.. [1] S. S. Wilks, "Determination of sample sizes for setting tolerance limits", Ann. Math. Stat. 12, 1941: the share
+   beyond an order statistic of n values follows a beta distribution, whatever theirs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from spikeloom.compiler.fixedpoint import DECAY_BITS, MEMBRANE_SHIFT, FloatArray, IntArray
+from spikeloom.compiler.targets.loihi1.netlist import Netlist, one_step_bounds
+from spikeloom.runtime.equivalence.certificates import wins
+from spikeloom.runtime.machines.loihi1.trace import BoolArray
+
+CONFIDENCE = 0.95
+"""Of the bound on the share of other races that end otherwise."""
+
+
+LONGEST = 4096
+"""Steps after which :func:`least_interval` looks no further: a spike may follow then."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Standing:
+    """Where votes stand after each step of the read-out.
+
+    Parameters
+    ----------
+    leader : (samples, steps) int64
+        Class with most votes, the lowest on a tie.
+    lead : (samples, steps) int64
+        Votes by which it is ahead of the next; all its votes if there is no other class.
+    left : (samples, steps) int64
+        Steps that are still to come; 0 from a recording's end on.
+    """
+
+    leader: IntArray
+    lead: IntArray
+    left: IntArray
+
+    @property
+    def decision(self) -> IntArray:
+        """Leader in the end; shape (samples,)."""
+        return self.leader[:, -1]
+
+    @property
+    def confidence(self) -> FloatArray:
+        """Lead in votes per root of a step that is left, infinite at the end; shape (samples, steps)."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            found: FloatArray = np.where(self.left == 0, np.inf, self.lead / np.sqrt(self.left))
+        return found
+
+
+def standing(votes: IntArray, lengths: IntArray) -> Standing:
+    """Say who leads, by how much, and for how long that can still change.
+
+    Parameters
+    ----------
+    votes : (samples, steps, classes) int64
+        Votes so far after each step of the read-out; those of shorter recordings stay as they are from their end on.
+    lengths : (samples,) int64
+        Steps of each recording.
+    """
+    ahead = votes[..., 0]
+    if votes.shape[2] > 1:
+        second, first = np.moveaxis(np.partition(votes, -2)[..., -2:], -1, 0)
+        ahead = first - second
+    left = np.maximum(np.reshape(lengths, (-1, 1)) - 1 - np.arange(votes.shape[1]), 0)
+    return Standing(leader=np.argmax(votes, axis=2), lead=ahead, left=left)
+
+
+def read_out_depth(netlist: Netlist) -> int:
+    """Chip steps by which the votes lag behind the data: the depth of the latest layer that votes."""
+    return max(netlist.layers[int(layer)].depth for layer in np.unique(netlist.layer[netlist.readout_class >= 0]))
+
+
+def least_interval(netlist: Netlist) -> IntArray:
+    """Least number of steps from one spike to the next of each output neuron, whatever it hears; 0 if it never spikes.
+
+    Returns
+    -------
+    (output neurons,) int64
+        In the order of their compartments.
+    """
+    voters = np.flatnonzero(netlist.readout_class >= 0)
+    positive = one_step_bounds(netlist)[0][voters]
+    # a current that loses lost/4096 a step and gains x stays at or below x * 4096 / lost
+    current = (positive << MEMBRANE_SHIFT + DECAY_BITS) // (netlist.decay_u[voters] + 1)
+    gain = current + (netlist.bias_mantissa << netlist.bias_exponent)[voters]
+    threshold = netlist.threshold[voters] << MEMBRANE_SHIFT
+    keep = 2**DECAY_BITS - netlist.decay_v[voters]
+    membrane, interval = np.zeros_like(gain), np.zeros_like(gain)
+    open_ = np.ones(len(gain), np.bool_)
+    for step in range(1, LONGEST + 1):
+        raised = (membrane * keep >> DECAY_BITS) + gain
+        fires = open_ & (raised > threshold)
+        interval[fires] = step
+        open_ &= ~fires & (raised > membrane)  # what no longer rises never will
+        membrane = np.maximum(raised, 0)
+        if not open_.any():
+            break
+    interval[open_] = LONGEST
+    return interval
+
+
+def most_votes(netlist: Netlist, steps: int) -> IntArray:
+    """Most votes that each class can still get when 0 … `steps` steps are left; shape (classes, steps + 1)."""
+    interval = least_interval(netlist)
+    left = np.arange(steps + 1)
+    each = np.where(interval[:, None] > 0, -(-left // np.maximum(interval, 1)[:, None]), 0)
+    most = np.zeros((netlist.classes, steps + 1), np.int64)
+    np.add.at(most, netlist.readout_class[netlist.readout_class >= 0], each)
+    return most
+
+
+def proven(votes: IntArray, at: Standing, most: IntArray) -> BoolArray:
+    """Whether the decision after each step is the last word, whatever follows; shape (samples, steps).
+
+    Parameters
+    ----------
+    votes : (samples, steps, classes) int64
+        As for :func:`standing`.
+    at : Standing
+        Of these votes.
+    most : (classes, longest + 1) int64
+        See :func:`most_votes`.
+    """
+    classes = votes.shape[2]
+    reach = votes + most.T[at.left]
+    sure = wins(at.leader.reshape(-1), votes.reshape(-1, classes), reach.reshape(-1, classes))
+    return sure.reshape(at.leader.shape)
+
+
+def exits(sure: BoolArray, at: Standing, factor: float = np.inf) -> IntArray:
+    """Step of the read-out, from 0, after which each recording may end; shape (samples,).
+
+    Parameters
+    ----------
+    sure : (samples, steps) bool
+        See :func:`proven`.
+    at : Standing
+        Of the same votes.
+    factor : float
+        Votes per root of a step left by which the leader must be ahead; infinite for the proof alone.
+    """
+    first: IntArray = np.argmax(sure | (at.confidence > factor), axis=1)
+    return first
+
+
+def live(netlist: Netlist, bins: int, factor: float) -> Callable[[int, IntArray], bool]:
+    """Make the rule of a grasp of so many bins that is stepped live.
+
+    Parameters
+    ----------
+    netlist : Netlist
+        What is stepped.
+    bins : int
+        Length of the grasp.
+    factor : float
+        As for :func:`exits`.
+
+    Returns
+    -------
+    callable
+        Told a chip step, from 0, and the votes (classes,) after it, says whether the grasp may end.
+    """
+    most, depth = most_votes(netlist, bins), read_out_depth(netlist)
+
+    def may_end(chip_step: int, counts: IntArray) -> bool:
+        seen = chip_step + 1 - depth
+        if seen < 1:
+            return False
+        votes = counts[None, None]
+        now = standing(votes, np.array([bins - seen + 1]))
+        return bool(proven(votes, now, most)[0, 0] or now.confidence[0, 0] > factor)
+
+    return may_end
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Calibrated:
+    """A factor and what it rests on.
+
+    Parameters
+    ----------
+    allowed : float
+        Share of races that might end otherwise.
+    factor : float
+        Votes per root of a step left.
+    races, differ : int
+        Races that it was chosen on, and how many of them end otherwise.
+    bound : float
+        Upper bound of the share of other such races that end otherwise, with the confidence of ``CONFIDENCE`` [1]_.
+    """
+
+    allowed: float
+    factor: float
+    races: int
+    differ: int
+    bound: float
+
+
+def races(votes: IntArray, lengths: IntArray) -> Standing:
+    """Standing of the race for second place: the votes of each recording without those of its winner.
+
+    With two classes there is none; then that of the vote itself.
+    """
+    whole = standing(votes, lengths)
+    if votes.shape[2] < 3:
+        return whole
+    others = votes.copy()
+    others[np.arange(len(votes)), :, whole.decision] = -1
+    return standing(others, lengths)
+
+
+def turning_points(at: Standing) -> FloatArray:
+    """Largest factor with which each recording ends with another decision; 0 where none does; shape (samples,)."""
+    confidence = at.confidence
+    before = np.maximum.accumulate(confidence, axis=1)[:, :-1]
+    before = np.concatenate([np.zeros((len(before), 1)), before], axis=1)
+    ends = (confidence > before) & (at.leader != at.decision[:, None])  # a smaller one would have ended it already
+    return np.asarray(np.where(ends, confidence, 0.0).max(axis=1, initial=0.0), np.float64)
+
+
+def calibrate(points: FloatArray, allowed: float) -> Calibrated:
+    """Smallest factor with which at most the share `allowed` of races ends otherwise, and so with every larger one.
+
+    Parameters
+    ----------
+    points : (races,) float64
+        See :func:`turning_points`.
+    allowed : float
+        From 0 to below 1.
+
+    Examples
+    --------
+    >>> calibrate(np.array([0.0, 3.0, 1.0, 2.0]), 0.25)
+    Calibrated(allowed=0.25, factor=2.0, races=4, differ=1, bound=0.7514)
+    """
+    from scipy.special import betaincinv  # a tenth of a second that other commands need not wait
+
+    spared = int(allowed * len(points) + 1e-9)
+    factor = float(np.sort(points)[::-1][spared])
+    bound = float(betaincinv(spared + 1, len(points) - spared, CONFIDENCE))
+    return Calibrated(
+        allowed=allowed,
+        factor=factor,
+        races=len(points),
+        differ=int(np.count_nonzero(points > factor)),
+        bound=round(bound, 4),
+    )

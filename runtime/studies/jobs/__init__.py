@@ -1,0 +1,1 @@
+"""Many measurements side by side."""

@@ -1,0 +1,1 @@
+"""What of a network its recordings do not need."""

@@ -1,0 +1,245 @@
+"""What of a compiled network its recordings do not need: each part is taken away and the decisions are counted again.
+
+A part is taken away by silencing it: synapses from it weigh nothing, so every other spike is as if it were not there.
+What is silenced together is found by bisection along a ranking, least effect first: of the sets that are looked at, the
+largest that changes no more training decisions than allowed. Nothing is chosen on the recordings that are reported.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from spikeloom.compiler.dynamics import with_clocks
+from spikeloom.compiler.fixedpoint import DECAY_BITS, ONE_STEP_SUM_MAX, FloatArray, IntArray
+from spikeloom.compiler.formats.checkpoint import Checkpoint
+from spikeloom.compiler.ir import IntegerNetwork
+from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.passes.prune import deaf_to
+from spikeloom.compiler.targets.loihi1.compilation import Compilation, without
+from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_only
+from spikeloom.compiler.targets.loihi1.storage.quantize import incoming
+from spikeloom.compiler.targets.loihi1.storage.scales import rounded
+from spikeloom.compiler.targets.loihi1.storage.weight_storage import Form
+from spikeloom.models.recordings.events import join_bins
+from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.runtime.machines.loihi1 import engine
+from spikeloom.runtime.machines.loihi1.trace import BoolArray
+from spikeloom.runtime.machines.votes import predictions
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Scene:
+    """Recordings of a split as a network's input.
+
+    Parameters
+    ----------
+    flat : (samples, n_inputs, T) uint8
+        Events of its channels, clocks among them.
+    labels : (samples,) int64
+    lengths : (samples,) int64, or None
+    """
+
+    flat: engine.EventArray
+    labels: IntArray
+    lengths: IntArray | None
+
+
+def scene(data: Recordings, netlist: Netlist) -> Scene:
+    """Recordings as the input of a netlist."""
+    return Scene(flat=with_clocks(data.events, netlist.clocks), labels=data.labels, lengths=data.lengths)
+
+
+def decisions(netlist: Netlist, of: Scene) -> IntArray:
+    """Class of each recording."""
+    return predictions(netlist, engine.simulate(netlist, of.flat, lengths=of.lengths).counts.spikes)
+
+
+def silenced(netlist: Netlist, sources: BoolArray) -> Netlist:
+    """The netlist with synapses of weight zero from some sources: input channels, then compartments."""
+    away = np.repeat(sources[netlist.axon_source], np.diff(netlist.axon_synapses))
+    weight = np.where(away, 0, netlist.synapse_weight).astype(netlist.synapse_weight.dtype)
+    return replace(netlist, synapse_weight=weight)
+
+
+def effects(netlist: Netlist, spikes: IntArray) -> FloatArray:
+    """Share that each compartment has in what its layer sends to listeners; shape (compartments,).
+
+    Parameters
+    ----------
+    netlist : Netlist
+        What ran.
+    spikes : (compartments,) int64
+        Spikes of each on the training recordings. They count by the weights that they meet, in thresholds; those that
+        vote have the share infinity.
+    """
+    met = np.zeros(netlist.n_inputs + netlist.n_compartments)
+    for core in range(netlist.n_cores):
+        source, compartment, weight = netlist.synapses_of(core)
+        np.add.at(met, source, np.abs(weight) / np.maximum(netlist.threshold[compartment], 1))
+    sent = spikes * met[netlist.n_inputs :]
+    whole = np.bincount(netlist.layer, sent, len(netlist.layers))
+    share: FloatArray = sent / np.maximum(whole, 1e-300)[netlist.layer]
+    share[netlist.readout_class >= 0] = np.inf
+    return share
+
+
+def most_spared(order: IntArray, least: int, fits: Callable[[IntArray], bool]) -> IntArray:
+    """Bisect for a longest beginning of `order` that fits; of one shorter than `least` nothing is asked.
+
+    Examples
+    --------
+    >>> most_spared(np.array([4, 2, 7, 1]), 1, lambda parts: len(parts) <= 3).tolist()
+    [4, 2, 7]
+    """
+    low, high = least, len(order)
+    while low < high:
+        middle = (low + high + 1) // 2
+        if fits(order[:middle]):
+            low = middle
+        else:
+            high = middle - 1
+    return order[:low]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Trial:
+    """A compiled network, and what may be taken from it.
+
+    Parameters
+    ----------
+    compilation : Compilation
+        As it was compiled.
+    integer : IntegerNetwork
+        What of it is left; at first all.
+    training : Scene
+        Recordings on which is chosen.
+    wanted : (samples,) int64
+        Decisions on them that are to be kept.
+    allowed : int
+        How many of them may change.
+    """
+
+    compilation: Compilation
+    integer: IntegerNetwork
+    training: Scene
+    wanted: IntArray
+    allowed: int
+
+    def differ(self, netlist: Netlist) -> int:
+        """Training decisions that a netlist changes."""
+        return int(np.count_nonzero(decisions(netlist, self.training) != self.wanted))
+
+    def built(self, unused: IntArray | None = None, of: Netlist | None = None) -> Netlist:
+        """Lay out what is left, without some compartments of a netlist `of` it."""
+        masks = tuple(np.zeros(population.size, np.bool_) for population in self.integer.populations)
+        if unused is not None and of is not None:
+            for layer, mask in enumerate(masks):
+                mask[of.neuron[unused[of.layer[unused] == layer]]] = True
+                held = of.neuron[of.compartments_of(layer)]
+                if len(held) and mask[held].all():
+                    mask[held[0]] = False  # a layer keeps one neuron
+        return without(replace(self.compilation, integer=self.integer), masks)
+
+    def spare_neurons(self, netlist: Netlist, spikes: IntArray) -> IntArray:
+        """Compartments that may go together, those that never spiked first; at least these."""
+        share = effects(netlist, spikes)
+        order = np.argsort(share, kind="stable")
+        order = order[np.isfinite(share[order])]
+        never = int(np.count_nonzero(share == 0))
+
+        def fits(gone: IntArray) -> bool:
+            sources = np.zeros(netlist.n_inputs + netlist.n_compartments, np.bool_)
+            sources[netlist.n_inputs + gone] = True
+            return self.differ(silenced(netlist, sources)) <= self.allowed
+
+        return most_spared(order, never, fits)
+
+    def spare_taxels(self, netlist: Netlist, alone: IntArray) -> IntArray:
+        """Taxels that may go together; those first without which, `alone`, fewest decisions change."""
+        touched = self.training.flat[:, : netlist.taxels * netlist.polarities].sum(axis=(0, 2), dtype=np.int64)
+        events = touched.reshape(netlist.taxels, netlist.polarities).sum(axis=1)
+        order = np.lexsort((events, alone))
+        return most_spared(
+            order,
+            int(np.count_nonzero(events == 0)) if np.all(alone[events == 0] == 0) else 0,
+            lambda gone: self.differ(silenced(netlist, sources_of(netlist, gone))) <= self.allowed,
+        )
+
+
+def sources_of(netlist: Netlist, taxels: IntArray) -> BoolArray:
+    """Channels of some taxels among the sources; shape (n_inputs + compartments,)."""
+    found = np.zeros(netlist.n_inputs + netlist.n_compartments, np.bool_)
+    channels = np.asarray(taxels)[:, None] * netlist.polarities + np.arange(netlist.polarities)
+    found[channels.ravel()] = True
+    return found
+
+
+def without_taxels(integer: IntegerNetwork, netlist: Netlist, taxels: IntArray) -> IntegerNetwork:
+    """The integer network deaf to some taxels."""
+    return deaf_to(integer, sources_of(netlist, taxels)[: netlist.n_inputs])
+
+
+def alone(netlist: Netlist, of: Scene, wanted: IntArray) -> IntArray:
+    """Decisions that change without each taxel; shape (taxels,)."""
+    prepared, changed = engine.prepare(netlist), np.zeros(netlist.taxels, np.int64)
+    for taxel in range(netlist.taxels):
+        channels = slice(taxel * netlist.polarities, (taxel + 1) * netlist.polarities)
+        if of.flat[:, channels].any():
+            without_it = of.flat.copy()
+            without_it[:, channels] = 0
+            counts = engine.simulate(prepared, without_it, lengths=of.lengths).counts
+            changed[taxel] = np.count_nonzero(predictions(netlist, counts.spikes) != wanted)
+    return changed
+
+
+def without_hops(
+    compilation: Compilation, checkpoint: Checkpoint, adjacency: FloatArray, hops: tuple[int, ...]
+) -> IntegerNetwork | None:
+    """The integer network with a first layer that lacks some hops, rounded to the storage that it has; others as is.
+
+    Neurons that were left out stay out. None where a register cannot hold what is left.
+    """
+    fewer = checkpoint.hops.copy()
+    fewer[list(hops)] = 0
+    integer, network = compilation.integer, expand(replace(checkpoint, hops=fewer), adjacency)
+    planes = [p for p in integer.projections if p.post == 0]
+    form = Form(
+        bits=planes[0].bits,
+        exponents=tuple(sorted({p.exponent for p in planes})),
+        threshold=np.maximum(integer.populations[0].threshold, 1),
+    )
+    layer = rounded(network.populations[0], incoming(network, 0), form)
+    if layer is None or layer.reached > ONE_STEP_SUM_MAX:
+        return None
+    return replace(integer, projections=(*layer.projections, *(p for p in integer.projections if p.post != 0)))
+
+
+def coarser(of: Scene, netlist: Netlist, bins: int) -> Scene:
+    """Bins joined to longer ones: an event wherever there was one in any of them."""
+    n_sensor = netlist.taxels * netlist.polarities
+    joined = join_bins(of.flat[:, :n_sensor], bins)
+    lengths = None if of.lengths is None else -(-of.lengths // bins)
+    clocks = coarse_netlist(netlist, bins, adapted=False).clocks
+    return Scene(
+        flat=with_clocks(joined.reshape(len(joined), netlist.taxels, netlist.polarities, -1), clocks),
+        labels=of.labels,
+        lengths=lengths,
+    )
+
+
+def coarse_netlist(netlist: Netlist, bins: int, *, adapted: bool) -> Netlist:
+    """The netlist for joined bins: clocks as much slower; if `adapted`, what membranes and currents keep in as many."""
+    clocks = replace(netlist.clocks, steps=max(1, round(netlist.clocks.steps / bins)))
+    if not adapted:
+        return replace(netlist, clocks=clocks)
+    one = 1 << DECAY_BITS
+    keep_v, keep_u = (one - netlist.decay_v) / one, (one - 1 - netlist.decay_u) / one
+    return replace(
+        netlist,
+        clocks=clocks,
+        decay_v=read_only(np.round(one * (1 - keep_v**bins))),
+        decay_u=read_only(np.minimum(np.round(one * (1 - keep_u**bins)), one) - 1),
+    )

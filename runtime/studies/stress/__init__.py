@@ -1,0 +1,1 @@
+"""Where float network and chip break."""

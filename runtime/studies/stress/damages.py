@@ -1,0 +1,217 @@
+"""What may happen to a network on its chip, done to the netlist and to the float network alike.
+
+A damage takes a :class:`Pair` and hands back another. What is stored in integers is changed there; the float weight
+moves by as much in its own units, which is the same relative change up to rounding. Compartments alone are damaged: a
+neuron that the chip does not hold stays as it is in the float network.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+
+from spikeloom.compiler.fixedpoint import (
+    DECAY_BITS,
+    THRESHOLD_MANTISSA_MAX,
+    FloatArray,
+    IntArray,
+    round_half_even,
+    weight_step,
+)
+from spikeloom.compiler.ir import INPUT, Network, Population, Projection
+from spikeloom.compiler.targets.loihi1.netlist import Netlist, frozen, in_units, read_only
+from spikeloom.compiler.targets.loihi1.storage.weight_storage import decay_registers
+
+Mask = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Pair:
+    """A netlist and the float network beside it, of the same populations."""
+
+    netlist: Netlist
+    network: Network
+
+
+# -- weights -----------------------------------------------------------------------------------------------------------
+
+
+def with_weights(pair: Pair, weight: npt.NDArray[Any]) -> Pair:
+    """Store other mantissas (synapses,); float weights move by as many weight units.
+
+    Entries in which nothing changes keep their float weight, bit for bit.
+    """
+    netlist, network = pair.netlist, pair.network
+    moved = np.flatnonzero(weight != netlist.synapse_weight)
+    axon = netlist.axon_of_synapse()[moved]
+    exponent = netlist.format_exponent[netlist.axon_format[axon]]
+    units = in_units(weight[moved], exponent) - in_units(netlist.synapse_weight[moved], exponent)
+    target = netlist.synapse_compartment()[moved]
+    source = netlist.axon_source[axon]
+    inner = source >= netlist.n_inputs
+    sender = np.where(inner, source - netlist.n_inputs, 0)
+    pre = np.where(inner, netlist.layer[sender], INPUT)
+    column = np.where(inner, netlist.neuron[sender], source)
+    post, row, step = netlist.layer[target], netlist.neuron[target], units / netlist.scale[target]
+    projections = []
+    for projection in network.projections:
+        own = (post == projection.post) & (pre == projection.pre)
+        more = sparse.csr_array((step[own], (row[own], column[own])), shape=projection.weight.shape)
+        projections.append(replace(projection, weight=projection.weight + more if own.any() else projection.weight))
+    stored = frozen(weight.astype(netlist.synapse_weight.dtype))
+    return Pair(
+        netlist=replace(netlist, synapse_weight=stored), network=replace(network, projections=tuple(projections))
+    )
+
+
+def _codes(netlist: Netlist) -> tuple[IntArray, IntArray]:
+    """Stored weights in steps of their format, and the width of each; both (synapses,) int64."""
+    bits = netlist.format_weight_bits[netlist.axon_format[netlist.axon_of_synapse()]]
+    return netlist.synapse_weight.astype(np.int64) // weight_steps(bits), bits
+
+
+def weight_steps(bits: IntArray) -> IntArray:
+    """Distance of neighbouring mantissas of each width; as :func:`fixedpoint.weight_step`."""
+    known = np.array([0, 0, *(weight_step(width) for width in range(2, 9))])
+    return known[bits]
+
+
+def flip_bits(pair: Pair, share: float, rng: np.random.Generator) -> Pair:
+    """Flip each bit of synaptic memory that holds a weight with a probability; weights in two's complement."""
+    code, bits = _codes(pair.netlist)
+    last = np.cumsum(bits)
+    total = int(last[-1]) if len(last) else 0
+    bit = np.unique(rng.integers(0, max(total, 1), rng.binomial(total, share)))
+    synapse = np.searchsorted(last, bit, side="right")
+    flips = np.zeros(len(code), np.int64)
+    np.bitwise_or.at(flips, synapse, np.int64(1) << (last[synapse] - 1 - bit))
+    half = np.int64(1) << (bits - 1)
+    flipped = (((code + 2 * half) ^ flips) & (2 * half - 1)) + half
+    return with_weights(pair, ((flipped & (2 * half - 1)) - half) * weight_steps(bits))
+
+
+def fewer_bits(pair: Pair, width: int) -> Pair:
+    """Keep so many bits of each weight at most, rounded to the nearest; scales stay."""
+    code, bits = _codes(pair.netlist)
+    factor = np.int64(1) << np.maximum(bits - width, 0)
+    most = (np.int64(1) << (np.minimum(bits, width) - 1)) - 1
+    kept = np.clip(round_half_even(code / factor), -most, most) * factor
+    return with_weights(pair, kept * weight_steps(bits))
+
+
+# -- neurons -----------------------------------------------------------------------------------------------------------
+
+
+def hidden(pair: Pair) -> IntArray:
+    """Compartments that neither vote nor relay a clock; (…,) int64."""
+    netlist = pair.netlist
+    relays = np.array([population.size - population.relays for population in pair.network.populations])
+    found: IntArray = np.flatnonzero((netlist.readout_class < 0) & (netlist.neuron < relays[netlist.layer]))
+    return found
+
+
+def stick_neurons(pair: Pair, share: float, rng: np.random.Generator, *, firing: bool) -> Pair:
+    """Some hidden neurons never fire, or fire in every step, whatever they hear."""
+    netlist = pair.netlist
+    among = hidden(pair)
+    stuck = np.zeros(netlist.n_compartments, np.bool_)
+    stuck[rng.permutation(among)[: round(share * len(among))]] = True
+    target = netlist.synapse_compartment()
+    changed = replace(
+        netlist,
+        synapse_weight=frozen(np.where(stuck[target], 0, netlist.synapse_weight).astype(netlist.synapse_weight.dtype)),
+        bias_mantissa=read_only(np.where(stuck, int(firing), netlist.bias_mantissa)),
+        bias_exponent=read_only(np.where(stuck, 0, netlist.bias_exponent)),
+        threshold=read_only(np.where(stuck & firing, 0, netlist.threshold)),
+    )
+
+    def population(number: int, old: Population) -> Population:
+        level = 2 * old.theta if firing else 0.0
+        return replace(old, bias=np.where(_neurons(netlist, stuck, number), level, old.bias))
+
+    populations = tuple(population(i, old) for i, old in enumerate(pair.network.populations))
+    free = [np.where(_neurons(netlist, stuck, i), 0.0, 1.0) for i in range(len(populations))]
+    return Pair(netlist=changed, network=replace(_rows_scaled(pair.network, free), populations=populations))
+
+
+def with_thresholds(pair: Pair, threshold: IntArray) -> Pair:
+    """Other threshold mantissas (compartments,); in the float network they change by the same factor.
+
+    A neuron with another threshold fires as one with the old one whose weights and bias are divided by the factor.
+    """
+    netlist = pair.netlist
+    held = np.clip(threshold, 1, THRESHOLD_MANTISSA_MAX)
+    factor = np.maximum(netlist.threshold, 1) / held
+    relays = [population.size - population.relays for population in pair.network.populations]
+    factors = []
+    for number, layer in enumerate(netlist.layers):
+        ids = netlist.compartments_of(number)
+        whole = np.ones(layer.neurons)
+        whole[netlist.neuron[ids]] = factor[ids]
+        whole[relays[number] :] = 1.0
+        factors.append(whole)
+    apart = np.array(relays)[netlist.layer] <= netlist.neuron
+    changed = replace(netlist, threshold=read_only(np.where(apart, netlist.threshold, held)))
+    network = _rows_scaled(pair.network, factors)
+    populations = tuple(
+        replace(population, bias=population.bias * by)
+        for population, by in zip(network.populations, factors, strict=True)
+    )
+    return Pair(netlist=changed, network=replace(network, populations=populations))
+
+
+def scale_thresholds(pair: Pair, factor: FloatArray | float) -> Pair:
+    """Multiply all thresholds by a factor, or each by its own (compartments,); rounded to what registers hold."""
+    return with_thresholds(pair, round_half_even(pair.netlist.threshold * np.asarray(factor)))
+
+
+def spread_thresholds(pair: Pair, spread: float, rng: np.random.Generator) -> Pair:
+    """Each threshold drifts by a factor of its own: normal around 1, not below a twentieth."""
+    drift = rng.standard_normal(pair.netlist.n_compartments)
+    return scale_thresholds(pair, np.maximum(1 + spread * drift, 0.05))
+
+
+def shorten_decay(pair: Pair, factor: float) -> Pair:
+    """Membranes and lasting currents keep a smaller share of themselves: decays times a factor below 1."""
+    netlist = pair.netlist
+    registers = np.array([decay_registers(layer.beta * factor, layer.alpha * factor) for layer in netlist.layers])
+    decay_u, decay_v = registers[netlist.layer].T
+    changed = replace(netlist, decay_u=read_only(decay_u), decay_v=read_only(decay_v))
+    one = 1 << DECAY_BITS
+    populations = tuple(
+        replace(population, beta=(one - v) / one, alpha=(one - 1 - u) / one)
+        for population, (u, v) in zip(pair.network.populations, registers.tolist(), strict=True)
+    )
+    return Pair(netlist=changed, network=replace(pair.network, populations=populations))
+
+
+def open_late(pair: Pair, steps: int) -> Pair:
+    """All layers but the first open their windows later: they miss the first steps of what they hear.
+
+    The float network needs no change: :func:`float_engine.prepare` takes depths from the netlist.
+    """
+    layers = tuple(replace(layer, depth=layer.depth + steps) if layer.depth else layer for layer in pair.netlist.layers)
+    return Pair(netlist=replace(pair.netlist, layers=layers), network=pair.network)
+
+
+def _neurons(netlist: Netlist, flags: Mask, layer: int) -> Mask:
+    """Flags of compartments as those of a layer's neurons."""
+    found = np.zeros(netlist.layers[layer].neurons, np.bool_)
+    ids = netlist.compartments_of(layer)
+    found[netlist.neuron[ids]] = flags[ids]
+    return found
+
+
+def _rows_scaled(network: Network, factors: list[FloatArray]) -> Network:
+    """Multiply what each neuron hears by a factor of its own."""
+
+    def scaled(projection: Projection) -> Projection:
+        weight = projection.weight.copy()
+        weight.data *= np.repeat(factors[projection.post], np.diff(weight.indptr))
+        return replace(projection, weight=weight)
+
+    return replace(network, projections=tuple(scaled(projection) for projection in network.projections))

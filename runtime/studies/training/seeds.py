@@ -1,0 +1,163 @@
+"""Trainings side by side: one process a seed, all ended together, each continued from where it was interrupted."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, closing
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+
+from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.fixedpoint import IntArray
+from spikeloom.compiler.formats.atomic import remove_leftovers
+from spikeloom.runtime.studies.jobs.locks import only_one
+from spikeloom.runtime.studies.jobs.workers import ProcessDied, cores, ended_by_signal, run_side_by_side
+from spikeloom.runtime.studies.training.training import Job, recall, run_job, state_of
+
+Result = tuple[dict[str, Any], IntArray | None]
+
+
+class Writes(Protocol):
+    """A job that crosses process borders."""
+
+    @property
+    def output(self) -> Path:
+        """File that it writes."""
+
+
+AJob = TypeVar("AJob", bound=Writes)
+AResult = TypeVar("AResult")
+
+
+def train_seeds(jobs: Sequence[Job], *, resume: bool) -> list[Result]:
+    """Train several seeds, side by side on the cores where there are several.
+
+    Parameters
+    ----------
+    jobs : sequence of Job
+        One for each seed.
+    resume : bool
+        Leave finished seeds alone, go on with interrupted ones, and start the rest.
+
+    Returns
+    -------
+    list of (record, predictions)
+        In the order of the jobs, see :func:`training.run_job`.
+
+    Raises
+    ------
+    OptionError
+        If there is something to resume and `resume` is false, or the reverse; if a file holds another training; or if
+        a training ended without a result; if another process works on a file.
+    KeyboardInterrupt
+        On an interrupt or a request to end; its text says what is kept.
+    """
+    with ExitStack() as locks:
+        for job in jobs:
+            locks.enter_context(only_one(job.output))
+        return _train(jobs, resume=resume)
+
+
+def _train(jobs: Sequence[Job], *, resume: bool) -> list[Result]:
+    results: dict[int, Result] = {}
+    for index, job in enumerate(jobs):
+        if resume and finished(job):
+            results[index] = recall(job)
+    _require_right_start(jobs, resume=resume, some_finished=bool(results))
+    for index, job in enumerate(jobs):
+        clear(job)
+        if index in results:
+            sys.stderr.write(f"spikeloom: {job.output}: is finished, not trained again\n")
+        elif resume and not states(job):
+            sys.stderr.write(f"spikeloom: {job.output}: was not begun, trained from the start\n")
+    waiting = [index for index in range(len(jobs)) if index not in results]
+    try:
+        with ended_by_signal():
+            if len(waiting) == 1:
+                results[waiting[0]] = run_job(jobs[waiting[0]])
+            else:
+                side_by_side(jobs, waiting, results, run_job)
+    except KeyboardInterrupt as interrupt:
+        done = [jobs[index] for index in waiting if index in results]
+        raise KeyboardInterrupt(_kept(done, jobs)) from interrupt
+    return [results[index] for index in range(len(jobs))]
+
+
+def finished(job: Job) -> bool:
+    """Whether its checkpoint is there and nothing is left to go on with."""
+    return not states(job) and job.output.exists()
+
+
+def clear(job: Job) -> None:
+    """Remove what a killed process left half-written."""
+    for file in (job.output, *state_of(job)):
+        remove_leftovers(file)
+
+
+def states(job: Job) -> list[Path]:
+    """Files of an interrupted training, as far as they are there."""
+    return [file for file in state_of(job) if file.exists()]
+
+
+def _require_right_start(jobs: Sequence[Job], *, resume: bool, some_finished: bool) -> None:
+    """Neither lose an interrupted training nor begin anew in silence."""
+    kept = [file for job in jobs for file in states(job)]
+    if kept and not resume:
+        raise OptionError(
+            f"{', '.join(map(str, kept))}: an interrupted training is kept here; go on with --resume, or delete "
+            f"{'it' if len(kept) == 1 else 'them'} to train anew"
+        )
+    if resume and not kept and not some_finished:
+        raise OptionError(
+            f"--resume: nothing was interrupted, neither {jobs[0].output} nor {state_of(jobs[0])[0]} exists; "
+            "leave --resume away"
+        )
+
+
+def _kept(done: Sequence[Job], jobs: Sequence[Job]) -> str:
+    """What an interrupt left, and how to go on; empty if nothing."""
+    written = [str(job.output) for job in done]
+    kept = [str(file) for job in jobs for file in states(job)]
+    parts = [f"{', '.join(written)} {'is' if len(written) == 1 else 'are'} finished"] if written else []
+    if kept:
+        parts.append(f"the epochs so far are kept in {', '.join(kept)}")
+    return f"{' and '.join(parts)}; go on with the same command and --resume" if parts else ""
+
+
+def side_by_side(
+    jobs: Sequence[AJob],
+    waiting: Sequence[int],
+    results: dict[int, AResult],
+    run: Callable[[AJob], AResult],
+) -> None:
+    """Run jobs in processes of their own; whatever ends this ends them all.
+
+    Parameters
+    ----------
+    jobs : sequence
+        All of them.
+    waiting : sequence of int
+        Which to run, in this order.
+    results : dict
+        Takes the result of each job by its place among `jobs`.
+    run : callable
+        Does the work; a function of a module, since it crosses process borders.
+
+    Raises
+    ------
+    SpikeloomError, OSError, MemoryError
+        What ended a job.
+    """
+    work = [jobs[index] for index in waiting]
+    with closing(run_side_by_side(work, run, processes=cores())) as at_work:
+        for place, found in at_work:
+            index = waiting[place]
+            if isinstance(found, ProcessDied):
+                raise OptionError(
+                    f"{jobs[index].output}: {found}, perhaps for lack of memory; go on with --resume, and with fewer "
+                    "--seeds"
+                )
+            if isinstance(found, Exception):
+                raise found
+            results[index] = found
