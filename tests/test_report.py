@@ -27,7 +27,7 @@ from spikeloom.runtime import cli
 from spikeloom.runtime.costs import cost
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.trace import aligned
-from spikeloom.runtime.report.page.traces import MARK, ROWS, drawn, raster
+from spikeloom.runtime.page.traces import MARK, ROWS, drawn, raster
 
 REPORT = ("report", "net.loom", "--checkpoint", "net.pt", "--data", "data", "-o", "out.html")
 HEADINGS = ["Verdict", "Decisions", "Cores", "Taxels", "One recording", "Energy and time", "Provenance"]

@@ -24,7 +24,7 @@ from spikeloom.runtime.costs.spent import Account, explained
 from spikeloom.runtime.equivalence.levels import levels_of, unmet
 from spikeloom.runtime.equivalence.verdicts import verify_json
 from spikeloom.runtime.machines.loihi1.trace import check_channels
-from spikeloom.runtime.report.page.text import report_text
+from spikeloom.runtime.page.text import report_text
 from spikeloom.runtime.report.render import netlist_json
 from spikeloom.runtime.studies.chart.file import read_chart
 
@@ -65,13 +65,13 @@ def report(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], 
     SpikeloomError
         If an option, the netlist, the checkpoint or the recordings cannot be used, or do not belong together.
     """
-    from spikeloom.runtime.report.page.page import page
+    from spikeloom.runtime.page.page import page
 
     require_place(arguments.output, "-o", arguments)
     netlist = read_netlist(arguments.netlist)
     stability: Json = {}
     if arguments.stress is not None:
-        from spikeloom.runtime.report.page.stress import read_stress
+        from spikeloom.runtime.page.stress import read_stress
 
         sha256 = hashlib.sha256(Path(arguments.netlist).read_bytes()).hexdigest()
         stability = {"stress": read_stress(arguments.stress, arguments.netlist, sha256)}
@@ -142,8 +142,8 @@ def _facts(
     from spikeloom.runtime.costs.estimate import estimate
     from spikeloom.runtime.costs.estimates import estimate_json
     from spikeloom.runtime.equivalence.verify import verify
-    from spikeloom.runtime.report.page import facts as report_facts
-    from spikeloom.runtime.report.page.recording import recording_json
+    from spikeloom.runtime.page import facts as report_facts
+    from spikeloom.runtime.page.recording import recording_json
 
     account = Account(netlist, data, checked=arguments.spec_samples)
     target = load_target(netlist.target)

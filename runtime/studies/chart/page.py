@@ -60,7 +60,7 @@ def chart_page(report: Json) -> str:
     }
     body = "".join(section(name, heading, content) for name, (heading, content) in sections.items())
     links = "".join(f'<li><a href="#{name}">{escape(heading)}</a></li>' for name, (heading, _) in sections.items())
-    page, files = resources.files("spikeloom.runtime.report.page"), resources.files("spikeloom.runtime.studies.chart")
+    page, files = resources.files("spikeloom.runtime.page"), resources.files("spikeloom.runtime.studies.chart")
     style = "".join(sheet.read_text("utf-8") for sheet in (page / "report.css", files / "chart.css"))
     script = files.joinpath("chart.js").read_text("utf-8")
     return (

@@ -8,10 +8,10 @@ from html import escape
 from importlib import resources
 from typing import Any
 
+from spikeloom.runtime.page import costs as report_costs
+from spikeloom.runtime.page import sections as report_sections
+from spikeloom.runtime.page import stress as report_stress
 from spikeloom.runtime.report.markup import paragraph, section, table
-from spikeloom.runtime.report.page import costs as report_costs
-from spikeloom.runtime.report.page import sections as report_sections
-from spikeloom.runtime.report.page import stress as report_stress
 from spikeloom.runtime.studies.chart.page import chart_section
 
 Json = dict[str, Any]
@@ -31,7 +31,7 @@ def page(report: Json) -> str:
     shown = {name: found for name, found in made_of.items() if found[1]}
     body = "".join(section(name, heading, content) for name, (heading, content) in shown.items())
     links = "".join(f'<li><a href="#{name}">{escape(heading)}</a></li>' for name, (heading, _) in shown.items())
-    files, charts = resources.files("spikeloom.runtime.report.page"), resources.files("spikeloom.runtime.studies.chart")
+    files, charts = resources.files("spikeloom.runtime.page"), resources.files("spikeloom.runtime.studies.chart")
     sheets = [files / "report.css", *([charts / "chart.css"] if "chart" in report else [])]
     style = "".join(sheet.read_text("utf-8") for sheet in sheets)
     script = files.joinpath("report.js").read_text("utf-8")

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from itertools import groupby
 from typing import Any
 
-from spikeloom.runtime.report.page.text import trace_spikes, trace_title
+from spikeloom.runtime.page.text import trace_spikes, trace_title
 from spikeloom.runtime.report.svg import WIDTH, Frame, drawing, legend, number, shape, words
 
 Json = dict[str, Any]

@@ -6,7 +6,7 @@ import math
 from collections import Counter
 from typing import Any
 
-from spikeloom.runtime.report.page.text import sender
+from spikeloom.runtime.page.text import sender
 from spikeloom.runtime.report.svg import LETTER, WIDTH, drawing, legend, shape, words
 
 Json = dict[str, Any]

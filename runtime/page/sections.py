@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 from spikeloom.runtime.equivalence.verdicts import divergence_text
+from spikeloom.runtime.page import figures as report_figures
+from spikeloom.runtime.page.text import confusions, sender, trace_spikes, trace_title
+from spikeloom.runtime.page.traces import drawn, membranes, raster
 from spikeloom.runtime.report import svg
 from spikeloom.runtime.report.markup import facts, figure, paragraph, table, unfold
-from spikeloom.runtime.report.page import figures as report_figures
-from spikeloom.runtime.report.page.text import confusions, sender, trace_spikes, trace_title
-from spikeloom.runtime.report.page.traces import drawn, membranes, raster
 from spikeloom.runtime.report.tables import percent, si
 
 Json = dict[str, Any]
