@@ -22,11 +22,11 @@ import numpy as np
 import onnx
 import onnxruntime
 
+from spikeloom import __version__
 from spikeloom.compiler.formats.atomic import write_atomically
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.models.recordings.evtouch import load_recordings
-from spikeloom.runtime.commands.inputs import version
 from spikeloom.runtime.machines.loihi1 import engine, onnx_engine
 
 FEW = 8
@@ -99,7 +99,7 @@ def main() -> None:
         "netlist_sha256": hashlib.sha256(Path(arguments.netlist).read_bytes()).hexdigest(),
         "recordings": Path(arguments.recordings).name,
         "steps": events.shape[2],
-        "spikeloom": version(),
+        "spikeloom": __version__,
         "onnx": onnx.__version__,
         "onnxruntime": onnxruntime.__version__,
         "python": platform.python_version(),

@@ -16,6 +16,7 @@ from made_files import CLASSES, FEATURES, STEPS, TAXELS, events, own_file, recor
 from made_files import weights as made_weights
 from spikeloom.runtime.__main__ import main as start
 
+from spikeloom import __version__
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.interpret import channels_last, run_integer
 from spikeloom.compiler.targets.base import EVENTS, load_target
@@ -28,6 +29,7 @@ from spikeloom.runtime import cli
 from spikeloom.runtime.commands import inputs
 from spikeloom.runtime.commands.inputs import recordings
 from spikeloom.runtime.commands.main_job import compile as compile_command
+from spikeloom.runtime.commands.main_job import demo
 
 SIZES = {"conv1": TAXELS * FEATURES, "fc1": 9, "fc2": 8, "fc3": CLASSES}
 
@@ -203,7 +205,7 @@ def test_every_storage_width(as_json, tmp_path, bits):
 def test_provenance_names_everything_that_decided(as_json, place):
     report = as_json("inspect", "net.loom")
     assert report["provenance"] == {
-        "spikeloom": cli.version(),
+        "spikeloom": __version__,
         "checkpoint_sha256": hashlib.sha256((place / "net.pt").read_bytes()).hexdigest(),
         "run": 0,
         "weights": "last",
@@ -601,7 +603,7 @@ def test_demo_runs_the_main_job(spikeloom, tmp_path):
     assert code == (0 if reports["verify"]["decision_agreement"] >= 0.95 else 1)
     again, out, err = spikeloom("demo")
     assert (again, err) == (code, "")
-    for command in cli.DEMO:
+    for command in demo.STEPS:
         assert f"$ spikeloom {' '.join(command).replace('{folder}/', '')}\n" in out
     assert sorted(file.name for file in tmp_path.iterdir()) == ["grasps.pt"]
 
@@ -610,7 +612,7 @@ def test_version(capsys):
     with pytest.raises(SystemExit) as stop:
         cli.main(["--version"])
     assert stop.value.code == 0
-    assert capsys.readouterr().out == f"spikeloom {cli.version()}\n"
+    assert capsys.readouterr().out == f"spikeloom {__version__}\n"
 
 
 def test_help_names_every_command(capsys):

@@ -16,7 +16,7 @@ from spikeloom.models.recordings.fetch import DataSet
 from spikeloom.models.recordings.found import show_counts
 from spikeloom.models.recordings.grasps import synthetic_split
 from spikeloom.models.recordings.release import write_event_lines, write_released
-from spikeloom.runtime.commands.exchange.data import add_bin_option, add_data_commands
+from spikeloom.runtime.commands.options import add_bin_option, add_data_commands
 
 
 def start(*words):

@@ -16,6 +16,7 @@ from random_netlists import Axon, Neuron, build, large_netlist
 from test_export import run
 from test_onnx_engine import three_neurons
 
+from spikeloom import __version__
 from spikeloom.compiler.errors import FormatError, ModelError, OptionError
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.loihi1.compilation import compile_network
@@ -24,7 +25,6 @@ from spikeloom.compiler.targets.loihi1.netlist_file import netlist_bytes, write_
 from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe
 from spikeloom.models.networks.reference import float_spikes
 from spikeloom.runtime import cli
-from spikeloom.runtime.commands.inputs import version
 from spikeloom.runtime.formats import onnx_float, onnx_graph
 from spikeloom.runtime.formats.onnx_nodes import port_words
 from spikeloom.runtime.formats.onnx_plan import digits, is_pipeline, plan
@@ -151,9 +151,9 @@ def test_metadata_tell_where_a_file_comes_from():
         "input": "2 taxels x 1 polarities; channel = taxel * 1 + polarity; 0 or 1",
         "max_depth": "1",
         "netlist_sha256": hashlib.sha256(netlist_bytes(netlist)).hexdigest(),
-        "version": version(),
+        "version": __version__,
     }
-    assert (model.producer_name, model.producer_version) == ("spikeloom", version())
+    assert (model.producer_name, model.producer_version) == ("spikeloom", __version__)
     assert "LAYER.membrane" in model.doc_string
 
 

@@ -45,7 +45,7 @@ def parser() -> argparse.ArgumentParser:
 
 def command(*words: object) -> tuple[dict, str]:
     """Run the command; its summary as values and as text."""
-    report, as_text, code = watch.watch(parser().parse_args([str(word) for word in words]))
+    report, as_text, code = watch.run(parser().parse_args([str(word) for word in words]))
     assert code == 0
     return report, as_text(report)
 
@@ -448,7 +448,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)  # jobs in the backgrou
 parser = argparse.ArgumentParser()
 parser.add_argument("--json", action="store_true")
 watch.add_arguments(parser)
-report, as_text, code = watch.watch(parser.parse_args())
+report, as_text, code = watch.run(parser.parse_args())
 print(as_text(report))
 sys.exit(code)
 """

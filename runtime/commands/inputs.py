@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 
-from spikeloom import __version__
 from spikeloom.compiler.errors import DataError, ModelError, OptionError
 from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.formats.checkpoint import Checkpoint, read_checkpoint
@@ -24,8 +23,10 @@ from spikeloom.models.recordings.events import BIN_S, MAX_STEPS, joined_bins, lo
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.recordings.found import show_counts
 from spikeloom.models.recordings.grasps import SYNTHETIC, synthetic_split
+from spikeloom.models.recordings.windows import first_part, window_asked
 from spikeloom.models.sensors import read_layout, sensor_graph
 from spikeloom.models.systems import NO_GRAPH, grid_cells, propagation_of
+from spikeloom.runtime.report.console import progress
 
 _RECORDINGS = "recordings are shown by spikeloom data describe"
 
@@ -258,18 +259,6 @@ def require_inspectable(path: str) -> None:
     raise OptionError(f"{path}: holds {shown}, not a netlist or a checkpoint; {_RECORDINGS}")
 
 
-def version() -> str:
-    """Version of the installed package."""
-    return __version__
-
-
-def progress(label: str) -> None:
-    """Say on a terminal what is being done; an empty label wipes the line."""
-    if sys.stderr.isatty():
-        sys.stderr.write(f"\r\x1b[K{label} …" if label else "\r\x1b[K")
-        sys.stderr.flush()
-
-
 def asked_checkpoint(path: str, arguments: argparse.Namespace) -> Checkpoint:
     """Read a checkpoint as the options say.
 
@@ -293,3 +282,9 @@ def asked_checkpoint(path: str, arguments: argparse.Namespace) -> Checkpoint:
         system=arguments.system,
         cells=grid_cells(places) if places.shape[1] == 2 else None,
     )
+
+
+def netlist_recordings(arguments: argparse.Namespace, netlist: Netlist, *, labels_for: str | None = None) -> Recordings:
+    """Recordings that a netlist can take, as long a part of each as ``--window`` says."""
+    percent = window_asked(arguments.window)
+    return first_part(asked_recordings(arguments, netlist, labels_for=labels_for), percent)

@@ -20,7 +20,8 @@ from spikeloom.compiler.formats.onnx.reader import OnnxNetwork, read_onnx
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
-from spikeloom.runtime.commands.inputs import asked_checkpoint, asked_graph, progress, propagation
+from spikeloom.runtime.commands.inputs import asked_checkpoint, asked_graph, propagation
+from spikeloom.runtime.report.console import progress
 
 TITLES = {ONNX: "ONNX", NIR: "NIR"}
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.runtime.commands.inputs import progress
+from spikeloom.runtime.report.console import progress
 
 Json = dict[str, Any]
 

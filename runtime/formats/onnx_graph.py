@@ -41,11 +41,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from spikeloom import __version__
 from spikeloom.compiler.dynamics import Clocks
 from spikeloom.compiler.ir import INPUT
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import netlist_bytes
-from spikeloom.runtime.commands.inputs import version
 from spikeloom.runtime.formats.onnx_neuron import bias, gathered, integrate, products
 from spikeloom.runtime.formats.onnx_nodes import Nodes, Port, model_bytes
 from spikeloom.runtime.formats.onnx_plan import Layer, is_pipeline, plan
@@ -94,7 +94,7 @@ def export(netlist: Netlist, form: str) -> bytes:
         name=f"spikeloom-{form}",
         about=__doc__.replace("``", "") if __doc__ else "",
         facts={
-            "version": version(),
+            "version": __version__,
             "netlist_sha256": hashlib.sha256(netlist_bytes(netlist)).hexdigest(),
             "form": form,
             "input": f"{netlist.taxels} taxels x {netlist.polarities} polarities; "

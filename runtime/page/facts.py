@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from spikeloom import __version__
 from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.systems import GRAPH_SYSTEMS
 from spikeloom.compiler.targets.base import Target
@@ -22,7 +23,7 @@ from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.models.graphs import NEUTOUCH
 from spikeloom.models.recordings.events import BIN_S
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.runtime.commands.inputs import asked_places, version
+from spikeloom.runtime.commands.inputs import asked_places
 from spikeloom.runtime.commands.load_network import Asked
 from spikeloom.runtime.equivalence.verify import Verdict
 from spikeloom.runtime.machines.loihi1.trace import Counts
@@ -201,7 +202,7 @@ def provenance_json(
             "energy_tables": {table.name: table.title for table in target.energy},
             "time_tables": {table.name: table.title for table in target.time},
         },
-        "versions": {"spikeloom": version(), "python": platform.python_version()}
+        "versions": {"spikeloom": __version__, "python": platform.python_version()}
         | {name: metadata.version(name) for name in PACKAGES},
         "commands": _commands(arguments, netlist, recording),
     }

@@ -1,9 +1,7 @@
-"""Numbers and tables as people read them, and how a result reaches them."""
+"""Numbers and tables as people read them."""
 
 from __future__ import annotations
 
-import os
-import sys
 from collections.abc import Iterable, Sequence
 
 from spikeloom.runtime.report.intervals import wilson
@@ -55,24 +53,3 @@ def si(value: float, unit: str) -> str:
         if abs(value) >= 0.9995 * factor:  # what three digits round up to the next prefix
             return f"{value / factor:.3g} {prefix}{unit}"
     return f"{value:.3g} {unit}"
-
-
-def show(text: str) -> None:
-    """Write a result to standard output; a reader that goes away early (``| head``) is no mistake.
-
-    Letters that the terminal's encoding lacks become question marks.
-
-    Raises
-    ------
-    OSError
-        If the output cannot take the text, for example on a full disk.
-    """
-    encoding = sys.stdout.encoding or "utf-8"
-    try:
-        sys.stdout.write(text.encode(encoding, "replace").decode(encoding) + "\n")
-        sys.stdout.flush()
-    except OSError as error:
-        # Python flushes again when it ends, and would complain again: let that go nowhere.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        if not isinstance(error, BrokenPipeError):
-            raise OSError(error.errno, error.strerror, "standard output") from error

@@ -40,7 +40,6 @@ if TYPE_CHECKING:
 
 Json = dict[str, Any]
 
-SUMMARY = "say why chip and float model differ on one recording: roots, their causes, and what removes them"
 NOTES = """\
 An entry (neuron and step) that differs is a root if no input of the neuron differed since the last step in which both
 sides fired; everything else follows from roots. Without --sample the first recording that differs is explained, of
@@ -65,7 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = NOTES
 
 
-def explain(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
+def run(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
     """Run the command; differences are its subject, not a failure.
 
     Raises

@@ -17,8 +17,9 @@ from typing import TYPE_CHECKING, Any
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.formats.atomic import write_atomically
-from spikeloom.runtime.commands.inputs import progress, require_place
+from spikeloom.runtime.commands.inputs import require_place
 from spikeloom.runtime.commands.options import add_network, add_recordings
+from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.studies.jobs.sweep import Point, add_sweep_arguments, content_key, sweep
 from spikeloom.runtime.studies.stress.battery import NAMES, SEEDS, levels_of, why_not
 from spikeloom.runtime.studies.stress.perturbation import Level
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
 
 Json = dict[str, Any]
 
-SUMMARY = "where float network and chip break: a seeded battery of perturbations, with curves, verdicts and reasons"
 NOTES = """\
 Perturbations: {names}.
 Accuracies are means over the seeds with a 95 % interval; a level leaves where the mean is below the interval of the
@@ -74,7 +74,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = NOTES.format(names=", ".join(NAMES))
 
 
-def stress(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
+def run(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
     """Run the command; exit code 1 where a requirement is missed.
 
     Raises

@@ -14,8 +14,6 @@ from spikeloom.runtime.costs import yardsticks
 
 Json = dict[str, Any]
 
-SUMMARY = "NeuroBench's metrics of a checkpoint, and arithmetic energy on a processor"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Describe the options of the command."""
@@ -24,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_recordings(parser)
 
 
-def measure(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
+def run(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
     """Run the command: the report, how to print it, and the exit code."""
     from spikeloom.models.networks.reference import float_spikes  # torch, so only here
 

@@ -18,19 +18,19 @@ from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.models.recordings.eventfiles import UNLABELLED
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.runtime.commands.inputs import progress, recordings, require_place
+from spikeloom.runtime.commands.inputs import recordings, require_place
 from spikeloom.runtime.commands.load_network import asked_network
 from spikeloom.runtime.commands.options import add_network, add_recordings
 from spikeloom.runtime.costs import course
 from spikeloom.runtime.costs.course import Course
 from spikeloom.runtime.machines.loihi1.trace import check_channels
+from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.intervals import wilson
 from spikeloom.runtime.studies.anytime import exits
 from spikeloom.runtime.studies.anytime.text import anytime_text
 
 Json = dict[str, Any]
 
-SUMMARY = "how early decisions could be taken: by proof, or as sure as training says, and what that saves"
 NOTES = """\
 By proof: stop once no further spike can change the vote. With --calibrate also: stop once the leader is ahead by a
 times the root of the steps left, where a is the smallest factor that lets no more than --differ of the training split's
@@ -71,7 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = NOTES
 
 
-def anytime(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
+def run(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
     """Run the command.
 
     Raises

@@ -31,7 +31,6 @@ from spikeloom.compiler.targets.loihi1.storage.width_search import Found, Point,
 from spikeloom.models.recordings.events import BIN_S
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.recordings.fetch import data_folder
-from spikeloom.runtime.commands.exchange.data import add_bin_option
 from spikeloom.runtime.commands.inputs import (
     asked_checkpoint,
     asked_graph,
@@ -40,12 +39,11 @@ from spikeloom.runtime.commands.inputs import (
     require_place,
     shipped,
 )
-from spikeloom.runtime.commands.options import add_model
+from spikeloom.runtime.commands.options import add_bin_option, add_model
 from spikeloom.runtime.report.tables import percent, table
 
 Json = dict[str, Any]
 
-SUMMARY = "find the storage width of each layer that a wanted accuracy or agreement needs"
 NOTES = """\
 Every combination of widths is tried on training recordings; test recordings are not read, so check the netlist with
 spikeloom verify. Accuracy is the share of recordings that the chip decides right, agreement the share that it decides
@@ -84,7 +82,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = NOTES
 
 
-def bits(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
+def run(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
     """Run the command; exit code 1 if nothing reaches what is wanted.
 
     Raises

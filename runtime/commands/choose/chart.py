@@ -10,13 +10,14 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from spikeloom import __version__
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.formats.atomic import write_atomically
 from spikeloom.compiler.targets.base import CROSSBARS, Target, load_target
-from spikeloom.runtime.commands.exchange.data import add_bin_option
-from spikeloom.runtime.commands.inputs import bin_words, progress, version
-from spikeloom.runtime.commands.options import DATA_HELP, add_model
+from spikeloom.runtime.commands.inputs import bin_words
+from spikeloom.runtime.commands.options import DATA_HELP, add_bin_option, add_model
 from spikeloom.runtime.machines.truenorth.charted import TICK, time_title
+from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.studies.chart import networks as chart_networks
 from spikeloom.runtime.studies.chart import plan as chart_plan
 from spikeloom.runtime.studies.chart import points as chart_points
@@ -33,7 +34,6 @@ Json = dict[str, Any]
 KIND = "chart"
 STORE = "points.jsonl"
 
-SUMMARY = "accuracy against energy, time and size for a grid of configurations: fronts, and which one to deploy"
 NOTES = """\
 Axes of the grid: bits (2-6, 8, or one a layer as in 8+4+4+8), planes (1-3), groups (1-8), prune (0, 1), cores (cores,
 energy, latency, or LAYER:N as in fc1:6+conv1:4), window (per cent of each recording, 25-100% is every quarter,
@@ -69,7 +69,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = NOTES
 
 
-def chart(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
+def run(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
     """Run the command; exit code 1 if no point fits a budget.
 
     Raises
@@ -244,7 +244,7 @@ def _report(
         described.append(chart_networks.network_json(network) | {"float": windows})
     return {
         "format": FORMAT,
-        "spikeloom": version(),
+        "spikeloom": __version__,
         "target": target.name,
         "data": {"path": facts.data.path, "bin_s": facts.data.bin_s, "sha256": facts.data_sha256},
         "tables": {

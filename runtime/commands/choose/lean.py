@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from spikeloom import __version__
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.formats.atomic import write_atomically
@@ -20,12 +21,13 @@ from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.recordings.found import number
-from spikeloom.runtime.commands.inputs import progress, recordings, require_place, version
+from spikeloom.runtime.commands.inputs import recordings, require_place
 from spikeloom.runtime.commands.load_network import Asked, asked_network
 from spikeloom.runtime.commands.main_job.compile import storage
 from spikeloom.runtime.commands.options import add_network, add_recordings
 from spikeloom.runtime.costs.estimate import estimate
 from spikeloom.runtime.machines.loihi1 import engine
+from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.studies.pruning.leaner import (
     Scene,
     Trial,
@@ -41,7 +43,6 @@ from spikeloom.runtime.studies.pruning.text import lean_text
 
 Json = dict[str, Any]
 
-SUMMARY = "what of a network its recordings do not need: neurons, taxels, hops, fine bins; and a netlist without it"
 NOTES = """\
 Everything is chosen on the training split and reported on --split: how many decisions change, what is right,
 operations, energy and time. Of several checkpoints the cheapest within one training recording of the best is taken.
@@ -73,7 +74,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = NOTES
 
 
-def lean(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
+def run(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
     """Run the command.
 
     Raises
@@ -147,7 +148,7 @@ def _read(arguments: argparse.Namespace, split: str, limit: int | None, asked: A
 
 
 def _provenance(arguments: argparse.Namespace, asked: Asked) -> Json:
-    made = {"spikeloom": version(), "checkpoint_sha256": asked.sha256, **asked.origin(arguments.run)}
+    made = {"spikeloom": __version__, "checkpoint_sha256": asked.sha256, **asked.origin(arguments.run)}
     made |= storage(None, asked.checkpoint)
     return made | {"keep_all": False, "prune_unused": True, "ranges": "proven", "calibrated": True}
 

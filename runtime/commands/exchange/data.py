@@ -6,7 +6,7 @@ import argparse
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from spikeloom.compiler.fixedpoint import FloatArray
 from spikeloom.models.graphs import NEUTOUCH
 from spikeloom.models.recordings.describe import RULES, Description, describe
 from spikeloom.models.recordings.eventfiles import UNLABELLED
-from spikeloom.models.recordings.events import BIN_S, EventCounts, data_splits, joined_bins, load_data, require_events
+from spikeloom.models.recordings.events import EventCounts, data_splits, joined_bins, load_data, require_events
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.recordings.fetch import DATA_SETS, data_folder, fetch_data
 from spikeloom.models.recordings.found import counts_json, counts_text, number, show_notes
@@ -23,32 +23,22 @@ from spikeloom.models.recordings.grasps import SPLITS, SYNTHETIC, synthetic_spli
 from spikeloom.models.recordings.release import SOURCES, write_event_lines, write_released
 from spikeloom.models.sensors import read_layout
 from spikeloom.runtime.commands.inputs import require_bins, require_place
+from spikeloom.runtime.commands.options import add_bin_option, add_common
 from spikeloom.runtime.report.tables import table
 
-if TYPE_CHECKING:
-    from spikeloom.runtime.cli import Outcome
-
 Arguments = argparse.Namespace
+Outcome = tuple[dict[str, Any], Callable[[dict[str, Any]], str], int]
 Json = dict[str, Any]
 
 
-def add_bin_option(parser: argparse.ArgumentParser) -> None:
-    """Add ``--bin``."""
-    what = f"width of a time bin for event files (default: {BIN_S:g} s)"
-    parser.add_argument("--bin", type=float, default=BIN_S, metavar="S", help=what)
-
-
-def add_data_commands(commands: argparse._SubParsersAction[Any]) -> None:
-    """Add ``data`` and the commands under it."""
-    summary = "fetch recordings, describe them, convert events to the released layout"
-    below = commands.add_parser("data", help=summary, description=summary)
-    actions = below.add_subparsers(dest="data_command", required=True, metavar="COMMAND")
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the commands under ``data``."""
+    actions = parser.add_subparsers(dest="data_command", required=True, metavar="COMMAND")
 
     def command(name: str, action: Callable[[Arguments], Outcome], summary: str) -> argparse.ArgumentParser:
         sub: argparse.ArgumentParser = actions.add_parser(name, help=summary, description=summary)
         sub.set_defaults(action=action)
-        sub.add_argument("--json", action="store_true", help="print the result as one JSON object")
-        sub.add_argument("--debug", action="store_true", help="show a traceback on errors")
+        add_common(sub)
         return sub
 
     sub = command("fetch", _fetch, "download released recordings; --data then takes their name")

@@ -17,16 +17,14 @@ from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.models.recordings.events import BIN_S
-from spikeloom.runtime.commands.exchange.data import add_bin_option
 from spikeloom.runtime.commands.inputs import asked_checkpoint, asked_graph, propagation, recordings, require_place
-from spikeloom.runtime.commands.options import DATA_HELP, MODEL, add_model
+from spikeloom.runtime.commands.options import DATA_HELP, MODEL, add_bin_option, add_model
 from spikeloom.runtime.formats import netx_export, nir_export, onnx_float, onnx_graph, sanafe
 from spikeloom.runtime.formats.onnx_nodes import port_words
 from spikeloom.runtime.machines.truenorth.commands import export_ranc
 
 Json = dict[str, Any]
 
-SUMMARY = "write a network in the format of another program"
 
 FORMATS = {
     "sanafe": f"network and mapping of a netlist for SANA-FE {sanafe.VERSION}, YAML",
@@ -243,7 +241,7 @@ def _require_fit(arguments: argparse.Namespace) -> None:
             raise OptionError(f"{shown}: is for checkpoints, --to {arguments.to} takes a netlist; leave it away")
 
 
-def export(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
+def run(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
     """Run the command: the report, how to print it, and the exit code."""
     _require_fit(arguments)
     require_place(arguments.output, "-o", arguments)

@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from spikeloom.compiler.fixedpoint import IntArray
     from spikeloom.runtime.machines.loihi1.stream import Step, Stream
 
-SUMMARY = "read event lines (time_s,taxel,polarity) and print the running decision"
 NOTES = """\
 Lines come in the order of their times: an event whose bin is over, since a later one came, is counted as late and not
 used. What follows a # is a comment, and a grasp may begin with a header that names the columns, in any order. An empty
@@ -255,7 +254,7 @@ class Watch:
         self._display.grasp(self.grasps, bins, last, early=None if self._may_end is None else early)
 
 
-def watch(arguments: argparse.Namespace) -> tuple[dict[str, Any], Callable[[dict[str, Any]], str], int]:
+def run(arguments: argparse.Namespace) -> tuple[dict[str, Any], Callable[[dict[str, Any]], str], int]:
     """Run the command; its result is the summary, everything else was printed before.
 
     Raises

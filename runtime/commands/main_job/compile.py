@@ -8,23 +8,25 @@ from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any
 
+from spikeloom import __version__
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.formats.checkpoint import Checkpoint
 from spikeloom.compiler.targets.base import CROSSBARS, known_targets, load_target, require_target
 from spikeloom.compiler.targets.loihi1.compare import WeightDifference, compare
-from spikeloom.compiler.targets.loihi1.compilation import compile_network
-from spikeloom.compiler.targets.loihi1.layout.choose import require_goal
+from spikeloom.compiler.targets.loihi1.compilation import STAGES, compile_network
+from spikeloom.compiler.targets.loihi1.layout.choose import GOALS, require_goal
 from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist, write_netlist
-from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe
+from spikeloom.compiler.targets.loihi1.storage.quantize import RANGES, Recipe
 from spikeloom.compiler.text import text
-from spikeloom.runtime.commands.inputs import progress, recordings, require_place, version
+from spikeloom.runtime.commands.inputs import recordings, require_place
 from spikeloom.runtime.commands.load_network import Asked, asked_network
 from spikeloom.runtime.commands.main_job.restore import is_whole, take
-from spikeloom.runtime.commands.options import MARGIN, cores_asked
+from spikeloom.runtime.commands.options import MARGIN, add_bin_option, add_network, cores_asked
 from spikeloom.runtime.machines.truenorth import in_time, native
 from spikeloom.runtime.machines.truenorth.refusal import refuse
 from spikeloom.runtime.report import render
+from spikeloom.runtime.report.console import progress
 
 Json = dict[str, Any]
 
@@ -32,7 +34,59 @@ LISTED = 20
 """Weights that differ from another netlist's which the text names; JSON has them all."""
 
 
-def compile_netlist(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
+def add_arguments(sub: argparse.ArgumentParser) -> None:
+    """Add the options."""
+    sub.add_argument("checkpoint", help="checkpoint, or a network as an ONNX, NIR or netx file")
+    add_network(sub)
+    sub.add_argument("--against", metavar="NET.loom", help="list the weights that differ from another netlist's")
+    sub.add_argument("--target", default="loihi1", help="chip: loihi1 (default), or truenorth, to hear why not")
+    sub.add_argument(
+        "--weight-bits",
+        metavar="N[,N]",
+        help="storage width, one or one a layer: 2 to 6 or 8 (default: 8)",
+    )
+    sub.add_argument("--planes", metavar="N[,N]", help="times a synapse is stored, 1 to 3 (default: 1)")
+    sub.add_argument("--scale-groups", metavar="N[,N]", help="scales in a layer, 1 to 8 (default: 1)")
+    sub.add_argument(
+        "--spike-exact",
+        action="store_true",
+        help="add planes and scales until the training spikes are the float model's",
+    )
+    sub.add_argument("--keep-all", action="store_true", help="keep neurons that provably never fire or are never heard")
+    sub.add_argument(
+        "--prune-unused", action="store_true", help="leave out neurons that never fired on the training split, too"
+    )
+    sub.add_argument("--calibrate", metavar="PATH", help="recordings whose train split chooses the scales")
+    add_bin_option(sub)
+    sub.add_argument(
+        "--in-time",
+        type=int,
+        metavar="N",
+        help="truenorth: lower a history-free network, N axons an input (2 to 4), whose sums travel in 20 ticks a step",
+    )
+    sub.add_argument(
+        "--ranges", default="proven", help=f"how overflow is excluded: {' or '.join(RANGES)} (default: proven)"
+    )
+    sub.add_argument("--margin", type=float, help=f"share added to observed ranges (default: {MARGIN:g})")
+    sub.add_argument(
+        "--cores-for",
+        metavar="LAYER=N[,…]",
+        help="at least N cores for a layer, which it shares with none, as in conv1=4,fc1=6",
+    )
+    sub.add_argument("--chips", type=int, default=1, metavar="N", help="use up to N chips (default: 1)")
+    sub.add_argument(
+        "--optimize",
+        default="cores",
+        metavar="GOAL",
+        help=f"choose the cores for {', '.join(GOALS)}; the last two need --calibrate (default: cores)",
+    )
+    sub.add_argument(
+        "--dump-after", action="append", default=[], choices=STAGES, help="print the network after a stage, on stderr"
+    )
+    sub.add_argument("-o", "--output", required=True, metavar="NET.loom")
+
+
+def run(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
     """Run the command: the report, how to print it, and the exit code."""
     require_place(arguments.output, "-o", arguments)
     require_target(arguments.target)
@@ -115,7 +169,7 @@ def provenance(arguments: argparse.Namespace, asked: Asked, *, calibrated: bool)
     """
     checkpoint, cores_for = asked.checkpoint, cores_asked(arguments.cores_for)
     return {
-        "spikeloom": version(),
+        "spikeloom": __version__,
         "checkpoint_sha256": asked.sha256,
         **asked.origin(arguments.run),
         **({"towers": checkpoint.towers} if checkpoint is not None and checkpoint.towers > 1 else {}),

@@ -30,7 +30,6 @@ from spikeloom.runtime.studies.chart.file import read_chart
 
 Json = dict[str, Any]
 
-SUMMARY = "one self-contained page: verdict, accuracy, cores, taxels, spikes, membranes, energy, time, provenance"
 NOTES = """\
 The page opens from disk and loads nothing; its figures are inline SVG, each with its numbers as a table. What is
 printed is the same for people who open no page; --json prints the data behind both. The exit code is 1 if specification
@@ -57,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = NOTES
 
 
-def report(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
+def run(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
     """Run the command; nothing is written before everything is known.
 
     Raises

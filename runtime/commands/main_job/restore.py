@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Callable
 from typing import Any
 
+from spikeloom import __version__
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.formats.netx.layout import SUFFIX as NETX
 from spikeloom.compiler.formats.netx.reader import read_netx
@@ -19,9 +20,9 @@ from spikeloom.compiler.targets.loihi1.legalize import measure
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist
 from spikeloom.compiler.targets.loihi1.placing import place_integers
-from spikeloom.runtime.commands.inputs import progress, version
 from spikeloom.runtime.commands.options import MODEL, PLACING, ROUNDING, cores_asked
 from spikeloom.runtime.report import render
+from spikeloom.runtime.report.console import progress
 
 Json = dict[str, Any]
 Outcome = tuple[Json, Callable[[Json], str], int]
@@ -84,7 +85,7 @@ def _from_netx(arguments: argparse.Namespace) -> tuple[Netlist, list[str]]:
         chips=arguments.chips,
         optimize=arguments.optimize,
         provenance={
-            "spikeloom": version(),
+            "spikeloom": __version__,
             "checkpoint_sha256": found.sha256,
             "format": "netx",
             "keep_all": arguments.keep_all,

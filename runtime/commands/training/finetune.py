@@ -21,7 +21,6 @@ from spikeloom.compiler.targets.loihi1.storage.quantize import round_to_forms
 from spikeloom.models.graphs import Graph
 from spikeloom.models.recordings.events import joined_bins
 from spikeloom.models.recordings.grasps import SYNTHETIC
-from spikeloom.runtime.commands.exchange.data import add_bin_option
 from spikeloom.runtime.commands.inputs import (
     asked_checkpoint,
     asked_graph,
@@ -32,11 +31,9 @@ from spikeloom.runtime.commands.inputs import (
     require_place,
     shipped,
 )
-from spikeloom.runtime.commands.options import DATA_HELP, add_model
+from spikeloom.runtime.commands.options import DATA_HELP, add_bin_option, add_model
 from spikeloom.runtime.report.tables import percent, table
 from spikeloom.runtime.studies.jobs.locks import only_one
-
-SUMMARY = "train a network on, on the very integers of the chip, down to ternary weights"
 
 Report = dict[str, Any]
 
@@ -91,7 +88,7 @@ def _state(output: Path, *, resume: bool) -> Path:
     return state
 
 
-def finetune(arguments: argparse.Namespace) -> tuple[Report, Callable[[Report], str], int]:
+def run(arguments: argparse.Namespace) -> tuple[Report, Callable[[Report], str], int]:
     """Fine-tune, write the checkpoint, report.
 
     Raises

@@ -23,8 +23,6 @@ from spikeloom.runtime.machines.truenorth import joining, native
 from spikeloom.runtime.report.render import tower_line
 from spikeloom.runtime.report.tables import percent
 
-SUMMARY = "put several trained networks side by side in one, whose votes add up"
-
 Report = dict[str, Any]
 
 KEPT = ("command", "seed", "epochs", "recipe", "data", "data_sha256", "test_samples", "fine_tuned_from")
@@ -43,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", required=True, metavar="OUT.pt")
 
 
-def join(arguments: Namespace) -> tuple[Report, Callable[[Report], str], int]:
+def run(arguments: Namespace) -> tuple[Report, Callable[[Report], str], int]:
     """Join, write the checkpoint, report.
 
     Raises

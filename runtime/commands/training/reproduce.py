@@ -40,8 +40,6 @@ from spikeloom.runtime.studies.paper.cells import (
 
 Json = dict[str, Any]
 
-SUMMARY = "rebuild the tables of the TactileSGNet paper: train, compile and measure, in parts, from what is there"
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DataSet:
@@ -93,7 +91,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", required=True, metavar="FOLDER")
 
 
-def reproduce(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
+def run(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
     """Run the command; exit code 1 where trainings are missing in the end.
 
     Raises

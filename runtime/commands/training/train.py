@@ -8,34 +8,94 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from spikeloom import __version__
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.formats.checkpoint_file import WEIGHTS
 from spikeloom.compiler.systems import GRAPH_SYSTEMS, GRID_CNN, TACTILESGNET, TITLES, Grid
+from spikeloom.compiler.targets.truenorth.native import BASES, USUAL_COPIES
 from spikeloom.compiler.targets.truenorth.native import SYSTEM as NATIVE
-from spikeloom.compiler.targets.truenorth.native import USUAL_COPIES
 from spikeloom.models.graphs import CHOICES, Graph
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.recordings.grasps import SYNTHETIC
 from spikeloom.models.systems import PADDINGS, sensor_grid, taxels_alone
 from spikeloom.models.training.recipes import CROSSBARS, RECIPES, RELEASED, STEPS, Recipe, check_recipe, decays_asked
+from spikeloom.models.training.schedule import DECAY_EPOCHS
 from spikeloom.runtime.commands.inputs import (
     asked_graph,
     asked_places,
     bin_words,
     graph_words,
-    progress,
     recordings,
     require_bins,
     require_place,
-    version,
 )
+from spikeloom.runtime.commands.options import DATA_HELP, add_bin_option, add_graph_options, add_system
+from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.studies.training.picture import PICTURES, draw_training
 from spikeloom.runtime.studies.training.training import LAYERS, Job, check_seeds, output_of, summary, training_text
 
 Json = dict[str, Any]
 
 
-def train(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options."""
+    parser.add_argument("--data", required=True, metavar="PATH", help=DATA_HELP)
+    add_bin_option(parser)
+    parser.add_argument(
+        "--join", type=int, default=1, metavar="N", help="a step joins N bins, an event where one has any (default: 1)"
+    )
+    needing = ", ".join((*GRAPH_SYSTEMS, NATIVE))
+    add_system(parser, f"default: {TACTILESGNET}; {needing} need a graph", NATIVE)
+    parser.add_argument(
+        "--padding",
+        choices=PADDINGS,
+        help="of a grid-cnn's window: none, moving by 2 (default), or same, of which no Loihi core holds all neurons",
+    )
+    add_graph_options(parser, "to train on")
+    defaults = ", ".join(f"{recipe.epochs} ({name})" for name, recipe in RECIPES.items())
+    parser.add_argument(
+        "--recipe",
+        choices=tuple(RECIPES),
+        default=RELEASED.name,
+        help="how: as the released code does, or with lasting currents and clocks (default: released)",
+    )
+    parser.add_argument(
+        "--current-decay", metavar="LAYER=X[,…]", help="share of the synaptic current that a step keeps: fc1=0.95"
+    )
+    parser.add_argument(
+        "--membrane-decay", metavar="LAYER=X[,…]", help="share of the membrane, where it is not 0.2: fc1=0.5"
+    )
+    parser.add_argument("--clocks", type=int, metavar="K", help="inputs that tell which K-th of the recording it is")
+    parser.add_argument("--features", type=int, metavar="N", help="of the first layer, per place")
+    parser.add_argument(
+        "--copies", type=int, choices=tuple(BASES), help=f"axons of an input on TrueNorth (default: {USUAL_COPIES})"
+    )
+    parser.add_argument("--batch", type=int, metavar="N", help="recordings to a step of the optimizer")
+    parser.add_argument(
+        "--spike-penalty", type=float, metavar="X", help="loss of a spike on every synapse in every step: fewer spikes"
+    )
+    parser.add_argument("--epochs", type=int, metavar="N", help=f"default: {defaults}")
+    parser.add_argument(
+        "--decay-epochs",
+        type=int,
+        metavar="N",
+        help=f"the learning rate falls to a tenth every N epochs, after epoch N + 1 first (default: {DECAY_EPOCHS})",
+    )
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of weights and order (default: 0)")
+    parser.add_argument("--seeds", type=int, default=1, metavar="N", help="train N seeds side by side (default: 1)")
+    parser.add_argument("--resume", action="store_true", help="go on with an interrupted training of the same options")
+    parser.add_argument("--device", default="cpu", help="cpu or cuda (default: cpu)")
+    parser.add_argument(
+        "--keep",
+        action="append",
+        choices=WEIGHTS,
+        help="epoch to store: last, best (on test) or clean (on validation); may be repeated (default: all three)",
+    )
+    parser.add_argument("--picture", metavar="OUT.png", help="draw learning curves and confusion matrix")
+    parser.add_argument("-o", "--output", required=True, metavar="OUT.pt")
+
+
+def run(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
     """Run the command: the report, how to print it, and the exit code."""
     from spikeloom.runtime.studies.training.seeds import train_seeds  # processes, so only here
 
@@ -125,7 +185,7 @@ def _jobs(
             output=output_of(arguments.output, seed, arguments.seeds),
             keep=keep,
             command=f"{command} --seed {seed}",
-            facts={"spikeloom": version(), "device": arguments.device},
+            facts={"spikeloom": __version__, "device": arguments.device},
             draws=arguments.picture is not None,
             position=position,
             system=system,

@@ -21,11 +21,12 @@ from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
 from spikeloom.compiler.targets.truenorth.netlist_file import read_crossbars
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.recordings.windows import first_part, window_asked
-from spikeloom.runtime.commands.inputs import progress, recordings
+from spikeloom.runtime.commands.inputs import recordings
 from spikeloom.runtime.formats import ranc
 from spikeloom.runtime.machines.truenorth import cost, engine, render
 from spikeloom.runtime.machines.truenorth.trace import Trace
 from spikeloom.runtime.report import decisions
+from spikeloom.runtime.report.console import progress
 
 Json = dict[str, Any]
 Outcome = tuple[Json, Callable[[Json], str], int]

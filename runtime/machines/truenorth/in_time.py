@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from spikeloom import __version__
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.targets.base import CROSSBARS, Target, load_target
 from spikeloom.compiler.targets.truenorth.codebook import COPIES, LevelNetwork, in_levels, run_levels
@@ -16,11 +17,11 @@ from spikeloom.compiler.targets.truenorth.legalize import require_legal
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
 from spikeloom.compiler.targets.truenorth.netlist_file import write_crossbars
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.runtime.commands.inputs import progress, version
 from spikeloom.runtime.commands.load_network import Asked, asked_network
 from spikeloom.runtime.machines.truenorth import render
 from spikeloom.runtime.machines.truenorth.refusal import require_crossbar_options
 from spikeloom.runtime.machines.truenorth.verdicts import BoolArray, compare, verdict_json, verdict_text
+from spikeloom.runtime.report.console import progress
 
 Json = dict[str, Any]
 Outcome = tuple[Json, Callable[[Json], str], int]
@@ -49,7 +50,7 @@ def compile_network(arguments: argparse.Namespace) -> Outcome:
     levels = _levels(arguments.checkpoint, asked, arguments.in_time, chip)
     progress("compiling")
     provenance = {
-        "spikeloom": version(),
+        "spikeloom": __version__,
         "checkpoint_sha256": asked.sha256,
         **asked.origin(arguments.run),
         "in_time": arguments.in_time,

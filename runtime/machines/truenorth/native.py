@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from spikeloom import __version__
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.targets.base import CROSSBARS, known_targets, load_target
 from spikeloom.compiler.targets.truenorth.legalize import require_legal
@@ -18,12 +19,13 @@ from spikeloom.compiler.targets.truenorth.native_file import Trained, is_trained
 from spikeloom.compiler.targets.truenorth.netlist_file import write_crossbars
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.recordings.windows import first_part, window_asked
-from spikeloom.runtime.commands.inputs import asked_recordings, progress, shipped, version
+from spikeloom.runtime.commands.inputs import asked_recordings, shipped
 from spikeloom.runtime.machines.loihi1.trace import ENGINES
 from spikeloom.runtime.machines.truenorth import in_time, render
 from spikeloom.runtime.machines.truenorth.commands import legal
 from spikeloom.runtime.machines.truenorth.refusal import require_crossbar_options
 from spikeloom.runtime.machines.truenorth.verdicts import BoolArray, compare, verdict_json, verdict_text
+from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.tables import table
 
 Json = dict[str, Any]
@@ -75,7 +77,7 @@ def compile_network(arguments: argparse.Namespace) -> Outcome:
 def provenance(trained: Trained) -> Json:
     """What a netlist remembers of the network that it is from."""
     return {
-        "spikeloom": version(),
+        "spikeloom": __version__,
         "checkpoint_sha256": trained.sha256,
         "weights": trained.weights,
         "graph": trained.graph,

@@ -18,12 +18,13 @@ from spikeloom.compiler.targets.truenorth.codebook import COPIES
 from spikeloom.compiler.targets.truenorth.native import SYSTEM
 from spikeloom.compiler.targets.truenorth.needs import needs
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.runtime.commands.inputs import progress, recordings
+from spikeloom.runtime.commands.inputs import recordings
 from spikeloom.runtime.commands.load_network import Asked, asked_network
 from spikeloom.runtime.commands.options import PLACING, ROUNDING
 from spikeloom.runtime.machines.truenorth.retrained import shipped_networks
 from spikeloom.runtime.machines.truenorth.trials import Trial
 from spikeloom.runtime.machines.truenorth.ways import RETRAINED, Planner, Way
+from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.tables import table
 
 Json = dict[str, Any]

@@ -9,9 +9,10 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+from spikeloom import __version__
 from spikeloom.compiler.targets.base import Target
 from spikeloom.models.recordings.windows import WHOLE
-from spikeloom.runtime.commands.inputs import bin_words, version
+from spikeloom.runtime.commands.inputs import bin_words
 from spikeloom.runtime.studies.chart.grid import Grid
 from spikeloom.runtime.studies.chart.networks import Given
 from spikeloom.runtime.studies.chart.tasks import FORMAT, Build, Data, Decide, Run
@@ -112,7 +113,7 @@ class Facts:
     def key(self, network: Given, **facts: Any) -> str:
         """Content key of a piece of work on a network."""
         target = repr(self.targets[network.target])
-        shared = {"format": FORMAT, "spikeloom": version(), "data": self.data_sha256, "target": target}
+        shared = {"format": FORMAT, "spikeloom": __version__, "data": self.data_sha256, "target": target}
         return content_key(shared | {"bin_s": self.data.bin_s} | facts)
 
 

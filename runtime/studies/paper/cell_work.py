@@ -14,7 +14,7 @@ from typing import Any
 from spikeloom.compiler.errors import DataError, UnfinishedError
 from spikeloom.compiler.systems import GCN, GRID_CNN, MLP, TACTILESGNET
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.runtime.commands.inputs import progress
+from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.studies.jobs.cluster import ClusterLostError
 from spikeloom.runtime.studies.jobs.locks import only_one
 from spikeloom.runtime.studies.jobs.sweep import Point, left_out, spread

@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from spikeloom import __version__
 from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.systems import GRAPH_SYSTEMS
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.models.graphs import NEUTOUCH
 from spikeloom.models.sensors import read_layout, sensor_graph
-from spikeloom.runtime.commands.inputs import asked_recordings, version
+from spikeloom.runtime.commands.inputs import asked_recordings
 from spikeloom.runtime.commands.load_network import Asked, asked_network
 from spikeloom.runtime.equivalence.side_by_side import ready
 from spikeloom.runtime.equivalence.verify import require_match
@@ -92,7 +93,7 @@ def distances(taxels: int, places: FloatArray | None, edges: IntArray | None) ->
 def facts_of(arguments: argparse.Namespace, asked: Asked, data: str) -> Json:
     """What the runs depend on beside perturbation, level and seed."""
     return {
-        "spikeloom": version(),
+        "spikeloom": __version__,
         "netlist_sha256": hashlib.sha256(Path(arguments.netlist).read_bytes()).hexdigest(),
         "checkpoint_sha256": asked.sha256,
         **asked.read_as,

@@ -1,0 +1,97 @@
+"""The command ``verify``: chip and float model compared, spike for spike."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from typing import Any
+
+from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
+from spikeloom.compiler.targets.truenorth.netlist_file import is_crossbars
+from spikeloom.runtime.commands.inputs import netlist_recordings
+from spikeloom.runtime.commands.load_network import asked_network
+from spikeloom.runtime.commands.options import MIN_AGREEMENT, add_explain_cost, add_network, add_recordings
+from spikeloom.runtime.costs.spent import Account, explained
+from spikeloom.runtime.equivalence import verdicts
+from spikeloom.runtime.equivalence.levels import levels_of, parse_requirements, unmet
+from spikeloom.runtime.equivalence.verify import verify
+from spikeloom.runtime.machines.loihi1.trace import ENGINES
+from spikeloom.runtime.machines.truenorth import native
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options."""
+    parser.add_argument("netlist")
+    parser.add_argument("--checkpoint", required=True, metavar="CKPT|NET.onnx")
+    add_network(parser)
+    add_recordings(parser, window=True)
+    parser.add_argument(
+        "--original", metavar="CKPT", help="float model for E2 and E3 (default: the weights of --checkpoint)"
+    )
+    parser.add_argument(
+        "--spec-samples", type=int, default=3, metavar="N", help="recordings for spec = engine (default: 3)"
+    )
+    parser.add_argument(
+        "--engine",
+        choices=ENGINES,
+        default=ENGINES[0],
+        help=f"onnx: onnxruntime runs the integer graph beside our engine (default: {ENGINES[0]})",
+    )
+    parser.add_argument(
+        "--min-agreement",
+        type=float,
+        metavar="X",
+        help=f"share of equal decisions to pass (default: {MIN_AGREEMENT:g})",
+    )
+    parser.add_argument(
+        "--require",
+        metavar="E0,E2=X,E3=X",
+        help="levels to pass instead: E0 specification = engine, E2 share of spikes in every layer, E3 of decisions",
+    )
+    add_explain_cost(parser)
+
+
+def run(arguments: argparse.Namespace) -> tuple[dict[str, Any], Callable[[dict[str, Any]], str], int]:
+    """Run the command."""
+    if is_crossbars(arguments.netlist):
+        return native.verify(arguments)
+    agreement = MIN_AGREEMENT if arguments.min_agreement is None else arguments.min_agreement
+    if not 0 <= agreement <= 1:
+        raise OptionError(f"--min-agreement {agreement}: not a share; give a number from 0 to 1")
+    required = {"E0": 1.0, "E3": agreement}
+    if arguments.require is not None:
+        if arguments.min_agreement is not None:
+            raise OptionError(
+                f"--min-agreement {agreement:g}: --require replaces it; write E3={agreement:g} into that instead"
+            )
+        required = parse_requirements(arguments.require)
+    netlist = read_netlist(arguments.netlist)
+    asked = asked_network(arguments.checkpoint, arguments, netlist)
+    original = None if arguments.original is None else asked_network(arguments.original, arguments)
+    data = netlist_recordings(arguments, netlist, labels_for="verify")
+    account = Account(netlist, data, checked=arguments.spec_samples)
+    verdict = verify(
+        netlist,
+        asked.model,
+        asked.adjacency,
+        data.events,
+        data.labels,
+        data.files,
+        original=None if original is None else original.model,
+        sha256=asked.sha256,
+        spec_samples=arguments.spec_samples,
+        engine_name=arguments.engine,
+        lengths=data.lengths,
+        progress=account.begin,
+    )
+    told = explained(arguments, account)
+    compiled_for = netlist.provenance.get("graph", asked.graph)
+    if asked.graph not in (None, compiled_for):
+        sys.stderr.write(
+            f"spikeloom: warning: the netlist was compiled for graph {compiled_for}, this is {asked.graph}\n"
+        )
+    levels = levels_of(verdict)
+    missed = unmet(levels, required)
+    return verdicts.verify_json(verdict, levels, missed) | told, verdicts.verify_text, 1 if missed else 0
