@@ -42,7 +42,7 @@ def sources():
 @cache
 def netx_bytes():
     """A good netx file."""
-    from spikeloom.runtime.formats.netx_export import file_bytes
+    from spikeloom.compiler.formats.netx.writer import file_bytes
 
     rng = np.random.default_rng(0)
 

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from random_networks import LOIHI, integer_chain, small_target
 
 from spikeloom.compiler.errors import CapacityError, OptionError
+from spikeloom.compiler.formats import sanafe
 from spikeloom.compiler.passes.expand import expand_graph_convolution
 from spikeloom.compiler.targets.loihi1.emit import emit
 from spikeloom.compiler.targets.loihi1.layout.chips import chip_count, chip_of_core, place_on_chips, share
@@ -20,7 +21,6 @@ from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist, write_n
 from spikeloom.runtime.costs import cost
 from spikeloom.runtime.costs.estimate import estimate
 from spikeloom.runtime.costs.estimates import estimate_json, estimate_text
-from spikeloom.runtime.formats import sanafe
 from spikeloom.runtime.machines.loihi1 import engine, spec, timing
 
 SMALL = small_target(core_compartments=4, chip_cores=2, mesh_width=2, mesh_height=1, mesh_tile_cores=1)

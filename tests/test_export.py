@@ -6,14 +6,15 @@ import re
 from dataclasses import replace
 
 import pytest
+import sanafe_counts
 from random_netlists import Axon, Neuron, build
 from test_timing import LOIHI, six_steps
 
 from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.formats import sanafe
 from spikeloom.compiler.targets.loihi1.netlist import read_only
 from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist
 from spikeloom.runtime.commands.exchange import export
-from spikeloom.runtime.formats import sanafe
 
 SIX_STEPS = """\
 # spikeloom netlist for SANA-FE 2.2.9 and its loihi.yaml; give the neurons of group input 'spikes'
@@ -117,10 +118,10 @@ def test_a_neuron_names_the_unit_of_most_of_its_synapses():
     netlist = build([Neuron(), Neuron()], axons, n_inputs=3, depths=[0])
     netlist = replace(netlist, format_index_bits=read_only([0, 10, 10]))
     assert len(re.findall("loihi_sparse_synapse", "\n".join(lines(netlist)))) == 2
-    assert not sanafe.dense_synapses(netlist).any()
+    assert not sanafe_counts.dense_synapses(netlist).any()
     netlist = replace(netlist, format_index_bits=read_only([0, 0, 10]))
     assert len(re.findall("loihi_dense_synapse", "\n".join(lines(netlist)))) == 2
-    assert sanafe.dense_synapses(netlist).all()
+    assert sanafe_counts.dense_synapses(netlist).all()
 
 
 def test_names_are_such_that_the_format_can_hold_them():

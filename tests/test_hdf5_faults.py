@@ -15,10 +15,10 @@ from random_networks import chain
 
 from spikeloom.compiler.errors import FormatError, ModelError
 from spikeloom.compiler.formats.hdf5 import tree_of
+from spikeloom.compiler.formats.nir import writer as nir_export
 from spikeloom.compiler.formats.nir.neurons import CONVENTIONS
 from spikeloom.compiler.formats.nir.sidecar import restore, sidecar_bytes, sidecar_of
 from spikeloom.compiler.targets.loihi1.compilation import compile_network
-from spikeloom.runtime.formats import nir_export
 
 TESTS = Path(__file__).parent
 BATCH = 2000

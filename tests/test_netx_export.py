@@ -14,6 +14,7 @@ from random_networks import chain
 from timed_networks import written
 
 from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.formats.netx import writer as netx_export
 from spikeloom.compiler.formats.netx.layout import blocks_of
 from spikeloom.compiler.formats.netx.reader import integers_of, read_netx
 from spikeloom.compiler.targets.loihi1.compilation import compile_network
@@ -21,7 +22,6 @@ from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe
 from spikeloom.runtime.cli import main
-from spikeloom.runtime.formats import netx_export
 
 SETTINGS = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 

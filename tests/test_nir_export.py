@@ -17,6 +17,7 @@ from timed_networks import events_of, written
 
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import FormatError, ModelError, OptionError
+from spikeloom.compiler.formats.nir import writer as nir_export
 from spikeloom.compiler.formats.nir.neurons import CONVENTIONS
 from spikeloom.compiler.formats.nir.reader import read_nir
 from spikeloom.compiler.formats.nir.sidecar import restore, sidecar_bytes, sidecar_of
@@ -26,7 +27,6 @@ from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist import read_only
 from spikeloom.compiler.targets.loihi1.netlist_file import netlist_bytes, read_netlist, write_netlist
 from spikeloom.runtime.cli import main
-from spikeloom.runtime.formats import nir_export
 from spikeloom.runtime.machines.loihi1 import engine
 
 FEW = settings(max_examples=10, deadline=None, suppress_health_check=[HealthCheck.too_slow])

@@ -15,12 +15,13 @@ from random_netlists import Axon, Neuron, build, large_netlist, netlists, record
 from test_timing import six_steps
 
 from spikeloom.compiler.errors import DataError, ModelError, NumericRangeError, OptionError
+from spikeloom.compiler.formats.onnx import builder, writer_layers
+from spikeloom.compiler.formats.onnx import writer as onnx_writer
 from spikeloom.compiler.targets.loihi1.netlist import read_only
 from spikeloom.runtime import cli
-from spikeloom.runtime.formats import onnx_graph, onnx_nodes, onnx_plan
 from spikeloom.runtime.machines.loihi1 import engine, onnx_engine, spec
 
-FORMS = onnx_graph.FORMS
+FORMS = onnx_writer.FORMS
 SETTINGS = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 
@@ -100,13 +101,13 @@ def pipelines(draw):
 @given(st.data())
 def test_random_pipelines_are_the_specification(data):
     netlist = data.draw(pipelines())
-    layers = onnx_plan.plan(netlist)
+    layers = writer_layers.plan(netlist)
     assert not any(layer.checked for layer in layers)
-    assume(onnx_plan.is_pipeline(netlist, layers))  # weights may cancel in the one synapse of a layer
-    assert b"chip/" not in onnx_graph.export(netlist, "scan")
-    wide = data.draw(st.sampled_from([1, onnx_graph.WIDE]))
+    assume(writer_layers.is_pipeline(netlist, layers))  # weights may cancel in the one synapse of a layer
+    assert b"chip/" not in onnx_writer.export(netlist, "scan")
+    wide = data.draw(st.sampled_from([1, onnx_writer.WIDE]))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(onnx_graph, "WIDE", wide)
+        patch.setattr(onnx_writer, "WIDE", wide)
         assert_as_specified(netlist, data.draw(recordings(netlist)))
 
 
@@ -189,7 +190,7 @@ def test_a_program_that_is_not_installed(monkeypatch):
 
 
 def test_a_network_that_the_format_cannot_hold(monkeypatch):
-    monkeypatch.setattr(onnx_nodes, "SIZE_LIMIT", 5)
+    monkeypatch.setattr(builder, "SIZE_LIMIT", 5)
     with pytest.raises(ModelError) as caught:
         onnx_engine.prepare(three_neurons())
     assert str(caught.value) == (
@@ -257,7 +258,7 @@ def test_verify_without_the_program(verified, monkeypatch, capsys):
 
 
 def test_verify_where_the_format_is_too_small(verified, monkeypatch, capsys):
-    monkeypatch.setattr(onnx_nodes, "SIZE_LIMIT", 100)
+    monkeypatch.setattr(builder, "SIZE_LIMIT", 100)
     capsys.readouterr()
     assert cli.main([*verified, "--engine", "onnx"]) == 2
     assert capsys.readouterr().err.startswith("spikeloom: onnx: the weights need ")

@@ -18,6 +18,10 @@ from test_onnx_engine import three_neurons
 
 from spikeloom import __version__
 from spikeloom.compiler.errors import FormatError, ModelError, OptionError
+from spikeloom.compiler.formats.onnx import writer as onnx_writer
+from spikeloom.compiler.formats.onnx import writer_float as onnx_float
+from spikeloom.compiler.formats.onnx.builder import port_words
+from spikeloom.compiler.formats.onnx.writer_layers import digits, is_pipeline, plan
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.loihi1.compilation import compile_network
 from spikeloom.compiler.targets.loihi1.netlist import read_only
@@ -25,12 +29,9 @@ from spikeloom.compiler.targets.loihi1.netlist_file import netlist_bytes, write_
 from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe
 from spikeloom.models.networks.reference import float_spikes
 from spikeloom.runtime import cli
-from spikeloom.runtime.formats import onnx_float, onnx_graph
-from spikeloom.runtime.formats.onnx_nodes import port_words
-from spikeloom.runtime.formats.onnx_plan import digits, is_pipeline, plan
 from spikeloom.runtime.machines.loihi1 import engine, onnx_engine
 
-FORMS = onnx_graph.FORMS
+FORMS = onnx_writer.FORMS
 
 
 def model_of(content):
@@ -126,21 +127,21 @@ def lines_of(graph, indent=""):
 
 @pytest.mark.parametrize("form", FORMS)
 def test_the_text_of_a_small_graph(form, golden):
-    model = model_of(onnx_graph.export(three_neurons(), form))
+    model = model_of(onnx_writer.export(three_neurons(), form))
     golden(f"onnx_{form}.txt", "\n".join(lines_of(model.graph)) + "\n")
 
 
 @pytest.mark.parametrize("form", FORMS)
 def test_equal_netlists_give_equal_bytes(form):
     netlist = large_netlist(1, proved=True)
-    assert onnx_graph.export(netlist, form) == onnx_graph.export(replace(netlist), form)
+    assert onnx_writer.export(netlist, form) == onnx_writer.export(replace(netlist), form)
 
 
 def test_metadata_tell_where_a_file_comes_from():
     # the chip lacks neuron 1 of the first layer
     netlist = replace(three_neurons(), neuron=read_only([0, 2, 0]))
     netlist = replace(netlist, layers=(replace(netlist.layers[0], neurons=3), netlist.layers[1]))
-    model = model_of(onnx_graph.export(netlist, "step"))
+    model = model_of(onnx_writer.export(netlist, "step"))
     facts = {entry.key: entry.value for entry in model.metadata_props}
     assert json.loads(facts.pop("layers")) == [
         {"name": "layer0", "depth": 0, "neurons": 3, "held": [0, 2], "kind": "int32"},
@@ -161,11 +162,11 @@ def test_metadata_tell_where_a_file_comes_from():
 def test_every_name_is_documented(proved):
     netlist = replace(large_netlist(3, proved=proved), readout_class=read_only(np.arange(300) % 2), classes=2)
     for form in FORMS:
-        inputs, outputs = port_words(onnx_graph.export(netlist, form))
+        inputs, outputs = port_words(onnx_writer.export(netlist, form))
         for words in inputs + outputs:
             name = words.split(" ")[0].removesuffix("_next")
             shown = name if "." not in name else f"LAYER.{name.split('.')[1]}"
-            assert f"``{shown}``" in onnx_graph.__doc__
+            assert f"``{shown}``" in onnx_writer.__doc__
         assert any(words.startswith("overflow bool") for words in outputs) != proved
         kept = {words.split(" ")[0] for words in inputs}
         assert {name for name in kept if name.endswith(".current")} == (
@@ -178,7 +179,7 @@ def test_the_reference_of_the_format_computes_the_same():
     netlist = three_neurons()
     given = np.random.default_rng(2).integers(0, 2, (2, 2, 12), np.uint8)
     expected = engine.simulate(netlist, given, spikes=True).spikes
-    model = ReferenceEvaluator(model_of(onnx_graph.export(netlist, "scan")))
+    model = ReferenceEvaluator(model_of(onnx_writer.export(netlist, "scan")))
     found = dict(zip(model.output_names, model.run(None, {"events": given.transpose(2, 0, 1)}), strict=True))
     np.testing.assert_array_equal(found["layer0.spikes"].transpose(1, 0, 2), expected[:, :12, :2])
     np.testing.assert_array_equal(found["layer1.spikes"].transpose(1, 0, 2), expected[:, 1:13, 2:])
@@ -254,7 +255,7 @@ def test_the_command_writes_both_forms(tmp_path):
     for form, words in (("scan", ()), ("step", ("--form", "step"))):
         path = tmp_path / f"{form}.onnx"
         report, text = run(tmp_path / "net.loom", "--to", "onnx", *words, "-o", path)
-        content = onnx_graph.export(three_neurons(), form)
+        content = onnx_writer.export(three_neurons(), form)
         assert path.read_bytes() == content
         inputs, outputs = port_words(content)
         assert report == {

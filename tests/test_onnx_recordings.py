@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.formats.onnx import writer_float as onnx_float
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.models.networks.reference import float_spikes
 from spikeloom.models.recordings.evtouch import load_recordings
 from spikeloom.runtime import cli
-from spikeloom.runtime.formats import onnx_float
 from spikeloom.runtime.machines.loihi1 import engine, onnx_engine
 
 PART = 48

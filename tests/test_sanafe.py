@@ -13,11 +13,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import sanafe_counts
 from random_netlists import large_netlist
 from test_timing import DETAILED, ENERGY_PJ, LOIHI, SANAFE, SIMPLE, six_steps
 from timed_networks import events_of, written
 
 from spikeloom.compiler.dynamics import with_clocks
+from spikeloom.compiler.formats import sanafe
 from spikeloom.compiler.formats.checkpoint import read_checkpoint
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.loihi1.compilation import compile_network
@@ -25,7 +27,6 @@ from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_only
 from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.models.recordings.evtouch import load_recordings
 from spikeloom.runtime.costs import energy
-from spikeloom.runtime.formats import sanafe
 from spikeloom.runtime.machines.loihi1 import engine, timing
 
 FIT = next(table for table in LOIHI.energy if table.name == "sanafe")
@@ -99,8 +100,8 @@ def compare(python: str, netlist: Netlist, events: np.ndarray, folder: Path) -> 
     shifted = np.zeros((*events.shape[:2], steps), np.uint8)
     shifted[:, :, 1 : events.shape[2] + 1] = events
     trace = engine.simulate(engine.prepare(netlist, gated=False), shifted, spikes=True, membranes=True)
-    updated = sanafe.updates(netlist, shifted, trace.spikes, trace.membranes)
-    as_priced = {"input_tiles": timing.input_tiles(netlist, LOIHI), "dense": sanafe.dense_synapses(netlist)}
+    updated = sanafe_counts.updates(netlist, shifted, trace.spikes, trace.membranes)
+    as_priced = {"input_tiles": sanafe.input_tiles(netlist, LOIHI), "dense": sanafe_counts.dense_synapses(netlist)}
     clock = timing.prepare(netlist, LOIHI, SANAFE, **as_priced)
     batch = trace.spikes, updated, shifted
     simple, detailed = timing.simple(clock, *batch), timing.detailed(clock, *batch)

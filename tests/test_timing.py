@@ -4,15 +4,16 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+import sanafe_counts
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_netlists import Axon, Neuron, build, by_engine, large_netlist, netlists, recordings
 
 from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.formats import sanafe
 from spikeloom.compiler.targets.base import LATENCIES, Quantity, load_target
 from spikeloom.compiler.targets.loihi1.netlist import read_only
 from spikeloom.runtime.costs import cost, energy
-from spikeloom.runtime.formats import sanafe
 from spikeloom.runtime.machines.loihi1 import engine, timing
 from spikeloom.runtime.machines.loihi1.timing_spec import Chip
 
@@ -112,7 +113,7 @@ def test_the_published_energies_to_the_decimal():
     # each step as a recording of its own; a spike of the last step is sent and processed in it, as everywhere
     sent = np.column_stack([events[:, 1:], np.zeros(2, np.uint8)]).T
     counts = replace(trace.counts, inputs=sent, spikes=trace.spikes.astype(np.int64))
-    updated = sanafe.updates(netlist, events[None], trace.spikes[None], trace.membranes[None])[0]
+    updated = sanafe_counts.updates(netlist, events[None], trace.spikes[None], trace.membranes[None])[0]
     updates = energy.updates_by_core(netlist, updated[:, None])
     amounts = energy.count_by_core(netlist, LOIHI, counts, updates, 1, input_tiles=(0,))
     (fit,) = (entry for entry in LOIHI.energy if entry.name == "sanafe")
@@ -123,7 +124,7 @@ def test_the_published_energies_to_the_decimal():
 
 def test_updates_as_the_reference_counts_them():
     netlist, events, trace = six_steps()
-    seen = sanafe.updates(netlist, events[None], trace.spikes[None], trace.membranes[None])[0]
+    seen = sanafe_counts.updates(netlist, events[None], trace.spikes[None], trace.membranes[None])[0]
     # o fired in step 2 on what arrived; its current still holds that in step 3, and nothing else happens to it
     assert np.argwhere(trace.updated & ~seen).tolist() == [[3, 2]]
     assert not np.any(seen & ~trace.updated)
@@ -135,7 +136,7 @@ def test_updates_of_the_reference_by_hand(data):
     netlist = data.draw(netlists(weight_exponents=(0,)))
     events = data.draw(recordings(netlist))
     trace = by_engine(netlist, events, gated=False)
-    seen = sanafe.updates(netlist, events[None], trace.spikes[None], trace.membranes[None])[0]
+    seen = sanafe_counts.updates(netlist, events[None], trace.spikes[None], trace.membranes[None])[0]
     axon = netlist.axon_of_synapse()
     for t, c in np.ndindex(*trace.spikes.shape):
         active = set(np.flatnonzero(events[:, t]).tolist())
@@ -283,14 +284,14 @@ def test_a_recording_ends_with_its_own_steps():
 
 def test_input_cores_go_where_there_is_room():
     netlist, _, _ = six_steps()
-    assert timing.input_tiles(netlist, LOIHI) == (8,)
+    assert sanafe.input_tiles(netlist, LOIHI) == (8,)
     full = replace(netlist, core_tile=read_only([8] * 4 + [9] * 4), core_compartments=read_only([0, 2] + [3] * 7))
-    assert timing.input_tiles(full, LOIHI) == (0,)
+    assert sanafe.input_tiles(full, LOIHI) == (0,)
     wide = replace(full, taxels=3000)
-    assert timing.input_tiles(wide, LOIHI) == (0, 0, 0)
+    assert sanafe.input_tiles(wide, LOIHI) == (0, 0, 0)
     everywhere = replace(netlist, core_tile=read_only(list(range(32)) * 4))
     with pytest.raises(ModelError) as caught:
-        timing.input_tiles(everywhere, LOIHI)
+        sanafe.input_tiles(everywhere, LOIHI)
     assert str(caught.value) == "input channels: 1 cores needed, the chip has 0 left; compile for fewer cores"
 
 

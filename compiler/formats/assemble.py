@@ -13,7 +13,7 @@ import numpy as np
 
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.fixedpoint import FloatArray, IntArray
-from spikeloom.compiler.formats.tensors import printable
+from spikeloom.compiler.formats.names import printable
 from spikeloom.compiler.ir import INPUT, Input, Network, Population, Projection, Readout, Sparse, depths
 
 
@@ -68,20 +68,6 @@ def class_of_each(counts: Sparse) -> IntArray | None:
         return None
     label: IntArray = columns.indices.astype(np.int64)
     return label
-
-
-def unique_names(names: Sequence[str]) -> tuple[str, ...]:
-    """The names, or ``layer1`` … for those that are empty or not alone.
-
-    Examples
-    --------
-    >>> unique_names(["conv", "", "fc", "fc"])
-    ('conv', 'layer2', 'layer3', 'layer4')
-    """
-    usable = [
-        name if name and names.count(name) == 1 and len(name) < 40 and name.isprintable() else "" for name in names
-    ]
-    return tuple(name or f"layer{place}" for place, name in enumerate(usable, 1))
 
 
 def in_order(layers: Sequence[Layer]) -> list[int]:

@@ -27,7 +27,8 @@ from typing import Any, NoReturn
 import numpy as np
 
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.formats.tensors import Arrays, Shape, faults_of, printable, size, taxel_faults, wanted_dense
+from spikeloom.compiler.formats.names import printable
+from spikeloom.compiler.formats.tensors import Arrays, Shape, faults_of, size, taxel_faults, wanted_dense
 from spikeloom.compiler.systems import GCN, GRID_CNN, MLP, TACTILESGNET, TITLES
 
 CHANNELS = 2

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from spikeloom.compiler.formats.names import printable
+
 Arrays = dict[str, npt.NDArray[Any]]
 
 Shape = tuple[int | str, ...]
@@ -96,11 +98,6 @@ def size(arrays: Mapping[str, npt.NDArray[Any]], name: str, dimensions: int, axi
     """Length of one axis of a tensor, or `word` where the tensor cannot say."""
     array = arrays.get(name)
     return array.shape[axis] if array is not None and array.ndim == dimensions and array.size else word
-
-
-def printable(name: str) -> str:
-    """Name as a message can show it: quoted and escaped where it holds more than letters."""
-    return name if name.isprintable() and len(name) < 100 else repr(name[:100])
 
 
 def _fits(found: tuple[int, ...], wanted: Shape) -> bool:

@@ -18,7 +18,8 @@ from torch import Tensor, nn
 
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.fixedpoint import FloatArray
-from spikeloom.compiler.formats.assemble import Layer, assemble, class_of_each, unique_names
+from spikeloom.compiler.formats.assemble import Layer, assemble, class_of_each
+from spikeloom.compiler.formats.names import unique_names
 from spikeloom.compiler.sensor_layout import sensor_layout
 from spikeloom.compiler.ir import INPUT, Network, Sparse
 from spikeloom.compiler.passes.expand import AFFINE_TOLERANCE

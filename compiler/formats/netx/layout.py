@@ -21,7 +21,7 @@ import numpy as np
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.formats.hdf5 import Tree, read_hdf5
-from spikeloom.compiler.formats.tensors import printable
+from spikeloom.compiler.formats.names import printable
 
 SUFFIX = ".net"
 

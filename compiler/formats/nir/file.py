@@ -22,7 +22,7 @@ import numpy.typing as npt
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.fixedpoint import FloatArray
 from spikeloom.compiler.formats.hdf5 import Tree, read_hdf5
-from spikeloom.compiler.formats.tensors import printable
+from spikeloom.compiler.formats.names import printable
 
 DAMAGED = "export it again"
 

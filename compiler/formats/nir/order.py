@@ -13,9 +13,9 @@ from collections.abc import Mapping
 import networkx as nx
 
 from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.formats.names import printable
 from spikeloom.compiler.formats.nir.file import INPUT_NODE, Graph
 from spikeloom.compiler.formats.nir.neurons import SPIKING
-from spikeloom.compiler.formats.tensors import printable
 
 SHOWN = 8
 """Nodes of a circle that are named."""

@@ -14,7 +14,8 @@ from scipy import sparse
 from spikeloom.compiler.dynamics import MOST_STEPS, RELAY_WEIGHT, Clocks
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.fixedpoint import FloatArray, IntArray
-from spikeloom.compiler.formats.assemble import Layer, assemble, class_of_each, in_order, unique_names
+from spikeloom.compiler.formats.assemble import Layer, assemble, class_of_each, in_order
+from spikeloom.compiler.formats.names import printable, unique_names
 from spikeloom.compiler.formats.nir.facts import SpikingNode, facts_of, hint
 from spikeloom.compiler.formats.nir.file import Graph, Node, read_graph
 from spikeloom.compiler.formats.nir.neurons import CONVENTIONS, SPIKING, TOLERANCE, Steps, neurons_of, require_steps
@@ -22,7 +23,6 @@ from spikeloom.compiler.formats.nir.nodes import KNOWN, STAGES
 from spikeloom.compiler.formats.nir.order import in_order as nodes_in_order
 from spikeloom.compiler.formats.nir.order import loops
 from spikeloom.compiler.formats.nir.values import Value, added, filtered, scaled, spikes_of
-from spikeloom.compiler.formats.tensors import printable
 from spikeloom.compiler.ir import INPUT, Input, Network, Sparse
 from spikeloom.compiler.sensor_layout import sensor_layout
 

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.formats.tensors import printable
+from spikeloom.compiler.formats.names import printable
 
 Array = npt.NDArray[Any]
 """float64, int64 or bool."""

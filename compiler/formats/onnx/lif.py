@@ -14,6 +14,7 @@ import numpy as np
 
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.fixedpoint import FloatArray
+from spikeloom.compiler.formats.names import printable
 from spikeloom.compiler.formats.onnx.values import (
     INPUT_ATOM,
     MEMBRANE,
@@ -24,7 +25,6 @@ from spikeloom.compiler.formats.onnx.values import (
     diagonal,
     one_each,
 )
-from spikeloom.compiler.formats.tensors import printable
 from spikeloom.compiler.ir import Sparse
 
 EQUAL = 1e-12

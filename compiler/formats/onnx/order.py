@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Container
 
 from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.formats.names import printable
 from spikeloom.compiler.formats.onnx.elementwise import COMPARISONS
 from spikeloom.compiler.formats.onnx.file import Graph, Node
-from spikeloom.compiler.formats.tensors import printable
 
 COMPARING = frozenset((*COMPARISONS, "Sign"))
 _SHIFTS = frozenset(("Add", "Cast", "Div", "Identity", "Mul", "Sub"))

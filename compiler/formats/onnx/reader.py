@@ -17,7 +17,8 @@ import numpy as np
 
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.fixedpoint import IntArray
-from spikeloom.compiler.formats.assemble import Layer, assemble, unique_names
+from spikeloom.compiler.formats.assemble import Layer, assemble
+from spikeloom.compiler.formats.names import printable, unique_names
 from spikeloom.compiler.formats.onnx.affine import check
 from spikeloom.compiler.formats.onnx.file import BOOL, DOUBLE, Declared, Graph, Model, read_model
 from spikeloom.compiler.formats.onnx.gates import as_affine
@@ -26,7 +27,6 @@ from spikeloom.compiler.formats.onnx.order import inner
 from spikeloom.compiler.formats.onnx.run import run
 from spikeloom.compiler.formats.onnx.steps import Unrolled, group, readout
 from spikeloom.compiler.formats.onnx.values import INPUT_ATOM, Affine, Table
-from spikeloom.compiler.formats.tensors import printable
 from spikeloom.compiler.ir import INPUT, Network, Sparse
 from spikeloom.compiler.sensor_layout import sensor_layout
 

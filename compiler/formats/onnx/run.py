@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.formats.names import printable
 from spikeloom.compiler.formats.onnx.affine import apply, check
 from spikeloom.compiler.formats.onnx.file import Array, Graph, Node
 from spikeloom.compiler.formats.onnx.order import inner, membranes, ordered, reads
@@ -20,7 +21,6 @@ from spikeloom.compiler.formats.onnx.values import (
     diagonal,
     size_of,
 )
-from spikeloom.compiler.formats.tensors import printable
 
 STEP_LIMIT = 4096
 """Steps of a Scan or a Loop that are unrolled."""

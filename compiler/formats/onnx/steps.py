@@ -10,9 +10,9 @@ import numpy as np
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.formats.assemble import class_of_each
+from spikeloom.compiler.formats.names import printable
 from spikeloom.compiler.formats.onnx.lif import EQUAL, RESET, Neurons
 from spikeloom.compiler.formats.onnx.values import INPUT_ATOM, MEMBRANE, SPIKE, Affine, Table
-from spikeloom.compiler.formats.tensors import printable
 from spikeloom.compiler.ir import INPUT, Sparse
 
 

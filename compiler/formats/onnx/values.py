@@ -17,8 +17,8 @@ from scipy import sparse
 
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.fixedpoint import FloatArray, IntArray
+from spikeloom.compiler.formats.names import printable
 from spikeloom.compiler.formats.onnx.file import Array
-from spikeloom.compiler.formats.tensors import printable
 from spikeloom.compiler.ir import Sparse
 
 SAMPLES = 4

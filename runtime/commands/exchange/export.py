@@ -9,9 +9,15 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.formats import sanafe
 from spikeloom.compiler.formats.atomic import write_atomically
+from spikeloom.compiler.formats.netx import writer as netx_export
+from spikeloom.compiler.formats.nir import writer as nir_export
 from spikeloom.compiler.formats.nir.neurons import CONVENTIONS
 from spikeloom.compiler.formats.nir.sidecar import sidecar_bytes, sidecar_of
+from spikeloom.compiler.formats.onnx import writer as onnx_writer
+from spikeloom.compiler.formats.onnx import writer_float as onnx_float
+from spikeloom.compiler.formats.onnx.builder import port_words
 from spikeloom.compiler.interpret import channels_last
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.lift import lift
@@ -19,8 +25,6 @@ from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.models.recordings.events import BIN_S
 from spikeloom.runtime.commands.inputs import asked_checkpoint, asked_graph, propagation, recordings, require_place
 from spikeloom.runtime.commands.options import DATA_HELP, MODEL, add_bin_option, add_model
-from spikeloom.runtime.formats import netx_export, nir_export, onnx_float, onnx_graph, sanafe
-from spikeloom.runtime.formats.onnx_nodes import port_words
 from spikeloom.runtime.machines.truenorth.commands import export_ranc
 
 Json = dict[str, Any]
@@ -56,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--to", required=True, choices=tuple(FORMATS), help="; ".join(f"{key}: {what}" for key, what in FORMATS.items())
     )
     parser.add_argument(
-        "--form", choices=onnx_graph.FORMS, help="onnx: one step with its state, or whole recordings (default: scan)"
+        "--form", choices=onnx_writer.FORMS, help="onnx: one step with its state, or whole recordings (default: scan)"
     )
     parser.add_argument(
         "--data",
@@ -115,7 +119,7 @@ def _ranc(arguments: argparse.Namespace) -> Written:
 
 def _onnx(arguments: argparse.Namespace) -> Written:
     netlist = read_netlist(arguments.source)
-    content = onnx_graph.export(netlist, arguments.form or "scan")
+    content = onnx_writer.export(netlist, arguments.form or "scan")
     facts = {"neurons": netlist.n_compartments, "synapses": netlist.n_synapses}
     return Written(chunks=[content], facts=facts | _ports(arguments, content))
 

@@ -14,10 +14,10 @@ import numpy.typing as npt
 
 from spikeloom.compiler.errors import NumericRangeError
 from spikeloom.compiler.fixedpoint import IntArray
+from spikeloom.compiler.formats.onnx import writer as onnx_writer
+from spikeloom.compiler.formats.onnx.builder import package
+from spikeloom.compiler.formats.onnx.writer_layers import Layer, plan
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
-from spikeloom.runtime.formats import onnx_graph
-from spikeloom.runtime.formats.onnx_nodes import package
-from spikeloom.runtime.formats.onnx_plan import Layer, plan
 from spikeloom.runtime.machines.loihi1.engine import EventArray
 from spikeloom.runtime.machines.loihi1.trace import BoolArray, MembraneArray, check_channels
 
@@ -99,7 +99,7 @@ def prepare(netlist: Netlist, *, form: str = "scan", threads: int = 1) -> OnnxEn
     netlist : Netlist
         Network.
     form : {"step", "scan"}
-        See :mod:`formats.onnx_graph`.
+        See :mod:`formats.onnx.writer`.
     threads : int
         Threads of one operator.
 
@@ -111,7 +111,7 @@ def prepare(netlist: Netlist, *, form: str = "scan", threads: int = 1) -> OnnxEn
         If the format cannot hold the network.
     """
     package("onnxruntime")  # before any work
-    session = open_session(onnx_graph.export(netlist, form), threads=threads)
+    session = open_session(onnx_writer.export(netlist, form), threads=threads)
     layers = plan(netlist)
     runs = {layer.name: _runs(layer.ids) for layer in layers}
     return OnnxEngine(netlist=netlist, layers=layers, form=form, session=session, runs=runs)

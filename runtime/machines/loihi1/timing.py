@@ -28,7 +28,7 @@ from math import lcm
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.errors import DataError, ModelError
+from spikeloom.compiler.errors import DataError
 from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.targets.base import PICOSECONDS, Target, TimeTable
 from spikeloom.compiler.targets.loihi1.layout.chips import require_one_chip
@@ -113,27 +113,6 @@ class DetailedTimes:
     critical_core: IntArray
     receiving: BoolArray
     peak_load: FloatArray
-
-
-def input_tiles(netlist: Netlist, target: Target) -> tuple[int, ...]:
-    """Tiles for cores that hold nothing but input channels: those in use that have room, then the others.
-
-    Raises
-    ------
-    ModelError
-        If the chip has no room for them.
-    """
-    room = target.limit("mesh.tile_cores")
-    tiles = np.arange(target.limit("mesh.width") * target.limit("mesh.height"))
-    used = np.bincount(netlist.core_tile, minlength=len(tiles))
-    order = tiles[np.argsort(used == 0, kind="stable")]
-    free = np.repeat(order, np.maximum(room - used[order], 0))
-    wanted = -(-netlist.n_inputs // target.limit("core.compartments"))
-    if wanted > len(free):
-        raise ModelError(
-            f"input channels: {wanted} cores needed, the chip has {len(free)} left; compile for fewer cores"
-        )
-    return tuple(int(tile) for tile in free[:wanted])
 
 
 def _way(start: int, end: int, port: int, width: int, tile_links: int) -> list[int]:

@@ -13,6 +13,7 @@ import numpy as np
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.fixedpoint import IntArray
+from spikeloom.compiler.formats import ranc
 from spikeloom.compiler.formats.atomic import write_atomically
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.targets.base import CROSSBARS, Target, load_target, with_tables
@@ -22,7 +23,6 @@ from spikeloom.compiler.targets.truenorth.netlist_file import read_crossbars
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.recordings.windows import first_part, window_asked
 from spikeloom.runtime.commands.inputs import recordings
-from spikeloom.runtime.formats import ranc
 from spikeloom.runtime.machines.truenorth import cost, engine, render
 from spikeloom.runtime.machines.truenorth.trace import Trace
 from spikeloom.runtime.report import decisions

@@ -26,9 +26,10 @@ from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.targets.base import CROSSBARS, load_target
 from spikeloom.compiler.targets.truenorth.netlist import RESET_NONE, RESET_TO, CrossbarNetlist
-from spikeloom.runtime.machines.truenorth.trace import EventArray
 
 Json = dict[str, Any]
+
+EventArray = npt.NDArray[np.uint8] | npt.NDArray[np.bool_]
 
 
 def unsupported(netlist: CrossbarNetlist) -> list[str]:

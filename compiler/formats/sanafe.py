@@ -7,9 +7,9 @@ What the file says and what the chip does differ in a few points:
 * Input channels are neurons: they fire in one step and act in the next. They sit on cores of their own, cost nothing
   but their messages, and are silent until they are given ``spikes``.
 * A neuron names one unit for all of its synapses. A neuron that both dense and sparse lists reach names the one with
-  more of its synapses; :func:`dense_synapses` tells our models the same.
+  more of its synapses (:func:`dense_neurons`).
 * A neuron sends one message to a core, however many lists there listen to it.
-* A current that the step before left is no work to a neuron; :func:`updates` counts without it.
+* A current that the step before left is no work to a neuron.
 * A current that outlasts its step is a float there, cut to nothing; the chip cuts it to a whole 64th of a weight unit
   in every step. Spikes of such layers may differ, and of no others: :func:`floating_layers` names them.
 * Registers have no ends. No register of a compiled netlist reaches its own.
@@ -24,20 +24,20 @@ References
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from itertools import pairwise
 
 import numpy as np
-from scipy.sparse import csr_array
+import numpy.typing as npt
 
+from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.fixedpoint import DECAY_BITS, MEMBRANE_SHIFT, IntArray
+from spikeloom.compiler.formats.names import plain_names
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.layout.chips import require_one_chip
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
-from spikeloom.runtime.machines.loihi1.engine import EventArray
-from spikeloom.runtime.machines.loihi1.timing import input_tiles
-from spikeloom.runtime.machines.loihi1.trace import BoolArray, MembraneArray
+
+BoolArray = npt.NDArray[np.bool_]
 
 INPUT = "input"
 VERSION = "2.2.9"
@@ -47,8 +47,7 @@ UNITS = {True: "loihi_dense_synapse", False: "loihi_sparse_synapse"}
 
 def group_names(netlist: Netlist) -> tuple[str, ...]:
     """Names of the layers' groups; dots, which separate names from numbers, and the like become underscores."""
-    names = [re.sub(r"\W", "_", layer.name, flags=re.ASCII) for layer in netlist.layers]
-    return tuple(name if names.count(name) == 1 and name != INPUT else f"{name}_{i}" for i, name in enumerate(names))
+    return plain_names([layer.name for layer in netlist.layers], taken=[INPUT])
 
 
 def floating_layers(netlist: Netlist) -> tuple[str, ...]:
@@ -71,49 +70,32 @@ def _in_dense_list(netlist: Netlist) -> BoolArray:
     return found
 
 
-def _dense_neurons(netlist: Netlist) -> BoolArray:
+def dense_neurons(netlist: Netlist) -> BoolArray:
     """Which compartments name the unit of dense synapses."""
     balance = np.where(_in_dense_list(netlist), 1.0, -1.0)
     found: BoolArray = np.bincount(netlist.synapse_compartment(), balance, netlist.n_compartments) >= 0
     return found
 
 
-def dense_synapses(netlist: Netlist) -> BoolArray:
-    """Which synapses the file has priced as dense; shape (synapses,)."""
-    return _dense_neurons(netlist)[netlist.synapse_compartment()]
+def input_tiles(netlist: Netlist, target: Target) -> tuple[int, ...]:
+    """Tiles for cores that hold nothing but input channels: those in use that have room, then the others.
 
-
-def updates(netlist: Netlist, events: EventArray, spikes: BoolArray, membranes: MembraneArray) -> BoolArray:
-    """Neuron updates as SANA-FE counts them; shape of `spikes`.
-
-    A current that the step before left is no work to it. Only a neuron at rest, without bias, that nothing reaches
-    can have no other work; the other updates are those of :class:`trace.Trace`.
-
-    Parameters
-    ----------
-    netlist : Netlist
-        What ran, without windows.
-    events : (samples, n_inputs, T) uint8 or bool
-        What it was given.
-    spikes, membranes : (samples, chip steps, compartments)
-        What it did.
+    Raises
+    ------
+    ModelError
+        If the chip has no room for them.
     """
-    samples, steps, size = spikes.shape
-    works: BoolArray = np.zeros(spikes.shape, np.bool_)
-    works[:, 1:] = (membranes[:, :-1] != 0) & ~spikes[:, :-1]
-    works[:, :, netlist.bias_mantissa != 0] = True
-    sources = np.zeros((samples, steps, netlist.n_inputs + size), np.int32)
-    given = events[:, :, :steps] != 0
-    sources[:, : given.shape[2], : netlist.n_inputs] = given.transpose(0, 2, 1)
-    sources[:, 1:, netlist.n_inputs :] = spikes[:, :-1]
-    resting = np.flatnonzero(netlist.bias_mantissa == 0)
-    source, target = netlist.axon_source[netlist.axon_of_synapse()], netlist.synapse_compartment()
-    own = np.isin(target, resting)
-    shape = (netlist.n_inputs + size, size)
-    reach = csr_array((np.ones(int(own.sum()), np.int32), (source[own], target[own])), shape)[:, resting]
-    for i in range(samples):
-        works[i][:, resting] |= (sources[i] @ reach) > 0
-    return works
+    room = target.limit("mesh.tile_cores")
+    tiles = np.arange(target.limit("mesh.width") * target.limit("mesh.height"))
+    used = np.bincount(netlist.core_tile, minlength=len(tiles))
+    order = tiles[np.argsort(used == 0, kind="stable")]
+    free = np.repeat(order, np.maximum(room - used[order], 0))
+    wanted = -(-netlist.n_inputs // target.limit("core.compartments"))
+    if wanted > len(free):
+        raise ModelError(
+            f"input channels: {wanted} cores needed, the chip has {len(free)} left; compile for fewer cores"
+        )
+    return tuple(int(tile) for tile in free[:wanted])
 
 
 def cores(netlist: Netlist, target: Target) -> tuple[str, ...]:
@@ -180,7 +162,7 @@ def export(netlist: Netlist, target: Target) -> Iterator[str]:
 
 def _groups(netlist: Netlist, names: tuple[str, ...]) -> Iterator[str]:
     """Neurons of each layer; membranes count weight units."""
-    dense = _dense_neurons(netlist)
+    dense = dense_neurons(netlist)
     bias = netlist.bias_mantissa * 2.0**netlist.bias_exponent / 2**MEMBRANE_SHIFT
     leak = (2**DECAY_BITS - netlist.decay_v) / 2**DECAY_BITS
     kept = (2**DECAY_BITS - 1 - netlist.decay_u) / 2**DECAY_BITS

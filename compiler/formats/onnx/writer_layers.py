@@ -21,10 +21,10 @@ from spikeloom.compiler.fixedpoint import (
     MEMBRANE_SHIFT,
     IntArray,
 )
+from spikeloom.compiler.formats.names import plain_names
+from spikeloom.compiler.formats.onnx.builder import require_room
 from spikeloom.compiler.ir import INPUT
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, one_step_bounds
-from spikeloom.runtime.formats.onnx_nodes import require_room
-from spikeloom.runtime.formats.sanafe import group_names
 
 ONE = 2**DECAY_BITS
 NARROW = 2**31 - 1
@@ -143,7 +143,7 @@ def plan(netlist: Netlist) -> tuple[Layer, ...]:
     ModelError
         If their weights as dense matrices are more than a file holds.
     """
-    names = group_names(netlist)
+    names = plain_names([layer.name for layer in netlist.layers], taken=["input"])
     inner = netlist.axon_source >= netlist.n_inputs
     pre_of_axon = np.where(inner, netlist.layer[np.where(inner, netlist.axon_source - netlist.n_inputs, 0)], INPUT)
     # zeros of dense lists are no synapses

@@ -25,15 +25,22 @@ from __future__ import annotations
 
 import numpy as np
 
-from spikeloom import __version__
 from spikeloom.compiler.dynamics import NO_CLOCKS
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.fixedpoint import FloatArray
 from spikeloom.compiler.formats.checkpoint import Checkpoint
+from spikeloom.compiler.formats.onnx.builder import (
+    Nodes,
+    Port,
+    counted,
+    decided,
+    model_bytes,
+    read_sizes,
+    require_room,
+    rest,
+)
+from spikeloom.compiler.formats.onnx.writer import timing_words
 from spikeloom.compiler.passes.expand import expand_dense
-from spikeloom.runtime.formats.onnx_graph import timing_words
-from spikeloom.runtime.formats.onnx_nodes import Nodes, Port, model_bytes, require_room
-from spikeloom.runtime.formats.onnx_time import counted, decided, read_sizes, rest
 
 
 def export_float(checkpoint: Checkpoint, adjacency: FloatArray, form: str, *, graph_name: str) -> bytes:
@@ -76,7 +83,6 @@ def export_float(checkpoint: Checkpoint, adjacency: FloatArray, form: str, *, gr
         name=f"spikeloom-float-{form}",
         about=__doc__.replace("``", "") if __doc__ else "",
         facts={
-            "version": __version__,
             "checkpoint_sha256": checkpoint.sha256,
             "weights": checkpoint.weights,
             "graph": graph_name,

@@ -16,7 +16,6 @@ Neurons that the chip leaves out are there and hear nothing.
 from __future__ import annotations
 
 import io
-import re
 from typing import Any
 
 import numpy as np
@@ -24,6 +23,7 @@ import numpy.typing as npt
 
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT
+from spikeloom.compiler.formats.names import plain_names
 from spikeloom.compiler.ir import INPUT, IntegerNetwork, IntegerPopulation, Sparse
 from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
@@ -41,11 +41,8 @@ Params = dict[str, Any]
 
 def node_names(network: IntegerNetwork) -> tuple[str, ...]:
     """Names of the layers' neurons; what separates names in a file becomes an underscore."""
-    names = [re.sub(r"\W", "_", population.name, flags=re.ASCII) for population in network.populations]
-    taken = ("input", "output", "votes")
-    return tuple(
-        name if names.count(name) == 1 and name not in taken else f"{name}_{i}" for i, name in enumerate(names)
-    )
+    names = [population.name for population in network.populations]
+    return plain_names(names, taken=["input", "output", "votes"])
 
 
 def export(netlist: Netlist, dt: float) -> bytes:

@@ -41,16 +41,22 @@ from dataclasses import replace
 
 import numpy as np
 
-from spikeloom import __version__
 from spikeloom.compiler.dynamics import Clocks
+from spikeloom.compiler.formats.onnx.builder import Nodes, Port, counted, decided, model_bytes, read_sizes, rest, zeros
+from spikeloom.compiler.formats.onnx.writer_layers import Layer, is_pipeline, plan
+from spikeloom.compiler.formats.onnx.writer_step import (
+    bias,
+    chip_step,
+    gathered,
+    integrate,
+    poll,
+    products,
+    states,
+    voters,
+)
 from spikeloom.compiler.ir import INPUT
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import netlist_bytes
-from spikeloom.runtime.formats.onnx_neuron import bias, gathered, integrate, products
-from spikeloom.runtime.formats.onnx_nodes import Nodes, Port, model_bytes
-from spikeloom.runtime.formats.onnx_plan import Layer, is_pipeline, plan
-from spikeloom.runtime.formats.onnx_step import chip_step, poll, states, voters
-from spikeloom.runtime.formats.onnx_time import counted, decided, read_sizes, rest, zeros
 
 FORMS = ("step", "scan")
 
@@ -94,7 +100,6 @@ def export(netlist: Netlist, form: str) -> bytes:
         name=f"spikeloom-{form}",
         about=__doc__.replace("``", "") if __doc__ else "",
         facts={
-            "version": __version__,
             "netlist_sha256": hashlib.sha256(netlist_bytes(netlist)).hexdigest(),
             "form": form,
             "input": f"{netlist.taxels} taxels x {netlist.polarities} polarities; "

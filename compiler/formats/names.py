@@ -1,0 +1,39 @@
+"""Names from files and for files: how a message shows them, and what other programs accept."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Sequence
+
+
+def printable(name: str) -> str:
+    """Name as a message can show it: quoted and escaped where it holds more than letters."""
+    return name if name.isprintable() and len(name) < 100 else repr(name[:100])
+
+
+def plain_names(names: Sequence[str], taken: Collection[str] = ()) -> tuple[str, ...]:
+    """Names of letters, digits and underscores; one that is not unique, or taken, gets its place as a suffix.
+
+    Examples
+    --------
+    >>> plain_names(["a.b", "input", "fc", "fc"], taken=["input"])
+    ('a_b', 'input_1', 'fc_2', 'fc_3')
+    """
+    plain = [re.sub(r"\W", "_", name, flags=re.ASCII) for name in names]
+    return tuple(
+        name if plain.count(name) == 1 and name not in taken else f"{name}_{place}" for place, name in enumerate(plain)
+    )
+
+
+def unique_names(names: Sequence[str]) -> tuple[str, ...]:
+    """The names, or ``layer1`` … for those that are empty, long or not unique.
+
+    Examples
+    --------
+    >>> unique_names(["conv", "", "fc", "fc"])
+    ('conv', 'layer2', 'layer3', 'layer4')
+    """
+    usable = [
+        name if name and names.count(name) == 1 and len(name) < 40 and name.isprintable() else "" for name in names
+    ]
+    return tuple(name or f"layer{place}" for place, name in enumerate(usable, 1))
