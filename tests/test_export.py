@@ -55,7 +55,7 @@ def run(*words):
     """What the command reports and prints."""
     parser = argparse.ArgumentParser()
     export.add_arguments(parser)
-    report, text, code = export.export(parser.parse_args([str(word) for word in words]))
+    report, text, code = export.run(parser.parse_args([str(word) for word in words]))
     assert code == 0
     return report, text(report)
 
