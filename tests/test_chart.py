@@ -225,7 +225,7 @@ def test_two_processes_find_the_same(made, spikeloom, place):
 
 def test_after_a_kill_the_same_command_goes_on(made, spikeloom, place):
     started = subprocess.Popen(
-        [*RUNTIME, *CHART, "-o", "killed"], cwd=place, env=os.environ | {"PYTHONPATH": str(ROOT)}
+        [*RUNTIME, *CHART, "-o", "killed"], cwd=place, env=os.environ | {"PYTHONPATH": str(ROOT / "src")}
     )
     store = place / "killed" / "points.jsonl"
     end = time.monotonic() + 120

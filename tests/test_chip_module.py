@@ -107,7 +107,7 @@ def test_in_the_harness(timed, tmp_path):
     root = Path(__file__).resolve().parents[1]
     command = [python or sys.executable, "-W", "ignore", "-c", HARNESS, str(timed), str(tmp_path / "data.npz")]
     done = subprocess.run(
-        command, capture_output=True, text=True, check=False, env=os.environ | {"PYTHONPATH": str(root)}
+        command, capture_output=True, text=True, check=False, env=os.environ | {"PYTHONPATH": str(root / "src")}
     )
     assert done.returncode == 0, done.stderr
     said = json.loads(done.stdout.splitlines()[-1])

@@ -299,7 +299,7 @@ def test_dask_is_loaded_where_it_is_asked_for_only():
         "spikeloom.runtime.studies.jobs.cluster; "
         "sys.exit('distributed' in sys.modules or 'dask' in sys.modules)"
     )
-    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT / "src", check=False).returncode == 0
 
 
 # --- reproduce --------------------------------------------------------------------------------------------------------

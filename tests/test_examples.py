@@ -16,7 +16,7 @@ def test_the_square_sensor_example_reaches_a_decision(tmp_path):
     command.chmod(0o755)
     environment = os.environ | {
         "PATH": f"{command.parent}{os.pathsep}{os.environ['PATH']}",
-        "PYTHONPATH": str(ROOT),
+        "PYTHONPATH": str(ROOT / "src"),
     }
     done = subprocess.run(
         ["bash", ROOT / "examples" / "square_sensor.sh", tmp_path / "made"],

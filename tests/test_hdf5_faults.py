@@ -120,7 +120,7 @@ def test_a_hundred_thousand_files(exported):
 def path_env():
     import os
 
-    return os.environ | {"PYTHONPATH": f"{TESTS.parent}:{TESTS}"}
+    return os.environ | {"PYTHONPATH": f"{TESTS.parent / 'src'}:{TESTS}"}
 
 
 def test_the_same_seed_gives_the_same_ending():

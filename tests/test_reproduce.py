@@ -360,7 +360,7 @@ def test_in_processes_of_its_own_it_keeps_what_it_has(data):
     words = ["reproduce", "--data", "Ev-Grasps", "--table", "methods", "--epochs", "5000", "-o", "out", "--jobs", "2"]
     process = subprocess.Popen(
         [*RUNTIME, *words],
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        env=os.environ | {"PYTHONPATH": str(ROOT / "src")},
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,

@@ -83,7 +83,7 @@ def test_no_points(tmp_path):
 def test_a_killed_sweep_goes_on_with_what_it_had(tmp_path, jobs):
     store, log = tmp_path / "x.store", tmp_path / "log"
     words = [sys.executable, swept.__file__, str(store), str(log), "60", jobs]
-    process = subprocess.Popen(words, env=os.environ | {"PYTHONPATH": str(ROOT)})
+    process = subprocess.Popen(words, env=os.environ | {"PYTHONPATH": str(ROOT / "src")})
     deadline = time.monotonic() + 120
     while len(entries(store)) < 6 and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.002)

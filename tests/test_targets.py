@@ -117,7 +117,7 @@ def test_the_barrier_grows_with_the_tiles(tiles, nanoseconds):
 
 
 def test_every_number_has_unit_and_source():
-    raw = tomllib.loads((resources.files("spikeloom.compiler.targets.base") / "loihi1.toml").read_text("utf-8"))
+    raw = tomllib.loads((resources.files("spikeloom.compiler.targets") / "loihi1" / "chip.toml").read_text("utf-8"))
 
     def leaves(table):
         for value in table.values():
@@ -160,7 +160,7 @@ def test_a_target_that_does_not_exist(name, message):
 
 # -- files that are wrong ----------------------------------------------------------------------------------------------
 
-TEXT = (resources.files("spikeloom.compiler.targets.base") / "loihi1.toml").read_text("utf-8")
+TEXT = (resources.files("spikeloom.compiler.targets") / "loihi1" / "chip.toml").read_text("utf-8")
 
 
 def faults(path, text) -> list[str]:
@@ -347,7 +347,7 @@ def test_truenorth_energy_has_two_readings_and_only_one_has_a_floor():
 
 
 def test_a_crossbar_file_that_is_wrong(tmp_path):
-    text = (resources.files("spikeloom.compiler.targets.base") / "truenorth.toml").read_text("utf-8")
+    text = (resources.files("spikeloom.compiler.targets") / "truenorth" / "chip.toml").read_text("utf-8")
     for old, new in (
         ('confidence = "unverified" }', 'confidence = "rumour" }'),
         ("core.axon_types =", "core.kinds ="),

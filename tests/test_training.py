@@ -180,7 +180,7 @@ def test_killed_at_random_points_it_resumes_to_the_same_bytes(data):
     delays = random.Random(7)
     epochs = "40"
     words = [sys.executable, "-m", "spikeloom", "train", "--data", "data", "--graph", "manual", "--epochs", epochs]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    environment = os.environ | {"PYTHONPATH": str(ROOT / "src")}
     subprocess.run([*words, "-o", "whole.pt"], check=True, env=environment, capture_output=True)
     killed = 0
     for attempt in range(6):
@@ -213,7 +213,7 @@ def started(*words, until):
     """A training in a process of its own, once `until` is true."""
     process = subprocess.Popen(
         [*RUNTIME, *WORDS, *words],
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        env=os.environ | {"PYTHONPATH": str(ROOT / "src")},
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,
