@@ -1,15 +1,18 @@
-"""Results as JSON values: the one encoder of every ``--json``."""
+"""Results as JSON values, the one encoder of every ``--json``, and back from a file that a command wrote."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import MISSING, fields, is_dataclass
 from enum import Enum
 from pathlib import Path
-from typing import Any
+from types import NoneType, UnionType
+from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
+
+Result = TypeVar("Result")
 
 OPTIONAL: Mapping[str, bool] = {"optional": True}
 """Metadata of a field that is left out of the JSON where it is None."""
@@ -50,9 +53,49 @@ def encode(value: Any) -> Any:
             return [encode(each) for each in value]
     if not is_dataclass(value) or isinstance(value, type):
         raise TypeError(f"{type(value).__name__}: has no form in JSON")
-    found = {}
+    entries = {}
     for field in fields(value):
         each = getattr(value, field.name)
         if each is not None or not field.metadata.get("optional"):
-            found[field.metadata.get("key", field.name)] = encode(each)
-    return found | {name: encode(getattr(value, name)) for name in getattr(value, "json_properties", ())}
+            entries[field.metadata.get("key", field.name)] = encode(each)
+    return entries | {name: encode(getattr(value, name)) for name in getattr(value, "json_properties", ())}
+
+
+def decode(kind: type[Result], value: Any) -> Result:
+    """A dataclass from what :func:`encode` made of it; keys without a field are passed over.
+
+    Fields hold dataclasses, tuples, sequences, mappings, plain values, or one of these or None.
+
+    Raises
+    ------
+    TypeError, ValueError, KeyError
+        If the value is not of this kind, for instance since another version wrote it.
+    """
+    if not isinstance(value, Mapping):
+        raise TypeError(f"{type(value).__name__}: is no {kind.__name__}")
+    entries, hints = {}, get_type_hints(kind)
+    for field in fields(kind):  # type: ignore[arg-type]
+        name = field.metadata.get("key", field.name)
+        if name in value:
+            entries[field.name] = _decoded(hints[field.name], value[name])
+        elif field.default is MISSING and field.default_factory is MISSING:
+            raise KeyError(name)
+    return kind(**entries)
+
+
+def _decoded(kind: Any, value: Any) -> Any:
+    origin, inner = get_origin(kind), get_args(kind)
+    if origin in (Union, UnionType):
+        return None if value is None else _decoded(next(each for each in inner if each is not NoneType), value)
+    if is_dataclass(kind):
+        return decode(kind, value)  # type: ignore[arg-type]
+    if isinstance(origin, type) and issubclass(origin, Mapping):
+        return {inner[0](name): _decoded(inner[1], each) for name, each in value.items()}
+    if isinstance(origin, type) and issubclass(origin, Sequence):
+        kinds = inner[:1] * len(value) if origin is not tuple or inner[-1] is Ellipsis else inner
+        return tuple(_decoded(each, part) for each, part in zip(kinds, value, strict=True))
+    if kind is float and isinstance(value, int):
+        return float(value)
+    if isinstance(kind, type) and not isinstance(value, kind):
+        raise TypeError(f"{value!r}: is no {kind.__name__}")
+    return value

@@ -1,57 +1,92 @@
-"""What a result has to say, laid out once: sections of text, tables and figures, and three small renderers.
+"""What a result has to say, laid out once: sections of text, tables, figures and commands; and these as text.
 
-A study returns a frozen dataclass; a function beside it turns that into sections. The first heading of a table is its
-name. :func:`terminal` joins what stands in one section line by line and leaves an empty line between sections.
+A study returns a frozen dataclass; a function beside it turns that into sections. :func:`terminal` and :func:`markdown`
+print them as text, :mod:`report.html` as a page. The first heading of a table is its name.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from spikeloom.runtime.report.drawing import Drawing
 
 
 @dataclass(frozen=True, slots=True)
 class Text:
-    """A paragraph; a line break in it stays one on the terminal."""
+    """A paragraph; a line break in it stays one."""
 
     text: str
 
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Cells as people read them; all columns but the first are right-aligned, unless they hold words."""
+    """Cells as people read them; all columns but the first are right-aligned, unless they hold words.
+
+    A terminal shows the first `most` rows, if that is given: none of them for 0. The caption is for pages.
+    """
 
     head: Sequence[str]
     rows: Sequence[Sequence[str]]
     caption: str = ""
     words: bool = False
+    most: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """An SVG drawing and its numbers; terminal and Markdown show the numbers only."""
+    """A picture by :mod:`report.drawing` and its numbers; text shows the numbers only.
 
-    svg: str
+    It is drawn when a page needs it. The name is its id on the page.
+    """
+
+    name: str
+    draw: Callable[[], Drawing]
     caption: str
-    numbers: Table | None = None
+    numbers: Sequence[Table] = ()
 
 
-Block = Text | Table | Figure
+@dataclass(frozen=True, slots=True)
+class Facts:
+    """Key figures for the eye: name to value and a note about it; for pages, since the text says the same."""
+
+    values: Mapping[str, tuple[str, str]]
+
+
+@dataclass(frozen=True, slots=True)
+class Code:
+    """Commands to type."""
+
+    lines: Sequence[str]
+
+
+@dataclass(frozen=True, slots=True)
+class Details:
+    """Something to unfold on a page; terminals leave it out. Of those in one `group` one is unfolded at a time."""
+
+    title: str
+    blocks: Sequence[Block]
+    group: str = ""
+    unfolded: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """Blocks under one title; the title is for pages and Markdown."""
+    """Blocks under one title; terminals print the title only of a chapter."""
 
     title: str
     blocks: Sequence[Block]
+    chapter: bool = False
+
+
+Block = Text | Table | Figure | Facts | Code | Details | Section
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What a command has found: a result that :mod:`report.json` can encode, its layout, and the exit code."""
+    """What a command has found: a result that :mod:`report.encode` can encode, its layout, and the exit code."""
 
     result: Any
     sections: Callable[[Any], Iterable[Section]]
@@ -59,43 +94,74 @@ class Outcome:
 
 
 def terminal(sections: Iterable[Section]) -> str:
-    """Plain text.
+    """Plain text: the blocks of a section line by line, an empty line between sections.
 
     Examples
     --------
-    >>> spikes = Table(["layer", "spikes"], [["conv1", "12"], ["fc1", "3456"]])
-    >>> print(terminal([Section("Spikes", [Text("of 3 recordings"), spikes])]))
+    >>> spikes = Table(["layer", "spikes"], [["conv1", "12"], ["fc1", "3456"], ["fc2", "7"]], most=2)
+    >>> print(terminal([Section("Spikes", [Text("of 3 recordings"), spikes], chapter=True)]))
+    Spikes
+    ------
     of 3 recordings
       layer  spikes
       conv1      12
       fc1      3456
+      … and 1 more
     """
-    return "\n\n".join("\n".join(_plain(block) for block in section.blocks) for section in sections if section.blocks)
+    return "\n\n".join(filter(None, map(_printed, sections)))
 
 
-def _plain(block: Block) -> str:
+def _printed(section: Section) -> str:
+    """A section with those in it, which stand apart."""
+    parts: list[str] = []
+    apart = True
+    for block in section.blocks:
+        text = _plain(block)
+        if not text:
+            continue
+        if apart or isinstance(block, Section):
+            parts.append(text)
+        else:
+            parts[-1] += f"\n{text}"
+        apart = isinstance(block, Section)
+    if section.chapter and parts:
+        parts[0] = f"{section.title}\n{'-' * len(section.title)}\n{parts[0]}"
+    return "\n\n".join(parts)
+
+
+def _plain(block: Block) -> str:  # noqa: PLR0911 - one for each kind
     match block:
         case Text(text):
             return text
-        case Table(head, rows, words=words):
-            return _aligned([head, *rows], words=words)
-        case Figure(numbers=numbers, caption=caption):
-            return caption if numbers is None else _plain(numbers)
+        case Table(rows=rows, most=most):
+            if most == 0 or not block.head:
+                return ""
+            left = 0 if most is None else len(rows) - most
+            return _aligned(block) + (f"\n  … and {left:,} more" if left > 0 else "")
+        case Figure(numbers=numbers):
+            return "\n\n".join(filter(None, map(_plain, numbers)))
+        case Code(lines):
+            return "\n".join(f"$ {line}" for line in lines)
+        case Section():
+            return _printed(block)
+        case _:
+            return ""
 
 
-def _aligned(lines: Sequence[Sequence[str]], *, words: bool) -> str:
+def _aligned(table: Table) -> str:
+    lines = [table.head, *table.rows[: table.most]]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     return "\n".join(
         "  "
         + "  ".join(
-            cell.ljust(width) if i == 0 or words else cell.rjust(width)
+            cell.ljust(width) if i == 0 or table.words else cell.rjust(width)
             for i, (cell, width) in enumerate(zip(line, widths, strict=True))
         ).rstrip()
         for line in lines
     )
 
 
-def markdown(sections: Iterable[Section]) -> str:
+def markdown(sections: Iterable[Section], level: int = 2) -> str:
     """Markdown with a heading for each titled section.
 
     Examples
@@ -107,12 +173,12 @@ def markdown(sections: Iterable[Section]) -> str:
     """
     parts = []
     for section in sections:
-        parts += [f"## {section.title}"] if section.title else []
-        parts += [_marked(block) for block in section.blocks]
-    return "\n\n".join(parts)
+        parts += [f"{'#' * level} {section.title}"] if section.title else []
+        parts += [_marked(block, level) for block in section.blocks]
+    return "\n\n".join(filter(None, parts))
 
 
-def _marked(block: Block) -> str:
+def _marked(block: Block, level: int) -> str:
     match block:
         case Text(text):
             return text
@@ -120,40 +186,11 @@ def _marked(block: Block) -> str:
             ruler = "|".join(["---", *(["---" if words else "---:"] * (len(head) - 1))])
             lines = [f"| {' | '.join(head)} |", f"|{ruler}|", *(f"| {' | '.join(row)} |" for row in rows)]
             return "\n".join(lines)
-        case Figure(numbers=numbers, caption=caption):
-            return caption if numbers is None else f"{caption}\n\n{_marked(numbers)}"
-
-
-def html(sections: Iterable[Section]) -> str:
-    """Fragments of a page, one ``<section>`` each; the page's frame and style are :mod:`runtime.page`'s.
-
-    Examples
-    --------
-    >>> html([Section("Spikes", [Text("3 < 4")])])
-    '<section id="spikes"><h2>Spikes</h2><p>3 &lt; 4</p></section>'
-    """
-    return "".join(
-        f'<section id="{"-".join(section.title.lower().split())}"><h2>{escape(section.title)}</h2>'
-        f"{''.join(map(_tagged, section.blocks))}</section>"
-        for section in sections
-    )
-
-
-def _tagged(block: Block) -> str:
-    match block:
-        case Text(text):
-            return f"<p>{'<br>'.join(map(escape, text.splitlines()))}</p>"
-        case Table(head, rows, caption, words):
-            above = "".join(f'<th scope="col">{escape(cell)}</th>' for cell in head)
-            below = "".join(
-                f'<tr><th scope="row">{escape(row[0])}</th>{"".join(f"<td>{escape(cell)}</td>" for cell in row[1:])}'
-                "</tr>"
-                for row in rows
-            )
-            said = f"<caption>{escape(caption)}</caption>" if caption else ""
-            kind = ' class="left"' if words else ""
-            return f"<table{kind}>{said}<thead><tr>{above}</tr></thead><tbody>{below}</tbody></table>"
-        case Figure(svg, caption, numbers):
-            unfold = "" if numbers is None else f"<details><summary>Numbers</summary>{_tagged(numbers)}</details>"
-            said = f"<figcaption>{escape(caption)}</figcaption>"
-            return f'<figure>{said}{svg}<output class="readout"></output>{unfold}</figure>'
+        case Figure(caption=caption, numbers=numbers):
+            return "\n\n".join([caption, *(_marked(table, level) for table in numbers)])
+        case Facts(values):
+            return "\n".join(f"- {name}: {value} ({note})" for name, (value, note) in values.items())
+        case Code(lines):
+            return "\n".join(["```", *lines, "```"])
+        case Section() | Details():
+            return markdown([Section(block.title, block.blocks)], level + 1)

@@ -1,0 +1,421 @@
+"""All figures, in Matplotlib: inline on pages, where pointer and arrow keys read values, or as files to print.
+
+Series differ in shape or dash as well as in colour. Colours are Okabe and Ito's, which people with any colour vision
+tell apart; on pages the style sheet chooses them for light and dark.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import wraps
+from typing import TYPE_CHECKING, Any, Literal, ParamSpec
+
+import numpy as np
+import numpy.typing as npt
+
+from spikeloom.runtime.report.numbers import counted, si
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#d55e00", "#56b4e9", "#5b5b5b", "#b8a800")
+CHIP, FLOAT = COLOURS[0], COLOURS[4]
+GREY = "#808890"
+DASHES: tuple[Any, ...] = ("-", (0, (6, 2)), (0, (2, 2)), (0, (8, 2, 2, 2)))
+MARKERS = ("o", "s", "^", "D", "v", "P", "<", ">")
+WIDTH = 9.6
+"""Of a figure, in inches."""
+
+STYLE = {
+    "font.size": 9,
+    "font.family": "sans-serif",
+    "font.sans-serif": ["DejaVu Sans"],
+    "axes.edgecolor": GREY,
+    "axes.titlesize": 9,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.axisbelow": True,
+    "grid.color": GREY,
+    "grid.alpha": 0.25,
+    "xtick.color": GREY,
+    "ytick.color": GREY,
+    "xtick.labelcolor": "black",
+    "ytick.labelcolor": "black",
+    "legend.frameon": False,
+    "svg.fonttype": "none",
+    "svg.hashsalt": "spikeloom",
+}
+
+Options = ParamSpec("Options")
+
+
+@dataclass(eq=False)
+class Drawing:
+    """A Matplotlib figure and the values that pointer and keys read from it.
+
+    Parameters
+    ----------
+    figure : Figure
+    title : str
+        What screen readers say.
+    along : {"", "x", "y"}
+        Direction in which the pointer seeks the nearest value; both by default.
+    tips : list of (Axes, float, float, str)
+        Panel, place in it, and what is said there, in the order in which keys visit them.
+    cells : tuple of (Axes, sequence of str), optional
+        A panel whose rows have names and whose columns are steps: there the pointer reads every cell.
+    """
+
+    figure: Figure
+    title: str
+    along: Literal["", "x", "y"] = ""
+    tips: list[tuple[Axes, float, float, str]] = field(default_factory=list)
+    cells: tuple[Axes, Sequence[str]] | None = None
+
+    def svg(self, name: str) -> str:
+        """For a page, on which no other drawing has the name: see-through, colours by the style sheet."""
+        text = self.file("svg", transparent=True).decode()
+        text = text[text.index("<svg") :]
+        for index, colour in enumerate(COLOURS):
+            text = text.replace(colour, f"var(--c{index})")
+        return re.sub(r'(id="|href="#|url\(#)', rf"\1{name}-", text)
+
+    def values(self) -> dict[str, Any]:
+        """What a page's script reads: places in the units of the SVG."""
+        height = self.figure.get_figheight() * 72
+
+        def place(axes: Axes, x: float, y: float) -> list[float]:
+            right, up = axes.transData.transform((x, y)) * 72 / self.figure.dpi
+            return [round(float(right), 1), round(height - float(up), 1)]
+
+        found: dict[str, Any] = {
+            "along": self.along,
+            "tips": [[*place(axes, x, y), tip] for axes, x, y, tip in self.tips],
+        }
+        if self.cells is not None:
+            axes, names = self.cells
+            (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
+            found["cells"] = {"from": place(axes, left, top), "to": place(axes, right, bottom), "rows": list(names)}
+            found["cells"]["columns"] = round(right - left)
+        return found
+
+    def file(self, kind: str, **options: Any) -> bytes:
+        """As PNG, SVG or PDF; the same bytes for the same drawing."""
+        from matplotlib import rc_context
+
+        content = io.BytesIO()
+        none = {"svg": ("Creator", "Date", "Format", "Type"), "pdf": ("CreationDate",), "png": ("Software",)}[kind]
+        with rc_context(STYLE):  # type: ignore[arg-type]
+            self.figure.savefig(content, format=kind, dpi=150, metadata=dict.fromkeys(none), **options)
+        return content.getvalue()
+
+
+def styled(draw: Callable[Options, Drawing]) -> Callable[Options, Drawing]:
+    """Draw in the common style."""
+
+    @wraps(draw)
+    def in_style(*args: Options.args, **kwargs: Options.kwargs) -> Drawing:
+        from matplotlib import rc_context
+
+        with rc_context(STYLE):  # type: ignore[arg-type]
+            return draw(*args, **kwargs)
+
+    return in_style
+
+
+def sheet(title: str, height: float, *, width: float = WIDTH) -> Drawing:
+    """An empty figure; sizes in inches."""
+    from matplotlib.figure import Figure  # the object interface: no global state, no window
+
+    return Drawing(Figure(figsize=(width, height), layout="constrained"), title)
+
+
+def _scale(axes: Any, unit: str) -> None:
+    """Numbers of an axis with SI prefixes; letters for thousands and millions without a unit."""
+    axes.set_major_formatter(lambda value, _: si(value, unit) if unit else counted(value))
+
+
+@styled
+def bars(title: str, rows: Mapping[str, Sequence[float]], series: Sequence[str], unit: str = "") -> Drawing:
+    """Horizontal bars, one for each series in each row, with their values beside them."""
+    drawing = sheet(title, 0.5 + 0.21 * len(series) * len(rows) + 0.12 * len(rows))
+    drawing.along = "y"
+    axes = drawing.figure.subplots()
+    thick = 0.8 / len(series)
+    for place, (label, values) in enumerate(rows.items()):
+        for index, (value, kind) in enumerate(zip(values, series, strict=True)):
+            y = place + (index - (len(series) - 1) / 2) * thick
+            shown = si(value, unit) if unit else f"{value:,.0f}"
+            colour = COLOURS[index % len(COLOURS)]
+            axes.barh(y, value, thick * 0.9, color=colour, label=kind if place == 0 else None)
+            axes.annotate(shown, (value, y), (4, 0), textcoords="offset points", va="center", fontsize=8)
+            drawing.tips.append((axes, value, y, f"{label}, {kind}: {shown}"))
+    axes.set_yticks(range(len(rows)), list(rows))
+    axes.invert_yaxis()
+    axes.margins(x=0.12, y=0.02)
+    axes.xaxis.set_visible(False)
+    axes.spines["bottom"].set_visible(False)
+    if len(series) > 1:
+        drawing.figure.legend(loc="outside upper left", ncols=len(series))
+    return drawing
+
+
+@styled
+def lines(title: str, series: Mapping[str, Sequence[float]], label: str, unit: str = "") -> Drawing:
+    """Lines over steps, each in a colour and a dash of its own."""
+    drawing = sheet(title, 2.8)
+    drawing.along = "x"
+    axes = drawing.figure.subplots()
+    for index, (name, values) in enumerate(series.items()):
+        axes.plot(values, color=COLOURS[index % len(COLOURS)], ls=DASHES[index % len(DASHES)], lw=1.3, label=name)
+    most = max((max(values, default=0.0) for values in series.values()), default=0.0) or 1.0
+    for step in range(max(map(len, series.values()))):
+        there = {name: values[step] for name, values in series.items() if step < len(values)}
+        told = ", ".join(f"{si(value, unit)} {name}" for name, value in there.items())
+        drawing.tips.append((axes, step, max(there.values()), f"step {step}: {told}"))
+    axes.set(xlabel=label, ylim=(0, 1.05 * most))
+    axes.margins(x=0.01)
+    axes.grid(axis="y")
+    _scale(axes.yaxis, unit)
+    drawing.figure.legend(loc="outside upper left", ncols=4)
+    return drawing
+
+
+@styled
+def matrices(title: str, panels: Mapping[str, npt.NDArray[np.int64]]) -> Drawing:
+    """Confusion matrices side by side: rows are labels, columns decisions; right ones are of another colour."""
+    drawing = sheet(title, 4.6)
+    for axes, (side, counts) in zip(np.ravel(drawing.figure.subplots(1, len(panels))), panels.items(), strict=True):
+        totals = np.maximum(counts.sum(axis=1), 1)
+        size = min(9.0, 150 / len(counts))
+        for label, decided in np.argwhere(counts).tolist():
+            count = int(counts[label, decided])
+            colour, alpha = (CHIP if label == decided else FLOAT), 0.2 + 0.4 * count / totals[label]
+            axes.add_patch(_box(decided - 0.5, label - 0.5, 1, 1, facecolor=colour, alpha=alpha, edgecolor="none"))
+            axes.text(decided, label, str(count), ha="center", va="center", fontsize=size)
+            tip = f"{side}: label {label} decided as {decided}, {count} of {counts[label].sum()}"
+            drawing.tips.append((axes, decided, label, tip))
+        axes.set(xlim=(-0.5, len(counts) - 0.5), ylim=(len(counts) - 0.5, -0.5), aspect="equal", title=side)
+        axes.set(xlabel="decided as", ylabel="label")
+        axes.locator_params(integer=True)
+        axes.spines[:].set_visible(True)
+    return drawing
+
+
+def _box(x: float, y: float, wide: float, high: float, **look: Any) -> Any:
+    from matplotlib.patches import Rectangle
+
+    return Rectangle((x, y), wide, high, **look)
+
+
+@styled
+def raster(
+    title: str, neurons: Sequence[int], steps: int, spikes: Mapping[str, npt.NDArray[np.int64]], kind: str = "neuron"
+) -> Drawing:
+    """Spikes of both sides: rows are `neurons`, columns steps; differences are marked.
+
+    `spikes` holds pairs of step and neuron: ``both``, ``float`` and ``chip`` (of one side only).
+    """
+    drawing = sheet(title, min(max(0.032 * len(neurons), 1.0), 4.4) + 0.9)
+    axes = drawing.figure.subplots()
+    row = {neuron: index for index, neuron in enumerate(neurons)}
+
+    def places(side: str) -> npt.NDArray[np.int64]:
+        found = [(step, row[neuron]) for step, neuron in spikes[side].tolist() if neuron in row]
+        return np.array(sorted(found), np.int64).reshape(-1, 2)
+
+    image = np.zeros((max(len(neurons), 1), max(steps, 1), 4))
+    both = places("both")
+    image[both[:, 1], both[:, 0]] = (0.5, 0.53, 0.56, 0.9)
+    axes.imshow(image, aspect="auto", interpolation="nearest", extent=(-0.5, steps - 0.5, len(image) - 0.5, -0.5))
+    axes.plot([], [], "s", color=GREY, ms=4, label="both fire")
+    found = []
+    for side, colour, marker in (("float", FLOAT, "_"), ("chip", CHIP, "|")):
+        own = places(side)
+        name = "float model" if side == "float" else side
+        axes.plot(own[:, 0], own[:, 1], marker, color=colour, ms=6, mew=1.4, label=f"{name} only")
+        found += [(x, y, f"{kind} {neurons[y]}, step {x}: only the {name} fires") for x, y in own.tolist()]
+    drawing.tips += [(axes, x, y, tip) for x, y, tip in sorted(found)]
+    drawing.cells = axes, [f"{kind} {neuron}" for neuron in neurons]
+    if not neurons:
+        axes.text(0.02, 0.5, "silent", transform=axes.transAxes, va="center")
+    shown = range(0, len(neurons), max(1, -(-len(neurons) // 25)))
+    axes.set_yticks(shown, [str(neurons[index]) for index in shown], fontsize=7)
+    axes.set(xlabel="step", ylabel=kind)
+    drawing.figure.legend(loc="outside upper left", ncols=3)
+    return drawing
+
+
+# -- accuracy over a cost ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Mark:
+    """A point of a scatter plot; one with a name has a ring, and its interval of y.
+
+    `weight`, up to 1, is for its size; values are positive, since the axis is logarithmic.
+    """
+
+    x: float
+    y: float
+    series: str
+    tip: str
+    weight: float = 1.0
+    name: str = ""
+    interval: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scatter:
+    """One panel: marks, the stairs of a front, a level with its name, and the horizontal axis with its unit."""
+
+    marks: Sequence[Mark]
+    front: Sequence[tuple[float, float]]
+    level: tuple[float, str]
+    axis: str
+    unit: str
+
+
+@styled
+def scatters(title: str, panels: Sequence[Scatter], label: str, *, across: int = 1) -> Drawing:
+    """Marks over logarithmic axes, a panel for each; colours and shapes are for series."""
+    down = -(-len(panels) // across)
+    drawing = sheet(title, 4.5 * down, width=WIDTH if across == 1 else 7.2 * across)
+    rows = drawing.figure.subplots(down, across, squeeze=False, sharey=True)
+    for axes, panel in zip(rows.flat, panels, strict=False):
+        _scatter(drawing, axes, panel)
+    for axes in rows.flat[len(panels) :]:
+        axes.set_visible(False)
+    for row in rows:
+        row[0].set_ylabel(label)
+    handles, names = rows.flat[0].get_legend_handles_labels()
+    drawing.figure.legend(handles, names, loc="outside lower center", ncols=min(len(names), 6), fontsize=8)
+    if across > 1:
+        drawing.figure.suptitle(title, fontsize=10)
+    return drawing
+
+
+def _scatter(drawing: Drawing, axes: Axes, panel: Scatter) -> None:
+    from matplotlib.ticker import FixedLocator, NullFormatter
+
+    for index, series in enumerate(dict.fromkeys(mark.series for mark in panel.marks)):
+        own = [mark for mark in panel.marks if mark.series == series]
+        colour, hollow = COLOURS[index % len(COLOURS)], index // len(COLOURS) % 2 == 1
+        axes.scatter(
+            [mark.x for mark in own],
+            [mark.y for mark in own],
+            s=[14 + 30 * mark.weight for mark in own],
+            marker=MARKERS[index % len(MARKERS)],
+            facecolors="none" if hollow else colour,
+            edgecolors=colour,
+            linewidths=0.9,
+            label=series,
+            zorder=3,
+        )
+    if len(panel.front) > 1:
+        x, y = zip(*panel.front, strict=True)
+        axes.step(x, y, where="post", color=GREY, lw=1.0, ls=(0, (5, 2)), label="front on the test split", zorder=2)
+    axes.axhline(panel.level[0], color=GREY, lw=0.9, ls=":", label=panel.level[1], zorder=1)
+    named = [mark for mark in panel.marks if mark.interval is not None]
+    for place, mark in enumerate(named):
+        low, high = mark.interval or (mark.y, mark.y)
+        axes.plot([mark.x, mark.x], [low, high], color=GREY, lw=1.0, zorder=2)
+        axes.plot(mark.x, mark.y, "o", ms=12, mfc="none", mec=GREY, mew=1.4, zorder=4)
+        # in turn above and below the interval, where there are no marks
+        at, shift = (low, -11) if place % 2 else (high, 4)
+        offset: dict[str, Any] = {"textcoords": "offset points", "ha": "center", "fontweight": "bold"}
+        axes.annotate(mark.name, (mark.x, at), (0, shift), fontsize=8, zorder=5, **offset)
+    drawing.tips += [(axes, m.x, m.y, m.tip) for m in sorted(panel.marks, key=lambda mark: mark.x)]
+    axes.set_xscale("log")
+    axes.set_xlabel(panel.axis)
+    reach = [math.log10(mark.x) for mark in panel.marks] or [0.0]
+    axes.xaxis.set_major_locator(FixedLocator(log_ticks(min(reach) - 0.1, max(reach) + 0.1)))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    _scale(axes.xaxis, panel.unit)
+    axes.grid(True)
+    axes.margins(0.06, 0.08)
+
+
+def log_ticks(low: float, high: float) -> list[float]:
+    """Numbers 1, 2, 5 times a power of ten between two logarithms; powers of ten alone over three decades.
+
+    Examples
+    --------
+    >>> log_ticks(-4.1, -3.2)
+    [0.0001, 0.0002, 0.0005]
+    """
+    digits = (1, 2, 5) if high - low < 3 else (1,)
+    powers = range(math.floor(low), math.ceil(high) + 1)
+    found = [float(f"{digit}e{power}") for power in powers for digit in digits]
+    inside = [value for value in found if low <= math.log10(value) <= high]
+    return inside if len(inside) > 1 else [10**low, 10**high]
+
+
+# -- curves with intervals ---------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Curves:
+    """One panel of curves of float model and chip in per cent over named levels.
+
+    Parameters
+    ----------
+    title, axis : str
+    levels : sequence of str
+    sides : mapping of str to sequence of (float, float, float)
+        ``float`` and ``chip``: low end, mean and high end at each level.
+    leaves : mapping of str to (int or None)
+        Level at which a side leaves the grey band.
+    band : (float, float)
+    chance : float
+    """
+
+    title: str
+    axis: str
+    levels: Sequence[str]
+    sides: Mapping[str, Sequence[tuple[float, float, float]]]
+    leaves: Mapping[str, int | None]
+    band: tuple[float, float]
+    chance: float
+
+
+LOOKS: Mapping[str, tuple[str, str, Any]] = {"float": (FLOAT, "s", (0, (5, 2))), "chip": (CHIP, "o", "-")}
+"""Colour, marker and dash of a side."""
+
+
+@styled
+def curves(title: str, panels: Sequence[Curves], *, across: int = 3, names: int = 6) -> Drawing:
+    """Panels of curves with intervals; at most so many `names` of levels below each."""
+    across = min(across, len(panels))
+    down = -(-len(panels) // across)
+    drawing = sheet(title, 2.3 * down + 0.4, width=max(WIDTH, 3.2 * across))
+    rows = drawing.figure.subplots(down, across, squeeze=False, sharey=True)
+    for axes in rows.flat[len(panels) :]:
+        axes.set_visible(False)
+    for axes, panel in zip(rows.flat, panels, strict=False):
+        axes.axhspan(*panel.band, color=GREY, alpha=0.2, lw=0)
+        axes.axhline(panel.chance, color=GREY, ls=":", lw=1)
+        for side, shift in (("float", -0.07), ("chip", 0.07)):
+            colour, marker, dash = LOOKS[side]
+            low, mean, high = np.array(panel.sides[side]).T
+            at = np.arange(len(panel.levels)) + shift
+            reach = np.maximum([mean - low, high - mean], 0)
+            look = {"color": colour, "marker": marker, "ls": dash, "ms": 3.5, "lw": 1.3, "elinewidth": 1, "capsize": 2}
+            axes.errorbar(at, mean, yerr=reach, label="float model" if side == "float" else side, **look)
+            leaves = panel.leaves[side]
+            if leaves is not None:
+                axes.axvline(leaves + 2 * shift, color=colour, ls=dash, lw=1, alpha=0.6)
+            for x, level, (a, b, c) in zip(at, panel.levels, panel.sides[side], strict=True):
+                drawing.tips.append((axes, x, b, f"{panel.title}; {level}, {side}: {b:.1f} % ({a:.1f} … {c:.1f})"))
+        every = -(-len(panel.levels) // names)
+        axes.set_xticks(range(0, len(panel.levels), every), panel.levels[::every], fontsize=7)
+        axes.set(xlim=(-0.5, len(panel.levels) - 0.5), ylim=(-3, 103), title=panel.title, xlabel=panel.axis)
+        axes.grid(axis="y")
+    handles, labels = rows.flat[0].get_legend_handles_labels()
+    drawing.figure.legend(handles, labels, loc="outside upper left", ncols=2)
+    return drawing

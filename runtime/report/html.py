@@ -1,0 +1,53 @@
+"""Sections as a page: one HTML file that needs nothing else, the same bytes for the same sections."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from importlib import resources
+
+from spikeloom.runtime.report.sections import Section
+
+
+def page(title: str, about: str, sections: Iterable[Section]) -> str:
+    """A whole page.
+
+    Parameters
+    ----------
+    title, about : str
+        Its heading, and a sentence below it.
+    sections : iterable of Section
+        Its chapters, which the page links to; each has a title.
+    """
+    from jinja2 import Environment, PackageLoader, StrictUndefined  # a tenth of a second that other commands save
+
+    from spikeloom import __version__
+
+    environment = Environment(
+        loader=PackageLoader("spikeloom.runtime.report", "."),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["anchor"] = anchor
+    environment.tests["kind"] = lambda block, name: type(block).__name__ == name
+    files = resources.files("spikeloom.runtime.report")
+    return environment.get_template("page.html").render(
+        title=title,
+        about=about,
+        sections=list(sections),
+        style=files.joinpath("page.css").read_text("utf-8"),
+        script=files.joinpath("page.js").read_text("utf-8"),
+        version=__version__,
+    )
+
+
+def anchor(title: str) -> str:
+    """Id of a chapter.
+
+    Examples
+    --------
+    >>> anchor("Energy and time")
+    'energy-and-time'
+    """
+    return "-".join(title.lower().split())
