@@ -18,8 +18,8 @@ from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.loihi1.compilation import compile_network
 from spikeloom.models.recordings.evtouch import load_recordings
 from spikeloom.runtime.commands.choose.anytime import ALLOWED
-from spikeloom.runtime.commands.inputs import propagation
 from spikeloom.runtime.costs import course
+from spikeloom.runtime.inputs.network import propagation
 from spikeloom.runtime.report.tables import table
 from spikeloom.runtime.studies.anytime import exits
 

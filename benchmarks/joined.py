@@ -25,8 +25,8 @@ from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.compilation import compile_network
 from spikeloom.models.recordings.events import joined_bins
 from spikeloom.models.recordings.evtouch import Recordings, load_recordings
-from spikeloom.runtime.commands.inputs import propagation
 from spikeloom.runtime.costs.estimate import estimate
+from spikeloom.runtime.inputs.network import propagation
 from spikeloom.runtime.machines.votes import predictions
 from spikeloom.runtime.report.intervals import of_mean
 from spikeloom.runtime.studies.paper.measured import float_decisions

@@ -22,8 +22,8 @@ from spikeloom.compiler.targets.truenorth.codebook import COPIES, MOST, LevelNet
 from spikeloom.compiler.targets.truenorth.in_time import lower_in_time
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.cli import build_parser
-from spikeloom.runtime.commands.inputs import recordings
-from spikeloom.runtime.commands.load_network import asked_network
+from spikeloom.runtime.inputs.network import load_network
+from spikeloom.runtime.inputs.recordings import recordings
 from spikeloom.runtime.machines.votes import readout_counts
 from spikeloom.runtime.report.tables import table
 
@@ -56,7 +56,7 @@ def main() -> None:
     """Print the figures."""
     data_path, *words = sys.argv[1:]
     arguments = build_parser().parse_args(["compile", *words, "-o", "unused.loom"])
-    network, chip = asked_network(arguments.checkpoint, arguments).network, load_target("truenorth", CROSSBARS)
+    network, chip = load_network(arguments.checkpoint, arguments).network, load_target("truenorth", CROSSBARS)
     forgetful = replace(network, populations=tuple(replace(p, beta=0.0, alpha=0.0) for p in network.populations))
     data = recordings(data_path, "test", classes=network.classes, taxels=network.input.taxels)
 

@@ -30,7 +30,7 @@ from spikeloom.compiler.formats.archive import digest, read_members
 from spikeloom.compiler.targets.loihi1 import netlist_file as serialize
 from spikeloom.models.graphs import CHOICES
 from spikeloom.runtime import cli
-from spikeloom.runtime.commands import inputs
+from spikeloom.runtime.inputs import files as inputs
 
 GIVE_CHECKPOINT = "give a file of spikeloom train or of the released layout"
 GIVE_DATA = "give the folder or zip that holds train/ and test/"
@@ -287,7 +287,7 @@ def test_checkpoint_zip_bomb(refusal, tmp_path):
     ],
 )
 def test_choices_within_a_checkpoint(refusal, words, line, monkeypatch):
-    shipped = sorted(path.stem for path in Path(inputs.__file__).parents[1].glob("models/pretrained/*.pt"))
+    shipped = sorted(path.stem for path in Path(inputs.__file__).parents[2].glob("models/pretrained/*.pt"))
     assert refusal("inspect", *words) == line.format(shipped=", ".join(f"pretrained:{name}" for name in shipped))
 
 

@@ -21,7 +21,7 @@ from spikeloom.models.recordings.events import BIN_S, joined_bins, load_data
 from spikeloom.models.recordings.grasps import synthetic_grasps
 from spikeloom.models.recordings.release import write_event_lines, write_released
 from spikeloom.runtime.cli import main
-from spikeloom.runtime.commands.inputs import require_bins
+from spikeloom.runtime.inputs.recordings import require_bins
 from spikeloom.runtime.studies.chart import work as chart_work
 from spikeloom.runtime.studies.stress import disturbances
 from spikeloom.runtime.studies.stress import runs as stress_runs

@@ -289,7 +289,7 @@ def test_a_shipped_checkpoint_stands_in_for_a_graph_that_is_asked_for(spikeloom,
         return files[path]
 
     monkeypatch.setattr("spikeloom.runtime.studies.chart.networks.shipped", shipped)
-    monkeypatch.setattr("spikeloom.runtime.commands.inputs.shipped", shipped)
+    monkeypatch.setattr("spikeloom.runtime.inputs.recordings.shipped", shipped)
     words = ("chart", "pretrained:rings", "--data", "data", "--jobs", "1", "-o", "shipped", "--json", "--grid")
     code, out, _ = spikeloom(*words, "bits=8,window=100%,graph=ring/knn:1")
     assert code == 0

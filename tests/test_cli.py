@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from made_files import CLASSES, FEATURES, STEPS, TAXELS, events, own_file, recordings_folder, released, state_dict
 from made_files import weights as made_weights
-from spikeloom.runtime.__main__ import main as start
 
 from spikeloom import __version__
+from spikeloom.__main__ import main as start
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.interpret import channels_last, run_integer
 from spikeloom.compiler.targets.base import EVENTS, load_target
@@ -26,10 +26,10 @@ from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.compiler.text import text
 from spikeloom.models.graphs import build_graph
 from spikeloom.runtime import cli
-from spikeloom.runtime.commands import inputs
-from spikeloom.runtime.commands.inputs import recordings
 from spikeloom.runtime.commands.main_job import compile as compile_command
 from spikeloom.runtime.commands.main_job import demo
+from spikeloom.runtime.inputs import files as inputs
+from spikeloom.runtime.inputs.recordings import recordings
 
 SIZES = {"conv1": TAXELS * FEATURES, "fc1": 9, "fc2": 8, "fc3": CLASSES}
 

@@ -11,7 +11,7 @@ from spikeloom.compiler.targets.loihi1.compilation import compile_network
 from spikeloom.compiler.targets.loihi1.layout.core_graph import core_map
 from spikeloom.compiler.targets.loihi1.legalize import measure
 from spikeloom.models.graphs import normalised_adjacency
-from spikeloom.runtime.commands.inputs import shipped
+from spikeloom.runtime.inputs.files import shipped
 
 TARGET = load_target("loihi1")
 

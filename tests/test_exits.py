@@ -19,8 +19,8 @@ from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist import read_only
 from spikeloom.models.graphs import normalised_adjacency
 from spikeloom.models.recordings.evtouch import load_recordings
-from spikeloom.runtime.commands.inputs import shipped
 from spikeloom.runtime.costs import course
+from spikeloom.runtime.inputs.files import shipped
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.votes import predictions
 from spikeloom.runtime.studies.anytime import exits

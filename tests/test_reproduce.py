@@ -30,7 +30,7 @@ from spikeloom.models.networks.networks import Architecture
 from spikeloom.models.recordings.grasps import synthetic_grasps
 from spikeloom.models.recordings.release import write_released
 from spikeloom.runtime.cli import main
-from spikeloom.runtime.commands.inputs import propagation
+from spikeloom.runtime.inputs.network import propagation
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.votes import class_counts
 from spikeloom.runtime.studies.jobs.cluster import ClusterLostError

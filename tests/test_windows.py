@@ -6,7 +6,7 @@ from made_files import CLASSES, STEPS, events, own_file, recordings_folder
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.models.recordings.windows import first_part, window_asked
+from spikeloom.models.recordings.windows import first_part, parse_window
 from spikeloom.runtime import cli
 from spikeloom.runtime.machines.loihi1 import engine
 
@@ -40,13 +40,13 @@ def test_every_recording_keeps_its_part_of_its_own_length():
 
 @pytest.mark.parametrize(("words", "percent"), [("1%", 1), ("50", 50), (" 100% ", 100)])
 def test_whole_per_cent(words, percent):
-    assert window_asked(words) == percent
+    assert parse_window(words) == percent
 
 
 @pytest.mark.parametrize("words", ["0", "0%", "101%", "-5%", "12.5%", "half", "", "٣%", "50%%", "1000"])
 def test_what_is_no_part(words):
     with pytest.raises(OptionError) as caught:
-        window_asked(words)
+        parse_window(words)
     told = f"--window {words}: not a part of a recording; give whole per cent from 1% to 100%"
     assert str(caught.value) == told
 

@@ -15,7 +15,7 @@ WHOLE = 100
 """Per cent of a recording."""
 
 
-def window_asked(words: str) -> int:
+def parse_window(words: str) -> int:
     """Per cent of each recording, from the words of ``--window``.
 
     Raises
@@ -25,7 +25,7 @@ def window_asked(words: str) -> int:
 
     Examples
     --------
-    >>> window_asked("25%"), window_asked("100")
+    >>> parse_window("25%"), parse_window("100")
     (25, 100)
     """
     found = re.fullmatch(r"([0-9]{1,3})%?", words.strip(), re.ASCII)

@@ -164,12 +164,12 @@ def add_steps(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def cores_asked(words: str | None) -> dict[str, int] | None:
+def parse_cores(words: str | None) -> dict[str, int] | None:
     """Least number of cores by layer, from the words of ``--cores-for``.
 
     Examples
     --------
-    >>> cores_asked("conv1=8,fc1=6")
+    >>> parse_cores("conv1=8,fc1=6")
     {'conv1': 8, 'fc1': 6}
 
     Raises

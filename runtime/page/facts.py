@@ -23,9 +23,8 @@ from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.models.graphs import NEUTOUCH
 from spikeloom.models.recordings.events import BIN_S
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.runtime.commands.inputs import asked_places
-from spikeloom.runtime.commands.load_network import Asked
 from spikeloom.runtime.equivalence.verify import Verdict
+from spikeloom.runtime.inputs.network import LoadedNetwork, sensor_places
 from spikeloom.runtime.machines.loihi1.trace import Counts
 
 Json = dict[str, Any]
@@ -119,12 +118,12 @@ def _packets(netlist: Netlist, counts: Counts) -> FloatArray:
 # -- taxels ------------------------------------------------------------------------------------------------------------
 
 
-def taxels_json(netlist: Netlist, asked: Asked, data: Recordings, counts: Counts, taxels: str | None) -> Json:
+def taxels_json(netlist: Netlist, asked: LoadedNetwork, data: Recordings, counts: Counts, taxels: str | None) -> Json:
     """Taxels, the graph over them where there is one, and what each sends and its neurons fire in a mean recording.
 
     Parameters
     ----------
-    netlist, asked : Netlist, Asked
+    netlist, asked : Netlist, LoadedNetwork
         What ran on the chip, and the float model.
     data : Recordings
         What was run.
@@ -133,7 +132,7 @@ def taxels_json(netlist: Netlist, asked: Asked, data: Recordings, counts: Counts
     taxels : str or None
         The sensor that the user named.
     """
-    places = asked_places(taxels)
+    places = sensor_places(taxels)
     known = len(places) == netlist.taxels and places.shape[1] > 1
     events: IntArray = data.events.sum(axis=(2, 3), dtype=np.int64)
     checkpoint = asked.checkpoint
@@ -163,7 +162,12 @@ def taxels_json(netlist: Netlist, asked: Asked, data: Recordings, counts: Counts
 
 
 def provenance_json(
-    arguments: argparse.Namespace, netlist: Netlist, target: Target, asked: Asked, data: Recordings, recording: str
+    arguments: argparse.Namespace,
+    netlist: Netlist,
+    target: Target,
+    asked: LoadedNetwork,
+    data: Recordings,
+    recording: str,
 ) -> Json:
     """Files and their hashes, versions, seeds and options, and the commands that repeat the page.
 

@@ -19,11 +19,11 @@ from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.layout.chips import chip_count
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.runtime.commands.load_network import Asked
 from spikeloom.runtime.costs import cost
 from spikeloom.runtime.costs.estimate import Estimate, estimate
 from spikeloom.runtime.costs.estimates import estimate_json
 from spikeloom.runtime.equivalence.verify import membranes_of, spikes_of
+from spikeloom.runtime.inputs.network import LoadedNetwork
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.timing import DetailedTimes, SimpleTimes
 from spikeloom.runtime.machines.loihi1.trace import Counts, Trace, aligned, heard
@@ -55,7 +55,7 @@ class Sides:
     trace: Trace
 
 
-def run_both(netlist: Netlist, asked: Asked, events: npt.NDArray[np.uint8]) -> Sides:
+def run_both(netlist: Netlist, asked: LoadedNetwork, events: npt.NDArray[np.uint8]) -> Sides:
     """Run one recording, (taxels, polarities, steps), on both sides."""
     one = events[None]
     inputs = with_clocks(one, netlist.clocks)
@@ -81,7 +81,14 @@ def _heard_only(netlist: Netlist, layer: int, spikes: BoolArray) -> BoolArray:
 
 
 def recording_json(
-    netlist: Netlist, target: Target, asked: Asked, data: Recordings, index: int, found: Estimate, *, bin_s: float
+    netlist: Netlist,
+    target: Target,
+    asked: LoadedNetwork,
+    data: Recordings,
+    index: int,
+    found: Estimate,
+    *,
+    bin_s: float,
 ) -> Json:
     """Everything that the page shows of one recording.
 
@@ -91,7 +98,7 @@ def recording_json(
         What runs.
     target : Target
         Its chip.
-    asked : Asked
+    asked : LoadedNetwork
         The float model.
     data : Recordings
         All of them.

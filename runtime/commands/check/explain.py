@@ -26,12 +26,12 @@ from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.runtime.commands.inputs import recordings
-from spikeloom.runtime.commands.load_network import Asked, asked_network
 from spikeloom.runtime.commands.options import add_network, add_recordings
 from spikeloom.runtime.equivalence import causes
 from spikeloom.runtime.equivalence.causes import Explanation, Observed, RootCause
 from spikeloom.runtime.equivalence.suspects import BETA, BIAS, LEFT_OUT, SATURATION, THRESHOLD, TIE, TRUNCATION, WEIGHTS
+from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
+from spikeloom.runtime.inputs.recordings import recordings
 from spikeloom.runtime.machines.loihi1.trace import aligned, check_channels
 from spikeloom.runtime.report.tables import table
 
@@ -78,7 +78,7 @@ def run(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int
     if arguments.top < 1:
         raise OptionError(f"--top {arguments.top}: at least 1 root can be shown; give a positive number")
     netlist = read_netlist(arguments.netlist)
-    asked = asked_network(arguments.checkpoint, arguments, netlist)
+    asked = load_network(arguments.checkpoint, arguments, netlist)
     checkpoint, graph = asked.checkpoint, asked.graph
     require_match(netlist, asked.model)
     _warn(netlist, asked)
@@ -129,7 +129,7 @@ def run(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int
     return report | explanation_json(found, integer, checkpoint, arguments.top), explanation_text, 0
 
 
-def _warn(netlist: Netlist, asked: Asked) -> None:
+def _warn(netlist: Netlist, asked: LoadedNetwork) -> None:
     """Say on stderr what the netlist remembers of its origin, where that is something else."""
     made, checkpoint, graph = netlist.provenance, asked.checkpoint, asked.graph
     if made.get("graph", graph) != graph:

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.formats.atomic import write_atomically
-from spikeloom.runtime.commands.inputs import require_place
 from spikeloom.runtime.commands.options import add_network, add_recordings
+from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.studies.jobs.sweep import Point, add_sweep_arguments, content_key, sweep
 from spikeloom.runtime.studies.stress.battery import NAMES, SEEDS, levels_of, why_not

@@ -8,9 +8,11 @@ from typing import Any
 
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.targets.loihi1.netlist_file import is_netlist
-from spikeloom.runtime.commands.inputs import asked_checkpoint, asked_graph, propagation, recordings, shipped
 from spikeloom.runtime.commands.options import add_model, add_recordings
 from spikeloom.runtime.costs import yardsticks
+from spikeloom.runtime.inputs.files import shipped
+from spikeloom.runtime.inputs.network import load_checkpoint, load_graph, propagation
+from spikeloom.runtime.inputs.recordings import recordings
 
 Json = dict[str, Any]
 
@@ -29,8 +31,8 @@ def run(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int
     path = shipped(arguments.checkpoint)
     if is_netlist(path):
         raise ModelError(f"{path}: is a netlist, estimate says what it costs; give the checkpoint it was made from")
-    checkpoint = asked_checkpoint(path, arguments)
-    graph, adjacency = propagation(checkpoint, asked_graph(arguments, checkpoint.system), arguments.checkpoint)
+    checkpoint = load_checkpoint(path, arguments)
+    graph, adjacency = propagation(checkpoint, load_graph(arguments, checkpoint.system), arguments.checkpoint)
     data = recordings(
         arguments.data,
         arguments.split,

@@ -18,11 +18,12 @@ from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.models.recordings.eventfiles import UNLABELLED
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.runtime.commands.inputs import recordings, require_place
-from spikeloom.runtime.commands.load_network import asked_network
 from spikeloom.runtime.commands.options import add_network, add_recordings
 from spikeloom.runtime.costs import course
 from spikeloom.runtime.costs.course import Course
+from spikeloom.runtime.inputs.files import require_place
+from spikeloom.runtime.inputs.network import load_network
+from spikeloom.runtime.inputs.recordings import recordings
 from spikeloom.runtime.machines.loihi1.trace import check_channels
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.intervals import wilson
@@ -163,7 +164,7 @@ def _float_votes(arguments: argparse.Namespace, netlist: Netlist, data: Recordin
     from spikeloom.compiler.interpret import cut
     from spikeloom.runtime.equivalence.verify import require_match, spikes_of
 
-    asked = asked_network(arguments.checkpoint, arguments, netlist)
+    asked = load_network(arguments.checkpoint, arguments, netlist)
     require_match(netlist, asked.model)
     readout, lengths = asked.network.readout, _lengths(data)
     votes = []

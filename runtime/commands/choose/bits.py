@@ -31,15 +31,10 @@ from spikeloom.compiler.targets.loihi1.storage.width_search import Found, Point,
 from spikeloom.models.recordings.events import BIN_S
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.recordings.fetch import data_folder
-from spikeloom.runtime.commands.inputs import (
-    asked_checkpoint,
-    asked_graph,
-    propagation,
-    recordings,
-    require_place,
-    shipped,
-)
 from spikeloom.runtime.commands.options import add_bin_option, add_model
+from spikeloom.runtime.inputs.files import require_place, shipped
+from spikeloom.runtime.inputs.network import load_checkpoint, load_graph, propagation
+from spikeloom.runtime.inputs.recordings import recordings
 from spikeloom.runtime.report.tables import percent, table
 
 Json = dict[str, Any]
@@ -103,12 +98,12 @@ def run(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int
     path = shipped(arguments.checkpoint)
     if Path(path).is_file() and is_netlist(path):
         raise ModelError(f"{path}: is a netlist, its widths are decided; give the checkpoint that it was made from")
-    checkpoint = asked_checkpoint(path, arguments)
+    checkpoint = load_checkpoint(path, arguments)
     if checkpoint.forms is not None:
         raise ModelError(f"{path}: was fine-tuned for its own widths; give the network that it was made from")
     layers = ("conv1", *(dense.name for dense in checkpoint.dense))
     widths = check_widths(asked, arguments.scale_groups, len(layers), target)
-    _, adjacency = propagation(checkpoint, asked_graph(arguments, checkpoint.system), arguments.checkpoint)
+    _, adjacency = propagation(checkpoint, load_graph(arguments, checkpoint.system), arguments.checkpoint)
     _tell("reading the recordings")
     training = recordings(
         arguments.calibrate,

@@ -21,11 +21,12 @@ from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.recordings.found import number
-from spikeloom.runtime.commands.inputs import recordings, require_place
-from spikeloom.runtime.commands.load_network import Asked, asked_network
 from spikeloom.runtime.commands.main_job.compile import storage
 from spikeloom.runtime.commands.options import add_network, add_recordings
 from spikeloom.runtime.costs.estimate import estimate
+from spikeloom.runtime.inputs.files import require_place
+from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
+from spikeloom.runtime.inputs.recordings import recordings
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.studies.pruning.leaner import (
@@ -88,7 +89,7 @@ def run(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int
         if place is not None:
             for path in arguments.checkpoint:
                 require_place(place, option, argparse.Namespace(**vars(arguments) | {"checkpoint": path}))
-    found = [asked_network(path, arguments) for path in arguments.checkpoint]
+    found = [load_network(path, arguments) for path in arguments.checkpoint]
     first = found[0].network
     for path, asked in zip(arguments.checkpoint, found, strict=True):
         own = asked.network
@@ -133,7 +134,7 @@ def run(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int
     return report, lean_text, 0
 
 
-def _read(arguments: argparse.Namespace, split: str, limit: int | None, asked: Asked) -> Recordings:
+def _read(arguments: argparse.Namespace, split: str, limit: int | None, asked: LoadedNetwork) -> Recordings:
     progress("reading the recordings")
     return recordings(
         arguments.data,
@@ -147,14 +148,14 @@ def _read(arguments: argparse.Namespace, split: str, limit: int | None, asked: A
     )
 
 
-def _provenance(arguments: argparse.Namespace, asked: Asked) -> Json:
+def _provenance(arguments: argparse.Namespace, asked: LoadedNetwork) -> Json:
     made = {"spikeloom": __version__, "checkpoint_sha256": asked.sha256, **asked.origin(arguments.run)}
     made |= storage(None, asked.checkpoint)
     return made | {"keep_all": False, "prune_unused": True, "ranges": "proven", "calibrated": True}
 
 
 def _candidates(
-    arguments: argparse.Namespace, found: list[Asked], training: Recordings, test: Recordings
+    arguments: argparse.Namespace, found: list[LoadedNetwork], training: Recordings, test: Recordings
 ) -> tuple[list[Json], list[Compilation]]:
     """Each checkpoint on the chip: decisions and costs."""
     target, candidates, compilations = load_target(TARGET), [], []
@@ -199,7 +200,7 @@ class _Session:
     """All trials with one compiled network."""
 
     def __init__(
-        self, asked: Asked, compilation: Compilation, training: Recordings, test: Recordings, allowed: int
+        self, asked: LoadedNetwork, compilation: Compilation, training: Recordings, test: Recordings, allowed: int
     ) -> None:
         self.asked, self.compilation, self.target = asked, compilation, load_target(TARGET)
         self.netlist = compilation.netlist

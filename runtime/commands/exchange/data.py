@@ -22,8 +22,9 @@ from spikeloom.models.recordings.found import counts_json, counts_text, number, 
 from spikeloom.models.recordings.grasps import SPLITS, SYNTHETIC, synthetic_split
 from spikeloom.models.recordings.release import SOURCES, write_event_lines, write_released
 from spikeloom.models.sensors import read_layout
-from spikeloom.runtime.commands.inputs import require_bins, require_place
 from spikeloom.runtime.commands.options import add_bin_option, add_common
+from spikeloom.runtime.inputs.files import require_place
+from spikeloom.runtime.inputs.recordings import require_bins
 from spikeloom.runtime.report.tables import table
 
 Arguments = argparse.Namespace

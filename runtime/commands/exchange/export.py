@@ -23,8 +23,10 @@ from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.models.recordings.events import BIN_S
-from spikeloom.runtime.commands.inputs import asked_checkpoint, asked_graph, propagation, recordings, require_place
 from spikeloom.runtime.commands.options import DATA_HELP, MODEL, add_bin_option, add_model
+from spikeloom.runtime.inputs.files import require_place
+from spikeloom.runtime.inputs.network import load_checkpoint, load_graph, propagation
+from spikeloom.runtime.inputs.recordings import recordings
 from spikeloom.runtime.machines.truenorth.commands import export_ranc
 
 Json = dict[str, Any]
@@ -125,8 +127,8 @@ def _onnx(arguments: argparse.Namespace) -> Written:
 
 
 def _onnx_float(arguments: argparse.Namespace) -> Written:
-    checkpoint = asked_checkpoint(arguments.source, arguments)
-    name, adjacency = propagation(checkpoint, asked_graph(arguments), arguments.source)
+    checkpoint = load_checkpoint(arguments.source, arguments)
+    name, adjacency = propagation(checkpoint, load_graph(arguments), arguments.source)
     content = onnx_float.export_float(checkpoint, adjacency, arguments.form or "scan", graph_name=name)
     neurons = len(adjacency) * len(checkpoint.conv_bias) + sum(len(dense.bias) for dense in checkpoint.dense)
     return Written(chunks=[content], facts={"neurons": neurons, "graph": name} | _ports(arguments, content))

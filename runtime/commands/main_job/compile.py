@@ -19,10 +19,11 @@ from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist, write_netlist
 from spikeloom.compiler.targets.loihi1.storage.quantize import RANGES, Recipe
 from spikeloom.compiler.text import text
-from spikeloom.runtime.commands.inputs import recordings, require_place
-from spikeloom.runtime.commands.load_network import Asked, asked_network
 from spikeloom.runtime.commands.main_job.restore import is_whole, take
-from spikeloom.runtime.commands.options import MARGIN, add_bin_option, add_network, cores_asked
+from spikeloom.runtime.commands.options import MARGIN, add_bin_option, add_network, parse_cores
+from spikeloom.runtime.inputs.files import require_place
+from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
+from spikeloom.runtime.inputs.recordings import recordings
 from spikeloom.runtime.machines.truenorth import in_time, native
 from spikeloom.runtime.machines.truenorth.refusal import refuse
 from spikeloom.runtime.report import render
@@ -103,11 +104,11 @@ def run(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int
             f"--margin {arguments.margin:g}: only observed ranges have one; add --ranges observed or leave it away"
         )
     chip = load_target(arguments.target)
-    recipes = recipes_asked(arguments)
-    cores_for = cores_asked(arguments.cores_for)
+    recipes = parse_recipes(arguments)
+    cores_for = parse_cores(arguments.cores_for)
     require_goal(arguments.optimize, cores_for, chip, calibrated=arguments.calibrate is not None, chips=arguments.chips)
     other = None if arguments.against is None else lift(read_netlist(arguments.against))
-    asked = asked_network(arguments.checkpoint, arguments)
+    asked = load_network(arguments.checkpoint, arguments)
     checkpoint = asked.checkpoint
     training = None
     if arguments.calibrate is not None:
@@ -155,25 +156,25 @@ def run(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int
     return report, _text, 0
 
 
-def provenance(arguments: argparse.Namespace, asked: Asked, *, calibrated: bool) -> Json:
+def provenance(arguments: argparse.Namespace, asked: LoadedNetwork, *, calibrated: bool) -> Json:
     """What a netlist remembers of its compilation.
 
     Parameters
     ----------
     arguments : Namespace
         Options of ``compile``.
-    asked : Asked
+    asked : LoadedNetwork
         The network.
     calibrated : bool
         Whether recordings chose its scales.
     """
-    checkpoint, cores_for = asked.checkpoint, cores_asked(arguments.cores_for)
+    checkpoint, cores_for = asked.checkpoint, parse_cores(arguments.cores_for)
     return {
         "spikeloom": __version__,
         "checkpoint_sha256": asked.sha256,
         **asked.origin(arguments.run),
         **({"towers": checkpoint.towers} if checkpoint is not None and checkpoint.towers > 1 else {}),
-        **storage(recipes_asked(arguments), checkpoint),
+        **storage(parse_recipes(arguments), checkpoint),
         "spike_exact": arguments.spike_exact,
         "keep_all": arguments.keep_all,
         "prune_unused": arguments.prune_unused,
@@ -209,7 +210,7 @@ def _numbers(text: str, option: str) -> list[int]:
         raise OptionError(f"{option} {text}: not a number; give one, or one for each layer as in 8,4,4,8") from None
 
 
-def recipes_asked(arguments: argparse.Namespace) -> tuple[Recipe, ...] | None:
+def parse_recipes(arguments: argparse.Namespace) -> tuple[Recipe, ...] | None:
     """Storage that the options of ``compile`` ask for, or None where they do not.
 
     Raises

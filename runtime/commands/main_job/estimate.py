@@ -13,11 +13,11 @@ from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.compiler.targets.truenorth.netlist_file import is_crossbars
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.runtime.commands.inputs import netlist_recordings
 from spikeloom.runtime.commands.options import add_detail, add_recordings
 from spikeloom.runtime.costs.estimate import estimate
 from spikeloom.runtime.costs.estimates import estimate_json, estimate_text
 from spikeloom.runtime.costs.spent import Account, explained
+from spikeloom.runtime.inputs.recordings import netlist_recordings
 from spikeloom.runtime.machines.loihi1.trace import BoolArray
 from spikeloom.runtime.machines.truenorth import commands as truenorth
 from spikeloom.runtime.report.console import progress

@@ -13,8 +13,9 @@ from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.legalize import measure
 from spikeloom.compiler.targets.loihi1.netlist_file import is_netlist, read_netlist
 from spikeloom.compiler.targets.truenorth.netlist_file import is_crossbars
-from spikeloom.runtime.commands.inputs import asked_checkpoint, require_inspectable
 from spikeloom.runtime.commands.options import add_model
+from spikeloom.runtime.inputs.files import require_inspectable
+from spikeloom.runtime.inputs.network import load_checkpoint
 from spikeloom.runtime.machines.truenorth import commands as truenorth
 from spikeloom.runtime.machines.truenorth import native
 from spikeloom.runtime.report import render
@@ -43,4 +44,4 @@ def run(arguments: argparse.Namespace) -> tuple[dict[str, Any], Callable[[dict[s
         sha256 = hashlib.sha256(Path(arguments.path).read_bytes()).hexdigest()
         return render.netlist_json(netlist, uses, sha256), render.netlist_text, 0
     given = tuple(name for name in ("beta", "theta") if getattr(arguments, name) is not None)
-    return render.checkpoint_json(asked_checkpoint(arguments.path, arguments), given), render.checkpoint_text, 0
+    return render.checkpoint_json(load_checkpoint(arguments.path, arguments), given), render.checkpoint_text, 0

@@ -17,12 +17,13 @@ from spikeloom.compiler.targets.loihi1.legalize import measure
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.runtime.commands.inputs import asked_recordings, require_place
-from spikeloom.runtime.commands.load_network import Asked, asked_network
 from spikeloom.runtime.commands.options import add_explain_cost, add_network, add_recordings
 from spikeloom.runtime.costs.spent import Account, explained
 from spikeloom.runtime.equivalence.levels import levels_of, unmet
 from spikeloom.runtime.equivalence.verdicts import verify_json
+from spikeloom.runtime.inputs.files import require_place
+from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
+from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.machines.loihi1.trace import check_channels
 from spikeloom.runtime.page.text import report_text
 from spikeloom.runtime.report.render import netlist_json
@@ -74,10 +75,10 @@ def run(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int
 
         sha256 = hashlib.sha256(Path(arguments.netlist).read_bytes()).hexdigest()
         stability = {"stress": read_stress(arguments.stress, arguments.netlist, sha256)}
-    asked = asked_network(arguments.checkpoint, arguments, netlist)
+    asked = load_network(arguments.checkpoint, arguments, netlist)
     _require_origin(arguments, netlist, asked)
     chart = None if arguments.chart is None else read_chart(arguments.chart, asked.sha256, arguments.checkpoint)
-    data = asked_recordings(arguments, netlist, labels_for="report")
+    data = load_recordings(arguments, netlist, labels_for="report")
     check_channels(netlist, data.events.shape[1] * data.events.shape[2] + netlist.clocks.channels)
     chosen = None if arguments.recording is None else find_recording(data, arguments.recording)
     found, code = _facts(arguments, netlist, asked, data, chosen)
@@ -88,7 +89,7 @@ def run(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int
     return found | {"output": arguments.output}, report_text, code
 
 
-def _require_origin(arguments: argparse.Namespace, netlist: Netlist, asked: Asked) -> None:
+def _require_origin(arguments: argparse.Namespace, netlist: Netlist, asked: LoadedNetwork) -> None:
     """Refuse a netlist that says that it is from another network; the page would blame the chip for it.
 
     Raises
@@ -135,7 +136,7 @@ def find_recording(data: Recordings, asked: str) -> int:
 
 
 def _facts(
-    arguments: argparse.Namespace, netlist: Netlist, asked: Asked, data: Recordings, chosen: int | None
+    arguments: argparse.Namespace, netlist: Netlist, asked: LoadedNetwork, data: Recordings, chosen: int | None
 ) -> tuple[Json, int]:
     """All that the page shows, as JSON values, and the exit code."""
     from spikeloom.runtime.costs.estimate import estimate

@@ -20,7 +20,7 @@ from spikeloom.compiler.targets.loihi1.legalize import measure
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist
 from spikeloom.compiler.targets.loihi1.placing import place_integers
-from spikeloom.runtime.commands.options import MODEL, PLACING, ROUNDING, cores_asked
+from spikeloom.runtime.commands.options import MODEL, PLACING, ROUNDING, parse_cores
 from spikeloom.runtime.report import render
 from spikeloom.runtime.report.console import progress
 
@@ -76,7 +76,7 @@ def _from_netx(arguments: argparse.Namespace) -> tuple[Netlist, list[str]]:
     found = read_netx(path, polarities=arguments.polarities, polarities_first=arguments.polarities_first)
     verify(found.network)
     progress("compiling")
-    cores_for = cores_asked(arguments.cores_for)
+    cores_for = parse_cores(arguments.cores_for)
     placed = place_integers(
         found.network,
         removed=(nobody(found.network), nobody(found.network)) if arguments.keep_all else None,

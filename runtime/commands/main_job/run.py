@@ -12,10 +12,11 @@ from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.formats.atomic import write_atomically
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.compiler.targets.truenorth.netlist_file import is_crossbars
-from spikeloom.runtime.commands.inputs import netlist_recordings, require_place
 from spikeloom.runtime.commands.main_job.estimate import priced
 from spikeloom.runtime.commands.options import add_detail, add_recordings
 from spikeloom.runtime.costs.spent import Account, explained
+from spikeloom.runtime.inputs.files import require_place
+from spikeloom.runtime.inputs.recordings import netlist_recordings
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.trace import aligned
 from spikeloom.runtime.machines.truenorth import commands as truenorth

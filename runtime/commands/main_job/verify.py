@@ -10,13 +10,13 @@ from typing import Any
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.compiler.targets.truenorth.netlist_file import is_crossbars
-from spikeloom.runtime.commands.inputs import netlist_recordings
-from spikeloom.runtime.commands.load_network import asked_network
 from spikeloom.runtime.commands.options import MIN_AGREEMENT, add_explain_cost, add_network, add_recordings
 from spikeloom.runtime.costs.spent import Account, explained
 from spikeloom.runtime.equivalence import verdicts
 from spikeloom.runtime.equivalence.levels import levels_of, parse_requirements, unmet
 from spikeloom.runtime.equivalence.verify import verify
+from spikeloom.runtime.inputs.network import load_network
+from spikeloom.runtime.inputs.recordings import netlist_recordings
 from spikeloom.runtime.machines.loihi1.trace import ENGINES
 from spikeloom.runtime.machines.truenorth import native
 
@@ -68,8 +68,8 @@ def run(arguments: argparse.Namespace) -> tuple[dict[str, Any], Callable[[dict[s
             )
         required = parse_requirements(arguments.require)
     netlist = read_netlist(arguments.netlist)
-    asked = asked_network(arguments.checkpoint, arguments, netlist)
-    original = None if arguments.original is None else asked_network(arguments.original, arguments)
+    asked = load_network(arguments.checkpoint, arguments, netlist)
+    original = None if arguments.original is None else load_network(arguments.original, arguments)
     data = netlist_recordings(arguments, netlist, labels_for="verify")
     account = Account(netlist, data, checked=arguments.spec_samples)
     verdict = verify(

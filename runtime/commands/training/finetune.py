@@ -21,17 +21,10 @@ from spikeloom.compiler.targets.loihi1.storage.quantize import round_to_forms
 from spikeloom.models.graphs import Graph
 from spikeloom.models.recordings.events import joined_bins
 from spikeloom.models.recordings.grasps import SYNTHETIC
-from spikeloom.runtime.commands.inputs import (
-    asked_checkpoint,
-    asked_graph,
-    bin_words,
-    graph_words,
-    propagation,
-    recordings,
-    require_place,
-    shipped,
-)
 from spikeloom.runtime.commands.options import DATA_HELP, add_bin_option, add_model
+from spikeloom.runtime.inputs.files import require_place, shipped
+from spikeloom.runtime.inputs.network import graph_words, load_checkpoint, load_graph, propagation
+from spikeloom.runtime.inputs.recordings import bin_words, recordings
 from spikeloom.runtime.report.tables import percent, table
 from spikeloom.runtime.studies.jobs.locks import only_one
 
@@ -111,7 +104,7 @@ def _finetuned(arguments: argparse.Namespace, output: Path) -> Report:
     path = shipped(arguments.checkpoint)
     if Path(path).is_file() and is_netlist(path):
         raise ModelError(f"{path}: is a netlist, its weights are rounded already; give the checkpoint it was made from")
-    checkpoint = asked_checkpoint(path, arguments)
+    checkpoint = load_checkpoint(path, arguments)
     if checkpoint.forms is not None:
         raise ModelError(f"{path}: was fine-tuned already; give the network that it was made from")
     if not checkpoint.dynamics.is_plain:
@@ -123,7 +116,7 @@ def _finetuned(arguments: argparse.Namespace, output: Path) -> Report:
             f"{path}: has {checkpoint.towers} towers, which fine-tuning takes one by one; fine-tune what it was joined "
             "from, then join that"
         )
-    asked = asked_graph(arguments, checkpoint.system)
+    asked = load_graph(arguments, checkpoint.system)
     name, adjacency = propagation(checkpoint, asked, arguments.checkpoint)
     found = [
         recordings(

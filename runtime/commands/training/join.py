@@ -17,8 +17,8 @@ from spikeloom.compiler.formats.towers import arrays_of
 from spikeloom.compiler.formats.towers import join as join_networks
 from spikeloom.compiler.targets.loihi1.netlist_file import is_netlist
 from spikeloom.compiler.targets.truenorth.native import SYSTEM as NATIVE
-from spikeloom.runtime.commands.inputs import require_place, shipped
 from spikeloom.runtime.commands.training.finetune import stored_graph
+from spikeloom.runtime.inputs.files import require_place, shipped
 from spikeloom.runtime.machines.truenorth import joining, native
 from spikeloom.runtime.report.render import tower_line
 from spikeloom.runtime.report.tables import percent

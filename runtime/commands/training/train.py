@@ -20,16 +20,10 @@ from spikeloom.models.recordings.grasps import SYNTHETIC
 from spikeloom.models.systems import PADDINGS, sensor_grid, taxels_alone
 from spikeloom.models.training.recipes import CROSSBARS, RECIPES, RELEASED, STEPS, Recipe, check_recipe, decays_asked
 from spikeloom.models.training.schedule import DECAY_EPOCHS
-from spikeloom.runtime.commands.inputs import (
-    asked_graph,
-    asked_places,
-    bin_words,
-    graph_words,
-    recordings,
-    require_bins,
-    require_place,
-)
 from spikeloom.runtime.commands.options import DATA_HELP, add_bin_option, add_graph_options, add_system
+from spikeloom.runtime.inputs.files import require_place
+from spikeloom.runtime.inputs.network import graph_words, load_graph, sensor_places
+from spikeloom.runtime.inputs.recordings import bin_words, recordings, require_bins
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.studies.training.picture import PICTURES, draw_training
 from spikeloom.runtime.studies.training.training import LAYERS, Job, check_seeds, output_of, summary, training_text
@@ -266,9 +260,9 @@ def _sensor(arguments: argparse.Namespace) -> tuple[Graph, Grid | None]:
         system = TACTILESGNET  # and the same graphs
     if arguments.padding is not None and system != GRID_CNN:
         raise OptionError(f"--padding: is for grid-cnn, {TITLES[system]} has no window; leave it away")
-    graph = asked_graph(arguments, system)
+    graph = load_graph(arguments, system)
     if system not in GRAPH_SYSTEMS:
-        places = asked_places(arguments.taxels)
+        places = sensor_places(arguments.taxels)
         grid = sensor_grid(places, arguments.padding or PADDINGS[0]) if system == GRID_CNN else None
         return taxels_alone(places), grid
     if graph is None:

@@ -21,8 +21,8 @@ from spikeloom.compiler.targets.truenorth.legalize import require_legal
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
 from spikeloom.compiler.targets.truenorth.netlist_file import read_crossbars
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.models.recordings.windows import first_part, window_asked
-from spikeloom.runtime.commands.inputs import recordings
+from spikeloom.models.recordings.windows import first_part, parse_window
+from spikeloom.runtime.inputs.recordings import recordings
 from spikeloom.runtime.machines.truenorth import cost, engine, render
 from spikeloom.runtime.machines.truenorth.trace import Trace
 from spikeloom.runtime.report import decisions
@@ -55,7 +55,7 @@ def class_counts(netlist: CrossbarNetlist, votes: IntArray) -> IntArray:
 
 
 def _data(arguments: argparse.Namespace, netlist: CrossbarNetlist, split: str, limit: int | None) -> Recordings:
-    percent = window_asked(getattr(arguments, "window", "100%"))
+    percent = parse_window(getattr(arguments, "window", "100%"))
     progress("reading the recordings")
     classes, taxels = netlist.classes, netlist.taxels
     found = recordings(arguments.data, split, limit=limit, classes=classes, taxels=taxels, bin_s=arguments.bin)

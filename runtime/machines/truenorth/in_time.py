@@ -17,7 +17,7 @@ from spikeloom.compiler.targets.truenorth.legalize import require_legal
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
 from spikeloom.compiler.targets.truenorth.netlist_file import write_crossbars
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.runtime.commands.load_network import Asked, asked_network
+from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.machines.truenorth import render
 from spikeloom.runtime.machines.truenorth.refusal import require_crossbar_options
 from spikeloom.runtime.machines.truenorth.verdicts import BoolArray, compare, verdict_json, verdict_text
@@ -46,7 +46,7 @@ def compile_network(arguments: argparse.Namespace) -> Outcome:
     if arguments.calibrate is not None:
         raise OptionError("--calibrate: levels are chosen by the weights alone; leave it away")
     chip = load_target(arguments.target, CROSSBARS)
-    asked = asked_network(arguments.checkpoint, arguments)
+    asked = load_network(arguments.checkpoint, arguments)
     levels = _levels(arguments.checkpoint, asked, arguments.in_time, chip)
     progress("compiling")
     provenance = {
@@ -60,7 +60,7 @@ def compile_network(arguments: argparse.Namespace) -> Outcome:
     return render.netlist_json(netlist, chip, write_crossbars(netlist, arguments.output)), render.netlist_text, 0
 
 
-def _levels(path: str, asked: Asked, copies: int, chip: Target) -> LevelNetwork:
+def _levels(path: str, asked: LoadedNetwork, copies: int, chip: Target) -> LevelNetwork:
     try:
         return in_levels(asked.network, copies, chip)
     except ModelError as error:
@@ -71,7 +71,7 @@ def verify(
     arguments: argparse.Namespace, netlist: CrossbarNetlist, chip: Target, read: Callable[[], Recordings]
 ) -> Outcome:
     """Compare chip, specification and the network in levels; exit code 1 where one spike differs."""
-    asked = asked_network(arguments.checkpoint, arguments)
+    asked = load_network(arguments.checkpoint, arguments)
     if netlist.provenance.get("checkpoint_sha256") != asked.sha256:
         raise OptionError(
             f"--checkpoint {arguments.checkpoint}: {arguments.netlist} was compiled from another file; give that one"

@@ -12,7 +12,8 @@ import numpy as np
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.targets.truenorth.native import SYSTEM, NativeNetwork, joined
 from spikeloom.compiler.targets.truenorth.native_file import Trained, read_trained, write_trained
-from spikeloom.runtime.commands.inputs import recordings, require_place, shipped
+from spikeloom.runtime.inputs.files import require_place, shipped
+from spikeloom.runtime.inputs.recordings import recordings
 from spikeloom.runtime.report.console import progress
 
 Report = dict[str, Any]

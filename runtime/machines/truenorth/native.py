@@ -18,8 +18,9 @@ from spikeloom.compiler.targets.truenorth.native import BASES, SYSTEM, highest_l
 from spikeloom.compiler.targets.truenorth.native_file import Trained, is_trained, read_trained
 from spikeloom.compiler.targets.truenorth.netlist_file import write_crossbars
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.models.recordings.windows import first_part, window_asked
-from spikeloom.runtime.commands.inputs import asked_recordings, shipped
+from spikeloom.models.recordings.windows import first_part, parse_window
+from spikeloom.runtime.inputs.files import shipped
+from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.machines.loihi1.trace import ENGINES
 from spikeloom.runtime.machines.truenorth import in_time, render
 from spikeloom.runtime.machines.truenorth.commands import legal
@@ -168,10 +169,10 @@ def verify(arguments: argparse.Namespace) -> Outcome:
                 "the chip's; leave it away"
             )
     netlist, chip = legal(arguments.netlist)
-    percent = window_asked(arguments.window)
+    percent = parse_window(arguments.window)
 
     def recordings() -> Recordings:
-        return first_part(asked_recordings(arguments, netlist, labels_for="verify"), percent)
+        return first_part(load_recordings(arguments, netlist, labels_for="verify"), percent)
 
     if "in_time" in netlist.provenance:
         return in_time.verify(arguments, netlist, chip, recordings)

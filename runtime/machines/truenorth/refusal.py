@@ -18,9 +18,9 @@ from spikeloom.compiler.targets.truenorth.codebook import COPIES
 from spikeloom.compiler.targets.truenorth.native import SYSTEM
 from spikeloom.compiler.targets.truenorth.needs import needs
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.runtime.commands.inputs import recordings
-from spikeloom.runtime.commands.load_network import Asked, asked_network
 from spikeloom.runtime.commands.options import PLACING, ROUNDING
+from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
+from spikeloom.runtime.inputs.recordings import recordings
 from spikeloom.runtime.machines.truenorth.retrained import shipped_networks
 from spikeloom.runtime.machines.truenorth.trials import Trial
 from spikeloom.runtime.machines.truenorth.ways import RETRAINED, Planner, Way
@@ -56,7 +56,7 @@ def refuse(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], 
     """
     require_crossbar_options(arguments)
     chip = load_target(arguments.target, CROSSBARS)
-    asked = asked_network(arguments.checkpoint, arguments)
+    asked = load_network(arguments.checkpoint, arguments)
     if asked.network.input.clocks.channels:
         raise ModelError(
             f"{arguments.checkpoint}: hears clocks, of which ways out are not known; train one for the chip, which may "
@@ -82,12 +82,12 @@ def refuse(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], 
     return _report(arguments.checkpoint, asked, chip, trial, steps), refusal_text, 2
 
 
-def _trial(asked: Asked, data: Recordings) -> Trial:
+def _trial(asked: LoadedNetwork, data: Recordings) -> Trial:
     kept = np.linspace(0, len(data.labels) - 1, min(TRIED, len(data.labels))).round().astype(np.int64)
     return Trial(asked.network, channels_last(data.events[kept]), data.labels[kept])
 
 
-def _report(path: str, asked: Asked, chip: Target, trial: Trial | None, steps: int | None) -> Json:
+def _report(path: str, asked: LoadedNetwork, chip: Target, trial: Trial | None, steps: int | None) -> Json:
     network = asked.network
     sensor = {"taxels": network.input.taxels, "classes": network.classes}
     retrained = shipped_networks(chip, **sensor, checkpoint=asked.checkpoint)

@@ -13,7 +13,7 @@ from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.truenorth.lower import cores_needed
 from spikeloom.compiler.targets.truenorth.native import highest_level
 from spikeloom.compiler.targets.truenorth.native_file import Trained, is_trained, read_trained
-from spikeloom.runtime.commands.inputs import PRETRAINED
+from spikeloom.runtime.inputs.files import PRETRAINED
 from spikeloom.runtime.studies.paper.cells import file_safe
 
 Json = dict[str, Any]

@@ -31,7 +31,7 @@ from spikeloom.compiler.targets.truenorth.core_counts import Split, packed, rela
 from spikeloom.compiler.targets.truenorth.in_time import lower_in_time
 from spikeloom.compiler.targets.truenorth.needs import CURRENT, FAN_IN, LEAK, TARGETS, WEIGHTS, Need, targets_of
 from spikeloom.models.graphs import NEUTOUCH, build_graph, normalised_adjacency
-from spikeloom.runtime.commands.load_network import Asked
+from spikeloom.runtime.inputs.network import LoadedNetwork
 from spikeloom.runtime.machines.truenorth.retrained import Shipped, accuracy_on
 from spikeloom.runtime.machines.truenorth.trials import Change, Trial
 
@@ -92,7 +92,7 @@ class Planner:
 
     Parameters
     ----------
-    asked : Asked
+    asked : LoadedNetwork
         The network, and the checkpoint that it is from.
     chip : Target
     trial : Trial or None
@@ -104,7 +104,7 @@ class Planner:
     """
 
     def __init__(
-        self, asked: Asked, chip: Target, trial: Trial | None, path: str, retrained: Sequence[Shipped] = ()
+        self, asked: LoadedNetwork, chip: Target, trial: Trial | None, path: str, retrained: Sequence[Shipped] = ()
     ) -> None:
         self.network: Network = asked.network
         self.asked = asked

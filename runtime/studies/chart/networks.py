@@ -21,7 +21,8 @@ from spikeloom.compiler.targets.truenorth.native import SYSTEM, highest_level
 from spikeloom.compiler.targets.truenorth.native_file import is_trained, read_trained
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.systems import NO_GRAPH
-from spikeloom.runtime.commands.inputs import PRETRAINED, asked_checkpoint, asked_graph, propagation, shipped
+from spikeloom.runtime.inputs.files import PRETRAINED, shipped
+from spikeloom.runtime.inputs.network import load_checkpoint, load_graph, propagation
 from spikeloom.runtime.studies.chart.grid import Grid
 from spikeloom.runtime.studies.paper.cells import SHORT_EPOCHS, file_safe
 
@@ -130,11 +131,11 @@ def _read(path: str, arguments: argparse.Namespace) -> Given:
         return _read_native(path, arguments)
     if Path(file).is_file() and is_netlist(file):
         raise ModelError(f"{path}: is a netlist, a chart compiles its own; give the checkpoint that it was made from")
-    checkpoint = asked_checkpoint(path, arguments)
+    checkpoint = load_checkpoint(path, arguments)
     own = argparse.Namespace(**vars(arguments))
     if checkpoint.edges is not None:  # one that knows its graph needs no option; others of the same call may
         own.graph, own.edges, own.directed = None, None, False
-    graph, sees = propagation(checkpoint, asked_graph(own, checkpoint.system), path)
+    graph, sees = propagation(checkpoint, load_graph(own, checkpoint.system), path)
     return Given(
         path=path,
         name=Path(path.removeprefix(PRETRAINED)).stem,

@@ -12,7 +12,7 @@ from typing import Any
 from spikeloom import __version__
 from spikeloom.compiler.targets.base import Target
 from spikeloom.models.recordings.windows import WHOLE
-from spikeloom.runtime.commands.inputs import bin_words
+from spikeloom.runtime.inputs.recordings import bin_words
 from spikeloom.runtime.studies.chart.grid import Grid
 from spikeloom.runtime.studies.chart.networks import Given
 from spikeloom.runtime.studies.chart.tasks import FORMAT, Build, Data, Decide, Run

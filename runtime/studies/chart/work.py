@@ -30,11 +30,12 @@ from spikeloom.compiler.targets.truenorth.netlist_file import is_crossbars, read
 from spikeloom.models.recordings.events import joined_bins
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.recordings.windows import first_part, steps_of
-from spikeloom.runtime.commands.inputs import recordings, shipped
-from spikeloom.runtime.commands.load_network import Asked, asked_network
-from spikeloom.runtime.commands.main_job.compile import provenance, recipes_asked
-from spikeloom.runtime.commands.options import cores_asked
+from spikeloom.runtime.commands.main_job.compile import parse_recipes, provenance
+from spikeloom.runtime.commands.options import parse_cores
 from spikeloom.runtime.costs.estimate import estimate
+from spikeloom.runtime.inputs.files import shipped
+from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
+from spikeloom.runtime.inputs.recordings import recordings
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.truenorth import charted
 from spikeloom.runtime.machines.votes import predictions, readout_counts
@@ -90,9 +91,9 @@ def _heard(data: Data, taxels: int, classes: int, bins: int) -> dict[str, Record
 
 
 @lru_cache(maxsize=2)
-def _network(words: tuple[str, ...], sha256: str) -> Asked:
+def _network(words: tuple[str, ...], sha256: str) -> LoadedNetwork:
     arguments = parsed(words)
-    found = asked_network(arguments.checkpoint, arguments)
+    found = load_network(arguments.checkpoint, arguments)
     _require_same(arguments.checkpoint, found.sha256, sha256)
     return found
 
@@ -182,7 +183,7 @@ def _build(work: Build) -> Json:
             asked.network,
             forms=None if asked.checkpoint is None else asked.checkpoint.forms,
             target=some.target,
-            recipes=recipes_asked(some),
+            recipes=parse_recipes(some),
             prune_unused=some.prune_unused,
             training_events=training.events,
         )
@@ -194,7 +195,7 @@ def _build(work: Build) -> Json:
             netlist = place(
                 stored,
                 target=own.target,
-                cores_for=cores_asked(own.cores_for),
+                cores_for=parse_cores(own.cores_for),
                 optimize=own.optimize,
                 provenance=provenance(own, asked, calibrated=True),
             ).netlist

@@ -18,8 +18,8 @@ from spikeloom.compiler.targets.base import Target, load_target
 from spikeloom.compiler.targets.loihi1.compilation import Compilation, compile_network, without
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.runtime.commands.inputs import propagation
 from spikeloom.runtime.costs.estimate import estimate
+from spikeloom.runtime.inputs.network import propagation
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.votes import predictions, readout_counts
 

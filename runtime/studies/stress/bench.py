@@ -15,10 +15,10 @@ from spikeloom.compiler.systems import GRAPH_SYSTEMS
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.models.graphs import NEUTOUCH
 from spikeloom.models.sensors import read_layout, sensor_graph
-from spikeloom.runtime.commands.inputs import asked_recordings
-from spikeloom.runtime.commands.load_network import Asked, asked_network
 from spikeloom.runtime.equivalence.side_by_side import ready
 from spikeloom.runtime.equivalence.verify import require_match
+from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
+from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.studies.stress.damages import Pair
 from spikeloom.runtime.studies.stress.perturbation import Sensor
 from spikeloom.runtime.studies.stress.runs import Bench
@@ -26,12 +26,12 @@ from spikeloom.runtime.studies.stress.runs import Bench
 Json = dict[str, Any]
 
 
-def bench_of(arguments: argparse.Namespace) -> tuple[Bench, Asked, str]:
+def bench_of(arguments: argparse.Namespace) -> tuple[Bench, LoadedNetwork, str]:
     """Everything that is stressed, the float network, and a hash of the recordings."""
     netlist = read_netlist(arguments.netlist)
-    asked = asked_network(arguments.checkpoint, arguments, netlist)
+    asked = load_network(arguments.checkpoint, arguments, netlist)
     require_match(netlist, asked.model)
-    data = asked_recordings(arguments, netlist, labels_for="stress", joined=False)
+    data = load_recordings(arguments, netlist, labels_for="stress", joined=False)
     pair = Pair(netlist=netlist, network=asked.network)
     places, edges = _places(arguments, netlist.taxels), _edges(arguments, asked)
     digest = hashlib.sha256()
@@ -58,7 +58,7 @@ def _places(arguments: argparse.Namespace, taxels: int) -> FloatArray | None:
     return NEUTOUCH if taxels == len(NEUTOUCH) and not arguments.edges else None
 
 
-def _edges(arguments: argparse.Namespace, asked: Asked) -> IntArray | None:
+def _edges(arguments: argparse.Namespace, asked: LoadedNetwork) -> IntArray | None:
     """Edges of the taxel graph, where there is one."""
     checkpoint = asked.checkpoint
     if checkpoint is None or checkpoint.system not in GRAPH_SYSTEMS:
@@ -90,7 +90,7 @@ def distances(taxels: int, places: FloatArray | None, edges: IntArray | None) ->
     return found
 
 
-def facts_of(arguments: argparse.Namespace, asked: Asked, data: str) -> Json:
+def facts_of(arguments: argparse.Namespace, asked: LoadedNetwork, data: str) -> Json:
     """What the runs depend on beside perturbation, level and seed."""
     return {
         "spikeloom": __version__,

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
-from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.fixedpoint import FloatArray
-from spikeloom.compiler.formats.checkpoint import Checkpoint
+import numpy as np
+
+from spikeloom.compiler.errors import ModelError, OptionError
+from spikeloom.compiler.fixedpoint import FloatArray, IntArray
+from spikeloom.compiler.formats.checkpoint import Checkpoint, read_checkpoint
 from spikeloom.compiler.formats.netx.layout import SUFFIX as NETX
 from spikeloom.compiler.formats.nir.neurons import CONVENTIONS
 from spikeloom.compiler.formats.nir.reader import SUFFIX as NIR
@@ -19,15 +23,20 @@ from spikeloom.compiler.formats.onnx.reader import SUFFIX as ONNX
 from spikeloom.compiler.formats.onnx.reader import OnnxNetwork, read_onnx
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.systems import GRAPH_SYSTEMS, TACTILESGNET, TITLES
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
-from spikeloom.runtime.commands.inputs import asked_checkpoint, asked_graph, propagation
+from spikeloom.compiler.targets.truenorth.native_file import is_trained
+from spikeloom.models.graphs import CHOICES, NEUTOUCH, Graph
+from spikeloom.models.sensors import read_layout, sensor_graph
+from spikeloom.models.systems import NO_GRAPH, grid_cells, propagation_of
+from spikeloom.runtime.inputs.files import shipped
 from spikeloom.runtime.report.console import progress
 
-TITLES = {ONNX: "ONNX", NIR: "NIR"}
+FORMATS = {ONNX: "ONNX", NIR: "NIR"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Asked:
+class LoadedNetwork:
     """A float network and where it is from.
 
     Parameters
@@ -71,7 +80,7 @@ class Asked:
         return self.network if self.checkpoint is None else self.checkpoint
 
 
-def asked_network(path: str, arguments: argparse.Namespace, netlist: Netlist | None = None) -> Asked:
+def load_network(path: str, arguments: argparse.Namespace, netlist: Netlist | None = None) -> LoadedNetwork:
     """Read what a command is given.
 
     Of a checkpoint that holds several epochs, the one that `netlist` was compiled from where the options name none.
@@ -84,12 +93,12 @@ def asked_network(path: str, arguments: argparse.Namespace, netlist: Netlist | N
     suffix = next((suffix for suffix in (ONNX, NIR) if path.endswith(suffix)), None)
     _require_fit(path, suffix, arguments)
     if suffix is None:
-        checkpoint = asked_checkpoint(path, arguments)
+        checkpoint = load_checkpoint(path, arguments)
         if netlist is not None and arguments.weights is None and _from_file(netlist, checkpoint):
             made = netlist.provenance["weights"]
-            checkpoint = asked_checkpoint(path, argparse.Namespace(**(vars(arguments) | {"weights": made})))
-        graph, adjacency = propagation(checkpoint, asked_graph(arguments, checkpoint.system), path)
-        return Asked(
+            checkpoint = load_checkpoint(path, argparse.Namespace(**(vars(arguments) | {"weights": made})))
+        graph, adjacency = propagation(checkpoint, load_graph(arguments, checkpoint.system), path)
+        return LoadedNetwork(
             network=expand(checkpoint, adjacency),
             checkpoint=checkpoint,
             adjacency=adjacency,
@@ -116,8 +125,8 @@ def _from_file(netlist: Netlist, checkpoint: Checkpoint) -> bool:
     return made.get("weights") in checkpoint.sets and made["weights"] != checkpoint.weights
 
 
-def _asked(found: OnnxNetwork | NirNetwork, kind: str, read_as: Mapping[str, Any]) -> Asked:
-    return Asked(
+def _asked(found: OnnxNetwork | NirNetwork, kind: str, read_as: Mapping[str, Any]) -> LoadedNetwork:
+    return LoadedNetwork(
         network=found.network,
         checkpoint=None,
         adjacency=None,
@@ -142,9 +151,105 @@ def _require_fit(path: str, suffix: str | None, arguments: argparse.Namespace) -
         for name in ("system", "graph", "taxels", "edges", "directed", "weights", "beta", "theta", "run"):
             if getattr(arguments, name) not in (None, False, 0):
                 raise OptionError(
-                    f"--{name}: is for checkpoints, the {TITLES[suffix]} file {path} holds all it needs; leave it away"
+                    f"--{name}: is for checkpoints, the {FORMATS[suffix]} file {path} holds all it needs; leave it away"
                 )
     if suffix != NIR:
         for name in ("dt", "convention"):
             if getattr(arguments, name) is not None:
                 raise OptionError(f"--{name}: is for NIR files, {path} is none; leave it away")
+
+
+def load_graph(arguments: argparse.Namespace, system: str = TACTILESGNET) -> Graph | None:
+    """Graph that the options name, or None if they name none; warnings go to stderr.
+
+    Raises
+    ------
+    OptionError, ModelError
+        If there is no such graph, its files are wrong, or the system has no graph at all.
+    """
+    if system not in GRAPH_SYSTEMS:
+        for option in ("graph", "edges", "directed"):
+            if getattr(arguments, option):
+                raise OptionError(f"--{option}: is for taxel graphs, {TITLES[system]} has none; leave it away")
+        return None
+    if not (arguments.graph or arguments.taxels or arguments.edges or arguments.directed):
+        return None
+    graph, warnings = sensor_graph(
+        graph=arguments.graph, taxels=arguments.taxels, edges=arguments.edges, directed=arguments.directed
+    )
+    sys.stderr.writelines(f"spikeloom: warning: {warning}\n" for warning in warnings)
+    return graph
+
+
+def sensor_places(taxels: str | None) -> FloatArray:
+    """Positions of the taxels in millimetres: of ``--taxels``, where a number lines them up, or of the built-in sensor.
+
+    Raises
+    ------
+    OptionError, DataError
+        If there is no such sensor.
+    """
+    if taxels is None:
+        return NEUTOUCH
+    count, places = read_layout(taxels)
+    return np.arange(float(count))[:, None] if places is None else places
+
+
+def graph_words(arguments: argparse.Namespace) -> str:
+    """Options that name the graph, as they would be typed beside the files."""
+    files = {"--taxels": arguments.taxels, "--edges": arguments.edges}
+    words = [f"--graph {arguments.graph}"] if arguments.graph else []
+    words += [f"{option} {Path(name).name}" for option, name in files.items() if name]
+    return " ".join([*words, *(["--directed"] if arguments.directed else [])])
+
+
+def propagation(checkpoint: Checkpoint, asked: Graph | None, where: str) -> tuple[str, FloatArray]:
+    """Name of the graph that was asked for, or of the one in the checkpoint, and what the first layer sees.
+
+    Raises
+    ------
+    ModelError
+        If no graph is known, or another one than the checkpoint was trained on is asked for.
+    """
+
+    def seen(edges: IntArray, taxels: int) -> FloatArray:
+        return propagation_of(checkpoint.system, edges, taxels, checkpoint.grid, len(checkpoint.hops))
+
+    if checkpoint.system not in GRAPH_SYSTEMS:
+        return NO_GRAPH, seen(np.zeros((0, 2), np.int64), checkpoint.taxels)
+    if asked is None:
+        if checkpoint.edges is None:
+            raise ModelError(f"{where}: the graph is not in this file; name it with --graph: {CHOICES}")
+        return str(checkpoint.graph), seen(checkpoint.edges, checkpoint.taxels)
+    found = seen(asked.edges, asked.n_taxels)
+    if checkpoint.edges is not None and not np.array_equal(seen(checkpoint.edges, checkpoint.taxels), found):
+        raise ModelError(
+            f"{where}: graph and weights disagree: it was trained on {checkpoint.graph}, --graph says "
+            f"{asked.name}; leave --graph away"
+        )
+    return asked.name, found
+
+
+def load_checkpoint(path: str, arguments: argparse.Namespace) -> Checkpoint:
+    """Read a checkpoint as the options say.
+
+    Raises
+    ------
+    OptionError, ModelError
+        If it is not there, or not as they say.
+    """
+    progress("reading the checkpoint")
+    if is_trained(shipped(path)):
+        raise ModelError(
+            f"{path}: is a network for TrueNorth, which compile, verify, inspect and join take; this is for others"
+        )
+    places = sensor_places(getattr(arguments, "taxels", None))
+    return read_checkpoint(
+        shipped(path),
+        run=arguments.run,
+        weights=arguments.weights,
+        beta=arguments.beta,
+        theta=arguments.theta,
+        system=arguments.system,
+        cells=grid_cells(places) if places.shape[1] == 2 else None,
+    )

@@ -1,0 +1,87 @@
+"""Files that a user names: shipped checkpoints, places to write, what can be inspected."""
+
+from __future__ import annotations
+
+import argparse
+import zipfile
+from importlib import resources
+from pathlib import Path
+
+from spikeloom.compiler.errors import OptionError
+
+_RECORDINGS = "recordings are shown by spikeloom data describe"
+
+PRETRAINED = "pretrained:"
+
+
+def shipped(path: str) -> str:
+    """Resolve ``pretrained:NAME`` to the file that the package ships.
+
+    Raises
+    ------
+    OptionError
+        If there is no such checkpoint.
+    """
+    if not path.startswith(PRETRAINED):
+        return path
+    folder = Path(str(resources.files("spikeloom.models") / "pretrained"))
+    known = {file.stem: file for file in sorted(folder.glob("*.pt"), key=lambda file: file.stem)}
+    name = path.removeprefix(PRETRAINED)
+    if name not in known:
+        raise OptionError(f"{path}: no such shipped checkpoint; allowed: {', '.join(PRETRAINED + n for n in known)}")
+    return str(known[name])
+
+
+INPUTS = ("checkpoint", "original", "against", "netlist", "data", "calibrate", "source", "taxels", "edges", "stress")
+"""Arguments that may name a file to read."""
+
+
+def require_place(path: str, option: str, arguments: argparse.Namespace | None = None) -> None:
+    """Refuse, before any work is done, a place where a result could not be written.
+
+    Parameters
+    ----------
+    path, option : str
+        The place, and what names it.
+    arguments : Namespace, optional
+        Whose `INPUTS` must not be overwritten.
+
+    Raises
+    ------
+    OptionError
+        If the folder does not exist, the path is a folder or a device, or it is one of the inputs.
+    """
+    place = Path(path)
+    if not place.absolute().parent.is_dir():
+        raise OptionError(f"{option} {path}: the folder does not exist; make it first")
+    if place.exists() and not place.is_file():
+        raise OptionError(f"{option} {path}: is not a regular file; give the name of a file to write")
+    for name in INPUTS:
+        given = getattr(arguments, name, None)
+        if isinstance(given, str) and place.exists():
+            read = Path(shipped(given))
+            if read.exists() and place.samefile(read):
+                raise OptionError(f"{option} {path}: is an input of this command ({given}); give another name")
+
+
+def require_inspectable(path: str) -> None:
+    """Refuse what is neither a netlist nor a checkpoint, by what it is instead.
+
+    Raises
+    ------
+    OptionError
+        If it is a folder, or a zip or npz of something else.
+    """
+    if Path(path).is_dir():
+        raise OptionError(f"{path}: is a folder, not a netlist or a checkpoint; {_RECORDINGS}")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = {Path(name) for name in archive.namelist()}
+    except (zipfile.BadZipFile, OSError, ValueError):
+        return  # a released checkpoint is no zip; what else there is, its reader says
+    ours = {"manifest.json", "manifest.npy"} & {name.name for name in names}
+    torch = any(name.suffix == ".pkl" for name in names)
+    if ours or torch or path.endswith(".loom"):
+        return
+    shown = ", ".join(sorted(name.as_posix() for name in names)[:3]) or "nothing"
+    raise OptionError(f"{path}: holds {shown}, not a netlist or a checkpoint; {_RECORDINGS}")

@@ -1,0 +1,104 @@
+"""Recordings that a user names, held against a network."""
+
+from __future__ import annotations
+
+import argparse
+import math
+
+from spikeloom.compiler.errors import DataError, OptionError
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
+from spikeloom.models.recordings.events import BIN_S, MAX_STEPS, joined_bins, load_data, need_labels, require_events
+from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.models.recordings.found import show_counts
+from spikeloom.models.recordings.grasps import SYNTHETIC, synthetic_split
+from spikeloom.models.recordings.windows import first_part, parse_window
+from spikeloom.runtime.report.console import progress
+
+
+def recordings(
+    path: str,
+    split: str,
+    *,
+    limit: int | None = None,
+    classes: int | None,
+    taxels: int | None,
+    bin_s: float = BIN_S,
+    bins: int = 1,
+    labels_for: str | None = None,
+) -> Recordings:
+    """Read recordings of any form, or make the package's own synthetic ones; hold both against the network.
+
+    Counts of disorder in event files go to stderr. `bins` of them make a step of the network. `labels_for` names what
+    needs the label of every recording.
+
+    Raises
+    ------
+    DataError, OptionError
+        If they cannot be used, or do not suit the network.
+    """
+    if path != SYNTHETIC:
+        data, counts = load_data(path, split, bin_s=bin_s, limit=limit, classes=classes, taxels=taxels)
+        show_counts(data, counts)
+        if labels_for is not None:
+            need_labels(data, labels_for)
+        return joined_bins(data, bins)
+    require_events(SYNTHETIC, bin_s)
+    grasps = synthetic_split(split, limit=limit)
+    if taxels is not None and grasps.taxels != taxels:
+        raise DataError(
+            f"{SYNTHETIC}: has {grasps.taxels} taxels, the network has {taxels}; use recordings of its sensor"
+        )
+    if classes is not None and grasps.labels.max() >= classes:
+        raise DataError(
+            f"{SYNTHETIC}: label {grasps.labels.max()}, the network has {classes} classes (0..{classes - 1}); "
+            "use the network that was trained on these objects"
+        )
+    return joined_bins(grasps, bins)
+
+
+def require_bins(bins: int) -> None:
+    """Refuse a number of bins to join that is none.
+
+    Raises
+    ------
+    OptionError
+        If it is below 1, or more than a recording may have.
+    """
+    if not 1 <= bins <= MAX_STEPS:
+        raise OptionError(f"--join {bins}: allowed are 1 to {MAX_STEPS}; choose another")
+
+
+def load_recordings(
+    arguments: argparse.Namespace,
+    netlist: Netlist | CrossbarNetlist,
+    *,
+    labels_for: str | None = None,
+    joined: bool = True,
+) -> Recordings:
+    """Recordings that the options of a command name, held against a netlist; as `recordings` otherwise.
+
+    In steps of the network if `joined`, else in their own bins.
+    """
+    progress("reading the recordings")
+    return recordings(
+        arguments.data,
+        arguments.split,
+        limit=arguments.limit,
+        classes=netlist.classes,
+        taxels=netlist.taxels,
+        bin_s=arguments.bin,
+        bins=netlist.bins if joined and isinstance(netlist, Netlist) else 1,
+        labels_for=labels_for,
+    )
+
+
+def netlist_recordings(arguments: argparse.Namespace, netlist: Netlist, *, labels_for: str | None = None) -> Recordings:
+    """Recordings that a netlist can take, as long a part of each as ``--window`` says."""
+    percent = parse_window(arguments.window)
+    return first_part(load_recordings(arguments, netlist, labels_for=labels_for), percent)
+
+
+def bin_words(bin_s: float) -> list[str]:
+    """Words that ask for a width of a time bin; none for the usual one."""
+    return [] if math.isclose(bin_s, BIN_S) else ["--bin", f"{bin_s:g}"]
