@@ -16,6 +16,7 @@ from random_networks import LOIHI, integer_chain, integer_networks
 
 from spikeloom.compiler.errors import CapacityError, FormatError
 from spikeloom.compiler.formats import archive
+from spikeloom.compiler.formats.archive import is_netlist
 from spikeloom.compiler.targets.loihi1.emit import emit
 from spikeloom.compiler.targets.loihi1.layout.partition import partition
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
@@ -23,7 +24,6 @@ from spikeloom.compiler.targets.loihi1.netlist_file import (
     ARRAYS,
     LARGE,
     inconsistencies,
-    is_netlist,
     netlist_bytes,
     read_netlist,
     write_netlist,

@@ -11,9 +11,10 @@ from random_crossbars import crossbars
 
 from spikeloom.compiler.errors import FormatError
 from spikeloom.compiler.formats import archive
+from spikeloom.compiler.formats.archive import is_netlist
 from spikeloom.compiler.targets.base import CROSSBARS, load_target
 from spikeloom.compiler.targets.loihi1.netlist import read_only
-from spikeloom.compiler.targets.loihi1.netlist_file import is_netlist, read_netlist
+from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.compiler.targets.truenorth.builder import Draft, Neuron, history_free
 from spikeloom.compiler.targets.truenorth.legalize import faults
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
@@ -266,7 +267,7 @@ def test_every_broken_rule_is_told(place, capsys):
     [
         (
             ["run", "--detail", "cycle"],
-            "--detail cycle: a tick of TrueNorth has one length, whatever happens in it; use counts",
+            "--detail cycle: truenorth has no such price model; allowed: counts",
         ),
         (
             ["estimate", "--table", "sanafe"],

@@ -267,7 +267,7 @@ def test_what_verify_says_of_sums(spikeloom, place):
         ((*COMPILE, "--planes", "2"), "--planes: is for loihi1, not for truenorth; leave it away"),
         (
             ("compile", "free.pt", "--in-time", "3", "-o", "x.loom"),
-            "--in-time 3: is for truenorth; give --target truenorth, or leave it away",
+            "--in-time 3: loihi1 has no such option; omit it",
         ),
         (
             ("compile", "keeps.pt", *COMPILE[2:]),

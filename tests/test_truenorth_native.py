@@ -24,8 +24,8 @@ from spikeloom.compiler.targets.truenorth.native import (
 )
 from spikeloom.models.truenorth.network import run_network
 from spikeloom.runtime.machines.truenorth import engine, spec
-from spikeloom.runtime.machines.truenorth.commands import class_counts
 from spikeloom.runtime.machines.truenorth.twins import find_twins
+from spikeloom.runtime.machines.votes import class_counts
 
 CHIP = load_target("truenorth", CROSSBARS)
 

@@ -126,15 +126,31 @@ def read_members(path: Path) -> dict[str, Array]:
         raise FormatError(f"{path}: is truncated or not a netlist ({error}); compile it again") from error
 
 
-def stated_format(path: Path) -> str | None:
-    """Format that the manifest of an archive names, None where there is no such thing; nothing else is read."""
+def stated(path: Path, name: str) -> str | None:
+    """What the manifest of an archive says of `name`, None where there is no such thing; nothing else is read."""
     try:
         with zipfile.ZipFile(path) as archive, archive.open("manifest.npy") as member:
             manifest = json.loads(str(np.lib.format.read_array(member, allow_pickle=False)))
     except (*_ZIP_ERRORS, KeyError, OSError):
         return None
-    stated = manifest.get("format") if isinstance(manifest, dict) else None
-    return stated if isinstance(stated, str) else None
+    found = manifest.get(name) if isinstance(manifest, dict) else None
+    return found if isinstance(found, str) else None
+
+
+def stated_format(path: Path) -> str | None:
+    """Format that the manifest of an archive names, None where there is no such thing."""
+    return stated(path, "format")
+
+
+def is_netlist(path: str | os.PathLike[str]) -> bool:
+    """Whether a file claims to be a netlist: an archive with a manifest, or a name that ends in ``.loom``."""
+    if str(path).endswith(".loom"):
+        return True
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return "manifest.npy" in archive.namelist()
+    except (zipfile.BadZipFile, OSError):
+        return False
 
 
 def read_manifest(path: Path, members: Mapping[str, Array], wanted: str, versions: tuple[int, ...]) -> dict[str, Any]:

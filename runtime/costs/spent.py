@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.runtime.machines.base import Machine
 from spikeloom.runtime.report.console import progress
 
 Json = dict[str, Any]
@@ -86,7 +86,7 @@ class Account:
 
     Parameters
     ----------
-    netlist : Netlist
+    machine : Machine
         What is simulated.
     data : Recordings
         On what.
@@ -94,8 +94,8 @@ class Account:
         Recordings that the specification runs.
     """
 
-    def __init__(self, netlist: Netlist, data: Recordings, *, checked: int = 0) -> None:
-        self._netlist, self._checked = netlist, min(checked, len(data))
+    def __init__(self, machine: Machine, data: Recordings, *, checked: int = 0) -> None:
+        self._machine, self._checked = machine, min(checked, len(data))
         self._steps = np.full(len(data), data.steps) if data.lengths is None else data.lengths
         self._parts: list[tuple[str, float]] = []
 
@@ -121,20 +121,13 @@ class Account:
                     "arithmetic": kind.arithmetic,
                     "recordings": among,
                     "data_steps": int(steps.sum()) if kind.over != "one" else int(self._steps.max(initial=0)),
-                    "layers": [layer.name for layer in self._netlist.layers] if ran else [],
-                    "kernel": self._kernel() if ran and kind.arithmetic == CHIP else None,
+                    "layers": list(self._machine.layers) if ran else [],
+                    "kernel": self._machine.kernel if ran and kind.arithmetic == CHIP else None,
                     "why": kind.why,
                     "seconds": end - begun if ran else 0.0,
                 }
             )
         return found
-
-    def _kernel(self) -> str:
-        """Which kernel the engine takes."""
-        from spikeloom.runtime.machines.loihi1.blocks import obstacle
-
-        found = obstacle(self._netlist)
-        return "layer by layer, 64 neurons at a time" if found is None else f"step by step: {found}"
 
 
 def explained(arguments: argparse.Namespace, account: Account) -> Json:

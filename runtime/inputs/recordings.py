@@ -6,8 +6,7 @@ import argparse
 import math
 
 from spikeloom.compiler.errors import DataError, OptionError
-from spikeloom.compiler.targets.loihi1.netlist import Netlist
-from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
+from spikeloom.compiler.targets.netlist import Netlist
 from spikeloom.models.recordings.events import BIN_S, MAX_STEPS, joined_bins, load_data, need_labels, require_events
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.recordings.found import show_counts
@@ -71,7 +70,7 @@ def require_bins(bins: int) -> None:
 
 def load_recordings(
     arguments: argparse.Namespace,
-    netlist: Netlist | CrossbarNetlist,
+    netlist: Netlist,
     *,
     labels_for: str | None = None,
     joined: bool = True,
@@ -88,7 +87,7 @@ def load_recordings(
         classes=netlist.classes,
         taxels=netlist.taxels,
         bin_s=arguments.bin,
-        bins=netlist.bins if joined and isinstance(netlist, Netlist) else 1,
+        bins=netlist.bins if joined else 1,
         labels_for=labels_for,
     )
 

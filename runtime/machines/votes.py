@@ -2,15 +2,28 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
 
 from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.interpret import BoolArray, vote
 from spikeloom.compiler.ir import Readout
-from spikeloom.compiler.targets.loihi1.netlist import Netlist
 
 
-def class_counts(netlist: Netlist, spikes: IntArray) -> IntArray:
+class Voting(Protocol):
+    """A netlist of any chip, some of whose neurons vote."""
+
+    @property
+    def classes(self) -> int:
+        """How many."""
+
+    @property
+    def readout_class(self) -> IntArray:
+        """Class that each neuron votes for, -1 for none."""
+
+
+def class_counts(netlist: Voting, spikes: IntArray) -> IntArray:
     """Votes per class from spike counts per compartment (samples, compartments); shape (samples, classes)."""
     voters = np.flatnonzero(netlist.readout_class >= 0)
     counts = np.zeros((len(spikes), netlist.classes), np.int64)
@@ -25,6 +38,6 @@ def readout_counts(readout: Readout, classes: int, spikes: BoolArray) -> IntArra
     return counts
 
 
-def predictions(netlist: Netlist, spikes: IntArray) -> IntArray:
+def predictions(netlist: Voting, spikes: IntArray) -> IntArray:
     """Class of each recording from spike counts per compartment; ties go to the lowest class."""
     return vote(class_counts(netlist, spikes))

@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import math
 import os
-import zipfile
 from collections.abc import Mapping
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -155,17 +154,6 @@ def _widened(manifest: dict[str, Any]) -> dict[str, Any]:
     if isinstance(layers, list):
         layers = [layer | {"alpha": 0.0} if isinstance(layer, dict) else layer for layer in layers]
     return manifest | {"clocks": asdict(NO_CLOCKS), "layers": layers}
-
-
-def is_netlist(path: str | os.PathLike[str]) -> bool:
-    """Whether a file claims to be a netlist: an archive with a manifest, or a name that ends in ``.loom``."""
-    if str(path).endswith(".loom"):
-        return True
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return "manifest.npy" in archive.namelist()
-    except (zipfile.BadZipFile, OSError):
-        return False
 
 
 def _type_faults(manifest: dict[str, Any], members: Mapping[str, Array]) -> list[str]:

@@ -148,6 +148,11 @@ class CrossbarNetlist:
     clocks: Clocks = NO_CLOCKS
 
     @property
+    def bins(self) -> int:
+        """Bins of the recordings that make a data step."""
+        return 1
+
+    @property
     def n_inputs(self) -> int:
         """Number of input channels."""
         return self.taxels * self.polarities + self.clocks.channels

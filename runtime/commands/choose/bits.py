@@ -20,13 +20,13 @@ from typing import Any
 from spikeloom import __version__
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.fixedpoint import FloatArray
+from spikeloom.compiler.formats.archive import is_netlist
 from spikeloom.compiler.formats.atomic import write_atomically
 from spikeloom.compiler.formats.checkpoint import Checkpoint
 from spikeloom.compiler.formats.checkpoint_file import arrays_digest
 from spikeloom.compiler.interpret import channels_last
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.base import Target, load_target
-from spikeloom.compiler.targets.loihi1.netlist_file import is_netlist
 from spikeloom.compiler.targets.loihi1.storage.width_search import Found, Point, check_widths, front, search
 from spikeloom.models.recordings.events import BIN_S
 from spikeloom.models.recordings.evtouch import Recordings

@@ -8,8 +8,9 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.formats import sanafe
+from spikeloom.compiler.formats import ranc, sanafe
 from spikeloom.compiler.formats.atomic import write_atomically
 from spikeloom.compiler.formats.netx import writer as netx_export
 from spikeloom.compiler.formats.nir import writer as nir_export
@@ -27,7 +28,6 @@ from spikeloom.runtime.commands.options import DATA_HELP, MODEL, add_bin_option,
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import load_checkpoint, load_graph, propagation
 from spikeloom.runtime.inputs.recordings import recordings
-from spikeloom.runtime.machines.truenorth.commands import export_ranc
 
 Json = dict[str, Any]
 
@@ -115,8 +115,22 @@ def _sanafe(arguments: argparse.Namespace) -> Written:
 
 
 def _ranc(arguments: argparse.Namespace) -> Written:
-    lines, facts = export_ranc(arguments)
-    return Written(chunks=lines, facts=facts)
+    netlist, events = ranc.read(arguments.source), None
+    if arguments.data is not None:
+        data = recordings(
+            arguments.data,
+            arguments.split or "test",
+            classes=netlist.classes,
+            taxels=netlist.taxels,
+            bin_s=arguments.bin,
+        )
+        number = arguments.recording or 0
+        if not 0 <= number < len(data.files):
+            raise OptionError(f"--recording {number}: {arguments.data} has recordings 0 to {len(data.files) - 1}")
+        events = with_clocks(data.events[number : number + 1], netlist.clocks)[0, :, : data.steps_of(number)]
+    lines = (f"{line}\n".encode() for line in ranc.export(netlist, events))
+    ticks = None if events is None else netlist.ticks(events.shape[1]) + 1
+    return Written(chunks=lines, facts={"neurons": netlist.n_neurons, "synapses": netlist.n_synapses, "ticks": ticks})
 
 
 def _onnx(arguments: argparse.Namespace) -> Written:

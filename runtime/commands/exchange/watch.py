@@ -262,7 +262,7 @@ def run(arguments: argparse.Namespace) -> tuple[dict[str, Any], Callable[[dict[s
     SpikeloomError
         If an option, the netlist or a line cannot be used.
     """
-    from spikeloom.runtime.machines.loihi1.stream import load
+    from spikeloom.runtime.machines.base import machine_for
     from spikeloom.runtime.studies.anytime import exits
 
     bin_s = _duration(arguments.bin)  # of the recordings; a step of the network may join several
@@ -276,15 +276,15 @@ def run(arguments: argparse.Namespace) -> tuple[dict[str, Any], Callable[[dict[s
             f"--until-sure {factor:g}: no votes per root of a bin; give a number from 0, as spikeloom anytime prints "
             "it, or none for the proof alone"
         )
-    live = load(arguments.netlist)
-    netlist = live.netlist
+    machine = machine_for(arguments.netlist)
+    netlist = machine.netlist
     bin_s *= netlist.bins
     if netlist.polarities != 2:
         raise ModelError(
             f"{arguments.netlist}: {netlist.polarities} polarities per taxel found, event lines have 2; "
             "watch a network for events of two polarities"
         )
-    stream = live.stream()
+    stream = machine.stream()
     stdin = arguments.input == "-"
     name = "standard input" if stdin else arguments.input
     with _opened(arguments.input) as file:

@@ -11,7 +11,7 @@ from typing import Any
 from spikeloom import __version__
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.formats.checkpoint import Checkpoint
-from spikeloom.compiler.targets.base import CROSSBARS, known_targets, load_target, require_target
+from spikeloom.compiler.targets.base import load_target, require_target
 from spikeloom.compiler.targets.loihi1.compare import WeightDifference, compare
 from spikeloom.compiler.targets.loihi1.compilation import STAGES, compile_network
 from spikeloom.compiler.targets.loihi1.layout.choose import GOALS, require_goal
@@ -24,8 +24,7 @@ from spikeloom.runtime.commands.options import MARGIN, add_bin_option, add_netwo
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import recordings
-from spikeloom.runtime.machines.truenorth import in_time, native
-from spikeloom.runtime.machines.truenorth.refusal import refuse
+from spikeloom.runtime.machines.base import chip_commands, trained_for
 from spikeloom.runtime.report import render
 from spikeloom.runtime.report.console import progress
 
@@ -93,12 +92,11 @@ def run(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int
     require_target(arguments.target)
     if is_whole(arguments):
         return take(arguments)
-    if native.is_named(arguments.checkpoint):
-        return native.compile_network(arguments)
-    if arguments.target in known_targets(CROSSBARS):
-        return refuse(arguments) if arguments.in_time is None else in_time.compile_network(arguments)
+    own = trained_for(arguments.checkpoint) or chip_commands(arguments.target)
+    if own is not None:
+        return own.compile_network(arguments)  # type: ignore[no-any-return]
     if arguments.in_time is not None:
-        raise OptionError(f"--in-time {arguments.in_time}: is for truenorth; give --target truenorth, or leave it away")
+        raise OptionError(f"--in-time {arguments.in_time}: {arguments.target} has no such option; omit it")
     if arguments.margin is not None and arguments.ranges != "observed":
         raise OptionError(
             f"--margin {arguments.margin:g}: only observed ranges have one; add --ranges observed or leave it away"

@@ -3,24 +3,14 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
-from typing import Any
 
-from spikeloom.compiler.dynamics import with_clocks
-from spikeloom.compiler.fixedpoint import IntArray
-from spikeloom.compiler.targets.base import load_target, with_tables
-from spikeloom.compiler.targets.loihi1.netlist import Netlist
-from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
-from spikeloom.compiler.targets.truenorth.netlist_file import is_crossbars
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.commands.options import add_detail, add_recordings
-from spikeloom.runtime.costs.estimate import estimate
-from spikeloom.runtime.costs.estimates import estimate_json, estimate_text
 from spikeloom.runtime.costs.spent import Account, explained
 from spikeloom.runtime.inputs.recordings import netlist_recordings
-from spikeloom.runtime.machines.loihi1.trace import BoolArray
-from spikeloom.runtime.machines.truenorth import commands as truenorth
+from spikeloom.runtime.machines.base import Machine, Price, Run, machine_for
 from spikeloom.runtime.report.console import progress
+from spikeloom.runtime.report.sections import Outcome
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -30,33 +20,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_detail(parser, ("counts", "cycle"), "counts")
 
 
-def run(arguments: argparse.Namespace) -> tuple[dict[str, Any], Callable[[dict[str, Any]], str], int]:
+def run(arguments: argparse.Namespace) -> Outcome:
     """Run the command."""
-    if is_crossbars(arguments.netlist):
-        return truenorth.estimate(arguments)
-    netlist = read_netlist(arguments.netlist)
-    data = netlist_recordings(arguments, netlist)
-    account = Account(netlist, data)
+    machine = machine_for(arguments.netlist)
+    data = netlist_recordings(arguments, machine.netlist)
+    account = Account(machine, data)
     account.begin(arguments.detail)
-    _, report = priced(arguments, netlist, data)
+    _, price = priced(arguments, machine, data)
     account.begin("no float")
-    return report | explained(arguments, account), estimate_text, 0
+    return Outcome(price.outcome.result | explained(arguments, account), price.outcome.sections)
 
 
 def priced(
-    arguments: argparse.Namespace, netlist: Netlist, data: Recordings, spikes: BoolArray | None = None
-) -> tuple[IntArray, dict[str, Any]]:
-    """Spikes of each compartment, and what the recordings cost at the detail that was asked for; fills `spikes`."""
+    arguments: argparse.Namespace, machine: Machine, data: Recordings, *, spikes: bool = False
+) -> tuple[Run, Price]:
+    """Run the recordings and price them as the options say."""
     progress("running")
-    target = load_target(netlist.target)
-    target = target if arguments.table is None else with_tables(target, arguments.table)
-    counts, found = estimate(
-        netlist,
-        target,
-        with_clocks(data.events, netlist.clocks),
+    return machine.price(
+        data.events,
+        bin_s=arguments.bin,
         lengths=data.lengths,
         detail=arguments.detail,
+        table=arguments.table,
         spikes=spikes,
         progress=lambda done: progress(f"running: {done} of {len(data)}"),
     )
-    return counts.spikes, estimate_json(netlist, target, found, bin_s=arguments.bin * netlist.bins)

@@ -9,16 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.targets.base import load_target
-from spikeloom.compiler.targets.loihi1.legalize import measure
-from spikeloom.compiler.targets.loihi1.netlist_file import is_netlist, read_netlist
-from spikeloom.compiler.targets.truenorth.netlist_file import is_crossbars
+from spikeloom.compiler.formats.archive import is_netlist
 from spikeloom.runtime.commands.options import add_model
 from spikeloom.runtime.inputs.files import require_inspectable
 from spikeloom.runtime.inputs.network import load_checkpoint
-from spikeloom.runtime.machines.truenorth import commands as truenorth
-from spikeloom.runtime.machines.truenorth import native
+from spikeloom.runtime.machines.base import machine_for, trained_for
 from spikeloom.runtime.report import render
+from spikeloom.runtime.report.sections import Outcome
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -27,21 +24,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_model(parser, graph=False)
 
 
-def run(arguments: argparse.Namespace) -> tuple[dict[str, Any], Callable[[dict[str, Any]], str], int]:
+def run(arguments: argparse.Namespace) -> Outcome | tuple[dict[str, Any], Callable[[dict[str, Any]], str], int]:
     """Run the command."""
     require_inspectable(arguments.path)
-    if native.is_named(arguments.path):
-        return native.inspect(arguments)
+    if (own := trained_for(arguments.path)) is not None:
+        return own.inspect(arguments)  # type: ignore[no-any-return]
     if is_netlist(arguments.path):
         for name in ("beta", "theta", "weights", "run", "system"):
             value = getattr(arguments, name)
             if value is not None and (name, value) != ("run", 0):
                 raise OptionError(f"--{name} {value}: is for checkpoints, {arguments.path} is a netlist; omit it")
-        if is_crossbars(arguments.path):
-            return truenorth.inspect(arguments.path)
-        netlist = read_netlist(arguments.path)
-        uses = measure(netlist, load_target(netlist.target))
         sha256 = hashlib.sha256(Path(arguments.path).read_bytes()).hexdigest()
-        return render.netlist_json(netlist, uses, sha256), render.netlist_text, 0
+        return machine_for(arguments.path).describe(sha256)
     given = tuple(name for name in ("beta", "theta") if getattr(arguments, name) is not None)
     return render.checkpoint_json(load_checkpoint(arguments.path, arguments), given), render.checkpoint_text, 0

@@ -24,6 +24,7 @@ from spikeloom.runtime.equivalence.verdicts import verify_json
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import load_recordings
+from spikeloom.runtime.machines.base import machine_of
 from spikeloom.runtime.machines.loihi1.trace import check_channels
 from spikeloom.runtime.page.text import report_text
 from spikeloom.runtime.report.render import netlist_json
@@ -145,7 +146,7 @@ def _facts(
     from spikeloom.runtime.page import facts as report_facts
     from spikeloom.runtime.page.recording import recording_json
 
-    account = Account(netlist, data, checked=arguments.spec_samples)
+    account = Account(machine_of(netlist), data, checked=arguments.spec_samples)
     target = load_target(netlist.target)
     verdict = verify(
         netlist,

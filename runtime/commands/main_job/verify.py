@@ -8,8 +8,6 @@ from collections.abc import Callable
 from typing import Any
 
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
-from spikeloom.compiler.targets.truenorth.netlist_file import is_crossbars
 from spikeloom.runtime.commands.options import MIN_AGREEMENT, add_explain_cost, add_network, add_recordings
 from spikeloom.runtime.costs.spent import Account, explained
 from spikeloom.runtime.equivalence import verdicts
@@ -17,8 +15,8 @@ from spikeloom.runtime.equivalence.levels import levels_of, parse_requirements, 
 from spikeloom.runtime.equivalence.verify import verify
 from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.inputs.recordings import netlist_recordings
+from spikeloom.runtime.machines.base import chip_commands, machine_for
 from spikeloom.runtime.machines.loihi1.trace import ENGINES
-from spikeloom.runtime.machines.truenorth import native
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -55,8 +53,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> tuple[dict[str, Any], Callable[[dict[str, Any]], str], int]:
     """Run the command."""
-    if is_crossbars(arguments.netlist):
-        return native.verify(arguments)
+    machine = machine_for(arguments.netlist)
+    if (own := chip_commands(machine.netlist.target)) is not None:
+        return own.verify(arguments)  # type: ignore[no-any-return]
     agreement = MIN_AGREEMENT if arguments.min_agreement is None else arguments.min_agreement
     if not 0 <= agreement <= 1:
         raise OptionError(f"--min-agreement {agreement}: not a share; give a number from 0 to 1")
@@ -67,11 +66,11 @@ def run(arguments: argparse.Namespace) -> tuple[dict[str, Any], Callable[[dict[s
                 f"--min-agreement {agreement:g}: --require replaces it; write E3={agreement:g} into that instead"
             )
         required = parse_requirements(arguments.require)
-    netlist = read_netlist(arguments.netlist)
+    netlist = machine.netlist
     asked = load_network(arguments.checkpoint, arguments, netlist)
     original = None if arguments.original is None else load_network(arguments.original, arguments)
     data = netlist_recordings(arguments, netlist, labels_for="verify")
-    account = Account(netlist, data, checked=arguments.spec_samples)
+    account = Account(machine, data, checked=arguments.spec_samples)
     verdict = verify(
         netlist,
         asked.model,

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 
 from spikeloom.compiler.errors import ModelError, OptionError
+from spikeloom.compiler.formats.archive import is_netlist
 from spikeloom.compiler.formats.atomic import remove_leftovers
 from spikeloom.compiler.formats.checkpoint import Checkpoint, read_checkpoint
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.systems import GRAPH_SYSTEMS
 from spikeloom.compiler.targets.base import load_target
-from spikeloom.compiler.targets.loihi1.netlist_file import is_netlist
 from spikeloom.compiler.targets.loihi1.storage.quantize import round_to_forms
 from spikeloom.models.graphs import Graph
 from spikeloom.models.recordings.events import joined_bins

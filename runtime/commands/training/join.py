@@ -10,16 +10,16 @@ from pathlib import Path
 from typing import Any
 
 from spikeloom.compiler.errors import ModelError, OptionError
+from spikeloom.compiler.formats.archive import is_netlist
 from spikeloom.compiler.formats.atomic import remove_leftovers
 from spikeloom.compiler.formats.checkpoint import Checkpoint, read_checkpoint
 from spikeloom.compiler.formats.checkpoint_file import WEIGHTS
 from spikeloom.compiler.formats.towers import arrays_of
 from spikeloom.compiler.formats.towers import join as join_networks
-from spikeloom.compiler.targets.loihi1.netlist_file import is_netlist
 from spikeloom.compiler.targets.truenorth.native import SYSTEM as NATIVE
 from spikeloom.runtime.commands.training.finetune import stored_graph
 from spikeloom.runtime.inputs.files import require_place, shipped
-from spikeloom.runtime.machines.truenorth import joining, native
+from spikeloom.runtime.machines.base import trained_for
 from spikeloom.runtime.report.render import tower_line
 from spikeloom.runtime.report.tables import percent
 
@@ -49,8 +49,9 @@ def run(arguments: Namespace) -> tuple[Report, Callable[[Report], str], int]:
     SpikeloomError
         If a network cannot be used, or they do not fit together.
     """
-    if any(native.is_named(name) for name in arguments.checkpoints):
-        return joining.join(arguments, join_text)
+    own = next(filter(None, map(trained_for, arguments.checkpoints)), None)
+    if own is not None:
+        return own.join(arguments, join_text)  # type: ignore[no-any-return]
     if arguments.data is not None:
         raise OptionError(f"--data {arguments.data}: is for {NATIVE}; leave it away, and measure with spikeloom run")
     for name in arguments.checkpoints:

@@ -22,8 +22,8 @@ from spikeloom.compiler.targets.truenorth.netlist_file import write_crossbars
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.recordings.windows import steps_of
 from spikeloom.runtime.machines.truenorth import cost, engine
-from spikeloom.runtime.machines.truenorth.commands import class_counts
 from spikeloom.runtime.machines.truenorth.native import provenance
+from spikeloom.runtime.machines.votes import class_counts
 
 Json = dict[str, Any]
 

@@ -23,7 +23,7 @@ from spikeloom.runtime.inputs.files import shipped
 from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.machines.loihi1.trace import ENGINES
 from spikeloom.runtime.machines.truenorth import in_time, render
-from spikeloom.runtime.machines.truenorth.commands import legal
+from spikeloom.runtime.machines.truenorth.machine import load
 from spikeloom.runtime.machines.truenorth.refusal import require_crossbar_options
 from spikeloom.runtime.machines.truenorth.verdicts import BoolArray, compare, verdict_json, verdict_text
 from spikeloom.runtime.report.console import progress
@@ -168,7 +168,8 @@ def verify(arguments: argparse.Namespace) -> Outcome:
                 f"--{name.replace('_', '-')} {value}: a network for TrueNorth has one model, whose every spike must be "
                 "the chip's; leave it away"
             )
-    netlist, chip = legal(arguments.netlist)
+    machine = load(arguments.netlist)
+    netlist, chip = machine.netlist, machine.target
     percent = parse_window(arguments.window)
 
     def recordings() -> Recordings:

@@ -16,7 +16,7 @@ from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.machines.truenorth import engine, spec
-from spikeloom.runtime.machines.truenorth.commands import class_counts
+from spikeloom.runtime.machines.votes import class_counts
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.intervals import wilson
 from spikeloom.runtime.report.tables import table

@@ -1,0 +1,244 @@
+"""What every chip offers to those who run, price, show and stream netlists; nobody else asks which chip it is.
+
+A machine is found by the target that its netlist names: the module ``machines/NAME/machine.py`` of the target
+``compiler/targets/NAME``. A further chip is these two folders and no line elsewhere.
+"""
+
+from __future__ import annotations
+
+import os
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from pkgutil import iter_modules
+from typing import Any, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.fixedpoint import FloatArray, IntArray
+from spikeloom.compiler.formats.archive import stated
+from spikeloom.compiler.interpret import vote
+from spikeloom.compiler.targets.base import COMPARTMENTS, Target, load_target
+from spikeloom.compiler.targets.netlist import Netlist
+from spikeloom.runtime import machines
+from spikeloom.runtime.report.sections import Outcome, Section, Text
+
+BoolArray = npt.NDArray[np.bool_]
+EventArray = npt.NDArray[np.uint8 | np.bool_]
+
+DEFAULT = "loihi1"
+"""Whose reader says what is wrong with a file that names no target."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Run:
+    """What a chip made of recordings: votes (samples, classes) int64, and spikes by layer where they were kept."""
+
+    votes: IntArray
+    spikes: Mapping[str, BoolArray] | None = None
+
+    @property
+    def decisions(self) -> IntArray:
+        """Class of each recording; ties go to the lowest."""
+        return vote(self.votes)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Price:
+    """What recordings cost, in the terms that all chips share.
+
+    Parameters
+    ----------
+    synaptic_operations : (samples,)
+    energy_j, time_s : mapping of table to (samples,) float64
+        Joules and seconds of each recording.
+    step_s : mapping of time table to float
+        Seconds of the longest data step.
+    outcome : Outcome
+        All that the chip's own price model knows, with its layout.
+    """
+
+    synaptic_operations: IntArray | FloatArray
+    energy_j: Mapping[str, FloatArray]
+    time_s: Mapping[str, FloatArray]
+    step_s: Mapping[str, float]
+    outcome: Outcome
+
+
+@dataclass(frozen=True)
+class Machine(ABC):
+    """A netlist on its chip; made by :func:`machine_of` or :func:`machine_for`, prepared when it first runs."""
+
+    netlist: Any
+    """The placed network as the chip holds it, a :class:`Netlist`."""
+
+    cores: ClassVar[str] = COMPARTMENTS
+    details: ClassVar[tuple[str, ...]]
+    """How deep a price can go, the usual one first."""
+
+    @cached_property
+    def target(self) -> Target:
+        """The chip."""
+        return load_target(self.netlist.target, self.cores)
+
+    @property
+    @abstractmethod
+    def layers(self) -> tuple[str, ...]:
+        """Their names."""
+
+    @property
+    @abstractmethod
+    def kernel(self) -> str:
+        """How the simulator goes through a recording, in a few words."""
+
+    def require_detail(self, detail: str) -> None:
+        """Refuse a depth that the chip's price model has not.
+
+        Raises
+        ------
+        OptionError
+            Naming those that it has.
+        """
+        if detail not in self.details:
+            allowed = ", ".join(self.details)
+            raise OptionError(f"--detail {detail}: {self.netlist.target} has no such price model; allowed: {allowed}")
+
+    @abstractmethod
+    def legal(self) -> None:
+        """Hold the netlist against every limit of the chip.
+
+        Raises
+        ------
+        SpikeloomError
+            Naming each limit that it breaks.
+        """
+
+    @abstractmethod
+    def run(
+        self, events: EventArray, *, lengths: IntArray | None = None, spikes: bool = False, threads: int | None = None
+    ) -> Run:
+        """Run recordings, each from rest.
+
+        Parameters
+        ----------
+        events : (samples, taxels, polarities, steps) uint8 or bool
+            Any value but zero is an event; the network's clocks tick by themselves.
+        lengths : (samples,) int64, optional
+            Data steps of each where some are shorter.
+        spikes : bool
+            Keep them.
+        threads : int, optional
+            Recordings at a time, by default one per processor.
+
+        Raises
+        ------
+        DataError, NumericRangeError
+            If they are of another sensor, or a register overflows.
+        """
+
+    @abstractmethod
+    def price(
+        self,
+        events: EventArray,
+        *,
+        bin_s: float,
+        lengths: IntArray | None = None,
+        detail: str = "counts",
+        table: str | None = None,
+        spikes: bool = False,
+        progress: Callable[[int], object] | None = None,
+    ) -> tuple[Run, Price]:
+        """Run recordings and price them.
+
+        Parameters
+        ----------
+        events, lengths, spikes
+            As for `run`.
+        bin_s : float
+            Seconds of a bin at the pace of the sensor.
+        detail : str
+            One of `details`.
+        table : str, optional
+            Name of a table of prices, or a TOML file with some.
+        progress : callable, optional
+            Called with the number of recordings that are done.
+
+        Raises
+        ------
+        OptionError
+            If there is no such table or detail.
+        """
+
+    @abstractmethod
+    def batch(self, steps: int) -> int:
+        """Recordings of so many data steps whose price is worked out at a time where memory is short."""
+
+    @abstractmethod
+    def describe(self, sha256: str) -> Outcome:
+        """Layers, cores, and how full each limit is; `sha256` is the file's."""
+
+    @abstractmethod
+    def stream(self) -> Any:
+        """State of one grasp that runs bin after bin.
+
+        Raises
+        ------
+        OptionError
+            If this chip's simulator runs whole recordings only.
+        """
+
+
+def _module(name: str) -> Any:
+    return import_module(f"{__package__}.{name}.machine")
+
+
+def has_machine(name: str) -> bool:
+    """Whether there is a simulator of a chip."""
+    return find_spec(f"{__package__}.{name}") is not None
+
+
+def machine_of(netlist: Netlist) -> Machine:
+    """The machine of a netlist in memory."""
+    machine: Machine = _module(netlist.target).machine_of(netlist)
+    return machine
+
+
+def machine_for(path: str | os.PathLike[str]) -> Machine:
+    """Read a netlist file, whatever chip it is for.
+
+    Raises
+    ------
+    FormatError, SpikeloomError
+        If it is no netlist, or breaks a limit of its chip.
+    """
+    name = stated(Path(path), "target")
+    known = name is not None and name.isidentifier() and has_machine(name)
+    machine: Machine = _module(name if known and name else DEFAULT).load(path)
+    return machine
+
+
+def as_text(text: Callable[[Any], str], result: Any) -> list[Section]:
+    """Layout of a result that is printed as it stands."""
+    return [Section("", [Text(text(result))])]
+
+
+def chip_commands(name: str) -> Any | None:
+    """What a chip does in its own way: its module ``commands``, if it has one.
+
+    ``compile_network(arguments)`` and ``verify(arguments)`` for all networks; for checkpoints that were trained for the
+    chip, which ``takes(path)`` knows, ``inspect(arguments)`` and ``join(arguments)``.
+    """
+    module = f"{__package__}.{name}.commands"
+    return import_module(module) if has_machine(name) and find_spec(module) else None
+
+
+def trained_for(path: str) -> Any | None:
+    """Commands of the chip that a checkpoint was trained for; None for a checkpoint like any other."""
+    chips = (chip_commands(each.name) for each in iter_modules(machines.__path__) if each.ispkg)
+    return next((chip for chip in chips if chip is not None and chip.takes(path)), None)
