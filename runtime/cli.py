@@ -114,9 +114,9 @@ def build_parser(chosen: str | None = None) -> argparse.ArgumentParser:
     )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name in COMMANDS if chosen is None else filter(None, [chosen]):
-        sub = commands.add_parser(name, description=COMMANDS[name][1])
+        sub = commands.add_parser(name, description=COMMANDS[name][1], help=COMMANDS[name][1])
         module = _module(name)
-        sub.set_defaults(action=getattr(module, "run", None))
+        sub.set_defaults(action=getattr(module, "run", None), run_words=result_of)
         module.add_arguments(sub)
         if sub.get_default("action"):  # else it has commands of its own
             import_module("spikeloom.runtime.commands.options").add_common(sub)

@@ -5,6 +5,7 @@ import io
 import json
 import os
 import shutil
+import subprocess
 import sys
 import types
 import zipfile
@@ -25,11 +26,11 @@ from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.compiler.text import text
 from spikeloom.models.graphs import build_graph
+from spikeloom.models.recordings.grasps import synthetic_split
 from spikeloom.runtime import cli
-from spikeloom.runtime.commands.main_job import compile as compile_command
 from spikeloom.runtime.commands.main_job import demo
-from spikeloom.runtime.inputs import files as inputs
-from spikeloom.runtime.inputs.recordings import recordings
+from spikeloom.runtime.inputs import network
+from spikeloom.runtime.inputs import recordings as recordings_input
 
 SIZES = {"conv1": TAXELS * FEATURES, "fc1": 9, "fc2": 8, "fc3": CLASSES}
 
@@ -585,12 +586,8 @@ def shipped_grasps(monkeypatch, tmp_path):
     """A made-up network in place of the shipped one, and few grasps."""
     last = made_weights(taxels=39, sizes=(6, 5, 6))
     path = str(own_file(tmp_path / "grasps.pt", last=last, graph=build_graph("manual")))
-    monkeypatch.setattr(inputs, "shipped", lambda name: path if name == "pretrained:grasps" else name)
-    for module in (inputs, compile_command):
-        few = {"limit": 6}
-        monkeypatch.setattr(
-            module, "recordings", lambda *words, few=few, **options: recordings(*words, **options | few)
-        )
+    monkeypatch.setattr(network, "shipped", lambda name: path if name == "pretrained:grasps" else name)
+    monkeypatch.setattr(recordings_input, "synthetic_split", lambda split, **_: synthetic_split(split, limit=6))
 
 
 @pytest.mark.usefixtures("shipped_grasps")
@@ -620,8 +617,30 @@ def test_help_names_every_command(capsys):
         cli.main(["--help"])
     assert stop.value.code == 0
     out = capsys.readouterr().out
-    for name in ("compile", "inspect", "run", "verify", "estimate", "train", "demo"):
-        assert f"\n    {name} " in out
+    for group, names in cli.GROUPS.items():
+        assert all(f"\n  {name} " in out.split(f"\n{group}:")[1] for name in names)
+
+
+@pytest.mark.parametrize(
+    ("words", "meant"),
+    [(["verfy"], "verify"), (["run", "x.loom", "--lable"], "--table"), (["run", "--dta", "x"], "--data")],
+)
+def test_a_misspelt_word_is_answered_with_the_near_one(capsys, words, meant):
+    assert cli.main(words) == 2
+    assert f"did you mean {meant}?" in capsys.readouterr().err
+
+
+def test_help_imports_no_command():
+    code = "import sys; from spikeloom.runtime import cli\ntry: cli.main(['--help'])\nexcept SystemExit: pass\n"
+    check = "sys.exit(bool({'numpy', 'torch', 'matplotlib', 'numba', 'onnx'} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", code + check], check=False, stdout=subprocess.DEVNULL).returncode == 0
+
+
+def test_completion_scripts_know_commands_and_options(capsys):
+    assert cli.main(["--print-completion", "bash"]) == 0
+    script = capsys.readouterr().out
+    assert "anytime" in script
+    assert "--spike-exact" in script
 
 
 def test_debug_shows_where_it_happened(capsys):

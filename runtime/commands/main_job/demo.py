@@ -8,7 +8,6 @@ from collections.abc import Callable
 from typing import Any
 
 from spikeloom.models.recordings.grasps import SYNTHETIC
-from spikeloom.runtime.cli import result_of
 
 STEPS = (
     ("compile", "pretrained:grasps", "--calibrate", SYNTHETIC, "-o", "{folder}/grasps.loom"),
@@ -22,14 +21,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Take no options of its own."""
 
 
-def run(_arguments: argparse.Namespace) -> tuple[dict[str, Any], Callable[[dict[str, Any]], str], int]:
-    """Run the commands one after the other; the worst exit code counts."""
+def run(arguments: argparse.Namespace) -> tuple[dict[str, Any], Callable[[dict[str, Any]], str], int]:
+    """Run the commands one after the other, by what the command line gives for that; the worst exit code counts."""
     results: dict[str, Any] = {}
     texts: list[str] = []
     worst = 0
     with tempfile.TemporaryDirectory(prefix="spikeloom-") as folder:
         for words in STEPS:
-            results[words[0]], text, code = result_of([word.format(folder=folder) for word in words])
+            results[words[0]], text, code = arguments.run_words([word.format(folder=folder) for word in words])
             typed = " ".join(words).replace("{folder}/", "")
             texts.append(f"$ spikeloom {typed}\n{text}")
             worst = max(worst, code)
