@@ -456,6 +456,3 @@ def test_shipped_networks_for_the_sensor_of_the_paper(monkeypatch):
         small = found[0]
         assert (small.name, small.samples) == (f"pretrained:{name}-truenorth", samples)
         assert (small.cores, small.depth, small.levels, small.inputs) == (32, 3, 7, 78)
-        known = retrained.accuracy_on("mst:0", small)
-        assert known is not None
-        assert known[0] == f"pretrained:{name}-mst0"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from importlib import resources
@@ -14,7 +15,6 @@ from spikeloom.compiler.targets.truenorth.lower import cores_needed
 from spikeloom.compiler.targets.truenorth.native import highest_level
 from spikeloom.compiler.targets.truenorth.native_file import Trained, is_trained, read_trained
 from spikeloom.runtime.inputs.files import PRETRAINED
-from spikeloom.runtime.studies.paper.cells import file_safe
 
 Json = dict[str, Any]
 
@@ -88,7 +88,7 @@ def accuracy_on(graph: str, like: Shipped) -> tuple[str, float, str] | None:
 
     None where there is none that says what it reached.
     """
-    for file in _files(f"*-{file_safe(graph).replace('-', '')}.pt"):
+    for file in _files(f"*-{re.sub(r'[^A-Za-z0-9.]+', '', graph)}.pt"):
         training = read_checkpoint(file).training or {}
         reached = _reached(training)
         if reached is not None and training.get("data") == like.data and "command" in training:

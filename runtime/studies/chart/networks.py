@@ -1,10 +1,11 @@
-"""The networks of a chart: checkpoints that were given, and shipped ones that a grid's graphs ask for."""
+"""The networks of a chart."""
 
 from __future__ import annotations
 
 import argparse
+import re
 import shlex
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -24,12 +25,14 @@ from spikeloom.models.systems import NO_GRAPH
 from spikeloom.runtime.inputs.files import PRETRAINED, shipped
 from spikeloom.runtime.inputs.network import load_checkpoint, load_graph, propagation
 from spikeloom.runtime.studies.chart.grid import Grid
-from spikeloom.runtime.studies.paper.cells import SHORT_EPOCHS, file_safe
 
 Json = dict[str, Any]
 
 COMPARTMENT_CHIP, CROSSBAR_CHIP = "loihi1", "truenorth"
 """Chips of a chart: of checkpoints, and of networks in whole numbers."""
+
+GRAPH_EPOCHS = "60"
+"""Of a training on another graph: most best epochs come before."""
 
 LOIHI_AXES = ("bits", "planes", "groups", "prune", "cores")
 """Axes of the grid that networks in whole numbers do not have."""
@@ -102,7 +105,7 @@ def given_networks(arguments: argparse.Namespace, grid: Grid) -> tuple[Given, ..
     arguments : Namespace
         ``checkpoints``, ``data`` and the options of :func:`options.add_model`.
     grid : Grid
-        Whose graphs choose; a shipped checkpoint stands in for a graph that none of the given ones has.
+        Whose graphs choose.
 
     Raises
     ------
@@ -116,7 +119,7 @@ def given_networks(arguments: argparse.Namespace, grid: Grid) -> tuple[Given, ..
     read = [_read(path, arguments) for path in paths]
     for graph in grid.graph:
         if all(_plain(graph) != _plain(own.graph) for own in read):
-            read += [_read(_shipped_for(graph, paths, read, arguments.data), arguments)]
+            raise _untrained(graph, read, arguments.data)
     if grid.graph:
         wanted = [_plain(graph) for graph in grid.graph]
         read = [own for own in read if _plain(own.graph) in wanted]
@@ -189,29 +192,15 @@ def _model_words(arguments: argparse.Namespace, checkpoint: Checkpoint) -> tuple
 
 
 def _plain(graph: str) -> str:
-    return file_safe(graph).replace("-", "")
+    return re.sub(r"[^A-Za-z0-9.]+", "", graph)
 
 
-def _shipped_for(graph: str, paths: Iterable[str], there: Sequence[Given], data: str) -> str:
-    """A shipped checkpoint of another graph beside the given shipped ones: ``pretrained:objects-knn1``.
-
-    Raises
-    ------
-    OptionError
-        If there is none; says which command trains one.
-    """
-    families = dict.fromkeys(path.split("-")[0] for path in paths if path.startswith(PRETRAINED))
-    for family in families:
-        name = f"{family}-{_plain(graph)}"
-        try:
-            shipped(name)
-        except OptionError:
-            continue
-        return name
-    command = ["spikeloom", "train", "--data", data, "--graph", graph, "--epochs", str(SHORT_EPOCHS["graphs"])]
+def _untrained(graph: str, there: Sequence[Given], data: str) -> OptionError:
+    """Error of a graph that no checkpoint was trained on; says which command trains one."""
+    command = ["spikeloom", "train", "--data", data, "--graph", graph, "--epochs", GRAPH_EPOCHS]
     command += ["--join", str(there[0].bins)] if there[0].bins > 1 else []
     others = ", ".join(dict.fromkeys(own.graph for own in there))
-    raise OptionError(
+    return OptionError(
         f"--grid graph={graph}: no checkpoint was trained on that graph, those given on {others}; train one and "
         f"name it: {shlex.join([*command, '-o', f'{_plain(graph)}.pt'])}"
     )
