@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from paper.measured import float_decisions
 
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.formats.checkpoint import Checkpoint, read_checkpoint
@@ -29,7 +30,6 @@ from spikeloom.runtime.costs.estimate import estimate
 from spikeloom.runtime.inputs.network import propagation
 from spikeloom.runtime.machines.votes import predictions
 from spikeloom.runtime.report.intervals import of_mean
-from spikeloom.runtime.studies.paper.measured import float_decisions
 
 Json = dict[str, Any]
 

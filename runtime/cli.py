@@ -43,7 +43,6 @@ GROUPS: dict[str, dict[str, str]] = {
         "train": "train a network by the released protocol, reported by the paper's and a clean one",
         "finetune": "train a network further on the very integers of the chip, down to ternary weights",
         "join": "put several trained networks side by side in one, whose votes add up",
-        "reproduce": "rebuild the tables of the TactileSGNet paper, in parts, from what is there",
     },
     "exchange": {
         "export": "write a network in the format of another program",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import subprocess
@@ -11,7 +10,6 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from socket import create_server
 from types import SimpleNamespace
@@ -19,14 +17,9 @@ from types import SimpleNamespace
 import pytest
 from swept import KIND, VIOLATION, begun, points, square
 
-from spikeloom.compiler.errors import CapacityError, DataError, OptionError, UnfinishedError
-from spikeloom.models.recordings.grasps import synthetic_grasps
-from spikeloom.models.recordings.release import write_released
-from spikeloom.models.training.protocols import data_digest
-from spikeloom.runtime.cli import main
+from spikeloom.compiler.errors import CapacityError, OptionError, UnfinishedError
 from spikeloom.runtime.studies.jobs.cluster import facts, refusal, require_alike, source_digest
 from spikeloom.runtime.studies.jobs.sweep import sweep
-from spikeloom.runtime.studies.paper.cell_work import splits_on_worker
 
 pytest.importorskip("distributed", reason="distributed is not installed (extra 'cluster')")
 
@@ -300,60 +293,3 @@ def test_dask_is_loaded_where_it_is_asked_for_only():
         "sys.exit('distributed' in sys.modules or 'dask' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT / "src", check=False).returncode == 0
-
-
-# --- reproduce --------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_cells_of_the_paper_made_on_a_cluster_are_those_made_here(made, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("spikeloom.runtime.studies.paper.cells.METHODS", (("mlp", "none"), ("gcn", "manual")))
-    splits = [
-        replace(synthetic_grasps(per_class=2, steps=10, seed=seed), split=split)
-        for split, seed in (("train", 1), ("test", 2))
-    ]
-    write_released(tmp_path / "Ev-Grasps", splits)
-    words = ("reproduce", "--data", "Ev-Grasps", "--table", "methods", "--seeds", "1", "--epochs", "1", "-o")
-    cluster = made()
-    cluster.worker()
-    cluster.worker()
-    cluster.reachable(2)
-    assert main([*words, "there", "--scheduler", cluster.address]) == 0
-    assert main([*words, "here", "--jobs", "1"]) == 0
-    capsys.readouterr()
-    files = sorted(path.name for path in Path("here/cells").iterdir())
-    assert files == ["grasps-gcn-manual-e1-s0.json", "grasps-mlp-none-e1-s0.json"]
-    for name in files:
-        here, there = (json.loads((Path(where) / "cells" / name).read_text()) for where in ("here", "there"))
-        here["command"] = here["command"].replace("here/", "there/")
-        assert without_hash(there) == without_hash(here)
-    assert Path("here/methods.csv").read_bytes() == Path("there/methods.csv").read_bytes()
-
-    cluster.scheduler.kill()
-    shutil.rmtree("there")
-    assert main([*words, "there", "--scheduler", cluster.address]) == 2
-    assert capsys.readouterr().err.splitlines()[-1] == (
-        f"spikeloom: --scheduler {cluster.address}: nobody answers there within 5 s; start dask scheduler, or mend the "
-        "address"
-    )
-
-
-def without_hash(cell: dict) -> dict:
-    return {name: value for name, value in cell.items() if name != "checkpoint_sha256"}  # which holds the command
-
-
-def test_recordings_that_differ_on_a_worker(tmp_path):
-    splits = [
-        replace(synthetic_grasps(per_class=1, steps=10, seed=seed), split=split)
-        for split, seed in (("train", 1), ("test", 2))
-    ]
-    write_released(tmp_path / "Ev-Grasps", splits)
-    where = str(tmp_path / "Ev-Grasps")
-    training, test = splits_on_worker(where, data_digest(*splits))
-    assert (len(training), len(test)) == (len(splits[0]), len(splits[1]))
-    with pytest.raises(DataError) as raised:
-        splits_on_worker(where, "0" * 64)
-    assert str(raised.value) == (
-        f"{where}: holds other recordings on a worker than here; share the folder, or copy it there"
-    )

@@ -239,17 +239,13 @@ def test_the_command_to_go_on_with_is_told(monkeypatch, capsys):
     def unfinished(_arguments):
         raise UnfinishedError("a: left out\n5 of 6 points are kept in x", resume=("--resume",))
 
-    monkeypatch.setattr("spikeloom.runtime.commands.training.reproduce.reproduce", unfinished)
-    assert main(["reproduce", "--data", "a b", "-o", "x"]) == 1
+    monkeypatch.setattr("spikeloom.runtime.commands.choose.chart.run", unfinished)
+    assert main(["chart", "a.pt", "--data", "a b", "-o", "x"]) == 1
     assert capsys.readouterr().err.splitlines() == [
         "spikeloom: a: left out",
         "spikeloom: 5 of 6 points are kept in x",
-        "spikeloom: go on with: spikeloom reproduce --data 'a b' -o x --resume",
+        "spikeloom: go on with: spikeloom chart a.pt --data 'a b' -o x --resume",
     ]
-    assert main(["reproduce", "--data", "a", "--resume", "-o", "x"]) == 1
-    assert capsys.readouterr().err.splitlines()[-1] == (
-        "spikeloom: go on with: spikeloom reproduce --data a --resume -o x"
-    )
 
 
 def test_keys_name_all_that_decides():
