@@ -6,6 +6,7 @@ one of its own, and reads what comes out; it names each seed before, so that who
 
 import copy
 import random
+import resource
 import signal
 import sys
 from functools import cache
@@ -14,9 +15,8 @@ from pathlib import Path
 import numpy as np
 from fuzzed_bytes import changed_bytes
 
-from spikeloom.compiler.errors import SpikeloomError
-from spikeloom.compiler.formats import hdf5_child
-from spikeloom.compiler.formats.hdf5 import assembled
+from spikeloom.compiler.errors import ModelError, SpikeloomError
+from spikeloom.compiler.formats.hdf5 import MEMORY, SECONDS, tree_of
 from spikeloom.compiler.formats.netx.layout import blocks_of
 from spikeloom.compiler.formats.netx.reader import integers_of
 from spikeloom.compiler.formats.nir.file import graph_of
@@ -30,7 +30,7 @@ TYPES = ("Affine", "AvgPool2d", "Conv1d", "Conv2d", "CubaLIF", "Delay", "Flatten
 TYPES += ("LIF", "Linear", "NIRGraph", "Output", "Scale", "SumPool2d", "Threshold")
 TYPES += ("conv", "dense", "dense_rec", "flatten", "input")
 NUMBERS = (-(2**63), -(2**31), -100, -1, 0, 1, 2, 3, 7, 100, 2**20, 2**31, 2**62, 1e-300, 1e300, np.nan, np.inf, 0.5)
-SECONDS = 4
+ALARM = 4
 
 
 @cache
@@ -68,12 +68,7 @@ def netx_bytes():
 @cache
 def trees():
     """What is in them."""
-    return tuple(assembled_of(content) for content in sources())
-
-
-def assembled_of(content):
-    entries, arrays = hdf5_child.take_apart(content)
-    return assembled(entries, b"".join(array.tobytes() for array in arrays))
+    return tuple(tree_of(content) for content in sources())
 
 
 def read(tree):
@@ -171,22 +166,21 @@ def bytes_outcome(seed):
     rng = random.Random(seed)
     content = changed_bytes(rng.choice(sources()), rng)
     try:
-        tree = assembled_of(content)
-    except hdf5_child.RefusedError:
-        return "refused"
-    except Exception:  # as the process of its own tells it
-        return "damaged"
+        tree = tree_of(content)
+    except ModelError as error:
+        return "damaged" if "is truncated or damaged" in str(error) else "refused"
     return outcome(tree)
 
 
 def main():
     """See the module."""
     first, count = int(sys.argv[1]), int(sys.argv[2])
-    hdf5_child.limit_resources()
+    resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     for seed in range(first, first + count):
         sys.stdout.write(f"{seed}\n")
         sys.stdout.flush()
-        signal.alarm(SECONDS)
+        signal.alarm(ALARM)
         ending = bytes_outcome(seed)
         signal.alarm(0)
         sys.stdout.write(f"{ending}\n")

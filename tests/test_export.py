@@ -15,6 +15,8 @@ from spikeloom.compiler.formats import sanafe
 from spikeloom.compiler.targets.loihi1.netlist import read_only
 from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist
 from spikeloom.runtime.commands.exchange import export
+from spikeloom.runtime.report.encode import encode
+from spikeloom.runtime.report.sections import terminal
 
 SIX_STEPS = """\
 # spikeloom netlist for SANA-FE 2.2.9 and its loihi.yaml; give the neurons of group input 'spikes'
@@ -55,9 +57,9 @@ def run(*words):
     """What the command reports and prints."""
     parser = argparse.ArgumentParser()
     export.add_arguments(parser)
-    report, text, code = export.run(parser.parse_args([str(word) for word in words]))
-    assert code == 0
-    return report, text(report)
+    found = export.run(parser.parse_args([str(word) for word in words]))
+    assert found.code == 0
+    return encode(found.result), terminal(found.sections(found.result))
 
 
 def lines(netlist):
@@ -164,3 +166,30 @@ def test_a_place_that_cannot_be_written(tmp_path):
             run(tmp_path / "net.loom", "--to", "sanafe", "-o", place)
         assert str(caught.value) == f"-o {place}: {why}"
     assert (tmp_path / "net.loom").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("sanafe --data x", "--data x: is for netx and ranc"),
+        ("onnx --recording 0", "--recording 0: is for ranc"),
+        ("sanafe --bin 0.1", "--bin 0.1: is for netx and ranc"),
+        ("nir --split train", "--split train: is for netx and ranc"),
+        ("netx --recording 0 --data x", "--recording 0: is for ranc"),
+        ("ranc --limit 1 --data x", "--limit 1: is for netx"),
+        ("ranc --recording 3", "--recording 3: says which recording of --data"),
+        ("netx --split train", "--split train: says which recording of --data"),
+        ("netx --limit 2", "--limit 2: says which recording of --data"),
+        ("nir --form step", "--form step: is for onnx and onnx-float"),
+        ("sanafe --dt 1", "--dt 1.0: is for nir"),
+        ("sanafe --strict", "--strict: is for netx"),
+        ("sanafe --form scan", "--form scan: is for onnx and onnx-float"),
+        ("onnx --directed", "--directed: is for checkpoints, --to onnx takes a netlist"),
+        ("onnx --beta 0.5", "--beta 0.5: is for checkpoints"),
+        ("nir --graph manual", "--graph manual: is for checkpoints"),
+    ],
+)
+def test_options_that_a_format_would_ignore(tmp_path, words, said):
+    with pytest.raises(OptionError) as caught:
+        run("x.loom", "-o", tmp_path / "x", "--to", *words.split())
+    assert str(caught.value).startswith(said)

@@ -172,12 +172,3 @@ def test_netlists_that_the_format_cannot_hold():
     words = said(chain(weight), recipes=[Recipe(planes=2)])
     assert words.startswith("fc1: has weights from ")
     assert words.endswith("netx holds 8 bits without an exponent; compile with --planes 1 --weight-bits 8")
-
-
-def test_options_of_other_formats(tmp_path, capsys):
-    for words, name, only in (
-        (["--dt", "1"], "dt", "nir"),
-        (["--strict"], "strict", "netx"),
-    ):
-        code, _, said = run(capsys, "export", "x.loom", "--to", "sanafe", *words, "-o", tmp_path / "x")
-        assert (code, said) == (2, f"spikeloom: --{name}: is for {only}, --to says sanafe; leave it away\n")

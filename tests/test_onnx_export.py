@@ -287,21 +287,6 @@ def test_the_command_writes_a_float_network(tmp_path):
     model_of((tmp_path / "f.onnx").read_bytes())
 
 
-def test_options_that_would_be_ignored_are_refused(tmp_path):
-    write_netlist(three_neurons(), tmp_path / "net.loom")
-    checkpoints = "is for checkpoints, --to onnx takes a netlist; leave it away"
-    for words, why in (
-        (("--to", "sanafe", "--form", "scan"), "--form scan: is for onnx and onnx-float; leave it away"),
-        (("--to", "onnx", "--graph", "manual"), f"--graph manual: {checkpoints}"),
-        (("--to", "onnx", "--directed"), f"--directed: {checkpoints}"),
-        (("--to", "onnx", "--beta", "0.5"), f"--beta 0.5: {checkpoints}"),
-    ):
-        with pytest.raises(OptionError) as caught:
-            run(tmp_path / "net.loom", *words, "-o", tmp_path / "x.onnx")
-        assert str(caught.value) == why
-    assert [path.name for path in tmp_path.iterdir()] == ["net.loom"]
-
-
 def test_the_wrong_kind_of_file(tmp_path):
     own_file(tmp_path / "net.pt")
     write_netlist(three_neurons(), tmp_path / "net.loom")

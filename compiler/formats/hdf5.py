@@ -1,14 +1,14 @@
 """Read an HDF5 file as plain data, trusting nothing in it: no size, no link, not even that it can be read.
 
-The library is run in a process of its own, :mod:`formats.hdf5_child`; one that hangs or crashes is a file
-that is damaged.
+On crafted files the library behind h5py can spin or crash, so a file is read in a process of its own first; one that
+survives within its time and memory is read again here.
 """
 
 from __future__ import annotations
 
 import hashlib
-import json
-import math
+import io
+import os
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -26,12 +26,35 @@ Tree = dict[str, Any]
 """By name a further Tree, an Array of numbers or truth values, a string, lists of strings, or None for other things."""
 
 SIZE_LIMIT = 2**28
-"""Bytes that a file may have: 256 MiB, as of a checkpoint."""
+"""Bytes that a file may have, and that all its arrays may have together: 256 MiB, as of a checkpoint."""
+
+ITEM_LIMIT = 100_000
+NESTING = 64
+DIMENSIONS = 8
+"""Groups and arrays of a file, groups within groups (a nested graph takes two), and axes of an array."""
+
+FILTERS = frozenset({1, 2, 3, 32000})
+"""Deflate, shuffle, Fletcher-32 and LZF: what h5py itself brings. Others would load code from elsewhere."""
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
-SECONDS = 60.0
 
-CHILD = Path(__file__).with_name("hdf5_child.py")
+SECONDS, MEMORY = 30, 4 * 2**30
+"""What reading a file may take."""
+
+TRIAL = f"""
+import sys
+try:
+    import resource
+    resource.setrlimit(resource.RLIMIT_CPU, ({SECONDS}, {SECONDS}))
+    resource.setrlimit(resource.RLIMIT_AS, ({MEMORY}, {MEMORY}))
+except ImportError:
+    pass  # not on this system; the time limit remains
+from {__name__} import ModelError, tree_of
+try:
+    tree_of(sys.stdin.buffer.read())
+except ModelError:
+    pass  # refused, as it will be here
+"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -55,7 +78,7 @@ def read_hdf5(path: Path, what: str, remedy: str) -> File:
     Raises
     ------
     ModelError
-        If it is missing, too large, no HDF5 file or damaged.
+        If it is missing, too large, no HDF5 file, damaged, or holds what may not be read; without the path.
     OSError
         If it cannot be read.
     """
@@ -68,10 +91,37 @@ def read_hdf5(path: Path, what: str, remedy: str) -> File:
     content = path.read_bytes()
     if not content.startswith(SIGNATURE):
         raise ModelError(f"is no HDF5 file, as a {what} is; {remedy}")
-    return File(tree=tree_of(content, remedy), sha256=hashlib.sha256(content).hexdigest())
+    try:
+        try_reading(content)
+        return File(tree=tree_of(content), sha256=hashlib.sha256(content).hexdigest())
+    except ModelError as error:
+        raise ModelError(f"{error}; {remedy}") from error
 
 
-def tree_of(content: bytes, remedy: str) -> Tree:
+def try_reading(content: bytes) -> None:
+    """Read a file in a process of its own.
+
+    Raises
+    ------
+    ModelError
+        If that does not end well: the library spun, crashed, or ran out of its memory.
+    """
+    try:
+        done = subprocess.run(  # noqa: S603
+            [sys.executable, "-P", "-c", TRIAL],
+            input=content,
+            capture_output=True,
+            timeout=2 * SECONDS,
+            check=False,
+            env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
+        )
+    except subprocess.TimeoutExpired:
+        raise ModelError(f"cannot be read within {2 * SECONDS:g} s") from None
+    if done.returncode:
+        raise ModelError("is truncated or damaged (the HDF5 library gave up)")
+
+
+def tree_of(content: bytes) -> Tree:
     """Content of a file as a tree.
 
     Raises
@@ -79,52 +129,68 @@ def tree_of(content: bytes, remedy: str) -> Tree:
     ModelError
         If it is damaged, or holds what may not be read.
     """
-    command = [sys.executable, "-P", str(CHILD)]
+    import h5py  # slow to load, so only where it is used
+
     try:
-        done = subprocess.run(command, input=content, capture_output=True, timeout=SECONDS, check=False)  # noqa: S603
-    except subprocess.TimeoutExpired:
-        raise ModelError(f"cannot be read within {SECONDS:g} s; {remedy}") from None
-    line, _, numbers = done.stdout.partition(b"\n")
-    if done.returncode or not line:
-        # the library ran out of its memory or its time, or crashed
-        raise ModelError(f"is truncated or damaged (the HDF5 library gave up); {remedy}")
-    head = json.loads(line)
-    if "refused" in head:
-        raise ModelError(f"{head['refused']}; {remedy}")
-    if "damaged" in head:
-        raise ModelError(f"is truncated or damaged ({head['damaged']}); {remedy}")
-    return assembled(head["entries"], numbers)
+        with h5py.File(io.BytesIO(content), "r") as file:
+            return _Walk().group(file, [])
+    except ModelError:
+        raise
+    except Exception as error:  # h5py raises nearly anything on damaged files
+        raise ModelError(f"is truncated or damaged ({type(error).__name__})") from error
 
 
-def assembled(entries: list[dict[str, Any]], numbers: bytes) -> Tree:
-    """Tree of what the other process found.
+class _Walk:
+    """A way through all groups of a file, with what it may still take."""
 
-    Examples
-    --------
-    >>> entries = [
-    ...     {"path": ["a"], "kind": "group"},
-    ...     {"path": ["a", "b"], "kind": "array", "dtype": "<i2", "shape": [2]},
-    ... ]
-    >>> assembled(entries, bytes([1, 0, 2, 0]))
-    {'a': {'b': array([1, 2], dtype=int16)}}
-    """
-    root: Tree = {}
-    place = 0
-    for entry in entries:
-        *above, name = entry["path"]
-        group = root
-        for step in above:
-            group = group[step]
-        match entry["kind"]:
-            case "group":
-                group[name] = {}
-            case "text":
-                group[name] = entry["value"]
-            case "array":
-                kind, shape = np.dtype(entry["dtype"]), tuple(entry["shape"])
-                count = math.prod(shape)
-                group[name] = np.frombuffer(numbers, kind, count, place).reshape(shape)
-                place += count * kind.itemsize
-            case _:
-                group[name] = None
-    return root
+    def __init__(self) -> None:
+        self.items = ITEM_LIMIT
+        self.bytes = SIZE_LIMIT
+
+    def group(self, group: Any, above: list[str]) -> Tree:
+        import h5py
+
+        if len(above) > NESTING:
+            raise ModelError(f"has groups nested deeper than {NESTING}")
+        found: Tree = {}
+        for key in group:
+            path = [*above, str(key)]
+            self.items -= 1
+            if self.items < 0:
+                raise ModelError(f"has more than {ITEM_LIMIT} groups and arrays")
+            if not isinstance(group.get(key, getlink=True), h5py.HardLink):
+                raise ModelError(f"{'/'.join(path)} is a link to elsewhere, allowed are arrays in the file itself")
+            item = group[key]
+            if isinstance(item, h5py.Group):
+                found[path[-1]] = self.group(item, path)
+            else:
+                found[path[-1]] = self.array(item, "/".join(path)) if isinstance(item, h5py.Dataset) else None
+        return found
+
+    def array(self, item: Any, path: str) -> Any:
+        """Numbers or words of an array; None for anything else. Its declared size is checked before it is read."""
+        import h5py
+
+        if item.external or item.is_virtual:
+            raise ModelError(f"{path} keeps its numbers in another file, allowed is this file alone")
+        filters = item.id.get_create_plist()
+        if any(filters.get_filter(place)[0] not in FILTERS for place in range(filters.get_nfilters())):
+            raise ModelError(f"{path} is compressed in a way that is not known, allowed are gzip, LZF and shuffle")
+        if item.shape is None or len(item.shape) > DIMENSIONS:
+            return None
+        self.bytes -= item.dtype.itemsize * max(item.size, int(np.prod(item.chunks or (0,), dtype=object)))
+        if self.bytes < 0:
+            raise ModelError(f"announces more than {SIZE_LIMIT} bytes of numbers")
+        if item.dtype.kind == "S" or h5py.check_string_dtype(item.dtype) is not None:
+            values = item[()]
+            return _decoded(values.tolist() if isinstance(values, np.ndarray) else values)
+        if item.dtype.kind not in "biuf" or item.dtype.itemsize > 8:
+            return None
+        values = np.asarray(item[()])
+        return np.ascontiguousarray(values, values.dtype.newbyteorder("<")).reshape(values.shape)
+
+
+def _decoded(value: Any) -> Any:
+    if isinstance(value, list):
+        return [_decoded(one) for one in value]
+    return value.decode("utf-8", "backslashreplace") if isinstance(value, bytes) else str(value)

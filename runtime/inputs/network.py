@@ -15,10 +15,8 @@ from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.formats.checkpoint import Checkpoint, read_checkpoint
 from spikeloom.compiler.formats.netx.layout import SUFFIX as NETX
-from spikeloom.compiler.formats.nir.neurons import CONVENTIONS
 from spikeloom.compiler.formats.nir.reader import SUFFIX as NIR
 from spikeloom.compiler.formats.nir.reader import NirNetwork, read_nir
-from spikeloom.compiler.formats.nir.sidecar import read_said
 from spikeloom.compiler.formats.onnx.reader import SUFFIX as ONNX
 from spikeloom.compiler.formats.onnx.reader import OnnxNetwork, read_onnx
 from spikeloom.compiler.ir import Network
@@ -111,10 +109,8 @@ def load_network(path: str, arguments: argparse.Namespace, netlist: Netlist | No
     if suffix == ONNX:
         onnx = read_onnx(path, **layout)
         return _asked(onnx, "onnx", {})
-    said = read_said(path, CONVENTIONS) if arguments.dt is None else None
-    dt = arguments.dt if said is None else said.dt
-    convention = arguments.convention or (CONVENTIONS[0] if said is None else said.convention)
-    return _asked(read_nir(path, dt=dt, convention=convention, **layout), "nir", {"dt": dt, "convention": convention})
+    nir = read_nir(path, dt=arguments.dt, convention=arguments.convention, **layout)
+    return _asked(nir, "nir", {"dt": nir.steps.dt, "convention": nir.steps.convention})
 
 
 def _from_file(netlist: Netlist, checkpoint: Checkpoint) -> bool:

@@ -18,6 +18,10 @@ OPTIONAL: Mapping[str, bool] = {"optional": True}
 """Metadata of a field that is left out of the JSON where it is None."""
 
 
+INLINE: Mapping[str, bool] = {"inline": True}
+"""Metadata of a field whose own fields stand in its place."""
+
+
 def key(name: str) -> Mapping[str, str]:
     """Metadata of a field that has another name in JSON."""
     return {"key": name}
@@ -53,10 +57,12 @@ def encode(value: Any) -> Any:
             return [encode(each) for each in value]
     if not is_dataclass(value) or isinstance(value, type):
         raise TypeError(f"{type(value).__name__}: has no form in JSON")
-    entries = {}
+    entries: dict[str, Any] = {}
     for field in fields(value):
         each = getattr(value, field.name)
-        if each is not None or not field.metadata.get("optional"):
+        if field.metadata.get("inline"):
+            entries |= encode(each)
+        elif each is not None or not field.metadata.get("optional"):
             entries[field.metadata.get("key", field.name)] = encode(each)
     return entries | {name: encode(getattr(value, name)) for name in getattr(value, "json_properties", ())}
 

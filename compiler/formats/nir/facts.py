@@ -41,11 +41,14 @@ class SpikingNode:
     hears_itself: bool
 
 
-def hint(graph: Graph) -> str:
-    """What a file tells about the time step that it was written in, to go on a sentence; empty if nothing."""
+def stated_step(graph: Graph) -> float | None:
+    """Seconds of a step, where the metadata of a file say so."""
     said = graph.metadata.get("dt")
-    if isinstance(said, np.ndarray) and said.size == 1:
-        return f", but its metadata says dt = {float(said.ravel()[0]):g}"
+    return float(said.ravel()[0]) if isinstance(said, np.ndarray) and said.size == 1 else None
+
+
+def hint(graph: Graph) -> str:
+    """What the neurons of a file imply about the step that it was written in, to go on a sentence."""
     written = _written(graph)
     return "" if written is None else f", but its r is tau / {written:g}, as of steps of {written:g} s"
 

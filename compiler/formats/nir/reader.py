@@ -16,7 +16,7 @@ from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.formats.assemble import Layer, assemble, class_of_each, in_order
 from spikeloom.compiler.formats.names import printable, unique_names
-from spikeloom.compiler.formats.nir.facts import SpikingNode, facts_of, hint
+from spikeloom.compiler.formats.nir.facts import SpikingNode, facts_of, hint, stated_step
 from spikeloom.compiler.formats.nir.file import Graph, Node, read_graph
 from spikeloom.compiler.formats.nir.neurons import CONVENTIONS, SPIKING, TOLERANCE, Steps, neurons_of, require_steps
 from spikeloom.compiler.formats.nir.nodes import KNOWN, STAGES
@@ -47,17 +47,20 @@ class NirNetwork:
         What was read and what was assumed, for people.
     sha256 : str
         Of the file.
+    steps : Steps
+        How time constants were read.
     """
 
     network: Network
     facts: tuple[str, ...]
     sha256: str
+    steps: Steps
 
 
 def read_nir(
     path: str | os.PathLike[str],
     *,
-    dt: float | None,
+    dt: float | None = None,
     convention: str | None = None,
     polarities: int | None = None,
     polarities_first: bool | None = None,
@@ -68,8 +71,8 @@ def read_nir(
     ----------
     path : path
         File.
-    dt : float
-        Seconds of a time step. None is refused, with what the file tells about it.
+    dt : float, optional
+        Seconds of a time step; by default what the file says in its metadata, as those written here do.
     convention : {"euler", "exponential"}, optional
         How time constants become decays, see :mod:`nir.neurons`; by default ``euler``.
     polarities, polarities_first : optional
@@ -85,6 +88,7 @@ def read_nir(
     """
     try:
         graph = read_graph(Path(path))
+        dt = stated_step(graph) if dt is None else dt
         if dt is None:
             raise OptionError(f"{path}: NIR keeps no time step{hint(graph)}; give --dt SECONDS")
         steps = Steps(dt=dt, convention=convention or CONVENTIONS[0])
@@ -114,7 +118,7 @@ def network_of(
     network = assemble(layers, sensor, place, label)
     facts = facts_of(graph, steps, spiking, f"input {printable(entry.name)}: {words}", sensor)
     facts.append(f"classes: the spikes of {printable(spiking[voters].node.name)} in output {printable(end.name)}")
-    return NirNetwork(network=network, facts=tuple(facts), sha256=graph.sha256)
+    return NirNetwork(network=network, facts=tuple(facts), sha256=graph.sha256, steps=steps)
 
 
 def _walk(graph: Graph, steps: Steps, shape: tuple[int, ...]) -> tuple[list[SpikingNode], Value]:

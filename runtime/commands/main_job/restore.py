@@ -1,4 +1,4 @@
-"""Ways of ``compile`` that round nothing: a netlist from the side-car of a NIR file, and integers as they stand."""
+"""``compile`` of a file that brings its integers, netx: nothing is rounded."""
 
 from __future__ import annotations
 
@@ -10,9 +10,6 @@ from spikeloom import __version__
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.formats.netx.layout import SUFFIX as NETX
 from spikeloom.compiler.formats.netx.reader import read_netx
-from spikeloom.compiler.formats.nir.neurons import CONVENTIONS
-from spikeloom.compiler.formats.nir.reader import SUFFIX as NIR
-from spikeloom.compiler.formats.nir.sidecar import restore, sidecar_of
 from spikeloom.compiler.invariants import verify
 from spikeloom.compiler.passes.prune import nobody
 from spikeloom.compiler.targets.base import load_target
@@ -20,32 +17,25 @@ from spikeloom.compiler.targets.loihi1.legalize import measure
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist
 from spikeloom.compiler.targets.loihi1.placing import place_integers
-from spikeloom.runtime.commands.options import MODEL, PLACING, ROUNDING, parse_cores
+from spikeloom.runtime.commands.options import MODEL, ROUNDING, parse_cores
 from spikeloom.runtime.report import render
 from spikeloom.runtime.report.console import progress
 
 Json = dict[str, Any]
 Outcome = tuple[Json, Callable[[Json], str], int]
 
-READING: Json = {"polarities": None, "polarities_first": None}
-"""Options that say how inputs are laid out, and what they are where they are not given."""
-
 FLOATS: Json = {"dt": None, "convention": None, **ROUNDING, "calibrate": None}
-"""Options that say how a float network is read and rounded, likewise."""
+"""Options that say how a float network is read and rounded, and what they are where they are not given."""
 
 
 def is_whole(arguments: argparse.Namespace) -> bool:
-    """Whether what is to be compiled brings its integers: netx, or NIR with a side-car and no ``--dt``."""
-    path = arguments.checkpoint
-    if path.endswith(NETX):
-        return True
-    return bool(path.endswith(NIR) and arguments.dt is None and sidecar_of(path).is_file())
+    """Whether what is to be compiled brings its integers."""
+    return bool(arguments.checkpoint.endswith(NETX))
 
 
 def take(arguments: argparse.Namespace) -> Outcome:
     """Run the command for such a file: the report, how to print it, and the exit code."""
-    path = arguments.checkpoint
-    netlist, facts = _from_netx(arguments) if path.endswith(NETX) else _restored(arguments)
+    netlist, facts = _from_netx(arguments)
     sha256 = write_netlist(netlist, arguments.output)
     report = render.netlist_json(netlist, measure(netlist, load_target(netlist.target)), sha256)
     return report | {"path": arguments.output, "facts": facts}, _text, 0
@@ -56,14 +46,6 @@ def _refuse(arguments: argparse.Namespace, options: Json, why: str) -> None:
         if getattr(arguments, name) != absent:
             shown = "polarities-first or -last" if name == "polarities_first" else name.replace("_", "-")
             raise OptionError(f"--{shown}: {why}")
-
-
-def _restored(arguments: argparse.Namespace) -> tuple[Netlist, list[str]]:
-    beside = sidecar_of(arguments.checkpoint)
-    why = f"{beside} restores the netlist as it was; leave it away, or add --dt SECONDS to compile the network anew"
-    _refuse(arguments, {"target": "loihi1"} | PLACING | READING | FLOATS | MODEL, why)
-    progress("reading the netlist")
-    return restore(arguments.checkpoint, CONVENTIONS), [f"restored from {beside}: the netlist as it was"]
 
 
 def _from_netx(arguments: argparse.Namespace) -> tuple[Netlist, list[str]]:

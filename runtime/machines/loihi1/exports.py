@@ -1,0 +1,200 @@
+"""Netlists in the formats of other programs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.formats import sanafe
+from spikeloom.compiler.formats.netx import writer as netx
+from spikeloom.compiler.formats.nir import writer as nir
+from spikeloom.compiler.formats.nir.neurons import CONVENTIONS
+from spikeloom.compiler.formats.onnx import writer as onnx
+from spikeloom.compiler.formats.onnx.builder import port_words
+from spikeloom.compiler.interpret import channels_last
+from spikeloom.compiler.targets.base import load_target
+from spikeloom.compiler.targets.loihi1.lift import lift
+from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
+from spikeloom.models.recordings.events import BIN_S
+from spikeloom.runtime.machines.export_format import Export, Format, Request
+from spikeloom.runtime.report.encode import OPTIONAL
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SanafeFacts:
+    """What a file for SANA-FE holds: groups of neurons, and the cores (``tile.core``) of layers and inputs."""
+
+    neurons: int
+    synapses: int
+    groups: tuple[str, ...]
+    cores: tuple[str, ...]
+    input_cores: tuple[str, ...]
+    floating_currents: tuple[str, ...] | None = field(default=None, metadata=OPTIONAL)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OnnxFacts:
+    """What an ONNX file of a netlist holds, and what it takes and gives, as words."""
+
+    neurons: int
+    synapses: int
+    form: str
+    inputs: list[str]
+    outputs: list[str]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NirFacts:
+    """What a NIR file holds, and how its time constants count: seconds of a step, and the convention."""
+
+    neurons: int
+    synapses: int
+    dt: float
+    convention: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NetxLayer:
+    """What netx changes in a layer, and the spikes that this moves where recordings were given."""
+
+    name: str
+    biases: int
+    biases_rounded: int
+    furthest_steps: float
+    threshold_rounded: bool
+    rescaled_by: float
+    spikes_moved: int | None = field(default=None, metadata=OPTIONAL)
+    spikes: int | None = field(default=None, metadata=OPTIONAL)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NetxFacts:
+    """What a netx file holds; `exact` if it is the netlist as it was."""
+
+    neurons: int
+    synapses: int
+    exact: bool
+    layers: list[NetxLayer]
+    recordings: int | None = field(default=None, metadata=OPTIONAL)
+
+
+def _sanafe(request: Request) -> Export:
+    netlist = read_netlist(request.source)
+    target = load_target(netlist.target)
+    places = sanafe.cores(netlist, target)
+    facts = SanafeFacts(
+        neurons=netlist.n_compartments,
+        synapses=netlist.n_synapses,
+        groups=(sanafe.INPUT, *sanafe.group_names(netlist)),
+        cores=places[: netlist.n_cores],
+        input_cores=places[netlist.n_cores :],
+        floating_currents=sanafe.floating_layers(netlist) or None,
+    )
+    lines = [
+        f"groups: {', '.join(facts.groups)}",
+        f"cores (tile.core): {', '.join(facts.cores)}; of the inputs: {', '.join(facts.input_cores)}",
+    ]
+    if facts.floating_currents:
+        lines.append(f"currents of {', '.join(facts.floating_currents)} are floats there, so spikes may differ")
+    content = (f"{line}\n".encode() for line in sanafe.export(netlist, target))
+    return Export(content=content, facts=facts, synapses=facts.synapses, lines=tuple(lines))
+
+
+def _onnx(request: Request) -> Export:
+    netlist, form = read_netlist(request.source), request.form or "scan"
+    content = onnx.export(netlist, form)
+    inputs, outputs = port_words(content)
+    facts = OnnxFacts(
+        neurons=netlist.n_compartments, synapses=netlist.n_synapses, form=form, inputs=inputs, outputs=outputs
+    )
+    lines = port_lines(inputs, outputs)
+    return Export(content=[content], facts=facts, synapses=facts.synapses, form=form, lines=lines)
+
+
+def port_lines(inputs: list[str], outputs: list[str]) -> tuple[str, ...]:
+    """Inputs and outputs of an ONNX graph, for people."""
+    return ("inputs:", *(f"  {port}" for port in inputs), "outputs:", *(f"  {p}" for p in outputs))
+
+
+def _nir(request: Request) -> Export:
+    netlist = read_netlist(request.source)
+    dt = BIN_S * netlist.bins if request.dt is None else request.dt
+    facts = NirFacts(
+        neurons=sum(layer.neurons for layer in netlist.layers),
+        synapses=netlist.n_synapses,
+        dt=dt,
+        convention=CONVENTIONS[0],
+    )
+    lines = (f"in steps of {dt:g} s ({facts.convention})",)
+    return Export(content=[nir.export(netlist, dt)], facts=facts, synapses=facts.synapses, lines=lines)
+
+
+def _netx(request: Request) -> Export:
+    netlist = read_netlist(request.source)
+    network = lift(netlist)
+    blocks = netx.blocks_for(network)
+    layers = [
+        NetxLayer(
+            name=block.name,
+            biases=len(block.bias),
+            biases_rounded=block.rounded,
+            furthest_steps=block.furthest,
+            threshold_rounded=block.threshold_rounded,
+            rescaled_by=2.0**block.shift,
+        )
+        for block in blocks
+    ]
+    rounded = [line for layer in layers if (line := _rounding(layer))]
+    if request.strict and rounded:
+        raise OptionError(f"--strict: netx cannot hold {request.source} as it is ({'; '.join(rounded)})")
+    lines = rounded or ["biases, thresholds and weights are the netlist's"]
+    count = None
+    if request.recordings is not None:
+        data = request.recordings(netlist.classes, netlist.taxels, netlist.bins)
+        moved = netx.moved_spikes(network, blocks, channels_last(data.events, netlist.clocks))
+        layers = [replace(layer, spikes_moved=moved[layer.name][0], spikes=moved[layer.name][1]) for layer in layers]
+        count = len(data)
+        shown = ", ".join(f"{layer.name} {layer.spikes_moved:,} of {layer.spikes:,}" for layer in layers)
+        lines.append(f"spikes that differ from the netlist's on {count} recordings: {shown}")
+    elif rounded:
+        lines.append("--data counts the spikes that this moves")
+    facts = NetxFacts(
+        neurons=sum(len(block.bias) for block in blocks),
+        synapses=sum(block.synapses for block in blocks),
+        exact=not rounded,
+        layers=layers,
+        recordings=count,
+    )
+    content = netx.file_bytes(netx.tree_of(network, blocks))
+    return Export(content=[content], facts=facts, synapses=facts.synapses, lines=tuple(lines))
+
+
+def _rounding(layer: NetxLayer) -> str:
+    """What was rounded in a layer, for people; empty if nothing."""
+    words = []
+    if layer.biases_rounded:
+        words.append(
+            f"{layer.biases_rounded} of {layer.biases} biases rounded, by {layer.furthest_steps:.3g} steps at most"
+        )
+    words += ["threshold rounded"] if layer.threshold_rounded else []
+    words += [f"rescaled by {layer.rescaled_by:g}"] if layer.rescaled_by != 1 else []
+    return f"{layer.name}: {', '.join(words)}" if words else ""
+
+
+FORMATS = (
+    Format(
+        name="sanafe",
+        title=f"network and mapping of a netlist for SANA-FE {sanafe.VERSION}, YAML",
+        write=_sanafe,
+    ),
+    Format(
+        name="onnx", title="a netlist as an integer ONNX graph, bit for bit the chip", write=_onnx, options=("form",)
+    ),
+    Format(name="nir", title="a netlist as a NIR file in weight units", write=_nir, options=("dt",)),
+    Format(
+        name="netx",
+        title="a netlist as a .net file of lava-dl, biases rounded to whole weight steps",
+        write=_netx,
+        options=("data", "split", "bin", "limit", "strict"),
+    ),
+)

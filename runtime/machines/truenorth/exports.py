@@ -1,0 +1,48 @@
+"""Files of crossbar cores for other programs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from spikeloom.compiler.dynamics import with_clocks
+from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.formats import ranc
+from spikeloom.runtime.machines.export_format import Export, Format, Request
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RancFacts:
+    """What a file for RANC holds; `ticks` to run it for, None without a recording."""
+
+    neurons: int
+    synapses: int
+    ticks: int | None
+
+
+def _ranc(request: Request) -> Export:
+    netlist = ranc.read(request.source)
+    events = None
+    if request.recordings is not None:
+        data, number = request.recordings(netlist.classes, netlist.taxels, 1), request.recording or 0
+        if not 0 <= number < len(data.files):
+            raise OptionError(f"--recording {number}: --data has recordings 0 to {len(data.files) - 1}")
+        events = with_clocks(data.events[number : number + 1], netlist.clocks)[0, :, : data.steps_of(number)]
+    ticks = None if events is None else netlist.ticks(events.shape[1]) + 1
+    path, out = request.output, request.output.removesuffix(".json") + ".out"
+    shown = "no recording, add packets" if ticks is None else f"{ticks} ticks"
+    return Export(
+        content=(f"{line}\n".encode() for line in ranc.export(netlist, events)),
+        facts=RancFacts(neurons=netlist.n_neurons, synapses=netlist.n_synapses, ticks=ticks),
+        synapses=netlist.n_synapses,
+        lines=(f"run: ranc_sim {path} {out} {path} TICKS ({shown})",),
+    )
+
+
+FORMATS = (
+    Format(
+        name="ranc",
+        title="TrueNorth cores, and a recording, for RANC's simulator, JSON",
+        write=_ranc,
+        options=("data", "split", "bin", "recording"),
+    ),
+)
