@@ -12,10 +12,10 @@ import argparse
 
 import numpy as np
 
+from spikeloom.compiler import compile_network
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.formats.checkpoint import read_checkpoint
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.targets.loihi1.compilation import compile_network
 from spikeloom.models.recordings.evtouch import load_recordings
 from spikeloom.runtime.commands.choose.anytime import ALLOWED
 from spikeloom.runtime.costs import course

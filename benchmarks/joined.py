@@ -18,12 +18,12 @@ from typing import Any
 import numpy as np
 from paper.measured import float_decisions
 
+from spikeloom.compiler import Options, compile_network
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.formats.checkpoint import Checkpoint, read_checkpoint
 from spikeloom.compiler.formats.towers import join
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.base import load_target
-from spikeloom.compiler.targets.loihi1.compilation import compile_network
 from spikeloom.models.recordings.events import joined_bins
 from spikeloom.models.recordings.evtouch import Recordings, load_recordings
 from spikeloom.runtime.costs.estimate import estimate
@@ -74,7 +74,9 @@ def measured(network: Checkpoint, training: Recordings, test: Recordings, *, spi
     training, test = (joined_bins(each, network.bins) for each in (training, test))
     _, adjacency = propagation(network, None, "joined")
     decided = float_decisions(network, adjacency, test)
-    compilation = compile_network(expand(network, adjacency), training_events=training.events, spike_exact=spike_exact)
+    compilation = compile_network(
+        expand(network, adjacency), Options(training_events=training.events, spike_exact=spike_exact)
+    )
     netlist = compilation.netlist
     events = with_clocks(test.events, netlist.clocks)
     counts, costs = estimate(netlist, load_target("loihi1"), events, lengths=test.lengths)

@@ -14,9 +14,9 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from spikeloom.compiler import Options, compile_network
 from spikeloom.compiler.formats.checkpoint import read_checkpoint
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.targets.loihi1.compilation import compile_network
 from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.models.networks.reference import float_spikes
 from spikeloom.models.recordings.evtouch import load_recordings
@@ -44,12 +44,12 @@ def main() -> None:
     adjacency = normalised_adjacency(graph.edges, graph.n_taxels)
     train = load_recordings(arguments.recordings, "train").events
     test = load_recordings(arguments.recordings, "test").events
-    netlist = compile_network(expand(checkpoint, adjacency), training_events=train).netlist
+    netlist = compile_network(expand(checkpoint, adjacency), Options(training_events=train)).netlist
     flat = test.reshape(len(test), netlist.n_inputs, -1)
     prepared = engine.prepare(netlist)
 
     jobs: dict[str, Callable[[], Any]] = {
-        "compile, calibrated": lambda: compile_network(expand(checkpoint, adjacency), training_events=train),
+        "compile, calibrated": lambda: compile_network(expand(checkpoint, adjacency), Options(training_events=train)),
         "compile, from the weights": lambda: compile_network(expand(checkpoint, adjacency)),
         "engine, all recordings": lambda: engine.simulate(prepared, flat, threads=1),
         "engine, one recording": lambda: engine.simulate(prepared, flat[:1], threads=1),

@@ -16,13 +16,12 @@ from typing import Any
 
 import numpy as np
 
+from spikeloom.compiler import Options, Recipe, compile_network
 from spikeloom.compiler.formats.atomic import write_atomically
 from spikeloom.compiler.formats.checkpoint import Checkpoint, read_checkpoint
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.base import load_target
-from spikeloom.compiler.targets.loihi1.compilation import compile_network
-from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe
 from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.models.networks.reference import float_spikes
 from spikeloom.models.recordings.evtouch import Recordings, load_recordings
@@ -33,9 +32,9 @@ from spikeloom.runtime.machines.loihi1.trace import aligned, heard
 from spikeloom.runtime.machines.votes import predictions
 from spikeloom.runtime.report.intervals import wilson
 
-Options = dict[str, Any]
+Scheme = dict[str, Any]
 
-SCHEMES: dict[str, tuple[str, Options]] = {
+SCHEMES: dict[str, tuple[str, Scheme]] = {
     "8 bits, from the weights": ("", {"calibrated": False}),
     "8 bits": ("", {}),
     "2 × 8 bits": ("", {"recipes": (Recipe(planes=2),)}),
@@ -51,13 +50,13 @@ SCHEMES: dict[str, tuple[str, Options]] = {
 
 
 def measure(
-    checkpoint: Checkpoint, adjacency: Any, training: Recordings, test: Recordings, reference: Any, options: Options
-) -> Options:
+    checkpoint: Checkpoint, adjacency: Any, training: Recordings, test: Recordings, reference: Any, options: Scheme
+) -> Scheme:
     """Compile and run one network by one scheme."""
     options = dict(options)
     events = training.events if options.pop("calibrated", True) else None
     netlist = compile_network(
-        expand(checkpoint, adjacency), forms=checkpoint.forms, training_events=events, **options
+        expand(checkpoint, adjacency), Options(forms=checkpoint.forms, training_events=events, **options)
     ).netlist
     trace = engine.simulate(netlist, test.events.reshape(len(test), -1, test.steps), spikes=True)
     assert trace.spikes is not None

@@ -24,11 +24,11 @@ import numpy as np
 from growth_chart import draw_skins
 from scipy import sparse
 
+from spikeloom.compiler import Options, compile_network
 from spikeloom.compiler.formats.atomic import write_atomically
 from spikeloom.compiler.ir import INPUT, Input, Network, Population, Projection, Readout
 from spikeloom.compiler.passes.expand import expand_graph_convolution
 from spikeloom.compiler.targets.base import load_target
-from spikeloom.compiler.targets.loihi1.compilation import compile_network
 from spikeloom.compiler.targets.loihi1.layout.chips import chip_count
 from spikeloom.runtime.machines.loihi1 import engine
 
@@ -93,7 +93,7 @@ def measure(taxels: int) -> dict[str, Any]:
     network = skin(taxels)
     made = time.perf_counter()
     built = held()
-    compilation = compile_network(network, chips=1 + taxels // 1000)
+    compilation = compile_network(network, Options(chips=1 + taxels // 1000))
     netlist, placement = compilation.netlist, compilation.placement
     compiled, compile_bytes = time.perf_counter(), held()
     del network, compilation

@@ -1,1 +1,85 @@
 """Checkpoint to network to integer netlist; imports nothing of ours outside this package."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from spikeloom.compiler.ir import IntegerNetwork, Network
+    from spikeloom.compiler.passes.expand import Factored
+    from spikeloom.compiler.targets.loihi1.compilation import Compilation
+    from spikeloom.compiler.targets.loihi1.lift import lift
+    from spikeloom.compiler.targets.loihi1.netlist import Netlist
+    from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist, write_netlist
+    from spikeloom.compiler.targets.loihi1.options import Options, Recipe
+    from spikeloom.compiler.targets.loihi1.passes import lay_out_again, store, without
+
+__all__ = [
+    "Compilation",
+    "Netlist",
+    "Options",
+    "Recipe",
+    "compile_network",
+    "lay_out_again",
+    "lift",
+    "read_netlist",
+    "store",
+    "without",
+    "write_netlist",
+]
+
+DEFAULT_TARGET = "loihi1"
+
+_PLACES = {
+    "Compilation": "compilation",
+    "Netlist": "netlist",
+    "Options": "options",
+    "Recipe": "options",
+    "lay_out_again": "passes",
+    "lift": "lift",
+    "read_netlist": "netlist_file",
+    "store": "passes",
+    "without": "passes",
+    "write_netlist": "netlist_file",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name when it is first used."""
+    from importlib import import_module
+
+    if name not in _PLACES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.targets.{DEFAULT_TARGET}.{_PLACES[name]}"), name)
+
+
+def compile_network(
+    source: Factored | Network | IntegerNetwork,
+    options: Options | None = None,
+    *,
+    target: str = DEFAULT_TARGET,
+    after: Callable[[str, Compilation], object] | None = None,
+) -> Compilation:
+    """Lower a network, wherever it comes from, to a placed netlist that obeys every limit of the chip.
+
+    Parameters
+    ----------
+    source : Factored, Network or IntegerNetwork
+        Trained weights on their graph, a float network, or integers that are taken as they stand.
+    options : Options, optional
+        Of the target.
+    target : str
+        Chip.
+    after : callable, optional
+        Called with the name of each pass of the target and the compilation as far as it is.
+
+    Raises
+    ------
+    OptionError, ModelError, DataError, CapacityError
+        As the passes say.
+    """
+    from spikeloom.compiler.targets.base import load_target
+
+    done: Compilation = load_target(target).compile(source, options, after=after)
+    return done

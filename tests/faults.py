@@ -10,15 +10,14 @@ from dataclasses import dataclass
 import numpy as np
 from random_networks import compiled, random_checkpoint
 
+from spikeloom.compiler import Options, Recipe, compile_network, lift
 from spikeloom.compiler.errors import SpikeloomError
 from spikeloom.compiler.formats.checkpoint import Checkpoint
 from spikeloom.compiler.interpret import channels_last
 from spikeloom.compiler.ir import IntegerNetwork
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.targets.loihi1.compilation import compile_network
-from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
-from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe, round_to_forms
+from spikeloom.compiler.targets.loihi1.storage.quantize import round_to_forms
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import Form
 from spikeloom.models.graphs import normalised_adjacency
 from spikeloom.runtime.commands.check.explain import left_out
@@ -74,13 +73,15 @@ class Base:
         checkpoint = self.checkpoint if checkpoint is None else checkpoint
         adjacency = normalised_adjacency(self.edges if edges is None else edges, checkpoint.taxels)
         return compile_network(
-            expand(checkpoint, adjacency), recipes=(self.recipe,), training_events=self.calibration
+            expand(checkpoint, adjacency), Options(recipes=(self.recipe,), training_events=self.calibration)
         ).netlist
 
 
 def base_of(checkpoint, edges, recipe, events, calibration=None) -> Base:
     adjacency = normalised_adjacency(edges, checkpoint.taxels)
-    netlist = compile_network(expand(checkpoint, adjacency), recipes=(recipe,), training_events=calibration).netlist
+    netlist = compile_network(
+        expand(checkpoint, adjacency), Options(recipes=(recipe,), training_events=calibration)
+    ).netlist
     return Base(
         checkpoint=checkpoint,
         edges=edges,

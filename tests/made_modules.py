@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe
+from spikeloom.compiler import Options, Recipe
 from spikeloom.models.networks.lif import LIF, OneStep
 from spikeloom.models.networks.module import compile_module
 
@@ -130,7 +130,9 @@ def at_a_tie(*, cached):
     """Message passing with a weight between two integers, nearer to the other one for float32 coefficients."""
     net = seeded(lambda: graph_net(Messages(2, 8, cached=cached)))
     two = (Recipe(planes=2),)
-    scale = 2 * compile_module(gcn(), example_of("gcn"), recipes=two).integer.populations[0].threshold[0]
+    scale = (
+        2 * compile_module(gcn(), example_of("gcn"), options=Options(recipes=two)).integer.populations[0].threshold[0]
+    )
     exact, rounded = 1 / 3, float((np.float32(3) ** np.float32(-0.5)) ** 2)
     for middle in range(20, 4000):
         weight = np.float32((middle + 0.5) / scale / exact)

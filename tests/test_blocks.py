@@ -6,12 +6,11 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from random_netlists import Axon, Neuron, assert_equal, build, by_engine, by_steps, recording_of
 
+from spikeloom.compiler import Options, Recipe, compile_network
 from spikeloom.compiler.errors import NumericRangeError
 from spikeloom.compiler.formats.checkpoint import read_checkpoint
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.targets.loihi1.compilation import compile_network
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
-from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe
 from spikeloom.runtime.machines.loihi1 import engine, spec
 from spikeloom.runtime.machines.loihi1.blocks import lay_out_blocks
 from spikeloom.runtime.machines.loihi1.trace import Charges, pack, unpack
@@ -259,7 +258,7 @@ def test_the_released_network(released_checkpoint, objects_zip, recipe):
     graph = build_graph("manual")
     checkpoint = read_checkpoint(released_checkpoint)
     adjacency = normalised_adjacency(graph.edges, graph.n_taxels)
-    netlist = compile_network(expand(checkpoint, adjacency), recipes=(recipe,)).netlist
+    netlist = compile_network(expand(checkpoint, adjacency), Options(recipes=(recipe,))).netlist
     recordings = load_recordings(objects_zip, "test")
     events = recordings.events[::24].reshape(6, -1, recordings.steps)
     prepared = engine.prepare(netlist)

@@ -13,8 +13,9 @@ from random_networks import (
     recordings_for,
 )
 
+from spikeloom.compiler import Recipe
 from spikeloom.compiler.interpret import run_integer
-from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe, quantize
+from spikeloom.compiler.targets.loihi1.storage.quantize import quantize
 from spikeloom.compiler.targets.loihi1.storage.range_proof import prove_ranges
 
 

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from made_files import CLASSES, STEPS, TAXELS, events, small_checkpoint, weights
 
+from spikeloom.compiler import Options, Recipe, compile_network
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.targets.loihi1.compilation import compile_network
-from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe
 from spikeloom.runtime import cli
 from spikeloom.runtime.equivalence import verdicts
 from spikeloom.runtime.equivalence.breakdowns import breakdowns
@@ -81,7 +80,7 @@ def test_nearly_empty_recordings():
 
 def verified(folder, arrays, recordings, recipe, **options):
     checkpoint, adjacency = small_checkpoint(folder, last=arrays)
-    netlist = compile_network(expand(checkpoint, adjacency), recipes=(recipe,), **options).netlist
+    netlist = compile_network(expand(checkpoint, adjacency), Options(recipes=(recipe,), **options)).netlist
     verdict = verify(netlist, checkpoint, adjacency, recordings, LABELS, FILES)
     report = verdicts.verify_json(verdict, levels_of(verdict), [])
     return {breakdown["kind"]: breakdown for breakdown in report["breakdowns"]}, verdicts.verify_text(report)

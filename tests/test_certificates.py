@@ -8,12 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_files import CLASSES, FEATURES, TAXELS, events, ring, small_checkpoint, weights
 
+from spikeloom.compiler import Options, Recipe, compile_network, lift
 from spikeloom.compiler.formats.checkpoint import Checkpoint
 from spikeloom.compiler.interpret import channels_last, run_float, vote
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.targets.loihi1.compilation import compile_network
-from spikeloom.compiler.targets.loihi1.lift import lift
-from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe
 from spikeloom.models.networks.reference import float_spikes
 from spikeloom.runtime.equivalence.certainty import _recurrence, float_certainty
 from spikeloom.runtime.equivalence.certificates import certificate_json, certificate_text, certify, wins
@@ -192,7 +190,7 @@ def by_hand(checkpoint, adjacency, recordings, chip, kept=None, lengths=None):
 @pytest.mark.parametrize("bits", [4, 8])
 def test_entries_are_counted_once_each(folder, bits):
     checkpoint, adjacency = model(folder, 3)
-    netlist = compile_network(expand(checkpoint, adjacency), recipes=(Recipe(bits=bits),)).netlist
+    netlist = compile_network(expand(checkpoint, adjacency), Options(recipes=(Recipe(bits=bits),))).netlist
     recordings = events(4, samples=10, steps=12)
     chip, decisions = on_chip(netlist, recordings)
     found = certify(checkpoint, adjacency, lift(netlist), recordings, chip, decisions)
@@ -210,7 +208,7 @@ def test_entries_are_counted_once_each(folder, bits):
 
 def test_parts_of_layers_and_of_recordings(folder):
     checkpoint, adjacency = model(folder, 3)
-    netlist = compile_network(expand(checkpoint, adjacency), recipes=(Recipe(bits=4),)).netlist
+    netlist = compile_network(expand(checkpoint, adjacency), Options(recipes=(Recipe(bits=4),))).netlist
     recordings, lengths = events(4, samples=3, steps=12), np.array([5, 12, 9])
     for recording, length in zip(recordings, lengths, strict=True):
         recording[..., length:] = 0
@@ -226,7 +224,7 @@ def test_parts_of_layers_and_of_recordings(folder):
 
 def test_a_flipped_spike_is_certified_different(folder):
     checkpoint, adjacency = model(folder, 3)
-    netlist = compile_network(expand(checkpoint, adjacency), recipes=(Recipe(bits=8),)).netlist
+    netlist = compile_network(expand(checkpoint, adjacency), Options(recipes=(Recipe(bits=8),))).netlist
     recordings = events(4, samples=2, steps=12)
     chip, decisions = on_chip(netlist, recordings)
     _, doubt = float_certainty(checkpoint, adjacency, recordings)[1]
@@ -275,7 +273,7 @@ def test_the_same_network_at_its_thresholds_is_not(tmp_path):
 def test_registers_without_a_proof_are_named(tmp_path):
     """Almost without leak a negative input adds up almost without end: the membrane may clip, and is said to."""
     checkpoint, adjacency = small_checkpoint(tmp_path, beta=4095 / 4096)
-    netlist = compile_network(expand(checkpoint, adjacency), keep_all=True).netlist
+    netlist = compile_network(expand(checkpoint, adjacency), Options(keep_all=True)).netlist
     recordings = events(2, steps=8)
     found = certify(checkpoint, adjacency, lift(netlist), recordings, *on_chip(netlist, recordings))
     assert found.unproven == ("conv1", "fc1", "fc2", "fc3")

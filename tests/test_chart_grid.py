@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.targets.base import load_target
-from spikeloom.compiler.targets.loihi1.layout.choose import GOALS
+from spikeloom.compiler.targets.loihi1.options import GOALS
 from spikeloom.runtime.studies.chart.grid import Grid, axes, parse_grid
 
 TARGET = load_target("loihi1")

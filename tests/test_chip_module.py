@@ -16,11 +16,10 @@ from numpy.testing import assert_array_equal
 from random_networks import float_networks
 from timed_networks import events_of, written
 
+from spikeloom.compiler import compile_network, lift
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.interpret import run_integer, vote
-from spikeloom.compiler.targets.loihi1.compilation import compile_network
-from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.runtime.cli import main
 from spikeloom.runtime.machines.chip_module import ChipModule, neurobench_model

@@ -18,13 +18,12 @@ from made_files import weights as made_weights
 
 from spikeloom import __version__
 from spikeloom.__main__ import main as start
+from spikeloom.compiler import lift
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.interpret import channels_last, run_integer
 from spikeloom.compiler.targets.base import EVENTS, load_target
-from spikeloom.compiler.targets.loihi1.compilation import STAGES
-from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
-from spikeloom.compiler.text import text
+from spikeloom.compiler.targets.loihi1.netlist_text import netlist_text
 from spikeloom.models.graphs import build_graph
 from spikeloom.models.recordings.grasps import synthetic_split
 from spikeloom.runtime import cli
@@ -262,16 +261,19 @@ def test_inspect_shows_an_own_file(as_json, spikeloom):
 
 
 def test_dumps_go_to_standard_error(spikeloom, tmp_path):
-    words = [word for stage in STAGES for word in ("--dump-after", stage)]
+    words = [word for step in load_target("loihi1").passes for word in ("--dump-after", step.name)]
     code, out, err = spikeloom("compile", "net.pt", *words, "-o", tmp_path / "out.loom", "--json")
     assert code == 0
     json.loads(out)
-    netlist = text(read_netlist(tmp_path / "out.loom"))
+    netlist = netlist_text(read_netlist(tmp_path / "out.loom"))
     assert err.endswith(netlist)
     assert err.startswith("(float network (input 6 taxels x 2) (classes 4)\n")
     assert "(integer network (input 6 taxels x 2) (classes 4)\n" in err
-    _, _, err = spikeloom("compile", "net.pt", "--dump-after", "place", "-o", tmp_path / "out.loom")
+    _, _, err = spikeloom("compile", "net.pt", "--dump-after", "emit", "-o", tmp_path / "out.loom")
     assert err == netlist
+    code, _, err = spikeloom("compile", "net.pt", "--dump-after", "nothing", "-o", tmp_path / "out.loom")
+    assert code == 2
+    assert "--dump-after nothing: no such pass; allowed: expand, calibrate, " in err
 
 
 def test_the_graph_of_a_released_file_comes_from_the_user(as_json, tmp_path):

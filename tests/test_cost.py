@@ -8,12 +8,13 @@ from made_files import events, small_checkpoint
 from random_netlists import Axon, Neuron, build
 from random_networks import LOIHI, small_target
 
+from spikeloom.compiler import Recipe
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.base import EnergyTable, Quantity
 from spikeloom.compiler.targets.loihi1.emit import emit
 from spikeloom.compiler.targets.loihi1.layout.partition import partition
 from spikeloom.compiler.targets.loihi1.layout.place import core_traffic, place
-from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe, quantize
+from spikeloom.compiler.targets.loihi1.storage.quantize import quantize
 from spikeloom.runtime.costs import cost
 from spikeloom.runtime.costs.estimate import estimate
 from spikeloom.runtime.costs.estimates import estimate_json, estimate_text

@@ -9,12 +9,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 from random_networks import chain, compiled, integer_chain, random_checkpoint
 from timed_networks import written
 
+from spikeloom.compiler import Options, Recipe, compile_network, lift
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.formats.checkpoint import read_checkpoint
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.targets.loihi1.compilation import compile_network
-from spikeloom.compiler.targets.loihi1.lift import lift
-from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import decay_registers
 from spikeloom.models.graphs import normalised_adjacency
 from spikeloom.runtime.equivalence import float_engine
@@ -28,7 +26,7 @@ def made(seed=0, recipe=None, taxels=6):
     """A pair of a small TactileSGNet."""
     checkpoint = random_checkpoint(taxels=taxels, features=4, sizes=(9, 8, 4), seed=seed)
     network = expand(checkpoint, normalised_adjacency(ring(taxels).edges, taxels))
-    return Pair(netlist=compile_network(network, recipes=recipe).netlist, network=network)
+    return Pair(netlist=compile_network(network, Options(recipes=recipe)).netlist, network=network)
 
 
 def drawn(seed=0):

@@ -14,11 +14,12 @@ from random_networks import (
     tight_targets,
 )
 
+from spikeloom.compiler import Recipe
 from spikeloom.compiler.interpret import run_integer
 from spikeloom.compiler.ir import INPUT, fan_in
 from spikeloom.compiler.targets.loihi1.emit import emit
 from spikeloom.compiler.targets.loihi1.legalize import require_legal
-from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe, quantize
+from spikeloom.compiler.targets.loihi1.storage.quantize import quantize
 from spikeloom.runtime.machines.loihi1 import spec
 from spikeloom.runtime.machines.loihi1.trace import aligned
 

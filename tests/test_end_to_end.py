@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from made_files import own_file, recordings_folder, weights
 
+from spikeloom.compiler import Options, compile_network
 from spikeloom.compiler.formats.checkpoint import read_checkpoint
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.targets.loihi1.compilation import compile_network
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import netlist_bytes, read_netlist
 from spikeloom.models.graphs import build_graph, normalised_adjacency
@@ -213,8 +213,7 @@ def test_compiled_again_the_bytes_are_the_same(compiled, released_checkpoint, ob
     graph = build_graph("manual")
     again = compile_network(
         expand(read_checkpoint(released_checkpoint), normalised_adjacency(graph.edges, graph.n_taxels)),
-        training_events=load_recordings(objects_zip, "train").events,
-        provenance=first.provenance,
+        Options(training_events=load_recordings(objects_zip, "train").events, provenance=first.provenance),
     )
     assert netlist_bytes(again.netlist) == path.read_bytes()
 

@@ -10,13 +10,11 @@ from hypothesis import strategies as st
 from made_files import STEPS, events, own_file, recordings_folder, small_checkpoint, weights
 from random_netlists import Neuron, build
 
+from spikeloom.compiler import Options, Recipe, compile_network, lift
 from spikeloom.compiler.errors import DataError, ModelError
 from spikeloom.compiler.interpret import channels_last, run_float
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.targets.loihi1.compilation import compile_network
-from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist import read_only
-from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe
 from spikeloom.models.networks.reference import float_membranes, float_spikes
 from spikeloom.runtime import cli
 from spikeloom.runtime.equivalence import verify as equivalence
@@ -34,7 +32,7 @@ FILES = tuple("abcdef")
 def small(tmp_path_factory):
     """A checkpoint, its propagation matrix and a coarse netlist that often strays from it."""
     checkpoint, adjacency = small_checkpoint(tmp_path_factory.mktemp("small"))
-    netlist = compile_network(expand(checkpoint, adjacency), recipes=(Recipe(bits=4),)).netlist
+    netlist = compile_network(expand(checkpoint, adjacency), Options(recipes=(Recipe(bits=4),))).netlist
     return checkpoint, adjacency, netlist
 
 
@@ -108,7 +106,7 @@ def test_the_first_divergence_is_the_first(small, verdict):
 @pytest.mark.parametrize("seed", range(6))
 def test_the_first_divergence_of_other_networks(tmp_path, seed):
     checkpoint, adjacency = small_checkpoint(tmp_path, last=weights(seed))
-    netlist = compile_network(expand(checkpoint, adjacency), recipes=(Recipe(bits=6),), keep_all=True).netlist
+    netlist = compile_network(expand(checkpoint, adjacency), Options(recipes=(Recipe(bits=6),), keep_all=True)).netlist
     recordings = events(seed, samples=3)
     found = verify(netlist, checkpoint, adjacency, recordings, LABELS[:3], FILES[:3], spec_samples=1).first_divergence
     reference = list(float_spikes(checkpoint, adjacency, recordings).values())
@@ -197,7 +195,7 @@ def test_ill_posed_spikes_are_told_from_faults(tmp_path):
     arrays["fc1.bias"][:] = 2.0
     arrays["fc2.weight"][:, :2] = [1.0, 2.0**-25]
     checkpoint, adjacency = small_checkpoint(tmp_path, last=arrays, beta=0.0, theta=1.0)
-    netlist = compile_network(expand(checkpoint, adjacency), keep_all=True).netlist
+    netlist = compile_network(expand(checkpoint, adjacency), Options(keep_all=True)).netlist
     found = verify(netlist, checkpoint, adjacency, events(0), LABELS, FILES)
     assert found.spikes["fc2"].float == 0
     assert found.spikes["fc2"].ill_posed == 6 * STEPS * 8

@@ -7,10 +7,9 @@ import pytest
 from made_files import events, small_checkpoint
 from random_networks import LOIHI
 
+from spikeloom.compiler import Options, Recipe, compile_network
 from spikeloom.compiler.errors import DataError
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.targets.loihi1.compilation import compile_network
-from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe
 from spikeloom.runtime.costs import cost as cost_of
 from spikeloom.runtime.costs.charges import charges, simple_from
 from spikeloom.runtime.costs.estimate import estimate
@@ -23,7 +22,7 @@ LENGTHS = np.array([30, 7, 1, 30])
 @pytest.fixture(scope="module")
 def small(tmp_path_factory):
     checkpoint, adjacency = small_checkpoint(tmp_path_factory.mktemp("small"))
-    netlist = compile_network(expand(checkpoint, adjacency), recipes=(Recipe(planes=2),)).netlist
+    netlist = compile_network(expand(checkpoint, adjacency), Options(recipes=(Recipe(planes=2),))).netlist
     recordings = events(5, samples=4, steps=30)
     return netlist, recordings.reshape(4, netlist.n_inputs, -1)
 

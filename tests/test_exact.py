@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from random_networks import LOIHI, chain, random_checkpoint
 
+from spikeloom.compiler import Options, Recipe, compile_network
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.interpret import run_integer
 from spikeloom.compiler.invariants import verify
 from spikeloom.compiler.passes.calibrate import calibrate
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.targets.loihi1.compilation import compile_network
-from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe, quantize
+from spikeloom.compiler.targets.loihi1.storage.quantize import quantize
 from spikeloom.compiler.targets.loihi1.storage.spike_exact import make_exact
 
 
@@ -74,7 +74,7 @@ def test_an_outlier_takes_another_plane():
         ({}, "--spike-exact: nothing to be exact on; give --calibrate"),
         (
             {"training_events": np.ones((2, 5, 2, 8), np.uint8), "ranges": "observed"},
-            "--spike-exact: needs proven ranges, --ranges says observed; leave --ranges away",
+            "--spike-exact: needs proven ranges, --ranges says observed; omit --ranges",
         ),
         (
             {"training_events": np.ones((2, 5, 2, 8), np.uint8), "recipes": (Recipe(planes=2),)},
@@ -88,5 +88,5 @@ def test_an_outlier_takes_another_plane():
 )
 def test_exactness_that_cannot_be_had(options, message):
     with pytest.raises(OptionError) as caught:
-        compile_network(expand(random_checkpoint(), np.eye(5)), spike_exact=True, **options)
+        compile_network(expand(random_checkpoint(), np.eye(5)), Options(spike_exact=True, **options))
     assert str(caught.value) == message

@@ -9,13 +9,12 @@ from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 from random_netlists import Axon, Neuron, build, large_netlist, netlists, recordings
 
+from spikeloom.compiler import compile_network, lift
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import NumericRangeError
 from spikeloom.compiler.formats.checkpoint import read_checkpoint
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.targets.loihi1.compilation import compile_network
-from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist import read_only
 from spikeloom.models.graphs import normalised_adjacency
 from spikeloom.models.recordings.evtouch import load_recordings

@@ -1,17 +1,17 @@
 import dataclasses
-import re
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from oracles import probed
 from random_networks import random_checkpoint
 
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.interpret import run_float
 from spikeloom.compiler.invariants import verify
 from spikeloom.compiler.ir import INPUT, depths, fan_in
-from spikeloom.compiler.passes.expand import expand, expand_graph_convolution, probe_affine
+from spikeloom.compiler.passes.expand import expand, expand_graph_convolution
 from spikeloom.models.graphs import build_graph, normalised_adjacency
 
 # Pairs of taxels within three hops times 64 features and 2 polarities. The hand-drawn graph, the tree and 1, 3 and 4
@@ -66,14 +66,14 @@ def graphs(draw):
 def test_the_expanded_convolution_is_the_probed_one(adjacency, n_hops, features, channels, seed):
     hops = np.random.default_rng(seed).normal(size=(n_hops, features, channels))
     expanded = expand_graph_convolution(adjacency, hops)
-    weight, bias = probe_affine(factored(adjacency, hops), len(adjacency) * channels, name="conv1")
+    weight, bias = probed(factored(adjacency, hops), len(adjacency) * channels)
     np.testing.assert_allclose(expanded.toarray(), weight, rtol=0, atol=1e-12)
     assert not bias.any()
 
 
 def test_the_expanded_convolution_is_the_probed_one_on_the_manual_graph():
     adjacency, hops = adjacency_of("manual"), np.random.default_rng(1).normal(size=(4, 64, 2))
-    weight, _ = probe_affine(factored(adjacency, hops), 78, name="conv1")
+    weight, _ = probed(factored(adjacency, hops), 78)
     np.testing.assert_allclose(expand_graph_convolution(adjacency, hops).toarray(), weight, rtol=0, atol=1e-12)
 
 
@@ -116,52 +116,6 @@ def test_an_isolated_taxel_hears_itself_only():
     weight = expand_graph_convolution(adjacency, np.ones((4, 2, 2)))
     assert np.diff(weight.indptr).tolist() == [4, 4, 4, 4, 2, 2]
     assert weight.toarray()[4:].tolist() == [[0, 0, 0, 0, 1, 1]] * 2
-
-
-# --- probing
-
-
-@pytest.mark.parametrize(
-    "stage",
-    [
-        pytest.param(lambda x: np.maximum(x, 0), id="relu"),
-        pytest.param(lambda x: x + 1e-6 * x**2, id="slightly-square"),
-        pytest.param(lambda x: np.clip(x, -1e4, 1e4), id="clipped"),
-        pytest.param(lambda x: x - x.mean(axis=0), id="batch-normalised"),
-        pytest.param(lambda x: np.round(x, 3), id="rounded"),
-    ],
-)
-def test_a_stage_that_is_not_affine_is_refused(stage):
-    with pytest.raises(ModelError) as caught:
-        probe_affine(stage, 3, name="pool1")
-    assert re.fullmatch(
-        r"stage pool1: is not affine \(a random combination of inputs is off by [\d.e+-]+ of the response, 1e-09 "
-        r"allowed\); only affine stages between spiking layers can be lowered to synapses",
-        str(caught.value),
-    )
-
-
-def test_a_stage_that_is_not_a_number_is_refused():
-    with pytest.raises(ModelError) as caught:
-        probe_affine(lambda x: np.where(np.abs(x) > 1, np.nan, x), 2, name="odd")
-    assert str(caught.value) == (
-        "stage odd: is not affine (a random combination of inputs is off by nan of the response, 1e-09 allowed); "
-        "only affine stages between spiking layers can be lowered to synapses"
-    )
-
-
-def test_a_stage_that_ignores_its_input_is_affine():
-    weight, bias = probe_affine(lambda x: np.full((len(x), 2), 0.0), 3, name="silent")
-    assert (weight.tolist(), bias.tolist()) == ([[0, 0, 0], [0, 0, 0]], [0, 0])
-
-
-@given(st.integers(1, 6), st.integers(1, 6), st.integers(0, 2**32 - 1))
-def test_probing_finds_weights_and_bias(inputs, outputs, seed):
-    rng = np.random.default_rng(seed)
-    weight, bias = rng.normal(size=(outputs, inputs)), rng.normal(size=outputs)
-    found, offset = probe_affine(lambda x: x @ weight.T + bias, inputs, name="fc")
-    np.testing.assert_allclose(found, weight, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(offset, bias, rtol=0, atol=0)
 
 
 # --- whole checkpoints

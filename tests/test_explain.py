@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 from made_files import CLASSES, FEATURES, STEPS, TAXELS, own_file, recordings_folder, weights
 
+from spikeloom.compiler import Options, Recipe, compile_network, lift
 from spikeloom.compiler.formats.checkpoint import read_checkpoint
 from spikeloom.compiler.interpret import channels_last, run_float
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.targets.loihi1.compilation import compile_network
-from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
-from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe
 from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.models.recordings.events import load_data
 from spikeloom.runtime import cli
@@ -243,7 +241,7 @@ def test_every_cause_has_a_change(cause):
 def test_a_released_recording_is_explained(released_checkpoint, objects_zip):
     checkpoint = read_checkpoint(released_checkpoint)
     adjacency = normalised_adjacency(build_graph("manual").edges, checkpoint.taxels)
-    netlist = compile_network(expand(checkpoint, adjacency), recipes=(Recipe(),)).netlist
+    netlist = compile_network(expand(checkpoint, adjacency), Options(recipes=(Recipe(),))).netlist
     recording = load_data(objects_zip, "test", limit=4)[0].events[3:4]
     network, integer, prepared = expand(checkpoint, adjacency), lift(netlist), engine.prepare(netlist)
     absent, unheard = left_out(netlist)

@@ -18,9 +18,9 @@ from faults import (
     small_base,
 )
 
+from spikeloom.compiler import Recipe
 from spikeloom.compiler.formats.checkpoint import read_checkpoint
 from spikeloom.compiler.interpret import channels_last
-from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe
 from spikeloom.models.graphs import build_graph
 from spikeloom.models.recordings.events import load_data
 from spikeloom.runtime.equivalence.suspects import CAUSES, TIE, TRUNCATION

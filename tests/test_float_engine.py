@@ -10,12 +10,12 @@ from numpy.testing import assert_array_equal
 from random_networks import chain, compiled, float_networks, integer_chain, recordings_for
 from timed_networks import TIMING, events_of, written
 
+from spikeloom.compiler import Options, compile_network
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import SpikeloomError
 from spikeloom.compiler.formats.checkpoint import read_checkpoint
 from spikeloom.compiler.interpret import run_float, vote
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.targets.loihi1.compilation import compile_network
 from spikeloom.models.networks.reference import float_spikes
 from spikeloom.runtime.equivalence import float_engine
 from spikeloom.runtime.machines.loihi1 import engine
@@ -45,7 +45,7 @@ def spikes_of(prepared, netlist, inputs, **options):
 @pytest.mark.parametrize("seed", range(5))
 def test_spikes_and_votes_are_the_interpreters(seed):
     network = lively(seed=seed)
-    netlist = compile_network(network, keep_all=True).netlist
+    netlist = compile_network(network, Options(keep_all=True)).netlist
     inputs = random_inputs(network.input.size, seed)
     found, spikes = spikes_of(float_engine.prepare(network, netlist), netlist, inputs)
     wanted = run_float(network, inputs.transpose(0, 2, 1).astype(bool), dtype=np.float64).spikes
@@ -62,7 +62,7 @@ def test_spikes_and_votes_are_the_interpreters(seed):
 def test_any_wiring(drawn):
     network, events = drawn
     try:
-        netlist = compile_network(network, keep_all=True).netlist
+        netlist = compile_network(network, Options(keep_all=True)).netlist
     except SpikeloomError:
         return
     inputs = np.ascontiguousarray(np.asarray(events, np.uint8).reshape(len(events), network.input.size, -1))
@@ -126,7 +126,7 @@ def test_neurons_that_the_chip_leaves_out_are_counted_where_they_are_heard():
 
 def test_shorter_recordings_and_late_beginnings():
     network = lively(seed=4)
-    netlist = compile_network(network, keep_all=True).netlist
+    netlist = compile_network(network, Options(keep_all=True)).netlist
     prepared = float_engine.prepare(network, netlist)
     inputs, lengths, begin = random_inputs(network.input.size, 4), np.array([30, 11, 1, 20]), np.array([0, 5, 0, 19])
     found, spikes = spikes_of(prepared, netlist, inputs, lengths=lengths, begin=begin)
@@ -150,7 +150,7 @@ def test_threads_do_not_matter():
 
 def test_a_window_that_opens_late_misses_the_first_steps():
     network = lively(weights=2, seed=6)
-    netlist = compile_network(network, keep_all=True).netlist
+    netlist = compile_network(network, Options(keep_all=True)).netlist
     late = replace(netlist, layers=(netlist.layers[0], replace(netlist.layers[1], depth=netlist.layers[1].depth + 3)))
     inputs = random_inputs(network.input.size, 6)
     first = run_float(network, inputs.transpose(0, 2, 1).astype(bool)).spikes[0]

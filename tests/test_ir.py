@@ -20,6 +20,7 @@ from spikeloom.compiler.invariants import verify
 from spikeloom.compiler.ir import INPUT, Network, Projection, Readout, depths, fan_in, recurrent, to_networkx
 from spikeloom.compiler.targets.loihi1.emit import emit
 from spikeloom.compiler.targets.loihi1.layout.partition import partition
+from spikeloom.compiler.targets.loihi1.netlist_text import netlist_text
 from spikeloom.compiler.text import text
 
 replace = dataclasses.replace
@@ -280,7 +281,9 @@ def test_integer_text(golden):
 
 
 def test_netlist_text(golden):
-    golden("netlist.txt", text(placed(integer_chain([[2, -4, 0], [6, 8, 254]], [[2, 4]], thresholds=[[3, 5], 7]))))
+    golden(
+        "netlist.txt", netlist_text(placed(integer_chain([[2, -4, 0], [6, 8, 254]], [[2, 4]], thresholds=[[3, 5], 7])))
+    )
 
 
 @pytest.mark.parametrize("index", [0, 1])
@@ -330,4 +333,4 @@ def test_every_array_of_a_netlist_shows_in_its_text(field):
     netlist = placed(integer_chain([[2, -4, 0], [6, 8, 254]], [[2, 4]]))
     changed = getattr(netlist, field).copy()
     changed[len(changed) // 2] += 1
-    assert text(replace(netlist, **{field: changed})) != text(netlist)
+    assert netlist_text(replace(netlist, **{field: changed})) != netlist_text(netlist)

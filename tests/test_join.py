@@ -11,6 +11,7 @@ from numpy.testing import assert_array_equal
 from test_checkpoint import rebuilt
 from timed_networks import GRAPH, TIMING, events_of, written
 
+from spikeloom.compiler import Options, compile_network
 from spikeloom.compiler.dynamics import PLAIN, Clocks, Dynamics, with_clocks
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.checkpoint import read_checkpoint
@@ -18,7 +19,6 @@ from spikeloom.compiler.formats.onnx.reader import read_onnx
 from spikeloom.compiler.formats.towers import SHARED, arrays_of, join, members, side_by_side, towers_of
 from spikeloom.compiler.interpret import channels_last, run_float, run_integer, vote
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.targets.loihi1.compilation import compile_network
 from spikeloom.compiler.targets.loihi1.storage.quantize import round_to_forms
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import Form
 from spikeloom.models.graphs import build_graph
@@ -238,7 +238,7 @@ def test_one_tower_expands_as_ever(tmp_path):
 @pytest.mark.parametrize("dynamics", [PLAIN, TIMING], ids=["plain", "timed"])
 def test_compiled_and_verified(tmp_path, system, dynamics):
     _, wide, seen = joined(tmp_path, system, dynamics)
-    compilation = compile_network(expand(wide, seen), training_events=events_of(8, samples=12))
+    compilation = compile_network(expand(wide, seen), Options(training_events=events_of(8, samples=12)))
     events = events_of(9, samples=6, steps=25)
     labels, files = np.arange(6) % 4, tuple(f"r{i}" for i in range(6))
     verdict = verify(compilation.netlist, wide, seen, events, labels, files, spec_samples=3)
@@ -294,8 +294,8 @@ def test_fine_tuned_networks_keep_every_spike(tmp_path, system):
     singles = [tuned(single, seed) for seed, single in enumerate(singles)]
     wide = stored(tmp_path / "tuned.pt", join(singles, ["a", "b", "c"]))
     events = events_of(10, samples=5, steps=25)
-    parts = [compile_network(expand(s, seen), forms=s.forms, keep_all=True).netlist for s in singles]
-    netlist = compile_network(expand(wide, seen), forms=wide.forms, keep_all=True).netlist
+    parts = [compile_network(expand(s, seen), Options(forms=s.forms, keep_all=True)).netlist for s in singles]
+    netlist = compile_network(expand(wide, seen), Options(forms=wide.forms, keep_all=True)).netlist
     flat = with_clocks(events, wide.dynamics.clocks)
     traces = [engine.simulate(part, flat, spikes=True) for part in parts]
     alone = [

@@ -23,12 +23,13 @@ from spikeloom.compiler.passes.calibrate import Calibration
 from spikeloom.compiler.targets.loihi1.emit import emit
 from spikeloom.compiler.targets.loihi1.layout import forecast as forecast_module
 from spikeloom.compiler.targets.loihi1.layout import place as place_module
-from spikeloom.compiler.targets.loihi1.layout.choose import GOALS, asked_cores, lay_out, require_goal
+from spikeloom.compiler.targets.loihi1.layout.choose import asked_cores, lay_out, require_goal
 from spikeloom.compiler.targets.loihi1.layout.core_needs import Needs
 from spikeloom.compiler.targets.loihi1.layout.forecast import Forecast, sample, tables
 from spikeloom.compiler.targets.loihi1.layout.latency_search import _useful, estimate, fastest
 from spikeloom.compiler.targets.loihi1.layout.partition import cut, partition
 from spikeloom.compiler.targets.loihi1.legalize import require_legal
+from spikeloom.compiler.targets.loihi1.options import GOALS
 from spikeloom.runtime.costs import cost
 from spikeloom.runtime.machines.loihi1 import engine, timing
 from spikeloom.runtime.machines.loihi1.trace import Counts, aligned

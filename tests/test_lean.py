@@ -11,11 +11,10 @@ from numpy.testing import assert_array_equal
 from random_netlists import Axon, Neuron, build
 from timed_networks import written
 
+from spikeloom.compiler import Options, compile_network, lift
 from spikeloom.compiler.ir import INPUT
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.passes.prune import deaf_to
-from spikeloom.compiler.targets.loihi1.compilation import compile_network
-from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist import read_only
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.models.recordings.events import load_data
@@ -48,7 +47,7 @@ def place(tmp_path_factory):
 def compiled(tmp_path_factory):
     """A small network, what it was compiled to, and training recordings."""
     checkpoint, adjacency = small_checkpoint(tmp_path_factory.mktemp("small"), last=weights(3, gain=2.5))
-    compilation = compile_network(expand(checkpoint, adjacency), training_events=_recordings(1, 24))
+    compilation = compile_network(expand(checkpoint, adjacency), Options(training_events=_recordings(1, 24)))
     flat = _recordings(1, 24).reshape(24, -1, STEPS)
     seen = leaner.Scene(flat=flat, labels=np.arange(24) % CLASSES, lengths=None)
     return checkpoint, adjacency, compilation, seen

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from made_files import CLASSES, TAXELS, own_file, weights
 
+from spikeloom.compiler import lift
 from spikeloom.compiler.interpret import run_integer
-from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.models.networks.networks import Architecture, SpikingNet
 from spikeloom.models.recordings.events import load_data

@@ -9,13 +9,13 @@ from hypothesis import strategies as st
 from random_netlists import Axon, Neuron, build
 from random_networks import dense_weights, integer_chain, integer_networks, recordings_for, small_target
 
+from spikeloom.compiler import lift
 from spikeloom.compiler.errors import CapacityError, FormatError, NumericRangeError
 from spikeloom.compiler.interpret import run_integer
 from spikeloom.compiler.invariants import verify
 from spikeloom.compiler.ir import INPUT, IntegerNetwork
 from spikeloom.compiler.targets.loihi1.emit import emit
 from spikeloom.compiler.targets.loihi1.layout.partition import partition
-from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_only
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.trace import aligned

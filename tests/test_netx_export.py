@@ -13,14 +13,12 @@ from numpy.testing import assert_array_equal
 from random_networks import chain
 from timed_networks import written
 
+from spikeloom.compiler import Options, Recipe, compile_network, lift
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.netx import writer as netx_export
 from spikeloom.compiler.formats.netx.layout import blocks_of
 from spikeloom.compiler.formats.netx.reader import integers_of, read_netx
-from spikeloom.compiler.targets.loihi1.compilation import compile_network
-from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
-from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe
 from spikeloom.runtime.cli import main
 
 SETTINGS = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -159,7 +157,7 @@ def test_currents_and_clocks_come_back(tmp_path, capsys):
 
 def test_netlists_that_the_format_cannot_hold():
     def said(network, **options):
-        netlist = compile_network(network, **options).netlist
+        netlist = compile_network(network, Options(**options)).netlist
         with pytest.raises(ModelError) as caught:
             netx_export.blocks_for(lift(netlist))
         return str(caught.value)

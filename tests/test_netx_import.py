@@ -10,14 +10,13 @@ import torch
 from made_netx import conv, dense, even, events, flatten, given_input, neuron, write
 from numpy.testing import assert_array_equal
 
+from spikeloom.compiler import compile_network, lift
 from spikeloom.compiler.formats.netx.layout import read_blocks
 from spikeloom.compiler.formats.netx.reader import integers_of, read_netx
 from spikeloom.compiler.interpret import run_integer
 from spikeloom.compiler.invariants import verify
 from spikeloom.compiler.sensor_layout import sensor_layout
-from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
-from spikeloom.compiler.targets.loihi1.placing import place_integers
 from spikeloom.runtime.cli import main
 from spikeloom.runtime.machines.loihi1 import engine
 
@@ -110,7 +109,7 @@ def test_odd_weights_are_exact(tmp_path, most, exponents):
     verify(network)
     assert [projection.exponent for projection in network.projections] == exponents
     assert_array_equal(sum(projection.effective().toarray() for projection in network.projections), weight)
-    placed = place_integers(network)
+    placed = compile_network(network)
     given_ = events(rng, 4)
     fast = engine.simulate(placed.netlist, given_.T[None].astype(np.uint8), spikes=True)
     back = lift(placed.netlist)
@@ -149,7 +148,7 @@ def test_a_block_that_hears_itself(tmp_path, most):
     assert_array_equal(ours[0][0], hidden)
     assert_array_equal(ours[1][0], lif(last, 0, hidden, u=4096, v=1024, threshold=25))
     assert found.facts[2].split("; ")[1] == "it hears its own spikes of the step before"
-    placed = place_integers(found.network).netlist
+    placed = compile_network(found.network).netlist
     fast = engine.simulate(placed, given_.T[None].astype(np.uint8), spikes=True)
     ids = placed.compartments_of(0)
     assert_array_equal(fast.spikes[0][:40, ids], hidden[:, placed.neuron[ids]])

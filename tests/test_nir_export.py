@@ -13,13 +13,12 @@ from numpy.testing import assert_allclose, assert_array_equal
 from random_networks import float_networks
 from timed_networks import events_of, written
 
+from spikeloom.compiler import compile_network, lift
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.formats.nir import writer as nir_export
 from spikeloom.compiler.formats.nir.reader import read_nir
 from spikeloom.compiler.ir import INPUT
-from spikeloom.compiler.targets.loihi1.compilation import compile_network
-from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist import read_only
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist, write_netlist
 from spikeloom.runtime.cli import main

@@ -9,12 +9,11 @@ import pytest
 from made_nir import affine, chain, cuba, graph_with, lif, lowered, simulate
 from numpy.testing import assert_array_equal
 
+from spikeloom.compiler import Options, Recipe, compile_network
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.formats.nir.reader import read_nir
 from spikeloom.compiler.interpret import run_float, run_integer
 from spikeloom.compiler.ir import recurrent
-from spikeloom.compiler.targets.loihi1.compilation import compile_network
-from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe
 from spikeloom.runtime.machines.loihi1 import engine, spec
 
 FILES = Path(__file__).parent / "nir"
@@ -69,7 +68,7 @@ def test_one_of_each_package_on_the_chip(name):
     dt, convention = READ[name]
     network = read_nir(FILES / f"{name}.nir", dt=dt, convention=convention).network
     # what rounding moves in a layer that hears itself moves it again, so that one is stored more finely
-    compiled = compile_network(network, recipes=[Recipe(planes=2 if recurrent(network) else 1)])
+    compiled = compile_network(network, Options(recipes=[Recipe(planes=2 if recurrent(network) else 1)]))
     events = recording(network, np.load(FILES / f"{name}.npz")["events"], image="iaf" in name)
     given = with_clocks(events, network.input.clocks)
     fast = engine.simulate(compiled.netlist, given, spikes=True, membranes=True)

@@ -17,16 +17,15 @@ from test_export import run
 from test_onnx_engine import three_neurons
 
 from spikeloom import __version__
+from spikeloom.compiler import Options, Recipe, compile_network
 from spikeloom.compiler.errors import FormatError, ModelError, OptionError
 from spikeloom.compiler.formats.onnx import writer as onnx_writer
 from spikeloom.compiler.formats.onnx import writer_float as onnx_float
 from spikeloom.compiler.formats.onnx.builder import port_words
 from spikeloom.compiler.formats.onnx.writer_layers import digits, is_pipeline, plan
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.targets.loihi1.compilation import compile_network
 from spikeloom.compiler.targets.loihi1.netlist import read_only
 from spikeloom.compiler.targets.loihi1.netlist_file import netlist_bytes, write_netlist
-from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe
 from spikeloom.models.networks.reference import float_spikes
 from spikeloom.runtime import cli
 from spikeloom.runtime.machines.loihi1 import engine, onnx_engine
@@ -190,7 +189,7 @@ def test_the_reference_of_the_format_computes_the_same():
 @pytest.mark.parametrize("recipe", [Recipe(bits=8, planes=2), Recipe(bits=4, groups=4), Recipe(bits=2)])
 def test_planes_groups_and_few_bits(tmp_path, recipe):
     checkpoint, adjacency = small_checkpoint(tmp_path)
-    netlist = compile_network(expand(checkpoint, adjacency), recipes=(recipe,)).netlist
+    netlist = compile_network(expand(checkpoint, adjacency), Options(recipes=(recipe,))).netlist
     given = events(3).reshape(-1, netlist.n_inputs, events(3).shape[3])
     expected = engine.simulate(netlist, given, spikes=True).spikes
     assert expected.any()

@@ -1,24 +1,29 @@
 import json
+import sys
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from random_networks import random_checkpoint
 
-from spikeloom.compiler.errors import DataError, ModelError, OptionError
+from spikeloom.compiler import Options, Recipe, compile_network, lift, targets
+from spikeloom.compiler.errors import DataError, ModelError, OptionError, VerifyError
 from spikeloom.compiler.interpret import channels_last, run_float, run_integer, vote
-from spikeloom.compiler.ir import IntegerNetwork, Network, fan_in
-from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.targets.loihi1.compilation import STAGES, compile_network
-from spikeloom.compiler.targets.loihi1.lift import lift
-from spikeloom.compiler.targets.loihi1.netlist import Netlist, one_step_bounds
+from spikeloom.compiler.ir import fan_in
+from spikeloom.compiler.passes.expand import Factored, expand
+from spikeloom.compiler.pipeline import run
+from spikeloom.compiler.targets import base
+from spikeloom.compiler.targets.base import load_target
+from spikeloom.compiler.targets.loihi1.netlist import one_step_bounds
 from spikeloom.compiler.targets.loihi1.netlist_file import netlist_bytes, read_netlist, write_netlist
-from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe
+from spikeloom.compiler.targets.loihi1.passes import start
 from spikeloom.compiler.targets.loihi1.storage.range_proof import prove_ranges
 from spikeloom.compiler.text import text
 from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.models.recordings.evtouch import load_recordings
 from spikeloom.runtime.machines.loihi1 import engine
-from spikeloom.runtime.machines.loihi1.trace import aligned
+from spikeloom.runtime.machines.loihi1.trace import aligned, heard
 
 
 def ring(taxels):
@@ -35,13 +40,17 @@ def grasps(samples=6, *, taxels=5, steps=40, seed=0):
 
 
 def test_the_passes_run_in_order_and_hand_on_what_they_make():
-    seen = []
-    done = compile_network(
-        expand(random_checkpoint(), ring(5)), after=lambda stage, artefact: seen.append((stage, artefact))
-    )
-    assert tuple(stage for stage, _ in seen) == STAGES == ("expand", "quantize", "place")
-    assert [type(artefact) for _, artefact in seen] == [Network, IntegerNetwork, Netlist]
-    assert [artefact for _, artefact in seen] == [done.network, done.integer, done.netlist]
+    seen = {}
+    source = Factored(checkpoint=random_checkpoint(), propagation=ring(5))
+    done = compile_network(source, after=lambda name, made: seen.setdefault(name, made.newest))
+    assert list(seen) == [step.name for step in load_target("loihi1").passes]
+    assert [seen[name] for name in ("expand", "quantize", "remove", "emit")] == [
+        done.network,
+        done.integer,
+        done.held,
+        done.netlist,
+    ]
+    assert text(done.network) == text(expand(random_checkpoint(), ring(5)))
     assert done.proofs == prove_ranges(done.integer)
     assert all(proof.holds for proof in done.proofs)
     assert [choice.layer for choice in done.choices] == ["conv1", "fc1", "fc2", "fc3"]
@@ -49,14 +58,92 @@ def test_the_passes_run_in_order_and_hand_on_what_they_make():
     assert (done.core_bound, done.netlist.n_cores) == (1, 1)
     assert all(use.used <= use.allowed for use in done.uses)
     assert done.netlist.provenance == {}
-    assert (done.goal, done.layout, done.layout.expected) == ("cores", done.usual, None)
+    assert (done.layout, done.layout.expected) == (done.usual, None)
+
+
+def test_the_table_of_passes_in_the_docs():
+    docs = (Path(__file__).parents[1] / "docs" / "compile.md").read_text("utf-8")
+    for step in load_target("loihi1").passes:
+        assert f"| {step.name} | {step.does} | {step.keeps} |" in docs
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("calibrate", lambda done: replace(done, network=replace(done.network, classes=0))),
+        ("quantize", lambda done: replace(done, integer=replace(done.integer, classes=0))),
+        ("emit", lambda done: replace(done, netlist=replace(done.netlist, layer=done.netlist.layer + 9))),
+    ],
+)
+def test_a_pass_that_breaks_a_rule_is_named_at_once(name, change):
+    passes = [
+        replace(step, apply=lambda done, apply=step.apply: change(apply(done))) if step.name == name else step
+        for step in load_target("loihi1").passes
+    ]
+    work, _ = start(expand(random_checkpoint(), ring(5)), Options(), load_target("loihi1"))
+    seen = []
+    with pytest.raises(VerifyError):
+        run(passes, work, lambda name, _: seen.append(name))
+    assert name not in seen
+
+
+TOY = """
+from dataclasses import replace
+from spikeloom.compiler.passes.prune import compact, deaf_to
+from spikeloom.compiler.pipeline import Pass
+from spikeloom.compiler.targets.loihi1 import passes
+from spikeloom.compiler.targets.loihi1.options import Options
+
+def unplug(done):
+    channels = [channel == 0 for channel in range(done.integer.input.size)]
+    import numpy as np
+    return replace(done, integer=deaf_to(done.integer, np.array(channels)))
+
+PASSES = (*passes.FLOATS, Pass(name="unplug", does="ignores channel 0", keeps="the rest", apply=unplug),
+          *passes.INTEGERS, *passes.LAYOUT)
+
+def start(source, options, target):
+    return passes.start(source, options, target)[0], PASSES
+"""
+
+
+@pytest.fixture
+def toy(tmp_path, monkeypatch):
+    """A third chip: a folder with other limits and one other pass."""
+    (tmp_path / "toy").mkdir()
+    (tmp_path / "toy" / "passes.py").write_text(TOY)
+    limits = (Path(targets.__path__[0]) / "loihi1" / "chip.toml").read_text("utf-8")
+    small = limits.replace("core.compartments = { value = 1024", "core.compartments = { value = 8")
+    (tmp_path / "toy" / "chip.toml").write_text(small.replace('"loihi1"', '"toy"'))
+    monkeypatch.setattr(targets, "__path__", [*targets.__path__, str(tmp_path)])
+    base.shipped.cache_clear()
+    yield
+    base.shipped.cache_clear()
+    for name in [name for name in sys.modules if name.startswith("spikeloom.compiler.targets.toy")]:
+        del sys.modules[name]
+
+
+@pytest.mark.usefixtures("toy")
+def test_a_third_chip_is_a_folder(tmp_path):
+    done = compile_network(expand(random_checkpoint(), ring(5)), target="toy")
+    assert [step.name for step in load_target("toy").passes][4] == "unplug"
+    assert np.diff(done.netlist.core_compartments).max() <= 8
+    assert not (done.netlist.axon_source == 0).any()
+    write_netlist(done.netlist, tmp_path / "net.loom")
+    netlist = read_netlist(tmp_path / "net.loom")
+    assert netlist.target == "toy"
+    batch = grasps().reshape(6, 10, 40)
+    ran = engine.simulate(netlist, batch, spikes=True).spikes
+    expected = run_integer(done.integer, channels_last(grasps()))
+    for layer in range(4):
+        np.testing.assert_array_equal(aligned(netlist, ran, layer), expected.spikes[layer][..., heard(netlist, layer)])
 
 
 @pytest.mark.parametrize("options", [{"cores_for": {"conv1": 3, "fc2": 2}}, {"optimize": "latency"}])
 def test_a_layout_changes_no_spike(options):
     events = grasps(seed=9)
-    usual = compile_network(expand(random_checkpoint(seed=4), ring(5)), training_events=grasps())
-    done = compile_network(expand(random_checkpoint(seed=4), ring(5)), training_events=grasps(), **options)
+    usual = compile_network(expand(random_checkpoint(seed=4), ring(5)), Options(training_events=grasps()))
+    done = compile_network(expand(random_checkpoint(seed=4), ring(5)), Options(training_events=grasps(), **options))
     assert done.usual.parts.cores == usual.layout.parts.cores
     assert done.usual.expected == usual.layout.expected
     assert done.netlist.n_cores == len(done.layout.parts.cores) > usual.netlist.n_cores
@@ -68,10 +155,10 @@ def test_a_layout_changes_no_spike(options):
 
 
 def test_what_is_left_out_is_not_counted_among_the_neurons_of_a_layer():
-    kept = compile_network(expand(random_checkpoint(seed=4), ring(5)), cores_for={"conv1": 2})
+    kept = compile_network(expand(random_checkpoint(seed=4), ring(5)), Options(cores_for={"conv1": 2}))
     held = int(np.count_nonzero(kept.netlist.layer == 0))
     with pytest.raises(OptionError) as caught:
-        compile_network(expand(random_checkpoint(seed=4), ring(5)), cores_for={"conv1": held + 1})
+        compile_network(expand(random_checkpoint(seed=4), ring(5)), Options(cores_for={"conv1": held + 1}))
     assert str(caught.value) == (
         f"--cores-for conv1={held + 1}: conv1 has {held} neurons on the chip; give {held} or fewer"
     )
@@ -84,9 +171,7 @@ def test_two_compiles_give_the_same_bytes(bits, calibrated):
         events = grasps() if calibrated else None
         return compile_network(
             expand(random_checkpoint(), ring(5)),
-            recipes=(Recipe(bits=bits),),
-            training_events=events,
-            provenance={"seed": 1},
+            Options(recipes=(Recipe(bits=bits),), training_events=events, provenance={"seed": 1}),
         )
 
     one, two = compiled(), compiled()
@@ -96,7 +181,7 @@ def test_two_compiles_give_the_same_bytes(bits, calibrated):
 
 
 def test_the_file_means_the_integer_network(tmp_path):
-    done = compile_network(expand(random_checkpoint(seed=4), ring(5)), training_events=grasps())
+    done = compile_network(expand(random_checkpoint(seed=4), ring(5)), Options(training_events=grasps()))
     write_netlist(done.netlist, tmp_path / "a.loom")
     events = channels_last(grasps(seed=9))
     expected = run_integer(done.integer, events, membranes=True)
@@ -117,7 +202,7 @@ def test_the_proof_covers_the_netlist():
 
 def test_observed_ranges_need_recordings():
     with pytest.raises(OptionError) as caught:
-        compile_network(expand(random_checkpoint(), ring(5)), ranges="observed")
+        compile_network(expand(random_checkpoint(), ring(5)), Options(ranges="observed"))
     assert str(caught.value) == ("--ranges observed: nothing was observed; give --calibrate, or use --ranges proven")
 
 
@@ -125,7 +210,7 @@ def test_observed_ranges_need_recordings():
 def test_a_margin_that_is_no_share(margin):
     with pytest.raises(OptionError) as caught:
         compile_network(
-            expand(random_checkpoint(), ring(5)), training_events=grasps(), ranges="observed", margin=margin
+            expand(random_checkpoint(), ring(5)), Options(training_events=grasps(), ranges="observed", margin=margin)
         )
     assert str(caught.value) == f"--margin {margin:g}: is no share to add to a range; give a number from 0"
 
@@ -133,12 +218,14 @@ def test_a_margin_that_is_no_share(margin):
 def test_an_unknown_target():
     with pytest.raises(OptionError) as caught:
         compile_network(expand(random_checkpoint(), ring(5)), target="loihi2")
-    assert str(caught.value) == "--target loihi2: not modelled; no public per-event energies; allowed: loihi1"
+    assert (
+        str(caught.value) == "--target loihi2: not modelled; no public per-event energies; allowed: loihi1, truenorth"
+    )
 
 
 def test_an_empty_split():
     with pytest.raises(DataError) as caught:
-        compile_network(expand(random_checkpoint(), ring(5)), training_events=grasps(0))
+        compile_network(expand(random_checkpoint(), ring(5)), Options(training_events=grasps(0)))
     assert str(caught.value) == "calibration: the split is empty; give recordings with a train split"
 
 
@@ -171,7 +258,7 @@ def manual():
 @pytest.fixture(scope="module")
 def calibrated(released, manual, objects_zip):
     training = load_recordings(objects_zip, "train")
-    return compile_network(expand(released, manual), training_events=training.events)
+    return compile_network(expand(released, manual), Options(training_events=training.events))
 
 
 @pytest.mark.recordings
@@ -190,7 +277,7 @@ def test_the_released_network_fits_nine_cores(calibrated):
 def test_a_step_of_the_released_network_can_take_a_seventh(released, manual, objects_zip):
     """112 cores; the fc2 core of the usual layout and the fc1 cores keep the others waiting."""
     events = load_recordings(objects_zip, "train").events
-    done = compile_network(expand(released, manual), training_events=events, optimize="latency")
+    done = compile_network(expand(released, manual), Options(training_events=events, optimize="latency"))
     usual, fast = done.usual.expected, done.layout.expected
     assert 25_000 < usual.step_ns < 36_000
     assert fast.step_ns < usual.step_ns / 6

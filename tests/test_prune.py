@@ -7,12 +7,11 @@ from hypothesis import strategies as st
 from made_files import events, small_checkpoint
 from random_networks import chain, float_networks, integer_networks, random_checkpoint, recordings_for
 
+from spikeloom.compiler import Options, compile_network, lift
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.interpret import channels_last, run_float, run_integer
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.passes.prune import compact, disconnect, either, never_fires, nobody, removable
-from spikeloom.compiler.targets.loihi1.compilation import compile_network
-from spikeloom.compiler.targets.loihi1.lift import lift
+from spikeloom.compiler.passes.prune import compact, disconnect, either, never_fires, none_of, removable
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist, write_netlist
 from spikeloom.runtime.equivalence.verify import verify
 from spikeloom.runtime.machines.loihi1 import engine, spec
@@ -68,10 +67,10 @@ def test_silence_spreads_to_listeners():
 def test_a_pruned_netlist_decides_as_the_whole_one(tmp_path, seed):
     checkpoint, recordings = random_checkpoint(seed=seed), events(seed, taxels=5)
     flat = recordings.reshape(len(recordings), -1, recordings.shape[3])
-    pruned, whole = (compile_network(expand(checkpoint, np.eye(5)), keep_all=keep) for keep in (False, True))
-    assert sum(r.silent + r.unheard for r in whole.removals) == 0
+    pruned, whole = (compile_network(expand(checkpoint, np.eye(5)), Options(keep_all=keep)) for keep in (False, True))
+    assert sum(r.silent + r.unreceived for r in whole.removals) == 0
     left = sum(layer.neurons for layer in pruned.netlist.layers) - pruned.netlist.n_compartments
-    assert left == sum(r.silent + r.unheard + r.unused for r in pruned.removals)
+    assert left == sum(r.silent + r.unreceived + r.unused for r in pruned.removals)
     write_netlist(pruned.netlist, tmp_path / "net.loom")
     netlist = read_netlist(tmp_path / "net.loom")
     trace = engine.simulate(netlist, flat, spikes=True, membranes=True)
@@ -86,7 +85,7 @@ def test_a_pruned_netlist_decides_as_the_whole_one(tmp_path, seed):
         np.testing.assert_array_equal(found, expected[layer])
 
 
-def test_neurons_that_nobody_hears_are_not_compared(tmp_path):
+def test_neurons_that_none_of_hears_are_not_compared(tmp_path):
     """Their listeners' weights round to zero at two bits: they fire in the float model and are not on the chip."""
     checkpoint, adjacency = small_checkpoint(tmp_path)
     weak = checkpoint.dense[0].weight.copy()
@@ -107,19 +106,19 @@ def test_neurons_that_nobody_hears_are_not_compared(tmp_path):
 def test_pruning_by_evidence_is_asked_for(tmp_path):
     checkpoint, adjacency = small_checkpoint(tmp_path)
     quiet = events(1, rate=0.002)
-    plain = compile_network(expand(checkpoint, adjacency), training_events=quiet)
-    fewer = compile_network(expand(checkpoint, adjacency), training_events=quiet, prune_unused=True)
+    plain = compile_network(expand(checkpoint, adjacency), Options(training_events=quiet))
+    fewer = compile_network(expand(checkpoint, adjacency), Options(training_events=quiet, prune_unused=True))
     assert sum(r.unused for r in plain.removals) == 0
     assert sum(r.unused for r in fewer.removals) > 0
     assert fewer.netlist.n_compartments < plain.netlist.n_compartments
     for options in ({}, {"training_events": quiet, "keep_all": True}):
         with pytest.raises(OptionError) as caught:
-            compile_network(expand(checkpoint, adjacency), prune_unused=True, **options)
+            compile_network(expand(checkpoint, adjacency), Options(prune_unused=True, **options))
         assert str(caught.value) == (
             "--prune-unused: needs --calibrate, and neither --keep-all nor a fine-tuned checkpoint; change the options"
         )
 
 
-def test_nobody_is_nobody():
+def test_none_of_is_none_of():
     network = chain([[1.0]])
-    assert [mask.tolist() for mask in nobody(network)] == [[False]]
+    assert [mask.tolist() for mask in none_of(network)] == [[False]]

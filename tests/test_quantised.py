@@ -9,6 +9,7 @@ import pytest
 import torch
 from made_files import ring, small_checkpoint, weights
 
+from spikeloom.compiler import Options, Recipe, compile_network, lift
 from spikeloom.compiler.errors import DataError, ModelError, OptionError
 from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX
 from spikeloom.compiler.formats.checkpoint import read_checkpoint
@@ -17,9 +18,7 @@ from spikeloom.compiler.interpret import channels_last, run_integer
 from spikeloom.compiler.passes.calibrate import calibrate
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.base import load_target
-from spikeloom.compiler.targets.loihi1.compilation import compile_network
-from spikeloom.compiler.targets.loihi1.lift import lift
-from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe, round_to_forms
+from spikeloom.compiler.targets.loihi1.storage.quantize import round_to_forms
 from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.models.networks.checkpoint import save_checkpoint
 from spikeloom.models.networks.quantised import QuantisedNet, quantised_spikes, time_first
@@ -134,7 +133,7 @@ def test_a_fine_tuned_checkpoint_compiles_to_what_was_trained(tmp_path, bits):
     for ours, theirs in zip(again.forms, tuned.forms, strict=True):
         assert (ours.bits, ours.exponents) == (theirs.bits, theirs.exponents) == (bits, theirs.exponents)
         np.testing.assert_array_equal(ours.threshold, theirs.threshold)
-    netlist = compile_network(expand(again, adjacency), forms=again.forms).netlist
+    netlist = compile_network(expand(again, adjacency), Options(forms=again.forms)).netlist
     trace = engine.simulate(netlist, test.events.reshape(len(test), -1, test.steps), spikes=True)
     model = quantised_spikes(again, adjacency, test.events)
     for index, layer in enumerate(netlist.layers):
@@ -155,12 +154,10 @@ def test_a_fine_tuned_checkpoint_brings_its_own_storage(tmp_path):
         with pytest.raises(OptionError) as caught:
             compile_network(
                 expand(read_checkpoint(path), adjacency),
-                forms=read_checkpoint(path).forms,
-                training_events=train.events,
-                **options,
+                Options(forms=read_checkpoint(path).forms, training_events=train.events, **options),
             )
         assert str(caught.value) == (
-            "compile: the checkpoint was fine-tuned for its own storage; leave --weight-bits, --planes, "
+            "compile: the checkpoint was fine-tuned for its own storage; omit --weight-bits, --planes, "
             "--scale-groups, --spike-exact and --ranges away"
         )
 
@@ -318,7 +315,7 @@ def test_the_model_is_the_chip_on_every_recording(tmp_path, objects_zip, contain
         words = ["finetune", f"pretrained:{name}", "--data", str(place), "--weight-bits", "4", "--epochs", "2"]
         assert main([*words, "-o", str(output)]) == 0
         checkpoint = read_checkpoint(output)
-        netlist = compile_network(expand(checkpoint, adjacency), forms=checkpoint.forms).netlist
+        netlist = compile_network(expand(checkpoint, adjacency), Options(forms=checkpoint.forms)).netlist
         for split in ("train", "test"):
             data = load_recordings(place, split)
             model = quantised_spikes(checkpoint, adjacency, data.events)

@@ -25,18 +25,17 @@ from random_networks import (
 from test_sanafe import compare as with_sanafe
 from test_sanafe import interpreter  # noqa: F401
 
+from spikeloom.compiler import Options, Recipe, compile_network, lift
 from spikeloom.compiler.errors import CapacityError, ModelError, NumericRangeError
 from spikeloom.compiler.formats.netx.reader import read_netx
 from spikeloom.compiler.interpret import channels_last, run_float, run_integer
 from spikeloom.compiler.ir import INPUT, IntegerProjection, Projection, recurrent
 from spikeloom.compiler.passes.calibrate import calibrate
 from spikeloom.compiler.passes.prune import never_fires, removable
-from spikeloom.compiler.targets.loihi1.compilation import compile_network
 from spikeloom.compiler.targets.loihi1.emit import emit
 from spikeloom.compiler.targets.loihi1.layout.partition import partition
 from spikeloom.compiler.targets.loihi1.legalize import require_legal
-from spikeloom.compiler.targets.loihi1.lift import lift
-from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe, quantize
+from spikeloom.compiler.targets.loihi1.storage.quantize import quantize
 from spikeloom.compiler.targets.loihi1.storage.width_search import search
 from spikeloom.runtime.cli import main
 from spikeloom.runtime.costs import cost
@@ -146,7 +145,7 @@ def test_only_networks_with_recurrence_run_in_steps():
 @pytest.mark.parametrize("alpha", [0.0, 0.5])
 def test_every_spike_of_the_calibration_is_kept_if_asked(alpha):
     network, events = drawn(1, gain=1.5, alpha=alpha), events_for(2)
-    made = compile_network(network, training_events=events, spike_exact=True)
+    made = compile_network(network, Options(training_events=events, spike_exact=True))
     assert [layer.flips for layer in made.exactness] == [0, 0]
     given_ = channels_last(events)
     wanted, found = run_float(network, given_), run_integer(made.integer, given_)
@@ -177,7 +176,7 @@ def test_neurons_that_only_excite_each_other_are_silent():
     cut = chain([[0.05, 0.05], [0.05, 0], [1, 1], [0, 0]], np.ones((1, 4)))
     cut = hearing_itself(cut, 0, own * [0.1, 0.1, 1, 0])
     assert never_fires(cut)[0].tolist() == [True, True, False, False]
-    silent, unheard = removable(compile_network(cut, keep_all=True).integer)
+    silent, unheard = removable(compile_network(cut, Options(keep_all=True)).integer)
     assert silent[0].tolist() == [True, True, False, False]
     assert not unheard[0].any()
 
@@ -189,7 +188,7 @@ def test_neurons_that_only_each_other_hear_are_left_out():
     own[1, 0] = own[3, 2] = 1
     network = hearing_itself(network, 0, own)
     made = compile_network(network)
-    assert [removal.unheard for removal in made.removals] == [2, 0]
+    assert [removal.unreceived for removal in made.removals] == [2, 0]
     assert made.netlist.layers[0].unheard == (2, 3)
     own[2, 2] = 1  # what hears itself counts as heard
     made = compile_network(hearing_itself(replace(network, projections=network.projections[:2]), 0, own))
@@ -257,7 +256,7 @@ def test_a_loop_of_zeros_proves_as_much_as_none():
 @pytest.mark.parametrize("alpha", [0.0, 0.5])
 def test_the_verdict_on_a_network(alpha):
     network, events = drawn(9, gain=1.5, alpha=alpha), events_for(10, samples=8)
-    netlist = compile_network(network, training_events=events, recipes=(Recipe(planes=2),)).netlist
+    netlist = compile_network(network, Options(training_events=events, recipes=(Recipe(planes=2),))).netlist
     files = tuple(map(str, range(8)))
     found = verify(netlist, network, None, events, np.zeros(8, np.int64), files)
     assert found.spec_equals_engine
@@ -270,7 +269,7 @@ def test_the_verdict_on_a_network(alpha):
 
 def test_operations_count_what_a_layer_sends_itself():
     network, events = drawn(11), events_for(12, samples=3)
-    netlist = compile_network(network, keep_all=True).netlist
+    netlist = compile_network(network, Options(keep_all=True)).netlist
     flat = events.reshape(3, 10, -1)
     trace = engine.simulate(netlist, flat, spikes=True)
     fired = np.concatenate([flat.sum(axis=2), trace.counts.spikes], axis=1)
@@ -284,7 +283,7 @@ def test_operations_count_what_a_layer_sends_itself():
 
 def test_sanafe_runs_it_too(interpreter, tmp_path):  # noqa: F811
     # a core each: two lists of one neuron on a core are one packet there
-    netlist = compile_network(drawn(13), cores_for={"fc1": 1, "fc2": 1}).netlist
+    netlist = compile_network(drawn(13), Options(cores_for={"fc1": 1, "fc2": 1})).netlist
     for run in with_sanafe(interpreter, netlist, events_for(14, samples=2).reshape(2, 10, -1), tmp_path):
         assert run.spikes.sum() > 100
         assert_array_equal(run.spikes, run.expected_spikes)

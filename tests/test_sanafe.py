@@ -18,11 +18,11 @@ from random_netlists import large_netlist
 from test_timing import DETAILED, ENERGY_PJ, LOIHI, SANAFE, SIMPLE, six_steps
 from timed_networks import events_of, written
 
+from spikeloom.compiler import Options, compile_network
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.formats import sanafe
 from spikeloom.compiler.formats.checkpoint import read_checkpoint
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.targets.loihi1.compilation import compile_network
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_only
 from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.models.recordings.evtouch import load_recordings
@@ -196,7 +196,7 @@ def test_the_real_checkpoint(interpreter, released_checkpoint, objects_zip, tmp_
     graph = build_graph("manual")
     netlist = compile_network(
         expand(read_checkpoint(released_checkpoint), normalised_adjacency(graph.edges, graph.n_taxels)),
-        training_events=load_recordings(objects_zip, "train").events,
+        Options(training_events=load_recordings(objects_zip, "train").events),
     ).netlist
     recordings = load_recordings(objects_zip, "test").events[[0, 29, 58, 87, 116]]
     for run in compare(interpreter, netlist, recordings.reshape(5, netlist.n_inputs, -1), tmp_path):

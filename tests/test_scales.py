@@ -8,13 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_networks import BITS, LOIHI, chain, float_networks, recordings_for
 
+from spikeloom.compiler import Recipe
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX
 from spikeloom.compiler.interpret import run_integer
 from spikeloom.compiler.invariants import verify
 from spikeloom.compiler.passes.calibrate import calibrate
 from spikeloom.compiler.targets.loihi1.storage.compensate import compensated
-from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe, quantize
+from spikeloom.compiler.targets.loihi1.storage.quantize import quantize
 from spikeloom.compiler.targets.loihi1.storage.range_proof import prove_ranges
 from spikeloom.compiler.targets.loihi1.storage.scales import (
     choose_levels,

@@ -9,14 +9,13 @@ from made_files import CLASSES, STEPS, TAXELS, events, own_file, recordings_fold
 from numpy.testing import assert_array_equal
 from timed_networks import events_of, written
 
+from spikeloom.compiler import Options, Recipe, compile_network
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.formats.checkpoint import read_checkpoint
 from spikeloom.compiler.formats.towers import join
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.targets.loihi1.compilation import compile_network
 from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist
-from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe
 from spikeloom.models.graphs import NEUTOUCH
 from spikeloom.models.networks.reference import float_spikes
 from spikeloom.runtime import cli
@@ -626,7 +625,7 @@ def test_a_netlist_of_another_architecture_is_refused(spikeloom, place, tmp_path
 def test_planes_have_no_fewer_bits(bench):
     from spikeloom.runtime.studies.stress.battery import why_not
 
-    netlist = compile_network(bench.pair.network, recipes=(Recipe(planes=2),)).netlist
+    netlist = compile_network(bench.pair.network, Options(recipes=(Recipe(planes=2),))).netlist
     pair = Pair(netlist=netlist, network=bench.pair.network)
     assert why_not("fewer_bits", pair, bench.sensor) == "weights are stored in several planes"
     onnx = Sensor(distance=bench.sensor.distance, places=None, edges=None, checkpoint=None)

@@ -10,15 +10,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_files import released
 from numpy.testing import assert_allclose, assert_array_equal
+from oracles import probed
 from scipy import sparse
 
+from spikeloom.compiler import Options, compile_network
 from spikeloom.compiler.errors import CapacityError, DataError, ModelError, OptionError
 from spikeloom.compiler.formats.checkpoint import read_checkpoint
 from spikeloom.compiler.interpret import channels_last, run_float
-from spikeloom.compiler.passes.expand import expand, probe_affine
+from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.systems import GCN, GRAPH_SYSTEMS, GRID_CNN, MLP, SYSTEMS, Grid, in_order
 from spikeloom.compiler.targets.base import load_target
-from spikeloom.compiler.targets.loihi1.compilation import compile_network
 from spikeloom.models.graphs import NEUTOUCH, build_graph
 from spikeloom.models.networks.checkpoint import checkpoint_bytes, save_checkpoint
 from spikeloom.models.networks.layers import SURROGATE_HALF_WIDTH, filter_places
@@ -358,9 +359,7 @@ def test_expansion_equals_probing_the_layer(tmp_path, system):
     network = network_of(system)
     checkpoint = saved(tmp_path, network)
     first = plain_first(system, {name: tensor.double() for name, tensor in state_of(network).items()})
-    weight, bias = probe_affine(
-        lambda batch: np.stack([first(torch.tensor(row).view(39, 2)).numpy() for row in batch]), 78, name="conv1"
-    )
+    weight, bias = probed(lambda batch: np.stack([first(torch.tensor(row).view(39, 2)).numpy() for row in batch]), 78)
     expanded = expand(checkpoint, seen_by(system))
     assert expanded.populations[0].name == "conv1"
     assert_allclose(expanded.projections[0].weight.toarray(), weight, atol=1e-12)
@@ -413,7 +412,7 @@ def test_fine_tuned_on_the_chips_integers_they_are_the_chip(tmp_path, system):
         grid=checkpoint.grid,
     )
     again = read_checkpoint(tmp_path / "tuned.pt")
-    netlist = compile_network(expand(again, seen), forms=again.forms).netlist
+    netlist = compile_network(expand(again, seen), Options(forms=again.forms)).netlist
     verdict = verify(netlist, again, seen, test.events[:4], test.labels[:4], test.files[:4])
     assert verdict.quantised_different == 0
     assert verdict.spikes["fc1"].chip > 0
@@ -539,7 +538,7 @@ def test_on_recordings_after_a_short_training(containers_zip, tmp_path, system):
     network = SpikingNet(sizes, seen)
     network.load_weights(trained.last)
     checkpoint = saved(tmp_path, network)
-    compiled = compile_network(expand(checkpoint, seen), training_events=training.events)
+    compiled = compile_network(expand(checkpoint, seen), Options(training_events=training.events))
     verdict = verify(compiled.netlist, checkpoint, seen, test.events, test.labels, test.files, spec_samples=1)
     assert verdict.spec_equals_engine
     right = [int(np.sum(p == test.labels)) for p in (verdict.float_predictions, verdict.chip_predictions)]

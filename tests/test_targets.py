@@ -5,7 +5,14 @@ import pytest
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.targets import base as targets
-from spikeloom.compiler.targets.base import CROSSBARS, known_targets, load_target, read_target, with_tables
+from spikeloom.compiler.targets.base import (
+    COMPARTMENTS,
+    CROSSBARS,
+    known_targets,
+    load_target,
+    read_target,
+    with_tables,
+)
 from spikeloom.compiler.targets.loihi1.legalize import REMEDIES
 
 LIMITS = {
@@ -137,25 +144,24 @@ def test_every_limit_of_a_core_has_a_remedy():
     assert set(REMEDIES) == rules
 
 
-def test_known_targets_are_the_files():
-    assert known_targets() == ("loihi1",)
+def test_known_targets_are_the_folders():
+    assert known_targets() == ("loihi1", "truenorth")
     assert known_targets(CROSSBARS) == ("truenorth",)
 
 
 @pytest.mark.parametrize(
-    ("name", "message"),
+    ("name", "cores", "words"),
     [
-        ("loihi2", "--target loihi2: not modelled; no public per-event energies; allowed: loihi1"),
-        ("truenorth", "--target truenorth: its cores are crossbars, this is for compartments; allowed: loihi1"),
-        ("loihi", "--target loihi: unknown; allowed: loihi1"),
-        ("../loihi1", "--target ../loihi1: unknown; allowed: loihi1"),
-        ("", "--target : unknown; allowed: loihi1"),
+        ("loihi2", None, "not modelled; no public per-event energies; allowed: loihi1, truenorth"),
+        ("truenorth", COMPARTMENTS, "its cores are crossbars, this is for compartments; allowed: loihi1"),
+        ("../loihi1", None, "unknown; allowed: loihi1, truenorth"),
+        ("", None, "unknown; allowed: loihi1, truenorth"),
     ],
 )
-def test_a_target_that_does_not_exist(name, message):
+def test_a_target_that_does_not_exist(name, cores, words):
     with pytest.raises(OptionError) as caught:
-        load_target(name)
-    assert str(caught.value) == message
+        load_target(name, cores)
+    assert str(caught.value) == f"--target {name}: {words}"
 
 
 # -- files that are wrong ----------------------------------------------------------------------------------------------

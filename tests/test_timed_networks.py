@@ -12,6 +12,7 @@ from random_netlists import Axon, Neuron, build
 from random_networks import chain, integer_population
 from timed_networks import TIMING, events_of, written
 
+from spikeloom.compiler import Options, Recipe, compile_network, lift
 from spikeloom.compiler.dynamics import NO_CLOCKS, PLAIN, Clocks, Dynamics, with_clocks
 from spikeloom.compiler.errors import DataError, ModelError, NumericRangeError
 from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, MEMBRANE_MAX, ONE_STEP_SUM_MAX
@@ -21,14 +22,12 @@ from spikeloom.compiler.ir import Input
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.passes.prune import never_fires
 from spikeloom.compiler.targets.base import load_target
-from spikeloom.compiler.targets.loihi1.compilation import compile_network
-from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist import one_step_bounds
 from spikeloom.compiler.targets.loihi1.netlist_file import netlist_bytes, read_netlist, write_netlist
-from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe, quantize
+from spikeloom.compiler.targets.loihi1.netlist_text import netlist_text
+from spikeloom.compiler.targets.loihi1.storage.quantize import quantize
 from spikeloom.compiler.targets.loihi1.storage.range_proof import prove_ranges
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import current_load, decay_registers
-from spikeloom.compiler.text import text
 from spikeloom.models.networks.reference import float_spikes
 from spikeloom.models.recordings.grasps import synthetic_grasps
 from spikeloom.models.recordings.release import write_released
@@ -67,7 +66,7 @@ def timed(folder):
 
 @pytest.fixture(scope="module")
 def compiled(timed):
-    return compile_network(timed[2], training_events=events_of(5, samples=12))
+    return compile_network(timed[2], Options(training_events=events_of(5, samples=12)))
 
 
 # --- registers -----------------------------------------------------------------------------------------------------
@@ -248,7 +247,7 @@ def test_no_input_leaves_a_register(compiled, value):
 )
 def test_relays_tick_with_their_clocks_however_weights_are_stored(timed, options):
     _, _, network = timed
-    netlist = compile_network(network, **{"training_events": events_of(5, samples=12), **options}).netlist
+    netlist = compile_network(network, Options(**{"training_events": events_of(5, samples=12), **options})).netlist
     events = events_of(13, steps=14)
     trace = engine.simulate(netlist, with_clocks(events, TIMING.clocks), spikes=True)
     conv = aligned(netlist, trace.spikes, 0)
@@ -279,8 +278,8 @@ def test_all_layers_without_a_scale_are_listed(timed):
 def test_observed_ranges_count_what_a_current_gathers(timed):
     _, _, network = timed
     training = events_of(5, samples=12)
-    observed = compile_network(network, training_events=training, ranges="observed")
-    proven = compile_network(network, training_events=training)
+    observed = compile_network(network, Options(training_events=training, ranges="observed"))
+    proven = compile_network(network, Options(training_events=training))
     assert observed.choices[1].scale > 1.5 * proven.choices[1].scale
     trace = engine.simulate(observed.netlist, with_clocks(training, TIMING.clocks), membranes=True)
     assert trace.counts.spikes.any()  # nothing overflowed on what was observed
@@ -295,9 +294,9 @@ def test_a_netlist_survives_its_file(compiled, tmp_path):
     assert back.clocks == TIMING.clocks
     assert back.layers == compiled.netlist.layers
     assert netlist_bytes(back) == (tmp_path / "x.loom").read_bytes()
-    assert text(back) == text(compiled.netlist)
-    assert "(input 39 taxels x 2, 3 clocks of 4 steps)" in text(back)
-    assert "(alpha 0.95)" in text(back)
+    assert netlist_text(back) == netlist_text(compiled.netlist)
+    assert "(input 39 taxels x 2, 3 clocks of 4 steps)" in netlist_text(back)
+    assert "(alpha 0.95)" in netlist_text(back)
     assert version_of(compiled.netlist) == 3
 
 
@@ -312,7 +311,7 @@ def test_a_netlist_without_dynamics_keeps_its_version(tmp_path):
     _, _, network = float_network(tmp_path, dynamics=PLAIN)
     netlist = compile_network(network).netlist
     assert (version_of(netlist), netlist.clocks) == (2, NO_CLOCKS)
-    assert "alpha" not in text(netlist)
+    assert "alpha" not in netlist_text(netlist)
     _, _, network = float_network(tmp_path, dynamics=Dynamics(betas=TIMING.betas))
     assert version_of(compile_network(network).netlist) == 2  # decays of membranes were always by compartment
 

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from random_networks import LOIHI, chain, random_checkpoint, small_target
 
+from spikeloom.compiler import Options, Recipe, compile_network
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.interpret import cut, run_float, run_integer, vote
 from spikeloom.compiler.passes.calibrate import calibrate, evenly_spaced
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.passes.prune import disconnect, never_fires
-from spikeloom.compiler.targets.loihi1.compilation import compile_network
 from spikeloom.compiler.targets.loihi1.legalize import measure
 from spikeloom.compiler.targets.loihi1.storage import branches
-from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe, assemble, shortlist
+from spikeloom.compiler.targets.loihi1.storage.quantize import assemble, shortlist
 from spikeloom.compiler.targets.loihi1.storage.width_search import Found, Point, check_widths, front, search
 
 WIDTHS = (2, 4, 8)
@@ -40,7 +40,7 @@ def compiled(checkpoint, events, bits, groups=1):
     taxels = events.shape[1]
     recipes = [Recipe(bits=b, groups=groups) for b in bits]
     return compile_network(
-        expand(checkpoint, np.full((taxels, taxels), 1 / taxels)), recipes=recipes, training_events=events
+        expand(checkpoint, np.full((taxels, taxels), 1 / taxels)), Options(recipes=recipes, training_events=events)
     )
 
 

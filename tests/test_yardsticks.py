@@ -12,11 +12,11 @@ import pytest
 from made_files import recordings_folder, small_checkpoint
 from random_networks import random_checkpoint
 
+from spikeloom.compiler import compile_network
 from spikeloom.compiler.errors import DataError
 from spikeloom.compiler.formats.checkpoint import Dense
 from spikeloom.compiler.interpret import channels_last, run_float
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.targets.loihi1.compilation import compile_network
 from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist
 from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.models.recordings.evtouch import load_recordings

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from spikeloom.compiler import Compilation, Options, compile_network, without
 from spikeloom.compiler.errors import CapacityError
 from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.formats.checkpoint import Checkpoint, read_checkpoint
@@ -15,7 +16,6 @@ from spikeloom.compiler.interpret import cut, vote
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.base import Target, load_target
-from spikeloom.compiler.targets.loihi1.compilation import Compilation, compile_network, without
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.costs.estimate import estimate
@@ -70,7 +70,7 @@ def _compiled(network: Network, training: Recordings) -> Compilation:
     except CapacityError as error:
         if any(violation.used > HOPELESS * violation.allowed for violation in error.violations):
             raise
-    return compile_network(network, training_events=training.events)
+    return compile_network(network, Options(training_events=training.events))
 
 
 def float_decisions(checkpoint: Checkpoint, adjacency: FloatArray, test: Recordings) -> IntArray:

@@ -18,6 +18,10 @@ from spikeloom.compiler.ir import INPUT, IntegerNetwork, IntegerPopulation, Netw
 from spikeloom.compiler.passes.calibrate import Calibration
 
 Mask = npt.NDArray[np.bool_]
+"""Some neurons of a population, (neurons,) bool."""
+
+Masks = tuple[Mask, ...]
+"""Some neurons of each population."""
 
 FLOAT32_ROUNDING = 2.0**-23
 """Relative error of one float32 operation, doubled: the float model is silent in that precision and order too."""
@@ -33,7 +37,7 @@ class Removal:
         Population.
     silent : int
         Neurons that no input can make fire, in the float model or on the chip.
-    unheard : int
+    unreceived : int
         Neurons that fire, but without a synapse that is not zero to any that is left, and without a vote.
     unused : int
         Neurons that did not fire on the training recordings; on request only.
@@ -43,12 +47,12 @@ class Removal:
 
     layer: str
     silent: int
-    unheard: int
+    unreceived: int
     unused: int
     synapses: int
 
 
-def never_fires(network: Network) -> tuple[Mask, ...]:
+def never_fires(network: Network) -> Masks:
     """Neurons of the float model that no input can make fire, in any order of summation, in float32 or wider.
 
     Neurons that vote are never among them.
@@ -103,23 +107,23 @@ def _never_fires(network: Network, post: int, silent: Mapping[int, Mask]) -> Mas
     return below
 
 
-def never_fired(network: Network, calibration: Calibration) -> tuple[Mask, ...]:
+def never_fired(network: Network, calibration: Calibration) -> Masks:
     """Neurons that did not fire on the calibration recordings; never among them are those that vote."""
     fired = [np.asarray(spikes.any(axis=(0, 1)), np.bool_) for spikes in calibration.spikes]
     return _without_voters(network, tuple(~mask for mask in fired))
 
 
-def nobody(network: Network | IntegerNetwork) -> tuple[Mask, ...]:
+def none_of(network: Network | IntegerNetwork) -> Masks:
     """No neuron of any population."""
     return tuple(np.zeros(population.size, np.bool_) for population in network.populations)
 
 
-def either(first: tuple[Mask, ...], second: tuple[Mask, ...]) -> tuple[Mask, ...]:
+def either(first: Masks, second: Masks) -> Masks:
     """Neurons of one mask or the other."""
     return tuple(np.asarray(a | b, np.bool_) for a, b in zip(first, second, strict=True))
 
 
-def disconnect(network: Network, gone: tuple[Mask, ...]) -> Network:
+def disconnect(network: Network, gone: Masks) -> Network:
     """Set the weights from and to some neurons, and their biases, to zero; the structure stays."""
     if not any(mask.any() for mask in gone):
         return network
@@ -136,14 +140,14 @@ def disconnect(network: Network, gone: tuple[Mask, ...]) -> Network:
     )
 
 
-def removable(network: IntegerNetwork) -> tuple[tuple[Mask, ...], tuple[Mask, ...]]:
+def removable(network: IntegerNetwork) -> tuple[Masks, Masks]:
     """Neurons that the chip need not hold: those that no input can make fire, and others that nobody hears.
 
     Neurons that vote are never among them, and every population keeps one neuron.
 
     Returns
     -------
-    silent, unheard : tuple of (neurons,) bool
+    silent, unreceived : tuple of (neurons,) bool
         One mask per population; no neuron is in both.
     """
     silent: dict[int, Mask] = {INPUT: np.zeros(network.input.size, np.bool_)}
@@ -153,19 +157,19 @@ def removable(network: IntegerNetwork) -> tuple[tuple[Mask, ...], tuple[Mask, ..
             return _silent(network, post, silent | {post: own})
 
         silent[post] = _grown(network, post, judge)
-    unheard: dict[int, Mask] = {}
+    unreceived: dict[int, Mask] = {}
     for pre in reversed(range(len(network.populations))):
         if pre == network.readout.population:
             silent[pre] = np.zeros(network.populations[pre].size, np.bool_)
 
         def deaf(own: Mask, pre: int = pre) -> Mask:
-            return _unheard(network, pre, silent, unheard | {pre: own})
+            return _unreceived(network, pre, silent, unreceived | {pre: own})
 
-        unheard[pre] = _grown(network, pre, deaf)
-        if np.all(silent[pre] | unheard[pre]):
-            silent[pre][0] = unheard[pre][0] = False
+        unreceived[pre] = _grown(network, pre, deaf)
+        if np.all(silent[pre] | unreceived[pre]):
+            silent[pre][0] = unreceived[pre][0] = False
     indices = range(len(network.populations))
-    return tuple(silent[i] for i in indices), tuple(unheard[i] for i in indices)
+    return tuple(silent[i] for i in indices), tuple(unreceived[i] for i in indices)
 
 
 def _silent(network: IntegerNetwork, post: int, silent: Mapping[int, Mask]) -> Mask:
@@ -180,12 +184,12 @@ def _silent(network: IntegerNetwork, post: int, silent: Mapping[int, Mask]) -> M
     return _cannot_reach(population, up * (1 << MEMBRANE_SHIFT))
 
 
-def _unheard(network: IntegerNetwork, pre: int, silent: Mapping[int, Mask], unheard: Mapping[int, Mask]) -> Mask:
-    """Neurons of one population, not silent, without a vote or a synapse to one that is neither silent nor unheard."""
+def _unreceived(network: IntegerNetwork, pre: int, silent: Mapping[int, Mask], unreceived: Mapping[int, Mask]) -> Mask:
+    """Neurons of one population, not silent, without a vote or a synapse to one that is neither."""
     heard = np.full(network.populations[pre].size, pre == network.readout.population)
     for p in network.projections:
         if p.pre == pre:
-            listens = ~(silent[p.post] | unheard[p.post])
+            listens = ~(silent[p.post] | unreceived[p.post])
             for rows in row_parts(p.weight):
                 weight = p.weight[rows]
                 counts = np.repeat(listens[rows], np.diff(weight.indptr)) & (weight.data != 0)
@@ -219,7 +223,7 @@ def deaf_to(network: IntegerNetwork, channels: Mask) -> IntegerNetwork:
     )
 
 
-def compact(network: IntegerNetwork, gone: tuple[Mask, ...]) -> tuple[IntegerNetwork, tuple[IntArray, ...]]:
+def compact(network: IntegerNetwork, gone: Masks) -> tuple[IntegerNetwork, tuple[IntArray, ...]]:
     """Take neurons out.
 
     Returns
@@ -259,11 +263,9 @@ def compact(network: IntegerNetwork, gone: tuple[Mask, ...]) -> tuple[IntegerNet
     )
 
 
-def removals(
-    network: Network, silent: tuple[Mask, ...], unheard: tuple[Mask, ...], unused: tuple[Mask, ...]
-) -> tuple[Removal, ...]:
+def removals(network: Network, silent: Masks, unreceived: Masks, unused: Masks) -> tuple[Removal, ...]:
     """Count what was left out of `network`, layer by layer; what no input can make fire does not count as unused."""
-    proven, gone = never_fires(network), either(silent, unheard)
+    proven, gone = never_fires(network), either(silent, unreceived)
     found = []
     for post, population in enumerate(network.populations):
         by_evidence = unused[post] & ~proven[post] & gone[post]
@@ -280,7 +282,7 @@ def removals(
             Removal(
                 layer=population.name,
                 silent=int((silent[post] & ~by_evidence).sum()),
-                unheard=int((unheard[post] & ~by_evidence).sum()),
+                unreceived=int((unreceived[post] & ~by_evidence).sum()),
                 unused=int(by_evidence.sum()),
                 synapses=synapses,
             )
@@ -288,12 +290,12 @@ def removals(
     return tuple(found)
 
 
-def _without_voters(network: Network, masks: tuple[Mask, ...]) -> tuple[Mask, ...]:
+def _without_voters(network: Network, masks: Masks) -> Masks:
     voting = network.readout.population
     return tuple(np.zeros_like(mask) if i == voting else mask for i, mask in enumerate(masks))
 
 
-def _of(masks: tuple[Mask, ...], pre: int, size: int) -> Mask:
+def _of(masks: Masks, pre: int, size: int) -> Mask:
     return np.zeros(size, np.bool_) if pre == INPUT else masks[pre]
 
 

@@ -5,14 +5,16 @@ from __future__ import annotations
 import math
 import os
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
-from importlib import resources
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from spikeloom.compiler import targets
 from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.pipeline import Passes, run
 from spikeloom.compiler.targets.price_tables import (
     BARRIER,
     CROSSBAR_EVENTS,
@@ -51,7 +53,6 @@ __all__ = [
     "known_targets",
     "load_target",
     "read_target",
-    "require_target",
     "with_tables",
 ]
 
@@ -101,6 +102,40 @@ class Target:
     def limit(self, rule: str) -> int:
         """Largest amount that `rule`, for example ``core.axons_in``, allows."""
         return int(self.limits[rule].value)
+
+    @property
+    def module(self) -> Any:
+        """Module ``passes`` in the folder of the chip: ``PASSES``, ``Options`` and ``start``."""
+        return import_module(f"{targets.__name__}.{self.name}.passes")
+
+    @property
+    def passes(self) -> Passes:
+        """From what is trained to a netlist."""
+        passes: Passes = self.module.PASSES
+        return passes
+
+    @property
+    def options(self) -> type[Any]:
+        """Class of the options that :meth:`compile` takes."""
+        options: type[Any] = self.module.Options
+        return options
+
+    def compile(self, source: Any, options: Any = None, *, after: Callable[[str, Any], object] | None = None) -> Any:
+        """Lower what is trained; `after` is called with the name of each pass and all that was made so far.
+
+        Returns
+        -------
+        Compilation of the chip
+            With the result as ``netlist``.
+
+        Raises
+        ------
+        SpikeloomError
+            As the passes say.
+        """
+        module = self.module
+        work, passes = module.start(source, module.Options() if options is None else options, self)
+        return run(passes, work, after)
 
 
 def _entries(table: Any, leaf: str, prefix: str, faults: list[str]) -> dict[str, dict[str, Any]]:
@@ -337,40 +372,19 @@ def _check_unit(where: str, entry: Mapping[str, Any], unit: str, faults: list[st
 
 
 @cache
-def _targets() -> Mapping[str, Target]:
-    """Every target that is shipped."""
-    found = {}
-    for folder in resources.files(__package__).iterdir():
-        file = folder / "chip.toml"
-        if file.is_file():
-            with resources.as_file(file) as path:
-                found[folder.name] = read_target(path)
-    return found
+def shipped() -> Mapping[str, Target]:
+    """Every target there is: a folder beside this file with ``chip.toml`` and a module ``passes``."""
+    files = (file for place in targets.__path__ for file in Path(place).glob("*/chip.toml"))
+    return {file.parent.name: read_target(file) for file in files}
 
 
-def known_targets(cores: str = COMPARTMENTS) -> tuple[str, ...]:
-    """Names that :func:`load_target` accepts, sorted."""
-    return tuple(sorted(name for name, target in _targets().items() if target.cores == cores))
+def known_targets(cores: str | None = None) -> tuple[str, ...]:
+    """Names that :func:`load_target` accepts, sorted; all, or those of one kind of cores."""
+    return tuple(sorted(name for name, target in shipped().items() if cores in (None, target.cores)))
 
 
-def require_target(name: str) -> None:
-    """Refuse a name that is no target of any kind.
-
-    Raises
-    ------
-    OptionError
-        Listing all of them.
-    """
-    if name not in _targets():
-        raise OptionError(f"--target {name}: {_why(name)}; allowed: {', '.join(sorted(_targets()))}")
-
-
-def _why(name: str) -> str:
-    return _NOT_MODELLED.get(name, "unknown")
-
-
-def load_target(name: str, cores: str = COMPARTMENTS) -> Target:
-    """Read a target by name; its cores must be of the kind that the caller can handle.
+def load_target(name: str, cores: str | None = None) -> Target:
+    """Read a target by name; its cores must be of the kind that the caller can handle, if that is given.
 
     Raises
     ------
@@ -379,11 +393,12 @@ def load_target(name: str, cores: str = COMPARTMENTS) -> Target:
 
     Examples
     --------
-    >>> load_target("loihi1").limit("core.synapse_words"), load_target("truenorth", CROSSBARS).limit("core.axons")
+    >>> load_target("loihi1").limit("core.synapse_words"), load_target("truenorth").limit("core.axons")
     (16384, 256)
     """
-    found = _targets().get(name)
-    if found is None or found.cores != cores:
-        why = _why(name) if found is None else f"its cores are {found.cores}, this is for {cores}"
+    found = shipped().get(name)
+    if found is None or cores not in (None, found.cores):
+        why = _NOT_MODELLED.get(name, "unknown")
+        why = why if found is None else f"its cores are {found.cores}, this is for {cores}"
         raise OptionError(f"--target {name}: {why}; allowed: {', '.join(known_targets(cores))}")
     return found

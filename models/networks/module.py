@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -22,10 +23,11 @@ from spikeloom.compiler.formats.assemble import Layer, assemble, class_of_each
 from spikeloom.compiler.formats.names import unique_names
 from spikeloom.compiler.sensor_layout import sensor_layout
 from spikeloom.compiler.ir import INPUT, Network, Sparse
-from spikeloom.compiler.passes.expand import AFFINE_TOLERANCE
-from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe
-from spikeloom.compiler.targets.loihi1.compilation import Compilation, compile_network
+from spikeloom.compiler import DEFAULT_TARGET, Compilation, Options, compile_network
 from spikeloom.models.networks.lif import LIF, reset
+
+AFFINE_TOLERANCE = 1e-9
+"""Largest deviation from affinity, relative to the stage's largest response, that rounding in float64 explains."""
 
 PROBES = 512
 """Unit vectors that run together."""
@@ -232,25 +234,19 @@ def compile_module(
     *,
     polarities: int | None = None,
     polarities_first: bool | None = None,
-    target: str = "loihi1",
-    recipes: Sequence[Recipe] | None = None,
-    spike_exact: bool = False,
-    training_events: npt.NDArray[Any] | None = None,
+    target: str = DEFAULT_TARGET,
+    options: Options | None = None,
 ) -> Compilation:
-    """Compile a module: :func:`module_network`, then :func:`compilation.compile_network`.
+    """Compile a module: :func:`module_network`, then :func:`compiler.compile_network`.
 
     Parameters
     ----------
     net, example, polarities, polarities_first
         See :func:`module_network`.
-    target, recipes, spike_exact, training_events
-        See :func:`compilation.compile_network`; events are (samples, taxels, polarities, steps).
+    target, options
+        See :func:`compiler.compile_network`.
     """
-    return compile_network(
-        module_network(net, example, polarities=polarities, polarities_first=polarities_first),
-        target=target,
-        recipes=recipes,
-        spike_exact=spike_exact,
-        training_events=training_events,
-        provenance={"module": type(net).__name__},
-    )
+    network = module_network(net, example, polarities=polarities, polarities_first=polarities_first)
+    options = options or Options()
+    provenance = {"module": type(net).__name__, **options.provenance}
+    return compile_network(network, replace(options, provenance=provenance), target=target)

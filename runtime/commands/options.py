@@ -11,8 +11,6 @@ from spikeloom.compiler.systems import SYSTEMS
 from spikeloom.models.graphs import CHOICES
 from spikeloom.models.recordings.events import BIN_S
 
-MARGIN = 0.1
-
 MIN_AGREEMENT = 0.95
 """Share of equal decisions that ``verify`` wants."""
 
@@ -37,7 +35,6 @@ ROUNDING: dict[str, object] = {
     "prune_unused": False,
     "ranges": "proven",
     "margin": None,
-    "against": None,
     "dump_after": [],
 }
 """Options of ``compile`` that say how a float network is stored on Loihi, likewise."""
@@ -164,7 +161,7 @@ def add_steps(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def parse_cores(words: str | None) -> dict[str, int] | None:
+def parse_cores(words: str | None) -> dict[str, int]:
     """Least number of cores by layer, from the words of ``--cores-for``.
 
     Examples
@@ -178,7 +175,7 @@ def parse_cores(words: str | None) -> dict[str, int] | None:
         If they are none.
     """
     if words is None:
-        return None
+        return {}
     found: dict[str, int] = {}
     for word in words.split(","):
         layer, _, count = word.strip().partition("=")

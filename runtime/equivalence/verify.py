@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from spikeloom.compiler import lift
 from spikeloom.compiler.dynamics import Clocks, with_clocks
 from spikeloom.compiler.errors import DataError, ModelError
 from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT, FloatArray, IntArray
@@ -20,7 +21,6 @@ from spikeloom.compiler.interpret import BoolArray, channels_last, cut, run_floa
 from spikeloom.compiler.ir import IntegerNetwork, Network, Projection, Sparse
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.systems import GRAPH_SYSTEMS
-from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.storage.range_proof import prove_ranges
 from spikeloom.runtime.equivalence import onnx_check

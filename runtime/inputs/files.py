@@ -32,7 +32,7 @@ def shipped(path: str) -> str:
     return str(known[name])
 
 
-INPUTS = ("checkpoint", "original", "against", "netlist", "data", "calibrate", "source", "taxels", "edges", "stress")
+INPUTS = ("checkpoint", "original", "netlist", "data", "calibrate", "source", "taxels", "edges", "stress")
 """Arguments that may name a file to read."""
 
 

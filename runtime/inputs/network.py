@@ -20,7 +20,7 @@ from spikeloom.compiler.formats.nir.reader import NirNetwork, read_nir
 from spikeloom.compiler.formats.onnx.reader import SUFFIX as ONNX
 from spikeloom.compiler.formats.onnx.reader import OnnxNetwork, read_onnx
 from spikeloom.compiler.ir import Network
-from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.passes.expand import Factored, expand
 from spikeloom.compiler.systems import GRAPH_SYSTEMS, TACTILESGNET, TITLES
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.truenorth.native_file import is_trained
@@ -71,6 +71,13 @@ class LoadedNetwork:
         if self.checkpoint is None:
             return {"format": self.format, **self.read_as}
         return {"run": run, "weights": self.checkpoint.weights, "graph": self.graph}
+
+    @property
+    def source(self) -> Factored | Network:
+        """What the compiler starts from: the checkpoint on its graph where there is one."""
+        if self.checkpoint is None or self.adjacency is None:
+            return self.network
+        return Factored(checkpoint=self.checkpoint, propagation=self.adjacency)
 
     @property
     def model(self) -> Checkpoint | Network:

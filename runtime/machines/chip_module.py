@@ -17,10 +17,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from spikeloom.compiler import lift
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.fixedpoint import MEMBRANE_MAX, MEMBRANE_SHIFT
 from spikeloom.compiler.ir import INPUT, IntegerPopulation
-from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 
 

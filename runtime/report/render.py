@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from spikeloom.compiler import Compilation
 from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, FloatArray, IntArray
 from spikeloom.compiler.formats.checkpoint import Checkpoint
 from spikeloom.compiler.systems import GRAPH_SYSTEMS, TACTILESGNET
 from spikeloom.compiler.targets.base import load_target
-from spikeloom.compiler.targets.loihi1.compilation import Compilation
 from spikeloom.compiler.targets.loihi1.layout.chips import chip_count
 from spikeloom.compiler.targets.loihi1.layout.choose import Layout
 from spikeloom.compiler.targets.loihi1.legalize import LimitUse
@@ -114,7 +114,7 @@ def compilation_json(compilation: Compilation, sha256: str) -> Json:
         "core_bound": compilation.core_bound,
         "placement": asdict(compilation.placement),
         "layout": {
-            "optimize": compilation.goal,
+            "optimize": compilation.options.optimize,
             "expected": _expected(compilation.layout),
             "usual": _expected(compilation.usual),
         },

@@ -60,13 +60,13 @@ class Origin:
         With all neurons.
     identity : tuple of (neurons left,) int64
         For each population, which of its neurons the chip holds.
-    unheard : tuple of (neurons,) bool
-        Neurons left out although they fire, because nobody hears them.
+    unreceived : tuple of (neurons,) bool
+        Neurons removed although they fire, because no neuron receives them.
     """
 
     network: IntegerNetwork
     identity: tuple[IntArray, ...]
-    unheard: tuple[npt.NDArray[np.bool_], ...]
+    unreceived: tuple[npt.NDArray[np.bool_], ...]
 
 
 def unpruned(network: IntegerNetwork) -> Origin:
@@ -74,7 +74,7 @@ def unpruned(network: IntegerNetwork) -> Origin:
     return Origin(
         network=network,
         identity=tuple(np.arange(population.size) for population in network.populations),
-        unheard=tuple(np.zeros(population.size, np.bool_) for population in network.populations),
+        unreceived=tuple(np.zeros(population.size, np.bool_) for population in network.populations),
     )
 
 
@@ -84,7 +84,7 @@ def _layers(origin: Origin) -> tuple[Layer, ...]:
         Layer(
             name=population.name,
             neurons=population.size,
-            unheard=tuple(np.flatnonzero(origin.unheard[post]).tolist()),
+            unheard=tuple(np.flatnonzero(origin.unreceived[post]).tolist()),
             depth=depth,
             beta=population.beta,
             theta=population.theta,

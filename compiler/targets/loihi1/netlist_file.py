@@ -31,7 +31,7 @@ import numpy as np
 from spikeloom.compiler.dynamics import MOST_CLOCKS, MOST_STEPS, NO_CLOCKS, Clocks
 from spikeloom.compiler.errors import FormatError
 from spikeloom.compiler.formats.archive import Array, archive_bytes, read_archive, write_archive
-from spikeloom.compiler.targets.base import known_targets
+from spikeloom.compiler.targets.base import COMPARTMENTS, known_targets
 from spikeloom.compiler.targets.loihi1.netlist import Layer, Netlist, frozen, read_only, read_only_float
 
 FORMAT = "spikeloom-netlist"
@@ -126,10 +126,9 @@ def netlist_of(path: Path, manifest: dict[str, Any], members: Mapping[str, Array
     faults = _type_faults(manifest, members)
     if faults:
         raise FormatError(f"{path}: {'; '.join(faults)}; compile it again")
-    if manifest["target"] not in known_targets():
-        raise FormatError(
-            f"{path}: is for {manifest['target']!r}, this program knows {', '.join(known_targets())}; update spikeloom"
-        )
+    if manifest["target"] not in known_targets(COMPARTMENTS):
+        known = ", ".join(known_targets(COMPARTMENTS))
+        raise FormatError(f"{path}: is for {manifest['target']!r}, this program knows {known}; update spikeloom")
     netlist = Netlist(
         target=manifest["target"],
         taxels=manifest["taxels"],

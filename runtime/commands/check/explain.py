@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from spikeloom.compiler import lift
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.formats.checkpoint import Checkpoint
 from spikeloom.compiler.interpret import BoolArray, channels_last
 from spikeloom.compiler.ir import IntegerNetwork
 from spikeloom.compiler.systems import GRAPH_SYSTEMS, TACTILESGNET
-from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.models.recordings.evtouch import Recordings

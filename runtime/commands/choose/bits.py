@@ -26,7 +26,7 @@ from spikeloom.compiler.formats.checkpoint import Checkpoint
 from spikeloom.compiler.formats.checkpoint_file import arrays_digest
 from spikeloom.compiler.interpret import channels_last
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.targets.base import Target, load_target
+from spikeloom.compiler.targets.base import COMPARTMENTS, Target, load_target
 from spikeloom.compiler.targets.loihi1.storage.width_search import Found, Point, check_widths, front, search
 from spikeloom.models.recordings.events import BIN_S
 from spikeloom.models.recordings.evtouch import Recordings
@@ -94,7 +94,7 @@ def run(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int
             raise OptionError(f"--{option} {getattr(arguments, option)}: give 1 or more")
     if arguments.output is not None:
         require_place(arguments.output, "-o", arguments)
-    target, asked = load_target(arguments.target), _widths(arguments.widths)
+    target, asked = load_target(arguments.target, COMPARTMENTS), _widths(arguments.widths)
     path = shipped(arguments.checkpoint)
     if Path(path).is_file() and is_netlist(path):
         raise ModelError(f"{path}: is a netlist, its widths are decided; give the checkpoint that it was made from")

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 
 from spikeloom import __version__
+from spikeloom.compiler import Compilation, Options, compile_network
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.formats.atomic import write_atomically
 from spikeloom.compiler.systems import TACTILESGNET
 from spikeloom.compiler.targets.base import Target, load_target
-from spikeloom.compiler.targets.loihi1.compilation import Compilation, compile_network
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist
 from spikeloom.models.recordings.evtouch import Recordings
@@ -162,7 +162,9 @@ def _candidates(
     for path, asked in zip(arguments.checkpoint, found, strict=True):
         progress(f"compiling {path}")
         forms = None if asked.checkpoint is None else asked.checkpoint.forms
-        compilation = compile_network(asked.network, forms=forms, target=TARGET, training_events=training.events)
+        compilation = compile_network(
+            asked.network, Options(forms=forms, training_events=training.events), target=TARGET
+        )
         netlist = compilation.netlist
         seen, reported = scene(training, netlist), scene(test, netlist)
         (decided, cost), (decided_test, entry) = (_costs(netlist, target, of) for of in (seen, reported))

@@ -5,22 +5,17 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable
-from dataclasses import asdict
 from typing import Any
 
 from spikeloom import __version__
+from spikeloom.compiler import Compilation, Options, Recipe, compile_network, write_netlist
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.formats.checkpoint import Checkpoint
-from spikeloom.compiler.targets.base import load_target, require_target
-from spikeloom.compiler.targets.loihi1.compare import WeightDifference, compare
-from spikeloom.compiler.targets.loihi1.compilation import STAGES, compile_network
-from spikeloom.compiler.targets.loihi1.layout.choose import GOALS, require_goal
-from spikeloom.compiler.targets.loihi1.lift import lift
-from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist, write_netlist
-from spikeloom.compiler.targets.loihi1.storage.quantize import RANGES, Recipe
-from spikeloom.compiler.text import text
+from spikeloom.compiler.targets.base import load_target
+from spikeloom.compiler.targets.loihi1.layout.choose import require_goal
+from spikeloom.compiler.targets.loihi1.options import GOALS, MARGIN, RANGES
 from spikeloom.runtime.commands.main_job.restore import is_whole, take
-from spikeloom.runtime.commands.options import MARGIN, add_bin_option, add_network, parse_cores
+from spikeloom.runtime.commands.options import add_bin_option, add_network, parse_cores
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import recordings
@@ -30,15 +25,11 @@ from spikeloom.runtime.report.console import progress
 
 Json = dict[str, Any]
 
-LISTED = 20
-"""Weights that differ from another netlist's which the text names; JSON has them all."""
-
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
     """Add the options."""
     sub.add_argument("checkpoint", help="checkpoint, or a network as an ONNX, NIR or netx file")
     add_network(sub)
-    sub.add_argument("--against", metavar="NET.loom", help="list the weights that differ from another netlist's")
     sub.add_argument("--target", default="loihi1", help="chip: loihi1 (default), or truenorth, to hear why not")
     sub.add_argument(
         "--weight-bits",
@@ -81,7 +72,7 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
         help=f"choose the cores for {', '.join(GOALS)}; the last two need --calibrate (default: cores)",
     )
     sub.add_argument(
-        "--dump-after", action="append", default=[], choices=STAGES, help="print the network after a stage, on stderr"
+        "--dump-after", action="append", default=[], metavar="PASS", help="print the network after a pass, on stderr"
     )
     sub.add_argument("-o", "--output", required=True, metavar="NET.loom")
 
@@ -89,7 +80,7 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
     """Run the command: the report, how to print it, and the exit code."""
     require_place(arguments.output, "-o", arguments)
-    require_target(arguments.target)
+    chip = load_target(arguments.target)
     if is_whole(arguments):
         return take(arguments)
     own = trained_for(arguments.checkpoint) or chip_commands(arguments.target)
@@ -101,11 +92,12 @@ def run(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int
         raise OptionError(
             f"--margin {arguments.margin:g}: only observed ranges have one; add --ranges observed or leave it away"
         )
-    chip = load_target(arguments.target)
+    if unknown := set(arguments.dump_after) - {step.name for step in chip.passes}:
+        names = ", ".join(step.name for step in chip.passes)
+        raise OptionError(f"--dump-after {', '.join(sorted(unknown))}: no such pass; allowed: {names}")
     recipes = parse_recipes(arguments)
     cores_for = parse_cores(arguments.cores_for)
     require_goal(arguments.optimize, cores_for, chip, calibrated=arguments.calibrate is not None, chips=arguments.chips)
-    other = None if arguments.against is None else lift(read_netlist(arguments.against))
     asked = load_network(arguments.checkpoint, arguments)
     checkpoint = asked.checkpoint
     training = None
@@ -121,36 +113,31 @@ def run(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int
         ).events
     progress("compiling")
 
-    def dump(stage: str, artefact: Any) -> None:
-        if stage in arguments.dump_after:
-            sys.stderr.write(text(artefact))
+    def dump(name: str, done: Compilation) -> None:
+        if name in arguments.dump_after:
+            sys.stderr.write(done.text())
 
     compilation = compile_network(
-        asked.network,
-        forms=None if checkpoint is None else checkpoint.forms,
+        asked.source,
+        Options(
+            forms=None if checkpoint is None else checkpoint.forms,
+            recipes=recipes,
+            spike_exact=arguments.spike_exact,
+            keep_all=arguments.keep_all,
+            prune_unused=arguments.prune_unused,
+            training_events=training,
+            ranges=arguments.ranges,
+            margin=_margin(arguments),
+            cores_for=cores_for,
+            chips=arguments.chips,
+            optimize=arguments.optimize,
+            provenance=provenance(arguments, asked, calibrated=training is not None),
+        ),
         target=arguments.target,
-        recipes=recipes,
-        spike_exact=arguments.spike_exact,
-        keep_all=arguments.keep_all,
-        prune_unused=arguments.prune_unused,
-        training_events=training,
-        ranges=arguments.ranges,
-        margin=_margin(arguments),
-        cores_for=cores_for,
-        chips=arguments.chips,
-        optimize=arguments.optimize,
-        provenance=provenance(arguments, asked, calibrated=training is not None),
         after=dump,
     )
     report = render.compilation_json(compilation, write_netlist(compilation.netlist, arguments.output))
     report |= {"facts": list(asked.facts)} if asked.facts else {}
-    if other is not None:
-        found = compare(lift(compilation.netlist), other)
-        report["against"] = {
-            "synapses": found.synapses,
-            "weights": [asdict(weight) for weight in found.weights],
-            "registers": list(found.registers),
-        }
     return report, _text, 0
 
 
@@ -190,14 +177,8 @@ def _margin(arguments: argparse.Namespace) -> float:
 
 
 def _text(report: Json) -> str:
-    """A compilation for people, with what was read from another format and what differs from another netlist."""
+    """A compilation for people, with what was read from another format."""
     lines = [*report.get("facts", ()), *([""] if "facts" in report else []), render.compilation_text(report)]
-    if "against" in report:
-        weights, registers = report["against"]["weights"], report["against"]["registers"]
-        lines.append(f"against the other netlist: {len(weights)} of {report['against']['synapses']:,} weights differ")
-        lines += [f"  {WeightDifference(**weight)}" for weight in weights[:LISTED]]
-        lines += [f"  … and {len(weights) - LISTED} more, see --json"] if len(weights) > LISTED else []
-        lines += [f"  other registers in {layer}" for layer in registers]
     return "\n".join(lines)
 
 

@@ -7,16 +7,15 @@ from collections.abc import Callable
 from typing import Any
 
 from spikeloom import __version__
+from spikeloom.compiler import Options, compile_network
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.formats.netx.layout import SUFFIX as NETX
 from spikeloom.compiler.formats.netx.reader import read_netx
 from spikeloom.compiler.invariants import verify
-from spikeloom.compiler.passes.prune import nobody
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.legalize import measure
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist
-from spikeloom.compiler.targets.loihi1.placing import place_integers
 from spikeloom.runtime.commands.options import MODEL, ROUNDING, parse_cores
 from spikeloom.runtime.report import render
 from spikeloom.runtime.report.console import progress
@@ -59,10 +58,8 @@ def _from_netx(arguments: argparse.Namespace) -> tuple[Netlist, list[str]]:
     verify(found.network)
     progress("compiling")
     cores_for = parse_cores(arguments.cores_for)
-    placed = place_integers(
-        found.network,
-        removed=(nobody(found.network), nobody(found.network)) if arguments.keep_all else None,
-        target=arguments.target,
+    options = Options(
+        keep_all=arguments.keep_all,
         cores_for=cores_for,
         chips=arguments.chips,
         optimize=arguments.optimize,
@@ -75,7 +72,7 @@ def _from_netx(arguments: argparse.Namespace) -> tuple[Netlist, list[str]]:
             **({"chips": arguments.chips} if arguments.chips != 1 else {}),
         },
     )
-    return placed.netlist, list(found.facts)
+    return compile_network(found.network, options, target=arguments.target).netlist, list(found.facts)
 
 
 def _text(report: Json) -> str:

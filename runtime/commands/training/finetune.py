@@ -16,7 +16,7 @@ from spikeloom.compiler.formats.atomic import remove_leftovers
 from spikeloom.compiler.formats.checkpoint import Checkpoint, read_checkpoint
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.systems import GRAPH_SYSTEMS
-from spikeloom.compiler.targets.base import load_target
+from spikeloom.compiler.targets.base import COMPARTMENTS, load_target
 from spikeloom.compiler.targets.loihi1.storage.quantize import round_to_forms
 from spikeloom.models.graphs import Graph
 from spikeloom.models.recordings.events import joined_bins
@@ -99,7 +99,7 @@ def run(arguments: argparse.Namespace) -> tuple[Report, Callable[[Report], str],
 def _finetuned(arguments: argparse.Namespace, output: Path) -> Report:
     """Fine-tune and write the checkpoint; return the report."""
     state = _state(output, resume=arguments.resume)
-    target = load_target(arguments.target)
+    target = load_target(arguments.target, COMPARTMENTS)
     widths = _widths(arguments.weight_bits)
     path = shipped(arguments.checkpoint)
     if Path(path).is_file() and is_netlist(path):

@@ -13,8 +13,7 @@ from typing import Any
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.targets.loihi1.layout.choose import GOALS
-from spikeloom.compiler.targets.loihi1.storage.quantize import MAX_PLANES
+from spikeloom.compiler.targets.loihi1.options import GOALS, MAX_PLANES
 from spikeloom.models.recordings.windows import WHOLE
 
 WINDOW_STEP = 25

@@ -10,13 +10,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from spikeloom.compiler import Recipe
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.formats.archive import is_netlist
 from spikeloom.compiler.formats.checkpoint import Checkpoint
 from spikeloom.compiler.formats.checkpoint_file import arrays_digest
 from spikeloom.compiler.formats.onnx.reader import SUFFIX
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe, check_recipes
+from spikeloom.compiler.targets.loihi1.options import check_recipes
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import Form
 from spikeloom.compiler.targets.truenorth.native import SYSTEM, highest_level
 from spikeloom.compiler.targets.truenorth.native_file import is_trained, read_trained

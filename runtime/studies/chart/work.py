@@ -16,12 +16,12 @@ from typing import Any
 
 import numpy as np
 
+from spikeloom.compiler import Options, lay_out_again, store
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import CapacityError, DataError, FormatError, ModelError
 from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.interpret import cut, vote
 from spikeloom.compiler.targets.base import CROSSBARS, known_targets, load_target
-from spikeloom.compiler.targets.loihi1.compilation import place, store
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist, write_netlist
 from spikeloom.compiler.targets.truenorth.native_file import Trained, read_trained
@@ -180,25 +180,26 @@ def _build(work: Build) -> Json:
     training = _heard(work.data, sensor.taxels, asked.network.classes, sensor.bins)["train"]
     try:
         stored = store(
-            asked.network,
-            forms=None if asked.checkpoint is None else asked.checkpoint.forms,
-            target=some.target,
-            recipes=parse_recipes(some),
-            prune_unused=some.prune_unused,
-            training_events=training.events,
+            asked.source,
+            Options(
+                forms=None if asked.checkpoint is None else asked.checkpoint.forms,
+                recipes=parse_recipes(some),
+                prune_unused=some.prune_unused,
+                training_events=training.events,
+            ),
+            load_target(some.target),
         )
     except (CapacityError, ModelError) as error:
         return {layout: {"refused": str(error).splitlines()} for layout in work.layouts}
     found: Json = {}
     for layout, own in arguments.items():
         try:
-            netlist = place(
-                stored,
-                target=own.target,
+            options = Options(
                 cores_for=parse_cores(own.cores_for),
                 optimize=own.optimize,
                 provenance=provenance(own, asked, calibrated=True),
-            ).netlist
+            )
+            netlist = lay_out_again(stored, options).netlist
         except CapacityError as error:
             found[layout] = {"refused": str(error).splitlines()}
             continue

@@ -25,9 +25,7 @@ from spikeloom.compiler.targets.loihi1.layout.forecast import Expectation, Forec
 from spikeloom.compiler.targets.loihi1.layout.latency_search import estimate, fastest, tiles_for
 from spikeloom.compiler.targets.loihi1.layout.partition import Partition, arrange, chunks_of, cut, partition
 from spikeloom.compiler.targets.loihi1.layout.place import Placement, core_traffic, place_within
-
-GOALS = ("cores", "energy", "latency")
-"""What a layout may be chosen for."""
+from spikeloom.compiler.targets.loihi1.options import GOALS
 
 WORTH = 1e-3
 """Share of a step's energy that another layout has to save."""

@@ -22,7 +22,8 @@ from spikeloom.compiler.interpret import BATCH, BoolArray, cut, integer_recurren
 from spikeloom.compiler.ir import INPUT, IntegerNetwork, IntegerPopulation, Network
 from spikeloom.compiler.passes.calibrate import Calibration
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.targets.loihi1.storage.quantize import Candidate, Recipe, assemble, shortlist
+from spikeloom.compiler.targets.loihi1.options import Recipe
+from spikeloom.compiler.targets.loihi1.storage.quantize import Candidate, assemble, shortlist
 from spikeloom.compiler.targets.loihi1.storage.scales import Rounded
 
 STACKED = 2048

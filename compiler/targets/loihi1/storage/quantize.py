@@ -19,6 +19,7 @@ from spikeloom.compiler.interpret import run_integer
 from spikeloom.compiler.ir import IntegerNetwork, Network, Population, Projection, row_parts
 from spikeloom.compiler.passes.calibrate import MANY, Calibration, fewer
 from spikeloom.compiler.targets.base import Target
+from spikeloom.compiler.targets.loihi1.options import MARGIN, RANGES, Recipe, check_recipes
 from spikeloom.compiler.targets.loihi1.storage.compensate import compensated
 from spikeloom.compiler.targets.loihi1.storage.scales import Rounded, candidate, flips, grouped, observed_sums, rounded
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import (
@@ -34,30 +35,6 @@ CLIPPING = tuple(2 ** (k / 4) for k in range(21))
 
 SHORTLIST, SHORTLIST_RATIO = 3, 1.25
 """Scales of a layer that are compared within the whole network, and by how much they may exceed the fewest flips."""
-
-RANGES = ("proven", "observed")
-"""How a scale is kept from overflowing the accumulator; ``observed`` trusts the calibration recordings."""
-
-MAX_PLANES = 3
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Recipe:
-    """What the user asks of the storage of one population.
-
-    Parameters
-    ----------
-    bits : int
-        Storage width of a mantissa.
-    planes : int
-        Times that a synapse may be stored, with different exponents.
-    groups : int
-        Different thresholds, and so scales, at most.
-    """
-
-    bits: int = 8
-    planes: int = 1
-    groups: int = 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -258,37 +235,6 @@ def explain_choice(network: Network, post: int, chosen: Candidate, calibration: 
     )
 
 
-def check_recipes(recipes: Sequence[Recipe], layers: int, target: Target) -> tuple[Recipe, ...]:
-    """One recipe for each layer.
-
-    Raises
-    ------
-    OptionError
-        If there are neither one nor as many as layers, or the chip has no such storage.
-    """
-    if len(recipes) not in (1, layers):
-        raise OptionError(
-            f"--weight-bits: {len(recipes)} layers are described, the network has {layers}; "
-            "give one number, or one for each layer"
-        )
-    allowed = target.choices["synapse.weight_bits"]
-    for recipe in recipes:
-        if recipe.bits not in allowed:
-            raise OptionError(
-                f"--weight-bits {recipe.bits}: {target.title} does not store that width; "
-                f"allowed: {', '.join(map(str, allowed))}"
-            )
-        if not 1 <= recipe.planes <= MAX_PLANES:
-            raise OptionError(f"--planes {recipe.planes}: allowed are 1 to {MAX_PLANES}; choose one of these")
-        slots = target.limit("core.threshold_slots")
-        if not 1 <= recipe.groups <= slots:
-            raise OptionError(
-                f"--scale-groups {recipe.groups}: a core of {target.title} holds {slots} thresholds; "
-                f"give a number from 1 to {slots}"
-            )
-    return tuple(recipes) if len(recipes) == layers else tuple(recipes) * layers
-
-
 def quantize(
     network: Network,
     target: Target,
@@ -296,7 +242,7 @@ def quantize(
     recipes: Sequence[Recipe] = (Recipe(),),
     calibration: Calibration | None = None,
     ranges: str = "proven",
-    margin: float = 0.1,
+    margin: float = MARGIN,
 ) -> tuple[IntegerNetwork, tuple[Choice, ...]]:
     """Choose the scales of each population and round weights, thresholds, biases and decays.
 

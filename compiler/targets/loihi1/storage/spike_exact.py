@@ -16,10 +16,10 @@ from spikeloom.compiler.interpret import float_recurrence, product
 from spikeloom.compiler.ir import IntegerNetwork, Network
 from spikeloom.compiler.passes.calibrate import Calibration, fewer
 from spikeloom.compiler.targets.base import Target
+from spikeloom.compiler.targets.loihi1.options import Recipe
 from spikeloom.compiler.targets.loihi1.storage.quantize import (
     Candidate,
     Choice,
-    Recipe,
     assemble,
     explain_choice,
     incoming,

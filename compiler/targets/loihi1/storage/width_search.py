@@ -24,8 +24,8 @@ from spikeloom.compiler.passes.prune import Mask, compact, disconnect, either, n
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.layout.core_needs import Chunk, choose_dense, lists_into
 from spikeloom.compiler.targets.loihi1.layout.partition import partition
+from spikeloom.compiler.targets.loihi1.options import Recipe, check_recipes
 from spikeloom.compiler.targets.loihi1.storage.branches import Offers, Path, Widths, offer_forms, settle, usual, votes
-from spikeloom.compiler.targets.loihi1.storage.quantize import Recipe, check_recipes
 
 MAX_COMBINATIONS = 4096
 """Combinations that are searched at most: six widths in four layers are 1,296, five in five layers 3,125."""

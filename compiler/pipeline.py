@@ -1,0 +1,55 @@
+"""A compilation is a list of passes; what the list is, every target says for itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any, Generic, Protocol, TypeVar
+
+
+class Work(Protocol):
+    """What passes hand on: all that was made so far."""
+
+    def verify(self) -> None:
+        """Check every rule of the newest artefact; VerifyError if a pass broke one."""
+
+    def text(self) -> str:
+        """The newest artefact in print; equal text means equal content."""
+
+
+W = TypeVar("W", bound=Work)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Pass(Generic[W]):
+    """One step of a compilation.
+
+    Parameters
+    ----------
+    name : str
+        For ``--dump-after`` and the table in docs/compile.md.
+    does : str
+        Its contract in one sentence.
+    keeps : str
+        What is the same before and after it.
+    apply : callable
+        Makes new work of what it is given, which stays as it is.
+    """
+
+    name: str
+    does: str
+    keeps: str
+    apply: Callable[[W], W]
+
+
+def run(passes: Iterable[Pass[W]], work: W, after: Callable[[str, W], object] | None = None) -> W:
+    """Apply passes in order and verify what each one made; `after` gets the name of each and its work."""
+    for step in passes:
+        work = step.apply(work)
+        work.verify()
+        if after is not None:
+            after(step.name, work)
+    return work
+
+
+Passes = tuple[Pass[Any], ...]

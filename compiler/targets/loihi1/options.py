@@ -1,0 +1,164 @@
+"""What a user may ask of a compilation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy.typing as npt
+
+from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.targets.base import Target
+from spikeloom.compiler.targets.loihi1.storage.weight_storage import Form
+
+RANGES = ("proven", "observed")
+"""How a scale is kept from overflowing the accumulator; ``observed`` trusts the calibration recordings."""
+
+GOALS = ("cores", "energy", "latency")
+"""What a layout may be chosen for."""
+
+MAX_PLANES = 3
+
+MARGIN = 0.1
+"""Share that is added to observed ranges unless another is given."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Recipe:
+    """Storage of one population.
+
+    Parameters
+    ----------
+    bits : int
+        Storage width of a mantissa.
+    planes : int
+        Times that a synapse may be stored, with different exponents.
+    groups : int
+        Different thresholds, and so scales, at most.
+    """
+
+    bits: int = 8
+    planes: int = 1
+    groups: int = 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Options:
+    """Options of a compilation.
+
+    Parameters
+    ----------
+    forms : sequence of Form, optional
+        Storage that the network was fine-tuned for, by population.
+    recipes : sequence of Recipe, optional
+        Storage of each layer, or one for all; 8 bits by default. A fine-tuned network brings its own and takes none.
+    spike_exact : bool
+        Add planes and scales until every spike on the training recordings, all of them, is the float64 model's, see
+        :mod:`storage.spike_exact`; takes the width from `recipes` and nothing else.
+    keep_all : bool
+        Keep neurons that provably do nothing, too.
+    prune_unused : bool
+        Remove neurons that did not fire on any training recording, too.
+    training_events : (samples, taxels, polarities, steps), optional
+        Training recordings for calibration, of which 32, evenly spaced, are used; with several planes 256.
+    ranges : str
+        One of ``RANGES``.
+    margin : float
+        Share added to observed ranges.
+    cores_for : mapping of str to int
+        Least number of cores of a layer, by name; they hold no other. Its neurons are cut as evenly as possible.
+    chips : int
+        Number of chips at most; as few are used as hold the cores.
+    optimize : str
+        One of ``GOALS``: what the layout is chosen for, see :mod:`layout.choose`; all but cores need training events.
+    provenance : mapping
+        JSON values to store with the netlist.
+    """
+
+    forms: Sequence[Form] | None = None
+    recipes: Sequence[Recipe] | None = None
+    spike_exact: bool = False
+    keep_all: bool = False
+    prune_unused: bool = False
+    training_events: npt.NDArray[Any] | None = None
+    ranges: str = "proven"
+    margin: float = MARGIN
+    cores_for: Mapping[str, int] = field(default_factory=dict)
+    chips: int = 1
+    optimize: str = "cores"
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    def require_consistent(self) -> None:
+        """Refuse options that contradict each other.
+
+        Raises
+        ------
+        OptionError
+            Saying which, and what to change.
+        """
+        if not 0 <= self.margin < math.inf:
+            raise OptionError(f"--margin {self.margin:g}: is no share to add to a range; give a number from 0")
+        calibrated, fine_tuned = self.training_events is not None, self.forms is not None
+        if self.prune_unused and (not calibrated or self.keep_all or fine_tuned):
+            raise OptionError(
+                "--prune-unused: needs --calibrate, and neither --keep-all nor a fine-tuned checkpoint; "
+                "change the options"
+            )
+        if fine_tuned and (self.recipes is not None or self.spike_exact or self.ranges != "proven"):
+            raise OptionError(
+                "compile: the checkpoint was fine-tuned for its own storage; omit --weight-bits, --planes, "
+                "--scale-groups, --spike-exact and --ranges"
+            )
+        if self.spike_exact and not calibrated:
+            raise OptionError("--spike-exact: nothing to be exact on; give --calibrate")
+        if self.spike_exact and self.ranges != "proven":
+            raise OptionError(f"--spike-exact: needs proven ranges, --ranges says {self.ranges}; omit --ranges")
+        recipes = self.recipes or (Recipe(),)
+        if self.spike_exact and (len(recipes) > 1 or recipes[0] != Recipe(bits=recipes[0].bits)):
+            raise OptionError(
+                "--spike-exact: finds planes and scales itself; give one width, no --planes or --scale-groups"
+            )
+
+
+def check_recipes(recipes: Sequence[Recipe], layers: int, target: Target) -> tuple[Recipe, ...]:
+    """One recipe for each layer.
+
+    Raises
+    ------
+    OptionError
+        If there are neither one nor as many as layers, or the chip has no such storage.
+    """
+    if len(recipes) not in (1, layers):
+        raise OptionError(
+            f"--weight-bits: {len(recipes)} layers are described, the network has {layers}; "
+            "give one number, or one for each layer"
+        )
+    allowed = target.choices["synapse.weight_bits"]
+    for recipe in recipes:
+        if recipe.bits not in allowed:
+            raise OptionError(
+                f"--weight-bits {recipe.bits}: {target.title} does not store that width; "
+                f"allowed: {', '.join(map(str, allowed))}"
+            )
+        if not 1 <= recipe.planes <= MAX_PLANES:
+            raise OptionError(f"--planes {recipe.planes}: allowed are 1 to {MAX_PLANES}; choose one of these")
+        slots = target.limit("core.threshold_slots")
+        if not 1 <= recipe.groups <= slots:
+            raise OptionError(
+                f"--scale-groups {recipe.groups}: a core of {target.title} holds {slots} thresholds; "
+                f"give a number from 1 to {slots}"
+            )
+    return tuple(recipes) if len(recipes) == layers else tuple(recipes) * layers
+
+
+def require_stored(forms: Sequence[Form], names: Sequence[str], target: Target) -> None:
+    """Refuse storage that a network was fine-tuned for and the chip does not have; `names` are of the layers."""
+    bits, exponents = (set(target.choices[f"synapse.{what}"]) for what in ("weight_bits", "exponent"))
+    for name, form in zip(names, forms, strict=True):
+        if form.bits not in bits or not set(form.exponents) <= exponents:
+            raise OptionError(
+                f"{name}: was fine-tuned for weights of {form.bits} bits with exponent "
+                f"{', '.join(map(str, form.exponents))}, which {target.title} does not store; fine-tune for this target"
+            )

@@ -1,0 +1,261 @@
+"""The passes of this chip in their order: a trained network at the top, a netlist that obeys every limit at the end."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+from spikeloom.compiler.fixedpoint import FloatArray
+from spikeloom.compiler.interpret import channels_last
+from spikeloom.compiler.ir import IntegerNetwork, Network
+from spikeloom.compiler.passes import calibrate as calibration
+from spikeloom.compiler.passes import expand, prune
+from spikeloom.compiler.pipeline import Pass, run
+from spikeloom.compiler.targets.base import Target
+from spikeloom.compiler.targets.loihi1.compilation import LATER, Compilation
+from spikeloom.compiler.targets.loihi1.emit import Origin, emit
+from spikeloom.compiler.targets.loihi1.layout.choose import lay_out, require_goal
+from spikeloom.compiler.targets.loihi1.legalize import require_legal
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.targets.loihi1.options import Options, Recipe, check_recipes, require_stored
+from spikeloom.compiler.targets.loihi1.storage.quantize import quantize, round_to_forms
+from spikeloom.compiler.targets.loihi1.storage.range_proof import prove_ranges
+from spikeloom.compiler.targets.loihi1.storage.spike_exact import make_exact
+
+__all__ = ["INTEGERS", "LAYOUT", "PASSES", "STORAGE", "Options", "lay_out_again", "start", "store", "without"]
+
+
+def _expand(done: Compilation) -> Compilation:
+    assert not isinstance(done.source, IntegerNetwork), "integers start behind the passes of float networks"
+    source = done.source
+    network = source if isinstance(source, Network) else expand.expand(source.checkpoint, source.propagation)
+    return replace(done, network=network)
+
+
+def _calibrate(done: Compilation) -> Compilation:
+    options = done.options
+    if options.training_events is None:
+        return done
+    events = channels_last(options.training_events, done.network.input.clocks)
+    if not (options.spike_exact or options.prune_unused):
+        several = any(recipe.planes > 1 for recipe in options.recipes or ())
+        events = calibration.evenly_spaced(events, calibration.MANY if several else calibration.FEW)
+    found = calibration.calibrate(done.network, events)
+    return replace(done, calibration=found, rates=tuple(spikes.mean(axis=(0, 1)) for spikes in found.spikes))
+
+
+def _disconnect(done: Compilation) -> Compilation:
+    unused = prune.none_of(done.network)
+    if done.options.prune_unused and done.calibration is not None:
+        unused = prune.never_fired(done.network, done.calibration)
+    if done.options.keep_all or done.options.forms is not None:
+        return replace(done, connected=done.network, unused=unused)
+    gone = prune.either(prune.never_fires(done.network), unused)
+    return replace(done, connected=prune.disconnect(done.network, gone), unused=unused)
+
+
+def _quantize(done: Compilation) -> Compilation:
+    options, network, target = done.options, done.connected, done.target
+    recipes = options.recipes or (Recipe(),)
+    if options.forms is not None:
+        require_stored(options.forms, [population.name for population in network.populations], target)
+        integer, choices = round_to_forms(network, options.forms, done.calibration)
+        return replace(done, integer=integer, choices=choices, connected=LATER)
+    if options.spike_exact and done.calibration is not None:
+        check_recipes(recipes, len(network.populations), target)
+        integer, choices, exactness = make_exact(network, target, done.calibration, bits=recipes[0].bits)
+        return replace(done, integer=integer, choices=choices, exactness=exactness, connected=LATER)
+    integer, choices = quantize(
+        network,
+        target,
+        recipes=recipes,
+        calibration=done.calibration,
+        ranges=options.ranges,
+        margin=options.margin,
+    )
+    return replace(done, integer=integer, choices=choices, connected=LATER)  # large, and no pass needs it again
+
+
+def _prove(done: Compilation) -> Compilation:
+    return replace(done, proofs=prove_ranges(done.integer))
+
+
+def _remove(done: Compilation) -> Compilation:
+    integer, network = done.integer, done.network
+    none = prune.none_of(integer)
+    silent, unreceived = (none, none) if done.options.keep_all else prune.removable(integer)
+    unused = done.unused or none
+    removals = () if network is LATER else prune.removals(network, silent, unreceived, unused)
+    held, identity = prune.compact(integer, prune.either(silent, unreceived))
+    return replace(
+        done, held=held, identity=identity, silent=silent, unreceived=unreceived, unused=unused, removals=removals
+    )
+
+
+def _place(done: Compilation) -> Compilation:
+    options = done.options
+    rates = None
+    if done.rates is not None:
+        rates = tuple(rate[ids] for rate, ids in zip(done.rates, done.identity, strict=True))
+    layout, usual = lay_out(
+        done.held,
+        done.target,
+        goal=options.optimize,
+        cores_for=options.cores_for,
+        chips=options.chips,
+        rates=rates,
+        calibration=done.calibration,
+        identity=done.identity,
+    )
+    return replace(done, layout=layout, usual=usual)
+
+
+def _emit(done: Compilation) -> Compilation:
+    origin = Origin(network=done.integer, identity=done.identity, unreceived=done.unreceived)
+    parts, tiles = done.layout.parts, done.layout.placement.tiles
+    return replace(done, netlist=emit(done.held, parts, tiles, done.target, done.options.provenance, origin))
+
+
+def _legalize(done: Compilation) -> Compilation:
+    return replace(done, uses=require_legal(done.netlist, done.target))
+
+
+FLOATS = (
+    Pass(
+        name="expand",
+        does="writes the graph convolution out as synapses, W = sum over hops k of A^k x W_k, in float64",
+        keeps="every spike, up to the rounding of a differently ordered sum",
+        apply=_expand,
+    ),
+    Pass(
+        name="calibrate",
+        does="runs the float network on training recordings, where there are any",
+        keeps="the network",
+        apply=_calibrate,
+    ),
+    Pass(
+        name="disconnect",
+        does="zeroes the weights of neurons that no input can make fire; with --prune-unused also of those that never "
+        "fired in training",
+        keeps="every spike on any input; with --prune-unused on any input on which these stay silent",
+        apply=_disconnect,
+    ),
+    Pass(
+        name="quantize",
+        does="chooses the scales of each layer and rounds weights, biases, thresholds and decays to registers",
+        keeps="the decisions, as well as the width allows; every training spike where --spike-exact succeeds",
+        apply=_quantize,
+    ),
+)
+"""From floats to integers."""
+
+INTEGERS = (
+    Pass(
+        name="prove",
+        does="bounds every register by the weights alone",
+        keeps="the network",
+        apply=_prove,
+    ),
+    Pass(
+        name="remove",
+        does="takes out the neurons that no input can make fire and those that no neuron receives",
+        keeps="every spike of the neurons that are left, on any input",
+        apply=_remove,
+    ),
+)
+"""On integers, where they are no matter from."""
+
+LAYOUT = (
+    Pass(
+        name="place",
+        does="cuts the layers over as few cores as every limit allows and puts the cores on tiles with the fewest "
+        "spike-hops, or as --optimize asks",
+        keeps="every spike: where a neuron sits has no influence on any",
+        apply=_place,
+    ),
+    Pass(
+        name="emit",
+        does="writes cores, axons and synapse lists down as a netlist",
+        keeps="every synapse that is not zero, stored once",
+        apply=_emit,
+    ),
+    Pass(
+        name="legalize",
+        does="measures every limit again on the netlist and refuses one that breaks any",
+        keeps="the netlist",
+        apply=_legalize,
+    ),
+)
+"""From integers to a netlist."""
+
+STORAGE = (*FLOATS, *INTEGERS)
+"""The longest part of a compilation, which any number of layouts can share."""
+
+PASSES = (*STORAGE, *LAYOUT)
+
+
+def start(
+    source: expand.Factored | Network | IntegerNetwork, options: Options, target: Target
+) -> tuple[Compilation, tuple[Pass[Compilation], ...]]:
+    """What the passes begin with, and which of them are due: integers are rounded already.
+
+    Raises
+    ------
+    OptionError
+        If the options contradict each other.
+    """
+    calibrated = options.training_events is not None
+    require_goal(options.optimize, options.cores_for, target, calibrated=calibrated, chips=options.chips)
+    options.require_consistent()
+    work = Compilation(source=source, options=options, target=target)
+    if isinstance(source, IntegerNetwork):
+        return replace(work, integer=source), (*INTEGERS, *LAYOUT)
+    return work, PASSES
+
+
+def store(source: expand.Factored | Network, options: Options, target: Target) -> Compilation:
+    """Round a network to the integers of the chip, without a layout: :func:`lay_out_again` makes as many as wanted."""
+    return run(STORAGE, start(source, options, target)[0])
+
+
+def lay_out_again(done: Compilation, options: Options) -> Compilation:
+    """Lay out what was rounded already; of the options those that speak of layouts count, and the provenance."""
+    return run(LAYOUT, replace(done, options=options))
+
+
+def without(done: Compilation, unused: prune.Masks, *, rates: tuple[FloatArray, ...] | None = None) -> Netlist:
+    """Remove more neurons from what was compiled, and lay out the rest on the fewest cores.
+
+    Weights and thresholds are the same integers: on any recording on which none of these neurons fires, every other
+    spike is as before.
+
+    Parameters
+    ----------
+    done : Compilation
+        Of a network on one chip.
+    unused : tuple of (neurons,) bool
+        Neurons to remove, by population; each population keeps one.
+    rates : tuple of (neurons,) float64, optional
+        Spikes per step, for the placement.
+
+    Raises
+    ------
+    CapacityError
+        If a limit cannot be kept.
+    """
+    silent, unreceived = prune.removable(done.integer)
+    silent = prune.either(silent, unused)
+    held, identity = prune.compact(done.integer, prune.either(silent, unreceived))
+    provenance: Mapping[str, Any] = done.netlist.provenance
+    fewer = replace(
+        done,
+        options=Options(provenance=provenance),
+        held=held,
+        identity=identity,
+        silent=silent,
+        unreceived=unreceived,
+        calibration=None,
+        rates=rates,
+    )
+    return run(LAYOUT, fewer).netlist

@@ -1,0 +1,29 @@
+"""Slow and simple definitions that the product is held against."""
+
+import numpy as np
+
+
+def probed(stage, channels):
+    """Weights (outputs, channels) and bias of an affine stage, by its responses to unit vectors."""
+    bias = stage(np.zeros((1, channels)))[0]
+    return (stage(np.eye(channels)) - bias).T, bias
+
+
+def weight_differences(first, second):
+    """(layer, row, column, weight, other weight) of each synapse that two integer networks of the same layers differ
+    in; planes are added up. Thresholds, biases and decays must be the same."""
+    for one, other in zip(first.populations, second.populations, strict=True):
+        assert (one.decay_u, one.decay_v) == (other.decay_u, other.decay_v)
+        np.testing.assert_array_equal(one.threshold, other.threshold)
+        np.testing.assert_array_equal(one.bias, other.bias)
+    found = []
+    ends = {(p.pre, p.post) for network in (first, second) for p in network.projections}
+    for pre, post in sorted(ends):
+        one, other = (
+            sum(p.effective() for p in network.projections if (p.pre, p.post) == (pre, post))
+            for network in (first, second)
+        )
+        row, column = (one != other).nonzero()
+        name = first.populations[post].name
+        found += [(name, int(i), int(j), int(one[i, j]), int(other[i, j])) for i, j in zip(row, column, strict=True)]
+    return found
