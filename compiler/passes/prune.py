@@ -8,7 +8,7 @@ become finer. Left out on request only: neurons that did not fire on the trainin
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -47,7 +47,7 @@ class Removal:
 
     layer: str
     silent: int
-    unreceived: int
+    unreceived: int = field(metadata={"key": "unheard"})  # its name in JSON
     unused: int
     synapses: int
 

@@ -19,6 +19,7 @@ from spikeloom.compiler.targets.loihi1.layout.choose import Layout
 from spikeloom.compiler.targets.loihi1.legalize import LimitUse
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.runtime.machines.loihi1.trace import BoolArray
+from spikeloom.runtime.report.encode import encode
 from spikeloom.runtime.report.tables import si, table
 
 Json = dict[str, Any]
@@ -109,7 +110,7 @@ def compilation_json(compilation: Compilation, sha256: str) -> Json:
             {key: value if value != math.inf else None for key, value in asdict(proof).items()} | {"holds": proof.holds}
             for proof in compilation.proofs
         ],
-        "removals": [asdict(layer) for layer in compilation.removals],
+        "removals": [encode(layer) for layer in compilation.removals],
         "exactness": [asdict(layer) for layer in compilation.exactness],
         "core_bound": compilation.core_bound,
         "placement": asdict(compilation.placement),
