@@ -1,7 +1,7 @@
 """Other sensors: taxel positions and hand-drawn edges from CSV files, and the checks that they need.
 
 What makes a graph wrong is an error (a taxel that does not exist, two taxels in one place, an edge from a taxel to
-itself). What may be meant but rarely is (taxels that nobody hears, a graph in parts, an edge listed again) is a
+itself). What may be meant but rarely is (taxels without edges, a graph in parts, an edge listed again) is a
 warning: text that the caller shows.
 """
 
@@ -122,7 +122,7 @@ def read_edges(
         row = int(np.argmax(loops))
         raise DataError(
             f"{table.at(row)}: joins taxel {edges[row, 0]} to itself, allowed are two taxels; remove the line "
-            "(every taxel hears itself anyway)"
+            "(every taxel receives its own events anyway)"
         )
     kept, first = np.unique(edges, axis=0, return_index=True)
     warnings = _repeats(table, edges, first)
@@ -155,7 +155,7 @@ def sensor_graph(
     -------
     graph : Graph
         Named as in `graph`, or ``edges:FILE``. A sensor given by edges alone has no positions; its taxels then
-        stand on a line in their order, which nothing that is computed from edges sees.
+        stand on a line in their order, which nothing that is computed from edges uses.
     warnings : tuple of str
         One line each; NeuTouch graphs by name have none.
 
@@ -170,7 +170,7 @@ def sensor_graph(
         found = "neither was given" if graph is None else "both were given"
         raise OptionError(f"--graph and --edges: {found}, allowed is one of them; --graph takes {CHOICES}")
     if directed and edges is None:
-        raise OptionError("--directed: only edges from a file have directions; give --edges or leave it away")
+        raise OptionError("--directed: only edges from a file have directions; give --edges or omit it")
     count, places = (None, None) if taxels is None else read_layout(taxels)
     if edges is None:
         assert graph is not None  # the first check left one of them
@@ -196,7 +196,7 @@ def connection_warnings(where: str, edges: IntArray, n: int) -> tuple[str, ...]:
     --------
     >>> for line in connection_warnings("edges.csv", np.array([[0, 1], [2, 3], [3, 4]]), 6):
     ...     print(line)
-    edges.csv: taxel 5 has no edge, it hears only itself; add edges if it should not
+    edges.csv: taxel 5 has no edge, it receives its own events only; add edges if it should not
     edges.csv: the graph has 2 parts, of 3 and 2 taxels (with taxels 2 and 0); touch does not spread between them
     """
     warnings = []
@@ -204,10 +204,12 @@ def connection_warnings(where: str, edges: IntArray, n: int) -> tuple[str, ...]:
     first, sizes = np.unique(part, return_counts=True)
     isolated = first[sizes == 1].tolist()
     if isolated:
-        have = "has no edge, it hears" if len(isolated) == 1 else "have no edges, each hears"
+        have = "has no edge, it receives its" if len(isolated) == 1 else "have no edges, each receives its"
         should = "it" if len(isolated) == 1 else "they"
         taxel = "taxel" if len(isolated) == 1 else "taxels"
-        warnings.append(f"{where}: {taxel} {_listed(isolated)} {have} only itself; add edges if {should} should not")
+        warnings.append(
+            f"{where}: {taxel} {_listed(isolated)} {have} own events only; add edges if {should} should not"
+        )
     order = np.argsort(-sizes, kind="stable")
     several = [index for index in order.tolist() if sizes[index] > 1]
     if len(several) > 1:

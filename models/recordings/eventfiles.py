@@ -7,10 +7,8 @@ one code per file. The label is the class of the whole recording: one constant, 
 
 from __future__ import annotations
 
-import math
 import os
 import re
-import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,8 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spikeloom.compiler.errors import DataError
-from spikeloom.models.recordings import evtouch
 from spikeloom.models.recordings.csvtable import FloatArray, read_table
+from spikeloom.models.recordings.evtouch import opened
+from spikeloom.models.recordings.npy import parse_npy, read_bounded
 from spikeloom.models.sensors import MAX_TAXELS
 
 SUFFIXES = (".csv", ".npz")
@@ -34,9 +33,7 @@ UNIT_EVENTS, UNIT_SPAN = 8, 60.0
 """Different times, and what lies between first and last, below which no unit is guessed."""
 
 _REQUIRED = ("time_s", "taxel", "polarity")
-_COLUMNS = "time_s, taxel, polarity[, label]"
 _LABEL = re.compile(r"_label_([0-9]{1,6})(?![0-9])")
-_NUMBERS = re.compile(r"[<>|=](f[248]|[iu][1248]|b1)")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -73,12 +70,11 @@ def read_stream(path: str | os.PathLike[str], *, taxels: int | None = None, wher
     Parameters
     ----------
     path : path
-        A ``.csv`` (see :func:`csvtable.read_table`) or a ``.npz`` of one-dimensional arrays; ``label`` may be one
-        number.
+        A ``.csv`` or a ``.npz`` of one-dimensional arrays; ``label`` may be one number.
     taxels : int, optional
         How many the sensor has.
     where : str, optional
-        What messages call the file; its name if left out.
+        What messages call the file; its name by default.
 
     Raises
     ------
@@ -87,7 +83,12 @@ def read_stream(path: str | os.PathLike[str], *, taxels: int | None = None, wher
     """
     path = Path(path)
     where = where or path.name
-    columns, at = _read_csv(path, where) if path.suffix.lower() == ".csv" else _read_npz(path, where)
+    if path.suffix.lower() == ".csv":
+        table = read_table(path, _REQUIRED, ("label",), where=where)
+        columns: Mapping[str, FloatArray] = table.columns
+        at: Callable[[int], str] = table.at
+    else:
+        columns, at = _read_npz(path, where)
     time_s, taxel = columns["time_s"], columns["taxel"]
     wrong = ~(np.isfinite(time_s) & (time_s >= 0))
     if wrong.any():
@@ -176,54 +177,30 @@ def _label(where: str, name: str, column: FloatArray | None) -> int:
     return int(first)
 
 
-def _read_csv(path: Path, where: str) -> tuple[Mapping[str, FloatArray], Callable[[int], str]]:
-    table = read_table(path, _REQUIRED, ("label",), where=where)
-    return table.columns, table.at
-
-
 def _read_npz(path: Path, where: str) -> tuple[Mapping[str, FloatArray], Callable[[int], str]]:
-    """Columns of an npz, every size checked before memory is taken for it."""
-    try:
-        is_zip = zipfile.is_zipfile(path)
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror or error}); check the path and the disk") from error
-    if not is_zip:
-        raise DataError(f"{where}: not an npz file; save it with numpy.savez")
+    """Columns of an npz."""
     columns: dict[str, FloatArray] = {}
-    with evtouch._opened(path, set()) as (members, read):
-        missing = [name for name in _REQUIRED if f"{name}.npy" not in members]
-        if missing:
-            found = ", ".join(sorted(member.removesuffix(".npy") for member in members)) or "nothing"
-            raise DataError(f"{where}: holds {found}, expected are {_COLUMNS}; name the arrays so")
+    with opened(path) as members:
         for name in (*_REQUIRED, "label"):
-            if f"{name}.npy" in members:
+            if member := members.get(f"{name}.npy"):
                 place = f"{where}: {name}"
-                columns[name] = _array(place, evtouch._bounded(place, read, f"{name}.npy"))
-    sizes = {name: column.size for name, column in columns.items() if name != "label"}
-    if len(set(sizes.values())) > 1 or any(columns[name].ndim != 1 for name in sizes):
-        shapes = ", ".join(f"{name} {columns[name].shape}" for name in sizes)
-        raise DataError(f"{where}: shapes {shapes}, allowed is one number per event in each; save flat arrays")
-    if not columns["time_s"].size:
+                columns[name] = parse_npy(place, read_bounded(place, member)).astype(np.float64)
+        if missing := [name for name in _REQUIRED if name not in columns]:
+            found = ", ".join(sorted(member.removesuffix(".npy") for member in members)) or "nothing"
+            raise DataError(
+                f"{where}: holds {found}, without {', '.join(missing)}; name the arrays {', '.join(_REQUIRED)}[, label]"
+            )
+    shapes = {name: columns[name].shape for name in _REQUIRED}
+    if len(set(shapes.values())) > 1 or columns["time_s"].ndim != 1:
+        shown = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
+        raise DataError(f"{where}: shapes {shown}, allowed is one number per event in each; save flat arrays")
+    events = columns["time_s"].size
+    if not events:
         raise DataError(f"{where}: no events, a recording needs one or more; remove the file")
     if "label" in columns:
         columns["label"] = columns["label"].reshape(-1)
-        if columns["label"].size not in (1, columns["time_s"].size):
+        if columns["label"].size not in (1, events):
             raise DataError(
-                f"{where}: {columns['label'].size} labels for {columns['time_s'].size} events, allowed is one; "
-                "save one number"
+                f"{where}: {columns['label'].size} labels for {events} events, allowed is one; save one number"
             )
     return columns, lambda row: f"{where}: event {row}"
-
-
-def _array(where: str, data: bytes) -> FloatArray:
-    """Numbers of an npy file as float64."""
-    descr, _, shape, start = evtouch._header(where, data)
-    if not (isinstance(descr, str) and _NUMBERS.fullmatch(descr)):
-        raise DataError(f"{where}: dtype {descr!r}, allowed are numbers; convert it")
-    dtype = np.dtype(descr)
-    if math.prod(shape) * dtype.itemsize != len(data) - start:
-        raise DataError(
-            f"{where}: {len(data) - start} bytes of data, its header announces {math.prod(shape) * dtype.itemsize}; "
-            "truncated or damaged; copy it again"
-        )
-    return np.frombuffer(data, dtype=dtype, offset=start).reshape(shape).astype(np.float64)

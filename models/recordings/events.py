@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spikeloom.compiler.errors import DataError, OptionError
-from spikeloom.models.recordings import evtouch
+from spikeloom.models.recordings.counts import GAP_S, EventCounts
 from spikeloom.models.recordings.eventfiles import (
     SUFFIXES,
     UNLABELLED,
@@ -25,16 +26,22 @@ from spikeloom.models.recordings.eventfiles import (
     likely_unit,
     read_stream,
 )
-from spikeloom.models.recordings.evtouch import Recordings, load_recordings
+from spikeloom.models.recordings.evtouch import (
+    Recordings,
+    load_recordings,
+    opened,
+    parse_bins,
+    require_class,
+    require_memory,
+    splits_of,
+)
 from spikeloom.models.recordings.fetch import DATA_SETS, find_data
 from spikeloom.models.recordings.labels import NAME as TABLE
 from spikeloom.models.recordings.labels import is_table, labels_beside
+from spikeloom.models.recordings.npy import read_bounded
 
 BIN_S = 0.02
 """Width of a time bin in the released recordings, seconds."""
-
-GAP_S = 0.5
-"""A silence longer than this, between two events, counts as a gap; seconds."""
 
 MAX_STEPS = 1_000_000
 
@@ -43,33 +50,14 @@ MAX_STEPS = 1_000_000
 _EDGE = 1e-9
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class EventCounts:
-    """What was found while recordings were put into bins.
+@dataclass(frozen=True, slots=True)
+class _Recording:
+    """One recording in bins, (taxels, 2, steps), and what messages call it."""
 
-    Parameters
-    ----------
-    events : int
-        Events read, duplicates included.
-    out_of_order : int
-        Events with a time before that of an event that came earlier.
-    duplicates : int
-        Events whose taxel already had one of the same polarity in the same bin; they count once.
-    gaps : int
-        Silences longer than `GAP_S` between two events of a recording.
-    steps : tuple of int
-        Bins of each recording.
-    notes : tuple of str
-        What is worth a second look: times that look like another unit, taxels that seem to count from 1, a table of
-        labels.
-    """
-
-    events: int
-    out_of_order: int
-    duplicates: int
-    gaps: int
-    steps: tuple[int, ...]
-    notes: tuple[str, ...] = ()
+    where: str
+    grid: NDArray[np.uint8]
+    label: int
+    counts: EventCounts
 
 
 def load_data(
@@ -119,7 +107,6 @@ def load_data(
     path = find_data(str(path)) if str(path) in DATA_SETS else Path(path)
     found = _event_files(path)
     if found is None:
-        _require_released(path, split)
         require_events(path.name or str(path), bin_s)
         return load_recordings(path, split, limit=limit, classes=classes, taxels=taxels), None
     source = path.name or str(path)
@@ -129,46 +116,35 @@ def load_data(
         )
     files = sorted(found[split if split in found else ""], key=lambda file: file.name)[:limit]
     table, notes = labels_beside(path, files, source)
-    grids, labels, counts, places = [], [], [], []
+    read: list[_Recording] = []
     held = 0
     for file in files:
         where = source if file == path else f"{source}: {file.relative_to(path).as_posix()}"
-        if file.suffix.lower() == ".npy":
-            require_events(where, bin_s)
-        grid, label, count = _read(file, where, bin_s, taxels)
-        label = _merged(where, label, table.get(file))
-        if classes is not None and label >= classes:
-            raise DataError(
-                f"{where}: label {label}, the network has {classes} classes (0..{classes - 1}); "
-                "use the network that was trained on these objects"
-            )
-        grids.append(grid)
-        places.append(where)
-        labels.append(label)
-        counts.append(count)
-        held += grid.size
-        evtouch._check_total(source, held)
-    steps = tuple(grid.shape[2] for grid in grids)
-    shape = max(grid.shape[0] for grid in grids), 2, max(steps)
-    evtouch._check_total(source, len(grids) * math.prod(shape))
-    events = np.zeros((len(grids), *shape), dtype=np.uint8)
-    for index, grid in enumerate(grids):
-        events[index, : grid.shape[0], :, : grid.shape[2]] = grid
+        read.append(_read(file, where, bin_s, taxels, table.get(file)))
+        require_class(where, read[-1].label, classes)
+        held += read[-1].grid.size
+        require_memory(source, held)
+    steps = tuple(each.grid.shape[2] for each in read)
+    shape = max(each.grid.shape[0] for each in read), 2, max(steps)
+    require_memory(source, len(read) * math.prod(shape))
+    events = np.zeros((len(read), *shape), dtype=np.uint8)
+    for index, each in enumerate(read):
+        events[index, : each.grid.shape[0], :, : each.grid.shape[2]] = each.grid
     recordings = Recordings(
         events=events,
-        labels=np.array(labels, dtype=np.int64),
+        labels=np.array([each.label for each in read], dtype=np.int64),
         files=tuple(file.name for file in files),
         split=split,
         source=source,
         lengths=None if len(set(steps)) == 1 else np.array(steps, dtype=np.int64),
     )
     return recordings, EventCounts(
-        events=sum(count.events for count in counts),
-        out_of_order=sum(count.out_of_order for count in counts),
-        duplicates=sum(count.duplicates for count in counts),
-        gaps=sum(count.gaps for count in counts),
+        events=sum(each.counts.events for each in read),
+        out_of_order=sum(each.counts.out_of_order for each in read),
+        duplicates=sum(each.counts.duplicates for each in read),
+        gaps=sum(each.counts.gaps for each in read),
         steps=steps,
-        notes=(*notes, *_unit_notes(places, counts), *(_taxel_notes(source, events) if taxels is None else ())),
+        notes=(*notes, *_unit_notes(read), *(_taxel_notes(source, events) if taxels is None else ())),
     )
 
 
@@ -181,7 +157,7 @@ def require_events(where: str, bin_s: float) -> None:
         If it is another one than the default.
     """
     if bin_s != BIN_S:
-        raise OptionError(f"--bin {bin_s:g}: {where} holds bins, not times; leave --bin away")
+        raise OptionError(f"--bin {bin_s:g}: {where} holds bins, not times; omit --bin")
 
 
 def data_splits(path: str | os.PathLike[str]) -> tuple[str, ...]:
@@ -196,9 +172,8 @@ def data_splits(path: str | os.PathLike[str]) -> tuple[str, ...]:
     found = _event_files(path)
     if found is not None:
         return tuple(sorted(filter(None, found)))
-    _require_released(path, "test")
-    with evtouch._opened(path, {"train", "test"}) as (names, _):
-        return tuple(sorted(evtouch._splits(path.name or str(path), names, {"train", "test"})))
+    with opened(path) as members:
+        return tuple(sorted(splits_of(path.name or str(path), members, {"train", "test"})))
 
 
 def need_labels(recordings: Recordings, what: str) -> Recordings:
@@ -266,7 +241,7 @@ def bin_events(
     step = np.floor(stream.time_s / bin_s + _EDGE).astype(np.int64)
     steps = int(step.max()) + 1
     n = int(stream.taxel.max()) + 1 if taxels is None else taxels
-    evtouch._check_total(stream.name, n * 2 * steps)
+    require_memory(stream.name, n * 2 * steps)
     grid = np.zeros((n, 2, steps), dtype=np.uint8)
     grid[stream.taxel, stream.polarity, step] = 1
     sent = len(stream.time_s)
@@ -345,28 +320,9 @@ def _counts(file: Path, suffixes: tuple[str, ...]) -> bool:
     return file.suffix.lower() in suffixes and plain and file.is_file()
 
 
-def _require_released(path: Path, split: str) -> None:
-    """Say everything that a folder may hold if it holds nothing of it."""
-    splits = {"train", "test", split}
-    if path.is_dir() and not any(name.endswith(".npy") for name in evtouch._list_folder(path, splits)):
-        raise DataError(
-            f"{path.name or path}: no recordings; give a folder with event files (.csv, .npz) or bins (.npy), "
-            "together or in train/ and test/, or a released zip"
-        )
-
-
-def _merged(where: str, label: int, listed: int | None) -> int:
-    """Class of a recording that may stand in a table too."""
-    if listed is None:
-        return label
-    if label not in (UNLABELLED, listed):
-        raise DataError(f"{where}: label {label}, and {listed} in {TABLE}; mend one of them")
-    return listed
-
-
-def _unit_notes(places: list[str], counts: list[EventCounts]) -> list[str]:
+def _unit_notes(read: Sequence[_Recording]) -> list[str]:
     """One line for all recordings whose times look wrong."""
-    odd = [(place, note) for place, count in zip(places, counts, strict=True) for note in count.notes]
+    odd = [(each.where, note) for each in read for note in each.counts.notes]
     others = f" (and {len(odd) - 1} more)" if len(odd) > 1 else ""
     return [f"{place}{others}: {note}" for place, note in odd[:1]]
 
@@ -379,17 +335,20 @@ def _taxel_notes(source: str, events: NDArray[np.uint8]) -> list[str]:
     return [f"{source}: no event at taxel 0, some at each of 1..{len(alive) - 1}: if these count from 1, count from 0"]
 
 
-def _read(file: Path, where: str, bin_s: float, taxels: int | None) -> tuple[NDArray[np.uint8], int, EventCounts]:
-    """Events in bins, label and counts of one recording."""
-    if file.suffix.lower() != ".npy":
+def _read(file: Path, where: str, bin_s: float, taxels: int | None, listed: int | None) -> _Recording:
+    """One recording; `listed` is its class in a table of labels."""
+    if file.suffix.lower() == ".npy":
+        require_events(where, bin_s)
+        grid = parse_bins(where, read_bounded(where, lambda: file.open("rb")), taxels)
+        busy = np.flatnonzero(grid.any(axis=(0, 1)))
+        gaps = int(np.count_nonzero((np.diff(busy) - 1) * bin_s > GAP_S))
+        sent = int(np.count_nonzero(grid))
+        counts = EventCounts(events=sent, out_of_order=0, duplicates=0, gaps=gaps, steps=(grid.shape[2],))
+        label = label_in_name(file.name)
+    else:
         stream = read_stream(file, taxels=taxels, where=where)
-        grid, count = bin_events(stream, bin_s, taxels=taxels)
-        return grid, stream.label, count
-    data = evtouch._bounded(where, lambda _: evtouch._read_file(file), file.name)
-    grid = evtouch._parse(where, data, taxels)
-    busy = np.flatnonzero(grid.any(axis=(0, 1)))
-    gaps = int(np.count_nonzero((np.diff(busy) - 1) * bin_s > GAP_S))
-    count = EventCounts(
-        events=int(np.count_nonzero(grid)), out_of_order=0, duplicates=0, gaps=gaps, steps=(grid.shape[2],)
-    )
-    return grid, label_in_name(file.name), count
+        grid, counts = bin_events(stream, bin_s, taxels=taxels)
+        label = stream.label
+    if listed is not None and label not in (UNLABELLED, listed):
+        raise DataError(f"{where}: label {label}, and {listed} in {TABLE}; mend one of them")
+    return _Recording(where, grid, label if listed is None else listed, counts)

@@ -22,20 +22,10 @@ def is_table(file: Path) -> bool:
 
 
 def read_labels(path: Path, where: str) -> Mapping[str, int] | None:
-    """Read a table of labels.
+    """Class by name of file in a table of labels; None if the file is another kind of table.
 
-    Parameters
-    ----------
-    path : Path
-        Text in UTF-8. Its header names one of the columns ``file``, ``filename``, ``name`` and ``recording``, and one
-        of ``label`` and ``class``; others are passed over.
-    where : str
-        What messages call it.
-
-    Returns
-    -------
-    mapping of str to int, or None
-        Class by name of file; None if the file is another kind of table.
+    Its header names one of the columns ``file``, ``filename``, ``name`` and ``recording``, and one of ``label`` and
+    ``class``; others are passed over.
 
     Raises
     ------
@@ -72,16 +62,9 @@ def read_labels(path: Path, where: str) -> Mapping[str, int] | None:
 
 
 def labels_beside(path: Path, files: list[Path], source: str) -> tuple[dict[Path, int], list[str]]:
-    """Classes that a table beside recordings gives, by file, and what to say about it.
+    """Classes that tables beside recordings give, by file, and a note on each table.
 
-    Parameters
-    ----------
-    path : Path
-        Folder that was asked for, or one recording.
-    files : list of Path
-        Recordings in it.
-    source : str
-        What messages call it.
+    `path` is the folder that was asked for, or one recording; `files` are the recordings in it.
 
     Raises
     ------

@@ -7,9 +7,9 @@ import math
 
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.targets.netlist import Netlist
+from spikeloom.models.recordings.counts import show_counts
 from spikeloom.models.recordings.events import BIN_S, MAX_STEPS, joined_bins, load_data, need_labels, require_events
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.models.recordings.found import show_counts
 from spikeloom.models.recordings.grasps import SYNTHETIC, synthetic_split
 from spikeloom.models.recordings.windows import first_part, parse_window
 from spikeloom.runtime.report.console import progress
@@ -38,7 +38,7 @@ def recordings(
     """
     if path != SYNTHETIC:
         data, counts = load_data(path, split, bin_s=bin_s, limit=limit, classes=classes, taxels=taxels)
-        show_counts(data, counts)
+        show_counts(data.source, counts)
         if labels_for is not None:
             need_labels(data, labels_for)
         return joined_bins(data, bins)

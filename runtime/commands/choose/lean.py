@@ -19,8 +19,8 @@ from spikeloom.compiler.systems import TACTILESGNET
 from spikeloom.compiler.targets.base import Target, load_target
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist
+from spikeloom.models.recordings.counts import number
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.models.recordings.found import number
 from spikeloom.runtime.commands.main_job.compile import storage
 from spikeloom.runtime.commands.options import add_network, add_recordings
 from spikeloom.runtime.costs.estimate import estimate

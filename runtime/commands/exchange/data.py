@@ -3,33 +3,62 @@
 from __future__ import annotations
 
 import argparse
-import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.fixedpoint import FloatArray
 from spikeloom.models.graphs import NEUTOUCH
-from spikeloom.models.recordings.describe import RULES, Description, describe
-from spikeloom.models.recordings.eventfiles import UNLABELLED
-from spikeloom.models.recordings.events import EventCounts, data_splits, joined_bins, load_data, require_events
+from spikeloom.models.recordings.counts import EventCounts, Oddities, number, oddities, show_notes
+from spikeloom.models.recordings.describe import describe
+from spikeloom.models.recordings.events import data_splits, joined_bins, load_data, require_events
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.recordings.fetch import DATA_SETS, data_folder, fetch_data
-from spikeloom.models.recordings.found import counts_json, counts_text, number, show_notes
 from spikeloom.models.recordings.grasps import SPLITS, SYNTHETIC, synthetic_split
 from spikeloom.models.recordings.release import SOURCES, write_event_lines, write_released
 from spikeloom.models.sensors import read_layout
+from spikeloom.runtime.commands.exchange.described import described, described_sections
 from spikeloom.runtime.commands.options import add_bin_option, add_common
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.recordings import require_bins
-from spikeloom.runtime.report.tables import table
+from spikeloom.runtime.report.sections import Outcome, Section, Text
 
 Arguments = argparse.Namespace
-Outcome = tuple[dict[str, Any], Callable[[dict[str, Any]], str], int]
-Json = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FetchedData:
+    """Where released recordings are, and what to give to ``--data``."""
+
+    name: str
+    path: Path
+    new: bool
+    bytes: int
+    sha256: str
+    data: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ConvertedSplit:
+    """A split that was written, and what was odd about its events."""
+
+    recordings: int
+    found: Oddities | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Converted:
+    """Recordings that were written; `names` is the table of what became what."""
+
+    source: str
+    output: str
+    taxels: int
+    steps: int
+    names: str | None
+    splits: Mapping[str, ConvertedSplit]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -76,36 +105,35 @@ def _source(parser: argparse.ArgumentParser) -> None:
 
 
 def _fetch(arguments: Arguments) -> Outcome:
-    def progress(have: int, size: int) -> None:
-        if sys.stderr.isatty():
-            sys.stderr.write(f"\r\x1b[Kfetching {arguments.name}: {100 * have // size} % …")
-            sys.stderr.flush()
-
-    fetched = fetch_data(arguments.name, url=arguments.url, folder=arguments.dir, progress=progress)
+    fetched = fetch_data(arguments.name, url=arguments.url, folder=arguments.dir)
     data = DATA_SETS[arguments.name]
     default = fetched.path == data_folder() / data.file
-    report = {
-        "name": arguments.name,
-        "path": str(fetched.path),
-        "new": fetched.new,
-        "bytes": data.size,
-        "sha256": data.sha256,
-        "data": arguments.name if default else str(fetched.path),
-    }
-    return report, _fetch_text, 0
+    result = FetchedData(
+        name=arguments.name,
+        path=fetched.path,
+        new=fetched.new,
+        bytes=data.size,
+        sha256=data.sha256,
+        data=arguments.name if default else str(fetched.path),
+    )
+    return Outcome(result, _fetch_sections)
 
 
-def _fetch_text(report: Json) -> str:
-    state = "fetched" if report["new"] else "already there"
-    return (
-        f"{report['name']}: {state}, {report['bytes']:,} bytes, sha256 as released\n"
-        f"  {report['path']}\n  use it with --data {report['data']}"
+def _fetch_sections(result: FetchedData) -> Iterable[Section]:
+    state = "fetched" if result.new else "already there"
+    yield Section(
+        "Fetched",
+        [
+            Text(f"{result.name}: {state}, {result.bytes:,} bytes, sha256 as released"),
+            Text(f"  {result.path}\n  use it with --data {result.data}"),
+        ],
     )
 
 
 def _describe(arguments: Arguments) -> Outcome:
     if arguments.picture is not None:
-        _check_picture(arguments.picture)
+        if Path(arguments.picture).suffix.lower() != ".png":
+            raise OptionError(f"--picture {arguments.picture}: allowed is a PNG; give a name that ends in .png")
         require_place(arguments.picture, "--picture", arguments)
     count, places = _layout(arguments.taxels)
     recordings, counts = _load(arguments.source, arguments.split, arguments.bin, count)
@@ -117,73 +145,7 @@ def _describe(arguments: Arguments) -> Outcome:
         from spikeloom.runtime.report.data_picture import draw
 
         draw(arguments.picture, description, places, title=f"{recordings.source}, {recordings.split}")
-    return _description_json(recordings, description, counts, arguments.picture), _description_text, 0
-
-
-def _description_json(
-    recordings: Recordings, description: Description, counts: EventCounts | None, picture: str | None
-) -> Json:
-    """Statistics under the keys that scripts rely on."""
-    return {
-        "source": recordings.source,
-        "split": recordings.split,
-        "recordings": description.recordings,
-        "taxels": recordings.taxels,
-        "bin_s": description.bin_s,
-        "steps": recordings.steps,
-        "duration_s": dict(zip(("shortest", "median", "longest"), description.duration_s, strict=True)),
-        "events": description.events,
-        "found": None if counts is None else counts_json(counts),
-        "labels": {str(label): number for label, number in description.classes.items() if label != UNLABELLED},
-        "unlabelled": description.classes.get(UNLABELLED, 0),
-        "rate": {
-            "falling": float(description.rate[:, 0].sum()),
-            "rising": float(description.rate[:, 1].sum()),
-            "taxels": [{"falling": low, "rising": high} for low, high in description.rate.tolist()],
-        },
-        "dead": list(description.dead),
-        "one_sided": list(description.one_sided),
-        "hot": list(description.hot),
-        "rules": RULES,
-        "picture": picture,
-    }
-
-
-def _description_text(report: Json) -> str:
-    """Statistics for people."""
-    duration, rate = report["duration_s"], report["rate"]
-    short, middle, long = (f"{duration[key]:g}" for key in ("shortest", "median", "longest"))
-    lasts = f"{long} s" if short == long else f"{short} … {long} s (median {middle} s)"
-    labels = report["labels"]
-    each = sorted(set(labels.values()))
-    spread = number(each[0], "recording") if len(each) == 1 else f"{each[0]} … {each[-1]} recordings" if each else ""
-    lines = [
-        f"{report['source']}, {report['split']}: {number(report['recordings'], 'recording')}, "
-        f"{number(report['taxels'], 'taxel')}, "
-        f"{lasts} in bins of {report['bin_s']:g} s",
-        f"  labels: {number(len(labels), 'class') + f', {spread} each' if labels else 'none'}"
-        + (f"; {number(report['unlabelled'], 'recording')} without" if labels and report["unlabelled"] else ""),
-        f"  events: {report['events']:,} after binning; {rate['falling']:.1f} falling and {rate['rising']:.1f} rising "
-        "per second",
-    ]
-    if report["found"] is not None:
-        lines.append(f"  found: {counts_text(report['found'])}")
-    broken = {kind: set(report[kind.replace("-", "_")]) for kind in RULES}
-    for kind, taxels in broken.items():
-        shown = ", ".join(map(str, sorted(taxels))) or "none"
-        lines.append(f"  {kind} taxels: {shown} ({report['rules'][kind]})")
-    if report["picture"] is not None:
-        lines.append(f"  picture: {report['picture']}")
-    rows = [
-        [
-            str(taxel),
-            f"{one['falling']:.2f}",
-            f"{one['rising']:.2f}",
-            ", ".join(kind for kind, taxels in broken.items() if taxel in taxels),
-        ]
-        for taxel, one in enumerate(rate["taxels"])
-    ]
-    return "\n".join([*lines, "", table(["taxel", "falling/s", "rising/s", "looks"], rows)])
+    return Outcome(described(recordings, description, counts, arguments.picture), described_sections)
 
 
 def _convert(arguments: Arguments) -> Outcome:
@@ -204,45 +166,38 @@ def _convert(arguments: Arguments) -> Outcome:
         write_event_lines(arguments.output, [recordings for recordings, _ in loaded], bins * arguments.bin)
     else:
         write_released(arguments.output, [_grown(recordings, taxels, steps) for recordings, _ in loaded])
-    report = {
-        "source": arguments.source,
-        "output": arguments.output,
-        "taxels": taxels,
-        "steps": steps,
-        "names": None if lines else SOURCES,
-        "splits": {
-            recordings.split: {
-                "recordings": len(recordings),
-                "found": None if counts is None else counts_json(counts, steps),
-            }
-            for recordings, counts in loaded
-        },
+    splits = {
+        recordings.split: ConvertedSplit(
+            recordings=len(recordings), found=None if counts is None else oddities(counts, padded_to=steps)
+        )
+        for recordings, counts in loaded
     }
-    return report, _convert_text, 0
+    result = Converted(
+        source=arguments.source,
+        output=arguments.output,
+        taxels=taxels,
+        steps=steps,
+        names=None if lines else SOURCES,
+        splits=splits,
+    )
+    return Outcome(result, _convert_sections)
 
 
-def _convert_text(report: Json) -> str:
-    lines = [f"{report['output']}: {number(report['taxels'], 'taxel')}, {number(report['steps'], 'bin')}"]
-    for split, made in report["splits"].items():
-        lines.append(f"  {split}: {number(made['recordings'], 'recording')}")
-        if made["found"] is not None:
-            lines.append(f"    found: {counts_text(made['found'])}")
-    if report["names"] is not None:
-        lines.append(f"  names: {report['names']} in it says which recording became which")
-    return "\n".join(lines)
+def _convert_sections(result: Converted) -> Iterable[Section]:
+    lines = [f"{result.output}: {number(result.taxels, 'taxel')}, {number(result.steps, 'bin')}"]
+    for split, made in result.splits.items():
+        lines.append(f"  {split}: {number(made.recordings, 'recording')}")
+        lines += [] if made.found is None else [f"    found: {made.found}"]
+    if result.names is not None:
+        lines.append(f"  names: {result.names} in it says which recording became which")
+    yield Section("Converted", [Text("\n".join(lines))])
 
 
 def _grown(recordings: Recordings, taxels: int, steps: int) -> Recordings:
     """Silence for the taxels and the time that only another split has."""
     events = np.zeros((len(recordings), taxels, 2, steps), dtype=np.uint8)
     events[:, : recordings.taxels, :, : recordings.steps] = recordings.events
-    return Recordings(
-        events=events,
-        labels=recordings.labels,
-        files=recordings.files,
-        split=recordings.split,
-        source=recordings.source,
-    )
+    return replace(recordings, events=events, lengths=None)
 
 
 def _load(
@@ -257,9 +212,3 @@ def _load(
 def _layout(taxels: str | None) -> tuple[int | None, FloatArray | None]:
     """Number of taxels and their positions, as far as ``--taxels`` says them."""
     return (None, None) if taxels is None else read_layout(taxels)
-
-
-def _check_picture(path: str) -> None:
-    """Refuse before the work, not after it."""
-    if Path(path).suffix.lower() != ".png":
-        raise OptionError(f"--picture {path}: allowed is a PNG; give a name that ends in .png")

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from spikeloom.models.recordings.found import number as counted
+from spikeloom.models.recordings.counts import number as counted
 from spikeloom.runtime.report import svg
 from spikeloom.runtime.report.tables import si
 from spikeloom.runtime.studies.chart.costs import Cost, costs_of

@@ -7,7 +7,7 @@ import io
 from collections.abc import Sequence
 from typing import Any
 
-from spikeloom.models.recordings.found import number
+from spikeloom.models.recordings.counts import number
 from spikeloom.runtime.report.tables import percent, si, table
 from spikeloom.runtime.studies.chart.budget import UNITS
 from spikeloom.runtime.studies.chart.points import by_chip, own_value

@@ -1,0 +1,102 @@
+"""What was odd about recordings while their events were put into bins: counted, said on stderr, kept as JSON."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, field
+
+GAP_S = 0.5
+"""A silence longer than this, between two events, counts as a gap; seconds."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EventCounts:
+    """What was counted while recordings were put into bins.
+
+    Parameters
+    ----------
+    events : int
+        Events read, duplicates included.
+    out_of_order : int
+        Events with a time before that of an event that came earlier.
+    duplicates : int
+        Events whose taxel already had one of the same polarity in the same bin; they count once.
+    gaps : int
+        Silences longer than `GAP_S` between two events of a recording.
+    steps : tuple of int
+        Bins of each recording.
+    notes : tuple of str
+        What is worth a second look: times that look like another unit, taxels that seem to count from 1, a table of
+        labels.
+    """
+
+    events: int
+    out_of_order: int
+    duplicates: int
+    gaps: int
+    steps: tuple[int, ...]
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Oddities:
+    """Counts as scripts read them; recordings are either `shorter` than the longest, or were `padded` to one length."""
+
+    events: int
+    out_of_order: int
+    duplicates: int
+    gaps: int
+    gap_s: float = GAP_S
+    shorter: int | None = field(default=None, metadata={"optional": True})
+    padded: int | None = field(default=None, metadata={"optional": True})
+
+    def __str__(self) -> str:
+        """Counts for people."""
+        if self.shorter is None:
+            lengths = f"{number(self.padded or 0, 'recording')} padded at the end"
+        else:
+            lengths = f"{number(self.shorter, 'recording')} shorter than the longest"
+        return (
+            f"{number(self.events, 'event')} read, {self.out_of_order:,} out of order, "
+            f"{number(self.duplicates, 'duplicate')} in a bin, {number(self.gaps, 'gap')} over {self.gap_s:g} s, "
+            f"{lengths}"
+        )
+
+
+def oddities(counts: EventCounts, padded_to: int | None = None) -> Oddities:
+    """Counts as scripts read them; `padded_to` where all recordings were filled up to one length."""
+    longest = max(counts.steps) if padded_to is None else padded_to
+    less = sum(steps < longest for steps in counts.steps)
+    return Oddities(
+        events=counts.events,
+        out_of_order=counts.out_of_order,
+        duplicates=counts.duplicates,
+        gaps=counts.gaps,
+        shorter=less if padded_to is None else None,
+        padded=None if padded_to is None else less,
+    )
+
+
+def show_counts(source: str, counts: EventCounts | None) -> None:
+    """Say on stderr what was counted and is worth a second look; the released layout has nothing to say."""
+    if counts is not None:
+        sys.stderr.write(f"{source}: {oddities(counts)}\n")
+        show_notes(counts)
+
+
+def show_notes(counts: EventCounts | None) -> None:
+    """Say on stderr what is worth a second look."""
+    if counts is not None:
+        sys.stderr.writelines(f"spikeloom: warning: {note}\n" for note in counts.notes)
+
+
+def number(count: int, noun: str) -> str:
+    """A count with its noun.
+
+    Examples
+    --------
+    >>> number(1, "class"), number(2000, "event")
+    ('1 class', '2,000 events')
+    """
+    plural = f"{noun}es" if noun.endswith("s") else f"{noun}s"
+    return f"{count:,} {noun if count == 1 else plural}"
