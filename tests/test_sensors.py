@@ -78,7 +78,7 @@ def test_optional_columns_and_places(write):
         ("a,b\n1,\n", "t.csv: line 2: b is '', not a number; write plain numbers"),
         ('a,b\n1,"2"\n', "t.csv: line 2: b is '\"2\"', not a number; write plain numbers"),
         (f"1,{'x' * 99}\n", f"t.csv: line 1: b is '{'x' * 40}', not a number; write plain numbers"),
-        ("1,2\0\n", "t.csv: line 1: b is '2\x00', not a number; write plain numbers"),
+        ("1,2\0\n", "t.csv: line 1: b is '2\\x00', not a number; write plain numbers"),
     ],
 )
 def test_tables_name_the_fault(write, text, found):
