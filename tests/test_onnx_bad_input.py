@@ -109,7 +109,7 @@ STAGES = {
     "node stage (Reshape): cannot be evaluated (cannot reshape array of size 3 into shape (7,)); export it again": (
         lambda: with_stage(node("Reshape", "current seven", "stage"), constants={"seven": np.array([7])})
     ),
-    "node huge (Expand): makes 1000000000000 values or coefficients, allowed are 4194304; no chip "
+    "node huge (Expand): makes 3000000000000 values or coefficients, allowed are 4194304; no chip "
     "holds such a network": (
         lambda: with_stage(
             node("Expand", "current big", "huge"),
@@ -248,7 +248,7 @@ FILES = {
     f"tensor w is there twice; {AGAIN}": lambda: changed(
         two_layers(), lambda m: m.graph.initializer.add().CopyFrom(m.graph.initializer[0])
     ),
-    "makes 1000000000000 values or coefficients, allowed are 4194304; no chip holds such a network": lambda: model(
+    "makes 3000000000000 values or coefficients, allowed are 4194304; no chip holds such a network": lambda: model(
         [*STAGE, *neuron(0, "current")], [("x", [10**6, 10**6]), *STATE_IN[:2]], ["s0_new", "u0_new"]
     ),
     "input x: has an open size 'taxels', allowed are fixed ones; export without dynamic axes": lambda: model(

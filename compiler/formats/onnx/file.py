@@ -52,6 +52,9 @@ _STORED = {
 }
 """Element types by their number in the format: numpy's name, and the field that holds them where not raw."""
 
+SAME = {"MatMulInteger": "MatMul"}
+"""Operators that are another one once their numbers are widened."""
+
 _EXTERNAL = 1
 DAMAGED = "is truncated or damaged; export it again"
 
@@ -239,7 +242,11 @@ def _declared(proto: Any) -> Declared:
 def _node(proto: Any, content: _Content, left: list[int], nesting: int) -> Node:
     named = _text(proto.name or (proto.output[0] if proto.output else "?"))
     node = Node(
-        name=named, op=_text(proto.op_type), inputs=_texts(proto.input), outputs=_texts(proto.output), attributes={}
+        name=named,
+        op=SAME.get(_text(proto.op_type), _text(proto.op_type)),
+        inputs=_texts(proto.input),
+        outputs=_texts(proto.output),
+        attributes={},
     )
     if _text(proto.domain) not in ("", "ai.onnx"):
         raise ModelError(

@@ -9,12 +9,11 @@ from scipy import sparse
 
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.fixedpoint import FloatArray
-from spikeloom.compiler.formats.onnx.elementwise import COMPARISONS
+from spikeloom.compiler.formats.onnx.evaluate import COMPARISONS
 from spikeloom.compiler.formats.onnx.file import Node
 from spikeloom.compiler.formats.onnx.values import (
     INPUT_ATOM,
     MEMBRANE,
-    SAMPLES,
     SPIKE,
     Affine,
     Decision,
@@ -30,6 +29,18 @@ from spikeloom.compiler.formats.onnx.values import (
 )
 
 NOT_AFFINE = "is not affine in its input; only affine operators between two spiking layers can become synapses"
+
+
+def present(value: Value | None) -> Value:
+    """An operand that must be there.
+
+    Raises
+    ------
+    ModelError
+    """
+    if value is None:
+        raise ModelError("lacks an operand; export it again")
+    return value
 
 
 def as_affine(table: Table, value: Value) -> Affine:
@@ -50,16 +61,15 @@ def as_affine(table: Table, value: Value) -> Affine:
                 "takes a third value where the membrane equals the threshold; write a spike as u > theta or u >= theta"
             )
         spike = table.spike(value.point, strict=strict)
-        atom = table.atoms[spike]
-        return scaled_by(table.value(spike, value.shape), high - low, low, low + (high - low) * atom.sample)
+        return scaled_by(table.value(spike, value.shape), high - low, low)
     array = np.asarray(value, np.float64)
-    return Affine(shape=array.shape, terms={}, bias=array.ravel(), sample=np.tile(array.ravel(), (SAMPLES, 1)))
+    return Affine(shape=array.shape, terms={}, bias=array.ravel())
 
 
-def scaled_by(value: Affine, factor: FloatArray, shift: FloatArray, sample: FloatArray) -> Affine:
+def scaled_by(value: Affine, factor: FloatArray, shift: FloatArray) -> Affine:
     """Each element times one constant plus another."""
-    times = value if np.all(factor == 1) else scaled(value, factor, sample)
-    return Affine(shape=value.shape, terms=times.terms, bias=times.bias + shift, sample=sample)
+    times = value if np.all(factor == 1) else scaled(value, factor)
+    return Affine(shape=value.shape, terms=times.terms, bias=times.bias + shift)
 
 
 def compared(node: Node, table: Table, values: Sequence[Value | None]) -> Value:
@@ -100,9 +110,8 @@ def chosen(table: Table, values: Sequence[Value | None]) -> Value:
         raise ModelError("chooses by what is neither a spike nor a constant; only spikes can choose")
     shape = table.room(np.broadcast_shapes(*(np.shape(v) if isinstance(v, np.ndarray) else v.shape for v in values)))  # type: ignore[union-attr]
     s, a, b = (spread(as_affine(table, value), shape) for value in values)  # type: ignore[arg-type]
-    difference = added([(1.0, a), (-1.0, b)], shape, a.sample - b.sample)
-    product = multiplied(table, s, difference, s.sample * difference.sample)
-    return added([(1.0, b), (1.0, product)], shape, b.sample + product.sample)
+    product = multiplied(table, s, added([(1.0, a), (-1.0, b)], shape))
+    return added([(1.0, b), (1.0, product)], shape)
 
 
 def is_binary(table: Table, value: Affine) -> bool:
@@ -128,17 +137,16 @@ def spread(value: Affine, shape: tuple[int, ...]) -> Affine:
     if value.shape == shape:
         return value
     rows = np.broadcast_to(np.arange(size_of(value.shape)).reshape(value.shape), shape).ravel()
-    return picked(value, rows, shape, value.sample[:, rows])
+    return picked(value, rows, shape)
 
 
-def multiplied(table: Table, a: Affine, b: Affine, sample: FloatArray) -> Affine:
+def multiplied(table: Table, a: Affine, b: Affine) -> Affine:
     """A product of two values that vary: of a membrane with its spikes, or of two inputs that may be these."""
     size = len(a.bias)
     parts = []
     for value, factor in ((a, b.bias), (b, a.bias)):
         if np.any(factor):
-            linear = scaled(value, factor, sample)
-            parts.append(Affine(shape=a.shape, terms=linear.terms, bias=np.zeros(size), sample=sample))
+            parts.append(Affine(shape=a.shape, terms=scaled(value, factor).terms, bias=np.zeros(size)))
     for first, own in a.terms.items():
         for second, other in b.terms.items():
             one, two = one_each(own), one_each(other)
@@ -153,9 +161,9 @@ def multiplied(table: Table, a: Affine, b: Affine, sample: FloatArray) -> Affine
             atom = _pair(table, first, second)
             rows = np.flatnonzero(used)
             terms = sparse.csr_array((coefficient[rows], (rows, one[1][rows])), shape=(size, table.atoms[atom].size))
-            parts.append(Affine(shape=a.shape, terms={atom: terms}, bias=np.zeros(size), sample=sample))
-    constant = Affine(shape=a.shape, terms={}, bias=a.bias * b.bias, sample=sample)
-    return added([(1.0, part) for part in [constant, *parts]], a.shape, sample)
+            parts.append(Affine(shape=a.shape, terms={atom: terms}, bias=np.zeros(size)))
+    constant = Affine(shape=a.shape, terms={}, bias=a.bias * b.bias)
+    return added([(1.0, part) for part in [constant, *parts]], a.shape)
 
 
 def _pair(table: Table, first: int, second: int) -> int:

@@ -6,7 +6,7 @@ from collections.abc import Container
 
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.names import printable
-from spikeloom.compiler.formats.onnx.elementwise import COMPARISONS
+from spikeloom.compiler.formats.onnx.evaluate import COMPARISONS
 from spikeloom.compiler.formats.onnx.file import Graph, Node
 
 COMPARING = frozenset((*COMPARISONS, "Sign"))

@@ -19,10 +19,10 @@ from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.formats.assemble import Layer, assemble
 from spikeloom.compiler.formats.names import printable, unique_names
-from spikeloom.compiler.formats.onnx.affine import check
 from spikeloom.compiler.formats.onnx.file import BOOL, DOUBLE, Declared, Graph, Model, read_model
 from spikeloom.compiler.formats.onnx.gates import as_affine
 from spikeloom.compiler.formats.onnx.lif import Neurons, is_output, neurons_of
+from spikeloom.compiler.formats.onnx.operators import require_finite
 from spikeloom.compiler.formats.onnx.order import inner
 from spikeloom.compiler.formats.onnx.run import run
 from spikeloom.compiler.formats.onnx.steps import Unrolled, group, readout
@@ -90,7 +90,7 @@ def read_onnx(
 
 
 def _network(model: Model, polarities: int | None, polarities_first: bool | None) -> OnnxNetwork:
-    table = Table()
+    table = Table(opset=model.opset)
     facts: list[str] = []
     graph = _undecided(model.graph, facts)
     loops = any(node.op in ("Loop", "Scan") for node in graph.nodes)
@@ -104,7 +104,7 @@ def _network(model: Model, polarities: int | None, polarities_first: bool | None
     outputs = {name: as_affine(table, value) for name, value in results}
     for name, value in outputs.items():
         try:
-            check(table, value)
+            require_finite(value)
         except ModelError as error:
             raise ModelError(f"output {printable(name)}: {error}") from error
     found = group(table, neurons_of(table, outputs), shapes)

@@ -8,8 +8,10 @@ import numpy as np
 
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.names import printable
-from spikeloom.compiler.formats.onnx.affine import apply, check
+from spikeloom.compiler.formats.onnx.evaluate import misfit
 from spikeloom.compiler.formats.onnx.file import Array, Graph, Node
+from spikeloom.compiler.formats.onnx.gates import present
+from spikeloom.compiler.formats.onnx.operators import apply, require_finite
 from spikeloom.compiler.formats.onnx.order import inner, membranes, ordered, reads
 from spikeloom.compiler.formats.onnx.values import (
     INPUT_ATOM,
@@ -62,8 +64,7 @@ def run(graph: Graph, outer: Mapping[str, Value], given: Mapping[str, Value], ta
         except ModelError as error:
             raise ModelError(f"{node}: {error}") from error
         except _MISFIT as error:
-            reason = " ".join(f"{error}".split())[:120] or type(error).__name__
-            raise ModelError(f"{node}: cannot be evaluated ({reason}); export it again") from error
+            raise ModelError(f"{node}: {misfit(error)}") from error
         for name in reads(node):
             if last[name] == index and name not in outer and name not in graph.outputs:
                 values.pop(name, None)
@@ -77,7 +78,7 @@ def _set_apart(node: Node, name: str, value: Value, table: Table) -> Value:
     """Make a membrane an atom of its own, and remember what it is made of."""
     if not isinstance(value, Affine):
         return value
-    check(table, value)
+    require_finite(value)
     only = next(iter(value.terms), -1)
     known = len(value.terms) == 1 and diagonal(value.terms[only]) == 1 and not np.any(value.bias)
     if known and table.atoms[only].kind in (INPUT_ATOM, MEMBRANE):
@@ -93,9 +94,9 @@ def _evaluate(node: Node, values: Mapping[str, Value], table: Table) -> list[Val
         case "Constant":
             results: list[Value] = [_constant(node)]
         case "Shape" | "Size":
-            shape = np.array(_present(operands[0]).shape, np.int64)
+            shape = np.array(present(operands[0]).shape, np.int64)
             cut = shape[node.attributes.get("start", 0) : node.attributes.get("end", len(shape))]
-            results = [cut if node.op == "Shape" else np.array(size_of(_present(operands[0]).shape))]
+            results = [cut if node.op == "Shape" else np.array(size_of(present(operands[0]).shape))]
         case "If":
             results = run(node.attributes["then_branch" if _truth(operands[0]) else "else_branch"], values, {}, table)
         case "Loop":
@@ -107,12 +108,6 @@ def _evaluate(node: Node, values: Mapping[str, Value], table: Table) -> list[Val
         case _:
             results = apply(node, table, operands)
     return results
-
-
-def _present(value: Value | None) -> Value:
-    if value is None:
-        raise ModelError("lacks an operand; export it again")
-    return value
 
 
 def _constant(node: Node) -> Array:
@@ -128,17 +123,24 @@ def _truth(value: Value | None) -> bool:
     return bool(value.reshape(()))
 
 
-def _taken(value: Value, index: int, axis: int, table: Table) -> Value:
+def _taken(value: Value, step: int, take: Node, table: Table) -> Value:
     """One step of a sequence."""
-    node = Node(name="step", op="Gather", inputs=(), outputs=("step",), attributes={"axis": axis})
-    return apply(node, table, [value, np.array(index)])[0]
+    return apply(take, table, [value, np.array(step)])[0]
+
+
+def _takes(axis: int) -> Node:
+    return Node(name="step", op="Gather", inputs=("x", "step"), outputs=("y",), attributes={"axis": axis})
 
 
 def _stacked(parts: list[Value], axis: int, table: Table) -> Value:
-    """Steps side by side again."""
-    apart = Node(name="stack", op="Unsqueeze", inputs=(), outputs=("stack",), attributes={"axes": [axis]})
-    beside = Node(name="stack", op="Concat", inputs=(), outputs=("stack",), attributes={"axis": axis})
-    return apply(beside, table, [apply(apart, table, [part])[0] for part in parts])[0]
+    """Steps side by side again, along a new axis."""
+    apart = Node(name="stack", op="Reshape", inputs=("x", "shape"), outputs=("y",), attributes={})
+    names = tuple(f"x{place}" for place in range(len(parts)))
+    beside = Node(name="stack", op="Concat", inputs=names, outputs=("y",), attributes={"axis": axis})
+    shape = list(parts[0].shape)
+    at = axis if axis >= 0 else axis + len(shape) + 1
+    wide = np.array([*shape[:at], 1, *shape[at:]], np.int64)
+    return apply(beside, table, [apply(apart, table, [part, wide])[0] for part in parts])[0]
 
 
 def _steps(count: int) -> range:
@@ -182,8 +184,9 @@ def _scan(node: Node, values: Mapping[str, Value], operands: list[Value | None],
     taken = node.attributes.get("scan_input_axes", [0] * inputs)
     put = node.attributes.get("scan_output_axes", [0] * (len(body.outputs) - carried))
     kept: list[list[Value]] = [[] for _ in body.outputs[carried:]]
+    takes = [_takes(axis) for axis in taken]
     for step in _steps(sequences[0].shape[taken[0]]):
-        slices = [_taken(value, step, axis, table) for value, axis in zip(sequences, taken, strict=True)]
+        slices = [_taken(value, step, take, table) for value, take in zip(sequences, takes, strict=True)]
         names = [value.name for value in body.inputs]
         results = run(body, values, dict(zip(names, [*state, *slices], strict=True)), table)
         state = results[:carried]

@@ -2,8 +2,7 @@
 
 What varies are *atoms*: the inputs of the graph, each tensor that is compared with a threshold (a membrane), the
 spikes that follow from it, and products of a membrane with its spikes (a reset). An affine value holds its coefficients
-on atoms as sparse matrices, and beside them what it is for a few random numbers in place of the atoms, computed by
-the operators themselves and not from the coefficients: the numerical check that it is affine.
+on atoms as sparse matrices.
 """
 
 from __future__ import annotations
@@ -11,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from scipy import sparse
@@ -18,11 +18,8 @@ from scipy import sparse
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.formats.names import printable
-from spikeloom.compiler.formats.onnx.file import Array
+from spikeloom.compiler.formats.onnx.file import Array, Node
 from spikeloom.compiler.ir import Sparse
-
-SAMPLES = 4
-"""Random numbers in place of each atom's elements."""
 
 VALUE_LIMIT, COEFFICIENT_LIMIT = 2**22, 2**24
 """Elements of a value, and coefficients of an operator: more than the synapses of a chip."""
@@ -51,8 +48,6 @@ class Atom:
         Name of the value in the file, for messages.
     eye : csr_array (size, size)
         Its own coefficients.
-    sample : (SAMPLES, size) float64
-        Random numbers in its place.
     binary : bool
         Whether it is zeros and ones.
     of : tuple of int
@@ -64,7 +59,6 @@ class Atom:
     kind: str
     label: str
     eye: Sparse
-    sample: FloatArray
     binary: bool = False
     of: tuple[int, ...] = ()
     strict: bool = True
@@ -72,12 +66,12 @@ class Atom:
     @property
     def size(self) -> int:
         """Elements."""
-        return int(self.sample.shape[1])
+        return int(self.eye.shape[0])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Affine:
-    """``sum_a terms[a] @ atom_a + bias``, with the values for the random numbers beside it.
+    """``sum_a terms[a] @ atom_a + bias``.
 
     Parameters
     ----------
@@ -85,13 +79,11 @@ class Affine:
         Of the tensor; everything else is flat.
     terms : dict of int to csr_array (size, size of the atom)
     bias : (size,) float64
-    sample : (SAMPLES, size) float64
     """
 
     shape: tuple[int, ...]
     terms: dict[int, Sparse]
     bias: FloatArray
-    sample: FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -139,17 +131,18 @@ class Point:
 class Table:
     """What is met while a graph runs: atoms, comparisons, what membranes are made of, and the work done so far.
 
-    Matrices of linear operators are kept with the constants that they were made from, so that no other constant can
-    come to lie at the same address.
+    Matrices of linear operators are kept with the constants that they were made from, and operators with their nodes,
+    so that nothing else can come to lie at the same address.
     """
 
-    seed: int = 0
+    opset: int = 20
     atoms: list[Atom] = field(default_factory=list)
     points: list[Point] = field(default_factory=list)
     definitions: dict[int, Affine] = field(default_factory=dict)
     nodes: dict[int, str] = field(default_factory=dict)
     known: dict[tuple[object, ...], int] = field(default_factory=dict)
-    matrices: dict[tuple[object, ...], tuple[Sparse, FloatArray, list[Value]]] = field(default_factory=dict)
+    matrices: dict[tuple[object, ...], tuple[Sparse, tuple[int, ...], list[Value]]] = field(default_factory=dict)
+    operators: dict[int, tuple[Node, Any]] = field(default_factory=dict)
     done: int = 0
 
     def room(self, shape: Sequence[int], limit: int = VALUE_LIMIT) -> tuple[int, ...]:
@@ -175,25 +168,21 @@ class Table:
         binary: bool = False,
         of: tuple[int, ...] = (),
         strict: bool = True,
-        sample: FloatArray | None = None,
     ) -> int:
-        """Add an atom, if there may be one of that size; its random numbers are drawn unless they are given."""
+        """Add an atom, if there may be one of that size."""
         if size > ATOM_LIMIT:
             raise ModelError(
                 f"{printable(label)} has {size} elements, allowed are {ATOM_LIMIT}; no chip holds such a layer"
             )
-        if sample is None:
-            rng = np.random.default_rng((self.seed, len(self.atoms)))
-            sample = rng.normal(size=(SAMPLES, size)) * 10.0 ** np.arange(-1, SAMPLES - 1)[:, None]
         eye = sparse.eye_array(size, format="csr")
-        found = Atom(kind=kind, label=label, eye=eye, sample=sample, binary=binary, of=of, strict=strict)
+        found = Atom(kind=kind, label=label, eye=eye, binary=binary, of=of, strict=strict)
         self.atoms.append(found)
         return len(self.atoms) - 1
 
     def value(self, atom: int, shape: tuple[int, ...]) -> Affine:
         """The atom itself as a value."""
         found = self.atoms[atom]
-        return Affine(shape=shape, terms={atom: found.eye}, bias=np.zeros(found.size), sample=found.sample)
+        return Affine(shape=shape, terms={atom: found.eye}, bias=np.zeros(found.size))
 
     def spike(self, point: int, *, strict: bool) -> int:
         """The atom of a comparison's spikes."""
@@ -211,7 +200,7 @@ class Table:
         if key not in self.known:
             one, other = (self.atoms[index] for index in pair)
             label = f"{one.label} * {other.label}"
-            self.known[key] = self.atom(PRODUCT, label, one.size, of=pair, sample=one.sample * other.sample)
+            self.known[key] = self.atom(PRODUCT, label, one.size, of=pair)
         return self.known[key]
 
 
@@ -227,17 +216,16 @@ def rows_of(terms: Sparse, rows: IntArray) -> Sparse:
     return terms[rows]
 
 
-def picked(value: Affine, rows: IntArray, shape: tuple[int, ...], sample: FloatArray) -> Affine:
+def picked(value: Affine, rows: IntArray, shape: tuple[int, ...]) -> Affine:
     """Elements of a value in another order, some of them perhaps not or several times."""
     return Affine(
         shape=shape,
         terms={atom: own for atom, terms in value.terms.items() if (own := rows_of(terms, rows)).nnz},
         bias=value.bias[rows],
-        sample=sample,
     )
 
 
-def added(values: Sequence[tuple[float, Affine]], shape: tuple[int, ...], sample: FloatArray) -> Affine:
+def added(values: Sequence[tuple[float, Affine]], shape: tuple[int, ...]) -> Affine:
     """Weighted sum of values of one size."""
     terms: dict[int, Sparse] = {}
     bias = np.zeros(size_of(shape))
@@ -246,17 +234,17 @@ def added(values: Sequence[tuple[float, Affine]], shape: tuple[int, ...], sample
         for atom, own in value.terms.items():
             scaled = own if factor == 1 else own * factor
             terms[atom] = terms[atom] + scaled if atom in terms else scaled
-    return Affine(shape=shape, terms=terms, bias=bias, sample=sample)
+    return Affine(shape=shape, terms=terms, bias=bias)
 
 
-def scaled(value: Affine, factor: FloatArray, sample: FloatArray) -> Affine:
+def scaled(value: Affine, factor: FloatArray) -> Affine:
     """Each element times a constant of its own."""
     terms = {}
     for atom, own in value.terms.items():
         copy = own.copy()
         copy.data = copy.data * np.repeat(factor, np.diff(copy.indptr))
         terms[atom] = copy
-    return Affine(shape=value.shape, terms=terms, bias=value.bias * factor, sample=sample)
+    return Affine(shape=value.shape, terms=terms, bias=value.bias * factor)
 
 
 def one_each(terms: Sparse) -> tuple[FloatArray, IntArray] | None:

@@ -1,6 +1,6 @@
-"""Operators that are linear in one operand while the others are constant: products, convolutions, means and sums.
+"""Operators that are linear in one operand while the others are constant, as the matrix from operand to result.
 
-Each is said twice: as numbers, in numpy's own terms, and as the matrix that takes the flat operand to the flat result.
+Tensors are flat, in C order. Biases (of Conv, Gemm) are added by who asks for the matrix.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ import numpy as np
 from scipy import sparse
 
 from spikeloom.compiler.formats.onnx.file import Array, Node
-from spikeloom.compiler.formats.onnx.moves import Operands, axes_of, scatter_place
 from spikeloom.compiler.formats.onnx.values import COEFFICIENT_LIMIT, Table, size_of
 from spikeloom.compiler.ir import Sparse
 
+Operands = Sequence[Any]
+
 Matrix = Callable[[Node, Table, Operands, int], Sparse]
-Numbers = Callable[[Node, Table, Operands], list[Array]]
 
 
 def _matrix(out: Array, place: Array, weight: Array, shape: tuple[int, int]) -> Sparse:
@@ -56,13 +56,6 @@ def _positions(array: Array) -> Array:
     return np.arange(array.size).reshape(array.shape)
 
 
-def _matmul(_node: Node, table: Table, operands: Operands) -> list[Array]:
-    first, second = operands
-    batch = np.broadcast_shapes(first.shape[:-2], second.shape[:-2])
-    table.room((*batch, *first.shape[-2:-1], *second.shape[-1:]))
-    return [np.matmul(first, second)]
-
-
 def _matmul_matrix(_node: Node, table: Table, operands: Operands, which: int) -> Sparse:
     first, second = operands
     sides = [_positions(first), second] if which == 0 else [first, _positions(second)]
@@ -78,28 +71,11 @@ def _matmul_matrix(_node: Node, table: Table, operands: Operands, which: int) ->
     return _contract(table, spelled, sides[which], sides[1 - which], operands[which].size)
 
 
-def _gemm(node: Node, table: Table, operands: Operands) -> list[Array]:
-    a, b = (o.T if node.attributes.get(key, 0) else o for o, key in zip(operands, ("transA", "transB"), strict=False))
-    table.room((len(a), b.shape[1]))
-    product = node.attributes.get("alpha", 1.0) * (a @ b)
-    if len(operands) > 2 and operands[2] is not None:
-        product = product + node.attributes.get("beta", 1.0) * operands[2]
-    return [product]
-
-
 def _gemm_matrix(node: Node, table: Table, operands: Operands, which: int) -> Sparse:
     labels = ["zy" if node.attributes.get("transA", 0) else "yz", "xz" if node.attributes.get("transB", 0) else "zx"]
     spelled = f"{labels[which]},{labels[1 - which]}->yx"
     weight = node.attributes.get("alpha", 1.0) * operands[1 - which]
     return _contract(table, spelled, _positions(operands[which]), weight, operands[which].size)
-
-
-def _einsum(node: Node, table: Table, operands: Operands) -> list[Array]:
-    spelled = _equation(node, operands)
-    sizes = {label: n for part, o in zip(spelled.split("->")[0].split(","), operands, strict=True)
-             for label, n in zip(part, o.shape, strict=True)}  # fmt: skip
-    table.room(list(sizes.values()), COEFFICIENT_LIMIT)
-    return [np.einsum(spelled, *operands)]
 
 
 def _equation(node: Node, operands: Operands) -> str:
@@ -119,23 +95,13 @@ def _einsum_matrix(node: Node, table: Table, operands: Operands, which: int) -> 
 
 
 def _reduce_axes(node: Node, operands: Operands) -> tuple[int, ...]:
-    axes = axes_of(node, operands, 1)
+    axes = node.attributes.get("axes")  # of old operators; an operand of new ones
+    if axes is None and len(operands) > 1 and operands[1] is not None:
+        axes = operands[1].ravel().tolist()
     every = range(operands[0].ndim)
     if axes is None or not axes:
         return () if axes is not None and node.attributes.get("noop_with_empty_axes", 0) else tuple(every)
     return tuple(every[axis] for axis in axes)
-
-
-def _reduce(node: Node, _table: Table, operands: Operands) -> list[Array]:
-    reduce: dict[str, Callable[..., Any]] = {
-        "ReduceSum": np.sum,
-        "ReduceMean": np.mean,
-        "ReduceMax": np.max,
-        "ReduceMin": np.min,
-        "ReduceProd": np.prod,
-    }
-    kept = bool(node.attributes.get("keepdims", 1))
-    return [np.asarray(reduce[node.op](operands[0], axis=_reduce_axes(node, operands), keepdims=kept))]
 
 
 def _reduce_matrix(node: Node, table: Table, operands: Operands, _which: int) -> Sparse:
@@ -185,16 +151,6 @@ def _grouped(node: Node, table: Table, operands: Operands, data: Array, filling:
     return windows, filters, f"xyz{places}{kernel},ywz{kernel}->xyw{places}"
 
 
-def _conv(node: Node, table: Table, operands: Operands) -> list[Array]:
-    data, weight = operands[0], operands[1]
-    windows, filters, spelled = _grouped(node, table, operands, data, 0.0)
-    out = np.einsum(spelled, windows, filters, optimize=True)
-    out = out.reshape(len(data), len(weight), *out.shape[3:])
-    if len(operands) > 2 and operands[2] is not None:
-        out = out + operands[2].reshape(-1, *[1] * (data.ndim - 2))
-    return [out]
-
-
 def _conv_matrix(node: Node, table: Table, operands: Operands, _which: int) -> Sparse:
     windows, filters, spelled = _grouped(node, table, operands, _positions(operands[0]), -1)
     return _contract(table, spelled, windows, filters, operands[0].size)
@@ -209,15 +165,6 @@ def _pooled(node: Node, table: Table, data: Array) -> tuple[Array, int]:
     return _windows(node, table, _positions(data), kernel, -1), space
 
 
-def _pool(node: Node, table: Table, operands: Operands) -> list[Array]:
-    windows, space = _pooled(node, table, operands[0])
-    axes = tuple(range(-space, 0))
-    summed = np.where(windows >= 0, operands[0].ravel()[windows], 0.0).sum(axis=axes)
-    if node.op != "GlobalAveragePool" and not node.attributes.get("count_include_pad", 0):
-        return [summed / (windows >= 0).sum(axis=axes)]
-    return [summed / size_of(windows.shape[-space:])]
-
-
 def _pool_matrix(node: Node, table: Table, operands: Operands, _which: int) -> Sparse:
     windows, space = _pooled(node, table, operands[0])
     kernel = size_of(windows.shape[-space:])
@@ -227,24 +174,14 @@ def _pool_matrix(node: Node, table: Table, operands: Operands, _which: int) -> S
     return _matrix(np.arange(len(places))[:, None], places, share[:, None], (len(places), operands[0].size))
 
 
-def scatter_matrix(node: Node, operands: Operands) -> Sparse:
-    """What a scattering sum adds to its data, from its updates."""
-    flat = np.ravel_multi_index(scatter_place(node, operands), operands[0].shape)
-    return _matrix(flat.ravel(), np.arange(operands[2].size), np.array(1.0), (operands[0].size, operands[2].size))
-
-
-LINEAR: Mapping[str, tuple[Numbers, Matrix | None, tuple[int, ...]]] = {
-    "AveragePool": (_pool, _pool_matrix, (0,)),
-    "Conv": (_conv, _conv_matrix, (0,)),
-    "Einsum": (_einsum, _einsum_matrix, (0, 1)),
-    "Gemm": (_gemm, _gemm_matrix, (0, 1)),
-    "GlobalAveragePool": (_pool, _pool_matrix, (0,)),
-    "MatMul": (_matmul, _matmul_matrix, (0, 1)),
-    "MatMulInteger": (_matmul, _matmul_matrix, (0, 1)),
-    "ReduceMax": (_reduce, None, ()),
-    "ReduceMean": (_reduce, _reduce_matrix, (0,)),
-    "ReduceMin": (_reduce, None, ()),
-    "ReduceProd": (_reduce, None, ()),
-    "ReduceSum": (_reduce, _reduce_matrix, (0,)),
+LINEAR: Mapping[str, tuple[Matrix, tuple[int, ...]]] = {
+    "AveragePool": (_pool_matrix, (0,)),
+    "Conv": (_conv_matrix, (0,)),
+    "Einsum": (_einsum_matrix, (0, 1)),
+    "Gemm": (_gemm_matrix, (0, 1)),
+    "GlobalAveragePool": (_pool_matrix, (0,)),
+    "MatMul": (_matmul_matrix, (0, 1)),
+    "ReduceMean": (_reduce_matrix, (0,)),
+    "ReduceSum": (_reduce_matrix, (0,)),
 }
-"""By operator: as numbers, as a matrix (None: constants only), and which operands may vary."""
+"""By operator: its matrix, and which operands may vary."""
