@@ -248,7 +248,7 @@ FILES = {
     f"tensor w is there twice; {AGAIN}": lambda: changed(
         two_layers(), lambda m: m.graph.initializer.add().CopyFrom(m.graph.initializer[0])
     ),
-    "makes 3000000000000 values or coefficients, allowed are 4194304; no chip holds such a network": lambda: model(
+    "makes 1000000000000 values or coefficients, allowed are 4194304; no chip holds such a network": lambda: model(
         [*STAGE, *neuron(0, "current")], [("x", [10**6, 10**6]), *STATE_IN[:2]], ["s0_new", "u0_new"]
     ),
     "input x: has an open size 'taxels', allowed are fixed ones; export without dynamic axes": lambda: model(
