@@ -68,20 +68,21 @@ class Violation:
         Who breaks it, for example ``core 3 (fc1)``.
     rule : str
         Name of the limit in the target file, for example ``loihi1.core.axons_in``.
-    used, allowed : int
-        Amount found and amount allowed.
+    used, allowed : int or str
+        What was found and what is allowed: amounts, or words where the rule is no amount.
     remedy : str
         What would make it fit.
     """
 
     owner: str
     rule: str
-    used: int
-    allowed: int
+    used: int | str
+    allowed: int | str
     remedy: str
 
     def __str__(self) -> str:
-        return f"{self.owner}: {self.used} used, {self.allowed} allowed ({self.rule}); {self.remedy}"
+        used = f"{self.used} used" if isinstance(self.used, int) else self.used
+        return f"{self.owner}: {used}, {self.allowed} allowed ({self.rule}); {self.remedy}"
 
 
 class CapacityError(SpikeloomError):
@@ -93,37 +94,3 @@ class CapacityError(SpikeloomError):
 
     def __reduce__(self) -> tuple[type[CapacityError], tuple[tuple[Violation, ...]]]:
         return type(self), (self.violations,)  # not of its text, as exceptions usually are
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Fault:
-    """One rule of a chip that a network breaks, in words.
-
-    Parameters
-    ----------
-    where : str
-        Who breaks it, for example ``core 3, neuron 17``.
-    found, allowed : str
-        What is there, and what the rule allows.
-    rule : str
-        Its name in the target file, for example ``truenorth.neuron.delay``.
-    remedy : str
-        What would mend it.
-    """
-
-    where: str
-    found: str
-    allowed: str
-    rule: str
-    remedy: str
-
-    def __str__(self) -> str:
-        return f"{self.where}: {self.found}, allowed {self.allowed} ({self.rule}); {self.remedy}"
-
-
-class RuleError(SpikeloomError):
-    """A network breaks rules of its chip; holds every fault, not the first."""
-
-    def __init__(self, faults: tuple[Fault, ...]) -> None:
-        self.faults = faults
-        super().__init__("\n".join(str(fault) for fault in faults))

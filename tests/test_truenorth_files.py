@@ -256,8 +256,8 @@ def test_every_broken_rule_is_told(place, capsys):
     for words in (["inspect"], ["run", "--data", f"{place}/data"], ["estimate", "--data", f"{place}/data"]):
         found = asked(capsys, words[0], f"{place}/broken.loom", *words[1:], code=2)
         assert found.err.splitlines() == [
-            "spikeloom: core 0, neuron 0: leak 300, allowed -256 … 255 (truenorth.neuron.leak_bits); a smaller scale",
-            "spikeloom: clock 0: a period of 0 ticks, allowed 1 or more (truenorth.clock); "
+            "spikeloom: core 0, neuron 0: leak 300, -256 … 255 allowed (truenorth.neuron.leak_bits); a smaller scale",
+            "spikeloom: clock 0: a period of 0 ticks, 1 or more allowed (truenorth.clock); "
             "say every how many ticks it spikes",
         ]
 

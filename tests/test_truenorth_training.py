@@ -319,17 +319,17 @@ def test_mistakes_are_told_in_one_line(data, capsys):
         "--target loihi1: x.pt was trained for TrueNorth; give --target truenorth"
     )
     assert mistake(capsys, "compile", "x.pt", "--target", "truenorth", "--planes", "2", "-o", "y.loom") == (
-        "--planes: is for loihi1, not for truenorth; leave it away"
+        "--planes 2: is not for truenorth; omit it"
     )
     assert mistake(capsys, "inspect", "x.pt", "--beta", "0.3") == (
-        "--beta 0.3: x.pt is a network for TrueNorth and says that itself; leave it away"
+        "--beta 0.3: x.pt is a network for TrueNorth and says that itself; omit it"
     )
     assert mistake(capsys, "export", "x.pt", "--to", "onnx-float", "-o", "x.onnx") == (
         "x.pt: is a network for TrueNorth, which compile, verify, inspect and join take; this is for others"
     )
     words = ("verify", "x.loom", "--data", "data", "--checkpoint")
     assert mistake(capsys, *words, "x.pt", "--require", "E3=1") == (
-        "--require E3=1: a network for TrueNorth has one model, whose every spike must be the chip's; leave it away"
+        "--require E3=1: a network for TrueNorth has one model, whose every spike must be the chip's; omit it"
     )
     assert mistake(capsys, *words, "x.pt", "--weights", "best") == (
         "--weights best: x.loom was compiled from last; give the same"

@@ -68,7 +68,7 @@ def _compiled(network: Network, training: Recordings) -> Compilation:
     try:
         compile_network(network)  # scales from the weights: a second, where choosing them takes minutes in vain
     except CapacityError as error:
-        if any(violation.used > HOPELESS * violation.allowed for violation in error.violations):
+        if any(int(each.used) > HOPELESS * int(each.allowed) for each in error.violations):
             raise
     return compile_network(network, Options(training_events=training.events))
 

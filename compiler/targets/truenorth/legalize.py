@@ -10,7 +10,7 @@ from itertools import groupby
 
 import numpy as np
 
-from spikeloom.compiler.errors import Fault, RuleError
+from spikeloom.compiler.errors import CapacityError, Violation
 from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.truenorth.netlist import RESET_NONE, RESET_TO, CrossbarNetlist
@@ -21,7 +21,7 @@ Offender = tuple[int, str, str]
 RELAYS = "copy the neuron, or split its spikes by relays"
 
 
-def faults(netlist: CrossbarNetlist, chip: Target) -> tuple[Fault, ...]:
+def faults(netlist: CrossbarNetlist, chip: Target) -> tuple[Violation, ...]:
     """Every rule that a network breaks, in the order of cores, axons, neurons, wires, feeds and clocks."""
     parts = (_cores, _axons, _parameters, _targets, _wires, _feeds, _clocks)
     return tuple(fault for part in parts for fault in part(netlist, chip))
@@ -32,12 +32,12 @@ def require_legal(netlist: CrossbarNetlist, chip: Target) -> None:
 
     Raises
     ------
-    RuleError
+    CapacityError
         Listing every fault.
     """
     found = faults(netlist, chip)
     if found:
-        raise RuleError(found)
+        raise CapacityError(found)
 
 
 def signed_range(bits: int) -> tuple[int, int]:
@@ -51,18 +51,18 @@ def signed_range(bits: int) -> tuple[int, int]:
     return -(1 << (bits - 1)), (1 << (bits - 1)) - 1
 
 
-def _told(offenders: Iterable[Offender], allowed: str, rule: str, remedy: str, chip: Target) -> Iterator[Fault]:
+def _told(offenders: Iterable[Offender], allowed: str, rule: str, remedy: str, chip: Target) -> Iterator[Violation]:
     """A fault for each core with offenders."""
     for core, group in groupby(offenders, key=lambda offender: offender[0]):
         (_, who, found), *others = group
         place = f"core {core}{', ' * bool(who)}" if core >= 0 else ""
         more = f" (and {len(others)} more on this core)" if others else ""
-        yield Fault(
-            where=f"{place}{who}{more}", found=found, allowed=allowed, rule=f"{chip.name}.{rule}", remedy=remedy
+        yield Violation(
+            owner=f"{place}{who}{more}", used=found, allowed=allowed, rule=f"{chip.name}.{rule}", remedy=remedy
         )
 
 
-def _cores(netlist: CrossbarNetlist, chip: Target) -> Iterator[Fault]:
+def _cores(netlist: CrossbarNetlist, chip: Target) -> Iterator[Violation]:
     width, height = chip.limit("mesh.width"), chip.limit("mesh.height")
     places = list(zip(netlist.core_x.tolist(), netlist.core_y.tolist(), strict=True))
     on_mesh = f"x 0 … {width - 1} and y 0 … {height - 1}"
@@ -91,7 +91,7 @@ def _inside(x: int, y: int, chip: Target) -> bool:
     return 0 <= x < chip.limit("mesh.width") and 0 <= y < chip.limit("mesh.height")
 
 
-def _axons(netlist: CrossbarNetlist, chip: Target) -> Iterator[Fault]:
+def _axons(netlist: CrossbarNetlist, chip: Target) -> Iterator[Violation]:
     lines, kinds = chip.limit("core.axons"), chip.limit("core.axon_types")
     off, odd, twice, other = [], [], [], []
     seen: dict[tuple[int, int], int] = {}
@@ -115,7 +115,7 @@ def _axons(netlist: CrossbarNetlist, chip: Target) -> Iterator[Fault]:
     yield from _told(twice, "one axon to a line", "core.axons", "connect its neurons to one of them", chip)
 
 
-def _parameters(netlist: CrossbarNetlist, chip: Target) -> Iterator[Fault]:
+def _parameters(netlist: CrossbarNetlist, chip: Target) -> Iterator[Violation]:
     """Numbers that do not fit their registers."""
     unsigned = (0, (1 << chip.limit("neuron.threshold_bits")) - 1)
     signed = {what: signed_range(chip.limit(f"neuron.{what}_bits")) for what in ("weight", "leak", "reset", "membrane")}
@@ -148,7 +148,7 @@ def _on_cores(netlist: CrossbarNetlist, neurons: IntArray, found: list[str]) -> 
     return [(int(c), f"neuron {n}", what) for c, n, what in zip(cores, own, found, strict=True)]
 
 
-def _targets(netlist: CrossbarNetlist, chip: Target) -> Iterator[Fault]:
+def _targets(netlist: CrossbarNetlist, chip: Target) -> Iterator[Violation]:
     """Neurons with more than one target: an axon, or the way out of the chip."""
     limit = chip.limit("neuron.targets")
     places = sorted({*zip(netlist.wire_x.tolist(), netlist.wire_y.tolist(), strict=True)})
@@ -167,7 +167,7 @@ def _targets(netlist: CrossbarNetlist, chip: Target) -> Iterator[Fault]:
         yield from _told(_on_cores(netlist, neurons, found), str(limit), "neuron.targets", remedy, chip)
 
 
-def _wires(netlist: CrossbarNetlist, chip: Target) -> Iterator[Fault]:
+def _wires(netlist: CrossbarNetlist, chip: Target) -> Iterator[Violation]:
     longest, reach = chip.limit("neuron.delay"), chip.limit("mesh.reach")
     source = netlist.core_of_neuron()[netlist.wire_neuron]
     order = np.argsort(source, kind="stable")
@@ -200,7 +200,7 @@ def _wires(netlist: CrossbarNetlist, chip: Target) -> Iterator[Fault]:
     yield from _told(beyond, str(reach), "mesh.reach", "place the cores nearer to each other", chip)
 
 
-def _feeds(netlist: CrossbarNetlist, chip: Target) -> Iterator[Fault]:
+def _feeds(netlist: CrossbarNetlist, chip: Target) -> Iterator[Violation]:
     axon = netlist.axons_at(netlist.feed_core, netlist.feed_line)
     bad = np.flatnonzero(axon < 0).tolist()
     lost = [
@@ -219,7 +219,7 @@ def _feeds(netlist: CrossbarNetlist, chip: Target) -> Iterator[Fault]:
     yield from _told(early, "0 or later", "feed", "feed it when it is there", chip)
 
 
-def _clocks(netlist: CrossbarNetlist, chip: Target) -> Iterator[Fault]:
+def _clocks(netlist: CrossbarNetlist, chip: Target) -> Iterator[Violation]:
     axon = netlist.axons_at(netlist.clock_core, netlist.clock_line)
     for row in range(len(axon)):
         who, period, phase = f"clock {row}", int(netlist.clock_period[row]), int(netlist.clock_phase[row])

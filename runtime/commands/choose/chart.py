@@ -16,7 +16,8 @@ from spikeloom.compiler.formats.atomic import write_atomically
 from spikeloom.compiler.targets.base import CROSSBARS, Target, load_target
 from spikeloom.runtime.commands.options import DATA_HELP, add_bin_option, add_model
 from spikeloom.runtime.inputs.recordings import bin_words
-from spikeloom.runtime.machines.truenorth.charted import TICK, time_title
+from spikeloom.runtime.machines.truenorth.charted import time_title
+from spikeloom.runtime.machines.truenorth.machine import TICK
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.studies.chart import networks as chart_networks
 from spikeloom.runtime.studies.chart import plan as chart_plan

@@ -10,6 +10,7 @@ from spikeloom.runtime.costs.spent import Account, explained
 from spikeloom.runtime.inputs.recordings import netlist_recordings
 from spikeloom.runtime.machines.base import Machine, Price, Run, machine_for
 from spikeloom.runtime.report.console import progress
+from spikeloom.runtime.report.encode import encode
 from spikeloom.runtime.report.sections import Outcome
 
 
@@ -28,7 +29,8 @@ def run(arguments: argparse.Namespace) -> Outcome:
     account.begin(arguments.detail)
     _, price = priced(arguments, machine, data)
     account.begin("no float")
-    return Outcome(price.outcome.result | explained(arguments, account), price.outcome.sections)
+    found = price.outcome
+    return Outcome(encode(found.result) | explained(arguments, account), lambda _: found.sections(found.result))
 
 
 def priced(

@@ -3,19 +3,193 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
-from spikeloom.runtime.machines.truenorth import in_time, joining, native
-from spikeloom.runtime.machines.truenorth.refusal import refuse
+import numpy as np
 
-takes = native.is_named
-inspect = native.inspect
-verify = native.verify
+from spikeloom import __version__
+from spikeloom.compiler.errors import ModelError, OptionError
+from spikeloom.compiler.targets.base import CROSSBARS, Target, load_target
+from spikeloom.compiler.targets.truenorth.codebook import COPIES, LevelNetwork, in_levels, run_levels
+from spikeloom.compiler.targets.truenorth.in_time import first_spikes, lower_in_time
+from spikeloom.compiler.targets.truenorth.legalize import require_legal
+from spikeloom.compiler.targets.truenorth.lower import lower
+from spikeloom.compiler.targets.truenorth.native import SYSTEM
+from spikeloom.compiler.targets.truenorth.native_file import Trained, is_trained, read_trained
+from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
+from spikeloom.compiler.targets.truenorth.netlist_file import write_crossbars
+from spikeloom.runtime.inputs.files import shipped
+from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
+from spikeloom.runtime.inputs.recordings import netlist_recordings
+from spikeloom.runtime.machines.truenorth import joining, verdicts
+from spikeloom.runtime.machines.truenorth.describe import describe, describe_trained
+from spikeloom.runtime.machines.truenorth.machine import load
+from spikeloom.runtime.machines.truenorth.refusal import refuse
+from spikeloom.runtime.machines.truenorth.verdicts import BoolArray, PartialSums, Verdict, compare
+from spikeloom.runtime.report.console import progress
+from spikeloom.runtime.report.sections import Outcome
+
+TITLE = "TrueNorth"
+
+OTHERS: Mapping[str, Any] = {
+    **dict.fromkeys(("graph", "taxels", "edges", "beta", "theta", "system"), None),
+    **{"run": 0, "directed": False},
+}
+"""Options of other checkpoints, and what they are where they are not given."""
+
+STORAGE: Mapping[str, Any] = {
+    **dict.fromkeys(("weight_bits", "planes", "scale_groups", "calibrate", "margin", "cores_for", "against"), None),
+    **dict.fromkeys(("spike_exact", "prune_unused", "keep_all"), False),
+    **{"ranges": "proven", "chips": 1, "optimize": "cores", "dump_after": []},
+}
+"""Options of ``compile`` for chips that store rounded weights, likewise."""
+
+VERIFY: Mapping[str, Any] = {"original": None, "min_agreement": None, "require": None, "engine": "spikeloom"}
+"""Options of ``verify`` where chip and model may differ, likewise."""
+
+SPEC_STEPS = 5
+"""Data steps of a recording on which the specification runs, too: it takes a second for two hundred ticks."""
+
+FORGET = "give --beta 0 where the file does not say, or train it with --membrane-decay LAYER=0 for every layer"
+
+
 join = joining.join
 
 
-def compile_network(arguments: argparse.Namespace) -> Any:
-    """Place a network on cores and write it, or say why it does not fit."""
-    if takes(arguments.checkpoint):
-        return native.compile_network(arguments)
-    return refuse(arguments) if arguments.in_time is None else in_time.compile_network(arguments)
+def _refuse_options(arguments: argparse.Namespace, absent: Mapping[str, Any], why: str) -> None:
+    for name, value in absent.items():
+        given = getattr(arguments, name, value)
+        if given != value and (name, given) != ("system", SYSTEM):
+            raise OptionError(f"--{name.replace('_', '-')} {given}: {why}; omit it")
+
+
+def takes(path: str) -> bool:
+    """Whether what a user names is a network that was trained for the chip."""
+    return Path(shipped(path)).is_file() and is_trained(shipped(path))
+
+
+def read(path: str, arguments: argparse.Namespace) -> Trained:
+    """Read a trained network as the options say.
+
+    Raises
+    ------
+    OptionError, ModelError
+        If it is not as they say, or an option is for others.
+    """
+    _refuse_options(arguments, OTHERS, f"{path} is a network for {TITLE} and says that itself")
+    return read_trained(shipped(path), weights=arguments.weights)
+
+
+def inspect(arguments: argparse.Namespace) -> Outcome:
+    """Show what a trained network is."""
+    return describe_trained(read(arguments.path, arguments))
+
+
+def compile_network(arguments: argparse.Namespace) -> Outcome:
+    """Place a network on cores and write it, or say why it does not fit.
+
+    Raises
+    ------
+    OptionError, ModelError, CapacityError
+        If the options or the network cannot be used, or it does not fit.
+    """
+    path, trained = arguments.checkpoint, takes(arguments.checkpoint)
+    chip = load_target(arguments.target if not trained else "truenorth", CROSSBARS)
+    if trained and arguments.target != chip.name:
+        raise OptionError(f"--target {arguments.target}: {path} was trained for {TITLE}; give --target {chip.name}")
+    _refuse_options(arguments, STORAGE, f"is not for {chip.name}")
+    if trained:
+        _refuse_options(arguments, {"in_time": None}, f"{path} was trained for the chip")
+        network = read(path, arguments)
+        progress("compiling")
+        netlist = lower(network.network, chip, provenance=provenance(network))
+    else:
+        loaded = load_network(path, arguments)
+        if arguments.in_time is None:
+            return refuse(path, loaded.network, chip)
+        if arguments.in_time not in COPIES:
+            allowed = ", ".join(map(str, COPIES))
+            raise OptionError(f"--in-time {arguments.in_time}: allowed are {allowed} axons an input")
+        levels = _levels(path, loaded, arguments.in_time, chip)
+        progress("compiling")
+        origin = {"spikeloom": __version__, "checkpoint_sha256": loaded.sha256, **loaded.origin(arguments.run)}
+        netlist = lower_in_time(levels, chip, provenance=origin | {"in_time": arguments.in_time})
+    require_legal(netlist, chip)
+    return describe(netlist, chip, write_crossbars(netlist, arguments.output))
+
+
+def provenance(trained: Trained) -> dict[str, Any]:
+    """What a netlist remembers of the trained network that it is from."""
+    return {
+        "spikeloom": __version__,
+        "checkpoint_sha256": trained.sha256,
+        "weights": trained.weights,
+        "graph": trained.graph,
+        "copies": trained.network.copies,
+        "towers": len(trained.network.towers),
+    }
+
+
+def verify(arguments: argparse.Namespace) -> Outcome:
+    """Compare chip, specification and model; exit code 1 where one spike differs."""
+    why = f"a network for {TITLE} has one model, whose every spike must be the chip's"
+    _refuse_options(arguments, VERIFY, why)
+    machine = load(arguments.netlist)
+    netlist = machine.netlist
+    check = _verify_in_time if "in_time" in netlist.provenance else _verify_trained
+    verdict = check(arguments, netlist, machine.target)
+    return Outcome(verdict, verdicts.sections, 0 if verdict.exact else 1)
+
+
+def _require_same(arguments: argparse.Namespace, netlist: CrossbarNetlist, sha256: str) -> None:
+    if netlist.provenance.get("checkpoint_sha256") != sha256:
+        raise OptionError(
+            f"--checkpoint {arguments.checkpoint}: {arguments.netlist} was compiled from another file; give that one"
+        )
+
+
+def _verify_trained(arguments: argparse.Namespace, netlist: CrossbarNetlist, _: Target) -> Verdict:
+    trained = read(arguments.checkpoint, arguments)
+    _require_same(arguments, netlist, trained.sha256)
+    if netlist.provenance.get("weights") != trained.weights:
+        raise OptionError(
+            f"--weights {trained.weights}: {arguments.netlist} was compiled from {netlist.provenance.get('weights')}; "
+            "give the same"
+        )
+    data = netlist_recordings(arguments, netlist, labels_for="verify")
+    from spikeloom.models.truenorth.network import run_network  # torch, so only here
+
+    def spikes(events: Any) -> dict[str, BoolArray]:
+        return {name: held[0] for name, held in run_network(trained.network, events[None]).items()}
+
+    first = {stage.name: number for number, stage in enumerate(trained.network.towers[0])}
+    return compare(netlist, spikes, first, data, spec_samples=arguments.spec_samples)
+
+
+def _verify_in_time(arguments: argparse.Namespace, netlist: CrossbarNetlist, chip: Target) -> Verdict:
+    loaded = load_network(arguments.checkpoint, arguments)
+    _require_same(arguments, netlist, loaded.sha256)
+    levels = _levels(arguments.checkpoint, loaded, int(netlist.provenance["in_time"]), chip)
+    data = netlist_recordings(arguments, netlist, labels_for="verify")
+    sums = np.zeros((3, len(levels.layers)), np.int64)
+
+    def spikes(events: Any) -> dict[str, BoolArray]:
+        found = run_levels(levels, events.reshape(-1, events.shape[-1]))
+        sums[:2] += found.partial, found.saturated
+        np.maximum(sums[2], found.largest, out=sums[2])
+        return {layer.name: held for layer, held in zip(levels.layers, found.spikes, strict=True)}
+
+    samples = arguments.spec_samples
+    verdict = compare(netlist, spikes, first_spikes(levels), data, spec_samples=samples, spec_steps=SPEC_STEPS)
+    parts = zip(levels.layers, sums.T.tolist(), strict=True)
+    return replace(verdict, sums=tuple(PartialSums(layer.name, *each) for layer, each in parts if layer.is_split))
+
+
+def _levels(path: str, loaded: LoadedNetwork, copies: int, chip: Target) -> LevelNetwork:
+    try:
+        return in_levels(loaded.network, copies, chip)
+    except ModelError as error:
+        raise ModelError(f"{path}: {error}; {FORGET}") from error

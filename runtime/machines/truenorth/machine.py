@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from typing import NoReturn
 
 from spikeloom.compiler.dynamics import with_clocks
@@ -15,8 +15,9 @@ from spikeloom.compiler.targets.base import CROSSBARS, with_tables
 from spikeloom.compiler.targets.truenorth.legalize import require_legal
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
 from spikeloom.compiler.targets.truenorth.netlist_file import read_crossbars
-from spikeloom.runtime.machines.base import EventArray, Machine, Price, Run, as_text
-from spikeloom.runtime.machines.truenorth import cost, engine, render
+from spikeloom.runtime.machines.base import EventArray, Machine, Price, Run
+from spikeloom.runtime.machines.truenorth import cost, engine
+from spikeloom.runtime.machines.truenorth.describe import describe
 from spikeloom.runtime.machines.truenorth.trace import Trace
 from spikeloom.runtime.machines.votes import class_counts
 from spikeloom.runtime.report.sections import Outcome
@@ -69,13 +70,12 @@ class TrueNorth(Machine):
         chip = self.target if table is None else with_tables(self.target, table)
         trace = self._simulate(events, lengths, spikes=spikes)
         found = cost.estimate(self.netlist, chip, trace.counts)
-        report = render.costs_json(self.netlist, chip, found, trace.counts, bin_s)
         return self._run(trace), Price(
             synaptic_operations=found.synaptic_events.sum(axis=1),
             energy_j={name: each.total_j for name, each in found.energy.items()},
             time_s={TICK: found.time_s},
             step_s={TICK: self.netlist.bin_ticks * chip.limit("tick.length") * 1e-6},
-            outcome=Outcome(report, partial(as_text, render.costs_text)),
+            outcome=cost.summarise(self.netlist, chip, found, trace.counts, bin_s),
         )
 
     def batch(self, steps: int) -> int:
@@ -84,7 +84,7 @@ class TrueNorth(Machine):
 
     def describe(self, sha256: str) -> Outcome:
         """Sizes, layers, and the fullest core by each limit."""
-        return Outcome(render.netlist_json(self.netlist, self.target, sha256), partial(as_text, render.netlist_text))
+        return describe(self.netlist, self.target, sha256)
 
     def stream(self) -> NoReturn:
         """Whole recordings only."""
@@ -113,7 +113,7 @@ def load(path: str | os.PathLike[str]) -> TrueNorth:
 
     Raises
     ------
-    FormatError, RuleError
+    FormatError, CapacityError
         If it is no such file, or breaks a rule.
     """
     machine = TrueNorth(read_crossbars(path))

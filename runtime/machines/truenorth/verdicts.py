@@ -3,52 +3,85 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler.dynamics import with_clocks
-from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.interpret import vote
-from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.machines.truenorth import engine, spec
+from spikeloom.runtime.machines.truenorth.trace import Trace
 from spikeloom.runtime.machines.votes import class_counts
 from spikeloom.runtime.report.console import progress
+from spikeloom.runtime.report.encode import OPTIONAL, key
 from spikeloom.runtime.report.intervals import wilson
-from spikeloom.runtime.report.tables import table
+from spikeloom.runtime.report.sections import Section, Table, Text
 
-Json = dict[str, Any]
 BoolArray = npt.NDArray[np.bool_]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, slots=True)
+class AgainstSpec:
+    """Recordings on which engine and specification ran; spikes, membranes and counts that differ."""
+
+    samples: int
+    differences: int
+
+
+@dataclass(frozen=True, slots=True)
+class LayerSpikes:
+    """Spikes of the model, and those of neurons on the chip, copies included, that differ."""
+
+    name: str
+    spikes: int
+    differences: int
+
+
+@dataclass(frozen=True, slots=True)
+class AgainstModel:
+    """Spikes that differ, by layer."""
+
+    layers: tuple[LayerSpikes, ...]
+    json_properties = ("differences",)
+
+    @property
+    def differences(self) -> int:
+        """Of all layers."""
+        return sum(layer.differences for layer in self.layers)
+
+
+@dataclass(frozen=True, slots=True)
+class PartialSums:
+    """Partial sums of a layer that travel in time, those that saturate, and the largest."""
+
+    layer: str
+    partial: int
+    saturated: int
+    largest: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Verdict:
-    """Chip against definition and model.
+    """Chip against definition (E0) and model (E1); `spec_steps` confines the former to the first data steps of each."""
 
-    Parameters
-    ----------
-    spec_samples, spec_differences : int
-        Recordings on which engine and specification ran, and spikes, membranes and counts that differ.
-    spikes : dict of str to int
-        Spikes of the model by layer.
-    differences : dict of str to int
-        Of neurons on the chip, copies included, by layer: spikes that the model has not, or the reverse.
-    overflows : int
-        Ticks in which a membrane left its register.
-    counts : (samples, classes) int64
-        Votes on the chip.
-    """
+    target: str
+    samples: int
+    spec: AgainstSpec = field(metadata=key("E0"))
+    model: AgainstModel = field(metadata=key("E1"))
+    membranes_saturated: int
+    correct: int
+    spec_steps: int | None = field(default=None, metadata=OPTIONAL)
+    sums: tuple[PartialSums, ...] | None = field(default=None, metadata=OPTIONAL)
+    json_properties = ("exact",)
 
-    spec_samples: int
-    spec_differences: int
-    spikes: dict[str, int]
-    differences: dict[str, int]
-    overflows: int
-    counts: IntArray
+    @property
+    def exact(self) -> bool:
+        """Whether nothing differs, and no membrane left its register."""
+        return not (self.model.differences or self.spec.differences or self.membranes_saturated)
 
 
 def compare(
@@ -80,7 +113,7 @@ def compare(
     prepared = engine.prepare(netlist)
     layers = list(netlist.layers)
     spikes, differences = dict.fromkeys(first, 0), dict.fromkeys(first, 0)
-    counts, overflows, wrong = [], 0, 0
+    votes, overflows, wrong = np.zeros((len(data), netlist.classes), np.int64), 0, 0
     for index in range(len(data)):
         progress(f"comparing: {index} of {len(data)}")
         events = data.events[index : index + 1, ..., : data.steps_of(index)]
@@ -98,23 +131,26 @@ def compare(
             spikes[name] += int(expected[name].sum())
             differences[name] += int(np.count_nonzero(on_chip != due))
         overflows += int(trace.counts.overflows.sum())
-        counts.append(class_counts(netlist, trace.counts.votes)[0])
+        votes[index] = class_counts(netlist, trace.counts.votes)[0]
         if index < spec_samples and spec_steps is not None:
             trace = engine.simulate(prepared, channels[..., :spec_steps], spikes=True, membranes=True)
         if index < spec_samples:
             wrong += _against_spec(netlist, channels[0, :, :spec_steps], trace)
     return Verdict(
-        spec_samples=min(spec_samples, len(data)),
-        spec_differences=wrong,
-        spikes=spikes,
-        differences=differences,
-        overflows=overflows,
-        counts=np.array(counts, np.int64).reshape(len(data), netlist.classes),
+        target=netlist.target,
+        samples=len(data),
+        spec=AgainstSpec(min(spec_samples, len(data)), wrong),
+        model=AgainstModel(tuple(LayerSpikes(name, spikes[name], differences[name]) for name in first)),
+        membranes_saturated=overflows,
+        correct=int(np.count_nonzero(vote(votes) == data.labels)),
+        spec_steps=spec_steps,
     )
 
 
-def _against_spec(netlist: CrossbarNetlist, channels: Any, trace: Any) -> int:
+def _against_spec(netlist: CrossbarNetlist, channels: Any, trace: Trace) -> int:
     """Spikes, membranes, and spikes on axons that differ between engine and specification."""
+    assert trace.spikes is not None, "spikes were asked for"
+    assert trace.membranes is not None, "and membranes"
     slow = spec.simulate(netlist, channels)
     pairs = (
         (slow.spikes, trace.spikes[0]),
@@ -125,66 +161,43 @@ def _against_spec(netlist: CrossbarNetlist, channels: Any, trace: Any) -> int:
     return sum(int(np.count_nonzero(one != other)) for one, other in pairs)
 
 
-def verdict_json(verdict: Verdict, data: Recordings, chip: Target) -> Json:
-    """JSON values of a comparison."""
-    correct = int(np.count_nonzero(vote(verdict.counts) == data.labels))
-    different = sum(verdict.differences.values())
-    return {
-        "target": chip.name,
-        "samples": len(data),
-        "E0": {"samples": verdict.spec_samples, "differences": verdict.spec_differences},
-        "E1": {
-            "differences": different,
-            "layers": [
-                {"name": name, "spikes": verdict.spikes[name], "differences": verdict.differences[name]}
-                for name in verdict.spikes
-            ],
-        },
-        "membranes_saturated": verdict.overflows,
-        "correct": correct,
-        "exact": not (different or verdict.spec_differences or verdict.overflows),
-    }
-
-
-def verdict_text(report: Json) -> str:
+def sections(found: Verdict) -> list[Section]:
     """The same for people."""
-    samples, correct = report["samples"], report["correct"]
-    low, high = wilson(correct, samples)
-    spec_part, model_part = report["E0"], report["E1"]
-    rows = [[layer["name"], f"{layer['spikes']:,}", f"{layer['differences']:,}"] for layer in model_part["layers"]]
-    return "\n".join(
-        [
-            f"E0 specification = engine: {_told(spec_part)}{_part(report)}, membranes and counts too",
-            f"E1 model = chip: {_told(model_part | {'samples': samples})}, every copy of every neuron",
-            table(["layer", "spikes of the model", "different"], rows),
-            f"membranes that left their register: {report['membranes_saturated']:,}",
-            *_sums(report),
-            f"accuracy of the chip: {correct} of {samples}, {100 * correct / samples:.2f} % "
-            f"(95 %: {100 * low:.1f} … {100 * high:.1f}); the model's is the same, vote for vote"
-            if report["exact"]
-            else f"accuracy of the chip: {correct} of {samples}, {100 * correct / samples:.2f} %",
-        ]
-    )
-
-
-def _part(report: Json) -> str:
-    return f" (the first {report['spec_steps']} steps of each)" if "spec_steps" in report else ""
-
-
-def _sums(report: Json) -> list[str]:
-    """Partial sums that travel in time, and those that saturate."""
-    rows = [
-        [
-            sums["layer"],
-            f"{sums['partial']:,}",
-            f"{sums['saturated']:,} ({100 * sums['saturated'] / max(sums['partial'], 1):.2g} %)",
-            str(sums["largest"]),
-        ]
-        for sums in report.get("sums", ())
+    part = "" if found.spec_steps is None else f" (the first {found.spec_steps} steps of each)"
+    head = [
+        f"E0 specification = engine: {_differences(found.spec.differences, found.spec.samples)}{part}, "
+        "membranes and counts too",
+        f"E1 model = chip: {_differences(found.model.differences, found.samples)}, every copy of every neuron",
     ]
-    return [table(["layer", "partial sums", "saturated", "largest"], rows)] if rows else []
+    rows = [[layer.name, f"{layer.spikes:,}", f"{layer.differences:,}"] for layer in found.model.layers]
+    accuracy = f"accuracy of the chip: {found.correct} of {found.samples}, {100 * found.correct / found.samples:.2f} %"
+    if found.exact:
+        low, high = wilson(found.correct, found.samples)
+        accuracy += f" (95 %: {100 * low:.1f} … {100 * high:.1f}); the model's is the same, vote for vote"
+    sums = [
+        [
+            each.layer,
+            f"{each.partial:,}",
+            f"{each.saturated:,} ({100 * each.saturated / max(each.partial, 1):.2g} %)",
+            str(each.largest),
+        ]
+        for each in found.sums or ()
+    ]
+    saturated = f"membranes that left their register: {found.membranes_saturated:,}"
+    return [
+        Section(
+            "Verdict",
+            [
+                Text("\n".join(head)),
+                Table(["layer", "spikes of the model", "different"], rows),
+                Text(saturated),
+                *([Table(["layer", "partial sums", "saturated", "largest"], sums)] if sums else []),
+                Text(accuracy),
+            ],
+        )
+    ]
 
 
-def _told(level: Json) -> str:
-    on = f"on {level['samples']} recording{'s' * (level['samples'] != 1)}"
-    return f"{level['differences']:,} differences {on}" if level["differences"] else f"equal in every spike {on}"
+def _differences(differences: int, samples: int) -> str:
+    on = f"on {samples} recording{'s' * (samples != 1)}"
+    return f"{differences:,} differences {on}" if differences else f"equal in every spike {on}"

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from spikeloom.runtime.machines.truenorth.charted import TICK
+from spikeloom.runtime.machines.truenorth.machine import TICK
 from spikeloom.runtime.report.tables import si
 from spikeloom.runtime.studies.chart.points import by_chip, own_value
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import time
+from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -17,37 +18,29 @@ from typing import Any
 import numpy as np
 
 from spikeloom.compiler import Options, lay_out_again, store
-from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import CapacityError, DataError, FormatError, ModelError
 from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.interpret import cut, vote
-from spikeloom.compiler.targets.base import CROSSBARS, known_targets, load_target
-from spikeloom.compiler.targets.loihi1.netlist import Netlist
-from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist, write_netlist
+from spikeloom.compiler.targets.base import CROSSBARS, known_targets
+from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist
 from spikeloom.compiler.targets.truenorth.native_file import Trained, read_trained
-from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
-from spikeloom.compiler.targets.truenorth.netlist_file import is_crossbars, read_crossbars
 from spikeloom.models.recordings.events import joined_bins
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.recordings.windows import first_part, steps_of
 from spikeloom.runtime.commands.main_job.compile import parse_recipes, provenance
 from spikeloom.runtime.commands.options import parse_cores
-from spikeloom.runtime.costs.estimate import estimate
 from spikeloom.runtime.inputs.files import shipped
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import recordings
-from spikeloom.runtime.machines.loihi1 import engine
+from spikeloom.runtime.machines.base import Machine, machine_for
 from spikeloom.runtime.machines.truenorth import charted
-from spikeloom.runtime.machines.votes import predictions, readout_counts
+from spikeloom.runtime.machines.votes import readout_counts
 from spikeloom.runtime.studies.chart.tasks import SPLITS, Build, Data, Decide, Run
 
 Json = dict[str, Any]
 
 PART = 16
 """Recordings whose float spikes are held at a time."""
-
-SUMS = 1 << 24
-"""Sums of the time model that are held at a time: 128 MiB."""
 
 
 def measure(work: Decide | Build | Run) -> Json:
@@ -123,12 +116,12 @@ def parsed(words: tuple[str, ...]) -> argparse.Namespace:
 
 
 @lru_cache(maxsize=1)
-def _read(path: Path, sha256: str) -> Netlist | CrossbarNetlist | None:
-    """A netlist that is kept; None if it is gone, damaged or another one."""
+def _read(path: Path, sha256: str) -> Machine | None:
+    """A netlist that is kept, on its chip; None if it is gone, damaged or another one."""
     if not path.is_file() or hashlib.sha256(path.read_bytes()).hexdigest() != sha256:
         return None
     try:
-        return read_crossbars(path) if is_crossbars(path) else read_netlist(path)
+        return machine_for(path)
     except FormatError:
         return None
 
@@ -242,61 +235,49 @@ def model_words(words: tuple[str, ...]) -> tuple[str, ...]:
 def _run(work: Run) -> Json:
     """What a netlist decides on both splits, what that costs, and how fast the simulator is."""
     path = work.build.files[work.layout]
-    netlist = _read(path, work.sha256)
-    if netlist is None:
+    machine = _read(path, work.sha256)
+    if machine is None:
         _read.cache_clear()
         _build(work.build)
-        netlist = _read(path, work.sha256)
-    if netlist is None:
+        machine = _read(path, work.sha256)
+    if machine is None:
         raise FormatError(f"{path}: is not the netlist that was measured before; begin anew with --fresh")
-    bins = 1 if isinstance(netlist, CrossbarNetlist) else netlist.bins
-    splits = _heard(work.build.data, netlist.taxels, netlist.classes, bins)
-    parts = {split: first_part(data, work.window) for split, data in splits.items()}
-    if isinstance(netlist, CrossbarNetlist):
-        return charted.measure(netlist, parts)
-    found: Json = {split: _costs(netlist, data) for split, data in parts.items()}
-    found["recordings_per_s"] = _throughput(netlist, parts["test"])
+    netlist, data = machine.netlist, work.build.data
+    splits = _heard(data, netlist.taxels, netlist.classes, netlist.bins)
+    parts = {split: first_part(each, work.window) for split, each in splits.items()}
+    found: Json = {split: _costs(machine, each, data.bin_s) for split, each in parts.items()}
+    found["recordings_per_s"] = _throughput(machine, parts["test"])
     return found
 
 
-def _costs(netlist: Netlist, data: Recordings) -> Json:
+def _costs(machine: Machine, data: Recordings, bin_s: float) -> Json:
     """Decisions, and the mean inference: operations, energy by table, time by table, the longest step."""
-    target = load_target(netlist.target)
-    events = with_clocks(data.events, netlist.clocks)
     own = np.full(len(data), data.steps) if data.lengths is None else data.lengths
-    size = max(1, SUMS // ((data.steps + netlist.max_depth) * 2 * netlist.n_cores * max(1, len(target.time))))
-    decided: list[int] = []
-    operations: list[FloatArray] = []
-    energy: dict[str, list[FloatArray]] = {}
-    seconds: dict[str, list[FloatArray]] = {}
-    longest: dict[str, float] = {}
+    size = machine.batch(data.steps)
+    done = []
     for first in range(0, len(data), size):
         part = slice(first, first + size)
-        counts, costs = estimate(netlist, target, events[part], lengths=own[part])
-        decided += predictions(netlist, counts.spikes).tolist()
-        operations.append(costs.costs.synaptic_operations.sum(axis=1))
-        for name, joule in costs.costs.energy.items():
-            energy.setdefault(name, []).append(joule.sum(axis=1))
-        for name, times in costs.simple.items():
-            seconds.setdefault(name, []).append(times.duration_ns.sum(axis=1) * 1e-9)
-            longest[name] = max(longest.get(name, 0.0), float(times.duration_ns.max() * 1e-9))
+        done.append(machine.price(data.events[part], bin_s=bin_s, lengths=own[part]))
+    prices = [price for _, price in done]
+
+    def mean(values: Sequence[FloatArray | IntArray]) -> float:
+        return float(np.concatenate(values).mean())
+
     return {
-        "decisions": decided,
-        "synaptic_operations": float(np.concatenate(operations).mean()),
-        "energy_j": {name: float(np.concatenate(each).mean()) for name, each in energy.items()},
-        "time_s": {name: float(np.concatenate(each).mean()) for name, each in seconds.items()},
-        "step_s": longest,
+        "decisions": np.concatenate([run.decisions for run, _ in done]).tolist(),
+        "synaptic_operations": mean([price.synaptic_operations for price in prices]),
+        "energy_j": {name: mean([price.energy_j[name] for price in prices]) for name in prices[0].energy_j},
+        "time_s": {name: mean([price.time_s[name] for price in prices]) for name in prices[0].time_s},
+        "step_s": {name: max(price.step_s[name] for price in prices) for name in prices[0].step_s},
         "steps": float(own.mean()),
     }
 
 
-def _throughput(netlist: Netlist, data: Recordings) -> float:
+def _throughput(machine: Machine, data: Recordings) -> float:
     """Recordings a second on one thread, decisions only; the better of two rounds."""
-    prepared = engine.prepare(netlist)
-    events = with_clocks(data.events, netlist.clocks)
     rounds = []
     for _ in range(2):
         began = time.perf_counter()
-        engine.simulate(prepared, events, lengths=data.lengths, threads=1)
+        machine.run(data.events, lengths=data.lengths, threads=1)
         rounds.append(time.perf_counter() - began)
     return len(data) / min(rounds)
