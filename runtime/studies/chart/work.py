@@ -21,7 +21,7 @@ from spikeloom.compiler import Options, lay_out_again, store
 from spikeloom.compiler.errors import CapacityError, DataError, FormatError, ModelError
 from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.interpret import cut, vote
-from spikeloom.compiler.targets.base import CROSSBARS, known_targets
+from spikeloom.compiler.targets.base import CROSSBARS, known_targets, load_target
 from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist
 from spikeloom.compiler.targets.truenorth.native_file import Trained, read_trained
 from spikeloom.models.recordings.events import joined_bins
