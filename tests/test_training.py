@@ -17,6 +17,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from commands import RUNTIME
+from spikeloom.runtime.studies.jobs.workers import run_side_by_side
 
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.formats.checkpoint import read_checkpoint
@@ -24,8 +25,7 @@ from spikeloom.models.recordings.evtouch import load_recordings
 from spikeloom.models.recordings.grasps import synthetic_grasps
 from spikeloom.models.recordings.release import write_released
 from spikeloom.runtime.cli import main
-from spikeloom.runtime.studies.jobs.locks import only_one
-from spikeloom.runtime.studies.jobs.workers import run_side_by_side
+from spikeloom.runtime.studies.jobs import only_one
 from spikeloom.runtime.studies.training.picture import draw_training
 from spikeloom.runtime.studies.training.seeds import side_by_side
 from spikeloom.runtime.studies.training.training import summary

@@ -20,7 +20,7 @@ from spikeloom.compiler.formats.atomic import write_atomically
 from spikeloom.runtime.commands.options import add_network, add_recordings
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.report.console import progress
-from spikeloom.runtime.studies.jobs.sweep import Point, add_sweep_arguments, content_key, sweep
+from spikeloom.runtime.studies.jobs import Point, add_sweep_arguments, content_key, sweep
 from spikeloom.runtime.studies.stress.battery import NAMES, SEEDS, levels_of, why_not
 from spikeloom.runtime.studies.stress.perturbation import Level
 from spikeloom.runtime.studies.stress.text import stress_text

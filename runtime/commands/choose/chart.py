@@ -19,6 +19,7 @@ from spikeloom.runtime.inputs.recordings import bin_words
 from spikeloom.runtime.machines.truenorth.charted import time_title
 from spikeloom.runtime.machines.truenorth.machine import TICK
 from spikeloom.runtime.report.console import progress
+from spikeloom.runtime.studies import jobs as sweep
 from spikeloom.runtime.studies.chart import networks as chart_networks
 from spikeloom.runtime.studies.chart import plan as chart_plan
 from spikeloom.runtime.studies.chart import points as chart_points
@@ -28,12 +29,11 @@ from spikeloom.runtime.studies.chart.networks import Given
 from spikeloom.runtime.studies.chart.plan import Facts, Stored
 from spikeloom.runtime.studies.chart.tasks import FORMAT, SPLITS, Data
 from spikeloom.runtime.studies.chart.text import chart_text, csv_text
-from spikeloom.runtime.studies.jobs import sweep
 
 Json = dict[str, Any]
 
 KIND = "chart"
-STORE = "points.jsonl"
+STORE = "points.sqlite"
 
 NOTES = """\
 Axes of the grid: bits (2-6, 8, or one a layer as in 8+4+4+8), planes (1-3), groups (1-8), prune (0, 1), cores (cores,

@@ -26,7 +26,7 @@ from spikeloom.runtime.inputs.files import require_place, shipped
 from spikeloom.runtime.inputs.network import graph_words, load_checkpoint, load_graph, propagation
 from spikeloom.runtime.inputs.recordings import bin_words, recordings
 from spikeloom.runtime.report.tables import percent, table
-from spikeloom.runtime.studies.jobs.locks import only_one
+from spikeloom.runtime.studies.jobs import only_one
 
 Report = dict[str, Any]
 

@@ -16,7 +16,7 @@ from spikeloom.runtime.inputs.recordings import bin_words
 from spikeloom.runtime.studies.chart.grid import Grid
 from spikeloom.runtime.studies.chart.networks import Given
 from spikeloom.runtime.studies.chart.tasks import FORMAT, Build, Data, Decide, Run
-from spikeloom.runtime.studies.jobs.sweep import Point, content_key
+from spikeloom.runtime.studies.jobs import Point, content_key
 
 Json = dict[str, Any]
 

@@ -3,31 +3,19 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack, closing
+from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.formats.atomic import remove_leftovers
-from spikeloom.runtime.studies.jobs.locks import only_one
-from spikeloom.runtime.studies.jobs.workers import ProcessDied, cores, ended_by_signal, run_side_by_side
+from spikeloom.runtime.studies import jobs as processes
+from spikeloom.runtime.studies.jobs import ProcessDied, ended_by_signal, only_one
 from spikeloom.runtime.studies.training.training import Job, recall, run_job, state_of
 
 Result = tuple[dict[str, Any], IntArray | None]
-
-
-class Writes(Protocol):
-    """A job that crosses process borders."""
-
-    @property
-    def output(self) -> Path:
-        """File that it writes."""
-
-
-AJob = TypeVar("AJob", bound=Writes)
-AResult = TypeVar("AResult")
 
 
 def train_seeds(jobs: Sequence[Job], *, resume: bool) -> list[Result]:
@@ -74,10 +62,7 @@ def _train(jobs: Sequence[Job], *, resume: bool) -> list[Result]:
     waiting = [index for index in range(len(jobs)) if index not in results]
     try:
         with ended_by_signal():
-            if len(waiting) == 1:
-                results[waiting[0]] = run_job(jobs[waiting[0]])
-            else:
-                side_by_side(jobs, waiting, results, run_job)
+            _side_by_side(jobs, waiting, results)
     except KeyboardInterrupt as interrupt:
         done = [jobs[index] for index in waiting if index in results]
         raise KeyboardInterrupt(_kept(done, jobs)) from interrupt
@@ -125,39 +110,11 @@ def _kept(done: Sequence[Job], jobs: Sequence[Job]) -> str:
     return f"{' and '.join(parts)}; go on with the same command and --resume" if parts else ""
 
 
-def side_by_side(
-    jobs: Sequence[AJob],
-    waiting: Sequence[int],
-    results: dict[int, AResult],
-    run: Callable[[AJob], AResult],
-) -> None:
-    """Run jobs in processes of their own; whatever ends this ends them all.
-
-    Parameters
-    ----------
-    jobs : sequence
-        All of them.
-    waiting : sequence of int
-        Which to run, in this order.
-    results : dict
-        Takes the result of each job by its place among `jobs`.
-    run : callable
-        Does the work; a function of a module, since it crosses process borders.
-
-    Raises
-    ------
-    SpikeloomError, OSError, MemoryError
-        What ended a job.
-    """
-    work = [jobs[index] for index in waiting]
-    with closing(run_side_by_side(work, run, processes=cores())) as at_work:
-        for place, found in at_work:
-            index = waiting[place]
-            if isinstance(found, ProcessDied):
-                raise OptionError(
-                    f"{jobs[index].output}: {found}, perhaps for lack of memory; go on with --resume, and with fewer "
-                    "--seeds"
-                )
-            if isinstance(found, Exception):
-                raise found
-            results[index] = found
+def _side_by_side(jobs: Sequence[Job], waiting: Sequence[int], results: dict[int, Result]) -> None:
+    """Run jobs in processes of their own; whatever ends this ends them all."""
+    for place, found in processes.side_by_side([jobs[index] for index in waiting], run_job):
+        if isinstance(found, ProcessDied):
+            raise OptionError(f"{found}; go on with --resume, and with fewer --seeds")
+        if isinstance(found, Exception):
+            raise found
+        results[waiting[place]] = found

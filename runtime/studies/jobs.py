@@ -1,0 +1,337 @@
+"""Many measurements side by side, each kept as soon as it is there: on this machine, or on a cluster of Dask.
+
+A sweep can be ended at any time, by Ctrl-C, a kill or a loss of power. What was measured is in its store, by keys that
+name everything that decides a result; the same command goes on from there. joblib does the work.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import platform
+import signal
+import sqlite3
+import sys
+import threading
+import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from spikeloom import __version__
+from spikeloom.compiler.errors import DataError, OptionError, SpikeloomError, UnfinishedError
+
+APayload = TypeVar("APayload")
+AResult = TypeVar("AResult")
+
+CONNECT_S = 5.0
+"""How long a scheduler may take to answer."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Point:
+    """One measurement of a sweep.
+
+    Parameters
+    ----------
+    key : str
+        Of everything that decides the result, see `content_key`.
+    label : str
+        For messages.
+    payload : picklable
+        What is measured: absolute paths and options, no arrays; it may travel to another machine.
+    """
+
+    key: str
+    label: str
+    payload: Any
+
+
+class ProcessDied(Exception):  # noqa: N818 - it is handed over, not raised
+    """A process ended while it worked, and with it what the others had not finished."""
+
+
+def content_key(facts: Mapping[str, Any]) -> str:
+    """Key of a point: a hash of the JSON values that decide its result (options, hashes of files, versions).
+
+    Examples
+    --------
+    >>> content_key({"bits": 8, "data": "c0ffee"})
+    'a758198fa7fc427a63415cec'
+    >>> content_key({"bits": 8, "data": "c0ffee"}) == content_key({"data": "c0ffee", "bits": 8})
+    True
+    """
+    text = json.dumps(facts, sort_keys=True, allow_nan=False, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()[:24]
+
+
+def add_sweep_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options that say where many things are measured, and whether anew."""
+    group = parser.add_argument_group("sweep")
+    group.add_argument("--jobs", type=int, metavar="N", help="processes at a time (default: one a core)")
+    group.add_argument(
+        "--scheduler", metavar="tcp://HOST:PORT", help="work on the workers of this Dask scheduler instead"
+    )
+    group.add_argument("--fresh", action="store_true", help="measure anew what an earlier run left")
+
+
+def sweep(
+    points: Sequence[Point],
+    measure: Callable[[Any], Any],
+    store: Path,
+    *,
+    kind: str,
+    version: int,
+    jobs: int | None = None,
+    scheduler: str | None = None,
+    fresh: bool = False,
+    label: str,
+) -> dict[str, Any]:
+    """Measure points, as far as the store does not know them.
+
+    Parameters
+    ----------
+    points : sequence of Point
+        Begun in this order; of those with equal keys the first is measured.
+    measure : callable
+        Payload to JSON values; a function of a module, since it crosses process borders.
+    store : Path
+        SQLite file that keeps the results, in a folder that exists.
+    kind, version : str, int
+        What is measured; a store of another one is refused. The version goes up when results mean something else.
+    jobs : int, optional
+        Processes at a time, whose libraries use one thread each; as many as there are cores by default.
+    scheduler : str, optional
+        Address of a Dask scheduler, on whose workers to measure instead.
+    fresh : bool
+        Forget what the store holds.
+    label : str
+        Of the progress bar.
+
+    Returns
+    -------
+    dict of str to JSON values
+        Result of each point by its key, in the order of the points, as JSON gives it back (tuples are lists).
+
+    Raises
+    ------
+    OptionError
+        If an option cannot be meant, the scheduler cannot be reached, or another sweep is writing to the store.
+    DataError
+        If the store is of something else.
+    UnfinishedError
+        If a process died; it carries the results that are there.
+    SpikeloomError, OSError, MemoryError
+        What a measurement raised, with a note that names its point. Results that are there are kept.
+    KeyboardInterrupt
+        On an interrupt or a request to end; its text says what is kept.
+    """
+    from tqdm import tqdm  # here, since commands load this module before they know whether they measure
+
+    keys = list(dict.fromkeys(point.key for point in points))
+    with only_one(store), closing(_opened(store, f"{kind} {version}", fresh=fresh)) as kept:
+        results = {key: json.loads(result) for key, result in kept.execute("SELECT key, result FROM results")}
+        first = {point.key: point for point in reversed(points)}
+        waiting = [first[key] for key in keys if key not in results]
+
+        def standing() -> str:
+            return f"{sum(key in results for key in keys)} of {len(keys)} points are kept in {store}"
+
+        there = tqdm(total=len(keys), initial=len(keys) - len(waiting), desc=label, unit="point", disable=None)
+        with there as bar, ended_by_signal():
+            try:
+                payloads = [point.payload for point in waiting]
+                for index, found in side_by_side(payloads, measure, jobs=jobs, scheduler=scheduler):
+                    if isinstance(found, ProcessDied):
+                        raise UnfinishedError(f"{found}\n{standing()}", results)
+                    if isinstance(found, Exception):
+                        found.add_note(waiting[index].label)
+                        raise found
+                    text = json.dumps(found, allow_nan=False)
+                    with kept:
+                        kept.execute("INSERT INTO results VALUES (?, ?)", (waiting[index].key, text))
+                    results[waiting[index].key] = json.loads(text)
+                    bar.update()
+            except KeyboardInterrupt as interrupt:
+                raise KeyboardInterrupt(f"{standing()}; go on with the same command") from interrupt
+            except sqlite3.OperationalError as error:  # a full disk, say
+                raise OSError(None, str(error), str(store)) from error
+            except SpikeloomError as error:
+                if not isinstance(error, UnfinishedError):
+                    error.add_note(standing())
+                raise
+        return {key: results[key] for key in keys}
+
+
+def _opened(store: Path, content: str, *, fresh: bool) -> sqlite3.Connection:
+    """A store of such content, made where there is none."""
+    if fresh:
+        store.unlink(missing_ok=True)
+    database = sqlite3.connect(store)
+    try:
+        with database:
+            database.execute("CREATE TABLE IF NOT EXISTS results (key TEXT PRIMARY KEY, result TEXT)")
+            database.execute("CREATE TABLE IF NOT EXISTS content (name TEXT)")
+            found = database.execute("SELECT name FROM content").fetchone()
+            if found is None:
+                database.execute("INSERT INTO content VALUES (?)", (content,))
+    except sqlite3.Error as error:
+        database.close()
+        raise DataError(f"{store}: is no store of results ({error}); give another output, or delete it") from error
+    if found is not None and found[0] != content:
+        database.close()
+        raise DataError(
+            f"{store}: holds results of {found[0]}, this is {content}; delete it or give --fresh to measure anew"
+        )
+    return database
+
+
+def side_by_side(
+    payloads: Sequence[APayload],
+    run: Callable[[APayload], AResult],
+    *,
+    jobs: int | None = None,
+    scheduler: str | None = None,
+) -> Iterator[tuple[int, AResult | Exception]]:
+    """Work on payloads in processes of their own, or on a cluster; a single one is worked on here.
+
+    Parameters
+    ----------
+    payloads : sequence
+        Begun in this order.
+    run : callable
+        Does the work; a function of a module.
+    jobs, scheduler
+        As for :func:`sweep`.
+
+    Yields
+    ------
+    (int, result)
+        Place of a payload and what `run` made of it, as they come: its value, the exception that it raised, or
+        `ProcessDied`, after which nothing comes.
+
+    Raises
+    ------
+    OptionError
+        If `jobs` or `scheduler` cannot be meant, or the scheduler cannot be reached.
+    """
+    if jobs is not None and jobs < 1:
+        raise OptionError(f"--jobs {jobs}: allowed are 1 or more; choose another")
+    if jobs is not None and scheduler is not None:
+        raise OptionError(f"--jobs {jobs}: counts processes on this machine, --scheduler has its own; omit one")
+    processes = min(jobs or os.cpu_count() or 1, len(payloads))
+    if scheduler is None and processes <= 1:
+        with _one_thread():
+            yield from (_attempt(run, index, payload) for index, payload in enumerate(payloads))
+        return
+    from joblib import Parallel, delayed, parallel_config
+    from joblib.externals.loky.process_executor import TerminatedWorkerError
+
+    place: AbstractContextManager[Any]
+    if scheduler is None:
+        place = parallel_config("loky", n_jobs=processes, inner_max_num_threads=1)
+    else:
+        place = _cluster(scheduler)
+    with place:
+        work = Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch="all")
+        try:
+            yield from work(delayed(_attempt)(run, index, payload) for index, payload in enumerate(payloads))
+        except TerminatedWorkerError:
+            yield -1, ProcessDied("a process ended early, perhaps for lack of memory; go on with fewer --jobs")
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """As joblib's processes have it, so that the order of float sums is the same here."""
+    torch = sys.modules.get("torch")
+    threads = 0 if torch is None else torch.get_num_threads()
+    if torch is not None:
+        torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        if torch is not None:
+            torch.set_num_threads(threads)
+
+
+def _attempt(run: Callable[[APayload], AResult], index: int, payload: APayload) -> tuple[int, AResult | Exception]:
+    """What `run` makes of a payload, or the exception that it raised, such that it can cross process borders."""
+    try:
+        return index, run(payload)
+    except (SpikeloomError, OSError, MemoryError) as error:
+        return index, error.with_traceback(None)
+    except Exception:  # a defect; not every exception survives the way
+        return index, RuntimeError(traceback.format_exc())
+
+
+@contextmanager
+def _cluster(scheduler: str) -> Iterator[None]:
+    """Make joblib work on a cluster whose workers have the same versions as this machine."""
+    try:
+        from distributed import Client
+        from joblib import parallel_config
+    except ImportError:
+        raise OptionError(
+            f"--scheduler {scheduler}: needs Dask, which is not installed; install distributed, or omit it"
+        ) from None
+    try:
+        client = Client(scheduler, timeout=CONNECT_S, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise OptionError(
+            f"--scheduler {scheduler}: no answer within {CONNECT_S:g} s ({error}); give one as in tcp://10.0.0.1:8786"
+        ) from None
+    with client:
+        for worker, versions in sorted(client.run(_versions).items()):
+            if versions != _versions():
+                raise OptionError(f"--scheduler {scheduler}: worker {worker} has {versions}, here it is {_versions()}")
+        with parallel_config("dask", client=client):
+            yield
+
+
+def _versions() -> str:
+    import numpy as np
+
+    return f"spikeloom {__version__}, Python {platform.python_version()}, numpy {np.__version__}"
+
+
+@contextmanager
+def ended_by_signal() -> Iterator[None]:
+    """A request to end (SIGTERM) interrupts as Ctrl-C does, so that everything is left tidy."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # only the main thread may say what a signal does
+        return
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+@contextmanager
+def only_one(output: Path) -> Iterator[None]:
+    """Be the only process that works on `output`; ``NAME.lock`` beside it says so.
+
+    Raises
+    ------
+    OptionError
+        If another one works on it.
+    """
+    from filelock import FileLock, Timeout
+
+    lock = FileLock(f"{output}.lock")
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        raise OptionError(f"{output}: another process is working on it; wait for it, or give another output") from None
+    except NotImplementedError:  # a network's file system without locks
+        yield
+        return
+    try:
+        yield
+    finally:
+        Path(lock.lock_file).unlink(missing_ok=True)
+        lock.release()

@@ -1,1 +1,0 @@
-"""Many measurements side by side."""
