@@ -7,10 +7,11 @@ from made_files import CLASSES, STEPS, TAXELS, events, small_checkpoint, weights
 from spikeloom.compiler import Options, Recipe, compile_network
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.runtime import cli
-from spikeloom.runtime.equivalence import verdicts
 from spikeloom.runtime.equivalence.breakdowns import breakdowns
-from spikeloom.runtime.equivalence.levels import levels_of
+from spikeloom.runtime.equivalence.sections import sections
 from spikeloom.runtime.equivalence.verify import verify
+from spikeloom.runtime.report.encode import encode
+from spikeloom.runtime.report.sections import terminal
 
 FILES = tuple("abcdef")
 LABELS = np.arange(6) % CLASSES
@@ -82,8 +83,7 @@ def verified(folder, arrays, recordings, recipe, **options):
     checkpoint, adjacency = small_checkpoint(folder, last=arrays)
     netlist = compile_network(expand(checkpoint, adjacency), Options(recipes=(recipe,), **options)).netlist
     verdict = verify(netlist, checkpoint, adjacency, recordings, LABELS, FILES)
-    report = verdicts.verify_json(verdict, levels_of(verdict), [])
-    return {breakdown["kind"]: breakdown for breakdown in report["breakdowns"]}, verdicts.verify_text(report)
+    return {breakdown["kind"]: breakdown for breakdown in encode(verdict)["breakdowns"]}, terminal(sections(verdict))
 
 
 @pytest.mark.parametrize("bits", [4, 8])

@@ -14,7 +14,8 @@ from spikeloom.compiler.interpret import channels_last, run_float, vote
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.models.networks.reference import float_spikes
 from spikeloom.runtime.equivalence.certainty import _recurrence, float_certainty
-from spikeloom.runtime.equivalence.certificates import certificate_json, certificate_text, certify, wins
+from spikeloom.runtime.equivalence.certificates import certify, wins
+from spikeloom.runtime.equivalence.sections import certificate_table, certificate_text
 from spikeloom.runtime.equivalence.verify import verify
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.trace import aligned
@@ -255,9 +256,8 @@ def test_a_network_far_from_its_thresholds_is_certified_whole(tmp_path):
     assert all(layer.equal == layer.entries > 0 for layer in found.layers.values())
     assert all(layer.chip > 0 for layer in verdict.spikes.values())
     assert (found.decisions, found.samples, found.unproven) == (6, 6, ())
-    text = certificate_text(certificate_json(found))
-    assert text.endswith("6 of 6 decisions certified equal; no register overflows for any input")
-    assert text.count("100.0000 %") == 4
+    assert certificate_text(found) == ("6 of 6 decisions certified equal; no register overflows for any input")
+    assert [row[2] for row in certificate_table(found).rows] == ["100.0000 %"] * 4
 
 
 def test_the_same_network_at_its_thresholds_is_not(tmp_path):
@@ -277,7 +277,7 @@ def test_registers_without_a_proof_are_named(tmp_path):
     recordings = events(2, steps=8)
     found = certify(checkpoint, adjacency, lift(netlist), recordings, *on_chip(netlist, recordings))
     assert found.unproven == ("conv1", "fc1", "fc2", "fc3")
-    assert certificate_text(certificate_json(found)).endswith(
+    assert certificate_text(found).endswith(
         "decisions certified equal; some input may overflow a register of conv1, fc1, fc2, fc3: no proof of range"
     )
 

@@ -18,7 +18,8 @@ from spikeloom.compiler.targets.loihi1.netlist import read_only
 from spikeloom.models.networks.reference import float_membranes, float_spikes
 from spikeloom.runtime import cli
 from spikeloom.runtime.equivalence import verify as equivalence
-from spikeloom.runtime.equivalence.verify import LADDER, realised, verify
+from spikeloom.runtime.equivalence.ladder import LADDER, realised
+from spikeloom.runtime.equivalence.verify import verify
 from spikeloom.runtime.machines.loihi1 import engine, spec
 from spikeloom.runtime.machines.votes import class_counts, predictions
 from spikeloom.runtime.report.intervals import wilson
@@ -26,6 +27,11 @@ from spikeloom.runtime.report.intervals import wilson
 LAYERS = ["conv1", "fc1", "fc2", "fc3"]
 LABELS = np.array([0, 1, 2, 3, 0, 1])
 FILES = tuple("abcdef")
+
+
+def rungs(verdict):
+    """Different entries of each layer by rung of the ladder."""
+    return {rung.stage: rung.different for rung in verdict.ladder}
 
 
 @pytest.fixture(scope="module")
@@ -69,8 +75,8 @@ def test_spikes_and_decisions(small, verdict):
     decisions = [spikes[-1].sum(axis=1).argmax(axis=1) for spikes in (narrow, chip)]
     assert verdict.float_predictions.tolist() == decisions[0].tolist()
     assert verdict.chip_predictions.tolist() == decisions[1].tolist()
-    assert verdict.float_accuracy == np.mean(decisions[0] == LABELS)
-    assert verdict.chip_accuracy == np.mean(decisions[1] == LABELS)
+    assert verdict.accuracy["float"] == np.mean(decisions[0] == LABELS)
+    assert verdict.accuracy["chip"] == np.mean(decisions[1] == LABELS)
     assert verdict.decision_agreement == np.mean(decisions[0] == decisions[1])
     assert (verdict.files, verdict.labels.tolist()) == (FILES, LABELS.tolist())
     assert verdict.spec_equals_engine
@@ -124,8 +130,8 @@ def test_the_first_divergence_of_other_networks(tmp_path, seed):
 
 
 def test_the_ladder_ends_at_the_chip(verdict):
-    assert tuple(stage for stage, _ in verdict.ladder) == LADDER
-    ladder = dict(verdict.ladder)
+    assert tuple(rung.stage for rung in verdict.ladder) == LADDER
+    ladder = rungs(verdict)
     assert ladder["float64"] == {name: layer.ill_posed for name, layer in verdict.spikes.items()}
     assert ladder["saturation"] == {name: layer.different for name, layer in verdict.spikes.items()}
     assert sum(ladder["weights"].values()) > sum(ladder["beta"].values())
@@ -164,7 +170,7 @@ def test_saturation_is_a_rung_of_its_own(tmp_path):
     recordings[:, :, :, 30:] = 1
     netlist = compile_network(expand(checkpoint, adjacency)).netlist
     found = verify(netlist, checkpoint, adjacency, recordings, LABELS[:1], FILES[:1])
-    ladder = dict(found.ladder)
+    ladder = rungs(found)
     assert ladder["rounding"]["fc1"] < ladder["saturation"]["fc1"] == found.spikes["fc1"].different
     assert found.first_divergence.layer == "fc1"
     # the other way round than in the register: it clipped what the float model holds
@@ -185,7 +191,7 @@ def test_no_divergence_at_all(tmp_path):
     found = verify(netlist, checkpoint, adjacency, events(2, steps=8), LABELS, FILES)
     assert found.first_divergence is None
     assert all(layer.float == layer.chip > 0 for layer in found.spikes.values())
-    assert all(set(different.values()) == {0} for _, different in found.ladder)
+    assert all(set(different.values()) == {0} for different in rungs(found).values())
     assert found.decision_agreement == 1
 
 
@@ -200,7 +206,7 @@ def test_ill_posed_spikes_are_told_from_faults(tmp_path):
     assert found.spikes["fc2"].float == 0
     assert found.spikes["fc2"].ill_posed == 6 * STEPS * 8
     assert found.spikes["fc1"].ill_posed == 0
-    assert dict(found.ladder)["float64"] == {"conv1": 0, "fc1": 0, "fc2": 6 * STEPS * 8, "fc3": 0}
+    assert rungs(found)["float64"] == {"conv1": 0, "fc1": 0, "fc2": 6 * STEPS * 8, "fc3": 0}
     # a finer chip would have sided with float64; this one stands for it
     finer = dataclasses.replace(netlist, threshold=read_only(netlist.threshold - (netlist.layer == 2)))
     first = verify(finer, checkpoint, adjacency, events(0), LABELS, FILES).first_divergence

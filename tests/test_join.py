@@ -95,6 +95,11 @@ def one_by_one(single_runs, wide, name, kind=bool):
 # --- files ---------------------------------------------------------------------------------------------------------
 
 
+def rungs(verdict):
+    """Different entries of each layer by rung of the ladder."""
+    return {rung.stage: rung.different for rung in verdict.ladder}
+
+
 @pytest.mark.parametrize("system", SYSTEMS)
 @pytest.mark.parametrize("dynamics", [PLAIN, TIMING], ids=["plain", "timed"])
 def test_a_file_holds_its_towers_and_nothing_between_them(tmp_path, system, dynamics):
@@ -244,7 +249,7 @@ def test_compiled_and_verified(tmp_path, system, dynamics):
     verdict = verify(compilation.netlist, wide, seen, events, labels, files, spec_samples=3)
     assert verdict.spec_equals_engine
     assert verdict.certificate.unproven == ()
-    assert dict(verdict.ladder)["float64"] == dict.fromkeys(wide.neurons, 0)
+    assert rungs(verdict)["float64"] == dict.fromkeys(wide.neurons, 0)
     assert verdict.float_counts.shape == verdict.chip_counts.shape == (6, 4)
     assert_array_equal(
         verdict.float_counts, float_spikes(wide, seen, events)["fc3"].sum(axis=1).reshape(6, 3, 4).sum(axis=1)

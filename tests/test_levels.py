@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.runtime.cli import main
-from spikeloom.runtime.equivalence.levels import Level, levels_of, mcnemar, parse_requirements, spike_agreement, unmet
-from spikeloom.runtime.equivalence.verify import LayerSpikes
+from spikeloom.runtime.equivalence.levels import levels_of, mcnemar, parse_requirements, spike_agreement, unmet
+from spikeloom.runtime.equivalence.verdict import LayerSpikes, Level
 
 
 def layer(float_: int, chip: int, different: int) -> LayerSpikes:

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from random_networks import chain, integer_chain
 
-from spikeloom.runtime.equivalence.roots import Root, find_roots, sources_of
+from spikeloom.runtime.equivalence.explanation.roots import Root, find_roots, sources_of
 
 
 def array(*rows):

@@ -14,7 +14,7 @@ from spikeloom.compiler.targets.loihi1.netlist import read_only
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist, write_netlist
 from spikeloom.runtime import cli
 from spikeloom.runtime.costs import estimate
-from spikeloom.runtime.equivalence import verify as equivalence
+from spikeloom.runtime.equivalence import ladder
 from spikeloom.runtime.machines.loihi1 import blocks, engine
 
 RUN = ("run", "net.loom", "--data", "data")
@@ -140,7 +140,7 @@ def test_parts_of_verify_and_report(spikeloom, tmp_path):
 
 def test_a_rung_that_is_proven_is_what_it_would_be(spikeloom, monkeypatch):
     proven = json.loads(spikeloom(*VERIFY, "--json")[0])["ladder"]
-    monkeypatch.setattr(equivalence, "prove_ranges", lambda _: [type("Proof", (), {"holds": False})()])
+    monkeypatch.setattr(ladder, "prove_ranges", lambda _: [type("Proof", (), {"holds": False})()])
     out, _ = spikeloom(*VERIFY, "--explain-cost", "--json")
     report = json.loads(out)
     assert report["ladder"] == proven

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -21,7 +20,6 @@ from spikeloom.compiler.ir import IntegerNetwork, Network
 from spikeloom.compiler.targets.loihi1.storage.range_proof import prove_ranges
 from spikeloom.runtime.equivalence.certainty import float_certainty
 from spikeloom.runtime.machines.votes import readout_counts
-from spikeloom.runtime.report.tables import table
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,6 +39,8 @@ class LayerCertificate:
     entries: int
     equal: int
     different: int
+
+    json_properties = ("undecided",)
 
     @property
     def undecided(self) -> int:
@@ -147,44 +147,4 @@ def certify(
         samples=len(events),
         decisions=int(np.count_nonzero(wins(decisions, least, most))),
         unproven=tuple(proof.layer for proof in prove_ranges(integer) if not proof.holds),
-    )
-
-
-def certificate_json(certificate: Certificate) -> dict[str, Any]:
-    """A certificate under the keys that scripts rely on."""
-    return {
-        "samples": certificate.samples,
-        "decisions": certificate.decisions,
-        "unproven": list(certificate.unproven),
-        "layers": {
-            name: {
-                "entries": layer.entries,
-                "equal": layer.equal,
-                "different": layer.different,
-                "undecided": layer.undecided,
-            }
-            for name, layer in certificate.layers.items()
-        },
-    }
-
-
-def certificate_text(report: dict[str, Any]) -> str:
-    """A certificate for people."""
-    rows = [
-        [
-            name,
-            f"{layer['entries']:,}",
-            f"{100 * layer['equal'] / max(layer['entries'], 1):.4f} %",
-            *(f"{layer[key]:,}" for key in ("different", "undecided")),
-        ]
-        for name, layer in report["layers"].items()
-    ]
-    proof = "no register overflows for any input"
-    if report["unproven"]:
-        proof = f"some input may overflow a register of {', '.join(report['unproven'])}: no proof of range"
-    return "\n".join(
-        [
-            table(["certified in any order of sums", "entries", "equal", "different", "undecided"], rows),
-            f"{report['decisions']} of {report['samples']} decisions certified equal; {proof}",
-        ]
     )

@@ -9,35 +9,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import replace
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.fixedpoint import IntArray
-from spikeloom.runtime.equivalence.verify import LayerSpikes, Verdict
+from spikeloom.runtime.equivalence.verdict import LayerSpikes, Level, Verdict
 
 LEVELS = ("E0", "E1", "E2", "E3")
 
 SHARES = ("E2", "E3")
 """Levels whose gate needs a share."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Level:
-    """What was found on one level.
-
-    Parameters
-    ----------
-    name : str
-        One of ``LEVELS``.
-    share : float or None
-        From 0 to 1; None where the level does not apply.
-    text : str
-        For people.
-    """
-
-    name: str
-    share: float | None
-    text: str
 
 
 def spike_agreement(spikes: LayerSpikes) -> float:
@@ -161,6 +142,16 @@ def parse_requirements(words: str) -> dict[str, float]:
             raise OptionError(f"{where}: not a share; give a number from 0 to 1")
         required[name] = share
     return required
+
+
+def judged(verdict: Verdict, required: Mapping[str, float]) -> Verdict:
+    """A verdict with its levels and those of the required shares, by level, that it misses.
+
+    Weights that are not the checkpoint's are always a miss.
+    """
+    levels = levels_of(verdict)
+    missed = unmet(levels, required) + ([] if verdict.weights.holds else [f"weights: {verdict.weights.text}"])
+    return replace(verdict, levels=levels, missed=tuple(missed))
 
 
 def unmet(levels: tuple[Level, ...], required: Mapping[str, float]) -> list[str]:

@@ -23,7 +23,7 @@ from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.models.graphs import NEUTOUCH
 from spikeloom.models.recordings.events import BIN_S
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.runtime.equivalence.verify import Verdict
+from spikeloom.runtime.equivalence.verdict import Verdict
 from spikeloom.runtime.inputs.network import LoadedNetwork, sensor_places
 from spikeloom.runtime.machines.loihi1.trace import Counts
 

@@ -22,7 +22,7 @@ from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.costs import cost
 from spikeloom.runtime.costs.estimate import Estimate, estimate
 from spikeloom.runtime.costs.estimates import estimate_json
-from spikeloom.runtime.equivalence.verify import membranes_of, spikes_of
+from spikeloom.runtime.equivalence.reference import membranes_of, spikes_of
 from spikeloom.runtime.inputs.network import LoadedNetwork
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.timing import DetailedTimes, SimpleTimes

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from spikeloom.runtime.equivalence.verdicts import divergence_text
+from spikeloom.runtime.equivalence.divergence import Divergence
+from spikeloom.runtime.equivalence.sections import divergence_text
 from spikeloom.runtime.page import figures as report_figures
 from spikeloom.runtime.page.text import confusions, sender, trace_spikes, trace_title
 from spikeloom.runtime.page.traces import drawn, membranes, raster
@@ -82,7 +83,9 @@ def verdict(report: Json) -> list[str]:
         facts(cards),
         table("Levels of equivalence", ["level", "reached", "what was found"], levels, left=True),
         *(paragraph(f"Breakdown: {breakdown['text']}") for breakdown in found["breakdowns"]),
-        paragraph("No spike differs." if first is None else f"First divergence: {divergence_text(first)}."),
+        paragraph(
+            "No spike differs." if first is None else f"First divergence: {divergence_text(Divergence(**first))}."
+        ),
         "<h3>Equivalence ladder</h3>",
         figure(
             svg.bars(

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from spikeloom.runtime.costs.estimates import estimate_text
-from spikeloom.runtime.equivalence.verdicts import verify_text
 from spikeloom.runtime.report.render import netlist_text
 from spikeloom.runtime.report.tables import si, table
 from spikeloom.runtime.studies.chart.text import recommended_text
@@ -19,10 +18,10 @@ LISTED = 10
 """Rows of tables that are sorted by weight; the page and --json have them all."""
 
 
-def report_text(report: Json) -> str:
+def report_text(report: Json, verdict: str) -> str:
     """Section by section, under the headings of the page."""
     sections = {
-        "Verdict": verify_text(report["verify"]),
+        "Verdict": verdict,
         "Decisions": _decisions(report["decisions"]),
         "Cores": f"{netlist_text(report['netlist'])}\n\n{_cores(report['cores'])}",
         "Taxels": _taxels(report["taxels"]),

@@ -18,6 +18,9 @@ OPTIONAL: Mapping[str, bool] = {"optional": True}
 """Metadata of a field that is left out of the JSON where it is None."""
 
 
+HIDDEN: Mapping[str, bool] = {"hidden": True}
+"""Metadata of a field that the JSON does not show."""
+
 INLINE: Mapping[str, bool] = {"inline": True}
 """Metadata of a field whose own fields stand in its place."""
 
@@ -60,6 +63,8 @@ def encode(value: Any) -> Any:
     entries: dict[str, Any] = {}
     for field in fields(value):
         each = getattr(value, field.name)
+        if field.metadata.get("hidden"):
+            continue
         if field.metadata.get("inline"):
             entries |= encode(each)
         elif each is not None or not field.metadata.get("optional"):

@@ -114,7 +114,10 @@ def _place(done: Compilation) -> Compilation:
 def _emit(done: Compilation) -> Compilation:
     origin = Origin(network=done.integer, identity=done.identity, unreceived=done.unreceived)
     parts, tiles = done.layout.parts, done.layout.placement.tiles
-    return replace(done, netlist=emit(done.held, parts, tiles, done.target, done.options.provenance, origin))
+    provenance = dict(done.options.provenance)
+    if done.choices:
+        provenance["compensated"] = [choice.layer for choice in done.choices if choice.compensated]
+    return replace(done, netlist=emit(done.held, parts, tiles, done.target, provenance, origin))
 
 
 def _legalize(done: Compilation) -> Compilation:

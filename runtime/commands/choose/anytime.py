@@ -162,7 +162,7 @@ def _float_votes(arguments: argparse.Namespace, netlist: Netlist, data: Recordin
             raise OptionError(f"--{given[0]}: is for --checkpoint, which is not given; add it or leave this away")
         return None
     from spikeloom.compiler.interpret import cut
-    from spikeloom.runtime.equivalence.verify import require_match, spikes_of
+    from spikeloom.runtime.equivalence.reference import require_match, spikes_of
 
     asked = load_network(arguments.checkpoint, arguments, netlist)
     require_match(netlist, asked.model)

@@ -6,11 +6,10 @@ import argparse
 
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.commands.options import add_detail, add_recordings
-from spikeloom.runtime.costs.spent import Account, explained
+from spikeloom.runtime.costs.simulated import Account, Accounted
 from spikeloom.runtime.inputs.recordings import netlist_recordings
 from spikeloom.runtime.machines.base import Machine, Price, Run, machine_for
 from spikeloom.runtime.report.console import progress
-from spikeloom.runtime.report.encode import encode
 from spikeloom.runtime.report.sections import Outcome
 
 
@@ -29,8 +28,9 @@ def run(arguments: argparse.Namespace) -> Outcome:
     account.begin(arguments.detail)
     _, price = priced(arguments, machine, data)
     account.begin("no float")
-    found = price.outcome
-    return Outcome(encode(found.result) | explained(arguments, account), lambda _: found.sections(found.result))
+    shown = price.outcome
+    result = Accounted(result=shown.result, explained_cost=account.explained(arguments.explain_cost))
+    return Outcome(result, lambda result: shown.sections(result.result))
 
 
 def priced(

@@ -6,6 +6,7 @@ import argparse
 import hashlib
 from collections.abc import Callable
 from difflib import get_close_matches
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,16 +19,17 @@ from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.commands.options import add_explain_cost, add_network, add_recordings
-from spikeloom.runtime.costs.spent import Account, explained
-from spikeloom.runtime.equivalence.levels import levels_of, unmet
-from spikeloom.runtime.equivalence.verdicts import verify_json
+from spikeloom.runtime.costs.simulated import Account
+from spikeloom.runtime.equivalence.sections import sections
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.machines.base import machine_of
 from spikeloom.runtime.machines.loihi1.trace import check_channels
 from spikeloom.runtime.page.text import report_text
+from spikeloom.runtime.report.encode import encode
 from spikeloom.runtime.report.render import netlist_json
+from spikeloom.runtime.report.sections import terminal
 from spikeloom.runtime.studies.chart.file import read_chart
 
 Json = dict[str, Any]
@@ -82,12 +84,12 @@ def run(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int
     data = load_recordings(arguments, netlist, labels_for="report")
     check_channels(netlist, data.events.shape[1] * data.events.shape[2] + netlist.clocks.channels)
     chosen = None if arguments.recording is None else find_recording(data, arguments.recording)
-    found, code = _facts(arguments, netlist, asked, data, chosen)
+    found, verdict, code = _facts(arguments, netlist, asked, data, chosen)
     found |= stability
     found |= {} if chart is None else {"chart": chart}
     with write_atomically(arguments.output) as file:
         file.write(page(found).encode())
-    return found | {"output": arguments.output}, report_text, code
+    return found | {"output": arguments.output}, partial(report_text, verdict=verdict), code
 
 
 def _require_origin(arguments: argparse.Namespace, netlist: Netlist, asked: LoadedNetwork) -> None:
@@ -98,7 +100,7 @@ def _require_origin(arguments: argparse.Namespace, netlist: Netlist, asked: Load
     ModelError
         Naming what differs.
     """
-    from spikeloom.runtime.equivalence.verify import require_match
+    from spikeloom.runtime.equivalence.reference import require_match
 
     require_match(netlist, asked.model)
     made, where = netlist.provenance, arguments.netlist
@@ -138,8 +140,8 @@ def find_recording(data: Recordings, asked: str) -> int:
 
 def _facts(
     arguments: argparse.Namespace, netlist: Netlist, asked: LoadedNetwork, data: Recordings, chosen: int | None
-) -> tuple[Json, int]:
-    """All that the page shows, as JSON values, and the exit code."""
+) -> tuple[Json, str, int]:
+    """All that the page shows, as JSON values, the verdict as text, and the exit code."""
     from spikeloom.runtime.costs.estimate import estimate
     from spikeloom.runtime.costs.estimates import estimate_json
     from spikeloom.runtime.equivalence.verify import verify
@@ -158,9 +160,9 @@ def _facts(
         sha256=asked.sha256,
         spec_samples=arguments.spec_samples,
         lengths=data.lengths,
+        required={"E0": 1.0},
         progress=account.begin,
     )
-    levels = levels_of(verdict)
     if chosen is None:
         chosen = 0 if verdict.first_divergence is None else data.files.index(verdict.first_divergence.file)
     account.begin("costs")
@@ -168,7 +170,7 @@ def _facts(
     account.begin("the recording")
     provenance = report_facts.provenance_json(arguments, netlist, target, asked, data, data.files[chosen])
     found = {
-        "verify": verify_json(verdict, levels, unmet(levels, {"E0": 1.0})),
+        "verify": encode(verdict),
         "decisions": report_facts.decisions_json(verdict, netlist.classes),
         "netlist": netlist_json(netlist, measure(netlist, target), provenance["netlist"]["sha256"]),
         "cores": report_facts.cores_json(netlist, target, counts),
@@ -177,4 +179,6 @@ def _facts(
         "costs": estimate_json(netlist, target, costs, bin_s=arguments.bin * netlist.bins),
         "provenance": provenance,
     }
-    return found | explained(arguments, account), 1 if found["verify"]["missed"] else 0
+    if arguments.explain_cost:
+        found["explained_cost"] = encode(account.explained(True))
+    return found, terminal(sections(verdict)), 1 if verdict.missed else 0

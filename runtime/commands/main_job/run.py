@@ -10,7 +10,7 @@ import numpy as np
 from spikeloom.compiler.formats.atomic import write_atomically
 from spikeloom.runtime.commands.main_job.estimate import priced
 from spikeloom.runtime.commands.options import add_detail, add_recordings
-from spikeloom.runtime.costs.spent import Account, explained
+from spikeloom.runtime.costs.simulated import Account, Accounted
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.recordings import netlist_recordings
 from spikeloom.runtime.machines.base import Price, machine_for
@@ -54,4 +54,5 @@ def run(arguments: argparse.Namespace) -> Outcome:
         shown = [Section("", [Text(decisions.run_text(found))])]
         return shown if price is None else [*shown, *price.outcome.sections(price.outcome.result)]
 
-    return Outcome(found | costs | explained(arguments, account), sections)
+    result = Accounted(result=found | costs, explained_cost=account.explained(arguments.explain_cost))
+    return Outcome(result, sections)

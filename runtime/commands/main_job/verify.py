@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.runtime.commands.options import MIN_AGREEMENT, add_explain_cost, add_network, add_recordings
-from spikeloom.runtime.costs.spent import Account, explained
-from spikeloom.runtime.equivalence import verdicts
-from spikeloom.runtime.equivalence.levels import levels_of, parse_requirements, unmet
+from spikeloom.runtime.costs.simulated import Account
+from spikeloom.runtime.equivalence.levels import parse_requirements
+from spikeloom.runtime.equivalence.sections import sections
 from spikeloom.runtime.equivalence.verify import verify
 from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.inputs.recordings import netlist_recordings
 from spikeloom.runtime.machines.base import chip_commands, machine_for
 from spikeloom.runtime.machines.loihi1.trace import ENGINES
+from spikeloom.runtime.report.sections import Outcome
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -51,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_explain_cost(parser)
 
 
-def run(arguments: argparse.Namespace) -> tuple[dict[str, Any], Callable[[dict[str, Any]], str], int]:
+def run(arguments: argparse.Namespace) -> Outcome | tuple[Any, Any, int]:
     """Run the command."""
     machine = machine_for(arguments.netlist)
     if (own := chip_commands(machine.netlist.target)) is not None:
@@ -83,14 +84,13 @@ def run(arguments: argparse.Namespace) -> tuple[dict[str, Any], Callable[[dict[s
         spec_samples=arguments.spec_samples,
         engine_name=arguments.engine,
         lengths=data.lengths,
+        required=required,
         progress=account.begin,
     )
-    told = explained(arguments, account)
     compiled_for = netlist.provenance.get("graph", asked.graph)
     if asked.graph not in (None, compiled_for):
         sys.stderr.write(
             f"spikeloom: warning: the netlist was compiled for graph {compiled_for}, this is {asked.graph}\n"
         )
-    levels = levels_of(verdict)
-    missed = unmet(levels, required)
-    return verdicts.verify_json(verdict, levels, missed) | told, verdicts.verify_text, 1 if missed else 0
+    verdict = replace(verdict, explained_cost=account.explained(arguments.explain_cost))
+    return Outcome(verdict, sections, 1 if verdict.missed else 0)

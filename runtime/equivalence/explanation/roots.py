@@ -22,8 +22,7 @@ from spikeloom.compiler.interpret import BoolArray
 from spikeloom.compiler.ir import INPUT, IntegerNetwork, Network
 
 Sources = tuple[tuple[tuple[int, BoolArray], ...], ...]
-"""For each population the populations that it listens to, with the pairs (neurons of pre, neurons of post) that are
-connected."""
+"""For each population its presynaptic populations, and which pairs (neurons of pre, neurons of post) are connected."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,7 +50,7 @@ class Root:
 
 
 def sources_of(network: Network, integer: IntegerNetwork) -> Sources:
-    """Who listens to whom, by synapses whose weight is not zero in the float model or on the chip.
+    """Presynaptic populations, by synapses whose weight is not zero in the float model or on the chip.
 
     The input is left out: it cannot differ.
     """
@@ -75,7 +74,6 @@ def find_roots(differs: Sequence[BoolArray], resets: Sequence[BoolArray], source
     resets : sequence of (steps, neurons) bool
         Entries after which a neuron remembers nothing: both fired, and its current does not outlast a step.
     sources : Sources
-        Who listens to whom.
 
     Returns
     -------

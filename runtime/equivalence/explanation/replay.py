@@ -13,26 +13,31 @@ import numpy as np
 
 from spikeloom.compiler.fixedpoint import MEMBRANE_MAX, FloatArray, IntArray
 from spikeloom.compiler.interpret import BoolArray
-from spikeloom.runtime.equivalence.netlist_faults import LayerCheck
-from spikeloom.runtime.equivalence.suspects import BETA, BIAS, SATURATION, THRESHOLD, TRUNCATION, UNKNOWN, WEIGHTS
+from spikeloom.runtime.equivalence.explanation.deviations import (
+    BETA,
+    BIAS,
+    SATURATION,
+    THRESHOLD,
+    TRUNCATION,
+    UNKNOWN,
+    WEIGHTS,
+    LayerValues,
+)
 
-STORED, ROUNDED, UNROUNDED, UNCLIPPED = range(4)
-"""Synaptic sums of a replay: of the weights as stored, as rounded from the checkpoint, as stored without what rounding
-costs, as stored without what clipping costs."""
+STORED, UNROUNDED, UNCLIPPED = range(3)
+"""Synaptic sums of a replay: of the weights as stored, as the checkpoint has them, as stored but for clipped ones."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Variant:
-    """A replay: the stored neurons with one thing changed.
+    """A replay: the stored neurons without one deviation.
 
     Parameters
     ----------
     cause : str
         What deviation is gone.
-    part : str
-        What fault is gone, as in :class:`suspects.Suspect`; ``clipped`` where it is the clipping of weights.
-    inflow : int
-        Which weights: STORED, ROUNDED, UNROUNDED or UNCLIPPED.
+    weights : int
+        STORED, UNROUNDED or UNCLIPPED.
     bias, threshold : (neurons,) float64
         Membrane units.
     keep_u, keep_v : float
@@ -44,8 +49,7 @@ class Variant:
     """
 
     cause: str
-    part: str
-    inflow: int
+    weights: int
     bias: FloatArray
     threshold: FloatArray
     keep_u: float
@@ -54,53 +58,29 @@ class Variant:
     rounds: bool = True
 
 
-def variants_of(check: LayerCheck, rows: IntArray) -> list[Variant]:
-    """What to run: the netlist as it is; with faults mended; with what rounding costs taken away.
-
-    Parameters
-    ----------
-    check : LayerCheck
-        A population.
-    rows : (neurons,) int64
-        Which of its neurons to run.
-    """
-    stored, rounded, ideal = check.stored, check.rounded, check.ideal
-    asked = Variant(
+def variants_of(values: LayerValues, rows: IntArray) -> list[Variant]:
+    """What to run for the neurons `rows`: the netlist as it is, then without each deviation."""
+    stored, ideal = values.stored, values.ideal
+    netlist = Variant(
         cause=UNKNOWN,
-        part="machine",
-        inflow=STORED,
+        weights=STORED,
         bias=stored.bias[rows],
         threshold=stored.threshold[rows],
         keep_u=stored.keep_u,
         keep_v=stored.keep_v,
     )
-    mended = (
-        replace(asked, part="weight", inflow=ROUNDED),
-        replace(asked, part="bias", bias=rounded.bias[rows]),
-        replace(asked, part="threshold", threshold=rounded.threshold[rows]),
-        replace(asked, part="decay", keep_u=rounded.keep_u, keep_v=rounded.keep_v),
-    )
-    wrong = {suspect.part for suspect in check.suspects}
-    exact = asked.bias + (ideal.bias - rounded.bias)[rows]
+    exact = ideal.bias[rows]
     # where a rounding compensates, biases make up for weights: both go together
-    with_weights, alone = (exact, asked.bias) if check.compensated else (asked.bias, exact)
-    threshold = asked.threshold + (ideal.threshold - rounded.threshold)[rows]
+    with_weights, alone = (exact, netlist.bias) if values.compensated else (netlist.bias, exact)
     return [
-        asked,
-        *(variant for variant in mended if variant.part in wrong),
-        replace(asked, part="clipped", cause=WEIGHTS, inflow=UNCLIPPED),
-        replace(asked, part="", cause=WEIGHTS, inflow=UNROUNDED, bias=with_weights),
-        replace(asked, part="", cause=BIAS, bias=alone),
-        replace(asked, part="", cause=THRESHOLD, threshold=threshold),
-        replace(
-            asked,
-            part="",
-            cause=BETA,
-            keep_u=asked.keep_u + ideal.keep_u - rounded.keep_u,
-            keep_v=asked.keep_v + ideal.keep_v - rounded.keep_v,
-        ),
-        replace(asked, part="", cause=SATURATION, limit=np.inf),
-        replace(asked, part="", cause=TRUNCATION, rounds=False),  # last, see run_variants
+        netlist,
+        replace(netlist, cause=WEIGHTS, weights=UNCLIPPED),
+        replace(netlist, cause=WEIGHTS, weights=UNROUNDED, bias=with_weights),
+        replace(netlist, cause=BIAS, bias=alone),
+        replace(netlist, cause=THRESHOLD, threshold=ideal.threshold[rows]),
+        replace(netlist, cause=BETA, keep_u=ideal.keep_u, keep_v=ideal.keep_v),
+        replace(netlist, cause=SATURATION, limit=np.inf),
+        replace(netlist, cause=TRUNCATION, rounds=False),  # last, see run_variants
     ]
 
 
@@ -113,8 +93,8 @@ def run_variants(
     ----------
     variants : list of Variant
         The last one, and only it, does not round.
-    inflows : (4, steps, neurons) float64
-        Shifted synaptic sums, by ``Variant.inflow``.
+    inflows : (3, steps, neurons) float64
+        Shifted synaptic sums, by ``Variant.weights``.
     begins, steps : (neurons,) int64
         First and last step of each; the longest come first.
     fired : (steps, neurons) bool
@@ -133,7 +113,7 @@ def run_variants(
 
     bias, threshold = (np.stack(rows) for rows in zip(*((v.bias, v.threshold) for v in variants), strict=True))
     keep_u, keep_v = column([v.keep_u for v in variants]), column([v.keep_v for v in variants])
-    limit, which = column([v.limit for v in variants]), [v.inflow for v in variants]
+    limit, which = column([v.limit for v in variants]), [v.weights for v in variants]
     length = steps - begins + 1
     place = np.arange(len(length))
     u, v = np.zeros(bias.shape), np.zeros(bias.shape)

@@ -5,9 +5,9 @@ A command names each part as it begins; what is known about parts stands here, o
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,8 +15,7 @@ import numpy as np
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.machines.base import Machine
 from spikeloom.runtime.report.console import progress
-
-Json = dict[str, Any]
+from spikeloom.runtime.report.encode import INLINE, OPTIONAL
 
 CHIP, FLOAT = "chip integers", "float"
 
@@ -52,7 +51,7 @@ RUNS = {
 
 CHECKS = {
     "float32 reference": Kind("float32, released operator order", "all", "what the chip's spikes are held against"),
-    "float64 beside it": Kind("float64, released operator order", "all", "tells spikes that rounding of sums decides"),
+    "float64 beside it": Kind("float64, released operator order", "all", "shows spikes that rounding of sums decides"),
     "chip": Kind(CHIP, "all", "every spike kept, since every one is compared"),
     "fine-tuned model": Kind("chip integers in torch", "all", "E1: the fine-tuned model has to be the chip"),
     "specification": Kind(
@@ -81,18 +80,39 @@ PAGE = {
 KINDS = RUNS | CHECKS | PAGE
 
 
-class Account:
-    """Parts of a command as they go by.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Part:
+    """A part of a command as it went by; `kernel` is what the engine ran on, None where it did not run."""
 
-    Parameters
-    ----------
-    machine : Machine
-        What is simulated.
-    data : Recordings
-        On what.
-    checked : int
-        Recordings that the specification runs.
-    """
+    part: str
+    ran: bool
+    arithmetic: str
+    recordings: int
+    data_steps: int
+    layers: tuple[str, ...]
+    kernel: str | None
+    why: str
+    seconds: float
+
+    def __str__(self) -> str:
+        if not self.ran:
+            return f"not simulated, {self.arithmetic}: {self.why}"
+        noun = "recording" if self.recordings == 1 else "recordings"
+        what = [f"{self.recordings} {noun}, {self.data_steps:,} steps", f"{len(self.layers)} layers", self.arithmetic]
+        what += [self.kernel] if self.kernel else []
+        return f"simulated {self.part} ({', '.join(what)}), {self.seconds:.2f} s: {self.why}"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Accounted:
+    """A result, and the parts behind it where they are wanted."""
+
+    result: Any = field(metadata=INLINE)
+    explained_cost: tuple[Part, ...] | None = field(default=None, metadata=OPTIONAL)
+
+
+class Account:
+    """Parts of a command that simulates a netlist on recordings; the specification runs the first `checked`."""
 
     def __init__(self, machine: Machine, data: Recordings, *, checked: int = 0) -> None:
         self._machine, self._checked = machine, min(checked, len(data))
@@ -105,46 +125,32 @@ class Account:
         if KINDS[part].over != "none":
             progress(part)
 
-    def entries(self) -> list[Json]:
-        """All parts that are known, in their order; the last one ends now."""
+    def parts(self) -> tuple[Part, ...]:
+        """All parts in their order; the last one ends now."""
         ends = [begun for _, begun in self._parts[1:]] + [time.perf_counter()]
-        found = []
-        for (part, begun), end in zip(self._parts, ends, strict=True):
-            kind = KINDS[part]
-            among = {"all": len(self._steps), "checked": self._checked, "one": 1, "none": 0}[kind.over]
-            steps = self._steps[:among]
-            ran = bool(among)
-            found.append(
-                {
-                    "part": part,
-                    "ran": ran,
-                    "arithmetic": kind.arithmetic,
-                    "recordings": among,
-                    "data_steps": int(steps.sum()) if kind.over != "one" else int(self._steps.max(initial=0)),
-                    "layers": list(self._machine.layers) if ran else [],
-                    "kernel": self._machine.kernel if ran and kind.arithmetic == CHIP else None,
-                    "why": kind.why,
-                    "seconds": end - begun if ran else 0.0,
-                }
-            )
-        return found
+        return tuple(self._part(name, end - begun) for (name, begun), end in zip(self._parts, ends, strict=True))
 
+    def explained(self, wanted: bool) -> tuple[Part, ...] | None:
+        """All parts, written to stderr too, if they are wanted."""
+        if not wanted:
+            return None
+        parts = self.parts()
+        progress("")
+        sys.stderr.writelines(f"spikeloom: {part}\n" for part in parts)
+        return parts
 
-def explained(arguments: argparse.Namespace, account: Account) -> Json:
-    """Say what was simulated where that was asked for; the same for a report, else nothing."""
-    if not arguments.explain_cost:
-        return {}
-    entries = account.entries()
-    progress("")
-    sys.stderr.writelines(f"spikeloom: {line}\n" for line in map(_line, entries))
-    return {"explained_cost": entries}
-
-
-def _line(entry: Json) -> str:
-    if not entry["ran"]:
-        return f"not simulated, {entry['arithmetic']}: {entry['why']}"
-    noun = "recording" if entry["recordings"] == 1 else "recordings"
-    layers = len(entry["layers"])
-    parts = [f"{entry['recordings']} {noun}, {entry['data_steps']:,} steps", f"{layers} layers", entry["arithmetic"]]
-    parts += [entry["kernel"]] if entry["kernel"] else []
-    return f"simulated {entry['part']} ({', '.join(parts)}), {entry['seconds']:.2f} s: {entry['why']}"
+    def _part(self, name: str, seconds: float) -> Part:
+        kind = KINDS[name]
+        recordings = {"all": len(self._steps), "checked": self._checked, "one": 1, "none": 0}[kind.over]
+        ran = recordings > 0
+        return Part(
+            part=name,
+            ran=ran,
+            arithmetic=kind.arithmetic,
+            recordings=recordings,
+            data_steps=int(self._steps.max(initial=0) if kind.over == "one" else self._steps[:recordings].sum()),
+            layers=self._machine.layers if ran else (),
+            kernel=self._machine.kernel if ran and kind.arithmetic == CHIP else None,
+            why=kind.why,
+            seconds=seconds if ran else 0.0,
+        )

@@ -1,0 +1,1 @@
+"""Why single spikes differ: roots, and the deviation behind each."""

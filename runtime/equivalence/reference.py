@@ -1,0 +1,91 @@
+"""The float side of a comparison: whose spikes and membranes the chip is held against."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from spikeloom.compiler.dynamics import Clocks
+from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.fixedpoint import FloatArray
+from spikeloom.compiler.formats.checkpoint import Checkpoint
+from spikeloom.compiler.interpret import BoolArray, channels_last, run_float
+from spikeloom.compiler.ir import Network
+from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
+
+
+def require_match(netlist: Netlist, model: Checkpoint | Network) -> None:
+    """Refuse a netlist and a checkpoint or float network of different architecture.
+
+    Raises
+    ------
+    ModelError
+        If taxels, channels, timing, or layer names or sizes differ.
+    """
+    ours = {"taxels": netlist.taxels, "channels": netlist.polarities}
+    ours |= _timing(netlist.clocks, netlist.bins) | {layer.name: layer.neurons for layer in netlist.layers}
+    what = "network" if isinstance(model, Network) else "checkpoint"
+    if isinstance(model, Network):
+        theirs = {"taxels": model.input.taxels, "channels": model.input.polarities}
+        theirs |= _timing(model.input.clocks, model.input.bins) | {p.name: p.size for p in model.populations}
+    else:
+        theirs = {"taxels": model.taxels, "channels": model.hops.shape[2]}
+        theirs |= _timing(model.dynamics.clocks, model.bins) | model.neurons
+    if ours != theirs:
+        sizes = [", ".join(f"{name} {neurons}" for name, neurons in side.items()) for side in (ours, theirs)]
+        raise ModelError(
+            f"netlist and {what} disagree: the netlist has {sizes[0]}, the {what} {sizes[1]}; "
+            f"give the {what} that the netlist was compiled from"
+        )
+
+
+def _timing(clocks: Clocks, bins: int) -> dict[str, int]:
+    found = {"clocks": clocks.channels, "steps of a clock": clocks.steps} if clocks.channels else {}
+    return found | ({"bins of a step": bins} if bins > 1 else {})
+
+
+def spikes_of(
+    model: Checkpoint | Network, adjacency: FloatArray | None, events: npt.NDArray[np.uint8], dtype: str
+) -> list[BoolArray]:
+    """Float spikes of each layer: of a checkpoint in its own operator order, of a network as sums over synapses."""
+    from spikeloom.models.networks.reference import float_spikes  # torch, so only here
+
+    if isinstance(model, Network):
+        inputs = channels_last(events, model.input.clocks)
+        return list(run_float(model, inputs, dtype=np.dtype(dtype)).spikes)
+    assert adjacency is not None, "a checkpoint has a graph"
+    return list(float_spikes(model, adjacency, events, dtype=dtype).values())
+
+
+def membranes_of(
+    model: Checkpoint | Network, adjacency: FloatArray | None, events: npt.NDArray[np.uint8]
+) -> list[npt.NDArray[np.floating]]:
+    """Membranes of each layer in float32, likewise."""
+    from spikeloom.models.networks.reference import float_membranes  # torch, so only here
+
+    if isinstance(model, Network):
+        inputs = channels_last(events, model.input.clocks)
+        kept = run_float(model, inputs, dtype=np.float32, membranes=True).membranes
+        assert kept is not None, "membranes were asked for"
+        return list(kept)
+    assert adjacency is not None, "a checkpoint has a graph"
+    return list(float_membranes(model, adjacency, events).values())
+
+
+def tuned_spikes(
+    checkpoint: Checkpoint, adjacency: FloatArray | None, events: npt.NDArray[np.uint8]
+) -> list[BoolArray]:
+    """Spikes of each layer of a fine-tuned checkpoint's torch model, on chip integers."""
+    from spikeloom.models.networks.quantised import quantised_spikes
+
+    assert adjacency is not None, "a checkpoint has a graph"
+    return list(quantised_spikes(checkpoint, adjacency, events).values())
+
+
+def float_network(model: Checkpoint | Network, adjacency: FloatArray | None) -> Network:
+    """The float stage of a model."""
+    if isinstance(model, Network):
+        return model
+    assert adjacency is not None, "a checkpoint has a graph"
+    return expand(model, adjacency)

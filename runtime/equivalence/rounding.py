@@ -1,0 +1,229 @@
+"""Whether a netlist holds its checkpoint, rounded: every weight, bias, threshold and decay.
+
+All is judged at the netlist's own scale, threshold / theta of each neuron, so only the choice of the scale is free:
+
+* a threshold is theta times the scale, exactly;
+* decay registers are those nearest to the checkpoint's decays;
+* a weight is the nearest whole number of steps of its layer's finest plane, at most as large as the planes reach;
+* a bias is the nearest ``mantissa * 2**exponent``.
+
+The last two are not so in a layer that was rounded on recordings so that its errors cancel
+(:mod:`storage.compensate`). Which neighbours it took follows from those recordings, which the netlist does not carry.
+Of such a layer it is checked that most weights are the nearest, and that no bias makes up for more than its neuron's
+weights have lost.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+
+from spikeloom.compiler.fixedpoint import BIAS_EXPONENT_MAX, BIAS_MANTISSA_MAX, MEMBRANE_SHIFT, encode_bias
+from spikeloom.compiler.interpret import BoolArray
+from spikeloom.compiler.ir import INPUT, IntegerNetwork, Network, Sparse
+from spikeloom.compiler.passes.prune import never_fires
+from spikeloom.compiler.targets.base import load_target
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.targets.loihi1.storage.weight_storage import decay_registers, reach, step_units
+
+SLACK = 1 + 1e-9
+"""Factor by which a value may miss a limit that it meets in real numbers."""
+
+BIAS_LIMIT = BIAS_MANTISSA_MAX << BIAS_EXPONENT_MAX
+"""Largest bias that a register holds, membrane units."""
+
+MOVED = 0.5
+"""Share of a layer's weights that compensation may move from the nearest value; another checkpoint's hardly ever are
+the nearest."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LayerRounding:
+    """What a layer stores, against its checkpoint.
+
+    Parameters
+    ----------
+    weights : int
+        Weights between neurons that the chip holds, those that are zero on both sides not counted.
+    nearest : int
+        Those of them that are the nearest on the layer's grid.
+    farthest_steps : float
+        Largest distance of a weight from the checkpoint's, in steps of the grid, clipped weights from their limit.
+    compensated : bool
+        Whether it was rounded so that errors cancel: weights, and biases with them, need not be the nearest.
+    faults : tuple of str
+        What is not as rounding the checkpoint gives it.
+    """
+
+    weights: int
+    nearest: int
+    farthest_steps: float
+    compensated: bool
+    faults: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rounding:
+    """What all layers store, against their checkpoint."""
+
+    layers: Mapping[str, LayerRounding]
+
+    json_properties = ("holds",)
+
+    @property
+    def holds(self) -> bool:
+        """Whether everything is the rounding of the checkpoint."""
+        return not any(layer.faults for layer in self.layers.values())
+
+    @property
+    def text(self) -> str:
+        """One line for people."""
+        faults = [fault for layer in self.layers.values() for fault in layer.faults]
+        if faults:
+            return f"NOT the rounding of this checkpoint: {'; '.join(faults)}"
+        moved = [
+            f"{name} {100 * (1 - layer.nearest / layer.weights):.1f} %"
+            for name, layer in self.layers.items()
+            if layer.nearest < layer.weights
+        ]
+        what = "every weight, bias, threshold and decay is the checkpoint's, rounded"
+        return f"{what}; by compensation not to the nearest: {', '.join(moved)}" if moved else f"{what} to the nearest"
+
+
+def absent_neurons(netlist: Netlist) -> tuple[BoolArray, ...]:
+    """Neurons of each layer, (neurons,) bool, that the chip does not hold."""
+    layers = enumerate(netlist.layers)
+    return tuple(
+        ~np.isin(np.arange(layer.neurons), netlist.neuron[netlist.compartments_of(index)]) for index, layer in layers
+    )
+
+
+def check_rounding(
+    netlist: Netlist, network: Network, integer: IntegerNetwork, *, fine_tuned: bool = False
+) -> Rounding:
+    """Hold what a netlist stores against a float network of the same architecture.
+
+    Parameters
+    ----------
+    netlist : Netlist
+    network : Network
+        What it should have been compiled from.
+    integer : IntegerNetwork
+        The netlist, lifted.
+    fine_tuned : bool
+        Whether the network was trained on the chip's integers, which compensates nothing. Otherwise the netlist
+        remembers which layers were compensated, or at least whether there were recordings to do it on.
+    """
+    names = [population.name for population in network.populations]
+    calibrated = not fine_tuned and netlist.provenance.get("calibrated", True)
+    compensated = netlist.provenance.get("compensated", names if calibrated else [])
+    absent, pruned = absent_neurons(netlist), bool(netlist.provenance.get("prune_unused", False))
+    zeroed = [_may_be_zero(integer, post, mask, pruned) for post, mask in enumerate(never_fires(network))]
+    channels = np.zeros(network.input.size, np.bool_)
+    if "lean" in netlist.provenance:  # input channels that no neuron receives were pruned on evidence
+        channels[:] = True
+        channels[netlist.axon_source[netlist.axon_source < netlist.n_inputs]] = False
+    found = {}
+    for post, population in enumerate(network.populations):
+        found[population.name] = _check_layer(
+            network,
+            integer,
+            post,
+            absent=absent,
+            zeroed=zeroed,
+            channels=channels,
+            coarsest=max(load_target(netlist.target).choices["synapse.exponent"]),
+            compensates=population.name in compensated,
+        )
+    return Rounding(layers=found)
+
+
+def _may_be_zero(integer: IntegerNetwork, post: int, silent: BoolArray, pruned: bool) -> BoolArray:
+    """Neurons from and to which the compiler zeroed the weights, although the chip holds one of them."""
+    if not pruned:
+        return silent
+    stored = np.zeros(len(silent), np.bool_)
+    for projection in integer.projections:
+        if projection.post == post:
+            stored |= np.diff(projection.weight.indptr) > 0
+    return silent | ~stored
+
+
+def _sum(parts: Sequence[Sparse], shape: tuple[int, int]) -> Sparse:
+    return sum((part.astype(np.float64) for part in parts), start=sparse.csr_array(shape, dtype=np.float64))
+
+
+def _check_layer(
+    network: Network,
+    integer: IntegerNetwork,
+    post: int,
+    *,
+    absent: Sequence[BoolArray],
+    zeroed: Sequence[BoolArray],
+    channels: BoolArray,
+    coarsest: int,
+    compensates: bool,
+) -> LayerRounding:
+    wanted, chip, held = network.populations[post], integer.populations[post], ~absent[post]
+    planes = [p for p in integer.projections if p.post == post]
+    bits, exponents = min(p.bits for p in planes), tuple(sorted({p.exponent for p in planes if p.weight.nnz}))
+    exponents = exponents or (coarsest,)  # a layer that stores no weight: all of them rounded to zero at some step
+    step = step_units(bits, exponents)
+    most = reach(bits, exponents) * step
+    weights, wrong, farthest = 0, 0, 0.0
+    lost = np.zeros((2, wanted.size))  # what each neuron's weights lose to, and gain on, the checkpoint's; weight units
+    for pre in sorted({p.pre for stage in (network, integer) for p in stage.projections if p.post == post}):
+        size = network.input.size if pre == INPUT else network.populations[pre].size
+        real = _sum([p.weight for p in network.projections if (p.pre, p.post) == (pre, post)], (wanted.size, size))
+        real.data = np.clip(real.data * np.repeat(chip.scale, np.diff(real.indptr)), -most, most)
+        stored = _sum([p.effective() for p in planes if p.pre == pre], (wanted.size, size))
+        row, column = (abs(real) + abs(stored)).nonzero()
+        if not len(row):
+            continue
+        off = np.asarray((stored - real)[row, column]).ravel()
+        kept = np.asarray(stored[row, column]).ravel()
+        sends, silent = (~channels, np.zeros(size, np.bool_)) if pre == INPUT else (~absent[pre], zeroed[pre])
+        counts = held[row] & sends[column] & ~((kept == 0) & (zeroed[post][row] | silent[column]))
+        row, off = row[counts], off[counts]
+        weights += len(off)
+        wrong += int(np.count_nonzero(2 * np.abs(off) > step * SLACK))
+        farthest = max(farthest, float(np.abs(off).max(initial=0)) / step)
+        lost[0] += np.bincount(row, np.maximum(-off, 0), wanted.size)
+        lost[1] += np.bincount(row, np.maximum(off, 0), wanted.size)
+
+    faults = []
+    moved = compensates and 0 < wrong <= MOVED * weights
+    if wrong and not moved:
+        faults.append(
+            f"{wanted.name} has {wrong:,} of {weights:,} weights that are not the nearest, off by up to "
+            f"{farthest:.3g} steps"
+        )
+    unit = chip.scale * (1 << MEMBRANE_SHIFT)
+    bias = np.clip(wanted.bias * unit, -BIAS_LIMIT, BIAS_LIMIT)
+    coarse = 0.5 * (1 << np.maximum(encode_bias(bias)[1], chip.bias_exponent)) * SLACK
+    more, less = (lost * (1 << MEMBRANE_SHIFT) * SLACK) if moved else np.zeros((2, wanted.size))
+    off = chip.bias - bias
+    bad = held & ((off > more + coarse) | (-off > less + coarse)) & ~(zeroed[post] & (chip.bias == 0))
+    if bad.any():
+        faults.append(f"{wanted.name} has {np.count_nonzero(bad):,} of {np.count_nonzero(held):,} biases that are not")
+    theta = wanted.theta * chip.scale
+    bad = held & (np.abs(chip.threshold - theta) > 1e-6 * np.maximum(theta, 1))
+    if bad.any():
+        worst = int(np.argmax(bad))
+        faults.append(f"{wanted.name} neuron {worst} has threshold {chip.threshold[worst]} instead of {theta[worst]:g}")
+    registers = decay_registers(wanted.beta, wanted.alpha)
+    if (chip.decay_u, chip.decay_v) != registers:
+        faults.append(
+            f"{wanted.name} has decay registers {chip.decay_u} and {chip.decay_v} instead of {registers[0]} and "
+            f"{registers[1]}"
+        )
+    return LayerRounding(
+        weights=weights,
+        nearest=weights - wrong,
+        farthest_steps=farthest,
+        compensated=moved,
+        faults=tuple(faults),
+    )

@@ -1,0 +1,95 @@
+"""A verdict laid out for people."""
+
+from __future__ import annotations
+
+from spikeloom.runtime.equivalence.certificates import Certificate
+from spikeloom.runtime.equivalence.divergence import Divergence
+from spikeloom.runtime.equivalence.verdict import Verdict
+from spikeloom.runtime.report.sections import Section, Table, Text
+from spikeloom.runtime.report.tables import percent
+
+
+def sections(verdict: Verdict) -> list[Section]:
+    """Accuracies, levels and warnings; spikes; the ladder; the certificate; the first divergence."""
+    return [
+        Section("Levels", [Text("\n".join(_lines(verdict)))]),
+        Section("Spikes", [spike_table(verdict)]),
+        Section("Ladder", [ladder_table(verdict)]),
+        Section("Certificate", [certificate_table(verdict.certificate), Text(certificate_text(verdict.certificate))]),
+        Section("First divergence", [Text(first_divergence_text(verdict.first_divergence))]),
+    ]
+
+
+def _lines(verdict: Verdict) -> list[str]:
+    right = {side: round(share * verdict.samples) for side, share in verdict.accuracy.items()}
+    lines = [
+        f"float accuracy:  {percent(right['float'], verdict.samples)}",
+        f"chip accuracy:   {percent(right['chip'], verdict.samples)}",
+        f"weights: {verdict.weights.text}",
+        *(f"{level.name}  {level.text}" for level in verdict.levels),
+        *(f"missed: {line}" for line in verdict.missed),
+        *(f"breakdown: {breakdown.text}" for breakdown in verdict.breakdowns),
+    ]
+    if not verdict.same_checkpoint:
+        lines.append(
+            "note: the netlist was compiled from another checkpoint file than this one, or from other weights of it"
+        )
+    if verdict.not_compared:
+        absent = ", ".join(f"{name} {count:,}" for name, count in verdict.not_compared.items())
+        lines.append(f"not compared, left out because no neuron receives them: {absent}")
+    return lines
+
+
+def spike_table(verdict: Verdict) -> Table:
+    """Spikes of each layer on both sides."""
+    rows = [
+        [name, *(f"{count:,}" for count in (layer.float, layer.chip, layer.different, layer.ill_posed))]
+        for name, layer in verdict.spikes.items()
+    ]
+    return Table(["spikes", "float", "chip", "different", "ill-posed"], rows)
+
+
+def ladder_table(verdict: Verdict) -> Table:
+    """Entries that differ, rung by rung."""
+    rows = [[rung.stage, *(f"{rung.different[name]:,}" for name in verdict.spikes)] for rung in verdict.ladder]
+    return Table(["different, adding", *verdict.spikes], rows)
+
+
+def certificate_table(certificate: Certificate) -> Table:
+    """Entries that no order of summation changes, layer by layer."""
+    rows = [
+        [
+            name,
+            f"{layer.entries:,}",
+            f"{100 * layer.equal / max(layer.entries, 1):.4f} %",
+            f"{layer.different:,}",
+            f"{layer.undecided:,}",
+        ]
+        for name, layer in certificate.layers.items()
+    ]
+    return Table(["certified in any order of sums", "entries", "equal", "different", "undecided"], rows)
+
+
+def certificate_text(certificate: Certificate) -> str:
+    """Certified decisions, and whether registers stay in range."""
+    proof = "no register overflows for any input"
+    if certificate.unproven:
+        proof = f"some input may overflow a register of {', '.join(certificate.unproven)}: no proof of range"
+    return f"{certificate.decisions} of {certificate.samples} decisions certified equal; {proof}"
+
+
+def first_divergence_text(first: Divergence | None) -> str:
+    """Where the first spike differs, and how near both membranes were to their thresholds."""
+    return "no spike differs" if first is None else f"first divergence: {divergence_text(first)}"
+
+
+def divergence_text(first: Divergence) -> str:
+    """The same without its heading."""
+    where = f"neuron {first.neuron}"
+    if first.taxel is not None:
+        where = f"taxel {first.taxel}, feature {first.feature}"
+    return (
+        f"{first.file}, step {first.step}, {first.layer} {where}: membrane {first.float_membrane:.6f} float, "
+        f"{first.chip_membrane:.6f} chip ({first.chip_register}/64 units); threshold {first.theta:g} and "
+        f"{first.chip_theta:.6f}" + (" (ill-posed: float64 sides with the chip)" if first.ill_posed else "")
+    )
