@@ -4,101 +4,132 @@ from __future__ import annotations
 
 from typing import Any
 
-from spikeloom.runtime.studies.chart import points as chart_points
-from spikeloom.runtime.studies.chart.budget import parse_budgets, pick
-from spikeloom.runtime.studies.chart.points import share
+from spikeloom.runtime.studies.chart import choices
+from spikeloom.runtime.studies.chart.grid import Grid
+from spikeloom.runtime.studies.chart.results import (
+    Chart,
+    ChartedData,
+    ChartedNetwork,
+    ChosenBy,
+    Figures,
+    Measured,
+    Point,
+    Refused,
+    Tables,
+    share,
+)
 
-TABLES = {"energy": {"one": "prices <one>", "two": "prices two"}, "time": {"clock": "times"}}
 SAMPLES = {"train": 400, "test": 100}
+BY = ChosenBy(energy="one", time="clock")
 
 
-def made_split(right: int, samples: int, energy: float, time: float) -> dict[str, Any]:
+def made_figures(right: int, samples: int, energy: float, time: float, *, step: float = 20e-6) -> Figures:
     """Figures of a split: recordings right, µJ and ms."""
-    return {
-        "samples": samples,
-        **share(right, samples),
-        "float": share(min(samples, right + samples // 50), samples),
-        "equal": samples - 3,
-        "energy_j": {"one": energy * 1e-6, "two": 1.5e-6 * energy},
-        "time_s": {"clock": time * 1e-3},
-        "step_s": {"clock": 20e-6},
-        "synaptic_operations": 1e4 * energy,
-        "steps": 250.0,
+    accuracy = share(right, samples)
+    return Figures(
+        **{name: getattr(accuracy, name) for name in ("correct", "accuracy", "low", "high")},
+        samples=samples,
+        model=share(min(samples, right + samples // 50), samples),
+        equal=samples - 3,
+        energy_j={"one": energy * 1e-6, "two": 1.5e-6 * energy},
+        time_s={"clock": time * 1e-3},
+        step_s={"clock": step},
+        synaptic_operations=1e4 * energy,
+        steps=250.0,
+    )
+
+
+def made_point(number: int, **about: Any) -> Point:
+    """A point of the usual kind, but for what is said."""
+    usual: dict[str, Any] = {
+        "network": "grasps",
+        "target": "loihi1",
+        "graph": "manual",
+        "bits": (8,),
+        "planes": 1,
+        "groups": 1,
+        "prune": False,
+        "fine_tuned": False,
+        "storage": "8b",
+        "cores": "cores",
+        "window": 100,
+        "n_cores": 5,
+        "neurons": 2580,
+        "synapses": 385_000,
+        "netlist": "netlists/c0ffee.loom",
+        "netlist_sha256": "c0ffee",
+        "train": made_figures(400, 400, 1.0, 1.0),
+        "test": made_figures(100, 100, 1.0, 1.0),
+        "commands": ("spikeloom compile", "spikeloom run"),
     }
+    return Point(number=number, **(usual | about))
 
 
-def made_chart(*budgets: str) -> dict[str, Any]:
+def made_network(name: str = "grasps", **about: Any) -> ChartedNetwork:
+    """A network of the usual kind, but for what is said."""
+    usual: dict[str, Any] = {
+        "path": f"{name}.pt",
+        "target": "loihi1",
+        "sha256": "ab" * 32,
+        "system": "tactilesgnet",
+        "graph": "manual",
+        "has_graph": True,
+        "weights": "last",
+        "fine_tuned": False,
+        "trained_by": "spikeloom train",
+        "validation": 0.9,
+        "bins": 1,
+        "model": {"50": {split: share(n // 2, n) for split, n in SAMPLES.items()}}
+        | {"100": {split: share(n * 9 // 10, n) for split, n in SAMPLES.items()}},
+        "float_training": 1.0,
+    }
+    return ChartedNetwork(name=name, **(usual | about))
+
+
+def made_chart(*budgets: str) -> Chart:
     """Two networks, three widths, two windows; one configuration does not fit."""
-    points = []
+    points: list[Point] = []
     for net, graph in (("grasps", "manual"), ("grasps-knn1", "knn:1")):
         for bits in (2, 4, 8):
             for window in (50, 100):
                 worse = 4 * (8 - bits) + (20 if window == 50 else 0) + (6 if graph != "manual" else 0)
-                name = f"{net}-{bits}b.loom"
+                file = f"{net}-{bits}b.loom"
                 energy = bits * window * (0.2 if graph == "manual" else 0.15)
+                compiled = f"spikeloom compile {net}.pt --weight-bits {bits} --calibrate 'a <b>' -o {file}"
+                ran = f"spikeloom run {file} --data 'a <b>' --detail counts --window {window}%"
                 points.append(
-                    {
-                        "number": len(points) + 1,
-                        "network": net,
-                        "graph": graph,
-                        "bits": [bits],
-                        "planes": 1,
-                        "groups": 1,
-                        "prune": False,
-                        "fine_tuned": False,
-                        "storage": f"{bits}b",
-                        "cores": "cores",
-                        "window": window,
-                        "n_cores": 5,
-                        "neurons": 2580,
-                        "synapses": 385_000,
-                        "netlist": "netlists/c0ffee.loom",
-                        "netlist_sha256": "c0ffee",
-                        "train": made_split(398 - worse, 400, energy, window / 20),
-                        "test": made_split(90 - worse // 2, 100, energy, window / 20),
-                        "commands": [
-                            f"spikeloom compile {net}.pt --weight-bits {bits} --calibrate 'a <b>' -o {name}",
-                            f"spikeloom run {name} --data 'a <b>' --detail counts --window {window}%",
-                        ],
-                    }
+                    made_point(
+                        len(points) + 1,
+                        network=net,
+                        graph=graph,
+                        bits=(bits,),
+                        storage=f"{bits}b",
+                        window=window,
+                        train=made_figures(398 - worse, 400, energy, window / 20),
+                        test=made_figures(90 - worse // 2, 100, energy, window / 20),
+                        commands=(compiled, ran),
+                    )
                 )
-    networks = [
-        {
-            "name": name,
-            "path": f"{name}.pt",
-            "sha256": "ab" * 32,
-            "system": "tactilesgnet",
-            "graph": graph,
-            "has_graph": True,
-            "weights": "last",
-            "fine_tuned": False,
-            "trained_by": f"spikeloom train --graph {graph}",
-            "validation": validation,
-            "bins": 1,
-            "float_training": 1.0,
-            "float": {"50": {split: share(n // 2, n) for split, n in SAMPLES.items()}}
-            | {"100": {split: share(n * 9 // 10, n) for split, n in SAMPLES.items()}},
-        }
-        for name, graph, validation in (("grasps", "manual", 0.9), ("grasps-knn1", "knn:1", 0.88))
-    ]
-    report: dict[str, Any] = {
-        "format": 1,
-        "spikeloom": "0.1.0",
-        "target": "loihi1",
-        "command": "spikeloom chart grasps.pt grasps-knn1.pt --data 'a <b>' -o out",
-        "data": {"path": "a <b>", "bin_s": 0.02, "sha256": "cd" * 32, "steps": 250} | SAMPLES,
-        "tables": TABLES,
-        "chosen_by": {"energy": "one", "time": "clock"},
-        "grid": {"bits": [[2], [4], [8]], "window": [50, 100], "graph": []},
-        "networks": networks,
-        "expected": chart_points.with_expectations(points, networks),
-        "points": points,
-        "refused": [points[0] | {"storage": "8b 3p", "why": ["core 0 (fc1): 5 used, 4 allowed; fewer planes"]}],
-        "measured": {"recordings_per_s": {str(point["number"]): 1000.0 for point in points}},
-        "digest": "ef" * 32,
-    }
-    chart_points.with_fronts(points, "one", "clock")
-    report["recommended"] = chart_points.recommended(points, networks, energy="one", time="clock", bin_s=0.02)
-    report["saving"] = chart_points.saving(points, "one")
-    report["budget"] = pick(points, parse_budgets(budgets), energy="one", time="clock")
-    return report
+    networks = [made_network(), made_network("grasps-knn1", graph="knn:1", validation=0.88)]
+    points, networks, expected = choices.with_expectations(points, networks)
+    points = choices.with_fronts(points, BY)
+    named = ("network", "target", "graph", "bits", "planes", "groups", "prune", "fine_tuned", "cores")
+    refused = {name: getattr(points[0], name) for name in named}
+    return Chart(
+        spikeloom="0.1.0",
+        target="loihi1",
+        command="spikeloom chart grasps.pt grasps-knn1.pt --data 'a <b>' -o out",
+        data=ChartedData(path="a <b>", bin_s=0.02, sha256="cd" * 32, steps=250, **SAMPLES),
+        tables=Tables(energy={"one": "prices <one>", "two": "prices two"}, time={"clock": "times"}),
+        chosen_by=BY,
+        grid=Grid(bits=((2,), (4,), (8,)), window=(50, 100)),
+        networks=tuple(networks),
+        expected=expected,
+        points=tuple(points),
+        refused=(Refused(**refused, storage="8b 3p", why=("core 0 (fc1): 5 used, 4 allowed; fewer planes",)),),
+        recommended=choices.recommended(points, networks, BY, bin_s=0.02),
+        saving=choices.saving(points, BY),
+        budget=choices.pick(points, choices.parse_budgets(budgets), BY),
+        measured=Measured(recordings_per_s={str(point.number): 1000.0 for point in points}),
+        digest="ef" * 32,
+    )

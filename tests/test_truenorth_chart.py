@@ -99,7 +99,7 @@ def test_choices_and_fronts_are_of_the_chip_of_the_first_network(made):
 def test_every_file_of_a_chart_names_its_prices(made, place):
     page = (place / "out" / "chart.html").read_text()
     assert "energy of a mean inference (davies2018; truenorth: all_in)" in page
-    assert "time of a mean inference on the chip, simple model (sanafe; truenorth: tick)" in page
+    assert "time of a mean inference on the chip (sanafe; truenorth: tick)" in page
     assert "Points of another chip stand at their own prices" in page
     with (place / "out" / "chart.csv").open() as file:
         rows = [row for row in csv.DictReader(file) if row["network"] == "native"]
@@ -134,16 +134,11 @@ def test_a_chart_of_truenorth_alone_chooses_there(spikeloom, place):
 def test_axes_of_loihi_are_refused_where_there_is_nothing_for_loihi(spikeloom):
     code, _, err = spikeloom("chart", NATIVE, "--data", "data", "--grid", "bits=4", "-o", "no")
     assert code == 2
-    assert err == (
-        "spikeloom: --grid bits: is for loihi1, networks for truenorth have a storage and a layout of their "
-        "own; leave it away\n"
-    )
-
-
-def test_tables_of_the_other_chip_are_refused(spikeloom):
+    assert "--grid bits: is for loihi1, networks for truenorth" in err
     code, _, err = spikeloom("chart", NATIVE, "--data", "data", "--table", "sanafe", "-o", "no")
     assert code == 2
-    assert err == ("spikeloom: --table sanafe: IBM TrueNorth has no such energy table; give all_in or marginal\n")
+    assert "--table sanafe" in err
+    assert "all_in or marginal" in err
 
 
 @pytest.mark.parametrize("command", [("run",), ("estimate",), ("verify", "--checkpoint", NATIVE)], ids=lambda c: c[0])

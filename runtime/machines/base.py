@@ -234,7 +234,16 @@ def chip_commands(name: str) -> Any | None:
     ``compile_network(arguments)`` and ``verify(arguments)`` for all networks; for checkpoints that were trained for the
     chip, which ``takes(path)`` knows, ``inspect(arguments)`` and ``join(arguments)``.
     """
-    module = f"{__package__}.{name}.commands"
+    return _own_module(name, "commands")
+
+
+def chip_chart(name: str) -> Any | None:
+    """What a chart asks of networks that were trained for a chip: its module ``charted``, if it has one."""
+    return _own_module(name, "charted")
+
+
+def _own_module(name: str, what: str) -> Any | None:
+    module = f"{__package__}.{name}.{what}"
     return import_module(module) if has_machine(name) and find_spec(module) else None
 
 

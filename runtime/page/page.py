@@ -11,8 +11,10 @@ from typing import Any
 from spikeloom.runtime.page import costs as report_costs
 from spikeloom.runtime.page import sections as report_sections
 from spikeloom.runtime.page import stress as report_stress
+from spikeloom.runtime.report import html
 from spikeloom.runtime.report.markup import paragraph, section, table
-from spikeloom.runtime.studies.chart.page import chart_section
+from spikeloom.runtime.report.sections import Section
+from spikeloom.runtime.studies.chart.sections import figures, saved, taken
 
 Json = dict[str, Any]
 
@@ -31,9 +33,8 @@ def page(report: Json) -> str:
     shown = {name: found for name, found in made_of.items() if found[1]}
     body = "".join(section(name, heading, content) for name, (heading, content) in shown.items())
     links = "".join(f'<li><a href="#{name}">{escape(heading)}</a></li>' for name, (heading, _) in shown.items())
-    files, charts = resources.files("spikeloom.runtime.page"), resources.files("spikeloom.runtime.studies.chart")
-    sheets = [files / "report.css", *([charts / "chart.css"] if "chart" in report else [])]
-    style = "".join(sheet.read_text("utf-8") for sheet in sheets)
+    files = resources.files("spikeloom.runtime.page")
+    style = files.joinpath("report.css").read_text("utf-8")
     script = files.joinpath("report.js").read_text("utf-8")
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
@@ -60,7 +61,10 @@ def _about(report: Json) -> str:
 
 def _configurations(report: Json) -> list[str]:
     """What a chart of this network and others found; nothing where none was given."""
-    return chart_section(report["chart"]) if "chart" in report else []
+    if "chart" not in report:
+        return []
+    chart = report["chart"]
+    return [html.fragment(Section("", [*figures(chart, "pareto"), *taken(chart), saved(chart)]))]
 
 
 def _stability(report: Json) -> list[str]:

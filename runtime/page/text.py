@@ -8,8 +8,9 @@ import numpy as np
 
 from spikeloom.runtime.costs.estimates import estimate_text
 from spikeloom.runtime.report.render import netlist_text
+from spikeloom.runtime.report.sections import Section, terminal
 from spikeloom.runtime.report.tables import si, table
-from spikeloom.runtime.studies.chart.text import recommended_text
+from spikeloom.runtime.studies.chart.sections import taken
 from spikeloom.runtime.studies.stress.text import stress_text
 
 Json = dict[str, Any]
@@ -28,7 +29,7 @@ def report_text(report: Json, verdict: str) -> str:
         "One recording": _recording(report["recording"]),
         "Energy and time": estimate_text(report["costs"]),
         **({"Stability": stress_text(report["stress"])} if "stress" in report else {}),
-        **({"Configurations": recommended_text(report["chart"])} if "chart" in report else {}),
+        **({"Configurations": terminal([Section("", taken(report["chart"]))])} if "chart" in report else {}),
         "Provenance": _provenance(report["provenance"]),
     }
     parts = [f"{title}\n{'-' * len(title)}\n{text}" for title, text in sections.items()]

@@ -342,14 +342,14 @@ def _scatter(drawing: Drawing, axes: Axes, panel: Scatter) -> None:
 
 
 def log_ticks(low: float, high: float) -> list[float]:
-    """Numbers 1, 2, 5 times a power of ten between two logarithms; powers of ten alone over three decades.
+    """Numbers 1, 2, 5 times a power of ten between two logarithms, or more or fewer of them as the room is.
 
     Examples
     --------
-    >>> log_ticks(-4.1, -3.2)
-    [0.0001, 0.0002, 0.0005]
+    >>> log_ticks(-4.1, -3.2), log_ticks(0.5, 0.9)
+    ([0.0001, 0.0002, 0.0005], [4.0, 5.0, 6.0])
     """
-    digits = (1, 2, 5) if high - low < 3 else (1,)
+    digits = (1, 2, 3, 4, 5, 6, 8) if high - low < 0.8 else (1, 2, 5) if high - low < 3 else (1,)
     powers = range(math.floor(low), math.ceil(high) + 1)
     found = [float(f"{digit}e{power}") for power in powers for digit in digits]
     inside = [value for value in found if low <= math.log10(value) <= high]

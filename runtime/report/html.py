@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from importlib import resources
+from typing import TYPE_CHECKING
 
 from spikeloom.runtime.report.sections import Section
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
 
 
 def page(title: str, about: str, sections: Iterable[Section]) -> str:
@@ -18,9 +22,25 @@ def page(title: str, about: str, sections: Iterable[Section]) -> str:
     sections : iterable of Section
         Its chapters, which the page links to; each has a title.
     """
-    from jinja2 import Environment, PackageLoader, StrictUndefined  # a tenth of a second that other commands save
-
     from spikeloom import __version__
+
+    files = resources.files("spikeloom.runtime.report")
+    return (
+        _environment()
+        .get_template("page.html")
+        .render(
+            title=title,
+            about=about,
+            sections=list(sections),
+            style=files.joinpath("page.css").read_text("utf-8"),
+            script=files.joinpath("page.js").read_text("utf-8"),
+            version=__version__,
+        )
+    )
+
+
+def _environment() -> Environment:
+    from jinja2 import Environment, PackageLoader, StrictUndefined  # a tenth of a second that other commands save
 
     environment = Environment(
         loader=PackageLoader("spikeloom.runtime.report", "."),
@@ -31,15 +51,13 @@ def page(title: str, about: str, sections: Iterable[Section]) -> str:
     )
     environment.filters["anchor"] = anchor
     environment.tests["kind"] = lambda block, name: type(block).__name__ == name
-    files = resources.files("spikeloom.runtime.report")
-    return environment.get_template("page.html").render(
-        title=title,
-        about=about,
-        sections=list(sections),
-        style=files.joinpath("page.css").read_text("utf-8"),
-        script=files.joinpath("page.js").read_text("utf-8"),
-        version=__version__,
-    )
+    return environment
+
+
+def fragment(section: Section) -> str:
+    """A section alone."""
+    blocks = _environment().get_template("blocks.html").module
+    return str(blocks.show(section, 3))  # type: ignore[attr-defined]
 
 
 def anchor(title: str) -> str:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-from collections.abc import Callable
 from difflib import get_close_matches
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +27,8 @@ from spikeloom.runtime.machines.loihi1.trace import check_channels
 from spikeloom.runtime.page.text import report_text
 from spikeloom.runtime.report.encode import encode
 from spikeloom.runtime.report.render import netlist_json
-from spikeloom.runtime.report.sections import terminal
-from spikeloom.runtime.studies.chart.file import read_chart
+from spikeloom.runtime.report.sections import Outcome, Section, Text, terminal
+from spikeloom.runtime.studies.chart.files import read_chart
 
 Json = dict[str, Any]
 
@@ -60,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = NOTES
 
 
-def run(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
+def run(arguments: argparse.Namespace) -> Outcome:
     """Run the command; nothing is written before everything is known.
 
     Raises
@@ -89,7 +87,11 @@ def run(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int
     found |= {} if chart is None else {"chart": chart}
     with write_atomically(arguments.output) as file:
         file.write(page(found).encode())
-    return found | {"output": arguments.output}, partial(report_text, verdict=verdict), code
+    return Outcome(
+        found | {"output": arguments.output},
+        lambda result: [Section("", [Text(report_text(result, verdict=verdict))])],
+        code,
+    )
 
 
 def _require_origin(arguments: argparse.Namespace, netlist: Netlist, asked: LoadedNetwork) -> None:

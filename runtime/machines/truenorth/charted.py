@@ -1,8 +1,9 @@
-"""What a chart measures of networks for crossbar cores: decisions of the model, netlists, and these on recordings."""
+"""What a chart asks of networks that were trained for the chip: facts, decisions of the model, netlists."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -10,54 +11,77 @@ import numpy as np
 
 from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.interpret import vote
-from spikeloom.compiler.targets.base import CROSSBARS, Target, load_target
+from spikeloom.compiler.targets.base import Target, load_target
 from spikeloom.compiler.targets.truenorth.legalize import require_legal
 from spikeloom.compiler.targets.truenorth.lower import lower
-from spikeloom.compiler.targets.truenorth.native import NativeNetwork
-from spikeloom.compiler.targets.truenorth.native_file import Trained
+from spikeloom.compiler.targets.truenorth.native import SYSTEM, highest_level
+from spikeloom.compiler.targets.truenorth.native_file import Trained, read_trained
+from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
 from spikeloom.compiler.targets.truenorth.netlist_file import write_crossbars
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.recordings.windows import steps_of
+from spikeloom.runtime.inputs.files import shipped
 from spikeloom.runtime.machines.truenorth.commands import provenance
+from spikeloom.runtime.machines.truenorth.machine import TICK
 
-Json = dict[str, Any]
-
-
-def time_title(chip: Target) -> str:
-    """What is known of a chip's time."""
-    return f"{chip.title}: every tick takes {chip.limit('tick.length')} µs, whatever happens in it"
+NAME = "truenorth"
 
 
-def model_decisions(network: NativeNetwork, data: Recordings, windows: Sequence[int]) -> dict[str, list[int]]:
+def times(chip: Target) -> dict[str, str]:
+    """What is known of the chip's time, by name."""
+    return {TICK: f"{chip.title}: every tick takes {chip.limit('tick.length')} µs, whatever happens in it"}
+
+
+@lru_cache(maxsize=2)
+def trained(path: str, weights: str | None) -> Trained:
+    """The network of a file."""
+    return read_trained(shipped(path), weights=weights)
+
+
+def facts(path: str, weights: str | None) -> dict[str, Any]:
+    """What a chart says of a network: it knows everything but its weights itself."""
+    found = trained(path, weights)
+    network = found.network
+    return {
+        "target": NAME,
+        "graph": found.graph,
+        "sha256": found.sha256,
+        "weights": found.weights,
+        "system": SYSTEM,
+        "taxels": network.taxels,
+        "classes": network.classes,
+        "layers": tuple(network.neurons),
+        "training": found.training,
+        "levels": 2 * highest_level(network.copies) + 1,
+    }
+
+
+def decisions(path: str, weights: str | None, data: Recordings, windows: Sequence[int]) -> dict[str, list[int]]:
     """Decisions of the model, in torch, when parts of each recording have passed, by window in per cent."""
     from spikeloom.models.truenorth.network import run_network  # torch, so only here
 
+    network = trained(path, weights).network
     last = network.towers[0][-1].name
     counts: dict[int, list[IntArray]] = {window: [] for window in windows}
     for index in range(len(data)):
-        own = data.steps_of(index)
-        votes = run_network(network, data.events[index : index + 1, ..., :own])[last][0]
-        added = votes.reshape(own, -1, network.classes).sum(axis=1).cumsum(axis=0)
+        steps = data.steps_of(index)
+        votes = run_network(network, data.events[index : index + 1, ..., :steps])[last][0]
+        added = votes.reshape(steps, -1, network.classes).sum(axis=1).cumsum(axis=0)
         for window in windows:
-            counts[window].append(added[int(steps_of(np.array([own]), window)[0]) - 1])
+            counts[window].append(added[int(steps_of(np.array([steps]), window)[0]) - 1])
     return {str(window): vote(np.stack(each)).tolist() for window, each in counts.items()}
 
 
-def build(trained: Trained, file: Path) -> Json:
-    """Place a network, write it, and tell its size and hash.
+def build(path: str, weights: str | None, file: Path) -> tuple[CrossbarNetlist, int, str]:
+    """Place a network and write it; the netlist, its neurons, and the hash of its file.
 
     Raises
     ------
     CapacityError
         If it does not fit.
     """
-    chip = load_target("truenorth", CROSSBARS)
-    netlist = lower(trained.network, chip, provenance=provenance(trained))
+    found, chip = trained(path, weights), load_target(NAME)
+    netlist = lower(found.network, chip, provenance=provenance(found))
     require_legal(netlist, chip)
     file.parent.mkdir(parents=True, exist_ok=True)
-    return {
-        "sha256": write_crossbars(netlist, file),
-        "cores": netlist.n_cores,
-        "neurons": netlist.n_neurons,
-        "synapses": netlist.n_synapses,
-    }
+    return netlist, netlist.n_neurons, write_crossbars(netlist, file)

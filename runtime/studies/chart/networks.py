@@ -4,39 +4,32 @@ from __future__ import annotations
 
 import argparse
 import re
-import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
-from spikeloom.compiler import Recipe
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.formats.archive import is_netlist
-from spikeloom.compiler.formats.checkpoint import Checkpoint
 from spikeloom.compiler.formats.checkpoint_file import arrays_digest
 from spikeloom.compiler.formats.onnx.reader import SUFFIX
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.targets.loihi1.options import check_recipes
+from spikeloom.compiler.targets.loihi1.options import Recipe, check_recipes
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import Form
-from spikeloom.compiler.targets.truenorth.native import SYSTEM, highest_level
-from spikeloom.compiler.targets.truenorth.native_file import is_trained, read_trained
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.models.systems import NO_GRAPH
+from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.files import PRETRAINED, shipped
 from spikeloom.runtime.inputs.network import load_checkpoint, load_graph, propagation
+from spikeloom.runtime.machines.base import DEFAULT, chip_chart, trained_for
 from spikeloom.runtime.studies.chart.grid import Grid
+from spikeloom.runtime.studies.chart.requests import Source, Storage
 
-Json = dict[str, Any]
+EPOCHS = 60
+"""Of a training on another graph that is suggested: most best epochs come before."""
 
-COMPARTMENT_CHIP, CROSSBAR_CHIP = "loihi1", "truenorth"
-"""Chips of a chart: of checkpoints, and of networks in whole numbers."""
-
-GRAPH_EPOCHS = "60"
-"""Of a training on another graph: most best epochs come before."""
-
-LOIHI_AXES = ("bits", "planes", "groups", "prune", "cores")
-"""Axes of the grid that networks in whole numbers do not have."""
+STORAGE_AXES = ("bits", "planes", "groups", "prune", "cores")
+"""Axes of the grid that networks with a storage and layout of their own do not have."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -45,16 +38,14 @@ class Given:
 
     Parameters
     ----------
-    path : str
-        As typed.
+    source : Source
+        As typed, with the options that suit it.
     name : str
         Short, and no other network of the chart has it.
     target : str
         Chip that it is compiled for.
     graph : str
         That it was trained on; ``none`` of systems without.
-    words : tuple of str
-        Of a ``compile`` command that names the network and nothing else.
     sees : str
         Hash over what its first layer sees.
     sha256, weights, system : str
@@ -67,16 +58,15 @@ class Given:
     forms : tuple of Form, optional
         Storage that it was fine-tuned for.
     levels : int, optional
-        Levels of its weights, of a network that was trained in whole numbers.
+        Levels of its weights, of a network that was trained in whole numbers for its chip.
     bins : int
         Bins of the recordings that a step joins.
     """
 
-    path: str
+    source: Source
     name: str
     target: str
     graph: str
-    words: tuple[str, ...]
     sees: str
     sha256: str
     weights: str
@@ -92,10 +82,31 @@ class Given:
     @property
     def validation(self) -> float | None:
         """Share of recordings that its training left out and then decided right, where the file says so."""
-        found = self.training.get("validation")
-        if not isinstance(found, Mapping) or not found.get("samples"):
+        counts = self.training.get("validation")
+        if not isinstance(counts, Mapping) or not counts.get("samples"):
             return None
-        return float(found["correct"] / found["samples"])
+        return float(counts["correct"] / counts["samples"])
+
+    def storages(self, grid: Grid) -> Iterator[Storage]:
+        """Every storage that a grid asks for; of a network that was trained in one its own and no other."""
+        if self.levels is not None:
+            yield Storage(bits=(), planes=1, groups=1, prune=False, own=True, levels=self.levels)
+        elif self.forms is not None:
+            bits = tuple(form.bits for form in self.forms)
+            yield Storage(
+                bits=bits[:1] if len(set(bits)) == 1 else bits,
+                planes=max(len(form.exponents) for form in self.forms),
+                groups=max(len(set(form.threshold.tolist())) for form in self.forms),
+                prune=False,
+                own=True,
+            )
+        else:
+            for bits, planes, groups, prune in product(grid.bits, grid.planes, grid.groups, grid.prune):
+                yield Storage(bits=bits, planes=planes, groups=groups, prune=bool(prune))
+
+    def layouts(self, grid: Grid) -> tuple[str, ...]:
+        """Layouts that a grid asks for; of a network with its own storage the usual one."""
+        return grid.cores if self.levels is None else Grid().cores
 
 
 def given_networks(arguments: argparse.Namespace, grid: Grid) -> tuple[Given, ...]:
@@ -117,35 +128,39 @@ def given_networks(arguments: argparse.Namespace, grid: Grid) -> tuple[Given, ..
     for path in paths:
         if paths.count(path) > 1:
             raise OptionError(f"{path}: is given twice; give each checkpoint once")
-    read = [_read(path, arguments) for path in paths]
+    networks = [_read(path, arguments) for path in paths]
     for graph in grid.graph:
-        if all(_plain(graph) != _plain(own.graph) for own in read):
-            raise _untrained(graph, read, arguments.data)
+        if all(_plain(graph) != _plain(network.graph) for network in networks):
+            raise _untrained(graph, networks, arguments.data)
     if grid.graph:
         wanted = [_plain(graph) for graph in grid.graph]
-        read = [own for own in read if _plain(own.graph) in wanted]
-    return _named(read)
+        networks = [network for network in networks if _plain(network.graph) in wanted]
+    return _named(networks)
 
 
 def _read(path: str, arguments: argparse.Namespace) -> Given:
     if path.endswith(SUFFIX):
         raise ModelError(f"{path}: is an ONNX file, a chart takes checkpoints; give the checkpoint that it was made of")
     file = shipped(path)
-    if Path(file).is_file() and is_trained(file):
-        return _read_native(path, arguments)
+    chip = trained_for(file) if Path(file).is_file() else None
+    chart = None if chip is None else chip_chart(chip.__package__.rpartition(".")[2])
+    name = Path(path.removeprefix(PRETRAINED)).stem
+    if chart is not None:
+        known = chart.facts(path, arguments.weights)
+        source = Source(path=path, weights=arguments.weights, target=known["target"])
+        return Given(source=source, name=name, sees="", **known)
     if Path(file).is_file() and is_netlist(file):
         raise ModelError(f"{path}: is a netlist, a chart compiles its own; give the checkpoint that it was made from")
     checkpoint = load_checkpoint(path, arguments)
-    own = argparse.Namespace(**vars(arguments))
+    source = Source(path=path, **repeat.given(arguments, repeat.NETWORK))
     if checkpoint.edges is not None:  # one that knows its graph needs no option; others of the same call may
-        own.graph, own.edges, own.directed = None, None, False
-    graph, sees = propagation(checkpoint, load_graph(own, checkpoint.system), path)
+        source = replace(source, graph=None, edges=None, directed=False)
+    graph, sees = propagation(checkpoint, load_graph(source.arguments(), checkpoint.system), path)
     return Given(
-        path=path,
-        name=Path(path.removeprefix(PRETRAINED)).stem,
-        target=COMPARTMENT_CHIP,
+        source=source if checkpoint.edges is None else replace(source, taxels=None),
+        name=name,
+        target=DEFAULT,
         graph=graph,
-        words=("compile", path, *_model_words(own, checkpoint)),
         sees=arrays_digest({"propagation": sees}),
         sha256=checkpoint.sha256,
         weights=checkpoint.weights,
@@ -159,77 +174,37 @@ def _read(path: str, arguments: argparse.Namespace) -> Given:
     )
 
 
-def _read_native(path: str, arguments: argparse.Namespace) -> Given:
-    """A network that was trained for TrueNorth, which says everything but its weights itself."""
-    trained = read_trained(shipped(path), weights=arguments.weights)
-    network = trained.network
-    weights = ("--weights", arguments.weights) if arguments.weights else ()
-    return Given(
-        path=path,
-        name=Path(path.removeprefix(PRETRAINED)).stem,
-        target=CROSSBAR_CHIP,
-        graph=trained.graph,
-        words=("compile", path, *weights, "--target", CROSSBAR_CHIP),
-        sees="",
-        sha256=trained.sha256,
-        weights=trained.weights,
-        system=SYSTEM,
-        taxels=network.taxels,
-        classes=network.classes,
-        layers=tuple(network.neurons),
-        training=trained.training,
-        levels=2 * highest_level(network.copies) + 1,
-    )
-
-
-def _model_words(arguments: argparse.Namespace, checkpoint: Checkpoint) -> tuple[str, ...]:
-    """Options that say how a checkpoint is read."""
-    given = {name: getattr(arguments, name) for name in ("graph", "taxels", "edges", "system", "weights")}
-    given |= {"beta": arguments.beta, "theta": arguments.theta, "run": arguments.run or None}
-    if checkpoint.edges is not None:
-        given["taxels"] = None
-    words = [word for name, value in given.items() if value is not None for word in (f"--{name}", str(value))]
-    return (*words, *(["--directed"] if arguments.directed else []))
-
-
 def _plain(graph: str) -> str:
-    return re.sub(r"[^A-Za-z0-9.]+", "", graph)
+    """A graph's name as it stands in names of files: ``knn:1`` is ``knn1``."""
+    return re.sub(r"[^A-Za-z0-9.]", "", graph).strip(".")
 
 
 def _untrained(graph: str, there: Sequence[Given], data: str) -> OptionError:
     """Error of a graph that no checkpoint was trained on; says which command trains one."""
-    command = ["spikeloom", "train", "--data", data, "--graph", graph, "--epochs", GRAPH_EPOCHS]
-    command += ["--join", str(there[0].bins)] if there[0].bins > 1 else []
-    others = ", ".join(dict.fromkeys(own.graph for own in there))
+    bins = there[0].bins
+    options = {"data": data, "graph": graph, "epochs": EPOCHS, "join": bins if bins > 1 else None}
+    train = repeat.command("train", *repeat.words(options), "-o", f"{_plain(graph)}.pt")
+    others = ", ".join(dict.fromkeys(network.graph for network in there))
     return OptionError(
         f"--grid graph={graph}: no checkpoint was trained on that graph, those given on {others}; train one and "
-        f"name it: {shlex.join([*command, '-o', f'{_plain(graph)}.pt'])}"
+        f"name it: {train}"
     )
 
 
-def _named(read: Sequence[Given]) -> tuple[Given, ...]:
+def _named(networks: Sequence[Given]) -> tuple[Given, ...]:
     """Networks with names of their own: files of one name in different folders are counted."""
-    found: dict[str, Given] = {}
-    for own in read:
-        name, again = own.name, 1
-        while name in found:
+    named: dict[str, Given] = {}
+    for network in networks:
+        name, again = network.name, 1
+        while name in named:
             again += 1
-            name = f"{own.name}-{again}"
-        found[name] = replace(own, name=name)
-    return tuple(found.values())
+            name = f"{network.name}-{again}"
+        named[name] = replace(network, name=name)
+    return tuple(named.values())
 
 
 def require_suited(networks: Sequence[Given], splits: Mapping[str, Recordings], digest: str) -> None:
-    """Refuse networks that do not belong together, or were trained on other recordings.
-
-    Parameters
-    ----------
-    networks : sequence of Given
-        Of the chart.
-    splits : mapping of str to Recordings
-        Its data, by split.
-    digest : str
-        Hash over both, as trainings note it.
+    """Refuse networks that do not belong together, or were trained on other recordings than these of this hash.
 
     Raises
     ------
@@ -237,19 +212,17 @@ def require_suited(networks: Sequence[Given], splits: Mapping[str, Recordings], 
         Naming both.
     """
     first = networks[0]
-    for own in networks:
-        sizes = [(each.taxels, each.classes) for each in (first, own)]
+    for network in networks:
+        sizes = [(each.taxels, each.classes) for each in (first, network)]
         if sizes[0] != sizes[1]:
             raise ModelError(
-                f"{own.path}: has {sizes[1][0]} taxels and {sizes[1][1]} classes, {first.path} has {sizes[0][0]} and "
-                f"{sizes[0][1]}; chart networks of one data set at a time"
+                f"{network.source.path}: has {sizes[1][0]} taxels and {sizes[1][1]} classes, {first.source.path} has "
+                f"{sizes[0][0]} and {sizes[0][1]}; chart networks of one data set at a time"
             )
-        made = own.training.get("data_sha256")
-        if made not in (None, digest):
-            told = own.training.get("data", "others")
+        if network.training.get("data_sha256") not in (None, digest):
             raise ModelError(
-                f"{own.path}: was trained on other recordings ({told}) than {splits['test'].source}; give those, or a "
-                "checkpoint that was trained on these"
+                f"{network.source.path}: was trained on other recordings ({network.training.get('data', 'others')}) "
+                f"than {splits['test'].source}; give those, or a checkpoint that was trained on these"
             )
 
 
@@ -261,45 +234,27 @@ def require_grid(networks: Sequence[Given], grid: Grid, target: Target) -> None:
     OptionError
         Naming the network, or the axis.
     """
-    if all(own.levels is not None for own in networks):
-        axes = [axis for axis in LOIHI_AXES if getattr(grid, axis) != getattr(Grid(), axis)]
+    own = [network.target for network in networks if network.levels is not None]
+    if len(own) == len(networks):
+        axes = [axis for axis in STORAGE_AXES if getattr(grid, axis) != getattr(Grid(), axis)]
         if axes:
             raise OptionError(
-                f"--grid {axes[0]}: is for {COMPARTMENT_CHIP}, networks for {CROSSBAR_CHIP} have a storage and a "
-                "layout of their own; leave it away"
+                f"--grid {axes[0]}: is for {target.name}, networks for {own[0]} have a storage and a layout of their "
+                "own; omit it"
             )
-    for own in networks:
-        if own.levels is not None:
+    for network in networks:
+        if network.levels is not None:
             continue
-        for bits in grid.bits if own.forms is None else ():
-            if len(bits) not in (1, len(own.layers)):
+        path, layers = network.source.path, network.layers
+        for bits in grid.bits if network.forms is None else ():
+            if len(bits) not in (1, len(layers)):
                 raise OptionError(
-                    f"--grid bits={'+'.join(map(str, bits))}: {len(bits)} widths, {own.path} has {len(own.layers)} "
-                    f"layers ({', '.join(own.layers)}); give one width, or one for each layer"
+                    f"--grid bits={'+'.join(map(str, bits))}: {len(bits)} widths, {path} has {len(layers)} "
+                    f"layers ({', '.join(layers)}); give one width, or one for each layer"
                 )
-            check_recipes([Recipe(bits=width) for width in bits], len(own.layers), target)
+            check_recipes([Recipe(bits=width) for width in bits], len(layers), target)
         for layout in grid.cores:
             for part in layout.split("+") if ":" in layout else ():
                 layer = part.partition(":")[0]
-                if layer not in own.layers:
-                    raise OptionError(
-                        f"--grid cores={layout}: {own.path} has no layer {layer}; it has {', '.join(own.layers)}"
-                    )
-
-
-def network_json(own: Given) -> Json:
-    """A network for the chart's files."""
-    return {
-        "name": own.name,
-        "path": own.path,
-        "target": own.target,
-        "sha256": own.sha256,
-        "system": own.system,
-        "graph": own.graph,
-        "has_graph": own.graph != NO_GRAPH,
-        "weights": own.weights,
-        "fine_tuned": own.forms is not None,
-        "trained_by": own.training.get("command"),
-        "validation": own.validation,
-        "bins": own.bins,
-    }
+                if layer not in layers:
+                    raise OptionError(f"--grid cores={layout}: {path} has no layer {layer}; it has {', '.join(layers)}")

@@ -1,8 +1,7 @@
 """What a chart measures, in steps that can be kept: float decisions, netlists, and netlists on recordings.
 
-A network is rounded once for any number of layouts, a netlist is compiled once for any number of windows. Everything
-here is a function of files and of the words of ``spikeloom compile``, so that a netlist is the file, byte for byte,
-that the command would write.
+Everything here is a function of files and of a request, so that a netlist is the file, byte for byte, that the command
+``compile`` would write.
 """
 
 from __future__ import annotations
@@ -10,7 +9,8 @@ from __future__ import annotations
 import argparse
 import hashlib
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -21,30 +21,61 @@ from spikeloom.compiler import Options, lay_out_again, store
 from spikeloom.compiler.errors import CapacityError, DataError, FormatError, ModelError
 from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.interpret import cut, vote
-from spikeloom.compiler.targets.base import CROSSBARS, known_targets, load_target
+from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist
-from spikeloom.compiler.targets.truenorth.native_file import Trained, read_trained
 from spikeloom.models.recordings.events import joined_bins
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.recordings.windows import first_part, steps_of
 from spikeloom.runtime.commands.main_job.compile import parse_recipes, provenance
-from spikeloom.runtime.commands.options import parse_cores
-from spikeloom.runtime.inputs.files import shipped
+from spikeloom.runtime.commands.options import PLACING, ROUNDING, parse_cores
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import recordings
-from spikeloom.runtime.machines.base import Machine, machine_for
-from spikeloom.runtime.machines.truenorth import charted
+from spikeloom.runtime.machines.base import DEFAULT, Machine, chip_chart, machine_for
 from spikeloom.runtime.machines.votes import readout_counts
-from spikeloom.runtime.studies.chart.tasks import SPLITS, Build, Data, Decide, Run
-
-Json = dict[str, Any]
+from spikeloom.runtime.report.encode import encode
+from spikeloom.runtime.studies.chart.requests import SPLITS, Build, Data, Decide, Run, Source, layout_options
 
 PART = 16
 """Recordings whose float spikes are held at a time."""
 
+Decisions = Mapping[str, Mapping[str, tuple[int, ...]]]
+"""Of a float model, by split and window."""
 
-def measure(work: Decide | Build | Run) -> Json:
-    """Do one piece of a chart's work; JSON values.
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Built:
+    """Size and hash of a netlist, or the limits that it breaks."""
+
+    sha256: str = ""
+    cores: int = 0
+    neurons: int = 0
+    synapses: int = 0
+    refused: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ran:
+    """Decisions of a netlist on one split, and its costs on a mean recording; `step_s` is of the longest step."""
+
+    decisions: tuple[int, ...]
+    synaptic_operations: float
+    energy_j: Mapping[str, float]
+    time_s: Mapping[str, float]
+    step_s: Mapping[str, float]
+    steps: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RanBoth:
+    """The same on both splits, and how fast the simulator is here."""
+
+    train: Ran
+    test: Ran
+    recordings_per_s: float
+
+
+def measure(work: Decide | Build | Run) -> Any:
+    """Do one piece of a chart's work; the JSON of `Decisions`, of `Built` by layout, or of `RanBoth`.
 
     Raises
     ------
@@ -52,8 +83,8 @@ def measure(work: Decide | Build | Run) -> Json:
         If a file cannot be used.
     """
     if isinstance(work, Decide):
-        return _decide(work)
-    return _build(work) if isinstance(work, Build) else _run(work)
+        return encode(_decide(work))
+    return encode(_build(work) if isinstance(work, Build) else _run(work))
 
 
 # -- what is kept from one piece to the next ---------------------------------------------------------------------------
@@ -71,53 +102,41 @@ def both_splits(data: Data, taxels: int, classes: int) -> dict[str, Recordings]:
     from spikeloom.models.training.protocols import data_digest
 
     shared: dict[str, Any] = {"classes": classes, "taxels": taxels, "bin_s": data.bin_s, "labels_for": "chart"}
-    found = {split: recordings(data.path, split, **shared) for split in SPLITS}
-    if data.sha256 not in (None, data_digest(found["train"], found["test"])):
+    splits = {split: recordings(data.path, split, **shared) for split in SPLITS}
+    if data.sha256 not in (None, data_digest(splits["train"], splits["test"])):
         raise DataError(f"{data.path}: holds other recordings than where the chart was asked for; copy those here")
-    return found
+    return splits
 
 
 @lru_cache(maxsize=2)
-def _heard(data: Data, taxels: int, classes: int, bins: int) -> dict[str, Recordings]:
+def _in_steps(data: Data, taxels: int, classes: int, bins: int) -> dict[str, Recordings]:
     """The same in the steps of a network that joins bins."""
-    return {split: joined_bins(found, bins) for split, found in both_splits(data, taxels, classes).items()}
+    return {split: joined_bins(each, bins) for split, each in both_splits(data, taxels, classes).items()}
 
 
 @lru_cache(maxsize=2)
-def _network(words: tuple[str, ...], sha256: str) -> LoadedNetwork:
-    arguments = parsed(words)
-    found = load_network(arguments.checkpoint, arguments)
-    _require_same(arguments.checkpoint, found.sha256, sha256)
-    return found
+def _network(source: Source, sha256: str) -> LoadedNetwork:
+    network = load_network(source.path, source.arguments())
+    _require_same(source.path, network.sha256, sha256)
+    return network
 
 
-def _is_native(words: tuple[str, ...]) -> bool:
-    return parsed(words).target in known_targets(CROSSBARS)
-
-
-@lru_cache(maxsize=2)
-def _trained(words: tuple[str, ...], sha256: str) -> Trained:
-    arguments = parsed(words)
-    found = read_trained(shipped(arguments.checkpoint), weights=arguments.weights)
-    _require_same(arguments.checkpoint, found.sha256, sha256)
-    return found
-
-
-def _require_same(path: str, found: str, asked: str) -> None:
-    if found != asked:
+def _require_same(path: str, sha256: str, wanted: str) -> None:
+    if sha256 != wanted:
         raise ModelError(f"{path}: is another file than where the chart was asked for; copy that here")
 
 
-def parsed(words: tuple[str, ...]) -> argparse.Namespace:
-    """Options of a command, as they would be typed."""
-    from spikeloom.runtime.cli import build_parser
-
-    return build_parser().parse_args(list(words))
+def _chart_of(source: Source, sha256: str) -> Any | None:
+    """What its chip does for a chart, of a network that was trained for it."""
+    chart = None if source.target is None else chip_chart(source.target)
+    if chart is not None:
+        _require_same(source.path, chart.trained(source.path, source.weights).sha256, sha256)
+    return chart
 
 
 @lru_cache(maxsize=1)
-def _read(path: Path, sha256: str) -> Machine | None:
-    """A netlist that is kept, on its chip; None if it is gone, damaged or another one."""
+def _machine(path: Path, sha256: str) -> Machine | None:
+    """A netlist that is kept; None if it is gone, damaged or another one."""
     if not path.is_file() or hashlib.sha256(path.read_bytes()).hexdigest() != sha256:
         return None
     try:
@@ -129,53 +148,62 @@ def _read(path: Path, sha256: str) -> Machine | None:
 # -- float model -------------------------------------------------------------------------------------------------------
 
 
-def _decide(work: Decide) -> Json:
+def _decide(work: Decide) -> Decisions:
     """Decisions of the float32 model by split and window; one run each, since what comes later changes nothing."""
     from spikeloom.models.networks.reference import float_spikes  # torch, so only here
 
-    if _is_native(work.words):
-        network = _trained(work.words, work.sha256).network
-        both = both_splits(work.data, network.taxels, network.classes)
-        return {split: charted.model_decisions(network, data, work.windows) for split, data in both.items()}
-    asked = _network(work.words, work.sha256)
-    checkpoint, adjacency = asked.checkpoint, asked.adjacency
+    source, windows = work.source, work.windows
+    chart = _chart_of(source, work.sha256)
+    if chart is not None:
+        network = chart.trained(source.path, source.weights).network
+        splits = both_splits(work.data, network.taxels, network.classes)
+        return {split: chart.decisions(source.path, source.weights, data, windows) for split, data in splits.items()}
+    loaded = _network(source, work.sha256)
+    checkpoint, adjacency = loaded.checkpoint, loaded.adjacency
     assert checkpoint is not None, "a chart takes checkpoints"
     assert adjacency is not None, "and these have a first layer that sees something"
-    found: Json = {}
-    for split, data in _heard(work.data, checkpoint.taxels, checkpoint.classes, checkpoint.bins).items():
-        counts: dict[int, list[IntArray]] = {window: [] for window in work.windows}
-        own = np.full(len(data), data.steps) if data.lengths is None else data.lengths
+    decided: dict[str, dict[str, tuple[int, ...]]] = {}
+    for split, data in _in_steps(work.data, checkpoint.taxels, checkpoint.classes, checkpoint.bins).items():
+        counts: dict[int, list[IntArray]] = {window: [] for window in windows}
+        steps = _steps(data)
         for first in range(0, len(data), PART):
             part = slice(first, first + PART)
             *_, spikes = float_spikes(checkpoint, adjacency, data.events[part]).values()
-            for window in work.windows:
-                heard = cut(spikes, steps_of(own[part], window))
-                counts[window].append(readout_counts(checkpoint.readout, checkpoint.classes, heard))
-        found[split] = {str(window): vote(np.concatenate(each)).tolist() for window, each in counts.items()}
-    return found
+            for window in windows:
+                seen = cut(spikes, steps_of(steps[part], window))
+                counts[window].append(readout_counts(checkpoint.readout, checkpoint.classes, seen))
+        decided[split] = {str(window): tuple(vote(np.concatenate(each)).tolist()) for window, each in counts.items()}
+    return decided
+
+
+def _steps(data: Recordings) -> IntArray:
+    return np.full(len(data), data.steps) if data.lengths is None else data.lengths
 
 
 # -- netlists ----------------------------------------------------------------------------------------------------------
 
 
-def _build(work: Build) -> Json:
-    """Compile what is not there; by layout the netlist's size and hash, or the limits that it breaks."""
-    arguments = {layout: parsed(words) for layout, words in work.layouts.items()}
-    words = next(iter(work.layouts.values()))
-    if _is_native(words):
+def _build(work: Build) -> dict[str, Built]:
+    """Compile what is not there; by layout."""
+    chart = _chart_of(work.source, work.sha256)
+    if chart is not None:
         try:
-            return {name: charted.build(_trained(words, work.sha256), file) for name, file in work.files.items()}
+            return {
+                layout: _built(*chart.build(work.source.path, work.source.weights, file))
+                for layout, file in work.files.items()
+            }
         except CapacityError as error:
-            return {name: {"refused": str(error).splitlines()} for name in work.files}
-    some = next(iter(arguments.values()))
-    asked = _network(model_words(words), work.sha256)
-    sensor = asked.network.input
-    training = _heard(work.data, sensor.taxels, asked.network.classes, sensor.bins)["train"]
+            return dict.fromkeys(work.files, _refused(error))
+    network = _network(work.source, work.sha256)
+    options = {layout: _compile_options(work, layout) for layout in work.files}
+    some = next(iter(options.values()))
+    sensor = network.network.input
+    training = _in_steps(work.data, sensor.taxels, network.network.classes, sensor.bins)["train"]
     try:
         stored = store(
-            asked.source,
+            network.source,
             Options(
-                forms=None if asked.checkpoint is None else asked.checkpoint.forms,
+                forms=None if network.checkpoint is None else network.checkpoint.forms,
                 recipes=parse_recipes(some),
                 prune_unused=some.prune_unused,
                 training_events=training.events,
@@ -183,94 +211,94 @@ def _build(work: Build) -> Json:
             load_target(some.target),
         )
     except (CapacityError, ModelError) as error:
-        return {layout: {"refused": str(error).splitlines()} for layout in work.layouts}
-    found: Json = {}
-    for layout, own in arguments.items():
+        return dict.fromkeys(work.files, _refused(error))
+    built = {}
+    for layout, each in options.items():
         try:
-            options = Options(
-                cores_for=parse_cores(own.cores_for),
-                optimize=own.optimize,
-                provenance=provenance(own, asked, calibrated=True),
+            placing = Options(
+                cores_for=parse_cores(each.cores_for),
+                optimize=each.optimize,
+                provenance=provenance(each, network, calibrated=True),
             )
-            netlist = lay_out_again(stored, options).netlist
+            netlist = lay_out_again(stored, placing).netlist
         except CapacityError as error:
-            found[layout] = {"refused": str(error).splitlines()}
+            built[layout] = _refused(error)
             continue
-        work.files[layout].parent.mkdir(parents=True, exist_ok=True)
-        found[layout] = {
-            "sha256": write_netlist(netlist, work.files[layout]),
-            "cores": netlist.n_cores,
-            "neurons": netlist.n_compartments,
-            "synapses": netlist.n_synapses,
-        }
-    return found
+        file = work.files[layout]
+        file.parent.mkdir(parents=True, exist_ok=True)
+        built[layout] = _built(netlist, netlist.n_compartments, write_netlist(netlist, file))
+    return built
 
 
-STORAGE = ("--weight-bits", "--planes", "--scale-groups", "--optimize", "--cores-for", "-o")
-"""Options of ``compile`` that say nothing of the float network, each with a value; ``--prune-unused`` has none."""
+def _compile_options(work: Build, layout: str) -> argparse.Namespace:
+    """What the command ``compile`` would have parsed."""
+    return argparse.Namespace(
+        **{name: value for name, value in vars(work.source.arguments()).items() if name != "target"}
+        | {"target": DEFAULT}
+        | ROUNDING
+        | PLACING
+        | {name: value for name, value in work.storage.options().items() if value is not None}
+        | layout_options(layout)
+    )
 
 
-def model_words(words: tuple[str, ...]) -> tuple[str, ...]:
-    """The words of a ``compile`` command that name the float network.
+def _built(netlist: Any, neurons: int, sha256: str) -> Built:
+    return Built(sha256=sha256, cores=netlist.n_cores, neurons=neurons, synapses=netlist.n_synapses)
 
-    Examples
-    --------
-    >>> model_words(("compile", "a.pt", "--weight-bits", "4", "--prune-unused", "-o", "x.loom"))
-    ('compile', 'a.pt', '-o', 'x.loom')
-    """
-    kept, skip = [], False
-    for word in words:
-        if skip:
-            skip = False
-        elif word in STORAGE:
-            skip = True
-        elif word != "--prune-unused":
-            kept.append(word)
-    return (*kept, "-o", "x.loom")
+
+def _refused(error: CapacityError | ModelError) -> Built:
+    return Built(refused=tuple(str(error).splitlines()))
 
 
 # -- netlists on recordings --------------------------------------------------------------------------------------------
 
 
-def _run(work: Run) -> Json:
+def _run(work: Run) -> RanBoth:
     """What a netlist decides on both splits, what that costs, and how fast the simulator is."""
     path = work.build.files[work.layout]
-    machine = _read(path, work.sha256)
+    machine = _machine(path, work.sha256)
     if machine is None:
-        _read.cache_clear()
+        _machine.cache_clear()
         _build(work.build)
-        machine = _read(path, work.sha256)
+        machine = _machine(path, work.sha256)
     if machine is None:
         raise FormatError(f"{path}: is not the netlist that was measured before; begin anew with --fresh")
     netlist, data = machine.netlist, work.build.data
-    splits = _heard(data, netlist.taxels, netlist.classes, netlist.bins)
+    splits = _in_steps(data, netlist.taxels, netlist.classes, netlist.bins)
     parts = {split: first_part(each, work.window) for split, each in splits.items()}
-    found: Json = {split: _costs(machine, each, data.bin_s) for split, each in parts.items()}
-    found["recordings_per_s"] = _throughput(machine, parts["test"])
-    return found
+    return RanBoth(
+        train=_costs(machine, parts["train"], data.bin_s),
+        test=_costs(machine, parts["test"], data.bin_s),
+        recordings_per_s=_throughput(machine, parts["test"]),
+    )
 
 
-def _costs(machine: Machine, data: Recordings, bin_s: float) -> Json:
+def _costs(machine: Machine, data: Recordings, bin_s: float) -> Ran:
     """Decisions, and the mean inference: operations, energy by table, time by table, the longest step."""
-    own = np.full(len(data), data.steps) if data.lengths is None else data.lengths
-    size = machine.batch(data.steps)
-    done = []
+    steps, size = _steps(data), machine.batch(data.steps)
+    decided: list[int] = []
+    operations: list[IntArray | FloatArray] = []
+    energy: dict[str, list[FloatArray]] = {}
+    seconds: dict[str, list[FloatArray]] = {}
+    longest: dict[str, float] = {}
     for first in range(0, len(data), size):
         part = slice(first, first + size)
-        done.append(machine.price(data.events[part], bin_s=bin_s, lengths=own[part]))
-    prices = [price for _, price in done]
-
-    def mean(values: Sequence[FloatArray | IntArray]) -> float:
-        return float(np.concatenate(values).mean())
-
-    return {
-        "decisions": np.concatenate([run.decisions for run, _ in done]).tolist(),
-        "synaptic_operations": mean([price.synaptic_operations for price in prices]),
-        "energy_j": {name: mean([price.energy_j[name] for price in prices]) for name in prices[0].energy_j},
-        "time_s": {name: mean([price.time_s[name] for price in prices]) for name in prices[0].time_s},
-        "step_s": {name: max(price.step_s[name] for price in prices) for name in prices[0].step_s},
-        "steps": float(own.mean()),
-    }
+        ran, price = machine.price(data.events[part], bin_s=bin_s, lengths=steps[part])
+        decided += ran.decisions.tolist()
+        operations.append(price.synaptic_operations)
+        for name, joules in price.energy_j.items():
+            energy.setdefault(name, []).append(joules)
+        for name, each in price.time_s.items():
+            seconds.setdefault(name, []).append(each)
+            longest[name] = max(longest.get(name, 0.0), price.step_s[name])
+    return Ran(
+        decisions=tuple(decided),
+        synaptic_operations=float(np.concatenate(operations).mean()),
+        energy_j={name: float(np.concatenate(each).mean()) for name, each in energy.items()},
+        time_s={name: float(np.concatenate(each).mean()) for name, each in seconds.items()},
+        step_s=longest,
+        steps=float(steps.mean()),
+    )
 
 
 def _throughput(machine: Machine, data: Recordings) -> float:

@@ -1,0 +1,293 @@
+"""What a chart is: networks, configurations with their figures on both splits, and the choices among them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+from spikeloom.runtime.report.encode import key
+from spikeloom.runtime.report.intervals import wilson
+from spikeloom.runtime.studies.chart.grid import Grid
+from spikeloom.runtime.studies.chart.requests import FORMAT
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Share:
+    """An accuracy with its Wilson interval."""
+
+    correct: int
+    accuracy: float
+    low: float
+    high: float
+
+
+def share(correct: int, samples: int) -> Share:
+    """The share of right decisions.
+
+    Examples
+    --------
+    >>> share(3, 4).accuracy
+    0.75
+    """
+    low, high = wilson(correct, samples)
+    return Share(correct=correct, accuracy=correct / samples, low=low, high=high)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Figures(Share):
+    """A configuration on one split: accuracy, float model's, equal decisions, and costs of a mean recording.
+
+    Energy and time are by table, in joules and seconds; `step_s` is the longest step.
+    """
+
+    samples: int
+    model: Share = field(metadata=key("float"))
+    equal: int
+    energy_j: Mapping[str, float]
+    time_s: Mapping[str, float]
+    step_s: Mapping[str, float]
+    synaptic_operations: float
+    steps: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Configuration:
+    """A network in one storage and layout, by the axes of the grid."""
+
+    network: str
+    target: str
+    graph: str
+    bits: tuple[int, ...]
+    planes: int
+    groups: int
+    prune: bool
+    fine_tuned: bool
+    storage: str
+    cores: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Refused(Configuration):
+    """One that the chip refuses, and why."""
+
+    why: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Point(Configuration):
+    """One on a part of every recording: its size, its figures, and the commands that give them."""
+
+    number: int
+    window: int
+    n_cores: int
+    neurons: int
+    synapses: int
+    netlist: str
+    netlist_sha256: str
+    train: Figures
+    test: Figures
+    commands: tuple[str, ...]
+    expected: float = 0.0
+    front: Mapping[str, bool] = field(default_factory=dict)
+
+    @property
+    def label(self) -> str:
+        """Short name: ``objects 4b 2p, latency, 50 %``."""
+        layout = "" if self.cores == "cores" else f", {self.cores}"
+        return f"{self.network} {self.storage}{layout}, {self.window} %"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChartedNetwork:
+    """A network; accuracies of its float model by window and split, and what its points are expected to reach."""
+
+    name: str
+    path: str
+    target: str
+    sha256: str
+    system: str
+    graph: str
+    has_graph: bool
+    weights: str
+    fine_tuned: bool
+    trained_by: str | None
+    validation: float | None
+    bins: int
+    model: Mapping[str, Mapping[str, Share]] = field(metadata=key("float"))
+    float_training: float
+    expected: float = 0.0
+
+    @property
+    def whole(self) -> Share:
+        """The float model on whole test recordings."""
+        return self.model[max(self.model, key=int)]["test"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Against:
+    """A point beside another: how many times less test energy and time by table, and how much more accuracy."""
+
+    point: int
+    energy: Mapping[str, float | None]
+    time: Mapping[str, float | None]
+    accuracy: float
+    expected: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Saving:
+    """Points beside the usual mapping: `chosen` by what is expected, `seen` on the test split, which is no choice."""
+
+    usual: int
+    chosen: Against
+    seen: Against
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Miss:
+    """By how much a budget is missed."""
+
+    limit: float
+    found: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Pick:
+    """The point that fits the budgets best, how many fit, what it misses, and what it gives up beside the best."""
+
+    budgets: tuple[str, ...]
+    fits: bool
+    fitting: int
+    point: int
+    misses: Mapping[str, Miss]
+    best: int
+    given_up: Against
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChartedData:
+    """Recordings: where they are, their bins, a hash over both splits, how many there are, and steps of the longest."""
+
+    path: str
+    bin_s: float
+    sha256: str
+    train: int
+    test: int
+    steps: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Tables:
+    """Titles of tables of prices and times, by name."""
+
+    energy: Mapping[str, str]
+    time: Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChosenBy:
+    """Tables by which points are chosen and drawn; none for time where nothing is timed."""
+
+    energy: str
+    time: str | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Measured:
+    """What depends on the machine: simulated recordings a second, by number of the point."""
+
+    recordings_per_s: Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Chart:
+    """Every configuration of a grid, and which one to deploy."""
+
+    spikeloom: str
+    target: str
+    command: str
+    data: ChartedData
+    tables: Tables
+    chosen_by: ChosenBy
+    grid: Grid
+    networks: tuple[ChartedNetwork, ...]
+    expected: str
+    points: tuple[Point, ...]
+    refused: tuple[Refused, ...]
+    recommended: Mapping[str, int | None]
+    saving: Saving | None
+    budget: Pick | None
+    measured: Measured
+    digest: str = ""
+    format: int = FORMAT
+
+    def point(self, number: int) -> Point:
+        """A point by its number, from 1."""
+        return self.points[number - 1]
+
+    @property
+    def taken(self) -> dict[int, list[str]]:
+        """Points to take by number, and what for."""
+        names: dict[int, list[str]] = {}
+        for name, number in self.recommended.items():
+            if number is not None:
+                names.setdefault(number, []).append(name)
+        return names
+
+
+AnEntry = TypeVar("AnEntry", Point, ChartedNetwork)
+
+
+def by_chip(entries: Sequence[AnEntry], target: str) -> tuple[list[AnEntry], list[AnEntry]]:
+    """Points or networks of a chip, and those of others."""
+    return [entry for entry in entries if entry.target == target], [each for each in entries if each.target != target]
+
+
+def price(costs: Mapping[str, float], table: str) -> float:
+    """A cost by a table, or by the first of those of another chip, whose tables have other names.
+
+    Examples
+    --------
+    >>> price({"davies": 1.0, "sanafe": 2.0}, "sanafe"), price({"all_in": 3.0, "marginal": 4.0}, "sanafe")
+    (2.0, 3.0)
+    """
+    return costs[table] if table in costs else next(iter(costs.values()))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Axis:
+    """A cost that accuracy is drawn over: its title, the words below the axis, the unit, and the cost of a point."""
+
+    title: str
+    words: str
+    unit: str
+    value: Callable[[Point], float]
+
+
+def axes(chart: Chart, *, measured: bool = False) -> dict[str, Axis]:
+    """Costs of a chart by name; with `measured` also the speed of the simulator where the chart was made."""
+    energy, time = chart.chosen_by.energy, chart.chosen_by.time
+    _, beside = by_chip(chart.points, chart.target)
+
+    def others(costs: Callable[[Point], Mapping[str, float]], table: str) -> str:
+        """Tables by which the points of other chips are drawn."""
+        firsts = dict.fromkeys((point.target, next(iter(costs(point)))) for point in beside)
+        return "".join(f"; {target}: {first}" for target, first in firsts if first != table)
+
+    def axis(title: str, words: str, unit: str, value: Callable[[Point], float]) -> Axis:
+        return Axis(title=title, words=words, unit=unit, value=value)
+
+    named = f"energy of a mean inference ({energy}{others(lambda point: point.test.energy_j, energy)})"
+    found = {"energy": axis("energy", named, "J", lambda point: price(point.test.energy_j, energy))}
+    if time is not None:
+        named = f"time of a mean inference on the chip ({time}{others(lambda point: point.test.time_s, time)})"
+        found["latency"] = axis("time on the chip", named, "s", lambda point: price(point.test.time_s, str(time)))
+    named = "synaptic operations of a mean inference"
+    found["operations"] = axis("synaptic operations", named, "", lambda point: point.test.synaptic_operations)
+    found["cores"] = axis("cores", "cores in use", "", lambda point: float(point.n_cores))
+    if measured:
+        rates: Any = chart.measured.recordings_per_s
+        named = "recordings a second on one thread, decisions only, measured where the chart was made"
+        found["speed"] = axis("speed of the simulator", named, "", lambda point: float(rates[str(point.number)]))
+    return found

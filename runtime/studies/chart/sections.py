@@ -1,0 +1,356 @@
+"""A chart for people: which points to take, accuracy over every cost, fronts, every point, and where all is from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
+
+from spikeloom.models.recordings.counts import number
+from spikeloom.runtime.report import drawing
+from spikeloom.runtime.report.drawing import Drawing, Mark, Scatter
+from spikeloom.runtime.report.numbers import percent, si
+from spikeloom.runtime.report.sections import Block, Code, Details, Facts, Figure, Section, Table, Text
+from spikeloom.runtime.studies.chart.choices import UNITS
+from spikeloom.runtime.studies.chart.results import Axis, Chart, ChosenBy, Point, axes, by_chip, price
+
+NAMES = {
+    "cheapest": "cheapest within one sample of float",
+    "fastest": "fastest within it, real time",
+    "best": "best",
+}
+"""Recommended points in words."""
+
+LISTED = 20
+"""Rows of a table that a terminal shows."""
+
+MEANINGS = (
+    "Expected: what the training reached on recordings that it left out, times the share of training accuracy that the "
+    "point keeps; choices are made by this alone.\n"
+    "Front: no other point is right more often on the test split for the same cost. It describes, nothing is chosen by "
+    "it.\n"
+    "Storage: bits of a weight (b), times that a synapse is stored (p), scales in a layer (g).\n"
+    "Larger marks have seen more of each recording; rings and lines: recommended points and their 95 % intervals."
+)
+
+BESIDE = (
+    "Points of another chip stand at their own prices, named in brackets; fronts and choices leave them out, since "
+    "prices of two chips hold different things."
+)
+
+
+def sections(chart: Chart) -> list[Section]:
+    """All of a chart, in the order of its page."""
+    refused = f", {number(len(chart.refused), 'more configuration')} refused" if chart.refused else ""
+    data = chart.data
+    summary = (
+        f"{number(len(chart.points), 'point')} of {number(len(chart.networks), 'network')} on {data.test} test and "
+        f"{data.train} training recordings{refused}\n"
+        f"choices are made on the training split by what is expected: {chart.expected}; test figures are reported "
+        "beside"
+    )
+    return [
+        Section("Networks", [Text(summary), Section("", [_networks(chart)])]),
+        Section(
+            "Which one to deploy",
+            [Facts(_cards(chart)), Section("", taken(chart)), *_saving(chart), *_budget(chart)],
+        ),
+        Section("Accuracy against cost", [*_figures(chart), *_fronts(chart), *_others(chart), *_hint(chart)]),
+        Section("Every point", [*_points(chart), *_refused(chart)]),
+        Section("Provenance", [Details("Files, grid and tables", _provenance(chart), unfolded=True)]),
+    ]
+
+
+def printed(chart: Chart, folder: str) -> list[Section]:
+    """The same for a terminal, with the place of the files."""
+    where = f"written: {folder}/chart.html, .svg, .png, .csv, .json; netlists in {folder}/netlists"
+    return [*sections(chart), Section("", [Text(where)])]
+
+
+def taken(chart: Chart) -> list[Block]:
+    """Recommended points, and the commands that make them; for the page of a network, too."""
+    named = [(number, name) for number, names in chart.taken.items() for name in names]
+    order = list(chart.recommended)
+    named.sort(key=lambda each: order.index(each[1]))
+    rows = [[NAMES[name], *_cells(chart.chosen_by, chart.point(number))] for number, name in named]
+    missing = [f"  {NAMES[name]}: no point" for name, number in chart.recommended.items() if number is None]
+    return [
+        Text("recommended:"),
+        Table(["", *_head(chart.chosen_by)], rows, "Recommended points; test figures beside"),
+        *(Text(line) for line in missing),
+        *_commands(chart.point(number) for number in dict.fromkeys(number for number, _ in named)),
+    ]
+
+
+def figures(chart: Chart, prefix: str = "chart", *, measured: bool = False) -> list[Figure]:
+    """Test accuracy over each cost."""
+    return [
+        Figure(
+            f"{prefix}-{name}",
+            partial(panels, chart, [name], f"Test accuracy over {axis.title}", measured=measured),
+            f"Test accuracy over {axis.title}.",
+        )
+        for name, axis in axes(chart, measured=measured).items()
+    ]
+
+
+def panels(chart: Chart, names: Sequence[str], title: str, *, across: int = 1, measured: bool = False) -> Drawing:
+    """Figures of a chart as one drawing."""
+    costs = axes(chart, measured=measured)
+    label = "test accuracy on the chip (%)"
+    return drawing.scatters(title, [_scatter(chart, name, costs[name]) for name in names], label, across=across)
+
+
+def picture(chart: Chart) -> Drawing:
+    """All figures beside each other, to print."""
+    name = chart.data.path.rstrip("/").rsplit("/", 1)[-1]
+    title = (
+        f"{len(chart.points)} configurations, {chart.data.test} test recordings of {name}; larger marks have seen more "
+        "of each recording"
+    )
+    return panels(chart, list(axes(chart)), title, across=2)
+
+
+# -- figures -----------------------------------------------------------------------------------------------------------
+
+
+def series_of(points: Sequence[Point]) -> str:
+    """Which axis the colours and shapes are for: networks where there are several."""
+    names = ("network", "storage", "cores", "window")
+    return next((name for name in names if len({getattr(point, name) for point in points}) > 1), "network")
+
+
+def _scatter(chart: Chart, name: str, axis: Axis) -> Scatter:
+    points = [point for point in chart.points if axis.value(point) > 0]
+    series = series_of(chart.points)
+    network = max(by_chip(chart.networks, chart.target)[0], key=lambda each: each.expected)
+    return Scatter(
+        marks=[
+            Mark(
+                x=axis.value(point),
+                y=100 * point.test.accuracy,
+                series=str(getattr(point, series)),
+                tip=_tip(chart, point),
+                weight=point.window / 100,
+                name=f"#{point.number} {', '.join(chart.taken.get(point.number, []))}",
+                interval=(100 * point.test.low, 100 * point.test.high) if point.number in chart.taken else None,
+            )
+            for point in points
+        ],
+        front=sorted((axis.value(point), 100 * point.test.accuracy) for point in points if point.front.get(name)),
+        level=(100 * network.whole.accuracy, f"float model of {network.name}"),
+        axis=axis.words,
+        unit=axis.unit,
+    )
+
+
+def _tip(chart: Chart, point: Point) -> str:
+    """What is said of a point; then the commands that make it."""
+    test = point.test
+    costs = [f"{si(joules, 'J')} ({name})" for name, joules in test.energy_j.items()]
+    costs += [f"{si(seconds, 's')} ({name})" for name, seconds in test.time_s.items()]
+    right = f"test {100 * test.accuracy:.2f} % ({100 * test.low:.1f} … {100 * test.high:.1f})"
+    right += f", float {100 * test.model.accuracy:.2f} %, expected {100 * point.expected:.2f} %"
+    equal = f"{test.equal} of {chart.data.test} decisions equal"
+    size = f"{test.synaptic_operations:,.0f} synaptic operations, {number(point.n_cores, 'core')}"
+    return "\n".join([f"#{point.number} {point.label}: {right}, {equal}, {', '.join(costs)}, {size}", *point.commands])
+
+
+def _figures(chart: Chart) -> list[Block]:
+    """One figure at a time, energy first."""
+    return [
+        Details(f"over {figure.caption.removeprefix('Test accuracy over ').removesuffix('.')}", [figure], "cost", first)
+        for figure, first in ((each, each.name == "chart-energy") for each in figures(chart, measured=True))
+    ]
+
+
+# -- tables ------------------------------------------------------------------------------------------------------------
+
+
+def _head(by: ChosenBy) -> list[str]:
+    energy, time = by.energy, by.time
+    timed = "time" if time is None else f"time ({time})"
+    costs = [f"energy ({energy})", timed, "operations", "cores"]
+    return ["#", "configuration", "expected %", "test %", "interval", "float %", "equal", *costs]
+
+
+def _cells(by: ChosenBy, point: Point) -> list[str]:
+    test = point.test
+
+    def cost(costs: Mapping[str, float], name: str, unit: str) -> str:
+        """A cost; of a chip whose tables have other names with that of its own."""
+        return f"{si(price(costs, name), unit)}{'' if name in costs else f' ({next(iter(costs))})'}"
+
+    return [
+        str(point.number),
+        point.label,
+        f"{100 * point.expected:.2f}",
+        f"{100 * test.accuracy:.2f}",
+        f"{100 * test.low:.1f} … {100 * test.high:.1f}",
+        f"{100 * test.model.accuracy:.2f}",
+        f"{test.equal}",
+        cost(test.energy_j, by.energy, "J"),
+        "–" if by.time is None else cost(test.time_s, by.time, "s"),
+        f"{test.synaptic_operations:,.0f}",
+        str(point.n_cores),
+    ]
+
+
+def _networks(chart: Chart) -> Table:
+    rows = [
+        [
+            network.name,
+            network.graph,
+            "–" if network.validation is None else f"{100 * network.validation:.2f}",
+            f"{100 * network.float_training:.2f}",
+            percent(network.whole.correct, chart.data.test),
+        ]
+        for network in chart.networks
+    ]
+    head = ["network", "graph", "validation %", "float, training %", "float, test"]
+    return Table(head, rows, "Float models on whole recordings")
+
+
+def _cards(chart: Chart) -> dict[str, tuple[str, str]]:
+    cards = {}
+    for name, index in chart.recommended.items():
+        if index is None:
+            cards[NAMES[name]] = "none", "no point is good enough"
+            continue
+        test, by = chart.point(index).test, chart.chosen_by
+        costs = [si(test.energy_j[by.energy], "J"), *([] if by.time is None else [si(test.time_s[by.time], "s")])]
+        cards[NAMES[name]] = f"#{index}: {', '.join(costs)}", f"test accuracy {100 * test.accuracy:.2f} %"
+    return cards
+
+
+def _commands(points: Iterable[Point]) -> list[Block]:
+    return [block for point in points for block in (Text(f"#{point.number}:"), Code(point.commands))]
+
+
+def _fronts(chart: Chart) -> list[Block]:
+    blocks: list[Block] = []
+    for name in ("energy", "latency"):
+        on = sorted((p for p in chart.points if p.front.get(name)), key=lambda point: point.test.accuracy)
+        if on:
+            told = Text(f"front of test accuracy and {name} (a description, no choice):")
+            rows = [_cells(chart.chosen_by, point) for point in on]
+            caption = f"Front of test accuracy and {name}"
+            blocks.append(Section("", [told, Table(_head(chart.chosen_by), rows, caption, most=LISTED)]))
+    return blocks
+
+
+def _others(chart: Chart) -> list[Block]:
+    """Points of other chips, each under its own names of prices and time."""
+    _, others = by_chip(chart.points, chart.target)
+    blocks: list[Block] = []
+    for chip in dict.fromkeys(point.target for point in others):
+        own = [point for point in others if point.target == chip]
+        told = Text(f"on {chip}, whose prices are others (no choice, no front):")
+        by = ChosenBy(energy=next(iter(own[0].test.energy_j)), time=next(iter(own[0].test.time_s), None))
+        rows = [_cells(by, point) for point in own]
+        blocks.append(Section("", [told, Table(_head(by), rows, f"Points of {chip}", most=LISTED)]))
+    return blocks
+
+
+def _hint(chart: Chart) -> list[Block]:
+    _, others = by_chip(chart.points, chart.target)
+    return [Details("What is drawn", [Text(MEANINGS), *([Text(BESIDE)] if others else [])], unfolded=True)]
+
+
+def _times(ratios: Mapping[str, float | None], what: str) -> str:
+    return ", ".join(
+        f"{'–' if ratio is None else f'{ratio:.2f}'} times less {what} ({name})" for name, ratio in ratios.items()
+    )
+
+
+def saved(chart: Chart) -> Text:
+    """How much less energy than the usual mapping is needed, chosen cleanly and seen on the test split."""
+    if chart.saving is None:
+        return Text("the usual mapping (8 bits, one plane, whole recordings) is not in the grid: no saving to tell")
+    usual = chart.point(chart.saving.usual)
+    lines = [f"against {usual.label} (#{usual.number}), for at most a point of accuracy:"]
+    for words, other in (
+        ("chosen on the training split", chart.saving.chosen),
+        ("least on the test split (seen, not chosen)", chart.saving.seen),
+    ):
+        lines.append(
+            f"  {words}: #{other.point} {chart.point(other.point).label}: {_times(other.energy, 'energy')}, test "
+            f"accuracy {100 * other.accuracy:+.2f} points"
+        )
+    return Text("\n".join(lines))
+
+
+def _saving(chart: Chart) -> list[Block]:
+    return [Section("Less energy than the usual mapping", [saved(chart)])]
+
+
+def _budget(chart: Chart) -> list[Block]:
+    """The point that a budget picks, what it gives up, and its commands."""
+    pick = chart.budget
+    if pick is None:
+        return []
+    point, best, wanted = chart.point(pick.point), chart.point(pick.best), " and ".join(pick.budgets)
+    if pick.fits:
+        lines = [f"{wanted}: {pick.fitting} of {len(chart.points)} points fit; take #{point.number} {point.label}"]
+    else:
+        lines = [f"{wanted}: no point fits; the nearest is #{point.number} {point.label}"]
+        lines += [f"  misses {_missed(what, each.found, each.limit)}" for what, each in pick.misses.items()]
+    beside = "  it is the best of all points: nothing is given up"
+    if point is not best:
+        up = pick.given_up
+        costs = [_times(up.energy, "energy"), *([_times(up.time, "time")] if up.time else [])]
+        beside = (
+            f"  beside the best, #{best.number} {best.label}: expected {100 * up.expected:+.2f} points, test "
+            f"{100 * up.accuracy:+.2f} points, {', '.join(costs)}"
+        )
+    table = Table(_head(chart.chosen_by), [_cells(chart.chosen_by, point)], "The point that was picked")
+    return [Section("Your budget", [Text("\n".join(lines)), table, Text(beside), *_commands([point])])]
+
+
+def _missed(what: str, value: float, limit: float) -> str:
+    if what == "accuracy":
+        return f"{what}: expected are {100 * value:.2f} %, wanted {100 * limit:g} %"
+    unit = next(iter(UNITS[what]))
+    return f"{what}: it takes {si(value, unit)}, allowed {si(limit, unit)}"
+
+
+def _points(chart: Chart) -> list[Block]:
+    rates = chart.measured.recordings_per_s
+    rows = [[*_cells(chart.chosen_by, point), f"{rates[str(point.number)]:,.0f}"] for point in chart.points]
+    caption = f"{len(rows)} points; the last column is measured on the machine that charts"
+    table = Table([*_head(chart.chosen_by), "recordings/s, measured"], rows, caption, most=0)
+    return [table, Details("Commands of every point", _commands(chart.points))]
+
+
+def _refused(chart: Chart) -> list[Block]:
+    lines = [f"does not fit: {each.network} {each.storage}, {each.cores}: {each.why[0]}" for each in chart.refused]
+    left = len(lines) - LISTED
+    more = [f"does not fit: {left} more, see chart.json"] if left > 0 else []
+    return [Text("\n".join([*lines[:LISTED], *more]))] if lines else []
+
+
+def _provenance(chart: Chart) -> list[Block]:
+    files = [["recordings", chart.data.path, chart.data.sha256]]
+    files += [[network.name, network.path, network.sha256] for network in chart.networks]
+    trained = [[each.name, each.system, each.trained_by or "not known"] for each in chart.networks]
+    grid = [
+        [name, ", ".join(_value(value) for value in getattr(chart.grid, name)) or "all"]
+        for name in chart.grid.__slots__
+    ]
+    titles = [
+        [f"{kind}, {name}", title]
+        for kind, tables in (("energy", chart.tables.energy), ("time", chart.tables.time))
+        for name, title in tables.items()
+    ]
+    return [
+        Table(["", "name", "sha256"], files, "Files", words=True),
+        Table(["network", "system", "trained by"], trained, "Trainings", words=True),
+        Table(["axis", "values"], grid, "Grid", words=True),
+        Table(["", "source"], titles, "Tables of prices and times", words=True),
+        Text(f"Hash over all figures but measured ones: {chart.digest}"),
+        Text("Command that repeats this chart:"),
+        Code([chart.command]),
+    ]
+
+
+def _value(value: object) -> str:
+    return "+".join(map(str, value)) if isinstance(value, tuple) else str(value)
