@@ -17,7 +17,7 @@ import numpy as np
 
 from spikeloom.compiler.interpret import channels_last, run_float, vote
 from spikeloom.compiler.ir import Network
-from spikeloom.compiler.targets.base import CROSSBARS, load_target
+from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.truenorth.codebook import COPIES, MOST, LevelNetwork, Run, in_levels, run_levels
 from spikeloom.compiler.targets.truenorth.in_time import lower_in_time
 from spikeloom.models.recordings.evtouch import Recordings
@@ -56,7 +56,7 @@ def main() -> None:
     """Print the figures."""
     data_path, *words = sys.argv[1:]
     arguments = build_parser().parse_args(["compile", *words, "-o", "unused.loom"])
-    network, chip = load_network(arguments.checkpoint, arguments).network, load_target("truenorth", CROSSBARS)
+    network, chip = load_network(arguments.checkpoint, arguments).network, load_target("truenorth")
     forgetful = replace(network, populations=tuple(replace(p, beta=0.0, alpha=0.0) for p in network.populations))
     data = recordings(data_path, "test", classes=network.classes, taxels=network.input.taxels)
 

@@ -334,7 +334,7 @@ UNVERIFIED = {"neuron.leak_bits", "neuron.threshold_bits", "neuron.mask_bits", "
 
 
 def test_truenorth_limits_with_source_and_confidence():
-    target = load_target("truenorth", CROSSBARS)
+    target = load_target("truenorth")
     assert {rule: target.limit(rule) for rule in target.limits} == TRUENORTH
     assert all(entry.source and entry.confidence for entry in target.limits.values())
     assert {rule for rule, entry in target.limits.items() if entry.confidence == "unverified"} == UNVERIFIED
@@ -343,7 +343,7 @@ def test_truenorth_limits_with_source_and_confidence():
 
 
 def test_truenorth_energy_has_two_readings_and_only_one_has_a_floor():
-    target = load_target("truenorth", CROSSBARS)
+    target = load_target("truenorth")
     read = {table.name: (table.joule("synaptic_event"), table.floor_w) for table in target.energy}
     assert read == {
         "all_in": (pytest.approx(26e-12), None),

@@ -9,14 +9,14 @@ from hypothesis import strategies as st
 from random_crossbars import assert_same, crossbars, events
 
 from spikeloom.compiler.errors import DataError, NumericRangeError
-from spikeloom.compiler.targets.base import CROSSBARS, load_target
+from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.truenorth.builder import Draft, Neuron, history_free
 from spikeloom.compiler.targets.truenorth.legalize import faults
 from spikeloom.compiler.targets.truenorth.netlist import RESET_LINEAR, RESET_NONE, RESET_TO
 from spikeloom.runtime.machines.truenorth import engine, spec
 from spikeloom.runtime.machines.truenorth.trace import Counts, Trace
 
-CHIP = load_target("truenorth", CROSSBARS)
+CHIP = load_target("truenorth")
 
 
 def one(batch: Trace, sample: int = 0) -> Trace:

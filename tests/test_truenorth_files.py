@@ -12,7 +12,7 @@ from random_crossbars import crossbars
 from spikeloom.compiler.errors import FormatError
 from spikeloom.compiler.formats import archive
 from spikeloom.compiler.formats.archive import is_netlist
-from spikeloom.compiler.targets.base import CROSSBARS, load_target
+from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.netlist import read_only
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.compiler.targets.truenorth.builder import Draft, Neuron, history_free
@@ -152,7 +152,7 @@ def test_any_numbers_are_refused_or_told_or_run(tmp_path_factory, netlist, name,
         found = read_crossbars(path)
     except FormatError:
         return
-    if not faults(found, load_target("truenorth", CROSSBARS)):
+    if not faults(found, load_target("truenorth")):
         assert found.drain < 2**20
         engine.simulate(replace(found, readout_first=np.minimum(found.readout_first, 9)), np.ones((1, 3, 4), np.uint8))
 

@@ -15,24 +15,24 @@ from random_networks import chain
 from spikeloom.compiler.dynamics import Clocks
 from spikeloom.compiler.errors import CapacityError, ModelError
 from spikeloom.compiler.interpret import run_float
-from spikeloom.compiler.targets.base import CROSSBARS, load_target
+from spikeloom.compiler.targets.base import load_target
+from spikeloom.compiler.targets.truenorth.builder import crossing_points
 from spikeloom.compiler.targets.truenorth.codebook import (
     BIN_TICKS,
     COPIES,
     MOST,
+    WEIGHTS,
     Layer,
     LevelNetwork,
     codebook,
     in_levels,
-    level_points,
     run_levels,
-    type_weights,
 )
 from spikeloom.compiler.targets.truenorth.in_time import first_spikes, lower_in_time
 from spikeloom.compiler.targets.truenorth.legalize import faults
 from spikeloom.runtime.machines.truenorth import engine, spec
 
-CHIP = load_target("truenorth", CROSSBARS)
+CHIP = load_target("truenorth")
 NARROW = replace(CHIP, limits=dict(CHIP.limits) | {"core.axons": replace(CHIP.limits["core.axons"], value=60)})
 """The same chip with few axons, so that small layers are split."""
 
@@ -76,7 +76,7 @@ def replace_first(trace):
 def test_axons_make_every_level(copies):
     low, high = (-1, 1) if copies == 2 else (-(1 << copies - 1), (1 << copies - 1) - 1)
     levels = np.arange(low, high + 1)
-    made = level_points(levels, copies) @ np.array(type_weights(copies))[:copies]
+    made = crossing_points(levels, WEIGHTS[copies]) @ np.array(WEIGHTS[copies])
     np.testing.assert_array_equal(made, levels)
 
 

@@ -11,12 +11,12 @@ from random_crossbars import assert_same
 
 from spikeloom.compiler.dynamics import NO_CLOCKS, with_clocks
 from spikeloom.compiler.errors import CapacityError
-from spikeloom.compiler.targets.base import CROSSBARS, load_target
+from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.truenorth import legalize as rules
+from spikeloom.compiler.targets.truenorth.builder import crossing_points
 from spikeloom.compiler.targets.truenorth.lower import cores_needed, lower
 from spikeloom.compiler.targets.truenorth.native import (
     BASES,
-    crossing_points,
     faults,
     highest_level,
     joined,
@@ -27,7 +27,7 @@ from spikeloom.runtime.machines.truenorth import engine, spec
 from spikeloom.runtime.machines.truenorth.twins import find_twins
 from spikeloom.runtime.machines.votes import class_counts
 
-CHIP = load_target("truenorth", CROSSBARS)
+CHIP = load_target("truenorth")
 
 NETWORKS = st.builds(
     random_network,
@@ -43,7 +43,7 @@ NETWORKS = st.builds(
 @pytest.mark.parametrize("copies", BASES)
 def test_copies_of_an_input_make_every_level(copies):
     levels = np.arange(-highest_level(copies), highest_level(copies) + 1)
-    points = crossing_points(levels, copies)
+    points = crossing_points(levels, BASES[copies])
     assert set(np.unique(points)) == {0, 1}
     np.testing.assert_array_equal(points @ np.array(BASES[copies]), levels)
 

@@ -24,7 +24,7 @@ import numpy.typing as npt
 
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.fixedpoint import IntArray
-from spikeloom.compiler.targets.base import CROSSBARS, load_target
+from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.truenorth.legalize import require_legal
 from spikeloom.compiler.targets.truenorth.netlist import RESET_NONE, RESET_TO, CrossbarNetlist
 from spikeloom.compiler.targets.truenorth.netlist_file import read_crossbars
@@ -37,7 +37,7 @@ EventArray = npt.NDArray[np.uint8] | npt.NDArray[np.bool_]
 def read(path: str) -> CrossbarNetlist:
     """Read a netlist of crossbar cores that breaks no rule of its chip."""
     netlist = read_crossbars(path)
-    require_legal(netlist, load_target(netlist.target, CROSSBARS))
+    require_legal(netlist, load_target(netlist.target))
     return netlist
 
 
@@ -85,7 +85,7 @@ def export(netlist: CrossbarNetlist, events: EventArray | None = None) -> Iterat
     x, y = netlist.core_x - left, netlist.core_y - low
     voters = np.flatnonzero(netlist.readout_class >= 0)
     bus = (0, int(y.max()) + 1)  # a row of its own above all cores
-    chip = load_target(netlist.target, CROSSBARS)
+    chip = load_target(netlist.target)
     config = {
         "num_neurons": chip.limit("core.neurons"),
         "num_axons": chip.limit("core.axons"),

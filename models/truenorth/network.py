@@ -22,7 +22,7 @@ from torch import Tensor, nn
 
 from spikeloom.compiler.dynamics import NO_CLOCKS, Clocks
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.targets.base import CROSSBARS, load_target
+from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.truenorth.native import (
     LEAK_MOST,
     THRESHOLD_MOST,
@@ -127,7 +127,7 @@ def sized(
     OptionError
         If the sensor is too large, or the features cannot be dealt to groups that fit.
     """
-    axons = load_target(CHIP, CROSSBARS).limit("core.axons")
+    axons = load_target(CHIP).limit("core.axons")
     room = axons // copies
     if taxels * channels > room:
         raise OptionError(

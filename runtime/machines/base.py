@@ -24,7 +24,7 @@ from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.formats.archive import stated
 from spikeloom.compiler.interpret import vote
-from spikeloom.compiler.targets.base import COMPARTMENTS, Target, load_target
+from spikeloom.compiler.targets.base import Target, load_target
 from spikeloom.compiler.targets.netlist import Netlist
 from spikeloom.runtime import machines
 from spikeloom.runtime.report.sections import Outcome, Section, Text
@@ -78,14 +78,13 @@ class Machine(ABC):
     netlist: Any
     """The placed network as the chip holds it, a :class:`Netlist`."""
 
-    cores: ClassVar[str] = COMPARTMENTS
     details: ClassVar[tuple[str, ...]]
     """How deep a price can go, the usual one first."""
 
     @cached_property
     def target(self) -> Target:
         """The chip."""
-        return load_target(self.netlist.target, self.cores)
+        return load_target(self.netlist.target)
 
     @property
     @abstractmethod

@@ -13,8 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler.dynamics import NO_CLOCKS, Clocks
+from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.targets.loihi1.netlist import read_only
-from spikeloom.compiler.targets.truenorth.netlist import RESET_TO, CrossbarNetlist
+from spikeloom.compiler.targets.truenorth.netlist import AXON_TYPES, RESET_TO, CrossbarNetlist
 
 Rows = list[tuple[int, ...]]
 
@@ -23,7 +24,8 @@ Rows = list[tuple[int, ...]]
 class Neuron:
     """Parameters of a neuron; meanings as in :class:`netlist.CrossbarNetlist`."""
 
-    weights: tuple[int, int, int, int] = (1, 0, 0, 0)
+    weights: tuple[int, ...] = (1,)
+    """Of the axon types; zero for those that are not named."""
     leak: int = 0
     leak_reversal: bool = False
     threshold: int = 1
@@ -39,13 +41,31 @@ RELAY = Neuron()
 """Spikes in every tick in which its axon of type 0 does, and remembers nothing."""
 
 
-def history_free(weights: tuple[int, int, int, int], threshold: int, *, bias: int = 0) -> Neuron:
+def history_free(weights: tuple[int, ...], threshold: int, *, bias: int = 0) -> Neuron:
     """A neuron that spikes when its sum and bias reach the threshold, and forgets everything within the tick.
 
     The threshold is a leak: what is at least zero after it spikes and is reset to zero, what is below zero is reset to
     zero by the negative threshold. (The encoding of RANC's ``teaconversion.py``.)
     """
     return Neuron(weights=weights, leak=bias - threshold, threshold=0)
+
+
+def crossing_points(levels: IntArray, weights: Sequence[int]) -> IntArray:
+    """Which axons of an input to join, as 0 and 1 along a new last axis, so that their weights add up to each level.
+
+    One weight is negative, the others are 1, 2, 4 as far as they go.
+
+    Examples
+    --------
+    >>> crossing_points(np.array([-3, -2, -1, 0, 1, 2, 3]), (-3, 1, 2)).tolist()
+    [[1, 0, 0], [1, 1, 0], [1, 0, 1], [0, 0, 0], [0, 1, 0], [0, 0, 1], [0, 1, 1]]
+    >>> crossing_points(np.array([-4, -1, 0, 3]), (1, 2, -4)).tolist()
+    [[0, 0, 1], [1, 1, 1], [0, 0, 0], [1, 1, 0]]
+    """
+    negative = levels < 0
+    rest = np.where(negative, levels - min(weights), levels)
+    points = [negative if weight < 0 else (rest & weight) > 0 for weight in weights]
+    return np.stack(points, axis=-1).astype(np.int64)
 
 
 @dataclass(slots=True, kw_only=True)
@@ -161,6 +181,7 @@ class Draft:
         label, opens = np.full(len(neurons), -1), np.zeros(len(neurons), np.int64)
         for core, number, voted, tick in votes:
             label[first[core] + number], opens[first[core] + number] = voted, tick
+        weights = [(*neuron.weights, *[0] * (AXON_TYPES - len(neuron.weights))) for neuron, _, _ in neurons]
         held = [sorted(set(points)) for core in self.cores for points in core.synapses]
         parameters = {
             name: column([getattr(neuron, name) for neuron, _, _ in neurons])
@@ -182,7 +203,7 @@ class Draft:
             axon_type=column([kind for core in self.cores for _, kind in core.axons]),
             axon_synapses=read_only(np.cumsum([0, *map(len, held)])),
             synapse_neuron=column([neuron for points in held for neuron in points]),
-            weight=read_only(np.array([neuron.weights for neuron, _, _ in neurons], np.int64).reshape(-1, 4)),
+            weight=read_only(np.array(weights, np.int64).reshape(-1, AXON_TYPES)),
             layer=column([layer for _, layer, _ in neurons]),
             neuron=column([number for _, _, number in neurons]),
             readout_class=read_only(label),

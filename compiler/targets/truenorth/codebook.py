@@ -18,7 +18,6 @@ from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.ir import INPUT, Network, Population
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.netlist import read_only
-from spikeloom.compiler.targets.truenorth.netlist import AXON_TYPES
 
 BoolArray = npt.NDArray[np.bool_]
 
@@ -28,7 +27,10 @@ BIN_TICKS = 20
 MOST = BIN_TICKS - 1
 """Spikes that a partial sum sends at the most."""
 
-COPIES = (2, 3, 4)
+WEIGHTS = {2: (1, -1), 3: (1, 2, -4), 4: (1, 2, 4, -8)}
+"""Weights of the axon types of an input, in levels, by how many axons it has."""
+
+COPIES = tuple(WEIGHTS)
 """Axons of an input that can be asked for."""
 
 MOST_COPIES = 3
@@ -71,7 +73,7 @@ def codebook(weight: FloatArray, copies: int) -> Levels:
     >>> found.level.tolist(), [f"{step:.2f}" for step in found.step]
     ([[1.0, -1.0, 0.0]], ['0.45'])
     """
-    low, high = (-1, 1) if copies == 2 else (-(1 << (copies - 1)), (1 << (copies - 1)) - 1)
+    low, high = min(WEIGHTS[copies]), sum(WEIGHTS[copies][:-1])
     largest = np.maximum(np.abs(weight).max(axis=1, keepdims=True), 1e-12)
     best = np.full(len(weight), np.inf)
     step, level = np.ones(len(weight)), np.zeros(weight.shape)
@@ -82,32 +84,6 @@ def codebook(weight: FloatArray, copies: int) -> Levels:
         better = error < best
         best[better], step[better], level[better] = error[better], tried[better, 0], rounded[better]
     return Levels(level=level.astype(np.float32), step=step.astype(np.float32))
-
-
-def type_weights(copies: int) -> tuple[int, ...]:
-    """Weights of the four axon types, in levels, with so many axons an input: its own first, then none.
-
-    Examples
-    --------
-    >>> type_weights(2), type_weights(3), type_weights(4)
-    ((1, -1, 0, 0), (1, 2, -4, 0), (1, 2, 4, -8))
-    """
-    own = (1, -1) if copies == 2 else (*(1 << bit for bit in range(copies - 1)), -(1 << (copies - 1)))
-    return (*own, *[0] * (AXON_TYPES - copies))
-
-
-def level_points(levels: IntArray, copies: int) -> IntArray:
-    """Which axons of an input to join, as 0 and 1 along a new last axis, so that each level comes out.
-
-    Examples
-    --------
-    >>> level_points(np.array([-4, -1, 0, 3]), 3).tolist(), level_points(np.array([-1, 0, 1]), 2).tolist()
-    ([[0, 0, 1], [1, 1, 1], [0, 0, 0], [1, 1, 0]], [[0, 1], [0, 0], [1, 0]])
-    """
-    if copies == 2:
-        return np.stack([levels > 0, levels < 0], axis=-1).astype(np.int64)
-    found: IntArray = levels[..., None] >> np.arange(copies) & 1
-    return found
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -167,8 +143,8 @@ def group_width(copies: int, chip: Target) -> int:
 
     Examples
     --------
-    >>> from spikeloom.compiler.targets.base import CROSSBARS, load_target
-    >>> [group_width(copies, load_target("truenorth", CROSSBARS)) for copies in (2, 3)]
+    >>> from spikeloom.compiler.targets.base import load_target
+    >>> [group_width(copies, load_target("truenorth")) for copies in (2, 3)]
     [126, 84]
     """
     return (chip.limit("core.axons") - EMPTYING) // copies

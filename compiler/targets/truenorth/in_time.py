@@ -28,18 +28,17 @@ import numpy as np
 from spikeloom.compiler.errors import CapacityError, Violation
 from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.targets.truenorth.builder import RELAY, Draft, Neuron
+from spikeloom.compiler.targets.truenorth.builder import RELAY, Draft, Neuron, crossing_points
 from spikeloom.compiler.targets.truenorth.codebook import (
     BIN_TICKS,
     EMPTYING,
     LIFT,
     MOST,
     PULL,
+    WEIGHTS,
     Layer,
     LevelNetwork,
     gate_axons,
-    level_points,
-    type_weights,
 )
 from spikeloom.compiler.targets.truenorth.legalize import signed_range
 from spikeloom.compiler.targets.truenorth.lower import place_cores
@@ -52,13 +51,8 @@ RELAYED = 2
 """Ticks that a spike of a split layer takes to the next one, by a relay or without."""
 
 
-# -- placing -----------------------------------------------------------------------------------------------------------
-
 Place = tuple[int, int]
 """Core, and neuron or line on it."""
-
-Aim = tuple[int, int, int]
-"""Core, line, and ticks on the way."""
 
 
 def lower_in_time(
@@ -97,6 +91,11 @@ def _starts(network: LevelNetwork) -> list[int]:
     return starts
 
 
+def _types(copies: int) -> tuple[int, ...]:
+    """Weights of the four axon types where an input has so many axons."""
+    return (*WEIGHTS[copies], *[0] * (AXON_TYPES - copies))
+
+
 def first_spikes(network: LevelNetwork) -> dict[str, int]:
     """Tick in which each layer spikes for the first data step."""
     starts = _starts(network)
@@ -117,7 +116,7 @@ class _Placing:
     chip: Target
     starts: list[int]
     draft: Draft = field(default_factory=Draft)
-    wires: list[tuple[Place, Aim]] = field(default_factory=list)
+    wires: list[tuple[Place, tuple[int, int, int]]] = field(default_factory=list)
     relay_core: int | None = None
 
     def layer(self, depth: int, ends: list[list[Place]] | None) -> list[list[Place]]:
@@ -131,16 +130,15 @@ class _Placing:
         """A layer whose inputs fit a core: a neuron for each axon that hears it, all in one tick."""
         inputs: list[list[Place]] = [[] for _ in range(layer.level.shape[1])]
         aims = [(n, end) for n in range(len(layer.level)) for end in ([None] if ends is None else ends[n])]
-        own, start = type_weights(layer.copies), self.starts[depth]
+        types, start = _types(layer.copies), self.starts[depth]
         for part in self._packed(layer, aims):
             core = self.draft.core(0, 0)
             for n, end in part:
                 threshold = int(layer.threshold[n])
                 # one that would spike without inputs has to wait for a clock: its leak alone must not do
-                lift, leak = (own[CLOCK], -threshold) if threshold > 0 else (1 - threshold, -1)
+                lift, leak = (types[CLOCK], -threshold) if threshold > 0 else (1 - threshold, -1)
                 self._require_leak(layer, n, max(-leak, lift))
-                weights = (*own[:CLOCK], lift)
-                made = Neuron(weights=(weights[0], weights[1], weights[2], weights[3]), leak=leak, threshold=0)
+                made = Neuron(weights=(*types[:CLOCK], lift), leak=leak, threshold=0)
                 self._add(core, made, layer, n, end, depth)
             chosen = np.array([n for n, _ in part])
             self._inputs(core, layer, layer.level[chosen].T, range(layer.level.shape[1]), inputs)
@@ -154,15 +152,14 @@ class _Placing:
         inputs: list[list[Place]] = [[] for _ in range(layer.level.shape[1])]
         groups, start = layer.groups, self.starts[depth]
         sums = self._gated(depth, layer, len(groups), ends)
-        most, own = self.chip.limit("core.neurons"), type_weights(layer.copies)
+        most, types = self.chip.limit("core.neurons"), _types(layer.copies)
         for number, group in enumerate(groups):
             aims = [(n, sign) for n in range(len(layer.level)) for sign in (1, -1)]
             for first in range(0, len(aims), most):
                 core, part = self.draft.core(0, 0), aims[first : first + most]
                 for n, sign in part:
-                    weights = (*(sign * weight for weight in own[:CLOCK]), PULL)
                     made = Neuron(
-                        weights=(weights[0], weights[1], weights[2], weights[3]),
+                        weights=(*(sign * weight for weight in types[:CLOCK]), PULL),
                         reset_mode=RESET_LINEAR,
                         negative_saturates=True,
                     )
@@ -260,7 +257,7 @@ class _Placing:
 
     def _inputs(self, core: int, layer: Layer, levels: IntArray, sources: range, inputs: list[list[Place]]) -> None:
         """Add the axons of inputs (inputs, neurons of the core), a copy only where something is joined."""
-        points = level_points(levels, layer.copies)
+        points = crossing_points(levels, WEIGHTS[layer.copies])
         for row, source in enumerate(sources):
             for copy in range(layer.copies):
                 joined = np.flatnonzero(points[row, :, copy]).tolist()

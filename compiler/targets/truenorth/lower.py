@@ -20,17 +20,16 @@ import numpy as np
 from spikeloom.compiler.errors import CapacityError, Violation
 from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.targets.truenorth.builder import Draft, Neuron
+from spikeloom.compiler.targets.truenorth.builder import Draft, Neuron, crossing_points
 from spikeloom.compiler.targets.truenorth.native import (
     BASES,
     UNIT,
     NativeNetwork,
     Stage,
     Tower,
-    crossing_points,
     faults,
 )
-from spikeloom.compiler.targets.truenorth.netlist import AXON_TYPES, RESET_TO, CrossbarNetlist
+from spikeloom.compiler.targets.truenorth.netlist import RESET_TO, CrossbarNetlist
 
 Place = tuple[int, int]
 """Core, and neuron or line on it."""
@@ -139,7 +138,7 @@ class _Placing:
         own = range(block * stage.size, (block + 1) * stage.size)
         copies = [(n, end) for n in own for end in ([None] if ends is None else ends[n])]
         most, offset = self.chip.limit("core.neurons"), self.numbers.get(stage.name, 0)
-        points = crossing_points(stage.level[block], self.network.copies)
+        points = crossing_points(stage.level[block], BASES[self.network.copies])
         for first in range(0, len(copies), most):
             core = self.draft.core(0, 0)
             part = copies[first : first + most]
@@ -172,11 +171,9 @@ class _Placing:
 
     def neuron(self, stage: Stage, n: int, depth: int) -> Neuron:
         """A neuron of a stage, as the chip has it."""
-        bases = BASES[self.network.copies]
-        weights = [UNIT * base for base in (*bases, *[0] * (AXON_TYPES - len(bases)))]
         leak = int(stage.leak[n])
         return Neuron(
-            weights=(weights[0], weights[1], weights[2], weights[3]),
+            weights=tuple(UNIT * base for base in BASES[self.network.copies]),
             leak=leak,
             threshold=int(stage.threshold[n]),
             reset_mode=RESET_TO,

@@ -53,22 +53,6 @@ def highest_level(copies: int) -> int:
     return -BASES[copies][0]
 
 
-def crossing_points(levels: IntArray, copies: int) -> IntArray:
-    """Which copies of an input to join, as 0 and 1 along a new last axis, so that each level comes out.
-
-    Examples
-    --------
-    >>> crossing_points(np.array([-3, -2, -1, 0, 1, 2, 3]), 3).tolist()
-    [[1, 0, 0], [1, 1, 0], [1, 0, 1], [0, 0, 0], [0, 1, 0], [0, 0, 1], [0, 1, 1]]
-    """
-    most = highest_level(copies)
-    negative = levels < 0
-    rest = np.where(negative, levels + most, levels)[..., None]
-    bits = rest >> np.arange(copies - 1) & 1
-    found: IntArray = np.concatenate([negative[..., None], bits], axis=-1).astype(np.int64)
-    return found
-
-
 def steepest_leak(threshold: IntArray, depth: int) -> IntArray:
     """Largest leak at a depth: one that reaches neither threshold nor floor in the ticks before the first data.
 

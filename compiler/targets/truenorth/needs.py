@@ -6,10 +6,10 @@ Nothing is lowered. Bounds are those that no layout can avoid: a layer that brea
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
+from spikeloom.compiler.errors import Violation
 from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.ir import Network, fan_in
 from spikeloom.compiler.targets.base import Target
@@ -18,19 +18,7 @@ MOST_COPIES = 4
 """Axons of an input beyond which types repeat: there are four."""
 
 
-@dataclass(frozen=True, slots=True)
-class Need:
-    """A need of a layer that the chip does not meet, in words; `rule` is the limit in the target file."""
-
-    layer: str
-    where: str
-    found: str
-    allowed: str
-    rule: str
-    remedy: str
-
-
-def needs(network: Network, chip: Target) -> tuple[Need, ...]:
+def needs(network: Network, chip: Target) -> tuple[Violation, ...]:
     """Every need that the chip does not meet, layer by layer."""
     return tuple(need for layer in range(len(network.populations)) for need in _layer(network, layer, chip))
 
@@ -56,35 +44,38 @@ def _distinct_weights(network: Network, layer: int) -> IntArray:
     return found
 
 
-def _layer(network: Network, layer: int, chip: Target) -> Iterator[Need]:
+def _layer(network: Network, layer: int, chip: Target) -> Iterator[Violation]:
     population = network.populations[layer]
     name, axons = population.name, chip.limit("core.axons")
     everyone = f"{name}, all {population.size:,} neurons"
-    leak = f"{chip.name}.neuron.leak"
+
+    def need(owner: str, found: str, allowed: str, rule: str, remedy: str) -> Violation:
+        return Violation(owner=owner, used=found, allowed=allowed, rule=f"{chip.name}.{rule}", remedy=remedy)
+
     if 0 < population.beta < 1:
         kept = f"keep {population.beta:g} of their membranes a step"
-        yield Need(name, everyone, kept, "an added leak", leak, "forget within a step, or leak by a constant")
+        yield need(everyone, kept, "an added leak", "neuron.leak", "forget within a step, or leak by a constant")
     if population.alpha:
         kept = f"keep {population.alpha:g} of their currents a step"
-        yield Need(name, everyone, kept, "no current", leak, "omit the current")
+        yield need(everyone, kept, "no current", "neuron.leak", "omit the current")
     inputs = fan_in(network, layer)
     most = int(inputs.max(initial=0))
     if most > axons:
         remedy = "split the sum, or give the layer fewer inputs"
         where = _worst(name, inputs, axons)
-        yield Need(name, where, f"{most:,} inputs", str(axons), f"{chip.name}.core.axons", remedy)
+        yield need(where, f"{most:,} inputs", str(axons), "core.axons", remedy)
     copies = min(max(axons // max(most, 1), 1), MOST_COPIES, chip.limit("core.axon_types"))
     distinct, allowed = _distinct_weights(network, layer), 2**copies - 1
     if distinct.max(initial=0) > allowed:
         beside = f"{allowed} with {copies} axon{'s' * (copies > 1)} an input"
         remedy = "fewer weights, or each input on several axons of different types"
         where, found = _worst(name, distinct, allowed), f"{distinct.max():,} different weights"
-        yield Need(name, where, found, beside, f"{chip.name}.neuron.weight_bits", remedy)
+        yield need(where, found, beside, "neuron.weight_bits", remedy)
     reached, targets = _axons_reached(network, layer, chip), chip.limit("neuron.targets")
     if reached > targets:
         remedy = "copy the neurons, or split their spikes by relays"
         found = f"send spikes to {reached} axons at least"
-        yield Need(name, everyone, found, str(targets), f"{chip.name}.neuron.targets", remedy)
+        yield need(everyone, found, str(targets), "neuron.targets", remedy)
 
 
 def _worst(name: str, amounts: IntArray, allowed: int) -> str:

@@ -83,6 +83,9 @@ def run(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int
     chip = load_target(arguments.target)
     if is_whole(arguments):
         return take(arguments)
+    if unknown := set(arguments.dump_after) - {step.name for step in chip.passes}:
+        names = ", ".join(step.name for step in chip.passes)
+        raise OptionError(f"--dump-after {', '.join(sorted(unknown))}: no such pass; allowed: {names}")
     own = trained_for(arguments.checkpoint) or chip_commands(arguments.target)
     if own is not None:
         return own.compile_network(arguments)  # type: ignore[no-any-return]
@@ -92,9 +95,6 @@ def run(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int
         raise OptionError(
             f"--margin {arguments.margin:g}: only observed ranges have one; add --ranges observed or leave it away"
         )
-    if unknown := set(arguments.dump_after) - {step.name for step in chip.passes}:
-        names = ", ".join(step.name for step in chip.passes)
-        raise OptionError(f"--dump-after {', '.join(sorted(unknown))}: no such pass; allowed: {names}")
     recipes = parse_recipes(arguments)
     cores_for = parse_cores(arguments.cores_for)
     require_goal(arguments.optimize, cores_for, chip, calibrated=arguments.calibrate is not None, chips=arguments.chips)

@@ -12,12 +12,11 @@ import numpy as np
 from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.targets.base import Target, load_target
-from spikeloom.compiler.targets.truenorth.legalize import require_legal
-from spikeloom.compiler.targets.truenorth.lower import lower
 from spikeloom.compiler.targets.truenorth.native import SYSTEM, highest_level
 from spikeloom.compiler.targets.truenorth.native_file import Trained, read_trained
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
 from spikeloom.compiler.targets.truenorth.netlist_file import write_crossbars
+from spikeloom.compiler.targets.truenorth.passes import Options
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.recordings.windows import steps_of
 from spikeloom.runtime.inputs.files import shipped
@@ -81,7 +80,6 @@ def build(path: str, weights: str | None, file: Path) -> tuple[CrossbarNetlist, 
         If it does not fit.
     """
     found, chip = trained(path, weights), load_target(NAME)
-    netlist = lower(found.network, chip, provenance=provenance(found))
-    require_legal(netlist, chip)
+    netlist: CrossbarNetlist = chip.compile(found.network, Options(provenance=provenance(found))).netlist
     file.parent.mkdir(parents=True, exist_ok=True)
     return netlist, netlist.n_neurons, write_crossbars(netlist, file)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -12,22 +13,22 @@ import numpy as np
 
 from spikeloom import __version__
 from spikeloom.compiler.errors import ModelError, OptionError
-from spikeloom.compiler.targets.base import CROSSBARS, Target, load_target
-from spikeloom.compiler.targets.truenorth.codebook import COPIES, LevelNetwork, in_levels, run_levels
-from spikeloom.compiler.targets.truenorth.in_time import first_spikes, lower_in_time
-from spikeloom.compiler.targets.truenorth.legalize import require_legal
-from spikeloom.compiler.targets.truenorth.lower import lower
-from spikeloom.compiler.targets.truenorth.native import SYSTEM
+from spikeloom.compiler.ir import Network
+from spikeloom.compiler.passes.expand import Factored
+from spikeloom.compiler.targets.base import Target, load_target
+from spikeloom.compiler.targets.truenorth.codebook import in_levels, run_levels
+from spikeloom.compiler.targets.truenorth.in_time import first_spikes
+from spikeloom.compiler.targets.truenorth.native import SYSTEM, NativeNetwork
 from spikeloom.compiler.targets.truenorth.native_file import Trained, is_trained, read_trained
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
 from spikeloom.compiler.targets.truenorth.netlist_file import write_crossbars
+from spikeloom.compiler.targets.truenorth.passes import Compilation, Options
 from spikeloom.runtime.inputs.files import shipped
-from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
+from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.inputs.recordings import netlist_recordings
 from spikeloom.runtime.machines.truenorth import joining, verdicts
 from spikeloom.runtime.machines.truenorth.describe import describe, describe_trained
 from spikeloom.runtime.machines.truenorth.machine import load
-from spikeloom.runtime.machines.truenorth.refusal import refuse
 from spikeloom.runtime.machines.truenorth.verdicts import BoolArray, PartialSums, Verdict, compare
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.sections import Outcome
@@ -43,7 +44,7 @@ OTHERS: Mapping[str, Any] = {
 STORAGE: Mapping[str, Any] = {
     **dict.fromkeys(("weight_bits", "planes", "scale_groups", "calibrate", "margin", "cores_for", "against"), None),
     **dict.fromkeys(("spike_exact", "prune_unused", "keep_all"), False),
-    **{"ranges": "proven", "chips": 1, "optimize": "cores", "dump_after": []},
+    **{"ranges": "proven", "chips": 1, "optimize": "cores"},
 }
 """Options of ``compile`` for chips that store rounded weights, likewise."""
 
@@ -52,9 +53,6 @@ VERIFY: Mapping[str, Any] = {"original": None, "min_agreement": None, "require":
 
 SPEC_STEPS = 5
 """Data steps of a recording on which the specification runs, too: it takes a second for two hundred ticks."""
-
-FORGET = "give --beta 0 where the file does not say, or train it with --membrane-decay LAYER=0 for every layer"
-
 
 join = joining.join
 
@@ -89,7 +87,7 @@ def inspect(arguments: argparse.Namespace) -> Outcome:
 
 
 def compile_network(arguments: argparse.Namespace) -> Outcome:
-    """Place a network on cores and write it, or say why it does not fit.
+    """Place a network on cores and write it.
 
     Raises
     ------
@@ -97,27 +95,28 @@ def compile_network(arguments: argparse.Namespace) -> Outcome:
         If the options or the network cannot be used, or it does not fit.
     """
     path, trained = arguments.checkpoint, takes(arguments.checkpoint)
-    chip = load_target(arguments.target if not trained else "truenorth", CROSSBARS)
-    if trained and arguments.target != chip.name:
+    chip = load_target("truenorth")
+    if arguments.target != chip.name:
         raise OptionError(f"--target {arguments.target}: {path} was trained for {TITLE}; give --target {chip.name}")
     _refuse_options(arguments, STORAGE, f"is not for {chip.name}")
+    source: NativeNetwork | Factored | Network
     if trained:
-        _refuse_options(arguments, {"in_time": None}, f"{path} was trained for the chip")
         network = read(path, arguments)
-        progress("compiling")
-        netlist = lower(network.network, chip, provenance=provenance(network))
+        source, origin = network.network, provenance(network)
     else:
         loaded = load_network(path, arguments)
-        if arguments.in_time is None:
-            return refuse(path, loaded.network, chip)
-        if arguments.in_time not in COPIES:
-            allowed = ", ".join(map(str, COPIES))
-            raise OptionError(f"--in-time {arguments.in_time}: allowed are {allowed} axons an input")
-        levels = _levels(path, loaded, arguments.in_time, chip)
-        progress("compiling")
-        origin = {"spikeloom": __version__, "checkpoint_sha256": loaded.sha256, **loaded.origin(arguments.run)}
-        netlist = lower_in_time(levels, chip, provenance=origin | {"in_time": arguments.in_time})
-    require_legal(netlist, chip)
+        source, origin = loaded.source, {"spikeloom": __version__, "checkpoint_sha256": loaded.sha256}
+        origin |= loaded.origin(arguments.run) | {"in_time": arguments.in_time}
+    progress("compiling")
+
+    def dump(name: str, done: Compilation) -> None:
+        if name in arguments.dump_after:
+            sys.stderr.write(done.text())
+
+    try:
+        netlist = chip.compile(source, Options(in_time=arguments.in_time, provenance=origin), after=dump).netlist
+    except ModelError as error:
+        raise ModelError(f"{path}: {error}") from error
     return describe(netlist, chip, write_crossbars(netlist, arguments.output))
 
 
@@ -172,7 +171,7 @@ def _verify_trained(arguments: argparse.Namespace, netlist: CrossbarNetlist, _: 
 def _verify_in_time(arguments: argparse.Namespace, netlist: CrossbarNetlist, chip: Target) -> Verdict:
     loaded = load_network(arguments.checkpoint, arguments)
     _require_same(arguments, netlist, loaded.sha256)
-    levels = _levels(arguments.checkpoint, loaded, int(netlist.provenance["in_time"]), chip)
+    levels = in_levels(loaded.network, int(netlist.provenance["in_time"]), chip)
     data = netlist_recordings(arguments, netlist, labels_for="verify")
     sums = np.zeros((3, len(levels.layers)), np.int64)
 
@@ -186,10 +185,3 @@ def _verify_in_time(arguments: argparse.Namespace, netlist: CrossbarNetlist, chi
     verdict = compare(netlist, spikes, first_spikes(levels), data, spec_samples=samples, spec_steps=SPEC_STEPS)
     parts = zip(levels.layers, sums.T.tolist(), strict=True)
     return replace(verdict, sums=tuple(PartialSums(layer.name, *each) for layer, each in parts if layer.is_split))
-
-
-def _levels(path: str, loaded: LoadedNetwork, copies: int, chip: Target) -> LevelNetwork:
-    try:
-        return in_levels(loaded.network, copies, chip)
-    except ModelError as error:
-        raise ModelError(f"{path}: {error}; {FORGET}") from error

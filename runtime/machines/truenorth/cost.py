@@ -92,8 +92,8 @@ def price(table: EnergyTable, events: IntArray, time_s: FloatArray) -> Energy:
 
     Examples
     --------
-    >>> from spikeloom.compiler.targets.base import CROSSBARS, load_target
-    >>> all_in, marginal = load_target("truenorth", CROSSBARS).energy
+    >>> from spikeloom.compiler.targets.base import load_target
+    >>> all_in, marginal = load_target("truenorth").energy
     >>> price(all_in, np.array([1_000_000]), np.array([0.25])).total_j.round(9).tolist()
     [2.6e-05]
     >>> price(marginal, np.array([1_000_000]), np.array([0.25])).total_j.round(7).tolist()

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from spikeloom.compiler.errors import NumericRangeError
 from spikeloom.compiler.fixedpoint import IntArray
-from spikeloom.compiler.targets.base import CROSSBARS, load_target
+from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.truenorth.legalize import signed_range
 from spikeloom.compiler.targets.truenorth.netlist import RESET_LINEAR, RESET_TO, CrossbarNetlist
 from spikeloom.runtime.machines.truenorth import kernel
@@ -65,7 +65,7 @@ def prepare(netlist: CrossbarNetlist, *, careful: bool = False) -> Engine:
     careful : bool
         Whether neurons that nothing keeps within their register are never run together with others.
     """
-    bits = load_target(netlist.target, CROSSBARS).limit("neuron.membrane_bits")
+    bits = load_target(netlist.target).limit("neuron.membrane_bits")
     low, high = signed_range(bits)
     kinds = find_twins(netlist, kernel.HALF)
     twins, plain, steady, cap = _steady_first(netlist, kinds, low, high, careful=careful)

@@ -11,7 +11,7 @@ from typing import NoReturn
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.fixedpoint import IntArray
-from spikeloom.compiler.targets.base import CROSSBARS, with_tables
+from spikeloom.compiler.targets.base import with_tables
 from spikeloom.compiler.targets.truenorth.legalize import require_legal
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
 from spikeloom.compiler.targets.truenorth.netlist_file import read_crossbars
@@ -31,7 +31,6 @@ class TrueNorth(Machine):
     """A netlist that breaks no rule of its chip, and its simulator."""
 
     netlist: CrossbarNetlist
-    cores = CROSSBARS
     details = ("counts",)
     kernel = "tick by tick"
 

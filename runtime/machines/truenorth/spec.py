@@ -31,7 +31,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spikeloom.compiler.targets.base import CROSSBARS, load_target
+from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.truenorth.legalize import signed_range
 from spikeloom.compiler.targets.truenorth.netlist import RESET_LINEAR, RESET_TO, CrossbarNetlist
 from spikeloom.runtime.machines.truenorth.trace import Counts, EventArray, Trace, check_channels, random_bits
@@ -169,7 +169,7 @@ def simulate(netlist: CrossbarNetlist, events: EventArray, *, seed: int = 0) -> 
         If the recording has another number of input channels than the network.
     """
     check_channels(netlist, events.shape[0])
-    bits = load_target(netlist.target, CROSSBARS).limit("neuron.membrane_bits")
+    bits = load_target(netlist.target).limit("neuron.membrane_bits")
     steps = events.shape[1]
     ticks = netlist.ticks(steps)
     neurons = [

@@ -1,0 +1,161 @@
+"""The passes of this chip in their order: a trained network at the top, a netlist that obeys every rule at the end.
+
+There are two ways in. A network that was trained for the chip is whole numbers already and starts at `place`. A float
+network without memory (``--in-time``) is written out, and its weights become levels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from spikeloom.compiler.errors import CapacityError, ModelError, OptionError, VerifyError
+from spikeloom.compiler.invariants import verify
+from spikeloom.compiler.ir import Network
+from spikeloom.compiler.passes import expand
+from spikeloom.compiler.pipeline import Pass
+from spikeloom.compiler.targets.base import Target
+from spikeloom.compiler.targets.truenorth.codebook import COPIES, LevelNetwork, in_levels
+from spikeloom.compiler.targets.truenorth.in_time import lower_in_time
+from spikeloom.compiler.targets.truenorth.legalize import require_legal
+from spikeloom.compiler.targets.truenorth.lower import lower
+from spikeloom.compiler.targets.truenorth.native import SYSTEM, NativeNetwork
+from spikeloom.compiler.targets.truenorth.needs import needs
+from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
+from spikeloom.compiler.targets.truenorth.netlist_file import inconsistencies
+from spikeloom.compiler.text import digest, span, text
+
+WAYS = (
+    f"two ways lead to the chip: --in-time N, N of {', '.join(map(str, COPIES))}, for networks that forget within a "
+    f"step; or training for it, spikeloom train --system {SYSTEM}"
+)
+FORGET = "give --beta 0 where the file does not say, or train it with --membrane-decay LAYER=0 for every layer"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Options:
+    """Axons of an input of a float network, whose sums travel in time; and JSON values to store with the netlist."""
+
+    in_time: int | None = None
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Compilation:
+    """What one compilation was given and has made so far; each field is filled in by the pass of its name."""
+
+    source: NativeNetwork | expand.Factored | Network
+    options: Options
+    target: Target
+    network: Network | None = None
+    levels: LevelNetwork | None = None
+    netlist: CrossbarNetlist | None = None
+
+    def verify(self) -> None:
+        """Check every rule of the newest artefact; VerifyError if a pass broke one."""
+        if self.netlist is not None:
+            if wrong := inconsistencies(self.netlist):
+                raise VerifyError("; ".join(wrong))
+        elif self.levels is None and self.network is not None:
+            verify(self.network)
+
+    def text(self) -> str:
+        """The newest artefact in print."""
+        if self.netlist is not None:
+            made = self.netlist
+            head = f"netlist ({made.n_cores} cores) (neurons {made.n_neurons}) (synapses {made.n_synapses})"
+            arrays = digest(made.weight, made.threshold, made.leak, made.synapse_neuron, made.axon_type)
+            return f"{head} (wires {len(made.wire_neuron)}) #{arrays}\n"
+        if self.levels is not None:
+            return "".join(
+                f"{layer.name} (level {span(layer.level.reshape(-1))} #{digest(layer.level)}) "
+                f"(threshold {span(layer.threshold)} #{digest(layer.threshold)}) (copies {layer.copies})\n"
+                for layer in self.levels.layers
+            )
+        assert self.network is not None, "there is a first pass"
+        return text(self.network)
+
+
+def _expand(done: Compilation) -> Compilation:
+    source = done.source
+    assert not isinstance(source, NativeNetwork), "whole numbers start behind the passes of float networks"
+    network = source if isinstance(source, Network) else expand.expand(source.checkpoint, source.propagation)
+    if done.options.in_time is None:
+        error = CapacityError(needs(network, done.target))
+        if error.violations:
+            error.add_note(WAYS)
+            raise error
+        raise ModelError(f"a float network; {WAYS}")
+    return replace(done, network=network)
+
+
+def _levels(done: Compilation) -> Compilation:
+    assert done.network is not None, "made by the pass before"
+    assert done.options.in_time is not None, "asked for there"
+    try:
+        return replace(done, levels=in_levels(done.network, done.options.in_time, done.target))
+    except ModelError as error:
+        raise ModelError(f"{error}; {FORGET}") from error
+
+
+def _place(done: Compilation) -> Compilation:
+    provenance = done.options.provenance
+    if isinstance(done.source, NativeNetwork):
+        return replace(done, netlist=lower(done.source, done.target, provenance=provenance))
+    assert done.levels is not None, "made by the pass before"
+    return replace(done, netlist=lower_in_time(done.levels, done.target, provenance=provenance))
+
+
+def _legalize(done: Compilation) -> Compilation:
+    assert done.netlist is not None, "made by the pass before"
+    require_legal(done.netlist, done.target)
+    return done
+
+
+PASSES = (
+    Pass(
+        name="expand",
+        does="writes the graph convolution out as synapses, in float64; refuses what no layout could hold",
+        keeps="every spike, up to the rounding of a differently ordered sum",
+        apply=_expand,
+    ),
+    Pass(
+        name="levels",
+        does="rounds the weights of each neuron to a few levels of a step of its own",
+        keeps="the decisions, as well as the levels allow",
+        apply=_levels,
+    ),
+    Pass(
+        name="place",
+        does="puts neurons on cores, inputs on axons of the types that make their levels, and copies or relays where "
+        "a spike has several targets",
+        keeps="every spike; partial sums that travel in time saturate at 19",
+        apply=_place,
+    ),
+    Pass(
+        name="legalize",
+        does="holds the netlist against every rule and refuses one that breaks any",
+        keeps="the netlist",
+        apply=_legalize,
+    ),
+)
+
+
+def start(
+    source: NativeNetwork | expand.Factored | Network, options: Options, target: Target
+) -> tuple[Compilation, tuple[Pass[Compilation], ...]]:
+    """What the passes begin with, and which of them are due: whole numbers need no rounding.
+
+    Raises
+    ------
+    OptionError
+        If there is no such number of axons, or it is asked of whole numbers.
+    """
+    native = isinstance(source, NativeNetwork)
+    if native and options.in_time is not None:
+        raise OptionError(f"--in-time {options.in_time}: the network was trained for the chip; omit it")
+    if options.in_time not in (None, *COPIES):
+        raise OptionError(f"--in-time {options.in_time}: allowed are {', '.join(map(str, COPIES))} axons an input")
+    work = Compilation(source=source, options=options, target=target)
+    return work, PASSES[2:] if native else PASSES
