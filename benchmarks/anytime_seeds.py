@@ -18,8 +18,8 @@ from spikeloom.compiler.formats.checkpoint import read_checkpoint
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.models.recordings.evtouch import load_recordings
 from spikeloom.runtime.commands.choose.anytime import ALLOWED
-from spikeloom.runtime.costs import course
 from spikeloom.runtime.inputs.network import propagation
+from spikeloom.runtime.machines.loihi1.costs import cumulative
 from spikeloom.runtime.report.tables import table
 from spikeloom.runtime.studies.anytime import exits
 
@@ -36,7 +36,7 @@ def main() -> None:
         checkpoint = read_checkpoint(path)
         netlist = compile_network(expand(checkpoint, propagation(checkpoint, None, path)[1])).netlist
         seen, reported = (
-            course.votes_of(netlist, with_clocks(data.events, netlist.clocks), own)
+            cumulative.votes_of(netlist, with_clocks(data.events, netlist.clocks), own)
             for data, own in zip(splits, lengths, strict=True)
         )
         at = exits.standing(reported, lengths[1])

@@ -26,8 +26,8 @@ from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.models.recordings.events import joined_bins
 from spikeloom.models.recordings.evtouch import Recordings, load_recordings
-from spikeloom.runtime.costs.estimate import estimate
 from spikeloom.runtime.inputs.network import propagation
+from spikeloom.runtime.machines.loihi1.costs.estimate import estimate
 from spikeloom.runtime.machines.votes import predictions
 from spikeloom.runtime.report.intervals import of_mean
 

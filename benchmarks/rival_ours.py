@@ -11,8 +11,8 @@ from worker import Job, Task, UnfitError, serve
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
-from spikeloom.runtime.costs import charges, cost
 from spikeloom.runtime.machines.loihi1 import timing
+from spikeloom.runtime.machines.loihi1.costs import cost, simple_times
 from spikeloom.runtime.machines.loihi1.engine import prepare, simulate
 from spikeloom.runtime.machines.loihi1.trace import BoolArray, Trace, unpack
 
@@ -36,13 +36,13 @@ def counts(netlist: Netlist) -> Run:
     """Events and energy of every recording, and the time of every step by the simple model."""
     chip = load_target(netlist.target)
     clock, meter = timing.prepare(netlist, chip, chip.time[0]), cost.prepare(netlist, chip)
-    engine = prepare(netlist, charges=charges.charges(clock))
+    engine = prepare(netlist, charges=simple_times.charges(clock))
 
     def run(events: Any) -> Trace:
         trace = simulate(engine, events, threads=1)
         assert trace.charged is not None
         steps = np.full(len(events), events.shape[2])
-        charges.simple_from(clock, trace.charged, steps + engine.drain)
+        simple_times.simple_from(clock, trace.charged, steps + engine.drain)
         cost.estimate(meter, trace.counts, steps)
         return trace
 

@@ -25,9 +25,9 @@ from spikeloom.compiler.targets.base import load_target
 from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.models.networks.reference import float_spikes
 from spikeloom.models.recordings.evtouch import Recordings, load_recordings
-from spikeloom.runtime.costs import cost
 from spikeloom.runtime.equivalence.levels import mcnemar
 from spikeloom.runtime.machines.loihi1 import engine
+from spikeloom.runtime.machines.loihi1.costs import cost
 from spikeloom.runtime.machines.loihi1.trace import aligned, heard
 from spikeloom.runtime.machines.votes import predictions
 from spikeloom.runtime.report.intervals import wilson

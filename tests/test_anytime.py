@@ -15,8 +15,8 @@ from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist, write_netlist
 from spikeloom.models.recordings.events import load_data
 from spikeloom.runtime import cli
-from spikeloom.runtime.costs import cost, course, estimate
 from spikeloom.runtime.machines.loihi1 import engine
+from spikeloom.runtime.machines.loihi1.costs import cost, cumulative, estimate
 from spikeloom.runtime.machines.loihi1.trace import Counts
 from spikeloom.runtime.machines.votes import class_counts, predictions
 from spikeloom.runtime.studies.anytime import exits
@@ -119,7 +119,7 @@ def test_recordings_of_different_length_end_on_their_own(place, monkeypatch):
     monkeypatch.chdir(place)
     netlist, data = read_netlist("net.loom"), load_data("data", "test")[0]
     lengths = np.array([60, 1, 7, 24, 33, 2, 50, 59, 60, 60, 3, 40])
-    ran = course.run(netlist, load_target("loihi1"), with_clocks(data.events, netlist.clocks), lengths)
+    ran = cumulative.run(netlist, load_target("loihi1"), with_clocks(data.events, netlist.clocks), lengths)
     at = exits.standing(ran.votes, lengths)
     sure = exits.proven(ran.votes, at, exits.most_votes(netlist, STEPS))
     ends = exits.exits(sure, at)

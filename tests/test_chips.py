@@ -18,10 +18,13 @@ from spikeloom.compiler.targets.loihi1.layout.core_graph import core_map
 from spikeloom.compiler.targets.loihi1.layout.place import place
 from spikeloom.compiler.targets.loihi1.legalize import LimitUse, measure, require_legal
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist, write_netlist
-from spikeloom.runtime.costs import cost
-from spikeloom.runtime.costs.estimate import estimate
-from spikeloom.runtime.costs.estimates import estimate_json, estimate_text
 from spikeloom.runtime.machines.loihi1 import engine, spec, timing
+from spikeloom.runtime.machines.loihi1.costs import cost
+from spikeloom.runtime.machines.loihi1.costs.estimate import estimate
+from spikeloom.runtime.machines.loihi1.costs.result import cost_report
+from spikeloom.runtime.machines.loihi1.costs.sections import sections
+from spikeloom.runtime.report.encode import encode
+from spikeloom.runtime.report.sections import terminal
 
 SMALL = small_target(core_compartments=4, chip_cores=2, mesh_width=2, mesh_height=1, mesh_tile_cores=1)
 """Two cores of four neurons a chip, one on each tile."""
@@ -151,7 +154,7 @@ def test_packets_that_leave_are_counted_and_their_way_is_not(netlist, recordings
 
 def test_the_report_says_what_is_not_modelled(netlist, recordings):
     _, found = estimate(netlist, SMALL, recordings)
-    report = estimate_json(netlist, SMALL, found, bin_s=0.02)
+    report = encode(priced := cost_report(netlist, SMALL, found, bin_s=0.02))
     left = report["per_inference"]["packets_between_chips"]
     line = (
         f"links between the 3 chips: {left:,.0f} of {report['per_inference']['packets']:,.0f} packets of an inference "
@@ -162,7 +165,7 @@ def test_the_report_says_what_is_not_modelled(netlist, recordings):
     (static,) = report["static"]
     assert (static["chips"], static["full_speed_j"]) == (3, [])
     assert static["real_time_j"] == pytest.approx(3 * 104.4e-3 * 40 * 0.02)
-    shown = estimate_text(report)
+    shown = terminal(sections(priced))
     assert f"not modelled: {line}" in shown
     assert "an inference on 3 chips takes 251 mJ at the sensor's pace" in shown
     assert "slowest" not in shown

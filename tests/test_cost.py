@@ -15,10 +15,13 @@ from spikeloom.compiler.targets.loihi1.emit import emit
 from spikeloom.compiler.targets.loihi1.layout.partition import partition
 from spikeloom.compiler.targets.loihi1.layout.place import core_traffic, place
 from spikeloom.compiler.targets.loihi1.storage.quantize import quantize
-from spikeloom.runtime.costs import cost
-from spikeloom.runtime.costs.estimate import estimate
-from spikeloom.runtime.costs.estimates import estimate_json, estimate_text
 from spikeloom.runtime.machines.loihi1 import engine, spec
+from spikeloom.runtime.machines.loihi1.costs import cost
+from spikeloom.runtime.machines.loihi1.costs.estimate import estimate
+from spikeloom.runtime.machines.loihi1.costs.result import cost_report
+from spikeloom.runtime.machines.loihi1.costs.sections import sections
+from spikeloom.runtime.report.encode import encode
+from spikeloom.runtime.report.sections import terminal
 
 PICOJOULES = {
     "davies2018": {
@@ -191,7 +194,7 @@ def priced_by(*tables, silent=False):
         recording[:, 0, 0] = 1
     chip = dataclasses.replace(LOIHI, energy=tables)
     _, found = estimate(netlist, chip, recording)
-    return found.costs, estimate_json(netlist, chip, found, bin_s=0.02)
+    return found.costs, cost_report(netlist, chip, found, bin_s=0.02)
 
 
 @pytest.mark.parametrize("event", [name for name in cost.EVENTS if name not in ("synaptic_operation_dense", "spike")])
@@ -200,10 +203,10 @@ def test_a_table_without_a_price_is_left_out(event):
     costs, report = priced_by(table("lacking", **lacking), table("full", **FULL))
     assert set(costs.energy) == {"full"}
     assert costs.unpriced == {"lacking": (event,)}
-    assert report["not_modelled"] == [f"lacking: no price for {event}"]
-    for part in (report["per_inference"], report["min"], report["max"], *report["layers"]):
-        assert set(part["energy_j"]) == {"full"}
-    assert f"not modelled: lacking: no price for {event}\n" in estimate_text(report)
+    assert report.not_modelled == (f"lacking: no price for {event}",)
+    for part in (report.per_inference, report.min, report.max, *(layer.amounts for layer in report.layers)):
+        assert set(part.energy_j) == {"full"}
+    assert f"not modelled: lacking: no price for {event}\n" in terminal(sections(report))
 
 
 def test_every_lacking_price_is_named():
@@ -223,9 +226,9 @@ def test_every_lacking_price_is_named():
 
 def test_no_table_at_all():
     _, report = priced_by()
-    assert report["per_inference"]["energy_j"] == report["min"]["energy_j"] == {}
-    assert report["not_modelled"] == []
-    assert "synaptic operations" in estimate_text(report)
+    assert report.per_inference.energy_j == report.min.energy_j == {}
+    assert report.not_modelled == ()
+    assert "synaptic operations" in terminal(sections(report))
 
 
 def test_what_did_not_happen_needs_no_price():
@@ -243,7 +246,7 @@ def test_one_price_for_both_forms_of_a_list():
 
 def test_what_no_table_covers_is_always_listed():
     _, report = priced_by(table("full", **FULL))
-    assert report["not_priced"] == list(cost.NOT_PRICED)
+    assert report.not_priced == cost.NOT_PRICED
     assert len(cost.NOT_PRICED) == 2
 
 
@@ -256,7 +259,7 @@ def test_report_has_means_and_extremes_over_recordings(tmp_path):
     parts = partition(integer, LOIHI)
     netlist = emit(integer, parts, place(core_traffic(integer, parts, None), LOIHI).tiles, LOIHI, {})
     recordings = events(7, samples=5).reshape(5, netlist.n_inputs, -1)
-    report = estimate_json(netlist, LOIHI, estimate(netlist, LOIHI, recordings)[1], bin_s=0.02)
+    report = encode(cost_report(netlist, LOIHI, estimate(netlist, LOIHI, recordings)[1], bin_s=0.02))
     samples = [brute_force(netlist, recording) for recording in recordings]
     operations = [sum(s["synaptic_operation_dense"]) + sum(s["synaptic_operation_sparse"]) for s in samples]
     assert len(set(operations)) > 1

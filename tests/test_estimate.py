@@ -10,11 +10,14 @@ from random_networks import LOIHI
 from spikeloom.compiler import Options, Recipe, compile_network
 from spikeloom.compiler.errors import DataError
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.runtime.costs import cost as cost_of
-from spikeloom.runtime.costs.charges import charges, simple_from
-from spikeloom.runtime.costs.estimate import estimate
-from spikeloom.runtime.costs.estimates import estimate_json, estimate_text
 from spikeloom.runtime.machines.loihi1 import engine, timing
+from spikeloom.runtime.machines.loihi1.costs import cost as cost_of
+from spikeloom.runtime.machines.loihi1.costs.estimate import estimate
+from spikeloom.runtime.machines.loihi1.costs.result import cost_report
+from spikeloom.runtime.machines.loihi1.costs.sections import sections
+from spikeloom.runtime.machines.loihi1.costs.simple_times import charges, simple_from
+from spikeloom.runtime.report.encode import encode
+from spikeloom.runtime.report.sections import terminal
 
 LENGTHS = np.array([30, 7, 1, 30])
 
@@ -91,7 +94,7 @@ def test_the_detailed_model_takes_at_least_the_work_of_the_busiest_core(found):
 def test_the_report_says_power_and_pace(small, found):
     netlist, _ = small
     _, cost = found["cycle"]
-    report = estimate_json(netlist, LOIHI, cost, bin_s=0.02)
+    report = encode(priced := cost_report(netlist, LOIHI, cost, bin_s=0.02))
     energy, seconds = cost.costs.energy["sanafe"].sum(axis=1), cost.simple["sanafe"].duration_ns.sum(axis=1) * 1e-9
     (entry,) = [e for e in report["pace"]["full_speed"] if (e["energy_table"], e["model"]) == ("sanafe", "simple")]
     assert entry["power_w"] == pytest.approx((energy / seconds).mean())
@@ -102,7 +105,7 @@ def test_the_report_says_power_and_pace(small, found):
         assert sum(core["share_of_steps"] for core in times["critical_core"]) == pytest.approx(1)
     assert len(report["cores"]) == netlist.n_cores
     assert sum(core["energy_j"]["sanafe"] for core in report["cores"]) == pytest.approx(energy.mean())
-    text = estimate_text(report)
+    text = terminal(sections(priced))
     for words in ("time, sanafe, simple model", "time, sanafe, detailed model", "energy by part", "20 ms a step"):
         assert words in text
 
@@ -110,15 +113,15 @@ def test_the_report_says_power_and_pace(small, found):
 def test_the_range_names_both_ends(small, found):
     netlist, _ = small
     _, cost = found["counts"]
-    report = estimate_json(netlist, LOIHI, cost, bin_s=0.02)
+    report = encode(priced := cost_report(netlist, LOIHI, cost, bin_s=0.02))
     means = {name: energy.sum(axis=1).mean() for name, energy in cost.costs.energy.items()}
     ends = report["energy_range_j"]
     for end, choose in (("low", min), ("high", max)):
         assert ends[end]["energy_j"] == pytest.approx(choose(means.values()))
         assert means[ends[end]["table"]] == pytest.approx(choose(means.values()))
-    assert "sources differ: a mean inference takes" in estimate_text(report)
+    assert "sources differ: a mean inference takes" in terminal(sections(priced))
     single = dataclasses.replace(cost, costs=dataclasses.replace(cost.costs, energy={"one": cost.costs.zeros}))
-    alone = estimate_json(netlist, LOIHI, single, bin_s=0.02)
+    alone = encode(priced := cost_report(netlist, LOIHI, single, bin_s=0.02))
     assert alone["energy_range_j"] is None
 
 
@@ -161,6 +164,6 @@ def test_a_trace_that_does_not_belong_to_the_netlist(small):
 def test_a_chip_without_tables(small):
     netlist, recordings = small
     _, cost = estimate(netlist, dataclasses.replace(LOIHI, energy=(), time=()), recordings, detail="cycle")
-    report = estimate_json(netlist, LOIHI, cost, bin_s=0.02)
+    report = encode(priced := cost_report(netlist, LOIHI, cost, bin_s=0.02))
     assert (report["time"], report["energy_by_part_j"], report["pace"]["full_speed"]) == ([], {}, [])
-    assert "synaptic operations" in estimate_text(report)
+    assert "synaptic operations" in terminal(sections(priced))

@@ -18,9 +18,9 @@ from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.loihi1.netlist import read_only
 from spikeloom.models.graphs import normalised_adjacency
 from spikeloom.models.recordings.evtouch import load_recordings
-from spikeloom.runtime.costs import course
 from spikeloom.runtime.inputs.files import shipped
 from spikeloom.runtime.machines.loihi1 import engine
+from spikeloom.runtime.machines.loihi1.costs import cumulative
 from spikeloom.runtime.machines.votes import predictions
 from spikeloom.runtime.studies.anytime import exits
 
@@ -170,7 +170,7 @@ def test_no_output_neuron_spikes_more_often(data):
         assert np.all(np.diff(times) >= interval)
     length = events.shape[1]
     if length:
-        counted = course.votes_of(netlist, events[None], np.array([length]))
+        counted = cumulative.votes_of(netlist, events[None], np.array([length]))
         at = exits.standing(counted, np.array([length]))
         sure = exits.proven(counted, at, exits.most_votes(netlist, length))
         assert np.all(at.leader[sure] == at.decision[0])
@@ -181,7 +181,7 @@ def test_live_and_recorded_votes_end_alike():
     netlist = replace(netlist, classes=3, readout_class=read_only(np.arange(netlist.n_compartments) % 4 - 1))
     events = (np.random.default_rng(1).random((6, netlist.n_inputs, 40)) < 0.3).astype(np.uint8)
     lengths = np.full(6, 40)
-    votes = course.votes_of(netlist, events, lengths)
+    votes = cumulative.votes_of(netlist, events, lengths)
     at = exits.standing(votes, lengths)
     sure = exits.proven(votes, at, exits.most_votes(netlist, 40))
     depth = exits.read_out_depth(netlist)
@@ -201,7 +201,7 @@ def test_no_recording_is_decided_otherwise_by_proof(which, split, shipped_netlis
     netlist = shipped_netlists[which]
     data = load_recordings(request.getfixturevalue(f"{which}_zip"), split)
     lengths = np.full(len(data), data.steps)
-    votes = course.votes_of(netlist, with_clocks(data.events, netlist.clocks), lengths)
+    votes = cumulative.votes_of(netlist, with_clocks(data.events, netlist.clocks), lengths)
     at = exits.standing(votes, lengths)
     sure = exits.proven(votes, at, exits.most_votes(netlist, data.steps))
     ends = exits.exits(sure, at)

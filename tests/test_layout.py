@@ -30,8 +30,8 @@ from spikeloom.compiler.targets.loihi1.layout.latency_search import _useful, est
 from spikeloom.compiler.targets.loihi1.layout.partition import cut, partition
 from spikeloom.compiler.targets.loihi1.legalize import require_legal
 from spikeloom.compiler.targets.loihi1.options import GOALS
-from spikeloom.runtime.costs import cost
 from spikeloom.runtime.machines.loihi1 import engine, timing
+from spikeloom.runtime.machines.loihi1.costs import cost
 from spikeloom.runtime.machines.loihi1.trace import Counts, aligned
 
 WITHOUT_SHRINKING = tuple(phase for phase in Phase if phase is not Phase.shrink)

@@ -24,8 +24,8 @@ from spikeloom.models.graphs import normalised_adjacency
 from spikeloom.models.networks.reference import float_membranes, float_spikes
 from spikeloom.models.recordings.events import load_data
 from spikeloom.runtime import cli
-from spikeloom.runtime.costs import cost
 from spikeloom.runtime.machines.loihi1 import engine
+from spikeloom.runtime.machines.loihi1.costs import cost
 from spikeloom.runtime.machines.loihi1.trace import aligned
 from spikeloom.runtime.page.traces import MARK, ROWS, drawn, raster
 

@@ -26,8 +26,8 @@ from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_only
 from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.models.recordings.evtouch import load_recordings
-from spikeloom.runtime.costs import energy
 from spikeloom.runtime.machines.loihi1 import engine, timing
+from spikeloom.runtime.machines.loihi1.costs import energy
 
 FIT = next(table for table in LOIHI.energy if table.name == "sanafe")
 

@@ -13,9 +13,9 @@ from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.netlist import read_only
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist, write_netlist
 from spikeloom.runtime import cli
-from spikeloom.runtime.costs import estimate
 from spikeloom.runtime.equivalence import ladder
 from spikeloom.runtime.machines.loihi1 import blocks, engine
+from spikeloom.runtime.machines.loihi1.costs import estimate
 
 RUN = ("run", "net.loom", "--data", "data")
 ESTIMATE = ("estimate", "net.loom", "--data", "data")

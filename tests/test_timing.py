@@ -13,8 +13,8 @@ from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats import sanafe
 from spikeloom.compiler.targets.base import LATENCIES, Quantity, load_target
 from spikeloom.compiler.targets.loihi1.netlist import read_only
-from spikeloom.runtime.costs import cost, energy
 from spikeloom.runtime.machines.loihi1 import engine, timing
+from spikeloom.runtime.machines.loihi1.costs import cost, energy
 from spikeloom.runtime.machines.loihi1.timing_spec import Chip
 
 LOIHI = load_target("loihi1")

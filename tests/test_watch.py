@@ -26,8 +26,8 @@ from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.models.recordings.events import load_data
 from spikeloom.models.recordings.evtouch import load_recordings
 from spikeloom.runtime.commands.exchange import watch
-from spikeloom.runtime.costs import course
 from spikeloom.runtime.machines.loihi1 import engine
+from spikeloom.runtime.machines.loihi1.costs import cumulative
 from spikeloom.runtime.machines.votes import class_counts
 from spikeloom.runtime.studies.anytime import exits
 
@@ -493,7 +493,7 @@ def test_a_grasp_ends_as_soon_as_it_is_sure(lively, lively_file, lines, objects,
         given = () if factor is None else (factor,)
         words = (lively_file, "--input", lines(as_lines(events, seed)), "--bins", 40, "--until-sure", *given)
         found = objects(*words)
-        votes = course.votes_of(lively, events.reshape(1, 20, 40), np.array([40]))
+        votes = cumulative.votes_of(lively, events.reshape(1, 20, 40), np.array([40]))
         at = exits.standing(votes, np.array([40]))
         sure = exits.proven(votes, at, exits.most_votes(lively, 40))
         end = int(exits.exits(sure, at, np.inf if factor is None else factor)[0])

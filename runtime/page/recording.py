@@ -19,15 +19,16 @@ from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.layout.chips import chip_count
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.runtime.costs import cost
-from spikeloom.runtime.costs.estimate import Estimate, estimate
-from spikeloom.runtime.costs.estimates import estimate_json
 from spikeloom.runtime.equivalence.reference import membranes_of, spikes_of
 from spikeloom.runtime.inputs.network import LoadedNetwork
 from spikeloom.runtime.machines.loihi1 import engine
+from spikeloom.runtime.machines.loihi1.costs import cost
+from spikeloom.runtime.machines.loihi1.costs.estimate import Estimate, estimate
+from spikeloom.runtime.machines.loihi1.costs.result import cost_report
 from spikeloom.runtime.machines.loihi1.timing import DetailedTimes, SimpleTimes
 from spikeloom.runtime.machines.loihi1.trace import Counts, Trace, aligned, heard
 from spikeloom.runtime.machines.votes import class_counts, predictions, readout_counts
+from spikeloom.runtime.report.encode import encode
 
 Json = dict[str, Any]
 
@@ -132,7 +133,7 @@ def recording_json(
         "input": _pairs(channels[0].T.astype(np.bool_)),
         "layers": layers,
         "membranes": _traces(netlist, asked.model, sides),
-        "costs": estimate_json(netlist, target, own, bin_s=bin_s),
+        "costs": encode(cost_report(netlist, target, own, bin_s=bin_s)),
         "by_step": _by_step(netlist, target, channels[0], sides.trace, own, found),
     }
 

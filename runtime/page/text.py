@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from spikeloom.runtime.costs.estimates import estimate_text
 from spikeloom.runtime.report.render import netlist_text
 from spikeloom.runtime.report.sections import Section, terminal
 from spikeloom.runtime.report.tables import si, table
@@ -19,7 +18,7 @@ LISTED = 10
 """Rows of tables that are sorted by weight; the page and --json have them all."""
 
 
-def report_text(report: Json, verdict: str) -> str:
+def report_text(report: Json, verdict: str, costs: str) -> str:
     """Section by section, under the headings of the page."""
     sections = {
         "Verdict": verdict,
@@ -27,7 +26,7 @@ def report_text(report: Json, verdict: str) -> str:
         "Cores": f"{netlist_text(report['netlist'])}\n\n{_cores(report['cores'])}",
         "Taxels": _taxels(report["taxels"]),
         "One recording": _recording(report["recording"]),
-        "Energy and time": estimate_text(report["costs"]),
+        "Energy and time": costs,
         **({"Stability": stress_text(report["stress"])} if "stress" in report else {}),
         **({"Configurations": terminal([Section("", taken(report["chart"]))])} if "chart" in report else {}),
         "Provenance": _provenance(report["provenance"]),

@@ -43,8 +43,4 @@ def run_text(report: Json) -> str:
     if unknown:
         cells = [[file, str(found), str(counts[found])] for file, _, found, counts in unknown]
         lines.append(table(["without a label" if known else "recording", "decision", "votes"], cells))
-    if "costs" in report:
-        from spikeloom.runtime.costs.estimates import estimate_text  # brings the engine along
-
-        lines += ["", estimate_text(report["costs"])]
     return "\n".join(lines)

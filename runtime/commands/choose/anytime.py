@@ -19,11 +19,11 @@ from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.models.recordings.eventfiles import UNLABELLED
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.commands.options import add_network, add_recordings
-from spikeloom.runtime.costs import course
-from spikeloom.runtime.costs.course import Course
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.inputs.recordings import recordings
+from spikeloom.runtime.machines.loihi1.costs import cumulative
+from spikeloom.runtime.machines.loihi1.costs.cumulative import Cumulative
 from spikeloom.runtime.machines.loihi1.trace import check_channels
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.intervals import wilson
@@ -90,7 +90,7 @@ def run(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int
     floats = _float_votes(arguments, netlist, data)
     points = _races(arguments, netlist)
     progress("running")
-    ran = course.run(netlist, load_target(netlist.target), with_clocks(data.events, netlist.clocks), lengths)
+    ran = cumulative.run(netlist, load_target(netlist.target), with_clocks(data.events, netlist.clocks), lengths)
     rules: list[exits.Calibrated | None] = [None]
     rules += [] if points is None else [exits.calibrate(points, share) for share in allowed]
     report = _report(netlist, data, ran, rules, floats)
@@ -150,7 +150,7 @@ def _races(arguments: argparse.Namespace, netlist: Netlist) -> FloatArray | None
     training = _read(arguments.calibrate, "train", netlist, arguments)
     progress("calibrating")
     lengths = _lengths(training)
-    votes = course.votes_of(netlist, with_clocks(training.events, netlist.clocks), lengths)
+    votes = cumulative.votes_of(netlist, with_clocks(training.events, netlist.clocks), lengths)
     return exits.turning_points(exits.races(votes, lengths))
 
 
@@ -172,12 +172,12 @@ def _float_votes(arguments: argparse.Namespace, netlist: Netlist, data: Recordin
         progress(f"float model: {first} of {len(data)}")
         part = slice(first, first + PART)
         spikes = spikes_of(asked.model, asked.adjacency, data.events[part], "float32")[readout.population]
-        votes.append(course.float_votes(readout, netlist.classes, cut(spikes, lengths[part])))
+        votes.append(cumulative.float_votes(readout, netlist.classes, cut(spikes, lengths[part])))
     return np.concatenate(votes)
 
 
 def _report(
-    netlist: Netlist, data: Recordings, ran: Course, rules: list[exits.Calibrated | None], floats: IntArray | None
+    netlist: Netlist, data: Recordings, ran: Cumulative, rules: list[exits.Calibrated | None], floats: IntArray | None
 ) -> Json:
     """All figures as JSON values."""
     at = exits.standing(ran.votes, ran.lengths)
@@ -245,7 +245,7 @@ def _decided(at: exits.Standing, ends: IntArray, labels: IntArray) -> Json:
     }
 
 
-def _costs(ran: Course, index: IntArray) -> Json:
+def _costs(ran: Cumulative, index: IntArray) -> Json:
     """Mean chip steps, operations, joules and seconds up to and with a chip step of each recording."""
     rows = np.arange(len(index))
     return {
@@ -256,7 +256,7 @@ def _costs(ran: Course, index: IntArray) -> Json:
     }
 
 
-def _stopped(ran: Course, at: exits.Standing, ends: IntArray, labels: IntArray) -> Json:
+def _stopped(ran: Cumulative, at: exits.Standing, ends: IntArray, labels: IntArray) -> Json:
     """What a rule comes to, in the mean and for every recording."""
     last = ran.chip_steps - 1
     index = np.where(ends == ran.lengths - 1, last, np.minimum(ends + ran.depth, last))
@@ -288,7 +288,7 @@ def _stopped(ran: Course, at: exits.Standing, ends: IntArray, labels: IntArray) 
     }
 
 
-def _window(percent: int, data: Recordings, ran: Course, at: exits.Standing, beside: exits.Standing | None) -> Json:
+def _window(percent: int, data: Recordings, ran: Cumulative, at: exits.Standing, beside: exits.Standing | None) -> Json:
     """Accuracy where only the first part of each recording is observed; the read-out still runs to its end."""
     steps = np.maximum(ran.lengths * percent // 100, 1)
     known = int(np.count_nonzero(data.labels != UNLABELLED))

@@ -23,11 +23,11 @@ from spikeloom.models.recordings.counts import number
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.commands.main_job.compile import storage
 from spikeloom.runtime.commands.options import add_network, add_recordings
-from spikeloom.runtime.costs.estimate import estimate
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import recordings
 from spikeloom.runtime.machines.loihi1 import engine
+from spikeloom.runtime.machines.loihi1.costs.estimate import estimate
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.studies.pruning.leaner import (
     Scene,

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+from collections.abc import Callable
 from difflib import get_close_matches
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -82,16 +84,12 @@ def run(arguments: argparse.Namespace) -> Outcome:
     data = load_recordings(arguments, netlist, labels_for="report")
     check_channels(netlist, data.events.shape[1] * data.events.shape[2] + netlist.clocks.channels)
     chosen = None if arguments.recording is None else find_recording(data, arguments.recording)
-    found, verdict, code = _facts(arguments, netlist, asked, data, chosen)
+    found, as_text, code = _facts(arguments, netlist, asked, data, chosen)
     found |= stability
     found |= {} if chart is None else {"chart": chart}
     with write_atomically(arguments.output) as file:
         file.write(page(found).encode())
-    return Outcome(
-        found | {"output": arguments.output},
-        lambda result: [Section("", [Text(report_text(result, verdict=verdict))])],
-        code,
-    )
+    return Outcome(found | {"output": arguments.output}, lambda result: [Section("", [Text(as_text(result))])], code)
 
 
 def _require_origin(arguments: argparse.Namespace, netlist: Netlist, asked: LoadedNetwork) -> None:
@@ -142,11 +140,12 @@ def find_recording(data: Recordings, asked: str) -> int:
 
 def _facts(
     arguments: argparse.Namespace, netlist: Netlist, asked: LoadedNetwork, data: Recordings, chosen: int | None
-) -> tuple[Json, str, int]:
-    """All that the page shows, as JSON values, the verdict as text, and the exit code."""
-    from spikeloom.runtime.costs.estimate import estimate
-    from spikeloom.runtime.costs.estimates import estimate_json
+) -> tuple[Json, Callable[[Json], str], int]:
+    """All that the page shows, as JSON values, how to print them, and the exit code."""
     from spikeloom.runtime.equivalence.verify import verify
+    from spikeloom.runtime.machines.loihi1.costs.estimate import estimate
+    from spikeloom.runtime.machines.loihi1.costs.result import cost_report
+    from spikeloom.runtime.machines.loihi1.costs.sections import sections as cost_sections
     from spikeloom.runtime.page import facts as report_facts
     from spikeloom.runtime.page.recording import recording_json
 
@@ -169,6 +168,7 @@ def _facts(
         chosen = 0 if verdict.first_divergence is None else data.files.index(verdict.first_divergence.file)
     account.begin("costs")
     counts, costs = estimate(netlist, target, with_clocks(data.events, netlist.clocks), lengths=data.lengths)
+    priced = cost_report(netlist, target, costs, bin_s=arguments.bin * netlist.bins)
     account.begin("the recording")
     provenance = report_facts.provenance_json(arguments, netlist, target, asked, data, data.files[chosen])
     found = {
@@ -178,9 +178,10 @@ def _facts(
         "cores": report_facts.cores_json(netlist, target, counts),
         "taxels": report_facts.taxels_json(netlist, asked, data, counts, arguments.taxels),
         "recording": recording_json(netlist, target, asked, data, chosen, costs, bin_s=arguments.bin * netlist.bins),
-        "costs": estimate_json(netlist, target, costs, bin_s=arguments.bin * netlist.bins),
+        "costs": encode(priced),
         "provenance": provenance,
     }
     if arguments.explain_cost:
         found["explained_cost"] = encode(account.explained(True))
-    return found, terminal(sections(verdict)), 1 if verdict.missed else 0
+    shown = partial(report_text, verdict=terminal(sections(verdict)), costs=terminal(cost_sections(priced)))
+    return found, shown, 1 if verdict.missed else 0

@@ -74,8 +74,9 @@ class Loihi(Machine):
         progress: Callable[[int], object] | None = None,
     ) -> tuple[Run, Price]:
         """Decisions and costs, of the cores' tiles and times too."""
-        from spikeloom.runtime.costs.estimate import estimate
-        from spikeloom.runtime.costs.estimates import estimate_json, estimate_text
+        from spikeloom.runtime.machines.loihi1.costs.estimate import estimate
+        from spikeloom.runtime.machines.loihi1.costs.result import cost_report
+        from spikeloom.runtime.machines.loihi1.costs.sections import sections
 
         self.require_detail(detail)
         chip = self.target if table is None else with_tables(self.target, table)
@@ -90,13 +91,13 @@ class Loihi(Machine):
             spikes=kept,
             progress=progress,
         )
-        report = estimate_json(self.netlist, chip, found, bin_s=bin_s * self.netlist.bins)
+        report = cost_report(self.netlist, chip, found, bin_s=bin_s * self.netlist.bins)
         return self._run(counts.spikes, kept), Price(
             synaptic_operations=found.costs.synaptic_operations.sum(axis=1),
             energy_j={name: each.sum(axis=1) for name, each in found.costs.energy.items()},
             time_s={name: times.duration_ns.sum(axis=1) * 1e-9 for name, times in found.simple.items()},
             step_s={name: float(times.duration_ns.max() * 1e-9) for name, times in found.simple.items()},
-            outcome=Outcome(report, partial(as_text, estimate_text)),
+            outcome=Outcome(report, sections),
         )
 
     def batch(self, steps: int) -> int:

@@ -30,6 +30,7 @@ import numpy as np
 from spikeloom.compiler.fixedpoint import DECAY_BITS, MEMBRANE_SHIFT, FloatArray, IntArray
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, one_step_bounds
 from spikeloom.runtime.equivalence.certificates import wins
+from spikeloom.runtime.machines.loihi1.costs.cumulative import read_out_depth
 from spikeloom.runtime.machines.loihi1.trace import BoolArray
 
 CONFIDENCE = 0.95
@@ -87,11 +88,6 @@ def standing(votes: IntArray, lengths: IntArray) -> Standing:
         ahead = first - second
     left = np.maximum(np.reshape(lengths, (-1, 1)) - 1 - np.arange(votes.shape[1]), 0)
     return Standing(leader=np.argmax(votes, axis=2), lead=ahead, left=left)
-
-
-def read_out_depth(netlist: Netlist) -> int:
-    """Chip steps by which the votes lag behind the data: the depth of the latest layer that votes."""
-    return max(netlist.layers[int(layer)].depth for layer in np.unique(netlist.layer[netlist.readout_class >= 0]))
 
 
 def least_interval(netlist: Netlist) -> IntArray:

@@ -14,7 +14,7 @@ from scipy.sparse import csr_array
 from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.targets.base import EnergyTable, Target
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
-from spikeloom.runtime.costs.cost import EVENTS, price
+from spikeloom.runtime.machines.loihi1.costs.cost import EVENTS, price
 from spikeloom.runtime.machines.loihi1.trace import BoolArray, Counts
 
 PARTS = {
@@ -57,7 +57,7 @@ def count_by_core(
     input_tiles: tuple[int, ...] = (),
     dense: BoolArray | None = None,
 ) -> dict[str, FloatArray]:
-    """Amount of every event of ``spikeloom.runtime.costs.cost.EVENTS`` per recording and core.
+    """Amount of every event of ``events.EVENTS`` per recording and core.
 
     Synaptic operations belong to the core that receives them, packets and hops to the core that sends them.
 

@@ -17,14 +17,13 @@ from spikeloom.compiler.ir import Readout
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.layout.chips import chip_count
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
-from spikeloom.runtime.costs import charges, cost
 from spikeloom.runtime.machines.loihi1 import engine, timing
+from spikeloom.runtime.machines.loihi1.costs import cost, simple_times
 from spikeloom.runtime.machines.loihi1.trace import Charges
-from spikeloom.runtime.studies.anytime.exits import read_out_depth
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Course:
+class Cumulative:
     """Sums over chip steps up to and with each; after a recording's end they stay as they are.
 
     Parameters
@@ -54,6 +53,11 @@ class Course:
     time: Mapping[str, FloatArray]
 
 
+def read_out_depth(netlist: Netlist) -> int:
+    """Chip steps by which the votes lag behind the data: the depth of the latest layer that votes."""
+    return max(netlist.layers[int(layer)].depth for layer in np.unique(netlist.layer[netlist.readout_class >= 0]))
+
+
 def vote_charges(netlist: Netlist) -> Charges:
     """What a spike adds to the votes of each class."""
     spikes = np.zeros((netlist.n_compartments, netlist.classes), np.int64)
@@ -65,7 +69,7 @@ def vote_charges(netlist: Netlist) -> Charges:
 
 
 def votes_of(netlist: Netlist, events: engine.EventArray, lengths: IntArray) -> IntArray:
-    """Votes so far after each step of the read-out: ``Course.votes`` alone.
+    """Votes so far after each step of the read-out: ``Cumulative.votes`` alone.
 
     Parameters
     ----------
@@ -89,7 +93,7 @@ def float_votes(readout: Readout, classes: int, spikes: BoolArray) -> IntArray:
     return np.cumsum(votes, axis=1)
 
 
-def run(netlist: Netlist, target: Target, events: engine.EventArray, lengths: IntArray) -> Course:
+def run(netlist: Netlist, target: Target, events: engine.EventArray, lengths: IntArray) -> Cumulative:
     """Run recordings once.
 
     Parameters
@@ -111,8 +115,8 @@ def run(netlist: Netlist, target: Target, events: engine.EventArray, lengths: In
     timed = target.time if chip_count(netlist.core_tile, target) == 1 else ()
     clocks = [timing.prepare(netlist, target, table) for table in timed]
     meter = cost.prepare(netlist, target)
-    parts = [vote_charges(netlist), _event_charges(meter), *(charges.charges(clock) for clock in clocks)]
-    prepared = engine.prepare(netlist, charges=charges.side_by_side(parts))
+    parts = [vote_charges(netlist), _event_charges(meter), *(simple_times.charges(clock) for clock in clocks)]
+    prepared = engine.prepare(netlist, charges=simple_times.side_by_side(parts))
     trace = engine.simulate(prepared, events, lengths=lengths)
     assert trace.charged is not None, "sums were asked for"
     ends = np.cumsum([part.spikes.shape[1] for part in parts])[:-1]
@@ -122,7 +126,7 @@ def run(netlist: Netlist, target: Target, events: engine.EventArray, lengths: In
     events_by_step = _events(meter, happened, runs)
     found = {table.name: cost.price(table, events_by_step) for table in target.energy}
     operations = events_by_step["synaptic_operation_dense"] + events_by_step["synaptic_operation_sparse"]
-    return Course(
+    return Cumulative(
         votes=_aligned(netlist, np.cumsum(votes, axis=1), events.shape[2]),
         depth=read_out_depth(netlist),
         lengths=lengths,
@@ -130,7 +134,7 @@ def run(netlist: Netlist, target: Target, events: engine.EventArray, lengths: In
         operations=np.cumsum(operations, axis=1),
         energy={name: np.cumsum(each, axis=1) for name, each in found.items() if not isinstance(each, tuple)},
         time={
-            table.name: np.cumsum(charges.simple_from(clock, own, chip_steps).duration_ns, axis=1) * 1e-9
+            table.name: np.cumsum(simple_times.simple_from(clock, own, chip_steps).duration_ns, axis=1) * 1e-9
             for table, clock, own in zip(timed, clocks, times, strict=True)
         },
     )

@@ -20,9 +20,9 @@ from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.layout.chips import chip_count, require_one_chip
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
-from spikeloom.runtime.costs import charges, cost, energy
-from spikeloom.runtime.costs.cost import Costs
 from spikeloom.runtime.machines.loihi1 import engine, timing
+from spikeloom.runtime.machines.loihi1.costs import cost, energy, simple_times
+from spikeloom.runtime.machines.loihi1.costs.cost import Costs
 from spikeloom.runtime.machines.loihi1.timing import DetailedTimes, SimpleTimes
 from spikeloom.runtime.machines.loihi1.trace import BoolArray, Counts
 
@@ -117,7 +117,7 @@ def estimate(
     if charged is not None:
         sums = np.split(charged, len(clocks), axis=2)
         simple = {
-            name: charges.simple_from(clock, own, steps + prepared.drain)
+            name: simple_times.simple_from(clock, own, steps + prepared.drain)
             for (name, clock), own in zip(clocks.items(), sums, strict=True)
         }
     costs = cost.estimate(cost.prepare(netlist, target), counts, steps)
@@ -143,7 +143,7 @@ def _charged(netlist: Netlist, clocks: Mapping[str, timing.Clock]) -> engine.Eng
     """An engine that adds up the times of the simple model, one table's after the other's."""
     if not clocks:
         return engine.prepare(netlist)
-    wanted = charges.side_by_side([charges.charges(clock) for clock in clocks.values()])
+    wanted = simple_times.side_by_side([simple_times.charges(clock) for clock in clocks.values()])
     return engine.prepare(netlist, charges=wanted)
 
 

@@ -1,0 +1,1 @@
+"""What a run costs: events times price tables, and times."""

@@ -1,0 +1,324 @@
+"""Costs of an inference in numbers: by part, layer and core, by table and time model; with what is not known."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from spikeloom.compiler.fixedpoint import FloatArray
+from spikeloom.compiler.targets.base import Target
+from spikeloom.compiler.targets.loihi1.layout.chips import chip_count
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.runtime.machines.loihi1.costs.cost import NOT_PRICED, Costs
+from spikeloom.runtime.machines.loihi1.costs.estimate import Estimate
+from spikeloom.runtime.machines.loihi1.timing import DetailedTimes, SimpleTimes
+from spikeloom.runtime.report.encode import INLINE, OPTIONAL
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Amounts:
+    """Of one inference; the energy is by table."""
+
+    synaptic_operations: float
+    synaptic_operations_on_zeros: float
+    spikes: float
+    neuron_updates: float
+    neuron_accesses: float
+    packets: float
+    hops: float
+    packets_between_chips: float | None = field(default=None, metadata=OPTIONAL)
+    energy_j: Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LayerCosts:
+    """Of a mean inference."""
+
+    name: str
+    amounts: Amounts = field(metadata=INLINE)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CoreCosts:
+    """Of a mean inference: seconds by time table, and joules by energy table where they are worked out by core."""
+
+    core: int
+    tile: int
+    layers: tuple[str, ...]
+    sweep_s: Mapping[str, float]
+    receive_s: Mapping[str, float]
+    energy_j: Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class End:
+    """The mean inference by the table that makes it cheapest or dearest."""
+
+    table: str
+    energy_j: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EnergyRange:
+    """How far tables disagree."""
+
+    low: End
+    high: End
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CriticalCore:
+    """A core that others wait for, in which share of the steps, and in which share of these it receives."""
+
+    core: int
+    share_of_steps: float
+    receiving: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Times:
+    """How long inferences and steps take by one table and model; what the detailed model says of the mesh."""
+
+    table: str
+    model: str
+    inference_s: Mapping[str, float]
+    step_s: Mapping[str, float]
+    critical_core: tuple[CriticalCore, ...]
+    blocked_s: float | None = field(default=None, metadata=OPTIONAL)
+    peak_link_load: float | None = field(default=None, metadata=OPTIONAL)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FullSpeed:
+    """Mean dynamic power and energy-delay product if the chip runs as fast as it can."""
+
+    energy_table: str
+    time_table: str
+    model: str
+    power_w: float
+    energy_delay_js: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Pace:
+    """Mean dynamic power at the pace of the sensor, by energy table, and at full speed."""
+
+    bin_s: float
+    real_time_w: Mapping[str, float]
+    full_speed: tuple[FullSpeed, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StaticAtSpeed:
+    """Static energy of a mean inference at full speed."""
+
+    time_table: str
+    model: str
+    energy_j: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Static:
+    """Power that flows whatever happens, by one source, and the mean inference's share of it."""
+
+    source: str
+    chip_w: float
+    chips: int
+    real_time_j: float
+    full_speed_j: tuple[StaticAtSpeed, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CostReport:
+    """Costs of a batch of recordings.
+
+    Parameters
+    ----------
+    samples, chip_steps : int
+        Recordings, and steps of the longest.
+    detail : {"counts", "cycle"}
+    per_inference, min, max : Amounts
+        Means and extremes over recordings, each amount for itself.
+    energy_by_part_j : mapping of table to mapping of part to float
+        Of the mean inference.
+    energy_range_j : EnergyRange or None
+        Where tables disagree.
+    layers, cores, time, pace, static
+        See these classes.
+    not_modelled, not_priced : tuple of str
+        What is missing from all this.
+    """
+
+    samples: int
+    chip_steps: int
+    detail: str
+    per_inference: Amounts
+    min: Amounts
+    max: Amounts
+    energy_by_part_j: Mapping[str, Mapping[str, float]]
+    energy_range_j: EnergyRange | None
+    layers: tuple[LayerCosts, ...]
+    cores: tuple[CoreCosts, ...]
+    time: tuple[Times, ...]
+    pace: Pace
+    static: tuple[Static, ...]
+    not_modelled: tuple[str, ...]
+    not_priced: tuple[str, ...] = NOT_PRICED
+
+
+def cost_report(netlist: Netlist, target: Target, found: Estimate, *, bin_s: float) -> CostReport:
+    """Sum an estimate up; `bin_s` is the length of a data step in seconds, at the pace of the sensor."""
+    costs, chips = found.costs, chip_count(netlist.core_tile, target)
+
+    def whole(reduce: Callable[[FloatArray], Any]) -> Amounts:
+        return _amounts(costs, chips, lambda amount: float(reduce(amount.sum(axis=1))))
+
+    return CostReport(
+        samples=len(costs.zeros),
+        chip_steps=costs.steps,
+        detail="cycle" if found.detailed else "counts",
+        per_inference=whole(np.mean),
+        min=whole(np.min),
+        max=whole(np.max),
+        energy_by_part_j={
+            name: {part: float(each.sum(axis=1).mean()) for part, each in parts.items()}
+            for name, parts in found.parts.items()
+        },
+        energy_range_j=_energy_range(costs),
+        layers=tuple(
+            LayerCosts(name=layer.name, amounts=_amounts(costs, chips, _mean_of(i)))
+            for i, layer in enumerate(netlist.layers)
+        ),
+        cores=tuple(_core(netlist, found, core) for core in range(netlist.n_cores)),
+        time=tuple(_times(table, model, times) for table, model, times in _models(found)),
+        pace=_pace(found, bin_s),
+        static=tuple(
+            Static(
+                source=name,
+                chip_w=power.value * 1e-3,
+                chips=chips,
+                real_time_j=float((chips * power.value * 1e-3 * found.steps * bin_s).mean()),
+                full_speed_j=tuple(
+                    StaticAtSpeed(
+                        time_table=table,
+                        model=model,
+                        energy_j=float((power.value * 1e-3 * times.duration_ns.sum(axis=1) * 1e-9).mean()),
+                    )
+                    for table, model, times in _models(found)
+                ),
+            )
+            for name, power in target.static.items()
+        ),
+        not_modelled=(
+            *(f"{name}: no price for {', '.join(events)}" for name, events in costs.unpriced.items()),
+            *_links(chips, costs),
+        ),
+    )
+
+
+def _amounts(costs: Costs, chips: int, reduce: Callable[[FloatArray], float]) -> Amounts:
+    """Amounts that `reduce` makes of (samples, layers)."""
+    events = costs.events
+    return Amounts(
+        synaptic_operations=reduce(costs.synaptic_operations),
+        synaptic_operations_on_zeros=reduce(costs.zeros),
+        spikes=reduce(events["spike"]),
+        neuron_updates=reduce(events["neuron_active"]),
+        neuron_accesses=reduce(events["neuron_active"] + events["neuron_idle"]),
+        packets=reduce(events["packet"]),
+        hops=reduce(events["hop_east_west"] + events["hop_north_south"]),
+        packets_between_chips=reduce(costs.between_chips) if chips > 1 else None,
+        energy_j={name: reduce(each) for name, each in costs.energy.items()},
+    )
+
+
+def _mean_of(layer: int) -> Callable[[FloatArray], float]:
+    return lambda amount: float(amount[:, layer].mean())
+
+
+def _energy_range(costs: Costs) -> EnergyRange | None:
+    means = {name: float(each.sum(axis=1).mean()) for name, each in costs.energy.items()}
+    if len(means) < 2:
+        return None
+    low, high = (end(means, key=lambda name: means[name]) for end in (min, max))
+    return EnergyRange(low=End(table=low, energy_j=means[low]), high=End(table=high, energy_j=means[high]))
+
+
+def _links(chips: int, costs: Costs) -> list[str]:
+    """What is not known of a netlist on several chips."""
+    if chips == 1:
+        return []
+    left, sent = (float(amount.sum(axis=1).mean()) for amount in (costs.between_chips, costs.events["packet"]))
+    return [
+        f"links between the {chips} chips: {left:,.0f} of {sent:,.0f} packets of an inference leave their chip; their "
+        "hops and latency are left out, and so are all times (no public figures)"
+    ]
+
+
+def _models(found: Estimate) -> Iterator[tuple[str, str, SimpleTimes | DetailedTimes]]:
+    """Table, model and times."""
+    for table, simple in found.simple.items():
+        yield table, "simple", simple
+    for table, detailed in found.detailed.items():
+        yield table, "detailed", detailed
+
+
+def _times(table: str, model: str, times: SimpleTimes | DetailedTimes) -> Times:
+    seconds = times.duration_ns.sum(axis=1) * 1e-9
+    ran = times.critical_core >= 0
+    cores, steps = np.unique(times.critical_core[ran], return_counts=True)
+    detailed = times if isinstance(times, DetailedTimes) else None
+    return Times(
+        table=table,
+        model=model,
+        inference_s={"mean": float(seconds.mean()), "min": float(seconds.min()), "max": float(seconds.max())},
+        step_s={
+            "mean": float(times.duration_ns[ran].mean() * 1e-9),
+            "max": float(times.duration_ns.max() * 1e-9),
+        },
+        critical_core=tuple(
+            CriticalCore(
+                core=int(core),
+                share_of_steps=float(count / ran.sum()),
+                receiving=float(times.receiving[times.critical_core == core].mean()),
+            )
+            for core, count in sorted(zip(cores, steps, strict=True), key=lambda pair: -pair[1])
+        ),
+        blocked_s=None if detailed is None else float(detailed.blocked_ns.sum(axis=1).mean() * 1e-9),
+        peak_link_load=None if detailed is None else float(detailed.peak_load.max()),
+    )
+
+
+def _pace(found: Estimate, bin_s: float) -> Pace:
+    energies = {name: each.sum(axis=1) for name, each in found.costs.energy.items()}
+    return Pace(
+        bin_s=bin_s,
+        real_time_w={name: float((each / (found.steps * bin_s)).mean()) for name, each in energies.items()},
+        full_speed=tuple(
+            FullSpeed(
+                energy_table=name,
+                time_table=table,
+                model=model,
+                power_w=float((each / (times.duration_ns.sum(axis=1) * 1e-9)).mean()),
+                energy_delay_js=float((each * times.duration_ns.sum(axis=1) * 1e-9).mean()),
+            )
+            for table, model, times in _models(found)
+            for name, each in energies.items()
+        ),
+    )
+
+
+def _core(netlist: Netlist, found: Estimate, core: int) -> CoreCosts:
+    held = np.unique(netlist.layer[slice(*netlist.core_compartments[core : core + 2])])
+    simple = found.simple.items()
+    return CoreCosts(
+        core=core,
+        tile=int(netlist.core_tile[core]),
+        layers=tuple(netlist.layers[i].name for i in held),
+        sweep_s={name: float(times.generation_ns[:, core].mean() * 1e-9) for name, times in simple},
+        receive_s={name: float(times.processing_ns[:, core].mean() * 1e-9) for name, times in simple},
+        energy_j={name: float(each[:, core].mean()) for name, each in found.cores.items()},
+    )
