@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import hashlib
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -24,6 +25,7 @@ from spikeloom.compiler.passes.expand import Factored, expand
 from spikeloom.compiler.systems import GRAPH_SYSTEMS, TACTILESGNET, TITLES
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.truenorth.native_file import is_trained
+from spikeloom.compiler.text import text
 from spikeloom.models.graphs import CHOICES, NEUTOUCH, Graph
 from spikeloom.models.sensors import read_layout, sensor_graph
 from spikeloom.models.systems import NO_GRAPH, grid_cells, propagation_of
@@ -85,7 +87,7 @@ class LoadedNetwork:
         return self.network if self.checkpoint is None else self.checkpoint
 
 
-def load_network(path: str, arguments: argparse.Namespace, netlist: Netlist | None = None) -> LoadedNetwork:
+def load_network(path: str | Network, arguments: argparse.Namespace, netlist: Netlist | None = None) -> LoadedNetwork:
     """Read what a command is given.
 
     Of a checkpoint that holds several epochs, the one that `netlist` was compiled from where the options name none.
@@ -95,6 +97,8 @@ def load_network(path: str, arguments: argparse.Namespace, netlist: Netlist | No
     OptionError, ModelError
         If it is not there, not as the options say, or an option is for the other kind of file.
     """
+    if isinstance(path, Network):
+        return _in_memory(path)
     suffix = next((suffix for suffix in (ONNX, NIR) if path.endswith(suffix)), None)
     _require_fit(path, suffix, arguments)
     if suffix is None:
@@ -118,6 +122,14 @@ def load_network(path: str, arguments: argparse.Namespace, netlist: Netlist | No
         return _asked(onnx, "onnx", {})
     nir = read_nir(path, dt=arguments.dt, convention=arguments.convention, **layout)
     return _asked(nir, "nir", {"dt": nir.steps.dt, "convention": nir.steps.convention})
+
+
+def _in_memory(network: Network) -> LoadedNetwork:
+    """A network that Python made, as if it came from a file."""
+    sha256 = hashlib.sha256(text(network).encode()).hexdigest()
+    return LoadedNetwork(
+        network=network, checkpoint=None, adjacency=None, graph=None, facts=(), sha256=sha256, format="module"
+    )
 
 
 def _from_file(netlist: Netlist, checkpoint: Checkpoint) -> bool:

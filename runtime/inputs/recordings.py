@@ -16,7 +16,7 @@ from spikeloom.runtime.report.console import progress
 
 
 def recordings(
-    path: str,
+    path: str | Recordings,
     split: str,
     *,
     limit: int | None = None,
@@ -36,6 +36,9 @@ def recordings(
     DataError, OptionError
         If they cannot be used, or do not suit the network.
     """
+    if isinstance(path, Recordings):
+        require_suited(path, classes=classes, taxels=taxels)
+        return joined_bins(path if labels_for is None else need_labels(path, labels_for), bins)
     if path != SYNTHETIC:
         data, counts = load_data(path, split, bin_s=bin_s, limit=limit, classes=classes, taxels=taxels)
         show_counts(data.source, counts)
@@ -44,16 +47,27 @@ def recordings(
         return joined_bins(data, bins)
     require_events(SYNTHETIC, bin_s)
     grasps = synthetic_split(split, limit=limit)
-    if taxels is not None and grasps.taxels != taxels:
+    require_suited(grasps, classes=classes, taxels=taxels)
+    return joined_bins(grasps, bins)
+
+
+def require_suited(data: Recordings, *, classes: int | None, taxels: int | None) -> None:
+    """Refuse recordings of another sensor, or of more classes than a network has.
+
+    Raises
+    ------
+    DataError
+        Naming both.
+    """
+    if taxels is not None and data.taxels != taxels:
         raise DataError(
-            f"{SYNTHETIC}: has {grasps.taxels} taxels, the network has {taxels}; use recordings of its sensor"
+            f"{data.source}: has {data.taxels} taxels, the network has {taxels}; use recordings of its sensor"
         )
-    if classes is not None and grasps.labels.max() >= classes:
+    if classes is not None and data.labels.max(initial=0) >= classes:
         raise DataError(
-            f"{SYNTHETIC}: label {grasps.labels.max()}, the network has {classes} classes (0..{classes - 1}); "
+            f"{data.source}: label {data.labels.max()}, the network has {classes} classes (0..{classes - 1}); "
             "use the network that was trained on these objects"
         )
-    return joined_bins(grasps, bins)
 
 
 def require_bins(bins: int) -> None:

@@ -246,7 +246,9 @@ def _own_module(name: str, what: str) -> Any | None:
     return import_module(module) if has_machine(name) and find_spec(module) else None
 
 
-def trained_for(path: str) -> Any | None:
-    """Commands of the chip that a checkpoint was trained for; None for a checkpoint like any other."""
+def trained_for(path: object) -> Any | None:
+    """Commands of the chip that a checkpoint was trained for; None for any other network."""
+    if not isinstance(path, str):
+        return None
     chips = (chip_commands(each.name) for each in iter_modules(machines.__path__) if each.ispkg)
     return next((chip for chip in chips if chip is not None and chip.takes(path)), None)

@@ -232,6 +232,7 @@ def _commands(arguments: argparse.Namespace, netlist: Netlist, recording: str) -
 
 
 def _name(path: str) -> str:
+    path = str(getattr(path, "source", path))  # recordings that Python handed over
     return Path(path).name or path
 
 

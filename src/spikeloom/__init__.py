@@ -1,3 +1,29 @@
-"""Lower a trained spiking graph network for touch to an integer netlist, run it bit for bit and price it."""
+"""Lower a trained spiking network for touch to a chip's netlist, run it bit for bit, compare it and price it.
+
+>>> import spikeloom
+>>> net = spikeloom.compile("pretrained:grasps")
+>>> net
+loihi1: 2,886 neurons (2,517 on the chip), 451,712 synapses (363,967 stored, 345,889 non-zero), 5 cores …
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from spikeloom.compiler.errors import SpikeloomError
+    from spikeloom.models.networks.lif import LIF
+    from spikeloom.runtime.api import Compiled, compile, load, recordings
 
 __version__ = "0.1.0"
+__all__ = ["LIF", "Compiled", "SpikeloomError", "compile", "load", "recordings"]
+
+_PLACES = {"SpikeloomError": "compiler.errors", "LIF": "models.networks.lif"}
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name when it is first used."""
+    if name not in __all__:
+        raise AttributeError(f"module 'spikeloom' has no attribute {name!r}")
+    return getattr(import_module(f"spikeloom.{_PLACES.get(name, 'runtime.api')}"), name)

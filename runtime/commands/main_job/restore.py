@@ -29,7 +29,7 @@ FLOATS: Json = {"dt": None, "convention": None, **ROUNDING, "calibrate": None}
 
 def is_whole(arguments: argparse.Namespace) -> bool:
     """Whether what is to be compiled brings its integers."""
-    return bool(arguments.checkpoint.endswith(NETX))
+    return isinstance(arguments.checkpoint, str) and arguments.checkpoint.endswith(NETX)
 
 
 def take(arguments: argparse.Namespace) -> Outcome:

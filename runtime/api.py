@@ -1,0 +1,181 @@
+"""The main job in Python: what ``import spikeloom`` offers. Every option of a command is a keyword of its function."""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import tempfile
+import weakref
+from dataclasses import dataclass
+from functools import cached_property
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from spikeloom.compiler.errors import OptionError
+from spikeloom.runtime.report.sections import Outcome
+
+if TYPE_CHECKING:
+    from torch import Tensor, nn
+
+    from spikeloom.compiler.ir import Network
+    from spikeloom.models.recordings.evtouch import Recordings
+
+
+@dataclass(frozen=True)
+class Data:
+    """Recordings of a source by split, read when they are first needed; made by :func:`recordings`."""
+
+    source: str
+    bin_s: float
+
+    @cached_property
+    def train(self) -> Recordings:
+        """Those that may choose."""
+        return self.split("train")
+
+    @cached_property
+    def test(self) -> Recordings:
+        """Those that report."""
+        return self.split("test")
+
+    def split(self, name: str) -> Recordings:
+        """Recordings of a split: ``events`` (samples, taxels, 2, steps) uint8, ``labels``, ``files``.
+
+        Raises
+        ------
+        DataError
+            If there are none, or they cannot be read.
+        """
+        from spikeloom.runtime.inputs.recordings import recordings as read
+
+        return read(self.source, name, classes=None, taxels=None, bin_s=self.bin_s)
+
+
+def recordings(source: str, *, bin_s: float = 0.02) -> Data:
+    """Name recordings: a zip, folder or file of them, ``synthetic``, ``objects`` or ``containers``.
+
+    Parameters
+    ----------
+    source : str
+        As of ``--data``.
+    bin_s : float
+        Seconds of a time bin, for files of single events.
+    """
+    return Data(source, bin_s)
+
+
+@dataclass(frozen=True, eq=False)
+class Compiled:
+    """A netlist, with the network that it was compiled from; made by :func:`compile` or :func:`load`."""
+
+    path: Path
+    network: str | Network | None
+    options: dict[str, Any]
+    outcome: Outcome
+
+    def verify(self, data: Recordings | str, **options: Any) -> Outcome:
+        """Compare chip and float model on recordings; options as of ``spikeloom verify``."""
+        return _command("main_job.verify", netlist=str(self.path), data=data, **self._origin("verify"), **options)
+
+    def estimate(self, data: Recordings | str, **options: Any) -> Outcome:
+        """Operations, energy and time of recordings; options as of ``spikeloom estimate``."""
+        return _command("main_job.estimate", netlist=str(self.path), data=data, **options)
+
+    def run(self, data: Recordings | str, **options: Any) -> Outcome:
+        """Decisions of recordings, the chip's; options as of ``spikeloom run``."""
+        return _command("main_job.run", netlist=str(self.path), data=data, **options)
+
+    def report(self, output: str, data: Recordings | str, **options: Any) -> Outcome:
+        """Write a page with all of it; options as of ``spikeloom report``."""
+        given = self._origin("report") | options
+        return _command("main_job.report", netlist=str(self.path), output=output, data=data, **given)
+
+    def save(self, path: str) -> None:
+        """Write the netlist, a ``.loom`` file."""
+        shutil.copyfile(self.path, path)
+
+    def stream(self) -> Any:
+        """Open a live stream: ``step(events)`` takes one bin (taxels, 2), and gives the votes so far."""
+        from spikeloom.runtime.machines.base import machine_for
+
+        return machine_for(self.path).stream()
+
+    def _origin(self, what: str) -> dict[str, Any]:
+        if self.network is None:
+            raise OptionError(f"{what}: of a loaded netlist needs its network; give load(…, network=…)")
+        return {"checkpoint": self.network, **self.options}
+
+    def __repr__(self) -> str:
+        return repr(self.outcome)
+
+    def _repr_html_(self) -> str:
+        return self.outcome._repr_html_()
+
+
+def compile(
+    network: str | nn.Module,
+    *,
+    calibrate: Recordings | str | None = None,
+    example: Tensor | None = None,
+    **options: Any,
+) -> Compiled:
+    """Lower a network to a netlist that obeys every limit of its chip.
+
+    Parameters
+    ----------
+    network : str or Module
+        Checkpoint, ONNX, NIR or netx file, ``pretrained:NAME``, or a torch module of affine stages and
+        :class:`spikeloom.LIF` layers.
+    calibrate : Recordings or str, optional
+        Training recordings that choose the scales.
+    example : Tensor, optional
+        Input of one step, for a module.
+    options
+        As of ``spikeloom compile``: ``graph="manual"``, ``weight_bits="4"``, ``target=…``.
+
+    Raises
+    ------
+    SpikeloomError
+        If something cannot be used, or the network does not fit; the message says what to do.
+    """
+    source: str | Network
+    if isinstance(network, str):
+        source = network
+    else:
+        from spikeloom.models.networks.module import module_network
+
+        if example is None:
+            raise OptionError("compile: a module needs the input of one step; give example=torch.zeros(1, CHANNELS)")
+        source = module_network(network, example)
+    folder = tempfile.mkdtemp(prefix="spikeloom-")
+    path = Path(folder) / "netlist.loom"
+    words = {"checkpoint": source, "calibrate": calibrate, "output": str(path), **options}
+    outcome = _command("main_job.compile", **words)
+    kept = {name: value for name, value in options.items() if name in _defaults("main_job.verify")}
+    made = Compiled(path, source, kept, outcome)
+    weakref.finalize(made, shutil.rmtree, folder, ignore_errors=True)
+    return made
+
+
+def load(path: str, *, network: str | None = None, **options: Any) -> Compiled:
+    """Read a netlist; `network` is what it was compiled from, for `verify` and `report`, with options that name it."""
+    return Compiled(Path(path), network, options, _command("main_job.inspect", path=path))
+
+
+def _defaults(command: str) -> dict[str, Any]:
+    """What every option of a command is where it is not given."""
+    parser = argparse.ArgumentParser()
+    module = import_module(f"spikeloom.runtime.commands.{command}")
+    module.add_arguments(parser)
+    return {action.dest: action.default for action in parser._actions if action.dest != "help"}
+
+
+def _command(name: str, **options: Any) -> Outcome:
+    """Run a command on values in place of words."""
+    known = _defaults(name)
+    if unknown := sorted(set(options) - set(known)):
+        raise OptionError(f"{unknown[0]}: unknown option; allowed: {', '.join(sorted(known))}")
+    arguments = argparse.Namespace(**known | {"json": False, "debug": False} | options)
+    found = import_module(f"spikeloom.runtime.commands.{name}").run(arguments)
+    return found if isinstance(found, Outcome) else Outcome.plain(*found)

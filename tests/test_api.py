@@ -1,0 +1,105 @@
+"""The Python interface: the main job in a few lines, the same results as the commands, and one name of ours."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from made_files import TAXELS, own_file, recordings_folder
+from torch import nn
+
+import spikeloom as api
+from spikeloom.compiler.errors import DataError, OptionError
+from spikeloom.runtime import cli
+from spikeloom.runtime.report.encode import encode
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("api")
+    recordings_folder(folder / "data")
+    own_file(folder / "net.pt")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def data(place):
+    return api.recordings(str(place / "data"))
+
+
+@pytest.fixture(scope="module")
+def net(place, data):
+    return api.compile(str(place / "net.pt"), calibrate=data.train, weight_bits="4")
+
+
+def test_results_are_those_of_the_commands(place, data, net, capsys, monkeypatch):
+    monkeypatch.chdir(place)
+    words = {
+        "compile": ["net.pt", "--calibrate", "data", "--weight-bits", "4", "-o", "net.loom"],
+        "verify": ["net.loom", "--checkpoint", "net.pt", "--data", "data"],
+        "estimate": ["net.loom", "--data", "data"],
+        "run": ["net.loom", "--data", "data"],
+    }
+    found = {name: getattr(net, name)(data.test) for name in ("verify", "estimate", "run")} | {"compile": net.outcome}
+    for name, options in words.items():
+        capsys.readouterr()
+        assert cli.main([name, *options, "--json"]) in (0, 1)
+        assert json.loads(capsys.readouterr().out) == json.loads(json.dumps(encode(found[name].result)))
+    net.save("copy.loom")
+    assert Path("copy.loom").read_bytes() == Path("net.loom").read_bytes()
+    again = api.load("copy.loom", network="net.pt")
+    assert str(again.verify(data.test)) == str(found["verify"])
+    with pytest.raises(OptionError, match="network="):
+        api.load("copy.loom").verify(data.test)
+
+
+def test_results_show_themselves(place, data, net):
+    verdict = net.verify(data.test)
+    assert repr(verdict) == "\n".join(str(verdict).split("\n\n")[0].splitlines()[:8])
+    assert "float accuracy" in verdict._repr_html_()
+    assert repr(net).startswith("loihi1: ")
+    net.report(str(place / "page.html"), data.test)
+    assert (place / "page.html").read_text().startswith("<!DOCTYPE html>")
+
+
+def test_streams_give_the_votes_of_the_whole_recording(data, net):
+    stream = net.stream()
+    for step in np.moveaxis(data.test.events[0], -1, 0):
+        stream.step(step)
+    assert stream.finish()[-1].decision == net.run(data.test).result["predictions"][0]
+
+
+def test_modules_come_in_as_they_are(data):
+    module = nn.Sequential(nn.Linear(2 * TAXELS, 5), api.LIF(), nn.Linear(5, 4), api.LIF())
+    net = api.compile(module, example=torch.zeros(1, 2 * TAXELS))
+    assert "E0  specification = engine" in str(net.verify(data.test, min_agreement=0.0))
+    with pytest.raises(OptionError, match="example="):
+        api.compile(module)
+
+
+def test_what_does_not_suit_is_refused(data, net):
+    with pytest.raises(OptionError, match=r"wieght_bits: unknown option; allowed: .*weight_bits"):
+        api.compile("pretrained:grasps", wieght_bits="4")
+    with pytest.raises(DataError, match="has 39 taxels, the network has 6"):
+        net.run(api.recordings("synthetic").test)
+
+
+def test_a_folder_of_the_same_name_is_in_nobodys_way(tmp_path):
+    """Scripts in a project with packages ``models``, ``runtime`` and ``compiler`` of its own import both."""
+    for name in ("models", "runtime", "compiler"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "__init__.py").write_text("OWN = True\n")
+    code = (
+        "import models, runtime, compiler, spikeloom\n"
+        "net = spikeloom.compile('pretrained:grasps')\n"
+        "assert models.OWN and runtime.OWN and compiler.OWN and 'spikeloom.models' in __import__('sys').modules"
+    )
+    subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=True)
+
+
+def test_only_one_name_is_on_the_path():
+    code = "import importlib.util as u, sys; sys.exit(any(map(u.find_spec, ('compiler', 'runtime', 'models'))))"
+    assert subprocess.run([sys.executable, "-I", "-c", code], check=False).returncode == 0
