@@ -58,8 +58,9 @@ def test_results_are_those_of_the_commands(place, data, net, capsys, monkeypatch
 
 def test_results_show_themselves(place, data, net):
     verdict = net.verify(data.test)
-    assert repr(verdict) == "\n".join(str(verdict).split("\n\n")[0].splitlines()[:8])
-    assert "float accuracy" in verdict._repr_html_()
+    assert str(verdict).startswith(repr(verdict).removesuffix("\n…"))
+    assert repr(verdict).count("\n") <= 8
+    assert "<table" in verdict._repr_html_()
     assert repr(net).startswith("loihi1: ")
     net.report(str(place / "page.html"), data.test)
     assert (place / "page.html").read_text().startswith("<!DOCTYPE html>")
@@ -69,7 +70,7 @@ def test_streams_give_the_votes_of_the_whole_recording(data, net):
     stream = net.stream()
     for step in np.moveaxis(data.test.events[0], -1, 0):
         stream.step(step)
-    assert stream.finish()[-1].decision == net.run(data.test).result["predictions"][0]
+    assert stream.finish()[-1].decision == encode(net.run(data.test).result)["predictions"][0]
 
 
 def test_modules_come_in_as_they_are(data):
