@@ -26,7 +26,7 @@ from test_sanafe import compare as with_sanafe
 from test_sanafe import interpreter  # noqa: F401
 
 from spikeloom.compiler import Options, Recipe, compile_network, lift
-from spikeloom.compiler.errors import CapacityError, ModelError, NumericRangeError
+from spikeloom.compiler.errors import CapacityError, NumericRangeError
 from spikeloom.compiler.formats.netx.reader import read_netx
 from spikeloom.compiler.interpret import channels_last, run_float, run_integer
 from spikeloom.compiler.ir import INPUT, IntegerProjection, Projection, recurrent
@@ -368,14 +368,13 @@ def test_netx_has_the_loop_in_a_block_of_its_own(files, capsys):
     assert report["synapses"] == sum(p.weight.count_nonzero() for p in found.projections)
 
 
+def test_widths_are_searched_with_loops_too():
+    made = search(drawn(15), LOIHI, channels_last(events_for(0)), np.full(6, -1), widths=(4, 8))
+    assert {(8, 8), (4, 4)} <= {point.bits for point in made.points}
+    assert made.built
+
+
 def test_what_cannot_have_it_says_so(files, capsys):
-    network = drawn(15)
-    with pytest.raises(ModelError) as caught:
-        search(network, LOIHI, channels_last(events_for(0)), np.zeros(6, np.int64), widths=(4, 8))
-    assert str(caught.value) == (
-        "fc1: hears itself; combinations of widths are tried layer by layer, for networks without recurrence: compile "
-        "with --weight-bits"
-    )
     words = ["compile", f"{files}/net.nir", "--dt", "0.02", "--target", "truenorth", "-o", f"{files}/x.loom"]
     assert main(words) == 2
     assert capsys.readouterr().err == (

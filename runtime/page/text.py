@@ -6,7 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from spikeloom.runtime.report.render import netlist_text
+from spikeloom.compiler.dynamics import Clocks
+from spikeloom.compiler.targets.loihi1.legalize import LimitUse
+from spikeloom.runtime.machines.loihi1 import description
 from spikeloom.runtime.report.sections import Section, terminal
 from spikeloom.runtime.report.tables import si, table
 from spikeloom.runtime.studies.chart.sections import taken
@@ -23,7 +25,7 @@ def report_text(report: Json, verdict: str, costs: str) -> str:
     sections = {
         "Verdict": verdict,
         "Decisions": _decisions(report["decisions"]),
-        "Cores": f"{netlist_text(report['netlist'])}\n\n{_cores(report['cores'])}",
+        "Cores": f"{_netlist(report['netlist'])}\n\n{_cores(report['cores'])}",
         "Taxels": _taxels(report["taxels"]),
         "One recording": _recording(report["recording"]),
         "Energy and time": costs,
@@ -33,6 +35,14 @@ def report_text(report: Json, verdict: str, costs: str) -> str:
     }
     parts = [f"{title}\n{'-' * len(title)}\n{text}" for title, text in sections.items()]
     return "\n\n".join([*parts, f"page: {report['output']}"])
+
+
+def _netlist(facts: Json) -> str:
+    layers = [description.LayerFacts(**layer) for layer in facts["layers"]]
+    limits = [LimitUse(**use) for use in facts["limits"]]
+    clocks = {"clocks": Clocks(**facts["clocks"])} if "clocks" in facts else {}
+    found = description.NetlistFacts(**(facts | clocks | {"layers": layers, "limits": limits}))
+    return terminal(description.sections(found))
 
 
 def confusions(decisions: Json) -> list[tuple[int, int, int, int]]:

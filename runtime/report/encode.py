@@ -66,7 +66,7 @@ def encode(value: Any) -> Any:
         if field.metadata.get("hidden"):
             continue
         if field.metadata.get("inline"):
-            entries |= encode(each)
+            entries |= {} if each is None else encode(each)
         elif each is not None or not field.metadata.get("optional"):
             entries[field.metadata.get("key", field.name)] = encode(each)
     return entries | {name: encode(getattr(value, name)) for name in getattr(value, "json_properties", ())}

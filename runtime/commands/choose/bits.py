@@ -1,7 +1,7 @@
 """The command ``bits``: the storage width of each layer, from what the decisions have to keep.
 
-The search itself is :mod:`storage.width_search`. What it found is kept in the user's cache, so that another wanted
-share is answered at once.
+The search itself is :mod:`storage.width_search`. Its result is kept in the user's cache, so that another wanted share
+is answered at once.
 """
 
 from __future__ import annotations
@@ -12,12 +12,13 @@ import json
 import math
 import shlex
 import sys
-from collections.abc import Callable
-from dataclasses import asdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 from spikeloom import __version__
+from spikeloom.compiler import DEFAULT_TARGET
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.fixedpoint import FloatArray
 from spikeloom.compiler.formats.archive import is_netlist
@@ -27,31 +28,76 @@ from spikeloom.compiler.formats.checkpoint_file import arrays_digest
 from spikeloom.compiler.interpret import channels_last
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.base import COMPARTMENTS, Target, load_target
-from spikeloom.compiler.targets.loihi1.storage.width_search import Found, Point, check_widths, front, search
+from spikeloom.compiler.targets.loihi1.storage.width_search import Point, WidthSearch, check_widths, front, search
 from spikeloom.models.recordings.events import BIN_S
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.recordings.fetch import data_folder
+from spikeloom.runtime.commands.main_job import compile as compile_command
 from spikeloom.runtime.commands.options import add_bin_option, add_model
 from spikeloom.runtime.inputs.files import require_place, shipped
 from spikeloom.runtime.inputs.network import load_checkpoint, load_graph, propagation
 from spikeloom.runtime.inputs.recordings import recordings
-from spikeloom.runtime.report.tables import percent, table
-
-Json = dict[str, Any]
+from spikeloom.runtime.report.console import progress
+from spikeloom.runtime.report.encode import decode, encode, key
+from spikeloom.runtime.report.numbers import percent
+from spikeloom.runtime.report.sections import Block, Outcome, Section, Table, Text
 
 NOTES = """\
-Every combination of widths is tried on training recordings; test recordings are not read, so check the netlist with
-spikeloom verify. Accuracy is the share of recordings that the chip decides right, agreement the share that it decides
-as the float64 model does. Memory is counted in 64-bit words. What was found is kept in the user's cache.
+From the widest storage the layer is narrowed whose next smaller width keeps most decisions, again and again. Decisions
+are those on training recordings; test recordings are not read, so check the netlist with spikeloom verify. Accuracy is
+the share of recordings that the chip decides right, agreement the share that it decides as the float64 model does.
+Memory is counted in 64-bit words. The search is kept in the user's cache.
 """
 
-FORMAT = 1
+VERSION = 2
 """Of a cache file; goes up when a search could find something else, or the file means something else."""
 
 SAMPLES = 96
 
 FIGURES = {"accuracy": "right", "agreement": "equal"}
 """What can be wanted, and the count of a point that tells it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BuiltPoint:
+    """A combination of widths as the compiler builds it; shares of the recordings that were decided."""
+
+    weight_bits: Sequence[int]
+    words: int
+    cores: int | None
+    accuracy: float | None
+    agreement: float
+
+    def share(self, figure: str) -> float | None:
+        """Accuracy or agreement."""
+        return self.accuracy if figure == "accuracy" else self.agreement
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WrittenNetlist:
+    """File of a netlist, and its hash."""
+
+    file: str
+    sha256: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WidthChoice:
+    """Widths that keep what is wanted: `wanted` holds the one figure and its share."""
+
+    layers: Sequence[str]
+    widths: Sequence[int]
+    scale_groups: int
+    combinations: int
+    recordings: int
+    available: int = field(metadata=key("of"))
+    wanted: Mapping[str, float]
+    float_accuracy: float | None
+    front: Sequence[BuiltPoint]
+    recommended: BuiltPoint | None
+    command: str | None
+    cached: bool
+    netlist: WrittenNetlist | None
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -77,7 +123,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = NOTES
 
 
-def run(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
+def run(arguments: argparse.Namespace) -> Outcome:
     """Run the command; exit code 1 if nothing reaches what is wanted.
 
     Raises
@@ -94,7 +140,7 @@ def run(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int
             raise OptionError(f"--{option} {getattr(arguments, option)}: give 1 or more")
     if arguments.output is not None:
         require_place(arguments.output, "-o", arguments)
-    target, asked = load_target(arguments.target, COMPARTMENTS), _widths(arguments.widths)
+    target, given = load_target(arguments.target, COMPARTMENTS), _widths(arguments.widths)
     path = shipped(arguments.checkpoint)
     if Path(path).is_file() and is_netlist(path):
         raise ModelError(f"{path}: is a netlist, its widths are decided; give the checkpoint that it was made from")
@@ -102,9 +148,9 @@ def run(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int
     if checkpoint.forms is not None:
         raise ModelError(f"{path}: was fine-tuned for its own widths; give the network that it was made from")
     layers = ("conv1", *(dense.name for dense in checkpoint.dense))
-    widths = check_widths(asked, arguments.scale_groups, len(layers), target)
+    widths = check_widths(given, arguments.scale_groups, len(layers), target)
     _, adjacency = propagation(checkpoint, load_graph(arguments, checkpoint.system), arguments.checkpoint)
-    _tell("reading the recordings")
+    progress("reading the recordings")
     training = recordings(
         arguments.calibrate,
         "train",
@@ -114,39 +160,34 @@ def run(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int
         bin_s=arguments.bin,
         labels_for="--accuracy" if figure == "accuracy" else None,
     )
-    found, kept = _found(arguments, checkpoint, adjacency, training, target, widths)
-    _tell("")
-    best = front(found.built, FIGURES[figure])
-    reaching = [point for point in best if getattr(point, FIGURES[figure]) >= wanted * found.samples - 1e-9]
+    made, cached = _searched(arguments, checkpoint, adjacency, training, target, widths)
+    progress("")
+    best = front(made.built, FIGURES[figure])
+    reaching = [point for point in best if getattr(point, FIGURES[figure]) >= wanted * made.samples - 1e-9]
     command = _command(arguments, reaching[0].bits) if reaching else None
-    report: Json = {
-        "layers": list(layers),
-        "widths": list(widths),
-        "scale_groups": arguments.scale_groups,
-        "combinations": len(found.points),
-        "recordings": found.samples,
-        "of": len(training),
-        "wanted": {figure: wanted},
-        "float_accuracy": _share(found.float_right, found.samples),
-        "front": [_point_json(point, found.samples) for point in best],
-        "recommended": _point_json(reaching[0], found.samples) if reaching else None,
-        "command": None if command is None else shlex.join(command),
-        "cached": kept,
-        "netlist": None,
-    }
-    if arguments.output is not None and command is not None:
-        from spikeloom.runtime.cli import build_parser
-
-        compilation = build_parser().parse_args(command[1:])
-        compiled, _, _ = compilation.action(compilation)
-        report["netlist"] = {"file": arguments.output, "sha256": compiled["sha256"]}
-    return report, lambda found: bits_text(found, arguments.top), 0 if reaching else 1
+    choice = WidthChoice(
+        layers=layers,
+        widths=widths,
+        scale_groups=arguments.scale_groups,
+        combinations=len(made.points),
+        recordings=made.samples,
+        available=len(training),
+        wanted={figure: wanted},
+        float_accuracy=_share(made.float_right, made.samples),
+        front=[_built(point, made.samples) for point in best],
+        recommended=_built(reaching[0], made.samples) if reaching else None,
+        command=None if command is None else shlex.join(command),
+        cached=cached,
+        netlist=None if command is None or arguments.output is None else _compiled(command, arguments.output),
+    )
+    return Outcome(choice, partial(sections, top=arguments.top), 0 if reaching else 1)
 
 
-def _tell(what: str) -> None:
-    if sys.stderr.isatty():
-        sys.stderr.write(f"\r\x1b[K{what} …" if what else "\r\x1b[K")
-        sys.stderr.flush()
+def _compiled(command: Sequence[str], output: str) -> WrittenNetlist:
+    parser = argparse.ArgumentParser()
+    compile_command.add_arguments(parser)
+    made = compile_command.run(parser.parse_args(command[2:])).result
+    return WrittenNetlist(file=output, sha256=made.netlist.sha256)
 
 
 def _widths(words: str) -> list[int]:
@@ -160,18 +201,18 @@ def _share(count: int | None, samples: int) -> float | None:
     return None if count is None else count / samples
 
 
-def _point_json(point: Point, samples: int) -> Json:
-    return {
-        "weight_bits": list(point.bits),
-        "words": point.words,
-        "cores": point.cores,
-        "accuracy": _share(point.right, samples),
-        "agreement": _share(point.equal, samples),
-    }
+def _built(point: Point, samples: int) -> BuiltPoint:
+    return BuiltPoint(
+        weight_bits=point.bits,
+        words=point.words,
+        cores=point.cores,
+        accuracy=_share(point.right, samples),
+        agreement=point.equal / samples,
+    )
 
 
 def _command(arguments: argparse.Namespace, widths: tuple[int, ...]) -> list[str]:
-    """The words that compile what was found."""
+    """The words that compile the recommended widths."""
     words = ["spikeloom", "compile", arguments.checkpoint]
     given = {
         "--graph": arguments.graph,
@@ -181,7 +222,7 @@ def _command(arguments: argparse.Namespace, widths: tuple[int, ...]) -> list[str
         "--weights": arguments.weights,
         "--beta": arguments.beta,
         "--theta": arguments.theta,
-        "--target": None if arguments.target == "loihi1" else arguments.target,
+        "--target": None if arguments.target == DEFAULT_TARGET else arguments.target,
         "--calibrate": arguments.calibrate,
         "--bin": None if math.isclose(arguments.bin, BIN_S) else arguments.bin,
         "--weight-bits": ",".join(map(str, widths)),
@@ -194,17 +235,17 @@ def _command(arguments: argparse.Namespace, widths: tuple[int, ...]) -> list[str
 # -- the cache ---------------------------------------------------------------------------------------------------------
 
 
-def _found(
+def _searched(
     arguments: argparse.Namespace,
     checkpoint: Checkpoint,
     adjacency: FloatArray,
     training: Recordings,
     target: Target,
     widths: tuple[int, ...],
-) -> tuple[Found, bool]:
-    """What the search finds, and whether it was kept from an earlier one."""
+) -> tuple[WidthSearch, bool]:
+    """The search, and whether it was kept from an earlier call."""
     question = {
-        "format": FORMAT,
+        "version": VERSION,
         "spikeloom": __version__,
         "checkpoint": checkpoint.sha256,
         "run": arguments.run,
@@ -218,12 +259,12 @@ def _found(
         "scale_groups": arguments.scale_groups,
         "samples": arguments.samples,
     }
-    key = _digest(question)
-    path = data_folder() / "bits" / f"{key}.json"
-    found = None if arguments.no_cache else read_found(path, key)
-    if found is not None:
-        return found, True
-    found = search(
+    digest = hashlib.sha256(json.dumps(question, sort_keys=True).encode()).hexdigest()
+    path = data_folder() / "bits" / f"{digest}.json"
+    kept = None if arguments.no_cache else read_search(path)
+    if kept is not None:
+        return kept, True
+    made = search(
         expand(checkpoint, adjacency),
         target,
         channels_last(training.events, checkpoint.dynamics.clocks),
@@ -232,89 +273,81 @@ def _found(
         groups=arguments.scale_groups,
         samples=arguments.samples,
         lengths=training.lengths,
-        tell=_tell,
+        tell=progress,
     )
     if not arguments.no_cache:
-        write_found(path, key, found)
-    return found, False
+        write_search(path, made)
+    return made, False
 
 
-def _digest(values: Any) -> str:
-    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
-
-
-def write_found(path: Path, key: str, found: Found) -> None:
-    """Keep what a search found; if the folder cannot be written, a line on stderr says so."""
-    kept = {"key": key, "found": asdict(found)}
+def write_search(path: Path, made: WidthSearch) -> None:
+    """Keep a search; if the folder cannot be written, a line on stderr says so."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with write_atomically(path) as file:
-            file.write(json.dumps(kept | {"sha256": _digest(kept)}).encode())
+            file.write(json.dumps(encode(made)).encode())
     except OSError as error:
         sys.stderr.write(f"spikeloom: warning: {path}: {error.strerror}; the search is not kept for the next call\n")
 
 
-def read_found(path: Path, key: str) -> Found | None:
-    """What was kept under a key; None if nothing was, or, with a line on stderr, if it is damaged."""
+def read_search(path: Path) -> WidthSearch | None:
+    """A search that was kept; None if there is none, or, with a line on stderr, if it is damaged."""
     try:
-        kept = json.loads(path.read_bytes())
-        if kept["key"] != key or kept["sha256"] != _digest({"key": kept["key"], "found": kept["found"]}):
-            raise ValueError
-        found = kept["found"]
-        points, built = (
-            tuple(Point(**point | {"bits": tuple(point["bits"])}) for point in found[name])
-            for name in ("points", "built")
-        )
-        return Found(samples=found["samples"], float_right=found["float_right"], points=points, built=built)
-    except FileNotFoundError:
+        return decode(WidthSearch, json.loads(path.read_bytes()))
+    except (FileNotFoundError, NotADirectoryError):
         return None
     except (OSError, ValueError, KeyError, TypeError):
-        sys.stderr.write(f"spikeloom: warning: {path}: is damaged or of another version; it is left out\n")
+        sys.stderr.write(f"spikeloom: warning: {path}: is damaged or of another version; it is ignored\n")
         return None
 
 
 # -- for people --------------------------------------------------------------------------------------------------------
 
 
-def bits_text(report: Json, top: int) -> str:
+def sections(choice: WidthChoice, top: int) -> Iterator[Section]:
     """The front, the point to take, and the command that builds it."""
-    samples = report["recordings"]
-    (figure, wanted), recommended = next(iter(report["wanted"].items())), report["recommended"]
-    kept = ", kept from an earlier call" if report["cached"] else ""
-    lines = [
-        f"{report['combinations']:,} combinations of widths on {samples} of {report['of']} training recordings{kept}",
-        "training figures: they say how the combinations compare, not what the chip will reach on other recordings",
-    ]
-    if report["float_accuracy"] is not None:
-        lines.append(f"float64 model: {percent(round(report['float_accuracy'] * samples), samples)}")
-    shown = _shown(report["front"], recommended, top)
+    yield Section("", [*_blocks(choice, top)])
+
+
+def _blocks(choice: WidthChoice, top: int) -> Iterator[Block]:
+    samples, recommended = choice.recordings, choice.recommended
+    ((figure, wanted),) = choice.wanted.items()
+    kept = ", kept from an earlier call" if choice.cached else ""
+    yield Text(
+        f"{choice.combinations:,} combinations of widths on {samples} of {choice.available} training recordings{kept}"
+    )
+    yield Text(
+        "training figures: they say how the combinations compare, not what the chip will reach on other recordings"
+    )
+    if choice.float_accuracy is not None:
+        yield Text(f"float64 model: {percent(round(choice.float_accuracy * samples), samples)}")
+    shown = _shown(choice.front, recommended, top)
+    yield Text(f"most {figure} for the memory, least memory first ({len(shown)} of {len(choice.front)} points):")
     rows = [
         [
-            ",".join(map(str, point["weight_bits"])),
-            f"{point['words']:,}",
-            str(point["cores"]),
-            *("" if point[name] is None else f"{100 * point[name]:.2f} %" for name in FIGURES),
+            ",".join(map(str, point.weight_bits)),
+            f"{point.words:,}",
+            str(point.cores),
+            *("" if share is None else f"{100 * share:.2f} %" for share in map(point.share, FIGURES)),
             "<-" if point == recommended else "",
         ]
         for point in shown
     ]
-    lines.append(f"most {figure} for the memory, least memory first ({len(shown)} of {len(report['front'])} points):")
-    lines.append(table([",".join(report["layers"]), "words", "cores", *FIGURES, ""], rows))
+    yield Table([",".join(choice.layers), "words", "cores", *FIGURES, ""], rows)
     if recommended is None:
-        best = max((point[figure] for point in report["front"]), default=0.0)
-        lines.append(f"no combination reaches {figure} {wanted:g}; the best has {best:.4f}")
-        lines.append("  more --scale-groups or --widths may reach it; else fine-tune the network")
-        return "\n".join(lines)
-    chosen = ",".join(map(str, recommended["weight_bits"]))
-    reached = percent(round(recommended[figure] * samples), samples)
-    lines.append(f"{figure} {wanted:g} needs {chosen}: {recommended['words']:,} words; training {figure} {reached}")
-    lines.append(f"  {report['command']}")
-    if report["netlist"] is not None:
-        lines.append(f"  written: {report['netlist']['file']}")
-    return "\n".join(lines)
+        best = max((point.share(figure) or 0.0 for point in choice.front), default=0.0)
+        yield Text(f"no combination reaches {figure} {wanted:g}; the best has {best:.4f}")
+        yield Text("  more --scale-groups or --widths may reach it; else fine-tune the network")
+        return
+    widths = ",".join(map(str, recommended.weight_bits))
+    reached = percent(round((recommended.share(figure) or 0.0) * samples), samples)
+    yield Text(f"{figure} {wanted:g} needs {widths}: {recommended.words:,} words; training {figure} {reached}")
+    yield Text(f"  {choice.command}")
+    if choice.netlist is not None:
+        yield Text(f"  written: {choice.netlist.file}")
 
 
-def _shown(points: list[Json], recommended: Json | None, top: int) -> list[Json]:
+def _shown(points: Sequence[BuiltPoint], recommended: BuiltPoint | None, top: int) -> Sequence[BuiltPoint]:
     """The `top` points of a front around the recommended one, or the best ones."""
     middle = len(points) if recommended is None else points.index(recommended)
     first = max(0, min(middle - top // 2, len(points) - top))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
+from collections.abc import Mapping
 from typing import Any
 
 from spikeloom import __version__
@@ -14,16 +14,15 @@ from spikeloom.compiler.formats.checkpoint import Checkpoint
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.layout.choose import require_goal
 from spikeloom.compiler.targets.loihi1.options import GOALS, MARGIN, RANGES
-from spikeloom.runtime.commands.main_job.restore import is_whole, take
+from spikeloom.runtime.commands.main_job.integers import brings_integers, compile_integers
 from spikeloom.runtime.commands.options import add_bin_option, add_network, parse_cores
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import recordings
 from spikeloom.runtime.machines.base import chip_commands, trained_for
-from spikeloom.runtime.report import render
+from spikeloom.runtime.machines.loihi1 import compiled
 from spikeloom.runtime.report.console import progress
-
-Json = dict[str, Any]
+from spikeloom.runtime.report.sections import Outcome
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
@@ -77,12 +76,12 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("-o", "--output", required=True, metavar="NET.loom")
 
 
-def run(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
-    """Run the command: the report, how to print it, and the exit code."""
+def run(arguments: argparse.Namespace) -> Outcome:
+    """Run the command."""
     require_place(arguments.output, "-o", arguments)
     chip = load_target(arguments.target)
-    if is_whole(arguments):
-        return take(arguments)
+    if brings_integers(arguments.checkpoint):
+        return compile_integers(arguments)
     if unknown := set(arguments.dump_after) - {step.name for step in chip.passes}:
         names = ", ".join(step.name for step in chip.passes)
         raise OptionError(f"--dump-after {', '.join(sorted(unknown))}: no such pass; allowed: {names}")
@@ -93,14 +92,13 @@ def run(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int
         raise OptionError(f"--in-time {arguments.in_time}: {arguments.target} has no such option; omit it")
     if arguments.margin is not None and arguments.ranges != "observed":
         raise OptionError(
-            f"--margin {arguments.margin:g}: only observed ranges have one; add --ranges observed or leave it away"
+            f"--margin {arguments.margin:g}: only observed ranges have one; add --ranges observed or omit it"
         )
     recipes = parse_recipes(arguments)
     cores_for = parse_cores(arguments.cores_for)
     require_goal(arguments.optimize, cores_for, chip, calibrated=arguments.calibrate is not None, chips=arguments.chips)
     asked = load_network(arguments.checkpoint, arguments)
-    checkpoint = asked.checkpoint
-    training = None
+    checkpoint, training = asked.checkpoint, None
     if arguments.calibrate is not None:
         progress("reading the recordings")
         training = recordings(
@@ -136,12 +134,11 @@ def run(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int
         target=arguments.target,
         after=dump,
     )
-    report = render.compilation_json(compilation, write_netlist(compilation.netlist, arguments.output))
-    report |= {"facts": list(asked.facts)} if asked.facts else {}
-    return report, _text, 0
+    sha256 = write_netlist(compilation.netlist, arguments.output)
+    return Outcome(compiled.facts_of(compilation, sha256, asked.facts), compiled.sections)
 
 
-def provenance(arguments: argparse.Namespace, asked: LoadedNetwork, *, calibrated: bool) -> Json:
+def provenance(arguments: argparse.Namespace, asked: LoadedNetwork, *, calibrated: bool) -> Mapping[str, Any]:
     """What a netlist remembers of its compilation.
 
     Parameters
@@ -176,12 +173,6 @@ def _margin(arguments: argparse.Namespace) -> float:
     return float(MARGIN if arguments.margin is None else arguments.margin)
 
 
-def _text(report: Json) -> str:
-    """A compilation for people, with what was read from another format."""
-    lines = [*report.get("facts", ()), *([""] if "facts" in report else []), render.compilation_text(report)]
-    return "\n".join(lines)
-
-
 def _numbers(text: str, option: str) -> list[int]:
     try:
         return [int(part) for part in text.split(",")]
@@ -212,7 +203,7 @@ def parse_recipes(arguments: argparse.Namespace) -> tuple[Recipe, ...] | None:
     return tuple(Recipe(bits=b, planes=p, groups=g) for b, p, g in zip(*columns, strict=True))
 
 
-def storage(recipes: tuple[Recipe, ...] | None, checkpoint: Checkpoint | None) -> Json:
+def storage(recipes: tuple[Recipe, ...] | None, checkpoint: Checkpoint | None) -> Mapping[str, Any]:
     """The same for the provenance of a netlist."""
     if checkpoint is not None and checkpoint.forms is not None:
         return {"weight_bits": _one_or_list([form.bits for form in checkpoint.forms]), "fine_tuned": True}

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.formats.archive import is_netlist
+from spikeloom.runtime.commands.main_job.checkpoint_facts import facts_of, sections
 from spikeloom.runtime.commands.options import add_model
 from spikeloom.runtime.inputs.files import require_inspectable
 from spikeloom.runtime.inputs.network import load_checkpoint
 from spikeloom.runtime.machines.base import machine_for, trained_for
-from spikeloom.runtime.report import render
 from spikeloom.runtime.report.sections import Outcome
 
 
@@ -24,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_model(parser, graph=False)
 
 
-def run(arguments: argparse.Namespace) -> Outcome | tuple[dict[str, Any], Callable[[dict[str, Any]], str], int]:
+def run(arguments: argparse.Namespace) -> Outcome:
     """Run the command."""
     require_inspectable(arguments.path)
     if (own := trained_for(arguments.path)) is not None:
@@ -37,4 +35,4 @@ def run(arguments: argparse.Namespace) -> Outcome | tuple[dict[str, Any], Callab
         sha256 = hashlib.sha256(Path(arguments.path).read_bytes()).hexdigest()
         return machine_for(arguments.path).describe(sha256)
     given = tuple(name for name in ("beta", "theta") if getattr(arguments, name) is not None)
-    return render.checkpoint_json(load_checkpoint(arguments.path, arguments), given), render.checkpoint_text, 0
+    return Outcome(facts_of(load_checkpoint(arguments.path, arguments), given), sections)

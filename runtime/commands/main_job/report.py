@@ -25,10 +25,10 @@ from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.machines.base import machine_of
+from spikeloom.runtime.machines.loihi1.description import describe
 from spikeloom.runtime.machines.loihi1.trace import check_channels
 from spikeloom.runtime.page.text import report_text
 from spikeloom.runtime.report.encode import encode
-from spikeloom.runtime.report.render import netlist_json
 from spikeloom.runtime.report.sections import Outcome, Section, Text, terminal
 from spikeloom.runtime.studies.chart.files import read_chart
 
@@ -174,7 +174,7 @@ def _facts(
     found = {
         "verify": encode(verdict),
         "decisions": report_facts.decisions_json(verdict, netlist.classes),
-        "netlist": netlist_json(netlist, measure(netlist, target), provenance["netlist"]["sha256"]),
+        "netlist": encode(describe(netlist, measure(netlist, target), provenance["netlist"]["sha256"])),
         "cores": report_facts.cores_json(netlist, target, counts),
         "taxels": report_facts.taxels_json(netlist, asked, data, counts, arguments.taxels),
         "recording": recording_json(netlist, target, asked, data, chosen, costs, bin_s=arguments.bin * netlist.bins),

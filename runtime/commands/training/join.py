@@ -17,10 +17,10 @@ from spikeloom.compiler.formats.checkpoint_file import WEIGHTS
 from spikeloom.compiler.formats.towers import arrays_of
 from spikeloom.compiler.formats.towers import join as join_networks
 from spikeloom.compiler.targets.truenorth.native import SYSTEM as NATIVE
+from spikeloom.runtime.commands.main_job.checkpoint_facts import tower_line
 from spikeloom.runtime.commands.training.finetune import stored_graph
 from spikeloom.runtime.inputs.files import require_place, shipped
 from spikeloom.runtime.machines.base import trained_for
-from spikeloom.runtime.report.render import tower_line
 from spikeloom.runtime.report.tables import percent
 
 Report = dict[str, Any]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 
@@ -15,13 +15,12 @@ from spikeloom.compiler.targets.base import with_tables
 from spikeloom.compiler.targets.loihi1.legalize import measure, require_legal
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
-from spikeloom.runtime.machines.base import BoolArray, EventArray, Machine, Price, Run, as_text
-from spikeloom.runtime.machines.loihi1 import engine
+from spikeloom.runtime.machines.base import BoolArray, EventArray, Machine, Price, Run
+from spikeloom.runtime.machines.loihi1 import description, engine
 from spikeloom.runtime.machines.loihi1.blocks import obstacle
 from spikeloom.runtime.machines.loihi1.stream import Stream, open_stream
 from spikeloom.runtime.machines.loihi1.trace import aligned
 from spikeloom.runtime.machines.votes import class_counts
-from spikeloom.runtime.report import render
 from spikeloom.runtime.report.sections import Outcome
 
 SUMS = 1 << 24
@@ -107,8 +106,8 @@ class Loihi(Machine):
 
     def describe(self, sha256: str) -> Outcome:
         """Layers, scales, cores, and the fill of every limit."""
-        report = render.netlist_json(self.netlist, measure(self.netlist, self.target), sha256)
-        return Outcome(report, partial(as_text, render.netlist_text))
+        facts = description.describe(self.netlist, measure(self.netlist, self.target), sha256)
+        return Outcome(facts, description.sections)
 
     def stream(self) -> Stream:
         """One grasp, bin after bin."""

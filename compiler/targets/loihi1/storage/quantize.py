@@ -175,7 +175,7 @@ def round_with_more(
     return replace(candidate, layer=layer, flips=int(flips(layer, post, fewer(many)).sum()), compensated=True)
 
 
-def _settle(network: Network, shortlists: list[list[Candidate]], calibration: Calibration) -> list[Candidate]:
+def settle(network: Network, shortlists: list[list[Candidate]], calibration: Calibration) -> list[Candidate]:
     """Pick one scale per population, in order, by how far the whole network's class counts move from float64."""
     wanted = calibration.spikes[network.readout.population].sum(axis=1, dtype=np.int64)
     chosen = [candidates[0] for candidates in shortlists]
@@ -301,7 +301,7 @@ def quantize(
     if calibration is None or few is None:
         chosen = [candidates[0] for candidates in shortlists]
     else:
-        chosen = _settle(network, shortlists, few)
+        chosen = settle(network, shortlists, few)
         chosen = [
             candidate if recipe.planes == 1 else round_with_more(network, post, candidate, calibration, observed)
             for post, (candidate, recipe, observed) in enumerate(zip(chosen, recipes, limits, strict=True))

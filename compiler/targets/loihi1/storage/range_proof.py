@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -21,6 +22,8 @@ class RangeProof:
     accumulator, current, membrane : float
         Largest magnitude that any input can bring to any neuron; infinite where nothing bounds it.
     """
+
+    json_properties: ClassVar = ("holds",)
 
     layer: str
     accumulator: float

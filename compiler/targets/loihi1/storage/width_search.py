@@ -1,34 +1,35 @@
-"""Search the storage width of each layer: every combination, on the chip's own spikes.
+"""Search the storage width of each layer on the chip's own spikes: coordinate descent from the widest to the narrowest.
 
-Each layer is rounded once for each width, and every combination is run. Which of a layer's few best scales it gets is
-decided beside other layers at full width; the compiler decides that for each combination anew. So the combinations on
-the Pareto front are then settled as the compiler does, and built: their figures are those of the netlist that the
-compiler makes, and the front is drawn anew until all that is on it was built. A combination that would do better than
-it did here and so never came to the front is missed. The network is not changed.
+From the widest storage the layer is narrowed whose next smaller width keeps most decisions, again and again until all
+are at their narrowest; every combination on the way is a point. The best of these, on the Pareto front, are then
+rounded as the compiler does and laid out: their figures are those of the netlist that the compiler makes, and the
+front is drawn anew until all that is on it was built. The network is not changed.
 """
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from spikeloom.compiler.errors import CapacityError, ModelError, OptionError
 from spikeloom.compiler.fixedpoint import FloatArray, IntArray
-from spikeloom.compiler.interpret import BoolArray, cut, run_float, vote
-from spikeloom.compiler.ir import INPUT, IntegerNetwork, Network, Readout, recurrent
-from spikeloom.compiler.passes.calibrate import calibrate, evenly_spaced
-from spikeloom.compiler.passes.prune import Mask, compact, disconnect, either, never_fires, removable
+from spikeloom.compiler.interpret import BoolArray, cut, run_float, run_integer, vote
+from spikeloom.compiler.ir import IntegerNetwork, Network
+from spikeloom.compiler.passes.calibrate import Calibration, calibrate, evenly_spaced
+from spikeloom.compiler.passes.prune import compact, disconnect, either, never_fires, removable
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.targets.loihi1.layout.core_needs import Chunk, choose_dense, lists_into
+from spikeloom.compiler.targets.loihi1.layout.core_needs import Needs
 from spikeloom.compiler.targets.loihi1.layout.partition import partition
 from spikeloom.compiler.targets.loihi1.options import Recipe, check_recipes
-from spikeloom.compiler.targets.loihi1.storage.branches import Offers, Path, Widths, offer_forms, settle, usual, votes
+from spikeloom.compiler.targets.loihi1.storage.quantize import Candidate, assemble, settle, shortlist
 
-MAX_COMBINATIONS = 4096
-"""Combinations that are searched at most: six widths in four layers are 1,296, five in five layers 3,125."""
+Widths = tuple[int, ...]
+"""Storage width of each layer."""
+
+Offers = list[dict[int, list[Candidate]]]
+"""Scales worth a closer look of each layer, best first, by width; widest width first."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,8 +41,8 @@ class Point:
     bits : tuple of int
         Width of each layer.
     words : int
-        64-bit words of synaptic memory, each list in the smaller of its forms: estimated, or on the cores of the
-        netlist. A netlist uses the larger form where a core has room for it and it saves synaptic operations.
+        64-bit words of synaptic memory: of the weights alone, or, of what was built, of all lists in the smaller of
+        their forms. A netlist uses the larger form where a core has room for it and it saves synaptic operations.
     equal : int
         Recordings that are decided as the float64 model does.
     right : int or None
@@ -58,8 +59,8 @@ class Point:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Found:
-    """All combinations, and the best of them as netlists.
+class WidthSearch:
+    """Combinations that were tried, and the best of them as netlists.
 
     Parameters
     ----------
@@ -68,7 +69,7 @@ class Found:
     float_right : int or None
         Those of them that the float64 model decides right.
     points : tuple of Point
-        Every combination, in the order of its widths; scales as a rule, memory estimated.
+        Every combination that was tried, each layer at the scale that is best by itself.
     built : tuple of Point
         Those on a front (accuracy or agreement against memory) that fit the chip, as the compiler builds them.
     """
@@ -85,24 +86,17 @@ def check_widths(widths: Sequence[int], groups: int, layers: int, target: Target
     Raises
     ------
     OptionError
-        If the chip has no such storage, or there are too many combinations to try them all.
+        If the chip has no such storage.
     """
     allowed = target.choices["synapse.weight_bits"]
-    asked = f"--widths {','.join(map(str, widths))}"
     for width in widths:
         if width not in allowed:
+            given = ",".join(map(str, widths))
             raise OptionError(
-                f"{asked}: {target.title} does not store {width} bits; allowed: {', '.join(map(str, allowed))}"
+                f"--widths {given}: {target.title} does not store {width} bits; allowed: {', '.join(map(str, allowed))}"
             )
     check_recipes((Recipe(bits=widths[0], groups=groups),), layers, target)
-    found = tuple(sorted(set(widths)))
-    if len(found) ** layers > MAX_COMBINATIONS:
-        most = max(count for count in range(1, len(found)) if count**layers <= MAX_COMBINATIONS)
-        raise OptionError(
-            f"{asked}: {len(found)} widths in {layers} layers are {len(found) ** layers:,} combinations, the search "
-            f"tries them all up to {MAX_COMBINATIONS:,}; give {most} at most"
-        )
-    return found
+    return tuple(sorted(set(widths)))
 
 
 def front(points: Iterable[Point], by: str) -> tuple[Point, ...]:
@@ -114,11 +108,11 @@ def front(points: Iterable[Point], by: str) -> tuple[Point, ...]:
     >>> [point.bits for point in front(points, "equal")]
     [(2,), (4,)]
     """
-    found: list[Point] = []
+    best: list[Point] = []
     for point in sorted(points, key=lambda p: (p.words, -getattr(p, by), p.bits)):
-        if not found or getattr(point, by) > getattr(found[-1], by):
-            found.append(point)
-    return tuple(found)
+        if not best or getattr(point, by) > getattr(best[-1], by):
+            best.append(point)
+    return tuple(best)
 
 
 def search(
@@ -132,8 +126,8 @@ def search(
     samples: int = 96,
     lengths: IntArray | None = None,
     tell: Callable[[str], None] = lambda _stage: None,
-) -> Found:
-    """Try every combination of widths.
+) -> WidthSearch:
+    """Narrow one layer after the other.
 
     Parameters
     ----------
@@ -162,139 +156,102 @@ def search(
     DataError, OptionError
         If the recordings or the widths cannot be used.
     ModelError
-        If a layer has no usable scale at any width, or hears itself.
+        If a layer has no usable scale at any width.
     """
-    if loops := recurrent(network):
-        raise ModelError(
-            f"{', '.join(loops)}: hears itself; combinations of widths are tried layer by layer, for networks without "
-            "recurrence: compile with --weight-bits"
-        )
     widths = check_widths(widths, groups, len(network.populations), target)
     tell("running the float model")
     calibration = calibrate(network, evenly_spaced(events))
     chosen = np.linspace(0, len(events) - 1, min(samples, len(events))).round().astype(np.int64)
     shown, known = events[chosen], labels[chosen]
     ends = None if lengths is None else lengths[chosen]
-    labelled = bool(np.all(known >= 0))
-    reference = run_float(network, shown).spikes[network.readout.population]
-    wanted = _decide(cut(reference, ends).sum(axis=1), network.readout, network.classes)
+    figures = ("equal", "right") if np.all(known >= 0) else ("equal",)
+    label = (network.readout.label[:, None] == np.arange(network.classes)).astype(np.int64)
 
+    def decide(spikes: BoolArray) -> IntArray:
+        return vote(cut(spikes, ends).sum(axis=1, dtype=np.int64) @ label)
+
+    wanted = decide(run_float(network, shown).spikes[network.readout.population])
     tell("rounding each layer to each width")
     network = disconnect(network, never_fires(network))
-    offers = offer_forms(network, target, widths, groups, calibration)
-    memory = _Memory(network, offers, target)
-    decided: dict[Path, IntArray] = {}
+    offers = _offers(network, target, widths, groups, calibration)
 
-    def decide(paths: Iterable[Path]) -> None:
-        for path, counts in votes(network, offers, set(paths) - decided.keys(), shown, ends).items():
-            decided[path] = _decide(counts, network.readout, network.classes)
+    def point(bits: Widths, integer: IntegerNetwork, words: int, cores: int | None = None) -> Point:
+        decided = decide(run_integer(integer, shown).spikes[network.readout.population])
+        equal, right = (int(np.count_nonzero(decided == aim)) for aim in (wanted, known))
+        return Point(bits=bits, words=words, equal=equal, right=right if "right" in figures else None, cores=cores)
 
-    def point(bits: Widths, path: Path, words: int, cores: int | None = None) -> Point:
-        equal, right = (int(np.count_nonzero(decided[path] == aim)) for aim in (wanted, known))
-        return Point(bits=bits, words=words, equal=equal, right=right if labelled else None, cores=cores)
+    tried: dict[Widths, Point] = {}
 
-    forms = usual(network, offers, calibration)
-    paths = {
-        bits: tuple(known[width] for known, width in zip(forms, bits, strict=True))
-        for bits in itertools.product(*offers.places)
-    }
-    tell(f"trying {len(paths):,} combinations")
-    decide(paths.values())
-    points = [point(bits, path, memory.words(path)) for bits, path in paths.items()]
+    def attempt(bits: Widths) -> Point:
+        if bits not in tried:
+            tell(f"trying combination {len(tried) + 1}")
+            integer = assemble(network, [offers[post][width][0].layer for post, width in enumerate(bits)])
+            weights = sum(p.bits * p.weight.count_nonzero() for p in integer.projections)
+            tried[bits] = point(bits, integer, -(-int(weights) // target.limit("synapse.word_bits")))
+        return tried[bits]
+
+    for figure in figures:
+        at = attempt(tuple(next(iter(offer)) for offer in offers))
+        while narrower := [attempt(bits) for bits in _narrower(at.bits, offers)]:
+            at = max(narrower, key=lambda p: (getattr(p, figure), -p.words))
 
     # the front is drawn anew with the figures of what was built, until all that is on it was built
-    figures = ("equal", "right") if labelled else ("equal",)
     rates = tuple(spikes.mean(axis=(0, 1)) for spikes in calibration.spikes)
-    current, built = {found.bits: found for found in points}, dict[Widths, Point | None]()
-    while best := {found.bits for by in figures for found in front(current.values(), by)} - built.keys():
+    current, built = dict(tried), dict[Widths, Point | None]()
+    while best := {p.bits for figure in figures for p in front(current.values(), figure)} - built.keys():
         tell(f"building the best of them: {len(built) + len(best)}")
-        settled = settle(network, offers, best, calibration)
-        decide(settled.values())
-        for bits, path in settled.items():
-            size = _size(offers.put_together(network, path), target, rates)
-            built[bits] = None if size is None else point(bits, path, *size)
-            if size is None:
+        for bits in sorted(best):
+            scales = settle(network, [offers[post][width] for post, width in enumerate(bits)], calibration)
+            integer = assemble(network, [candidate.layer for candidate in scales])
+            size = _size(integer, target, rates)
+            made = None if size is None else point(bits, integer, *size)
+            built[bits] = made
+            if made is None:
                 del current[bits]
             else:
-                current[bits] = point(bits, path, current[bits].words)
-    return Found(
+                current[bits] = replace(made, words=tried[bits].words)
+    return WidthSearch(
         samples=len(chosen),
-        float_right=int(np.count_nonzero(wanted == known)) if labelled else None,
-        points=tuple(points),
-        built=tuple(found for _, found in sorted(built.items()) if found is not None),
+        float_right=int(np.count_nonzero(wanted == known)) if "right" in figures else None,
+        points=tuple(tried.values()),
+        built=tuple(made for _, made in sorted(built.items()) if made is not None),
     )
 
 
-def _decide(counts: IntArray, readout: Readout, classes: int) -> IntArray:
-    """Class of each recording from the spikes of each voting neuron (samples, neurons)."""
-    return vote(counts @ (readout.label[:, None] == np.arange(classes)).astype(np.int64))
+def _offers(network: Network, target: Target, widths: Widths, groups: int, calibration: Calibration) -> Offers:
+    """Scales of every layer at every width; a width at which a layer has none is left out for that layer."""
+    exponents = target.choices["synapse.exponent"]
+    offers: Offers = []
+    for post in range(len(network.populations)):
+        offer: dict[int, list[Candidate]] = {}
+        faults: list[ModelError] = []
+        for bits in reversed(widths):
+            try:
+                recipe = Recipe(bits=bits, groups=groups)
+                offer[bits] = shortlist(network, post, recipe, exponents, calibration, None)
+            except ModelError as error:
+                faults.append(error)
+        if not offer:
+            raise faults[0]
+        offers.append(offer)
+    return offers
 
 
-class _Memory:
-    """Estimates of synaptic memory: each layer on cores of its own, without the neurons that provably never fire."""
-
-    def __init__(self, network: Network, offers: Offers, target: Target) -> None:
-        self._network, self._offers, self._target = network, offers, target
-        usual = tuple(0 for _ in offers.forms)
-        self._fires: list[list[Mask]] = []
-        self._words: list[list[dict[int, IntArray]]] = []  # words for each neuron of each source, by layer and form
-        for post, forms in enumerate(offers.forms):
-            networks = [offers.put_together(network, (*usual[:post], k, *usual[post + 1 :])) for k in range(len(forms))]
-            self._fires.append([~removable(integer)[0][post] for integer in networks])
-            pairs = zip(networks, self._fires[-1], strict=True)
-            self._words.append([self._into(integer, post, fires) for integer, fires in pairs])
-
-    def words(self, path: Path) -> int:
-        """Words of one combination."""
-        total = 0
-        for post, form in enumerate(path):
-            for pre, words in self._words[post][form].items():
-                total += int(words.sum() if pre == INPUT else words[self._fires[pre][path[pre]]].sum())
-        return total
-
-    def _into(self, integer: IntegerNetwork, post: int, fires: Mask) -> dict[int, IntArray]:
-        laid, _ = compact(integer, tuple(~fires if i == post else mask for i, mask in enumerate(_nobody(integer))))
-        size, limit = laid.populations[post].size, self._target.limit("core.synapse_words")
-        most = min(size, self._target.limit("core.compartments"))
-        while True:
-            found: dict[int, IntArray] = {}
-            fullest = 0
-            for first in range(0, size, most):
-                chunk = Chunk(population=post, first=first, last=min(first + most, size))
-                words = _chunk_words(laid, chunk, 0, self._target)
-                fullest = max(fullest, sum(int(each.sum()) for each in words.values()))
-                found = {pre: found.get(pre, 0) + each for pre, each in words.items()}
-            if fullest <= limit or most == 1:
-                return found
-            most = max(1, most * limit // fullest)
-
-
-def _nobody(network: IntegerNetwork) -> tuple[Mask, ...]:
-    return tuple(np.zeros(population.size, np.bool_) for population in network.populations)
-
-
-def _chunk_words(network: IntegerNetwork, chunk: Chunk, base: int, target: Target) -> dict[int, IntArray]:
-    """Words that a chunk's lists take in their smaller form, for each neuron of each source population."""
-    found: dict[int, IntArray] = {}
-    for lists in lists_into(network, chunk):
-        projection = network.projections[lists.projection]
-        _, taken = choose_dense(lists, projection, base, chunk.size, lean=False, target=target)
-        words = found.setdefault(projection.pre, np.zeros(projection.weight.shape[1], np.int64))
-        words[lists.source] += taken
-    return found
+def _narrower(bits: Widths, offers: Offers) -> list[Widths]:
+    """Combinations in which one layer has its next smaller width."""
+    steps = []
+    for post, width in enumerate(bits):
+        smaller = [other for other in offers[post] if other < width]
+        steps += [(*bits[:post], max(smaller), *bits[post + 1 :])] if smaller else []
+    return steps
 
 
 def _size(integer: IntegerNetwork, target: Target, rates: tuple[FloatArray, ...]) -> tuple[int, int] | None:
     """Words that a network needs and cores that it takes as the compiler lays it out; None if it does not fit."""
-    laid, kept = compact(integer, either(*removable(integer)))
+    held, kept = compact(integer, either(*removable(integer)))
     try:
-        parts = partition(laid, target, tuple(rate[ids] for rate, ids in zip(rates, kept, strict=True)))
+        parts = partition(held, target, tuple(rate[ids] for rate, ids in zip(rates, kept, strict=True)))
     except CapacityError:
         return None
-    words = 0
-    for core in parts.cores:
-        base = 0
-        for chunk in core:
-            words += sum(int(each.sum()) for each in _chunk_words(laid, chunk, base, target).values())
-            base += chunk.size
-    return words, len(parts.cores)
+    needs = Needs(held, target)
+    return sum(needs.uses(core)["core.synapse_words"] for core in parts.cores), len(parts.cores)

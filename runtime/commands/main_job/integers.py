@@ -1,0 +1,76 @@
+"""``compile`` of a file that brings its integers (netx): nothing is rounded, they are laid out as they stand."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+from spikeloom import __version__
+from spikeloom.compiler import Options, compile_network, write_netlist
+from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.formats.netx.layout import SUFFIX
+from spikeloom.compiler.formats.netx.reader import read_netx
+from spikeloom.compiler.invariants import verify
+from spikeloom.runtime.commands.options import MODEL, ROUNDING, parse_cores
+from spikeloom.runtime.machines.loihi1 import description
+from spikeloom.runtime.report.console import progress
+from spikeloom.runtime.report.encode import INLINE
+from spikeloom.runtime.report.sections import Outcome, Section, Text
+
+FLOATS: Mapping[str, object] = {"dt": None, "convention": None, **ROUNDING, "calibrate": None}
+"""Options that say how a float network is read and rounded, and what they are where they are not given."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LaidOut:
+    """A netlist of integers as they stood, and what was read from their file."""
+
+    netlist: description.NetlistFacts = field(metadata=INLINE)
+    path: str
+    facts: Sequence[str]
+
+
+def brings_integers(source: object) -> bool:
+    """Whether what is to be compiled is rounded already."""
+    return isinstance(source, str) and source.endswith(SUFFIX)
+
+
+def compile_integers(arguments: argparse.Namespace) -> Outcome:
+    """Run the command for such a file."""
+    path = arguments.checkpoint
+    _refuse(arguments, FLOATS, f"is for float networks, {path} holds integers; omit it")
+    _refuse(arguments, MODEL, f"is for checkpoints, the netx file {path} holds all it needs; omit it")
+    why = f"weighs layouts by what a float network does on recordings, {path} holds integers; omit it"
+    _refuse(arguments, {"optimize": "cores"}, f"{why}, or give --cores-for")
+    progress("reading the network")
+    read = read_netx(path, polarities=arguments.polarities, polarities_first=arguments.polarities_first)
+    verify(read.network)
+    progress("compiling")
+    cores_for = parse_cores(arguments.cores_for)
+    provenance = {
+        "spikeloom": __version__,
+        "checkpoint_sha256": read.sha256,
+        "format": "netx",
+        "keep_all": arguments.keep_all,
+        **({"cores_for": cores_for} if cores_for else {}),
+        **({"chips": arguments.chips} if arguments.chips != 1 else {}),
+    }
+    options = Options(keep_all=arguments.keep_all, cores_for=cores_for, chips=arguments.chips, provenance=provenance)
+    done = compile_network(read.network, options, target=arguments.target)
+    sha256 = write_netlist(done.netlist, arguments.output)
+    facts = description.describe(done.netlist, done.uses, sha256)
+    return Outcome(LaidOut(netlist=facts, path=arguments.output, facts=read.facts), _sections)
+
+
+def _refuse(arguments: argparse.Namespace, options: Mapping[str, object], why: str) -> None:
+    for name, absent in options.items():
+        if getattr(arguments, name) != absent:
+            raise OptionError(f"--{name.replace('_', '-')}: {why}")
+
+
+def _sections(made: LaidOut) -> Iterator[Section]:
+    yield Section("", [*map(Text, made.facts)])
+    *first, last = description.sections(made.netlist)
+    yield from first
+    yield Section("", [*last.blocks, Text(f"sha256 {made.netlist.sha256}")])

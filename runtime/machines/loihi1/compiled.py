@@ -1,0 +1,202 @@
+"""What a compilation chose, proved and removed, and how ``compile`` shows it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX
+from spikeloom.compiler.passes.prune import Removal
+from spikeloom.compiler.targets.loihi1.compilation import Compilation
+from spikeloom.compiler.targets.loihi1.layout import choose
+from spikeloom.compiler.targets.loihi1.layout.forecast import Expectation
+from spikeloom.compiler.targets.loihi1.layout.place import Placement
+from spikeloom.compiler.targets.loihi1.storage.quantize import Choice
+from spikeloom.compiler.targets.loihi1.storage.range_proof import RangeProof
+from spikeloom.compiler.targets.loihi1.storage.spike_exact import Exactness
+from spikeloom.runtime.machines.loihi1 import description
+from spikeloom.runtime.machines.loihi1.description import LayerFacts, NetlistFacts
+from spikeloom.runtime.report.encode import INLINE, OPTIONAL
+from spikeloom.runtime.report.numbers import si
+from spikeloom.runtime.report.sections import Block, Section, Table, Text
+
+ZEROED = 0.25
+"""Share of a layer's weights from which on it is said that they round to zero."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LayoutFacts:
+    """A layout, and what a step of it is expected to take where that is known."""
+
+    cores: int
+    expected: Expectation | None = field(default=None, metadata=INLINE)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LayoutChoice:
+    """What the layout was chosen for, and beside it the layout of fewest cores."""
+
+    optimize: str
+    expected: LayoutFacts
+    usual: LayoutFacts
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CompilationFacts:
+    """A netlist with the reasons for its scales, the proofs and the placement.
+
+    `facts` is what was read from a file of another format.
+    """
+
+    netlist: NetlistFacts = field(metadata=INLINE)
+    calibration: Sequence[Choice]
+    proofs: Sequence[RangeProof]
+    removals: Sequence[Removal]
+    exactness: Sequence[Exactness]
+    core_bound: int
+    placement: Placement
+    layout: LayoutChoice
+    facts: Sequence[str] | None = field(default=None, metadata=OPTIONAL)
+
+
+def facts_of(done: Compilation, sha256: str, facts: Sequence[str] = ()) -> CompilationFacts:
+    """Facts of a compilation whose netlist was written to a file with a hash."""
+    return CompilationFacts(
+        netlist=description.describe(done.netlist, done.uses, sha256),
+        calibration=done.choices,
+        proofs=done.proofs,
+        removals=done.removals,
+        exactness=done.exactness,
+        core_bound=done.core_bound,
+        placement=done.placement,
+        layout=LayoutChoice(optimize=done.options.optimize, expected=_layout(done.layout), usual=_layout(done.usual)),
+        facts=facts or None,
+    )
+
+
+def _layout(layout: choose.Layout) -> LayoutFacts:
+    return LayoutFacts(cores=len(layout.parts.cores), expected=layout.expected)
+
+
+def sections(facts: CompilationFacts) -> Iterator[Section]:
+    """Layers, limits, calibration, proof, placement."""
+    if facts.facts:
+        yield Section("", [*map(Text, facts.facts)])
+    yield from description.sections(facts.netlist)
+    yield Section("", [*_storage(facts), *map(Text, [*_removed(facts), *_proven(facts), *_placed(facts)])])
+
+
+def _storage(facts: CompilationFacts) -> Iterator[Block]:
+    """How weights were rounded."""
+    if facts.calibration[0].flips is None:
+        yield Text("scales taken from the weights and the proven bounds; --calibrate chooses them on training data")
+    else:
+        rows = [
+            [
+                choice.layer,
+                str(choice.candidates),
+                f"{choice.clipped:,}",
+                "cancel" if choice.compensated else "nearest",
+                f"{choice.flips:,}",
+                f"{choice.spikes:,}",
+            ]
+            for choice in facts.calibration
+        ]
+        yield Text("storage chosen on training recordings (each layer on the float model's own input):")
+        yield Table(["layer", "tried", "weights clipped", "errors", "spikes moved", "of"], rows)
+        yield from _exactness(facts.exactness)
+    for choice in facts.calibration:
+        if choice.zeroed > ZEROED * choice.weights:
+            yield Text(
+                f"{choice.layer}: {100 * choice.zeroed / choice.weights:.0f} % of its weights round to zero; "
+                "more --planes, --scale-groups or --weight-bits keep them"
+            )
+
+
+def _exactness(layers: Sequence[Exactness]) -> Iterator[Block]:
+    """What was tried for equal spikes, and what is in the way."""
+    if layers and not any(layer.flips for layer in layers):
+        yield Text("spike-exact: every spike of every layer on all training recordings is the float64 model's")
+    elif layers:
+        rows = [
+            [
+                layer.layer,
+                "  ".join(f"{planes}×{groups}: {moved:,}" for planes, groups, moved in layer.tried),
+                f"{layer.flips:,} of {layer.spikes:,}",
+                ", ".join(f"{name} {count:,}" for name, count in layer.limits),
+                f"{layer.decay:,}",
+            ]
+            for layer in layers
+        ]
+        yield Text("spike-exact: not reached; spikes that still move on the training recordings")
+        head = ["layer", "planes×groups: moved on 32", "moved on all", "limited by", "12-bit decay alone"]
+        yield Table(head, rows)
+
+
+def _removed(facts: CompilationFacts) -> Iterator[str]:
+    """What the chip does not hold, and why."""
+    reasons = {
+        "that no input can make fire": [layer.silent for layer in facts.removals],
+        "that no neuron receives": [layer.unreceived for layer in facts.removals],
+        "that did not fire in training (by evidence, not by proof)": [layer.unused for layer in facts.removals],
+    }
+    for why, neurons in reasons.items():
+        counts = [f"{layer.layer} {n:,}" for layer, n in zip(facts.removals, neurons, strict=True) if n]
+        if counts:
+            yield f"left out, neurons {why}: {', '.join(counts)}"
+
+
+def _proven(facts: CompilationFacts) -> Iterator[str]:
+    """Whether registers stay in range, and what happens if some input brings one out of it."""
+    worst = max(facts.proofs, key=lambda proof: proof.accumulator)
+    loose = [proof for proof in facts.proofs if not proof.holds]
+    if not loose:
+        yield (
+            f"proof: no register overflows for any input (fullest accumulator: {worst.layer}, "
+            f"{100 * worst.accumulator / ACCUMULATOR_MAX:.1f} % of 21 bits)"
+        )
+    stops = [p.layer for p in loose if p.accumulator > ACCUMULATOR_MAX or p.current > CURRENT_MAX]
+    clips = [proof.layer for proof in loose if proof.layer not in stops]
+    if stops:
+        yield f"no proof of range for {', '.join(stops)}: the simulator stops at the first overflow"
+    if clips:
+        yield f"no register of {', '.join(clips)} overflows for any input, but some may saturate a membrane"
+
+
+def _placed(facts: CompilationFacts) -> Iterator[str]:
+    placement, spiking = facts.placement, ""
+    if facts.calibration[0].flips is None:
+        spiking = " if every neuron spiked"
+    optimal = "optimal" if placement.spike_hops <= placement.bound else f"bound {placement.bound:.1f}"
+    yield (
+        f"cores: {facts.netlist.cores} used, {facts.core_bound} at least; "
+        f"spike-hops a step{spiking}: {placement.spike_hops:.1f} ({optimal})"
+    )
+    if placement.between_chips:
+        yield (
+            f"packets a step that leave their chip{spiking}: {placement.between_chips:.1f}; "
+            "links between chips are not modelled"
+        )
+    yield from _expected(facts.layout, facts.netlist.layers)
+
+
+def _expected(layout: LayoutChoice, layers: Sequence[LayerFacts]) -> Iterator[str]:
+    """What a step is expected to take, and what another layout would."""
+    chosen, usual = layout.expected.expected, layout.usual.expected
+    if chosen is None:
+        return
+    held = ", ".join(layer.name for layer in layers if chosen.critical_core in layer.cores)
+    yield (
+        f"expected step on the training recordings ({chosen.time_table} table): {chosen.step_ns:,.0f} ns, "
+        f"{si(chosen.step_j, 'J')}; slowest most often: core {chosen.critical_core} ({held}), "
+        f"{'receiving' if chosen.receiving else 'sweeping its neurons and sending'}"
+    )
+    if layout.expected != layout.usual and usual is not None:
+        time, energy = chosen.step_ns / usual.step_ns, chosen.step_j / usual.step_j
+        yield (
+            f"layout of fewest cores: {layout.usual.cores} instead of {layout.expected.cores}, "
+            f"{usual.step_ns:,.0f} ns, {si(usual.step_j, 'J')}; "
+            f"this one takes {time:.2f} times the time and {energy:.2f} times the energy"
+        )
+    elif layout.optimize != "cores":
+        yield f"--optimize {layout.optimize}: found nothing better than the layout of fewest cores"

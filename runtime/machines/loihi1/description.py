@@ -1,0 +1,204 @@
+"""What a netlist is: sizes, layers, use of every limit; and how ``inspect`` shows it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from spikeloom.compiler.dynamics import Clocks
+from spikeloom.compiler.fixedpoint import FloatArray, IntArray
+from spikeloom.compiler.targets.base import load_target
+from spikeloom.compiler.targets.loihi1.layout.chips import chip_count
+from spikeloom.compiler.targets.loihi1.legalize import LimitUse
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.runtime.report.encode import OPTIONAL
+from spikeloom.runtime.report.sections import Section, Table, Text
+
+OneOrMany = float | Sequence[float]
+"""One value where all neurons of a layer share it, else the different ones, ascending."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LayerFacts:
+    """A layer: what it was and what the chip holds of it; `realised` is what registers make of a parameter."""
+
+    name: str
+    neurons: int
+    compartments: int
+    synapses: int
+    max_fan_in: int
+    weight_bits: int
+    scale: OneOrMany
+    exponents: Sequence[int]
+    threshold: OneOrMany
+    theta: float
+    theta_realised: OneOrMany
+    beta: float
+    beta_realised: OneOrMany
+    alpha: float | None = field(default=None, metadata=OPTIONAL)
+    alpha_realised: OneOrMany | None = field(default=None, metadata=OPTIONAL)
+    depth: int
+    synapses_stored: int
+    synapses_from_itself: int | None = field(default=None, metadata=OPTIONAL)
+    cores: Sequence[int]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NetlistFacts:
+    """A netlist; synapses are counted in the network, as stored on cores, and as stored and not zero."""
+
+    target: str
+    taxels: int
+    clocks: Clocks | None = field(default=None, metadata=OPTIONAL)
+    bins: int | None = field(default=None, metadata=OPTIONAL)
+    classes: int
+    neurons: int
+    compartments: int
+    synapses: int
+    synapses_stored: int
+    synapses_nonzero: int
+    cores: int
+    chips: int
+    tiles: Sequence[int]
+    layers: Sequence[LayerFacts]
+    limits: Sequence[LimitUse]
+    provenance: Mapping[str, Any]
+    sha256: str
+
+
+def describe(netlist: Netlist, uses: Sequence[LimitUse], sha256: str) -> NetlistFacts:
+    """Facts of a netlist whose file has a hash; `uses` as :func:`legalize.measure` counts them."""
+    return NetlistFacts(
+        target=netlist.target,
+        taxels=netlist.taxels,
+        clocks=netlist.clocks if netlist.clocks.channels else None,
+        bins=netlist.bins if netlist.bins > 1 else None,
+        classes=netlist.classes,
+        neurons=sum(layer.neurons for layer in netlist.layers),
+        compartments=netlist.n_compartments,
+        synapses=sum(layer.synapses for layer in netlist.layers),
+        synapses_stored=netlist.n_synapses,
+        synapses_nonzero=int(np.count_nonzero(netlist.synapse_weight)),
+        cores=netlist.n_cores,
+        chips=chip_count(netlist.core_tile, load_target(netlist.target)),
+        tiles=netlist.core_tile.tolist(),
+        layers=[_layer(netlist, index) for index in range(len(netlist.layers))],
+        limits=uses,
+        provenance=netlist.provenance,
+        sha256=sha256,
+    )
+
+
+def _layer(netlist: Netlist, index: int) -> LayerFacts:
+    layer, ids = netlist.layers[index], netlist.compartments_of(index)
+    axon = netlist.axon_of_synapse()[netlist.layer[netlist.synapse_compartment()] == index]
+    source = netlist.axon_source[axon] - netlist.n_inputs
+    from_itself = int(np.count_nonzero(netlist.layer[source[source >= 0]] == index))
+    alpha = (4095 - netlist.decay_u[ids]) / 4096
+    return LayerFacts(
+        name=layer.name,
+        neurons=layer.neurons,
+        compartments=len(ids),
+        synapses=layer.synapses,
+        max_fan_in=layer.max_fan_in,
+        weight_bits=layer.weight_bits,
+        scale=_one_or_many(netlist.scale[ids]),
+        exponents=np.unique(netlist.format_exponent[netlist.axon_format[axon]]).tolist(),
+        threshold=_one_or_many(netlist.threshold[ids]),
+        theta=layer.theta,
+        theta_realised=_one_or_many(netlist.threshold[ids] / netlist.scale[ids]),
+        beta=layer.beta,
+        beta_realised=_one_or_many((4096 - netlist.decay_v[ids]) / 4096),
+        alpha=layer.alpha if alpha.any() else None,
+        alpha_realised=_one_or_many(alpha) if alpha.any() else None,
+        depth=layer.depth,
+        synapses_stored=len(axon),
+        synapses_from_itself=from_itself or None,
+        cores=np.unique(netlist.core_of_compartment()[ids]).tolist(),
+    )
+
+
+def _one_or_many(values: IntArray | FloatArray) -> OneOrMany:
+    distinct: list[float] = np.unique(values).tolist()
+    return distinct[0] if len(distinct) == 1 else distinct
+
+
+def sections(facts: NetlistFacts) -> Iterator[Section]:
+    """Layers, cores and the fullest core of every limit."""
+    where = f"{facts.chips} chips" if facts.chips > 1 else f"tiles {', '.join(map(str, facts.tiles))}"
+    left = "" if facts.compartments == facts.neurons else f" ({facts.compartments:,} on the chip)"
+    lines = [
+        f"{facts.target}: {facts.neurons:,} neurons{left}, {facts.synapses:,} synapses "
+        f"({facts.synapses_stored:,} stored, {facts.synapses_nonzero:,} non-zero), {facts.cores} cores on {where}",
+        *clock_lines(facts.clocks),
+        *bin_lines(facts.bins or 1),
+    ]
+    yield Section("", [*map(Text, lines), _layer_table(facts.layers)])
+    fullest: dict[str, LimitUse] = {}
+    for use in facts.limits:
+        if use.name not in fullest or use.used > fullest[use.name].used:
+            fullest[use.name] = use
+    rows = [
+        [
+            use.name,
+            f"{use.used:,}",
+            f"{use.allowed:,}",
+            f"{100 * use.used / use.allowed:.0f} %",
+            "chip" if use.core is None else str(use.core),
+        ]
+        for use in fullest.values()
+    ]
+    yield Section("", [Table(["limit", "used", "allowed", "fill", "fullest core"], rows)])
+
+
+def _layer_table(layers: Sequence[LayerFacts]) -> Table:
+    columns = {
+        "layer": [layer.name for layer in layers],
+        "neurons": [f"{layer.neurons:,}" for layer in layers],
+        "on chip": [f"{layer.compartments:,}" for layer in layers],
+        "synapses": [f"{layer.synapses:,}" for layer in layers],
+        "stored": [f"{layer.synapses_stored:,}" for layer in layers],
+        "from itself": [f"{layer.synapses_from_itself or 0:,}" for layer in layers],
+        "fan-in": [str(layer.max_fan_in) for layer in layers],
+        "bits": [_width(layer) for layer in layers],
+        "scale": [_span(layer.scale) for layer in layers],
+        "threshold": [_span(layer.threshold) for layer in layers],
+        "θ": [_span(layer.theta_realised) for layer in layers],
+        "β": [_span(layer.beta_realised) for layer in layers],
+        "α": [_span(layer.alpha_realised or 0) for layer in layers],
+        "cores": [" ".join(map(str, layer.cores)) for layer in layers],
+    }
+    if not any(layer.synapses_from_itself for layer in layers):
+        del columns["from itself"]
+    if all(layer.alpha_realised is None for layer in layers):
+        del columns["α"]
+    return Table(list(columns), [list(row) for row in zip(*columns.values(), strict=True)])
+
+
+def _width(layer: LayerFacts) -> str:
+    """Storage width of a synapse: bits, times planes where there are several."""
+    planes = len(layer.exponents)
+    return f"{planes}×{layer.weight_bits}" if planes > 1 else str(layer.weight_bits)
+
+
+def _span(values: OneOrMany) -> str:
+    if not isinstance(values, Sequence):
+        return f"{values:.6g}"
+    ends = f"{min(values):.6g}", f"{max(values):.6g}"
+    return "…".join(ends) if ends[0] != ends[1] else ends[0]
+
+
+def clock_lines(clocks: Clocks | None) -> list[str]:
+    """What the clocks of a network are; none for most."""
+    if clocks is None or not clocks.channels:
+        return []
+    channels, steps = clocks.channels, clocks.steps
+    return [f"  {channels} clocks of {steps} steps each, {channels * steps} in all, beside the sensor"]
+
+
+def bin_lines(bins: int) -> list[str]:
+    """How long the steps of a network are, where they join bins of the recordings."""
+    return [f"  a step joins {bins} bins of the recordings"] if bins > 1 else []
