@@ -257,7 +257,7 @@ def test_no_hash(path):
 
 def test_compressed_members(path):
     write_members(path, members_of(path), compression=zipfile.ZIP_DEFLATED)
-    assert refused(path) == "has compressed members, a netlist stores them plainly; compile it again"
+    assert "has compressed members" in refused(path)
 
 
 def test_more_bytes_declared_than_there_are(path, monkeypatch):
@@ -266,7 +266,7 @@ def test_more_bytes_declared_than_there_are(path, monkeypatch):
         infos = archive.infolist()
     infos[0].file_size = 10**9
     monkeypatch.setattr(zipfile.ZipFile, "infolist", lambda _: infos)
-    assert refused(path) == "declares more bytes than it has; compile it again"
+    assert "bytes claim to hold 1000" in refused(path)
 
 
 def test_a_file_too_large_to_read(path, monkeypatch):
@@ -284,9 +284,7 @@ def test_an_array_of_objects_is_never_unpickled(path):
     np.lib.format.write_array(content, np.array([Trap()], object), allow_pickle=True)
     with zipfile.ZipFile(path, "a") as archive, pytest.warns(UserWarning, match="Duplicate name"):
         archive.writestr("neuron.npy", content.getvalue())
-    assert refused(path) == (
-        "is truncated or not a netlist (Object arrays cannot be loaded when allow_pickle=False); compile it again"
-    )
+    assert "an array of objects" in refused(path)
     assert not (path.parent / "unpickled").exists()
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import math
 import os
 import struct
 import zipfile
@@ -97,6 +98,45 @@ def require_file(path: Path) -> None:
         raise FormatError(f"{path}: {found}; write one with spikeloom compile")
 
 
+def stored_members(content: bytes) -> dict[str, bytes]:
+    """Members of a zip that stores them plainly and claims no more bytes than it has.
+
+    Raises
+    ------
+    ValueError
+        If it is something else, in words that go on a sentence.
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            infos = archive.infolist()
+            declared = sum(info.file_size for info in infos)
+            if declared > len(content) or any(info.compress_type != zipfile.ZIP_STORED for info in infos):
+                raise ValueError(f"has compressed members, {len(content)} bytes claim to hold {declared}")
+            return {info.filename: archive.read(info) for info in infos}
+    except (zipfile.BadZipFile, struct.error, EOFError, OSError, OverflowError, RuntimeError) as error:
+        raise ValueError(str(error)) from error
+
+
+def read_npy(content: bytes) -> Array:
+    """An array of plain numbers or text from the content of an npy file, whose size is checked against its header.
+
+    Raises
+    ------
+    ValueError
+        If it is none.
+    """
+    file = io.BytesIO(content)
+    try:
+        version = np.lib.format.read_magic(file)
+        shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
+    except Exception as error:  # numpy parses the header as Python and raises whatever that does
+        raise ValueError(f"no array: {error}") from error
+    held, wanted = len(content) - file.tell(), math.prod(shape) * dtype.itemsize
+    if version != (1, 0) or dtype.hasobject or fortran or min(shape, default=1) < 0 or held != wanted:
+        raise ValueError(f"an array of objects, not in C order, or of {wanted} bytes in {held}")
+    return np.frombuffer(content, dtype, offset=file.tell()).reshape(shape) if wanted else np.zeros(shape, dtype)
+
+
 def read_members(path: Path) -> dict[str, Array]:
     """All members of an archive by name.
 
@@ -109,20 +149,10 @@ def read_members(path: Path) -> dict[str, Array]:
     """
     if path.stat().st_size > SIZE_LIMIT:
         raise FormatError(f"{path}: {path.stat().st_size} bytes, {SIZE_LIMIT} allowed; this is no netlist of one chip")
-    file = io.BytesIO(path.read_bytes())
     try:
-        with zipfile.ZipFile(file) as archive:
-            infos = archive.infolist()
-            if any(info.compress_type != zipfile.ZIP_STORED for info in infos):
-                raise FormatError(f"{path}: has compressed members, a netlist stores them plainly; compile it again")
-            if sum(info.file_size for info in infos) > len(file.getbuffer()):
-                raise FormatError(f"{path}: declares more bytes than it has; compile it again")
-            found: dict[str, Array] = {}
-            for info in infos:
-                content = io.BytesIO(archive.read(info))
-                found[info.filename.removesuffix(".npy")] = np.lib.format.read_array(content, allow_pickle=False)
-            return found
-    except _ZIP_ERRORS as error:
+        members = stored_members(path.read_bytes())
+        return {name.removesuffix(".npy"): read_npy(content) for name, content in members.items()}
+    except ValueError as error:
         raise FormatError(f"{path}: is truncated or not a netlist ({error}); compile it again") from error
 
 

@@ -22,12 +22,12 @@ from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.formats.checkpoint_file import (
     WEIGHTS,
     Float32Array,
-    own_arrays,
+    own_contents,
     own_members,
     require_constants,
 )
 from spikeloom.compiler.formats.released_file import GIVE, read_released
-from spikeloom.compiler.formats.tensors import Arrays
+from spikeloom.compiler.formats.tensors import Arrays, Contents
 from spikeloom.compiler.ir import Readout
 from spikeloom.compiler.systems import (
     GRID_CNN,
@@ -207,61 +207,53 @@ def read_checkpoint(
     where, path = str(path), Path(path)
     content = _content(where, path)
     members = own_members(where, content)
-    given = {"beta": beta, "theta": theta}
     if members is None:
-        arrays, layout, runs, training, found = read_released(where, content, run, system)
-        grid = _released_grid(where, arrays, cells) if found == GRID_CNN else None
+        found = read_released(where, content, run, system)
         if weights not in (None, "last"):
-            raise ModelError(f"{where}: --weights {weights}: the file holds the last epoch only; leave --weights away")
-        graph, edges, chosen, held = None, None, "last", {"beta": BETA, "theta": THETA}
-        sets: tuple[str, ...] = ("last",)
-        forms, dynamics, towers, bins = None, PLAIN, 1, 1
-        assumed = tuple(name for name, value in given.items() if value is None)
+            raise ModelError(f"{where}: --weights {weights}: the file holds the last epoch only; omit --weights")
     else:
         if run != 0:
-            raise ModelError(f"{where}: --run {run}: the file holds only run 0; leave --run away")
-        arrays, (chosen, sets), (graph, edges, held, training), (found, grid, dynamics), (forms, towers, bins) = (
-            own_arrays(where, members, weights)
-        )
-        if system not in (None, found):
-            raise OptionError(f"--system {system}: {where} holds a {found}; leave --system away")
-        layout, runs, assumed = "spikeloom", 1, ()
-        for name, value in given.items():
-            if forms is not None and value not in (None, held[name]):
-                raise OptionError(
-                    f"--{name} {value:g}: {where} was fine-tuned with {held[name]:g}; leave --{name} away"
-                )
-        if beta is not None and dynamics.betas:
-            raise OptionError(
-                f"--beta {beta:g}: {where} has a decay for each layer, {', '.join(f'{b:g}' for b in dynamics.betas)}; "
-                "leave --beta away"
-            )
+            raise ModelError(f"{where}: --run {run}: the file holds only run 0; omit --run")
+        found = own_contents(where, members, weights)
+        _require_fit(where, found, system, beta, theta)
+    arrays = {name: _plain(array) for name, array in found.arrays.items()}
     stages = sorted({key.split(".")[0] for key in arrays if key.startswith("fc")}, key=lambda name: int(name[2:]))
+    constants = {"beta": (beta, found.beta, BETA), "theta": (theta, found.theta, THETA)}
+    known = {name: next(value for value in values if value is not None) for name, values in constants.items()}
     return Checkpoint(
-        hops=_plain(arrays["conv1.hops"]),
-        conv_bias=_plain(arrays["conv1.bias"]),
-        dense=tuple(
-            Dense(name=name, weight=_plain(arrays[f"{name}.weight"]), bias=_plain(arrays[f"{name}.bias"]))
-            for name in stages
-        ),
-        beta=held["beta"] if beta is None else beta,
-        theta=held["theta"] if theta is None else theta,
-        assumed=assumed,
-        graph=graph,
-        edges=edges,
-        layout=layout,
-        weights=chosen,
-        sets=sets,
-        runs=runs,
-        training=training,
-        forms=forms,
+        hops=arrays["conv1.hops"],
+        conv_bias=arrays["conv1.bias"],
+        dense=tuple(Dense(name=name, weight=arrays[f"{name}.weight"], bias=arrays[f"{name}.bias"]) for name in stages),
+        beta=known["beta"],
+        theta=known["theta"],
+        assumed=tuple(name for name, (given, held, _) in constants.items() if given is None and held is None),
+        graph=found.graph,
+        edges=found.edges,
+        layout=found.layout,
+        weights=found.weights,
+        sets=found.sets,
+        runs=found.runs,
+        training=found.training,
+        forms=found.forms,
         sha256=hashlib.sha256(content).hexdigest(),
-        system=found,
-        grid=grid,
-        dynamics=dynamics,
-        towers=towers,
-        bins=bins,
+        system=found.system,
+        grid=_released_grid(where, arrays, cells) if members is None and found.system == GRID_CNN else found.grid,
+        dynamics=found.dynamics,
+        towers=found.towers,
+        bins=found.bins,
     )
+
+
+def _require_fit(where: str, found: Contents, system: str | None, beta: float | None, theta: float | None) -> None:
+    """Refuse what contradicts a file of our own."""
+    if system not in (None, found.system):
+        raise OptionError(f"--system {system}: {where} holds a {found.system}; omit --system")
+    for name, value, held in (("beta", beta, found.beta), ("theta", theta, found.theta)):
+        if found.forms is not None and value not in (None, held):
+            raise OptionError(f"--{name} {value:g}: {where} was fine-tuned with {held:g}; omit --{name}")
+    if beta is not None and found.dynamics.betas:
+        decays = ", ".join(f"{each:g}" for each in found.dynamics.betas)
+        raise OptionError(f"--beta {beta:g}: {where} has a decay for each layer, {decays}; omit --beta")
 
 
 def _released_grid(where: str, arrays: Arrays, cells: IntArray | None) -> Grid:

@@ -10,34 +10,34 @@ Our own format is a plain zip (members stored, not compressed) that needs neithe
 ``last/NAME.npy``, ``best/NAME.npy``, ``clean/NAME.npy``
     float32: ``conv1.hops`` (K + 1, features, channels), ``conv1.bias``, ``weight`` and ``bias`` of ``fc1``, ``fc2`` …
 
-Version 2 adds ``forms`` to the manifest: how the chip stores each layer that the network was fine-tuned for, an
-object per layer with ``layer``, ``bits``, ``exponents`` and ``threshold`` (one integer a neuron).
+The manifest may have, beside these,
 
-Version 3 is for the other systems: ``architecture`` is "mlp", "gcn" or "grid-cnn", and ``conv1.hops`` holds a filter
-for each taxel, one filter, or one for each cell of the window, row by row; ``grid`` says of the last where the taxels
-lie (``rows``, ``columns``, ``stride``, ``padding``, ``cells``). ``forms`` may be there or not.
+``architecture``
+    Of the other systems: "mlp", "gcn" or "grid-cnn". ``conv1.hops`` holds a filter for each taxel, one filter, or one
+    for each cell of the window, row by row; ``grid`` says of the last where the taxels lie (``rows``, ``columns``,
+    ``stride``, ``padding``, ``cells``).
+``forms``
+    How the chip stores each layer that the network was fine-tuned for: ``layer``, ``bits``, ``exponents`` and
+    ``threshold`` (one integer a neuron).
+``dynamics``
+    ``betas`` and ``alphas`` (one a layer, or none) and ``clocks`` (``channels`` and ``steps``), see
+    :mod:`compiler.dynamics`; ``fc1`` has one more input for each clock, at the end.
+``towers``
+    How many networks of the same sizes lie side by side, see :mod:`formats.towers`. Arrays hold one tower after the
+    other: ``conv1.hops`` along its features, the others along their first axis, so that ``fc1.weight`` has the inputs
+    of one tower. Neuron ``tower * classes + class`` of the last layer votes for that class.
+``bins``
+    How many bins of the recordings a step joins, with an event where one of them has any.
 
-Version 4 is for networks with decays of single layers or with clocks, of any system: ``dynamics`` holds ``betas`` and
-``alphas`` (one a layer, or none) and ``clocks`` (``channels`` and ``steps``), see :mod:`compiler.dynamics`; ``fc1`` has
-one more input for each clock, at the end. ``forms`` may be there or not.
-
-Version 5 is for networks joined of several, of any system: ``towers`` says how many lie side by side, all of the same
-sizes. Arrays hold one tower after the other: ``conv1.hops`` along its features, the others along their first axis, so
-that ``fc1.weight`` has the inputs of one tower. Neuron ``tower * classes + class`` of the last layer votes for that
-class; ``classes`` counts classes. ``dynamics`` and ``forms`` may be there or not; see :mod:`formats.towers`.
-
-Version 6 is for networks whose steps join ``bins`` bins of the recordings, with an event where one of them has any.
-``dynamics``, ``forms`` and ``towers`` may be there or not.
+Versions 1 to 5 are those that lacked some of these entries.
 """
 
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import math
 import re
-import zipfile
 from collections.abc import Mapping
 from itertools import pairwise
 from typing import Any
@@ -47,14 +47,23 @@ import numpy.typing as npt
 
 from spikeloom.compiler.dynamics import MOST_STEPS, PLAIN, Dynamics, dynamics_from_json
 from spikeloom.compiler.errors import ModelError, OptionError
-from spikeloom.compiler.fixedpoint import THRESHOLD_MANTISSA_MAX, IntArray
+from spikeloom.compiler.fixedpoint import THRESHOLD_MANTISSA_MAX
+from spikeloom.compiler.formats.archive import read_npy, stored_members
 from spikeloom.compiler.formats.released_file import DAMAGED, NOT_A_CHECKPOINT
-from spikeloom.compiler.formats.tensors import Arrays, apart, faults_of, size, taxel_faults, tower_faults, wanted_dense
+from spikeloom.compiler.formats.tensors import (
+    Arrays,
+    Contents,
+    apart,
+    faults_of,
+    size,
+    taxel_faults,
+    tower_faults,
+    wanted_dense,
+)
 from spikeloom.compiler.systems import (
     GRAPH_SYSTEMS,
     GRID_CNN,
     SYSTEMS,
-    TACTILESGNET,
     TITLES,
     Grid,
     grid_from_json,
@@ -63,18 +72,13 @@ from spikeloom.compiler.systems import (
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import Form, plane_distance
 
 FORMAT = "spikeloom-checkpoint"
-VERSIONS = (1, 2, 3, 4, 5, 6)
-"""Of a plain file of a TactileSGNet, of one that holds the forms of a fine-tuning, of another system's, of one with
-decays of single layers or with clocks, of several joined ones, and of those whose steps join bins."""
+VERSION = 6
 
 WEIGHTS = ("last", "best", "clean")
 """Sets that our own format can hold."""
 
 Float32Array = npt.NDArray[np.float32]
 
-_NPY = re.compile(
-    rb"\x93NUMPY\x01\x00..\{'descr': '<f4', 'fortran_order': False, 'shape': \(([\d, ]{0,80})\), \} *\n", re.DOTALL
-)
 _AGAIN = "copy or train it again"
 
 
@@ -110,19 +114,10 @@ def own_members(where: str, content: bytes) -> dict[str, bytes] | None:
     if content[:2] != b"PK":
         return None
     try:
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            infos = archive.infolist()
-            declared = sum(info.file_size for info in infos)
-            if declared > len(content):
-                raise ModelError(
-                    f"{where}: {len(content)} bytes claim to hold {declared}, checkpoints are not compressed; "
-                    "do not trust this file"
-                )
-            if "manifest.json" not in archive.namelist():
-                return None
-            return {info.filename: archive.read(info) for info in infos}
-    except (zipfile.BadZipFile, EOFError, OSError, RuntimeError, ValueError) as error:
-        raise ModelError(f"{where}: {DAMAGED}") from error
+        members = stored_members(content)
+    except ValueError as error:
+        raise ModelError(f"{where}: is truncated or damaged ({error}); copy it again") from error
+    return members if "manifest.json" in members else None
 
 
 def _manifest(where: str, content: bytes) -> dict[str, Any]:
@@ -132,56 +127,57 @@ def _manifest(where: str, content: bytes) -> dict[str, Any]:
         raise ModelError(f"{where}: {DAMAGED}") from error
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
         raise ModelError(f"{where}: {NOT_A_CHECKPOINT}")
-    if manifest.get("version") not in VERSIONS:
+    version = manifest.get("version")
+    if type(version) is not int or not 1 <= version <= VERSION:
         raise ModelError(
-            f"{where}: has format version {manifest.get('version')!r}, this program reads up to {VERSIONS[-1]}; "
-            "update spikeloom"
+            f"{where}: has format version {version!r}, this program reads up to {VERSION}; update spikeloom"
         )
     return manifest
 
 
-def own_arrays(
-    where: str, members: dict[str, bytes], weights: str | None
-) -> tuple[
-    Arrays,
-    tuple[str, tuple[str, ...]],
-    tuple[str, IntArray, dict[str, float], dict[str, Any]],
-    tuple[str, Grid | None, Dynamics],
-    tuple[tuple[Form, ...] | None, int, int],
-]:
-    """Arrays; their set, all sets; graph, edges, constants, record; system, grid, dynamics; forms, towers, bins."""
+def own_contents(where: str, members: dict[str, bytes], weights: str | None) -> Contents:
+    """Check a file of our own format and take it apart.
+
+    Parameters
+    ----------
+    where : str
+        For messages.
+    members : dict of str to bytes
+        Of the file; the manifest is taken out.
+    weights : str, optional
+        Which set; by default the first of ``WEIGHTS`` that the file holds.
+
+    Raises
+    ------
+    ModelError
+        As :func:`checkpoint.read_checkpoint` says.
+    """
     manifest = _manifest(where, members.pop("manifest.json"))
     try:
-        arrays: Arrays = {name.removesuffix(".npy"): _read_npy(content) for name, content in members.items()}
+        arrays: Arrays = {name.removesuffix(".npy"): _read_float32(content) for name, content in members.items()}
     except ValueError as error:
         raise ModelError(f"{where}: {DAMAGED}") from error
     if content_digest(manifest, arrays) != manifest.get("sha256"):
         raise ModelError(f"{where}: its content does not match its hash, so it was altered; {_AGAIN}")
     try:
-        sets = [name for name in WEIGHTS if name in manifest["weights"]]
-        graph = manifest["graph"]
-        edges = np.array(graph["edges"], np.int64).reshape(-1, 2)
+        sets = tuple(name for name in WEIGHTS if name in manifest["weights"])
+        graph, beta, theta = str(manifest["graph"]["name"]), float(manifest["beta"]), float(manifest["theta"])
+        edges = np.array(manifest["graph"]["edges"], np.int64).reshape(-1, 2)
         edges.flags.writeable = False
-        held = {name: float(manifest[name]) for name in ("beta", "theta")}
-        taxels, classes = int(manifest["taxels"]), int(manifest["classes"])
-        facts = str(graph["name"]), edges, held, dict(manifest["training"])
-        system = str(manifest["architecture"]) if manifest["version"] >= VERSIONS[2] else TACTILESGNET
+        taxels, classes, training = int(manifest["taxels"]), int(manifest["classes"]), dict(manifest["training"])
+        system = str(manifest["architecture"])
         if system not in SYSTEMS:
             raise ValueError(f"architecture {system}")
         grid = grid_from_json(manifest["grid"]) if system == GRID_CNN else None
-        dynamics, version = PLAIN, manifest["version"]
-        towers = _count(
-            manifest, "towers", there=version == VERSIONS[4] or (version == VERSIONS[5] and "towers" in manifest)
-        )
-        bins = _count(manifest, "bins", there=version == VERSIONS[5])
-        if version == VERSIONS[3] or (version >= VERSIONS[4] and "dynamics" in manifest):
+        towers, bins = (_count(manifest, name) for name in ("towers", "bins"))
+        dynamics = PLAIN
+        if "dynamics" in manifest:
             stages = sum(re.fullmatch(r"[a-z]+/fc\d+\.weight", name) is not None for name in arrays) // len(sets)
             dynamics = dynamics_from_json(manifest["dynamics"], 1 + stages)
     except (KeyError, TypeError, ValueError, OverflowError, ZeroDivisionError) as error:
         raise ModelError(f"{where}: has an incomplete manifest ({error!r}); {_AGAIN}") from error
-    require_constants(f"{where}: ", ModelError, held["beta"], held["theta"])
-    if weights is None and sets:
-        weights = sets[0]
+    require_constants(f"{where}: ", ModelError, beta, theta)
+    weights = sets[0] if weights is None and sets else weights
     if weights not in sets:
         raise ModelError(f"{where}: --weights {weights}: the file holds {', '.join(sets)}; choose one that it holds")
     chosen = {name.removeprefix(f"{weights}/"): a for name, a in arrays.items() if name.startswith(f"{weights}/")}
@@ -192,23 +188,36 @@ def own_arrays(
         faults.append(f"the graph joins taxels outside 0..{taxels - 1}")
     if faults:
         raise ModelError(f"{where}: {'; '.join(faults)}; {_AGAIN}")
-    forms = _forms(where, manifest, chosen, towers, dynamics.clocks.channels)
-    return chosen, (weights, tuple(sets)), facts, (system, grid, dynamics), (forms, towers, bins)
+    return Contents(
+        arrays=chosen,
+        layout="spikeloom",
+        system=system,
+        beta=beta,
+        theta=theta,
+        graph=graph,
+        edges=edges,
+        weights=weights,
+        sets=sets,
+        training=training,
+        forms=_forms(where, manifest, chosen, towers, dynamics.clocks.channels),
+        grid=grid,
+        dynamics=dynamics,
+        towers=towers,
+        bins=bins,
+    )
 
 
-def _count(manifest: dict[str, Any], name: str, *, there: bool) -> int:
-    """A number above 1 that some versions have; 1 where it is not there."""
-    if not there:
-        return 1
-    count = manifest[name]
+def _count(manifest: dict[str, Any], name: str) -> int:
+    """A number above 1; 1 where it is not there."""
+    count = manifest.get(name, 2)
     if type(count) is not int or not 2 <= count <= MOST_STEPS:
         raise ValueError(f"{count} {name}")
-    return count
+    return count if name in manifest else 1
 
 
 def _forms(where: str, manifest: dict[str, Any], arrays: Arrays, towers: int, clocks: int) -> tuple[Form, ...] | None:
     """Storage of every layer of a fine-tuned network; None for a plain file."""
-    if manifest["version"] == VERSIONS[0] or (manifest["version"] >= VERSIONS[2] and "forms" not in manifest):
+    if "forms" not in manifest:
         return None
     sizes = {"conv1": (arrays["fc1.weight"].shape[1] - clocks) * towers + clocks}
     stages = sum(key.endswith(".weight") for key in arrays)
@@ -258,10 +267,8 @@ def _own_faults(arrays: Arrays, taxels: int, classes: int, kind: tuple[str, Grid
     return faults
 
 
-def _read_npy(content: bytes) -> Float32Array:
-    """Parse the one kind of npy file that we write (version 1.0, float32, C order), trusting no size in it."""
-    header = _NPY.match(content)
-    if header is None or header.end() != 10 + int.from_bytes(content[8:10], "little"):
-        raise ValueError("not an npy file of float32 in C order")
-    shape = tuple(int(length) for length in re.findall(rb"\d+", header[1]))
-    return np.frombuffer(content, "<f4", offset=header.end()).reshape(shape)
+def _read_float32(content: bytes) -> Float32Array:
+    array = read_npy(content)
+    if array.dtype != "<f4":
+        raise ValueError(f"an array of {array.dtype}")
+    return array

@@ -28,7 +28,7 @@ import numpy as np
 
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.names import printable
-from spikeloom.compiler.formats.tensors import Arrays, Shape, faults_of, size, taxel_faults, wanted_dense
+from spikeloom.compiler.formats.tensors import Arrays, Contents, Shape, faults_of, size, taxel_faults, wanted_dense
 from spikeloom.compiler.systems import GCN, GRID_CNN, MLP, TACTILESGNET, TITLES
 
 CHANNELS = 2
@@ -56,10 +56,8 @@ _ERRORS = (
 )  # what torch's reader was seen to raise on damaged files
 
 
-def read_released(
-    where: str, content: bytes, run: int, system: str | None = None
-) -> tuple[Arrays, str, int, dict[str, Any] | None, str]:
-    """Read the content of a torch file.
+def read_released(where: str, content: bytes, run: int, system: str | None = None) -> Contents:
+    """Read the content of a torch file; arrays are float32 under the names of our own format.
 
     Parameters
     ----------
@@ -72,18 +70,6 @@ def read_released(
     system : str, optional
         What the tensors must be; by default their names tell.
 
-    Returns
-    -------
-    arrays : dict
-        float32 under the names of our own format: ``conv1.hops``, ``conv1.bias``, ``fc1.weight`` …
-    layout : {"released", "state_dict"}
-    runs : int
-        How many the file holds.
-    training : dict or None
-        What the file tells of its training.
-    system : str
-        Which one it is.
-
     Raises
     ------
     ModelError
@@ -91,18 +77,21 @@ def read_released(
     """
     loaded = _load(where, content)
     if isinstance(loaded, dict) and "net_list" in loaded:
-        states = loaded["net_list"]
+        states, layout = loaded["net_list"], "released"
         if not isinstance(states, list | tuple) or not states:
             raise ModelError(f"{where}: net_list holds no run; give the file of a finished training")
-        _require_run(where, run, len(states))
-        arrays = _arrays(where, states[run], len(content), system)
-        known = system or _told(arrays)
-        unified = _unified(where, arrays, known)
-        return unified, "released", len(states), _training(loaded, run, len(states)), known
-    arrays = _arrays(where, loaded, len(content), system)
-    _require_run(where, run, 1)
+    else:
+        states, layout = [loaded], "state_dict"
+    _require_run(where, run, len(states))
+    arrays = _arrays(where, states[run], len(content), system)
     known = system or _told(arrays)
-    return _unified(where, arrays, known), "state_dict", 1, None, known
+    return Contents(
+        arrays=_unified(where, arrays, known),
+        layout=layout,
+        system=known,
+        runs=len(states),
+        training=_training(loaded, run, len(states)) if layout == "released" else None,
+    )
 
 
 def _told(names: Collection[str]) -> str:

@@ -16,7 +16,7 @@ import torch
 from spikeloom.compiler.formats.atomic import write_atomically
 from spikeloom.compiler.dynamics import PLAIN, Dynamics
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import Form
-from spikeloom.compiler.formats.checkpoint_file import FORMAT, VERSIONS, content_digest
+from spikeloom.compiler.formats.checkpoint_file import FORMAT, VERSION, content_digest
 from spikeloom.compiler.systems import TACTILESGNET, Grid
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.graphs import Graph
@@ -111,12 +111,9 @@ def checkpoint_bytes(
         for which, tensors in weights.items()
         for name, array in sorted(tensors.items())
     }
-    version = VERSIONS[2] if system != TACTILESGNET else VERSIONS[0] if forms is None else VERSIONS[1]
-    version = version if dynamics.is_plain else VERSIONS[3]
-    version = VERSIONS[5] if bins > 1 else VERSIONS[4] if towers > 1 else version
     manifest: dict[str, Any] = {
         "format": FORMAT,
-        "version": version,
+        "version": VERSION,
         "architecture": system,
         "taxels": graph.n_taxels,
         "classes": len(tensors_of_one[f"fc{stages}.bias"]) // towers,

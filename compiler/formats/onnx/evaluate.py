@@ -64,6 +64,9 @@ BatchNormalization ConstantOfShape Gemm MatMul NonZero Range ReduceMax ReduceMea
 NUMERIC = POINTWISE | frozenset(MOVES) | frozenset(_WHOLE.split())
 """Operators that are run on numbers. Others are refused, or are linear and run as their matrix."""
 
+LOOPS, LOOP_WORK = ("GatherND", "ScatterElements", "ScatterND"), 64
+"""Operators that the reference runs element by element, and what one counts for."""
+
 SMALL = 64
 """Elements of an operand that may decide the shape of a result."""
 
@@ -82,8 +85,22 @@ def evaluate(node: Node, table: Table, operands: Operands) -> list[Array]:
     if node.op == "BatchNormalization" and node.attributes.get("training_mode", 0):
         raise ModelError("is in training mode; export the module after eval()")
     shapes_of(node, table, operands)
+    if node.op in LOOPS:
+        table.spend(LOOP_WORK * max(operand.size for operand in operands if operand is not None))
     with _of_onnx():
+        if node.op == "GatherElements":
+            data, indices = operands
+            return [_gathered(np.asarray(data), np.asarray(indices), int(node.attributes.get("axis", 0)))]
         return [np.asarray(result) for result in _operator(node, table).run(*operands)]
+
+
+def _gathered(data: Array, indices: Array, axis: int) -> Array:
+    """GatherElements, which the reference takes too long for."""
+    axis = range(data.ndim)[axis]
+    sizes = [length if place != axis else data.shape[axis] for place, length in enumerate(indices.shape)]
+    if len(sizes) != data.ndim or any(size > held for size, held in zip(sizes, data.shape, strict=True)):
+        raise IndexError("indices outside the tensor")
+    return np.take_along_axis(data[tuple(slice(size) for size in sizes)], indices, axis)
 
 
 def misfit(error: Exception) -> ModelError:

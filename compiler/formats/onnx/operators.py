@@ -185,6 +185,8 @@ def _linear(node: Node, table: Table, values: Sequence[Value | None], varying: l
     value = values[place]
     assert isinstance(value, Affine)
     operands = [np.zeros(each.shape) if isinstance(each, Affine | Decision) else each for each in values]
+    if not node.op.startswith("Reduce"):  # whose second operand is a list of axes
+        operands = [None if each is None else each.astype(np.float64) for each in operands]
     constants = [operand for index, operand in enumerate(values) if index != place and operand is not None]
     key = (node.op, place, value.shape, str(sorted(node.attributes.items())), *(id(array) for array in constants))
     if key not in table.matrices:
