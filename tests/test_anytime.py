@@ -167,16 +167,16 @@ def test_several_chips_have_no_times(spikeloom, tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ((*WORDS, "--differ", "0.1"), "--differ 0.1: nothing to calibrate on; add --calibrate or leave it away"),
+        ((*WORDS, "--differ", "0.1"), "--differ 0.1: nothing to calibrate on; add --calibrate or omit it"),
         (
             (*WORDS, "--calibrate", "data", "--differ", "1"),
             "--differ 1: not a share; give a number from 0 to below 1",
         ),
         (
             (*WORDS, "--graph", "manual"),
-            "--graph: is for --checkpoint, which is not given; add it or leave this away",
+            "--graph: is for --checkpoint, which is not given; add it or omit this",
         ),
-        ((*WORDS, "--dt", "0.02"), "--dt: is for --checkpoint, which is not given; add it or leave this away"),
+        ((*WORDS, "--dt", "0.02"), "--dt: is for --checkpoint, which is not given; add it or omit this"),
         ((*WORDS, "-o", "net.loom"), "-o net.loom: is an input of this command (net.loom); give another name"),
         (
             (*WORDS, "--picture", "none/x.png"),

@@ -1,0 +1,319 @@
+"""What stopping early saves and changes, for each rule of :mod:`exits`, from one run of the recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from spikeloom.compiler.fixedpoint import FloatArray, IntArray
+from spikeloom.compiler.interpret import BoolArray
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.models.recordings.eventfiles import UNLABELLED
+from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.runtime.machines.loihi1.costs.cumulative import Cumulative
+from spikeloom.runtime.report.encode import INLINE, OPTIONAL, key
+from spikeloom.runtime.report.intervals import wilson
+from spikeloom.runtime.studies.anytime import exits
+
+WINDOWS = tuple(range(5, 101, 5))
+"""Percent of each recording that is observed."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Costs:
+    """Of a mean recording, or shares of them: chip steps, synaptic operations, joules and seconds by table."""
+
+    chip_steps: float
+    operations: float
+    energy_j: Mapping[str, float]
+    time_s: Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Full:
+    """Where nothing is stopped; right decisions are None without labels."""
+
+    costs: Costs = field(metadata=INLINE)
+    correct: int | None
+    float_correct: int | None = field(default=None, metadata=OPTIONAL)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Changes:
+    """Decisions that differ from those at the end, right ones, and those that stopping makes right or wrong."""
+
+    differ: int
+    correct: int | None
+    gained: int
+    lost: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FloatStops:
+    """What the same rule does to the float model; its mean steps."""
+
+    changes: Changes = field(metadata=INLINE)
+    steps: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Samples:
+    """What a rule comes to for every recording."""
+
+    chip_steps: list[int]
+    decisions: list[int]
+    saved_operations: list[float]
+    saved_energy_j: Mapping[str, list[float]]
+    saved_time_s: Mapping[str, list[float]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rule:
+    """A rule and what it comes to; of the proof, which rests on no races, the first five fields are None.
+
+    Parameters
+    ----------
+    allowed, factor, races, races_differ, bound
+        See :class:`exits.Calibrated`.
+    mean, saved : Costs
+        Up to the stop, and the shares that are saved.
+    changes : Changes
+    samples : Samples
+    model : FloatStops or None
+        Of the float model, where there is one.
+    """
+
+    allowed: float | None
+    factor: float | None
+    races: int | None
+    races_differ: int | None
+    bound: float | None
+    mean: Costs
+    saved: Costs
+    changes: Changes = field(metadata=INLINE)
+    samples: Samples
+    model: FloatStops | None = field(default=None, metadata={**key("float"), **OPTIONAL})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Right:
+    """Right decisions, and the 95 % interval of their share."""
+
+    correct: int
+    interval: tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Window:
+    """Decisions of which only the first part of each recording is observed; the read-out still runs to its end."""
+
+    percent: int
+    bins: float
+    chip: Right
+    model: Right | None = field(default=None, metadata={**key("float"), **OPTIONAL})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Anytime:
+    """How early decisions could be taken.
+
+    Parameters
+    ----------
+    samples, labelled : int
+        Recordings, and those with a label.
+    source, split : str
+    bins : int
+        Of the longest recording.
+    least_interval : int
+        Least steps from one spike of an output neuron to its next.
+    full : Full
+    windows : tuple of Window
+        Empty without labels.
+    files, labels, decisions, chip_steps
+        Of every recording.
+    rules : tuple of Rule
+        The proof first.
+    savings : mapping of str to int
+        Index of the rule that saves most with ``identical`` decisions, or with at most ``one_lost``.
+    calibrated_on : str or None
+    chosen : int or None
+        Index of the rule that was asked for.
+    """
+
+    samples: int
+    labelled: int
+    source: str
+    split: str
+    bins: int
+    least_interval: int
+    full: Full
+    windows: tuple[Window, ...]
+    files: tuple[str, ...]
+    labels: list[int]
+    decisions: list[int]
+    chip_steps: list[int]
+    rules: tuple[Rule, ...]
+    savings: Mapping[str, int]
+    calibrated_on: str | None = field(default=None, metadata=OPTIONAL)
+    chosen: int | None = field(default=None, metadata=OPTIONAL)
+
+
+def study(
+    netlist: Netlist,
+    data: Recordings,
+    ran: Cumulative,
+    calibrated: Sequence[exits.Calibrated] = (),
+    *,
+    model_votes: IntArray | None = None,
+    calibrated_on: str | None = None,
+    chosen: int | None = None,
+) -> Anytime:
+    """Apply the proof and calibrated rules to recordings.
+
+    Parameters
+    ----------
+    netlist : Netlist
+    data : Recordings
+    ran : Cumulative
+        Their run.
+    calibrated : sequence of Calibrated
+    model_votes : (samples, steps, classes) int64, optional
+        Votes of the float model so far.
+    calibrated_on, chosen
+        To be remembered.
+    """
+    at = exits.standing(ran.votes, ran.lengths)
+    sure = exits.proven(ran.votes, at, exits.most_votes(netlist, data.steps))
+    model = None
+    if model_votes is not None:
+        standing = exits.standing(model_votes, ran.lengths)
+        voters = np.bincount(netlist.readout_class[netlist.readout_class >= 0], minlength=netlist.classes)
+        model = standing, exits.proven(model_votes, standing, voters[:, None] * np.arange(data.steps + 1))
+    rules = tuple(_rule(rule, ran, at, sure, model, data.labels) for rule in (None, *calibrated))
+    right = _correct(at.decision, data.labels)
+    labelled = int(np.count_nonzero(data.labels != UNLABELLED))
+    return Anytime(
+        samples=len(data),
+        labelled=labelled,
+        source=data.source,
+        split=data.split,
+        bins=data.steps,
+        least_interval=int(exits.least_interval(netlist).min(initial=1)),
+        full=Full(
+            costs=_costs(ran, ran.chip_steps - 1),
+            correct=right,
+            float_correct=None if model is None else _correct(model[0].decision, data.labels),
+        ),
+        windows=tuple(_window(share, data, ran, at, model and model[0]) for share in WINDOWS) if labelled else (),
+        files=tuple(data.files),
+        labels=data.labels.tolist(),
+        decisions=at.decision.tolist(),
+        chip_steps=ran.chip_steps.tolist(),
+        rules=rules,
+        savings=_savings(rules, right),
+        calibrated_on=calibrated_on,
+        chosen=chosen,
+    )
+
+
+def _rule(
+    rule: exits.Calibrated | None,
+    ran: Cumulative,
+    at: exits.Standing,
+    sure: BoolArray,
+    model: tuple[exits.Standing, BoolArray] | None,
+    labels: IntArray,
+) -> Rule:
+    factor = np.inf if rule is None else rule.factor
+    ends, last = exits.exits(sure, at, factor), ran.chip_steps - 1
+    index = np.where(ends == ran.lengths - 1, last, np.minimum(ends + ran.depth, last))
+    rows = np.arange(len(ends))
+    mean, whole = _costs(ran, index), _costs(ran, last)
+
+    def saved(sums: FloatArray) -> list[float]:
+        return [float(each) for each in sums[rows, last] - sums[rows, index]]
+
+    stops = None
+    if model is not None:
+        model_ends = exits.exits(model[1], model[0], factor)
+        stops = FloatStops(changes=_changes(model[0], model_ends, labels), steps=float(np.mean(model_ends + 1)))
+    return Rule(
+        allowed=None if rule is None else rule.allowed,
+        factor=None if rule is None else rule.factor,
+        races=None if rule is None else rule.races,
+        races_differ=None if rule is None else rule.differ,
+        bound=None if rule is None else rule.bound,
+        mean=mean,
+        saved=Costs(
+            chip_steps=_share(mean.chip_steps, whole.chip_steps),
+            operations=_share(mean.operations, whole.operations),
+            energy_j={name: _share(each, whole.energy_j[name]) for name, each in mean.energy_j.items()},
+            time_s={name: _share(each, whole.time_s[name]) for name, each in mean.time_s.items()},
+        ),
+        changes=_changes(at, ends, labels),
+        samples=Samples(
+            chip_steps=(index + 1).tolist(),
+            decisions=at.leader[rows, ends].tolist(),
+            saved_operations=saved(ran.operations),
+            saved_energy_j={name: saved(each) for name, each in ran.energy.items()},
+            saved_time_s={name: saved(each) for name, each in ran.time.items()},
+        ),
+        model=stops,
+    )
+
+
+def _share(kept: float, whole: float) -> float:
+    """What is saved of the whole."""
+    return 1 - kept / whole if whole else 0.0
+
+
+def _correct(decisions: IntArray, labels: IntArray) -> int | None:
+    known = labels != UNLABELLED
+    return int(np.count_nonzero(known & (decisions == labels))) if known.any() else None
+
+
+def _changes(at: exits.Standing, ends: IntArray, labels: IntArray) -> Changes:
+    early, late = at.leader[np.arange(len(ends)), ends], at.decision
+    known = labels != UNLABELLED
+    return Changes(
+        differ=int(np.count_nonzero(early != late)),
+        correct=_correct(early, labels),
+        gained=int(np.count_nonzero(known & (early == labels) & (late != labels))),
+        lost=int(np.count_nonzero(known & (early != labels) & (late == labels))),
+    )
+
+
+def _costs(ran: Cumulative, index: IntArray) -> Costs:
+    """Means up to and with a chip step of each recording."""
+    rows = np.arange(len(index))
+    return Costs(
+        chip_steps=float(np.mean(index + 1)),
+        operations=float(ran.operations[rows, index].mean()),
+        energy_j={name: float(each[rows, index].mean()) for name, each in ran.energy.items()},
+        time_s={name: float(each[rows, index].mean()) for name, each in ran.time.items()},
+    )
+
+
+def _window(
+    percent: int, data: Recordings, ran: Cumulative, at: exits.Standing, model: exits.Standing | None
+) -> Window:
+    steps = np.maximum(ran.lengths * percent // 100, 1)
+    known = int(np.count_nonzero(data.labels != UNLABELLED))
+
+    def right(votes: exits.Standing) -> Right:
+        correct = _correct(votes.leader[np.arange(len(steps)), steps - 1], data.labels) or 0
+        return Right(correct=correct, interval=wilson(correct, known))
+
+    return Window(
+        percent=percent, bins=float(steps.mean()), chip=right(at), model=None if model is None else right(model)
+    )
+
+
+def _savings(rules: Sequence[Rule], right: int | None) -> dict[str, int]:
+    """Rules that save most steps with the same decisions, and with at most one recording less right."""
+    fitting = {"identical": [index for index, rule in enumerate(rules) if rule.changes.differ == 0]}
+    if right is not None:
+        fitting["one_lost"] = [i for i, rule in enumerate(rules) if (rule.changes.correct or 0) >= right - 1]
+    return {name: max(found, key=lambda index: rules[index].saved.chip_steps) for name, found in fitting.items()}
