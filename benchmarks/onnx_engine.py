@@ -23,7 +23,7 @@ import onnx
 import onnxruntime
 
 from spikeloom import __version__
-from spikeloom.compiler.formats.atomic import write_atomically
+from spikeloom.compiler.atomic import write_atomically
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.models.recordings.evtouch import load_recordings

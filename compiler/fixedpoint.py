@@ -11,6 +11,8 @@ References
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 
@@ -174,3 +176,23 @@ def encode_bias(bias: FloatArray) -> tuple[IntArray, IntArray]:
     if np.any(np.abs(mantissa) > BIAS_MANTISSA_MAX):
         raise ValueError(f"bias of magnitude {np.abs(bias).max():.6g} exceeds 4095 * 2**7 membrane units")
     return mantissa, exponent
+
+
+def frozen(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """The same array, read-only from now on."""
+    array.flags.writeable = False
+    return array
+
+
+def read_only(array: npt.ArrayLike) -> IntArray:
+    """Copy to a read-only int64 array, as most fields of netlists are."""
+    copy = np.array(array, dtype=np.int64)
+    copy.flags.writeable = False
+    return copy
+
+
+def read_only_float(array: npt.ArrayLike) -> FloatArray:
+    """Copy to a read-only float64 array."""
+    copy = np.array(array, dtype=np.float64)
+    copy.flags.writeable = False
+    return copy

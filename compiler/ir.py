@@ -129,6 +129,25 @@ class Network:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Form:
+    """How one population is stored.
+
+    Parameters
+    ----------
+    bits : int
+        Storage width of a mantissa.
+    exponents : tuple of int
+        Exponent of each plane, finest first.
+    threshold : (neurons,) int64
+        Threshold mantissas, at least 1.
+    """
+
+    bits: int
+    exponents: tuple[int, ...]
+    threshold: IntArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class IntegerPopulation:
     """The same neurons in Loihi's registers; units as in :class:`netlist.Netlist`.
 

@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from spikeloom.compiler.formats.checkpoint import Checkpoint, read_checkpoint
+from spikeloom.compiler.checkpoint import Checkpoint
+from spikeloom.compiler.formats.checkpoint import read_checkpoint
 from spikeloom.models.graphs import Graph, normalised_adjacency
 from spikeloom.models.networks.checkpoint import save_checkpoint
 

@@ -9,10 +9,10 @@ from hypothesis import assume
 from hypothesis import strategies as st
 from scipy import sparse
 
+from spikeloom.compiler.checkpoint import Checkpoint, Dense
 from spikeloom.compiler.dynamics import PLAIN
 from spikeloom.compiler.errors import CapacityError
 from spikeloom.compiler.fixedpoint import weight_step
-from spikeloom.compiler.formats.checkpoint import Checkpoint, Dense
 from spikeloom.compiler.ir import (
     INPUT,
     Input,

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from spikeloom.compiler.formats.atomic import remove_leftovers, write_atomically
+from spikeloom.compiler.atomic import remove_leftovers, write_atomically
 
 
 def interrupted_at(line: int, write):

@@ -25,8 +25,8 @@ from made_files import (
 )
 from made_files import weights as made_weights
 
+from spikeloom.compiler.archive import digest, read_members
 from spikeloom.compiler.errors import FormatError
-from spikeloom.compiler.formats.archive import digest, read_members
 from spikeloom.compiler.targets.loihi1 import netlist_file as serialize
 from spikeloom.models.graphs import CHOICES
 from spikeloom.runtime import cli

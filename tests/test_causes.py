@@ -7,8 +7,8 @@ import pytest
 from random_networks import chain
 
 from spikeloom.compiler.interpret import run_integer
+from spikeloom.compiler.ir import Form
 from spikeloom.compiler.targets.loihi1.storage.quantize import round_to_forms
-from spikeloom.compiler.targets.loihi1.storage.weight_storage import Form
 from spikeloom.runtime.equivalence.explanation.causes import Explanation, Observed, explain
 from spikeloom.runtime.equivalence.explanation.deviations import (
     BETA,

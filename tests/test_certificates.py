@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from made_files import CLASSES, FEATURES, TAXELS, events, ring, small_checkpoint, weights
 
 from spikeloom.compiler import Options, Recipe, compile_network, lift
-from spikeloom.compiler.formats.checkpoint import Checkpoint
+from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.interpret import channels_last, run_float, vote
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.models.networks.reference import float_spikes

@@ -12,9 +12,9 @@ from random_netlists import Neuron, build
 
 from spikeloom.compiler import Options, Recipe, compile_network, lift
 from spikeloom.compiler.errors import DataError, ModelError
+from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.interpret import channels_last, run_float
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.targets.loihi1.netlist import read_only
 from spikeloom.models.networks.reference import float_membranes, float_spikes
 from spikeloom.runtime import cli
 from spikeloom.runtime.equivalence import verify as equivalence

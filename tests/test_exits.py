@@ -12,10 +12,10 @@ from random_netlists import Axon, Neuron, build, large_netlist, netlists, record
 from spikeloom.compiler import compile_network, lift
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import NumericRangeError
+from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.formats.checkpoint import read_checkpoint
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.targets.loihi1.netlist import read_only
 from spikeloom.models.graphs import normalised_adjacency
 from spikeloom.models.recordings.evtouch import load_recordings
 from spikeloom.runtime.inputs.files import shipped

@@ -11,8 +11,8 @@ from random_netlists import Axon, Neuron, build
 from test_timing import LOIHI, six_steps
 
 from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.formats import sanafe
-from spikeloom.compiler.targets.loihi1.netlist import read_only
 from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist
 from spikeloom.runtime.commands.exchange import export
 from spikeloom.runtime.report.encode import encode

@@ -8,9 +8,8 @@ from random_networks import BITS, chain, float_networks
 
 from spikeloom.compiler.fixedpoint import quantise_weights, weight_step
 from spikeloom.compiler.invariants import verify
-from spikeloom.compiler.ir import IntegerNetwork
+from spikeloom.compiler.ir import Form, IntegerNetwork
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import (
-    Form,
     one_sided_sums,
     plane_distance,
     reach,

@@ -12,15 +12,16 @@ from test_checkpoint import rebuilt
 from timed_networks import GRAPH, TIMING, events_of, written
 
 from spikeloom.compiler import Options, compile_network
+from spikeloom.compiler.checkpoint import SHARED, towers_of
 from spikeloom.compiler.dynamics import PLAIN, Clocks, Dynamics, with_clocks
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.checkpoint import read_checkpoint
 from spikeloom.compiler.formats.onnx.reader import read_onnx
-from spikeloom.compiler.formats.towers import SHARED, arrays_of, join, members, side_by_side, towers_of
+from spikeloom.compiler.formats.towers import arrays_of, join, members, side_by_side
 from spikeloom.compiler.interpret import channels_last, run_float, run_integer, vote
+from spikeloom.compiler.ir import Form
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.loihi1.storage.quantize import round_to_forms
-from spikeloom.compiler.targets.loihi1.storage.weight_storage import Form
 from spikeloom.models.graphs import build_graph
 from spikeloom.models.networks.checkpoint import checkpoint_bytes, save_checkpoint
 from spikeloom.models.networks.quantised import quantised_spikes

@@ -12,10 +12,10 @@ from random_netlists import Axon, Neuron, build
 from timed_networks import written
 
 from spikeloom.compiler import Options, compile_network, lift
+from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.ir import INPUT
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.passes.prune import deaf_to
-from spikeloom.compiler.targets.loihi1.netlist import read_only
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.models.recordings.events import load_data
 from spikeloom.runtime.machines.loihi1 import engine

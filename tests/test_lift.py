@@ -11,12 +11,13 @@ from random_networks import dense_weights, integer_chain, integer_networks, reco
 
 from spikeloom.compiler import lift
 from spikeloom.compiler.errors import CapacityError, FormatError, NumericRangeError
+from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.interpret import run_integer
 from spikeloom.compiler.invariants import verify
 from spikeloom.compiler.ir import INPUT, IntegerNetwork
 from spikeloom.compiler.targets.loihi1.emit import emit
 from spikeloom.compiler.targets.loihi1.layout.partition import partition
-from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_only
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.trace import aligned
 

@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from spikeloom.compiler.formats.checkpoint import Checkpoint, Dense, read_checkpoint
+from spikeloom.compiler.checkpoint import Checkpoint, Dense
+from spikeloom.compiler.formats.checkpoint import read_checkpoint
 from spikeloom.compiler.passes.expand import expand_graph_convolution
 from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.models.networks.layers import SURROGATE_HALF_WIDTH, LifSteps, lif, spike_linear, tag_convolution

@@ -16,10 +16,10 @@ from timed_networks import events_of, written
 from spikeloom.compiler import compile_network, lift
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import ModelError, OptionError
+from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.formats.nir import writer as nir_export
 from spikeloom.compiler.formats.nir.reader import read_nir
 from spikeloom.compiler.ir import INPUT
-from spikeloom.compiler.targets.loihi1.netlist import read_only
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist, write_netlist
 from spikeloom.runtime.cli import main
 from spikeloom.runtime.machines.loihi1 import engine

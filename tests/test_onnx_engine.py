@@ -15,9 +15,9 @@ from random_netlists import Axon, Neuron, build, large_netlist, netlists, record
 from test_timing import six_steps
 
 from spikeloom.compiler.errors import DataError, ModelError, NumericRangeError, OptionError
+from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.formats.onnx import builder, writer_layers
 from spikeloom.compiler.formats.onnx import writer as onnx_writer
-from spikeloom.compiler.targets.loihi1.netlist import read_only
 from spikeloom.runtime import cli
 from spikeloom.runtime.machines.loihi1 import engine, onnx_engine, spec
 

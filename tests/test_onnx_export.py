@@ -19,12 +19,12 @@ from test_onnx_engine import three_neurons
 from spikeloom import __version__
 from spikeloom.compiler import Options, Recipe, compile_network
 from spikeloom.compiler.errors import FormatError, ModelError, OptionError
+from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.formats.onnx import writer as onnx_writer
 from spikeloom.compiler.formats.onnx import writer_float as onnx_float
 from spikeloom.compiler.formats.onnx.builder import port_words
 from spikeloom.compiler.formats.onnx.writer_layers import digits, is_pipeline, plan
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.targets.loihi1.netlist import read_only
 from spikeloom.compiler.targets.loihi1.netlist_file import netlist_bytes, write_netlist
 from spikeloom.models.networks.reference import float_spikes
 from spikeloom.runtime import cli

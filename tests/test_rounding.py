@@ -10,8 +10,8 @@ from made_files import TAXELS, events, own_file, recordings_folder, small_checkp
 from random_networks import chain
 
 from spikeloom.compiler import Options, Recipe, compile_network, lift
+from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.targets.loihi1.netlist import read_only
 from spikeloom.models.graphs import normalised_adjacency
 from spikeloom.runtime.equivalence.rounding import check_rounding
 

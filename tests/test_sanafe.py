@@ -20,10 +20,11 @@ from timed_networks import events_of, written
 
 from spikeloom.compiler import Options, compile_network
 from spikeloom.compiler.dynamics import with_clocks
+from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.formats import sanafe
 from spikeloom.compiler.formats.checkpoint import read_checkpoint
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_only
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.models.recordings.evtouch import load_recordings
 from spikeloom.runtime.machines.loihi1 import engine, timing

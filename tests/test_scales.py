@@ -13,6 +13,7 @@ from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX
 from spikeloom.compiler.interpret import run_integer
 from spikeloom.compiler.invariants import verify
+from spikeloom.compiler.ir import Form
 from spikeloom.compiler.passes.calibrate import calibrate
 from spikeloom.compiler.targets.loihi1.storage.compensate import compensated
 from spikeloom.compiler.targets.loihi1.storage.quantize import quantize
@@ -25,7 +26,7 @@ from spikeloom.compiler.targets.loihi1.storage.scales import (
     planes_from,
     rounded,
 )
-from spikeloom.compiler.targets.loihi1.storage.weight_storage import Form, one_sided_sums, round_population
+from spikeloom.compiler.targets.loihi1.storage.weight_storage import one_sided_sums, round_population
 
 LOIHI_EXPONENTS = LOIHI.choices["synapse.exponent"]
 

@@ -14,9 +14,9 @@ import pytest
 from hypothesis import given, settings
 from random_networks import LOIHI, integer_chain, integer_networks
 
+from spikeloom.compiler import archive
+from spikeloom.compiler.archive import is_netlist
 from spikeloom.compiler.errors import CapacityError, FormatError
-from spikeloom.compiler.formats import archive
-from spikeloom.compiler.formats.archive import is_netlist
 from spikeloom.compiler.targets.loihi1.emit import emit
 from spikeloom.compiler.targets.loihi1.layout.partition import partition
 from spikeloom.compiler.targets.loihi1.netlist import Netlist

@@ -9,8 +9,8 @@ import pytest
 from made_files import STEPS, own_file, recordings_folder
 from random_netlists import Axon, Neuron, build, large_netlist
 
+from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.targets.base import load_target
-from spikeloom.compiler.targets.loihi1.netlist import read_only
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist, write_netlist
 from spikeloom.runtime import cli
 from spikeloom.runtime.equivalence import ladder

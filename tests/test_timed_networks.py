@@ -15,14 +15,14 @@ from timed_networks import TIMING, events_of, written
 from spikeloom.compiler import Options, Recipe, compile_network, lift
 from spikeloom.compiler.dynamics import NO_CLOCKS, PLAIN, Clocks, Dynamics, with_clocks
 from spikeloom.compiler.errors import DataError, ModelError, NumericRangeError
-from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, MEMBRANE_MAX, ONE_STEP_SUM_MAX
+from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, MEMBRANE_MAX, ONE_STEP_SUM_MAX, read_only
 from spikeloom.compiler.formats.checkpoint import read_checkpoint
 from spikeloom.compiler.interpret import channels_last, run_float, run_integer
 from spikeloom.compiler.ir import Input
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.passes.prune import never_fires
 from spikeloom.compiler.targets.base import load_target
-from spikeloom.compiler.targets.loihi1.netlist import one_step_bounds, read_only
+from spikeloom.compiler.targets.loihi1.netlist import one_step_bounds
 from spikeloom.compiler.targets.loihi1.netlist_file import netlist_bytes, read_netlist, write_netlist
 from spikeloom.compiler.targets.loihi1.netlist_text import netlist_text
 from spikeloom.compiler.targets.loihi1.storage.quantize import quantize

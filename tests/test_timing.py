@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from random_netlists import Axon, Neuron, build, by_engine, large_netlist, netlists, recordings
 
 from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.formats import sanafe
 from spikeloom.compiler.targets.base import LATENCIES, Quantity, load_target
-from spikeloom.compiler.targets.loihi1.netlist import read_only
 from spikeloom.runtime.machines.loihi1 import engine, timing
 from spikeloom.runtime.machines.loihi1.costs import cost, energy
 from spikeloom.runtime.machines.loihi1.timing_spec import Chip

@@ -9,11 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_crossbars import crossbars
 
+from spikeloom.compiler import archive
+from spikeloom.compiler.archive import is_netlist
 from spikeloom.compiler.errors import FormatError
-from spikeloom.compiler.formats import archive
-from spikeloom.compiler.formats.archive import is_netlist
+from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.targets.base import load_target
-from spikeloom.compiler.targets.loihi1.netlist import read_only
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.compiler.targets.truenorth.builder import Draft, Neuron, history_free
 from spikeloom.compiler.targets.truenorth.legalize import faults

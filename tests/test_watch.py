@@ -18,9 +18,10 @@ from random_netlists import Axon, Neuron, build, large_netlist
 
 from spikeloom.compiler import compile_network
 from spikeloom.compiler.errors import DataError, ModelError, OptionError
+from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.formats.checkpoint import read_checkpoint
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_only
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist
 from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.models.recordings.events import load_data

@@ -13,8 +13,8 @@ from made_files import recordings_folder, small_checkpoint
 from random_networks import random_checkpoint
 
 from spikeloom.compiler import compile_network
+from spikeloom.compiler.checkpoint import Dense
 from spikeloom.compiler.errors import DataError
-from spikeloom.compiler.formats.checkpoint import Dense
 from spikeloom.compiler.interpret import channels_last, run_float
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist

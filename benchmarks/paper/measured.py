@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from spikeloom.compiler import Compilation, Options, compile_network, without
+from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.errors import CapacityError
 from spikeloom.compiler.fixedpoint import FloatArray, IntArray
-from spikeloom.compiler.formats.checkpoint import Checkpoint, read_checkpoint
+from spikeloom.compiler.formats.checkpoint import read_checkpoint
 from spikeloom.compiler.interpret import cut, vote
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.passes.expand import expand

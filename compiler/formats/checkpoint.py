@@ -8,158 +8,31 @@ from __future__ import annotations
 import hashlib
 import math
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.dynamics import PLAIN, Dynamics
+from spikeloom.compiler.checkpoint import WEIGHTS, Checkpoint, Dense, Float32Array
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.fixedpoint import IntArray
-from spikeloom.compiler.formats.checkpoint_file import (
-    WEIGHTS,
-    Float32Array,
-    own_contents,
-    own_members,
-    require_constants,
-)
+from spikeloom.compiler.formats.checkpoint_file import own_contents, own_members, require_constants
 from spikeloom.compiler.formats.released_file import GIVE, read_released
 from spikeloom.compiler.formats.tensors import Arrays, Contents
-from spikeloom.compiler.ir import Readout
 from spikeloom.compiler.systems import (
     GRID_CNN,
-    MLP,
     SYSTEMS,
-    TACTILESGNET,
     Grid,
     kernel_of,
     window_forms,
 )
-from spikeloom.compiler.targets.loihi1.storage.weight_storage import Form
 
 BETA, THETA = 0.2, 0.5
 """Decay and threshold of the released code; files in its layout do not hold them."""
 
 SIZE_LIMIT = 2**28
 """Bytes that a checkpoint may have: 256 MiB, a hundred times the released ones."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Dense:
-    """A fully connected stage.
-
-    Parameters
-    ----------
-    name : str
-        ``fc1`` …
-    weight : (outputs, inputs) float32
-        Of a joined network with the inputs of one tower: no row has weights from another one.
-    bias : (outputs,) float32
-    """
-
-    name: str
-    weight: Float32Array
-    bias: Float32Array
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Checkpoint:
-    """Trained weights, and what is known about them.
-
-    Parameters
-    ----------
-    system : str
-        One of ``SYSTEMS``.
-    hops : (filters, features, channels) float32
-        Filters of the first layer: of a TactileSGNet K + 1, one for each hop.
-    conv_bias : (features,) float32
-    dense : tuple of Dense
-        Fully connected stages in order.
-    beta, theta : float
-        Membrane decay and threshold.
-    assumed : tuple of str
-        Which of ``beta`` and ``theta`` neither the file nor the user gave.
-    graph : str or None
-        Name of the graph that it was trained on.
-    edges : (edges, 2) int64 or None
-        Its edge list, (source, target).
-    layout : {"spikeloom", "released", "state_dict"}
-        Kind of file.
-    weights : {"last", "best", "clean"}
-        Epoch that the weights are from.
-    sets : tuple of str
-        All epochs that the file holds.
-    runs : int
-        Trainings that the file holds; this is one of them.
-    training : mapping or None
-        JSON values: how it was made and what it reached.
-    forms : tuple of Form, or None
-        How the chip stores each layer, where the network was fine-tuned for it.
-    sha256 : str
-        Of the file.
-    grid : Grid or None
-        Of a grid-based CNN.
-    dynamics : Dynamics
-        Decays of single layers, and clocks.
-    towers : int
-        Networks that lie side by side and vote together, see :mod:`formats.towers`.
-    bins : int
-        Bins of the recordings that a step joins.
-    """
-
-    hops: Float32Array
-    conv_bias: Float32Array
-    dense: tuple[Dense, ...]
-    beta: float
-    theta: float
-    assumed: tuple[str, ...]
-    graph: str | None
-    edges: IntArray | None
-    layout: str
-    weights: str
-    sets: tuple[str, ...]
-    runs: int
-    training: Mapping[str, Any] | None
-    forms: tuple[Form, ...] | None
-    sha256: str
-    system: str = TACTILESGNET
-    grid: Grid | None = None
-    dynamics: Dynamics = PLAIN
-    towers: int = 1
-    bins: int = 1
-
-    @property
-    def places(self) -> int:
-        """Number of places that the first fully connected stage was trained on."""
-        heard = self.dense[0].weight.shape[1] - self.dynamics.clocks.channels
-        return int(heard * self.towers // self.hops.shape[1])
-
-    @property
-    def taxels(self) -> int:
-        """Number of taxels of the sensor."""
-        if self.grid is not None:
-            return len(self.grid.cells)
-        return len(self.hops) if self.system == MLP else self.places
-
-    @property
-    def classes(self) -> int:
-        """Number of classes."""
-        return len(self.dense[-1].bias) // self.towers
-
-    @property
-    def neurons(self) -> dict[str, int]:
-        """Neurons of each layer, the relays of clocks among those of the first."""
-        first = self.places * self.hops.shape[1] + self.dynamics.clocks.channels
-        return {"conv1": int(first)} | {dense.name: len(dense.bias) for dense in self.dense}
-
-    @property
-    def readout(self) -> Readout:
-        """The vote: each tower has one neuron for each class."""
-        label = np.arange(len(self.dense[-1].bias)) % self.classes
-        return Readout(population=len(self.dense), label=label)
 
 
 def read_checkpoint(

@@ -45,10 +45,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from spikeloom.compiler.archive import read_npy, stored_members
+from spikeloom.compiler.checkpoint import WEIGHTS, Float32Array
 from spikeloom.compiler.dynamics import MOST_STEPS, PLAIN, Dynamics, dynamics_from_json
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.fixedpoint import THRESHOLD_MANTISSA_MAX
-from spikeloom.compiler.formats.archive import read_npy, stored_members
 from spikeloom.compiler.formats.released_file import DAMAGED, NOT_A_CHECKPOINT
 from spikeloom.compiler.formats.tensors import (
     Arrays,
@@ -60,6 +61,7 @@ from spikeloom.compiler.formats.tensors import (
     tower_faults,
     wanted_dense,
 )
+from spikeloom.compiler.ir import Form
 from spikeloom.compiler.systems import (
     GRAPH_SYSTEMS,
     GRID_CNN,
@@ -69,15 +71,11 @@ from spikeloom.compiler.systems import (
     grid_from_json,
     shape_faults,
 )
-from spikeloom.compiler.targets.loihi1.storage.weight_storage import Form, plane_distance
+from spikeloom.compiler.targets.loihi1.storage.weight_storage import plane_distance
 
 FORMAT = "spikeloom-checkpoint"
 VERSION = 6
 
-WEIGHTS = ("last", "best", "clean")
-"""Sets that our own format can hold."""
-
-Float32Array = npt.NDArray[np.float32]
 
 _AGAIN = "copy or train it again"
 

@@ -12,8 +12,8 @@ import numpy.typing as npt
 from spikeloom.compiler.dynamics import PLAIN, Dynamics
 from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.formats.names import printable
+from spikeloom.compiler.ir import Form
 from spikeloom.compiler.systems import TACTILESGNET, Grid
-from spikeloom.compiler.targets.loihi1.storage.weight_storage import Form
 
 Arrays = dict[str, npt.NDArray[Any]]
 

@@ -18,31 +18,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from spikeloom.compiler.checkpoint import SHARED, Checkpoint, towers_of
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.fixedpoint import IntArray
-from spikeloom.compiler.formats.checkpoint import Checkpoint
 from spikeloom.compiler.formats.tensors import Arrays, apart, together
-from spikeloom.compiler.systems import in_order
-from spikeloom.compiler.targets.loihi1.storage.weight_storage import Form
-
-SHARED = -1
-"""Tower of the relays of clocks."""
-
-
-def towers_of(checkpoint: Checkpoint) -> tuple[IntArray, ...]:
-    """Tower of each neuron, one array a layer; relays of clocks are `SHARED`."""
-    towers = np.arange(checkpoint.towers)
-    features = np.repeat(towers, checkpoint.hops.shape[1] // checkpoint.towers)
-    first = in_order(checkpoint.system, np.tile(features, (checkpoint.places, 1)))
-    relays = np.full(checkpoint.dynamics.clocks.channels, SHARED)
-    dense = (np.repeat(towers, len(stage.bias) // checkpoint.towers) for stage in checkpoint.dense)
-    return (np.concatenate([first, relays]), *dense)
-
-
-def inputs_of(checkpoint: Checkpoint, layer: int) -> IntArray:
-    """Neurons of the layer before that each tower of a fully connected layer hears, (towers, inputs), in order."""
-    before = towers_of(checkpoint)[layer - 1]
-    return np.stack([np.flatnonzero((before == t) | (before == SHARED)) for t in range(checkpoint.towers)])
+from spikeloom.compiler.ir import Form
 
 
 def members(checkpoint: Checkpoint) -> tuple[Checkpoint, ...]:

@@ -24,11 +24,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
+from spikeloom.compiler.checkpoint import Checkpoint, inputs_of
 from spikeloom.compiler.dynamics import RELAY_WEIGHT
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.fixedpoint import FloatArray
-from spikeloom.compiler.formats.checkpoint import Checkpoint
-from spikeloom.compiler.formats.towers import inputs_of
 from spikeloom.compiler.ir import INPUT, Input, Network, Population, Projection, Sparse
 from spikeloom.compiler.systems import TACTILESGNET, TITLES, in_order
 

@@ -13,9 +13,9 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from spikeloom.compiler.formats.atomic import write_atomically
+from spikeloom.compiler.atomic import write_atomically
 from spikeloom.compiler.dynamics import PLAIN, Dynamics
-from spikeloom.compiler.targets.loihi1.storage.weight_storage import Form
+from spikeloom.compiler.ir import Form
 from spikeloom.compiler.formats.checkpoint_file import FORMAT, VERSION, content_digest
 from spikeloom.compiler.systems import TACTILESGNET, Grid
 from spikeloom.models.recordings.evtouch import Recordings

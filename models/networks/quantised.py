@@ -26,8 +26,9 @@ from spikeloom.compiler.fixedpoint import (
     ONE_STEP_SUM_MAX,
     encode_bias,
 )
-from spikeloom.compiler.targets.loihi1.storage.weight_storage import Form, decay_registers, reach, round_steps, step_units
-from spikeloom.compiler.formats.checkpoint import Checkpoint
+from spikeloom.compiler.targets.loihi1.storage.weight_storage import decay_registers, reach, round_steps, step_units
+from spikeloom.compiler.ir import Form
+from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.systems import in_order
 from spikeloom.compiler.formats.towers import members, side_by_side
 from spikeloom.compiler.passes.expand import effective_weight, stack_of

@@ -16,7 +16,7 @@ import numpy.typing as npt
 import torch
 
 from spikeloom.compiler.dynamics import RELAY_WEIGHT
-from spikeloom.compiler.formats.checkpoint import Checkpoint
+from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.systems import GCN, TACTILESGNET, feature_major, in_order
 from spikeloom.compiler.formats.towers import members, side_by_side
 from spikeloom.models.networks.currents import lasting_current

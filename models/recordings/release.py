@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
+from spikeloom.compiler.atomic import beside, write_atomically
 from spikeloom.compiler.errors import DataError, OptionError
-from spikeloom.compiler.formats.atomic import beside, write_atomically
 from spikeloom.models.recordings.events import need_labels
 from spikeloom.models.recordings.evtouch import Recordings
 

@@ -25,17 +25,17 @@ import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.fixedpoint import BIAS_EXPONENT_MAX, BIAS_MANTISSA_MAX, MEMBRANE_SHIFT, THRESHOLD_MANTISSA_MAX
-from spikeloom.compiler.formats.checkpoint import Checkpoint
 from spikeloom.compiler.formats.checkpoint_file import arrays_digest
 from spikeloom.compiler.formats.towers import arrays_of
 from spikeloom.compiler.interpret import channels_last
-from spikeloom.compiler.ir import Network
+from spikeloom.compiler.ir import Form, Network
 from spikeloom.compiler.passes.calibrate import Calibration, calibrate, evenly_spaced
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.targets.loihi1.storage.weight_storage import Form, reach, step_units
+from spikeloom.compiler.targets.loihi1.storage.weight_storage import reach, step_units
 from spikeloom.models.networks.networks import Weights
 from spikeloom.models.networks.quantised import QuantisedNet, time_first
 from spikeloom.models.recordings.evtouch import Recordings

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 
+from spikeloom.compiler.checkpoint import WEIGHTS
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.formats.checkpoint_file import WEIGHTS
 from spikeloom.compiler.formats.nir.neurons import CONVENTIONS
 from spikeloom.compiler.systems import SYSTEMS
 from spikeloom.models.graphs import CHOICES

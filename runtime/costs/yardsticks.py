@@ -23,10 +23,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import DataError
 from spikeloom.compiler.fixedpoint import FloatArray
-from spikeloom.compiler.formats.checkpoint import Checkpoint
 from spikeloom.compiler.ir import INPUT, Network
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.systems import GCN, TACTILESGNET

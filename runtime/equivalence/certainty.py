@@ -20,8 +20,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.fixedpoint import FloatArray
-from spikeloom.compiler.formats.checkpoint import Checkpoint
 from spikeloom.compiler.interpret import BATCH, DENORMAL, BoolArray, channels_last
 from spikeloom.compiler.ir import INPUT, Network
 from spikeloom.compiler.passes.expand import effective_weight, expand, stack_of

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.fixedpoint import FloatArray, IntArray
-from spikeloom.compiler.formats.checkpoint import Checkpoint
 from spikeloom.compiler.interpret import BoolArray, cut
 from spikeloom.compiler.ir import IntegerNetwork, Network
 from spikeloom.compiler.targets.loihi1.storage.range_proof import prove_ranges

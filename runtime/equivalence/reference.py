@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.dynamics import Clocks
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.fixedpoint import FloatArray
-from spikeloom.compiler.formats.checkpoint import Checkpoint
 from spikeloom.compiler.interpret import BoolArray, channels_last, run_float
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.passes.expand import expand

@@ -13,10 +13,10 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler import lift
+from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import DataError
 from spikeloom.compiler.fixedpoint import FloatArray, IntArray
-from spikeloom.compiler.formats.checkpoint import Checkpoint
 from spikeloom.compiler.interpret import BoolArray, channels_last, cut, vote
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.systems import GRAPH_SYSTEMS

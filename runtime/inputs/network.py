@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.fixedpoint import FloatArray, IntArray
-from spikeloom.compiler.formats.checkpoint import Checkpoint, read_checkpoint
+from spikeloom.compiler.formats.checkpoint import read_checkpoint
 from spikeloom.compiler.formats.netx.layout import SUFFIX as NETX
 from spikeloom.compiler.formats.nir.reader import SUFFIX as NIR
 from spikeloom.compiler.formats.nir.reader import NirNetwork, read_nir

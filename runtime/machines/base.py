@@ -20,9 +20,9 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
+from spikeloom.compiler.archive import stated
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.fixedpoint import FloatArray, IntArray
-from spikeloom.compiler.formats.archive import stated
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.targets.base import Target, load_target
 from spikeloom.compiler.targets.netlist import Netlist

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT, FloatArray, IntArray
-from spikeloom.compiler.formats.checkpoint import Checkpoint
 from spikeloom.compiler.interpret import BoolArray
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.systems import GRAPH_SYSTEMS

@@ -25,10 +25,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.dynamics import NO_CLOCKS
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.fixedpoint import FloatArray
-from spikeloom.compiler.formats.checkpoint import Checkpoint
 from spikeloom.compiler.formats.onnx.builder import (
     Nodes,
     Port,

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.fixedpoint import IntArray
+from spikeloom.compiler.fixedpoint import IntArray, frozen, read_only, read_only_float
 from spikeloom.compiler.ir import INPUT, MANTISSA, IntegerNetwork, depths, fan_in
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.layout.core_needs import (
@@ -25,7 +25,7 @@ from spikeloom.compiler.targets.loihi1.layout.core_needs import (
     lists_into,
 )
 from spikeloom.compiler.targets.loihi1.layout.partition import Partition
-from spikeloom.compiler.targets.loihi1.netlist import Layer, Netlist, frozen, read_only, read_only_float
+from spikeloom.compiler.targets.loihi1.netlist import Layer, Netlist
 
 
 def _entries(

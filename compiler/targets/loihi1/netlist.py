@@ -29,7 +29,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from spikeloom.compiler.dynamics import NO_CLOCKS, Clocks
 from spikeloom.compiler.fixedpoint import FloatArray, IntArray
@@ -245,23 +244,3 @@ def in_units(mantissa: IntArray, exponent: IntArray) -> IntArray:
     """``mantissa * 2**exponent``, int64; at exponent -1 mantissas are even."""
     wide = mantissa.astype(np.int64)
     return np.where(exponent < 0, wide >> 1, wide << np.maximum(exponent, 0))
-
-
-def frozen(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """The same array, read-only from now on."""
-    array.flags.writeable = False
-    return array
-
-
-def read_only(array: npt.ArrayLike) -> IntArray:
-    """Copy to a read-only int64 array, as every field of a netlist but ``scale`` is."""
-    copy = np.array(array, dtype=np.int64)
-    copy.flags.writeable = False
-    return copy
-
-
-def read_only_float(array: npt.ArrayLike) -> FloatArray:
-    """Copy to a read-only float64 array."""
-    copy = np.array(array, dtype=np.float64)
-    copy.flags.writeable = False
-    return copy

@@ -28,11 +28,12 @@ from typing import Any
 
 import numpy as np
 
+from spikeloom.compiler.archive import Array, archive_bytes, read_archive, write_archive
 from spikeloom.compiler.dynamics import MOST_CLOCKS, MOST_STEPS, NO_CLOCKS, Clocks
 from spikeloom.compiler.errors import FormatError
-from spikeloom.compiler.formats.archive import Array, archive_bytes, read_archive, write_archive
+from spikeloom.compiler.fixedpoint import frozen, read_only, read_only_float
 from spikeloom.compiler.targets.base import COMPARTMENTS, known_targets
-from spikeloom.compiler.targets.loihi1.netlist import Layer, Netlist, frozen, read_only, read_only_float
+from spikeloom.compiler.targets.loihi1.netlist import Layer, Netlist
 
 FORMAT = "spikeloom-netlist"
 VERSIONS = (2, 3, 4)

@@ -10,8 +10,8 @@ from typing import Any
 import numpy.typing as npt
 
 from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.ir import Form
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.targets.loihi1.storage.weight_storage import Form
 
 RANGES = ("proven", "observed")
 """How a scale is kept from overflowing the accumulator; ``observed`` trusts the calibration recordings."""

@@ -14,10 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.fixedpoint import FloatArray, IntArray
+from spikeloom.compiler.fixedpoint import FloatArray, IntArray, read_only
 from spikeloom.compiler.ir import INPUT, Network, Population
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.targets.loihi1.netlist import read_only
 
 BoolArray = npt.NDArray[np.bool_]
 

@@ -1,4 +1,4 @@
-"""File of a network trained for crossbar cores; an archive of :mod:`formats.archive`.
+"""File of a network trained for crossbar cores; an archive of :mod:`compiler.archive`.
 
 Members, format version 1: the ``manifest`` (``format`` "spikeloom-native", ``version``, ``taxels``, ``polarities``,
 ``classes``, ``copies``, ``clocks``, ``graph`` with ``name`` and ``edges``, ``layers``, ``towers``, ``weights``: the
@@ -18,10 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from spikeloom.compiler.dynamics import MOST_CLOCKS, MOST_STEPS, Clocks
-from spikeloom.compiler.errors import FormatError, ModelError
-from spikeloom.compiler.fixedpoint import IntArray
-from spikeloom.compiler.formats.archive import (
+from spikeloom.compiler.archive import (
     Array,
     archive_bytes,
     read_manifest,
@@ -29,9 +26,11 @@ from spikeloom.compiler.formats.archive import (
     require_whole,
     stated_format,
 )
-from spikeloom.compiler.formats.atomic import write_atomically
-from spikeloom.compiler.formats.checkpoint_file import WEIGHTS
-from spikeloom.compiler.targets.loihi1.netlist import read_only
+from spikeloom.compiler.atomic import write_atomically
+from spikeloom.compiler.checkpoint import WEIGHTS
+from spikeloom.compiler.dynamics import MOST_CLOCKS, MOST_STEPS, Clocks
+from spikeloom.compiler.errors import FormatError, ModelError
+from spikeloom.compiler.fixedpoint import IntArray, read_only
 from spikeloom.compiler.targets.truenorth.native import NativeNetwork, Stage, faults
 
 FORMAT = "spikeloom-native"

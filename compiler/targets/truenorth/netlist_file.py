@@ -1,4 +1,4 @@
-"""Network of crossbar cores to one file and back; the archive of :mod:`formats.archive`.
+"""Network of crossbar cores to one file and back; the archive of :mod:`compiler.archive`.
 
 Members, format version 1: the ``manifest`` (``format`` "spikeloom-crossbars", ``version``, ``target``, ``taxels``,
 ``polarities``, ``classes``, ``bin_ticks``, ``layers``, ``clocks``, ``provenance``), every array field of
@@ -15,11 +15,11 @@ from typing import Any
 
 import numpy as np
 
+from spikeloom.compiler.archive import Array, archive_bytes, read_archive, stated_format, write_archive
 from spikeloom.compiler.dynamics import MOST_CLOCKS, MOST_STEPS, Clocks
 from spikeloom.compiler.errors import FormatError
-from spikeloom.compiler.formats.archive import Array, archive_bytes, read_archive, stated_format, write_archive
+from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.targets.base import CROSSBARS, known_targets
-from spikeloom.compiler.targets.loihi1.netlist import read_only
 from spikeloom.compiler.targets.truenorth.netlist import AXON_TYPES, PER_NEURON, CrossbarNetlist
 
 FORMAT = "spikeloom-crossbars"

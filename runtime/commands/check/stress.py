@@ -15,8 +15,8 @@ from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from spikeloom.compiler.atomic import write_atomically
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.formats.atomic import write_atomically
 from spikeloom.runtime.commands.options import add_network, add_recordings
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.report.console import progress

@@ -6,8 +6,8 @@ import argparse
 from collections.abc import Callable
 from typing import Any
 
+from spikeloom.compiler.archive import is_netlist
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.formats.archive import is_netlist
 from spikeloom.runtime.commands.options import add_model, add_recordings
 from spikeloom.runtime.costs import yardsticks
 from spikeloom.runtime.inputs.files import shipped

@@ -19,11 +19,11 @@ from pathlib import Path
 
 from spikeloom import __version__
 from spikeloom.compiler import DEFAULT_TARGET
+from spikeloom.compiler.archive import is_netlist
+from spikeloom.compiler.atomic import write_atomically
+from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.fixedpoint import FloatArray
-from spikeloom.compiler.formats.archive import is_netlist
-from spikeloom.compiler.formats.atomic import write_atomically
-from spikeloom.compiler.formats.checkpoint import Checkpoint
 from spikeloom.compiler.formats.checkpoint_file import arrays_digest
 from spikeloom.compiler.interpret import channels_last
 from spikeloom.compiler.passes.expand import expand

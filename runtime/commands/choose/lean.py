@@ -12,9 +12,9 @@ import numpy as np
 
 from spikeloom import __version__
 from spikeloom.compiler import Compilation, Options, compile_network
+from spikeloom.compiler.atomic import write_atomically
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.fixedpoint import IntArray
-from spikeloom.compiler.formats.atomic import write_atomically
 from spikeloom.compiler.systems import TACTILESGNET
 from spikeloom.compiler.targets.base import Target, load_target
 from spikeloom.compiler.targets.loihi1.netlist import Netlist

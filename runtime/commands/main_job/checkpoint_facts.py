@@ -6,8 +6,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.dynamics import Dynamics
-from spikeloom.compiler.formats.checkpoint import Checkpoint
 from spikeloom.compiler.systems import GRAPH_SYSTEMS, TACTILESGNET
 from spikeloom.runtime.report.encode import OPTIONAL
 from spikeloom.runtime.report.sections import Section, Text

@@ -9,8 +9,8 @@ from typing import Any
 
 from spikeloom import __version__
 from spikeloom.compiler import Compilation, Options, Recipe, compile_network, write_netlist
+from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.formats.checkpoint import Checkpoint
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.layout.choose import require_goal
 from spikeloom.compiler.targets.loihi1.options import GOALS, MARGIN, RANGES

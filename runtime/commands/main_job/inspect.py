@@ -6,8 +6,8 @@ import argparse
 import hashlib
 from pathlib import Path
 
+from spikeloom.compiler.archive import is_netlist
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.formats.archive import is_netlist
 from spikeloom.runtime.commands.main_job.checkpoint_facts import facts_of, sections
 from spikeloom.runtime.commands.options import add_model
 from spikeloom.runtime.inputs.files import require_inspectable

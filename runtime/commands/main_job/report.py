@@ -10,9 +10,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from spikeloom.compiler.atomic import write_atomically
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import DataError, ModelError, OptionError
-from spikeloom.compiler.formats.atomic import write_atomically
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.legalize import measure
 from spikeloom.compiler.targets.loihi1.netlist import Netlist

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from spikeloom.compiler.formats.atomic import write_atomically
+from spikeloom.compiler.atomic import write_atomically
 from spikeloom.runtime.commands.main_job.estimate import priced
 from spikeloom.runtime.commands.options import add_detail, add_recordings
 from spikeloom.runtime.costs.simulated import Account, Accounted

@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from spikeloom.compiler.archive import is_netlist
+from spikeloom.compiler.atomic import remove_leftovers
+from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.errors import ModelError, OptionError
-from spikeloom.compiler.formats.archive import is_netlist
-from spikeloom.compiler.formats.atomic import remove_leftovers
-from spikeloom.compiler.formats.checkpoint import Checkpoint, read_checkpoint
+from spikeloom.compiler.formats.checkpoint import read_checkpoint
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.systems import GRAPH_SYSTEMS
 from spikeloom.compiler.targets.base import COMPARTMENTS, load_target

@@ -9,11 +9,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from spikeloom.compiler.archive import is_netlist
+from spikeloom.compiler.atomic import remove_leftovers
+from spikeloom.compiler.checkpoint import WEIGHTS, Checkpoint
 from spikeloom.compiler.errors import ModelError, OptionError
-from spikeloom.compiler.formats.archive import is_netlist
-from spikeloom.compiler.formats.atomic import remove_leftovers
-from spikeloom.compiler.formats.checkpoint import Checkpoint, read_checkpoint
-from spikeloom.compiler.formats.checkpoint_file import WEIGHTS
+from spikeloom.compiler.formats.checkpoint import read_checkpoint
 from spikeloom.compiler.formats.towers import arrays_of
 from spikeloom.compiler.formats.towers import join as join_networks
 from spikeloom.compiler.targets.truenorth.native import SYSTEM as NATIVE

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from spikeloom import __version__
+from spikeloom.compiler.checkpoint import WEIGHTS
 from spikeloom.compiler.errors import DataError, OptionError
-from spikeloom.compiler.formats.checkpoint_file import WEIGHTS
 from spikeloom.compiler.systems import GRAPH_SYSTEMS, GRID_CNN, TACTILESGNET, TITLES, Grid
 from spikeloom.compiler.targets.truenorth.native import BASES, USUAL_COPIES
 from spikeloom.compiler.targets.truenorth.native import SYSTEM as NATIVE

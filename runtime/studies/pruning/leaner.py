@@ -13,16 +13,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from spikeloom.compiler import Compilation, without
+from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.dynamics import with_clocks
-from spikeloom.compiler.fixedpoint import DECAY_BITS, ONE_STEP_SUM_MAX, FloatArray, IntArray
-from spikeloom.compiler.formats.checkpoint import Checkpoint
-from spikeloom.compiler.ir import IntegerNetwork
+from spikeloom.compiler.fixedpoint import DECAY_BITS, ONE_STEP_SUM_MAX, FloatArray, IntArray, read_only
+from spikeloom.compiler.ir import Form, IntegerNetwork
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.passes.prune import deaf_to
-from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_only
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.storage.quantize import incoming
 from spikeloom.compiler.targets.loihi1.storage.scales import rounded
-from spikeloom.compiler.targets.loihi1.storage.weight_storage import Form
 from spikeloom.models.recordings.events import join_bins
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.machines.loihi1 import engine

@@ -19,11 +19,13 @@ from spikeloom.compiler.fixedpoint import (
     THRESHOLD_MANTISSA_MAX,
     FloatArray,
     IntArray,
+    frozen,
+    read_only,
     round_half_even,
     weight_step,
 )
 from spikeloom.compiler.ir import INPUT, Network, Population, Projection
-from spikeloom.compiler.targets.loihi1.netlist import Netlist, frozen, in_units, read_only
+from spikeloom.compiler.targets.loihi1.netlist import Netlist, in_units
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import decay_registers
 
 Mask = npt.NDArray[np.bool_]

@@ -14,9 +14,17 @@ import numpy.typing as npt
 from scipy import sparse
 
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX, IntArray, round_half_even
+from spikeloom.compiler.fixedpoint import (
+    ONE_STEP_SUM_MAX,
+    IntArray,
+    frozen,
+    read_only,
+    read_only_float,
+    round_half_even,
+)
 from spikeloom.compiler.ir import (
     INPUT,
+    Form,
     IntegerNetwork,
     IntegerPopulation,
     IntegerProjection,
@@ -24,8 +32,8 @@ from spikeloom.compiler.ir import (
     Population,
     Projection,
 )
-from spikeloom.compiler.targets.loihi1.netlist import Netlist, frozen, read_only, read_only_float
-from spikeloom.compiler.targets.loihi1.storage.weight_storage import Form, loads, round_population
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.targets.loihi1.storage.weight_storage import loads, round_population
 from spikeloom.runtime.studies.stress.damages import Pair
 
 

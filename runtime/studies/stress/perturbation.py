@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.fixedpoint import FloatArray, IntArray
-from spikeloom.compiler.formats.checkpoint import Checkpoint
 from spikeloom.runtime.studies.stress.damages import Pair
 from spikeloom.runtime.studies.stress.disturbances import Events
 

@@ -34,7 +34,7 @@ def draw_training(path: str, records: list[dict[str, Any]], labels: IntArray, pr
     from matplotlib import pyplot as plt
     from matplotlib.ticker import MaxNLocator
 
-    from spikeloom.compiler.formats.atomic import write_atomically
+    from spikeloom.compiler.atomic import write_atomically
 
     classes = int(max(labels.max(), *(p.max() for p in predictions))) + 1
     confusion = np.zeros((classes, classes), np.int64)

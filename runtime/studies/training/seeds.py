@@ -8,9 +8,9 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+from spikeloom.compiler.atomic import remove_leftovers
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.fixedpoint import IntArray
-from spikeloom.compiler.formats.atomic import remove_leftovers
 from spikeloom.runtime.studies import jobs as processes
 from spikeloom.runtime.studies.jobs import ProcessDied, ended_by_signal, only_one
 from spikeloom.runtime.studies.training.training import Job, recall, run_job, state_of

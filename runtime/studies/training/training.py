@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from spikeloom.compiler.checkpoint import WEIGHTS, Checkpoint
 from spikeloom.compiler.dynamics import clocks_over
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.fixedpoint import FloatArray, IntArray
-from spikeloom.compiler.formats.checkpoint import Checkpoint, read_checkpoint
-from spikeloom.compiler.formats.checkpoint_file import WEIGHTS
+from spikeloom.compiler.formats.checkpoint import read_checkpoint
 from spikeloom.compiler.formats.towers import arrays_of
 from spikeloom.compiler.systems import TACTILESGNET, Grid
 from spikeloom.compiler.targets.truenorth.native import SYSTEM as NATIVE

@@ -18,10 +18,10 @@ from scipy import sparse
 from scipy.linalg import solve_triangular
 
 from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX, FloatArray, IntArray
-from spikeloom.compiler.ir import Population, Projection
+from spikeloom.compiler.ir import Form, Population, Projection
 from spikeloom.compiler.passes.calibrate import Calibration
 from spikeloom.compiler.targets.loihi1.storage.scales import Rounded, flips
-from spikeloom.compiler.targets.loihi1.storage.weight_storage import Form, loads, reach, scales, step_units, store
+from spikeloom.compiler.targets.loihi1.storage.weight_storage import loads, reach, scales, step_units, store
 
 DAMPING = 1e-3
 """Share of the mean activity that is added to each input's own: inputs that never spiked are rounded to nearest."""

@@ -24,10 +24,9 @@ from spikeloom.compiler.fixedpoint import (
     weight_step,
 )
 from spikeloom.compiler.interpret import BATCH, integer_recurrence, integer_sums, lasting_currents, product
-from spikeloom.compiler.ir import IntegerPopulation, IntegerProjection, Population, Projection, Sparse
+from spikeloom.compiler.ir import Form, IntegerPopulation, IntegerProjection, Population, Projection, Sparse
 from spikeloom.compiler.passes.calibrate import Calibration
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import (
-    Form,
     loads,
     plane_distance,
     reach,

@@ -12,7 +12,6 @@ bits are one weight of up to 16 bits. Only a weight that the finest plane cannot
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -30,6 +29,7 @@ from spikeloom.compiler.fixedpoint import (
 )
 from spikeloom.compiler.ir import (
     MANTISSA,
+    Form,
     IntegerPopulation,
     IntegerProjection,
     Population,
@@ -43,25 +43,6 @@ DECAY_ONE = 1 << DECAY_BITS
 
 FORGETS = DECAY_ONE - 1
 """`decay_u` of a current that forgets everything in one step."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Form:
-    """How one population is stored.
-
-    Parameters
-    ----------
-    bits : int
-        Storage width of a mantissa.
-    exponents : tuple of int
-        Exponent of each plane, finest first.
-    threshold : (neurons,) int64
-        Threshold mantissas, at least 1.
-    """
-
-    bits: int
-    exponents: tuple[int, ...]
-    threshold: IntArray
 
 
 def decay_registers(beta: float, alpha: float = 0.0) -> tuple[int, int]:

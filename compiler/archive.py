@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 
+from spikeloom.compiler.atomic import write_atomically
 from spikeloom.compiler.errors import FormatError
-from spikeloom.compiler.formats.atomic import write_atomically
 
 Array = np.ndarray[Any, Any]
 
