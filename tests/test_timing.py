@@ -5,6 +5,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 import sanafe_counts
+import timing_oracle
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_netlists import Axon, Neuron, build, by_engine, large_netlist, netlists, recordings
@@ -15,7 +16,6 @@ from spikeloom.compiler.formats import sanafe
 from spikeloom.compiler.targets.base import LATENCIES, Quantity, load_target
 from spikeloom.runtime.machines.loihi1 import engine, timing
 from spikeloom.runtime.machines.loihi1.costs import cost, energy
-from spikeloom.runtime.machines.loihi1.timing_spec import Chip
 
 LOIHI = load_target("loihi1")
 (SANAFE,) = LOIHI.time
@@ -38,13 +38,13 @@ def both(netlist, trace, events, *, times=SANAFE, input_tiles=()):
     """Simple and detailed times of one recording."""
     clock = timing.prepare(netlist, LOIHI, times, input_tiles=input_tiles)
     batch = trace.spikes[None], trace.updated[None], events[None]
-    return timing.simple(clock, *batch), timing.detailed(clock, *batch)
+    return timing_oracle.simple(clock, *batch), timing.detailed(clock, *batch)
 
 
 def assert_as_defined(netlist, trace, events, *, times=SANAFE, input_tiles=()):
     """Every figure of both models is the definition's; returns what it says."""
     simple, detailed = both(netlist, trace, events, times=times, input_tiles=input_tiles)
-    wanted = Chip(netlist, LOIHI, times, input_tiles).run(trace.spikes, trace.updated, events)
+    wanted = timing_oracle.Chip(netlist, LOIHI, times, input_tiles).run(trace.spikes, trace.updated, events)
 
     def column(name, scale=PICO):
         return np.array([[getattr(step, name) for step in wanted]]) / scale
@@ -270,7 +270,7 @@ def test_a_recording_ends_with_its_own_steps():
     clock = timing.prepare(netlist, LOIHI, SANAFE)
     batch = [np.stack([a, a]) for a in (trace.spikes, trace.updated, events)]
     cut = [a[:4].copy() for a in (trace.spikes, trace.updated)]
-    for model in (timing.simple, timing.detailed):
+    for model in (timing_oracle.simple, timing.detailed):
         found = model(clock, *batch, steps=np.array([6, 4]))
         alone = model(clock, cut[0][None], cut[1][None], events[None])
         for field in fields(found):

@@ -14,7 +14,7 @@ from spikeloom.compiler.errors import CapacityError
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.truenorth import legalize as rules
 from spikeloom.compiler.targets.truenorth.builder import crossing_points
-from spikeloom.compiler.targets.truenorth.lower import cores_needed, lower
+from spikeloom.compiler.targets.truenorth.lower import lower
 from spikeloom.compiler.targets.truenorth.native import (
     BASES,
     faults,
@@ -158,12 +158,6 @@ def test_what_contradicts_itself_is_told():
     assert faults(replace(network, clocks=NO_CLOCKS)) == [
         f"tower 0, {stage.name}: hears 2 clocks of 0" for stage in rest
     ]
-
-
-@settings(max_examples=20, deadline=None)
-@given(network=NETWORKS | st.builds(random_network, st.integers(0, 9), copies=st.just(3), hidden=st.just((60, 40))))
-def test_cores_are_known_before_lowering(network):
-    assert cores_needed(network, CHIP) == lower(network, CHIP).n_cores
 
 
 def test_only_networks_of_one_kind_are_joined():

@@ -69,21 +69,6 @@ def lower(network: NativeNetwork, chip: Target, *, provenance: Mapping[str, Any]
     )
 
 
-def cores_needed(network: NativeNetwork, chip: Target) -> int:
-    """Cores that :func:`lower` takes, without placing anything."""
-    most, total = chip.limit("core.neurons"), 0
-    for tower in network.towers:
-        ends = np.ones(tower[-1].neurons, np.int64)
-        for depth in range(len(tower) - 1, -1, -1):
-            stage = tower[depth]
-            cores = -(-ends.reshape(stage.blocks, stage.size).sum(axis=1) // most)
-            total += int(cores.sum())
-            if depth:
-                ends = np.zeros(tower[depth - 1].neurons, np.int64)
-                np.add.at(ends, stage.inputs, network.copies * cores[:, None])
-    return total
-
-
 def _require_axons(network: NativeNetwork, chip: Target) -> None:
     limit = chip.limit("core.axons")
     broken = [

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from spikeloom.compiler.archive import Array, archive_bytes, read_archive, stated_format, write_archive
+from spikeloom.compiler.archive import Array, archive_bytes, read_archive, write_archive
 from spikeloom.compiler.dynamics import MOST_CLOCKS, MOST_STEPS, Clocks
 from spikeloom.compiler.errors import FormatError
 from spikeloom.compiler.fixedpoint import read_only
@@ -62,11 +62,6 @@ def write_crossbars(netlist: CrossbarNetlist, path: str | os.PathLike[str]) -> s
         If the file cannot be written; an older file is left as it was.
     """
     return write_archive(crossbar_bytes(netlist), path)
-
-
-def is_crossbars(path: str | os.PathLike[str]) -> bool:
-    """Whether a file is an archive that says it holds crossbar cores; whatever else it is, its own reader says."""
-    return stated_format(Path(path)) == FORMAT
 
 
 def read_crossbars(path: str | os.PathLike[str]) -> CrossbarNetlist:

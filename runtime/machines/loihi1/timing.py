@@ -5,8 +5,8 @@ of these, then the barrier.
 
 *Detailed.* Every message is sent when the sweep reaches its neuron, crosses the mesh along x, then along y, slower
 where others are under way and blocked where the links are full, and waits until the receiving core is free. A step
-lasts until the last neuron is swept and the last message processed, then the barrier. :mod:`loihi1.timing_spec` is
-the definition.
+lasts until the last neuron is swept and the last message processed, then the barrier. The tests hold both models
+against a plain definition, one message at a time.
 
 Spikes of a step are sent and processed within that step and act in the next. *Input events* act in the step in which
 they arrive: the receiving cores process them from its start, and nobody pays for their injection. Other simulators
@@ -34,7 +34,7 @@ from spikeloom.compiler.targets.base import PICOSECONDS, Target, TimeTable
 from spikeloom.compiler.targets.loihi1.layout.chips import require_one_chip
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.runtime.machines.loihi1.engine import EventArray
-from spikeloom.runtime.machines.loihi1.timing_kernel import Steps, Tables, conclude, loads, schedule
+from spikeloom.runtime.machines.loihi1.timing_kernel import Steps, Tables, conclude, schedule
 from spikeloom.runtime.machines.loihi1.trace import BoolArray
 
 EAST, WEST, NORTH, SOUTH, PORTS = range(5)
@@ -253,37 +253,6 @@ def _slots(
     return np.concatenate([fired, sent], 2), np.concatenate([worked, sent], 2), seen[:, :, :0]
 
 
-def simple(
-    clock: Clock, spikes: BoolArray, updated: BoolArray, events: EventArray, *, steps: IntArray | None = None
-) -> SimpleTimes:
-    """Time a batch of recordings by the simple model.
-
-    Parameters
-    ----------
-    clock : Clock
-        The prepared netlist.
-    spikes, updated : (samples, chip steps, compartments) bool
-        What a simulator found, see :class:`trace.Trace`.
-    events : (samples, n_inputs, T) uint8 or bool
-        What it was given.
-    steps : (samples,) int64, optional
-        Chip steps of each recording, by default all.
-
-    Raises
-    ------
-    DataError
-        If the trace is of another netlist.
-    """
-    fired, worked, events = _slots(clock, spikes, updated, events)
-    samples, length = spikes.shape[:2]
-    cores = len(clock.core_tile)
-    generation, processing = np.zeros((2, samples, length, cores), np.int64)
-    own = np.full(samples, length) if steps is None else steps
-    for i in range(samples):
-        loads(clock.tables, fired[i], worked[i], events[i], int(own[i]), generation[i], processing[i])
-    return simple_times(clock, np.concatenate([generation, processing], axis=2), np.zeros(cores, np.int64), own)
-
-
 def simple_times(clock: Clock, sums: IntArray, sweep: IntArray, steps: IntArray) -> SimpleTimes:
     """Times of the simple model from what each core does in each step.
 
@@ -315,7 +284,24 @@ def simple_times(clock: Clock, sums: IntArray, sweep: IntArray, steps: IntArray)
 def detailed(
     clock: Clock, spikes: BoolArray, updated: BoolArray, events: EventArray, *, steps: IntArray | None = None
 ) -> DetailedTimes:
-    """Time a batch of recordings by the detailed model; parameters and errors as those of :func:`simple`."""
+    """Time a batch of recordings by the detailed model.
+
+    Parameters
+    ----------
+    clock : Clock
+        The prepared netlist.
+    spikes, updated : (samples, chip steps, compartments) bool
+        What a simulator found, see :class:`trace.Trace`.
+    events : (samples, n_inputs, T) uint8 or bool
+        What it was given.
+    steps : (samples,) int64, optional
+        Chip steps of each recording, by default all.
+
+    Raises
+    ------
+    DataError
+        If the trace is of another netlist.
+    """
     fired, worked, events = _slots(clock, spikes, updated, events)
     samples, length = spikes.shape[:2]
     own = np.full(samples, length) if steps is None else steps

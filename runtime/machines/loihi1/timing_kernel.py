@@ -99,68 +99,6 @@ def _inject(first: IntArray, destination: IntArray, cost: IntArray, events: AnyA
                     busy[destination[a]] += cost[a]
 
 
-@compiled
-def _works(row: AnyArray) -> int:
-    """Number of ones; in 32 bits, for wider numbers would halve the speed."""
-    works = np.int32(0)
-    for i in range(row.size):
-        works = np.int32(works + np.int32(row[i]))
-    return int(works)
-
-
-@compiled
-def _list_fired(row: AnyArray, fired: IntArray) -> int:
-    """List the slots of a row that are not zero; `fired` has room for one more than the row. Return how many."""
-    n = 0
-    whole = row.size // 8
-    words = row[: 8 * whole].view(np.uint64)
-    for w in range(whole):
-        if words[w]:  # most groups of eight are silent
-            for i in range(8 * w, 8 * w + 8):
-                fired[n] = i
-                n += row[i]
-    for i in range(8 * whole, row.size):
-        fired[n] = i
-        n += row[i]
-    return n
-
-
-@compiled
-def charge(tables: Tables, fired: IntArray, generation: IntArray, processing: IntArray) -> None:
-    """Add what the spikes of a step cost: sending on their own cores, and receiving; both (cores,) picoseconds."""
-    # an array taken out of a tuple costs more than a message: take them out once
-    sender, sending, first = tables.sender, tables.sending, tables.first
-    destination, cost = tables.destination, tables.processing
-    for k in range(fired.size):
-        slot = fired[k]
-        generation[sender[slot]] += sending[slot]
-        for a in range(first[slot], first[slot + 1]):
-            processing[destination[a]] += cost[a]
-
-
-@compiled_and_cached
-def loads(
-    tables: Tables,
-    fired: AnyArray,
-    updated: AnyArray,
-    events: AnyArray,
-    steps: int,
-    generation: IntArray,
-    processing: IntArray,
-) -> None:
-    """Picoseconds that each core spends on sweep and sending, and on receiving; both (steps, cores), zeroed."""
-    first, destination, cost = tables.channel_first, tables.channel_destination, tables.channel_processing
-    slots = np.empty(fired.shape[1] + 1, np.int64)
-    for t in range(steps):
-        n = _list_fired(fired[t], slots)
-        charge(tables, slots[:n], generation[t], processing[t])
-        _inject(first, destination, cost, events, t, processing[t])
-        for core in range(tables.access.size):
-            begin, end = tables.start[core], tables.start[core + 1]
-            generation[t, core] += (end - begin) * tables.access[core]
-            generation[t, core] += _works(updated[t, begin:end]) * tables.update[core]
-
-
 @compiled_and_cached
 def conclude(
     sums: AnyArray,
@@ -356,7 +294,7 @@ def _send_all(  # noqa: PLR0915 - one loop over local state, which numba passes 
 
 @compiled_and_cached
 def schedule(tables: Tables, fired: AnyArray, updated: AnyArray, events: AnyArray, steps: int, found: Steps) -> None:
-    """Send the messages of each step in the order of time; :mod:`loihi1.timing_spec` is the definition."""
+    """Send the messages of each step in the order of time."""
     cores = tables.access.size
     most = tables.destination.size + cores
     delivery, generation, later = np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most, np.int64)

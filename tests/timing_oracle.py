@@ -1,4 +1,4 @@
-"""The definition of the two time models of :mod:`loihi1.timing`: plain Python, one message at a time, to be read.
+"""The definition of the two time models of :mod:`loihi1.timing`: plain Python, one message at a time.
 
 Both must agree on every figure, exactly. All times are picoseconds.
 """
@@ -13,6 +13,7 @@ import numpy as np
 from spikeloom.compiler.targets.base import Target, TimeTable
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.runtime.machines.loihi1.engine import EventArray
+from spikeloom.runtime.machines.loihi1.timing import Clock, SimpleTimes, simple_times
 from spikeloom.runtime.machines.loihi1.trace import BoolArray
 
 Link = tuple[int, int, str]
@@ -215,3 +216,37 @@ class Chip:
             else:
                 times.append(self.step(fired, worked, channels))
         return times
+
+
+def simple(clock: Clock, spikes: BoolArray, updated: BoolArray, events: EventArray, *, steps=None) -> SimpleTimes:
+    """Times of the simple model from spikes and updates (samples, chip steps, compartments), as matrix products."""
+    tables, n, length = clock.tables, clock.netlist.n_compartments, spikes.shape[1]
+    cores, slots = len(clock.core_tile), len(tables.sender)
+    ran = np.full(len(spikes), length) if steps is None else steps
+    within = np.arange(length) < ran[:, None]
+    seen = np.zeros((*spikes.shape[:2], clock.netlist.n_inputs), np.int64)
+    fired, works = spikes.astype(np.int64), updated.astype(np.int64)
+    if slots > n:  # channels on cores send in the step before
+        ahead = (events[:, :, 1 : length + 1] != 0).transpose(0, 2, 1)
+        seen[:, : ahead.shape[1]] = ahead
+        fired, works = np.concatenate([fired, seen], 2), np.concatenate([works, seen], 2)
+    else:
+        now = (events[:, :, :length] != 0).transpose(0, 2, 1)
+        seen[:, : now.shape[1]] = now
+
+    def by(sender, receiver, cost, size):
+        matrix = np.zeros((size, cores), np.int64)
+        np.add.at(matrix, (sender, receiver), cost)
+        return matrix
+
+    own = np.arange(slots)
+    sweep = by(own, tables.sender, tables.access[tables.sender], slots).sum(axis=0)
+    generation = fired @ by(own, tables.sender, tables.sending, slots) + sweep
+    generation += works @ by(own, tables.sender, tables.update[tables.sender], slots)
+    slot = np.repeat(own, np.diff(tables.first))
+    processing = fired @ by(slot, tables.destination, tables.processing, slots)
+    if slots == n:
+        channel = np.repeat(np.arange(clock.netlist.n_inputs), np.diff(tables.channel_first))
+        processing += seen @ by(channel, tables.channel_destination, tables.channel_processing, seen.shape[2])
+    sums = np.concatenate([generation, processing], axis=2) * within[..., None]
+    return simple_times(clock, sums, np.zeros(cores, np.int64), ran)
