@@ -19,7 +19,6 @@ from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist
 from spikeloom.models.graphs import NEUTOUCH
 from spikeloom.models.networks.reference import float_spikes
 from spikeloom.runtime import cli
-from spikeloom.runtime.equivalence.side_by_side import evaluate, ready
 from spikeloom.runtime.machines.loihi1 import engine, spec
 from spikeloom.runtime.machines.loihi1.trace import unpack
 from spikeloom.runtime.machines.votes import class_counts, readout_counts
@@ -38,6 +37,7 @@ from spikeloom.runtime.studies.stress.runs import (
     measure,
     whole,
 )
+from spikeloom.runtime.studies.stress.side_by_side import evaluate, ready
 from spikeloom.runtime.studies.stress.text import stress_text
 from spikeloom.runtime.studies.stress.verdicts import curve, parse_requirement, reasons, spread, unmet
 

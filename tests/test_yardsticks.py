@@ -21,7 +21,9 @@ from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist
 from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.models.recordings.evtouch import load_recordings
 from spikeloom.runtime import cli
-from spikeloom.runtime.costs.yardsticks import HOROWITZ, measure, yardsticks_json, yardsticks_text
+from spikeloom.runtime.costs.yardsticks import HOROWITZ, measure, sections
+from spikeloom.runtime.report.encode import encode
+from spikeloom.runtime.report.sections import terminal
 
 PAIR = np.array([[0.0, 1.0], [1.0, 0.0]])
 """Propagation between two taxels."""
@@ -43,7 +45,7 @@ def by_hand():
 
 def test_a_network_counted_by_hand():
     checkpoint, events, spikes = by_hand()
-    found = yardsticks_json(measure(checkpoint, PAIR, events, spikes))
+    found = encode(measure(checkpoint, PAIR, events, spikes))
     assert found["neurobench"] == {
         "footprint": (4 + 2 + 2 + 1) * 4,  # weights and biases of both layers
         "connection_sparsity": 0.1667,  # one of six
@@ -78,15 +80,15 @@ def test_steps_with_other_inputs_than_ones_are_multiplications():
     checkpoint, events, spikes = by_hand()
     events[0, 0, 0, 0] = 3
     bench = measure(checkpoint, PAIR, events, spikes).neurobench
-    assert (bench.effective_macs, bench.effective_acs) == (2, 5)
+    assert (bench.synaptic_operations.effective_macs, bench.synaptic_operations.effective_acs) == (2, 5)
 
 
 def test_what_comes_after_a_recording_is_not_counted():
     checkpoint, events, spikes = by_hand()
     long_events, long_spikes = np.repeat(events, 2, axis=0), {k: np.repeat(s, 2, axis=0) for k, s in spikes.items()}
     found = measure(checkpoint, PAIR, long_events, long_spikes, lengths=np.array([3, 1])).neurobench
-    assert found.effective_acs == (7 + 3) / 2
-    assert found.dense == (18 + 6) / 2
+    assert found.synaptic_operations.effective_acs == (7 + 3) / 2
+    assert found.synaptic_operations.dense == (18 + 6) / 2
     assert found.activation_sparsity == pytest.approx((5 / 9 + 0 / 3) / 2)
 
 
@@ -127,7 +129,7 @@ def test_counts_equal_those_of_loops(seed):
         for sample, step, neuron in zip(*np.nonzero(source), strict=True):
             assert source[sample, step, neuron] == 1
             acs += np.count_nonzero(weight[:, neuron])
-    assert bench.effective_acs == acs / len(events)
+    assert bench.synaptic_operations.effective_acs == acs / len(events)
     assert bench.activation_sparsity == pytest.approx(1 - np.mean(np.concatenate(spikes, axis=2)))
 
 
@@ -211,7 +213,7 @@ def ask_package(python, folder, checkpoint, network, events):
 @pytest.mark.parametrize("seed", range(3))
 def test_equal_to_the_package(package, tmp_path, seed):
     checkpoint, adjacency, events, network, spikes = drawn(seed)
-    ours = yardsticks_json(measure(checkpoint, adjacency, events, spikes))["neurobench"]
+    ours = encode(measure(checkpoint, adjacency, events, spikes))["neurobench"]
     assert ours == ask_package(package, tmp_path, checkpoint, network, events)
 
 
@@ -224,14 +226,15 @@ def test_the_released_network_in_round_figures(released_checkpoint, objects_zip)
     adjacency = normalised_adjacency(graph.edges, graph.n_taxels)
     events = load_recordings(objects_zip, "test", limit=2).events
     spikes = run_float(expand(checkpoint, adjacency), channels_last(events), dtype=np.float32).spikes
-    found = yardsticks_json(measure(checkpoint, adjacency, events, spikes))
+    result = measure(checkpoint, adjacency, events, spikes)
+    found = encode(result)
     classes = checkpoint.dense[-1].weight.shape[0]
     dense = 78 * 2496 + 2496 * 128 + 128 * 256 + 256 * classes
     assert found["neurobench"]["synaptic_operations"]["Dense"] == 250 * dense
     assert found["neurobench"]["footprint"] == 4 * (dense + 2496 + 128 + 256 + classes)
     effective = found["neurobench"]["synaptic_operations"]["Effective_ACs"]
     assert 0 < effective < 0.2 * 250 * dense
-    text = yardsticks_text(found)
+    text = terminal(sections(result))
     assert f"{250 * dense:,}" in text
     assert "Horowitz, ISSCC 2014" in text
 

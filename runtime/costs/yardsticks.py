@@ -17,8 +17,7 @@ References
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -31,9 +30,10 @@ from spikeloom.compiler.ir import INPUT, Network
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.systems import GCN, TACTILESGNET
 from spikeloom.compiler.targets.base import Quantity
-from spikeloom.runtime.report.tables import si, table
+from spikeloom.runtime.report.encode import key
+from spikeloom.runtime.report.sections import Section, Table, Text
+from spikeloom.runtime.report.tables import si
 
-Json = dict[str, Any]
 SpikeTrain = npt.NDArray[np.bool_]
 
 FLOAT_BYTES = 4
@@ -59,6 +59,23 @@ NOT_COUNTED = "memory, instructions, clock and leakage (arithmetic alone; a lowe
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class SynapticOperations:
+    """Non-zero weights that meet a non-zero input, per recording.
+
+    Parameters
+    ----------
+    effective_macs, effective_acs : float
+        Multiply-accumulates where a step's input is not in {-1, 0, 1}, else accumulations.
+    dense : float
+        The same with all inputs and weights set to one.
+    """
+
+    effective_macs: float = field(metadata=key("Effective_MACs"))
+    effective_acs: float = field(metadata=key("Effective_ACs"))
+    dense: float = field(metadata=key("Dense"))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class NeuroBench:
     """NeuroBench's metrics, means over recordings as its harness gives them for batches of one.
 
@@ -70,19 +87,13 @@ class NeuroBench:
         Share of weights that are zero, rounded to four digits as the package does.
     activation_sparsity : float
         Share of neurons and steps without a spike.
-    effective_macs, effective_acs : float
-        Non-zero weights that meet a non-zero input, per recording: multiply-accumulates where a step's input is not
-        in {-1, 0, 1}, else accumulations.
-    dense : float
-        The same with all inputs and weights set to one.
+    synaptic_operations : SynapticOperations
     """
 
     footprint: int
     connection_sparsity: float
     activation_sparsity: float
-    effective_macs: float
-    effective_acs: float
-    dense: float
+    synaptic_operations: SynapticOperations
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -104,8 +115,10 @@ class Arithmetic:
     macs: float
     acs: float
 
+    json_properties = ("energy_j",)
+
     @property
-    def joule(self) -> float:
+    def energy_j(self) -> float:
         """Energy per recording."""
         parts = [HOROWITZ[part].value for part in MULTIPLY_ACCUMULATE[self.numbers]]
         return (self.macs * sum(parts) + self.acs * parts[-1]) * 1e-12
@@ -120,14 +133,23 @@ class Yardsticks:
     samples : int
         Recordings.
     neurobench : NeuroBench
-        Counts.
     arithmetic : tuple of Arithmetic
         Dense, with the convolution in its factors, and effective; each in float32 and int8.
+    graph : str, optional
+        Name of the network's graph.
+    prices_pj, source, not_counted
+        What the energies rest on.
     """
 
     samples: int
     neurobench: NeuroBench
     arithmetic: tuple[Arithmetic, ...]
+    graph: str | None = None
+    prices_pj: Mapping[str, float] = field(
+        default_factory=lambda: {name: price.value for name, price in HOROWITZ.items()}
+    )
+    source: str = _SOURCE
+    not_counted: str = NOT_COUNTED
 
 
 def measure(
@@ -168,13 +190,14 @@ def measure(
     inputs = with_clocks(events, checkpoint.dynamics.clocks).transpose(0, 2, 1) * counted[:, :, None]
 
     bench = _neurobench(network, inputs, trains, last)
+    operations = bench.synaptic_operations
     mean_steps = float(last.mean())
     decays = sum(train.shape[2] for train in trains) * mean_steps
     saved = network.populations[0].size * network.input.size - _factored(checkpoint, adjacency)
     forms = (
-        ("dense", bench.dense + decays, 0.0),
-        ("dense, convolution in factors", bench.dense + decays - saved * mean_steps, 0.0),
-        ("effective", bench.effective_macs + decays, bench.effective_acs),
+        ("dense", operations.dense + decays, 0.0),
+        ("dense, convolution in factors", operations.dense + decays - saved * mean_steps, 0.0),
+        ("effective", operations.effective_macs + decays, operations.effective_acs),
     )
     return Yardsticks(
         samples=samples,
@@ -224,9 +247,11 @@ def _neurobench(
         footprint=parameters * FLOAT_BYTES,
         connection_sparsity=round(float(np.float32(zeros) / np.float32(weights)), 4),
         activation_sparsity=float(np.mean(1 - fired / (neurons * last))),
-        effective_macs=macs / len(inputs),
-        effective_acs=acs / len(inputs),
-        dense=weights * float(last.mean()),
+        synaptic_operations=SynapticOperations(
+            effective_macs=macs / len(inputs),
+            effective_acs=acs / len(inputs),
+            dense=weights * float(last.mean()),
+        ),
     )
 
 
@@ -238,54 +263,31 @@ def _factored(checkpoint: Checkpoint, adjacency: FloatArray) -> int:
     return maps + times * int(np.count_nonzero(adjacency)) * int(channels) + checkpoint.dynamics.clocks.channels
 
 
-def yardsticks_json(found: Yardsticks) -> Json:
-    """Both yardsticks; ``neurobench`` under the key names of that package."""
-    bench = found.neurobench
-    return {
-        "samples": found.samples,
-        "neurobench": {
-            "footprint": bench.footprint,
-            "connection_sparsity": bench.connection_sparsity,
-            "activation_sparsity": bench.activation_sparsity,
-            "synaptic_operations": {
-                "Effective_MACs": bench.effective_macs,
-                "Effective_ACs": bench.effective_acs,
-                "Dense": bench.dense,
-            },
-        },
-        "arithmetic": [
-            {"what": row.what, "numbers": row.numbers, "macs": row.macs, "acs": row.acs, "energy_j": row.joule}
-            for row in found.arithmetic
-        ],
-        "prices_pj": {name: price.value for name, price in HOROWITZ.items()},
-        "source": _SOURCE,
-        "not_counted": NOT_COUNTED,
-    }
-
-
-def yardsticks_text(report: Json) -> str:
+def sections(found: Yardsticks) -> list[Section]:
     """Both yardsticks for people."""
-    bench = report["neurobench"]
-    operations = bench["synaptic_operations"]
+    bench = found.neurobench
+    operations = bench.synaptic_operations
     counts = [
-        ["synaptic operations, dense", f"{operations['Dense']:,.0f}"],
-        ["effective accumulations", f"{operations['Effective_ACs']:,.0f}"],
-        ["effective multiply-accumulates", f"{operations['Effective_MACs']:,.0f}"],
-        ["activation sparsity", f"{bench['activation_sparsity']:.4f}"],
-        ["connection sparsity", f"{bench['connection_sparsity']:.4f}"],
-        ["footprint in float32, bytes", f"{bench['footprint']:,}"],
+        ["synaptic operations, dense", f"{operations.dense:,.0f}"],
+        ["effective accumulations", f"{operations.effective_acs:,.0f}"],
+        ["effective multiply-accumulates", f"{operations.effective_macs:,.0f}"],
+        ["activation sparsity", f"{bench.activation_sparsity:.4f}"],
+        ["connection sparsity", f"{bench.connection_sparsity:.4f}"],
+        ["footprint in float32, bytes", f"{bench.footprint:,}"],
     ]
     energy = [
-        [f"{row['what']}, {row['numbers']}", f"{row['macs']:,.0f}", f"{row['acs']:,.0f}", si(row["energy_j"], "J")]
-        for row in report["arithmetic"]
+        [f"{row.what}, {row.numbers}", f"{row.macs:,.0f}", f"{row.acs:,.0f}", si(row.energy_j, "J")]
+        for row in found.arithmetic
     ]
-    return "\n".join(
-        [
-            f"NeuroBench's metrics per recording, over {report['samples']}, on the convolution's effective matrix:",
-            table(["", "value"], counts),
-            "",
-            f"arithmetic energy per recording, prices of {report['source']}:",
-            table(["", "multiply-accumulates", "accumulations", "energy"], energy),
-            f"not counted: {report['not_counted']}",
-        ]
-    )
+    what = f"NeuroBench's metrics per recording, over {found.samples}, on the convolution's effective matrix:"
+    return [
+        Section("NeuroBench", [Text(what), Table(["", "value"], counts)]),
+        Section(
+            "Arithmetic energy",
+            [
+                Text(f"arithmetic energy per recording, prices of {found.source}:"),
+                Table(["", "multiply-accumulates", "accumulations", "energy"], energy),
+                Text(f"not counted: {found.not_counted}"),
+            ],
+        ),
+    ]

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
-from typing import Any
+from dataclasses import replace
 
 from spikeloom.compiler.archive import is_netlist
 from spikeloom.compiler.errors import ModelError
@@ -13,8 +12,7 @@ from spikeloom.runtime.costs import yardsticks
 from spikeloom.runtime.inputs.files import shipped
 from spikeloom.runtime.inputs.network import load_checkpoint, load_graph, propagation
 from spikeloom.runtime.inputs.recordings import recordings
-
-Json = dict[str, Any]
+from spikeloom.runtime.report.sections import Outcome
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -24,8 +22,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_recordings(parser)
 
 
-def run(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
-    """Run the command: the report, how to print it, and the exit code."""
+def run(arguments: argparse.Namespace) -> Outcome:
+    """Run the command."""
     from spikeloom.models.networks.reference import float_spikes  # torch, so only here
 
     path = shipped(arguments.checkpoint)
@@ -44,4 +42,4 @@ def run(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int
     )
     spikes = float_spikes(checkpoint, adjacency, data.events)
     found = yardsticks.measure(checkpoint, adjacency, data.events, spikes, lengths=data.lengths)
-    return yardsticks.yardsticks_json(found) | {"graph": graph}, yardsticks.yardsticks_text, 0
+    return Outcome(replace(found, graph=graph), yardsticks.sections)

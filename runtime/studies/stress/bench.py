@@ -16,12 +16,12 @@ from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.models.graphs import NEUTOUCH
 from spikeloom.models.sensors import read_layout, sensor_graph
 from spikeloom.runtime.equivalence.reference import require_match
-from spikeloom.runtime.equivalence.side_by_side import ready
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.studies.stress.damages import Pair
 from spikeloom.runtime.studies.stress.perturbation import Sensor
 from spikeloom.runtime.studies.stress.runs import Bench
+from spikeloom.runtime.studies.stress.side_by_side import ready
 
 Json = dict[str, Any]
 

@@ -19,11 +19,11 @@ from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.models.recordings.events import join_bins
 from spikeloom.runtime.equivalence.breakdowns import undecided
-from spikeloom.runtime.equivalence.side_by_side import SIDES, Inputs, Outcome, Ready, evaluate, ready
 from spikeloom.runtime.studies.stress.battery import NAMES
 from spikeloom.runtime.studies.stress.damages import Pair
 from spikeloom.runtime.studies.stress.disturbances import Events
 from spikeloom.runtime.studies.stress.perturbation import Level, Sensor
+from spikeloom.runtime.studies.stress.side_by_side import SIDES, Inputs, Outcome, Ready, evaluate, ready
 
 Json = dict[str, Any]
 
