@@ -13,13 +13,40 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from spikeloom.compiler.errors import OptionError
-from spikeloom.runtime.report.sections import Outcome
+from spikeloom.runtime.report.sections import Outcome, Section, terminal
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
 
     from spikeloom.compiler.ir import Network
     from spikeloom.models.recordings.evtouch import Recordings
+
+
+BRIEF = 8
+"""Lines of a result that Python shows by itself."""
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class Result:
+    """What a command found, in `value`: a dataclass whose fields are the keys of ``--json``."""
+
+    value: Any
+    sections: tuple[Section, ...]
+
+    def __str__(self) -> str:
+        """All of it, as on a terminal."""
+        return terminal(self.sections)
+
+    def __repr__(self) -> str:
+        """The first lines; ``print`` shows all."""
+        first = str(self).split("\n\n", 1)[0].splitlines()
+        return "\n".join(first[:BRIEF] + ["…"] * (len(first) > BRIEF))
+
+    def _repr_html_(self) -> str:
+        """What notebooks show."""
+        from spikeloom.runtime.report.html import fragment
+
+        return "".join(map(fragment, self.sections))
 
 
 @dataclass(frozen=True)
@@ -72,21 +99,21 @@ class Compiled:
     path: Path
     network: str | Network | None
     options: dict[str, Any]
-    outcome: Outcome
+    result: Result
 
-    def verify(self, data: Recordings | str, **options: Any) -> Outcome:
+    def verify(self, data: Recordings | str, **options: Any) -> Result:
         """Compare chip and float model on recordings; options as of ``spikeloom verify``."""
         return _command("main_job.verify", netlist=str(self.path), data=data, **self._origin("verify"), **options)
 
-    def estimate(self, data: Recordings | str, **options: Any) -> Outcome:
+    def estimate(self, data: Recordings | str, **options: Any) -> Result:
         """Operations, energy and time of recordings; options as of ``spikeloom estimate``."""
         return _command("main_job.estimate", netlist=str(self.path), data=data, **options)
 
-    def run(self, data: Recordings | str, **options: Any) -> Outcome:
+    def run(self, data: Recordings | str, **options: Any) -> Result:
         """Decisions of recordings, the chip's; options as of ``spikeloom run``."""
         return _command("main_job.run", netlist=str(self.path), data=data, **options)
 
-    def report(self, output: str, data: Recordings | str, **options: Any) -> Outcome:
+    def report(self, output: str, data: Recordings | str, **options: Any) -> Result:
         """Write a page with all of it; options as of ``spikeloom report``."""
         given = self._origin("report") | options
         return _command("main_job.report", netlist=str(self.path), output=output, data=data, **given)
@@ -107,10 +134,10 @@ class Compiled:
         return {"checkpoint": self.network, **self.options}
 
     def __repr__(self) -> str:
-        return repr(self.outcome)
+        return repr(self.result)
 
     def _repr_html_(self) -> str:
-        return self.outcome._repr_html_()
+        return self.result._repr_html_()
 
 
 def compile(
@@ -151,9 +178,9 @@ def compile(
     folder = tempfile.mkdtemp(prefix="spikeloom-")
     path = Path(folder) / "netlist.loom"
     words = {"checkpoint": source, "calibrate": calibrate, "output": str(path), **options}
-    outcome = _command("main_job.compile", **words)
+    result = _command("main_job.compile", **words)
     kept = {name: value for name, value in options.items() if name in _defaults("main_job.verify")}
-    made = Compiled(path, source, kept, outcome)
+    made = Compiled(path, source, kept, result)
     weakref.finalize(made, shutil.rmtree, folder, ignore_errors=True)
     return made
 
@@ -171,11 +198,12 @@ def _defaults(command: str) -> dict[str, Any]:
     return {action.dest: action.default for action in parser._actions if action.dest != "help"}
 
 
-def _command(name: str, **options: Any) -> Outcome:
+def _command(name: str, **options: Any) -> Result:
     """Run a command on values in place of words."""
     known = _defaults(name)
     if unknown := sorted(set(options) - set(known)):
         raise OptionError(f"{unknown[0]}: unknown option; allowed: {', '.join(sorted(known))}")
     arguments = argparse.Namespace(**known | {"json": False, "debug": False} | options)
-    found = import_module(f"spikeloom.runtime.commands.{name}").run(arguments)
-    return found if isinstance(found, Outcome) else Outcome.plain(*found)
+    found: Outcome = import_module(f"spikeloom.runtime.commands.{name}").run(arguments)
+    value = getattr(found.result, "result", found.result)  # without how it was simulated
+    return Result(value, tuple(found.sections(found.result)))

@@ -43,11 +43,11 @@ def test_results_are_those_of_the_commands(place, data, net, capsys, monkeypatch
         "estimate": ["net.loom", "--data", "data"],
         "run": ["net.loom", "--data", "data"],
     }
-    found = {name: getattr(net, name)(data.test) for name in ("verify", "estimate", "run")} | {"compile": net.outcome}
+    found = {name: getattr(net, name)(data.test) for name in ("verify", "estimate", "run")} | {"compile": net.result}
     for name, options in words.items():
         capsys.readouterr()
         assert cli.main([name, *options, "--json"]) in (0, 1)
-        assert json.loads(capsys.readouterr().out) == json.loads(json.dumps(encode(found[name].result)))
+        assert json.loads(capsys.readouterr().out) == json.loads(json.dumps(encode(found[name].value)))
     net.save("copy.loom")
     assert Path("copy.loom").read_bytes() == Path("net.loom").read_bytes()
     again = api.load("copy.loom", network="net.pt")
@@ -70,7 +70,7 @@ def test_streams_give_the_votes_of_the_whole_recording(data, net):
     stream = net.stream()
     for step in np.moveaxis(data.test.events[0], -1, 0):
         stream.step(step)
-    assert stream.finish()[-1].decision == encode(net.run(data.test).result)["predictions"][0]
+    assert stream.finish()[-1].decision == net.run(data.test).value.predictions[0]
 
 
 def test_modules_come_in_as_they_are(data):

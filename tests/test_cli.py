@@ -16,7 +16,6 @@ import pytest
 from made_files import CLASSES, FEATURES, STEPS, TAXELS, events, own_file, recordings_folder, released, state_dict
 from made_files import weights as made_weights
 
-from spikeloom import __version__
 from spikeloom.__main__ import main as start
 from spikeloom.compiler import lift
 from spikeloom.compiler.errors import ModelError
@@ -24,6 +23,7 @@ from spikeloom.compiler.interpret import channels_last, run_integer
 from spikeloom.compiler.targets.base import EVENTS, load_target
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.compiler.targets.loihi1.netlist_text import netlist_text
+from spikeloom.compiler.version import __version__
 from spikeloom.models.graphs import build_graph
 from spikeloom.models.recordings.grasps import synthetic_split
 from spikeloom.runtime import cli

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from spikeloom import __version__
 from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.systems import GRAPH_SYSTEMS
 from spikeloom.compiler.targets.base import Target
@@ -20,6 +19,7 @@ from spikeloom.compiler.targets.loihi1.layout.chips import chip_of_core, chip_ti
 from spikeloom.compiler.targets.loihi1.layout.core_graph import core_map
 from spikeloom.compiler.targets.loihi1.legalize import measure
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.version import __version__
 from spikeloom.models.graphs import NEUTOUCH
 from spikeloom.models.recordings.events import BIN_S
 from spikeloom.models.recordings.evtouch import Recordings

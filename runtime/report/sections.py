@@ -84,36 +84,13 @@ class Section:
 Block = Text | Table | Figure | Facts | Code | Details | Section
 
 
-BRIEF = 8
-"""Lines of a result that Python shows by itself."""
-
-
-@dataclass(frozen=True, slots=True, repr=False)
+@dataclass(frozen=True, slots=True)
 class Outcome:
     """What a command has found: a result that :mod:`report.encode` can encode, its layout, and the exit code."""
 
     result: Any
     sections: Callable[[Any], Iterable[Section]]
     code: int = 0
-
-    @classmethod
-    def plain(cls, result: Any, text: Callable[[Any], str], code: int) -> Outcome:
-        """What is printed as it stands."""
-        return cls(result, lambda found: [Section("", [Text(text(found))])], code)
-
-    def __repr__(self) -> str:
-        """The first lines; ``print`` shows all."""
-        first = str(self).split("\n\n", 1)[0].splitlines()
-        return "\n".join(first[:BRIEF] + ["…"] * (len(first) > BRIEF))
-
-    def __str__(self) -> str:
-        return terminal(self.sections(self.result))
-
-    def _repr_html_(self) -> str:
-        """What notebooks show."""
-        from spikeloom.runtime.report.html import fragment
-
-        return "".join(map(fragment, self.sections(self.result)))
 
 
 def terminal(sections: Iterable[Section]) -> str:

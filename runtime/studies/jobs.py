@@ -22,8 +22,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from spikeloom import __version__
 from spikeloom.compiler.errors import DataError, OptionError, SpikeloomError, UnfinishedError
+from spikeloom.compiler.version import __version__
 
 APayload = TypeVar("APayload")
 AResult = TypeVar("AResult")

@@ -16,8 +16,9 @@ if TYPE_CHECKING:
     from spikeloom.models.networks.lif import LIF
     from spikeloom.runtime.api import Compiled, compile, load, recordings
 
-__version__ = "0.1.0"
-__all__ = ["LIF", "Compiled", "SpikeloomError", "compile", "load", "recordings"]
+from spikeloom.compiler.version import __version__
+
+__all__ = ["LIF", "Compiled", "SpikeloomError", "__version__", "compile", "load", "recordings"]
 
 _PLACES = {"SpikeloomError": "compiler.errors", "LIF": "models.networks.lif"}
 

@@ -17,7 +17,6 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
-from spikeloom import __version__
 from spikeloom.compiler import DEFAULT_TARGET
 from spikeloom.compiler.archive import is_netlist
 from spikeloom.compiler.atomic import write_atomically
@@ -29,6 +28,7 @@ from spikeloom.compiler.interpret import channels_last
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.base import COMPARTMENTS, Target, load_target
 from spikeloom.compiler.targets.loihi1.storage.width_search import Point, WidthSearch, check_widths, front, search
+from spikeloom.compiler.version import __version__
 from spikeloom.models.recordings.events import BIN_S
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.recordings.fetch import data_folder

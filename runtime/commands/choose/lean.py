@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from spikeloom import __version__
 from spikeloom.compiler import Compilation, Options, compile_network
 from spikeloom.compiler.atomic import write_atomically
 from spikeloom.compiler.errors import OptionError
@@ -19,6 +18,7 @@ from spikeloom.compiler.systems import TACTILESGNET
 from spikeloom.compiler.targets.base import Target, load_target
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist
+from spikeloom.compiler.version import __version__
 from spikeloom.models.recordings.counts import number
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.commands.main_job.compile import storage

@@ -7,13 +7,13 @@ import sys
 from collections.abc import Mapping
 from typing import Any
 
-from spikeloom import __version__
 from spikeloom.compiler import Compilation, Options, Recipe, compile_network, write_netlist
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.layout.choose import require_goal
 from spikeloom.compiler.targets.loihi1.options import GOALS, MARGIN, RANGES
+from spikeloom.compiler.version import __version__
 from spikeloom.runtime.commands.main_job.integers import brings_integers, compile_integers
 from spikeloom.runtime.commands.options import add_bin_option, add_network, parse_cores
 from spikeloom.runtime.inputs.files import require_place

@@ -6,12 +6,12 @@ import argparse
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from spikeloom import __version__
 from spikeloom.compiler import Options, compile_network, write_netlist
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.formats.netx.layout import SUFFIX
 from spikeloom.compiler.formats.netx.reader import read_netx
 from spikeloom.compiler.invariants import verify
+from spikeloom.compiler.version import __version__
 from spikeloom.runtime.commands.options import MODEL, ROUNDING, parse_cores
 from spikeloom.runtime.machines.loihi1 import description
 from spikeloom.runtime.report.console import progress

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any
 
 import numpy as np
 
 from spikeloom.compiler.atomic import write_atomically
+from spikeloom.runtime.commands.main_job.decisions import Decisions, sections
 from spikeloom.runtime.commands.main_job.estimate import priced
 from spikeloom.runtime.commands.options import add_detail, add_recordings
 from spikeloom.runtime.costs.simulated import Account, Accounted
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.recordings import netlist_recordings
 from spikeloom.runtime.machines.base import Price, machine_for
-from spikeloom.runtime.report import decisions
 from spikeloom.runtime.report.console import progress
-from spikeloom.runtime.report.sections import Outcome, Section, Text
+from spikeloom.runtime.report.sections import Outcome
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -47,12 +46,13 @@ def run(arguments: argparse.Namespace) -> Outcome:
     if done.spikes is not None:
         with write_atomically(arguments.spikes) as file:
             np.savez_compressed(file, **done.spikes)  # type: ignore[arg-type]
-    found = decisions.run_json(data.files, data.labels, done.votes, done.decisions)
-    costs = {} if price is None else {"costs": price.outcome.result}
-
-    def sections(_: Any) -> list[Section]:
-        shown = [Section("", [Text(decisions.run_text(found))])]
-        return shown if price is None else [*shown, *price.outcome.sections(price.outcome.result)]
-
-    result = Accounted(result=found | costs, explained_cost=account.explained(arguments.explain_cost))
-    return Outcome(result, sections)
+    found = Decisions(
+        files=data.files,
+        labels=data.labels,
+        predictions=done.decisions,
+        counts=done.votes,
+        price=price,
+        costs=None if price is None else price.outcome.result,
+    )
+    result = Accounted(result=found, explained_cost=account.explained(arguments.explain_cost))
+    return Outcome(result, lambda result: sections(result.result))

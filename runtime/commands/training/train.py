@@ -8,12 +8,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from spikeloom import __version__
 from spikeloom.compiler.checkpoint import WEIGHTS
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.systems import GRAPH_SYSTEMS, GRID_CNN, TACTILESGNET, TITLES, Grid
 from spikeloom.compiler.targets.truenorth.native import BASES, USUAL_COPIES
 from spikeloom.compiler.targets.truenorth.native import SYSTEM as NATIVE
+from spikeloom.compiler.version import __version__
 from spikeloom.models.graphs import CHOICES, Graph
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.recordings.grasps import SYNTHETIC

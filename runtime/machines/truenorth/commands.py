@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from spikeloom import __version__
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.passes.expand import Factored
@@ -23,6 +22,7 @@ from spikeloom.compiler.targets.truenorth.native_file import Trained, is_trained
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
 from spikeloom.compiler.targets.truenorth.netlist_file import write_crossbars
 from spikeloom.compiler.targets.truenorth.passes import Compilation, Options
+from spikeloom.compiler.version import __version__
 from spikeloom.runtime.inputs.files import shipped
 from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.inputs.recordings import netlist_recordings

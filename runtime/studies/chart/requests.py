@@ -11,8 +11,8 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from spikeloom import __version__
 from spikeloom.compiler.targets.base import Target
+from spikeloom.compiler.version import __version__
 from spikeloom.models.recordings.windows import WHOLE
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.report.encode import encode

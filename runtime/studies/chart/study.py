@@ -8,9 +8,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from spikeloom import __version__
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.fixedpoint import IntArray
+from spikeloom.compiler.version import __version__
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.systems import NO_GRAPH
 from spikeloom.runtime.machines.base import chip_chart

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from spikeloom import __version__
 from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.systems import GRAPH_SYSTEMS
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
+from spikeloom.compiler.version import __version__
 from spikeloom.models.graphs import NEUTOUCH
 from spikeloom.models.sensors import read_layout, sensor_graph
 from spikeloom.runtime.equivalence.reference import require_match
