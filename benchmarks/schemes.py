@@ -29,7 +29,7 @@ from spikeloom.models.recordings.evtouch import Recordings, load_recordings
 from spikeloom.runtime.equivalence.levels import mcnemar
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.costs import cost
-from spikeloom.runtime.machines.loihi1.trace import aligned, heard
+from spikeloom.runtime.machines.loihi1.trace import aligned, comparable
 from spikeloom.runtime.machines.votes import predictions
 from spikeloom.runtime.report.intervals import wilson
 
@@ -64,7 +64,7 @@ def measure(
     costs = cost.estimate(cost.prepare(netlist, load_target(netlist.target)), trace.counts, test.steps)
     different = {
         layer.name: int(
-            np.count_nonzero((aligned(netlist, trace.spikes, i) != reference[layer.name])[..., heard(netlist, i)])
+            np.count_nonzero((aligned(netlist, trace.spikes, i) != reference[layer.name])[..., comparable(netlist, i)])
         )
         for i, layer in enumerate(netlist.layers)
     }

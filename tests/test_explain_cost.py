@@ -150,7 +150,10 @@ def test_a_rung_that_is_proven_is_what_it_would_be(spikeloom, monkeypatch):
 def test_why_a_netlist_runs_step_by_step(spikeloom, tmp_path):
     netlist = read_netlist("net.loom")
     assert blocks.obstacle(netlist) is None
-    assert blocks.obstacle(large_netlist(1, proved=True)) == "a layer hears itself or others than the one before it"
+    assert (
+        blocks.obstacle(large_netlist(1, proved=True))
+        == "a layer is recurrent or receives from others than the one before it"
+    )
     wide = build([Neuron()], [Axon(source=0, targets=((0, 254),), exponent=7)], n_inputs=1, depths=[0])
     wide = replace(wide, axon_source=read_only([0]))
     many = replace(

@@ -26,7 +26,7 @@ from spikeloom.models.recordings.evtouch import Recordings, load_recordings
 from spikeloom.models.training.finetune import finetune, initial_forms
 from spikeloom.runtime.cli import main
 from spikeloom.runtime.machines.loihi1 import engine
-from spikeloom.runtime.machines.loihi1.trace import aligned, heard
+from spikeloom.runtime.machines.loihi1.trace import aligned, comparable
 
 LOIHI = load_target("loihi1")
 EXPONENTS = LOIHI.choices["synapse.exponent"]
@@ -321,7 +321,7 @@ def test_the_model_is_the_chip_on_every_recording(tmp_path, objects_zip, contain
             model = quantised_spikes(checkpoint, adjacency, data.events)
             trace = engine.simulate(netlist, data.events.reshape(len(data), -1, data.steps), spikes=True)
             for index, layer in enumerate(netlist.layers):
-                kept = heard(netlist, index)  # the chip leaves out what nobody hears
+                kept = comparable(netlist, index)  # the chip leaves out what nobody hears
                 ours = aligned(netlist, trace.spikes, index)[..., kept]
                 np.testing.assert_array_equal(ours, model[layer.name][..., kept])
 

@@ -134,7 +134,7 @@ def test_only_networks_with_recurrence_run_in_steps():
     without = chain(np.full((3, 4), 0.5), np.full((2, 3), 0.5))
     assert obstacle(compile_network(without).netlist) is None
     netlist = compile_network(hearing_itself(without, 0, np.full((3, 3), 0.5))).netlist
-    assert obstacle(netlist) == "a layer hears itself or others than the one before it"
+    assert obstacle(netlist) == "a layer is recurrent or receives from others than the one before it"
     assert engine.prepare(netlist).blocks is None
     assert [layer.depth for layer in netlist.layers] == [0, 1]
 

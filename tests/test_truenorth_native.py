@@ -156,7 +156,7 @@ def test_what_contradicts_itself_is_told():
     assert told(inputs=first.inputs * 0) == ["tower 0, conv1: 1 blocks do not share 8 inputs among them"]
     assert faults(replace(network, classes=5)) == ["tower 0: 12 voting neurons for 5 classes"]
     assert faults(replace(network, clocks=NO_CLOCKS)) == [
-        f"tower 0, {stage.name}: hears 2 clocks of 0" for stage in rest
+        f"tower 0, {stage.name}: receives 2 clocks of 0" for stage in rest
     ]
 
 

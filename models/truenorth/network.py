@@ -1,9 +1,9 @@
 """A TactileSGNet that TrueNorth holds: whole weights of few levels, blocks of few inputs, neurons that only add.
 
-The graph convolution hears the sensor as ever: its filters are shared by all taxels, and expanded to a weight for each
+The graph convolution sees the sensor as ever: its filters are shared by all taxels, and expanded to a weight for each
 channel and neuron. Its features are dealt to groups, so that every group of the first dense layer sees the whole skin
-in a few of them; each group of the second hears a share of every group of the first; the output neurons vote, several
-for each class in every group. The dense layers hear the clocks, which the chip gives them from outside.
+in a few of them; each group of the second receives a share of every group of the first; the output neurons vote,
+several for each class in every group. The dense layers receive the clocks, which the chip gives them from outside.
 
 What the chip rounds is rounded in every pass, and the gradient goes past the rounding as if it were not there: what is
 trained is what the chip computes, :class:`native.NativeNetwork`.
@@ -81,7 +81,7 @@ class NativeArchitecture:
     copies : int
         Axons of an input, see :mod:`truenorth.native`.
     clocks : Clocks
-        That the dense layers hear.
+        That the dense layers receive.
     floor : float
         Lowest membrane, in thresholds below zero, at least 1.
     """
@@ -104,7 +104,7 @@ class NativeArchitecture:
         return (CONV, *(f"fc{i}" for i in range(1, len(self.hidden) + 2)))
 
     def inputs(self) -> list[NDArray[np.int64]]:
-        """Neurons that each group of the dense layers hears, (groups, inputs of a group) for each layer."""
+        """Neurons from which each group of the dense layers receives, (groups, inputs of a group) for each layer."""
         widths = (self.taxels * self.features, *(self.groups * size for size in self.hidden))
         rows = (self.taxels, *[self.groups] * len(self.hidden))
         return [
@@ -284,17 +284,17 @@ def run_layers(
     Parameters
     ----------
     layers : sequence of Rounded
-        The first hears the sensor in one block.
+        The first receives the sensor in one block.
     inputs : sequence of (blocks, width) int64
-        What each block of the others hears of the layer before.
+        What each block of the others receives from the layer before.
     """
     steps, samples = events.shape[:2]
     ticks = torch.from_numpy(clocks.events(steps).T.astype(np.float32))
     spikes = _spikes(layers[0], block_sums(events.reshape(steps, samples, -1), layers[0].weight), surrogate)
     found = [spikes]
-    for layer, heard in zip(layers[1:], inputs, strict=True):
-        width = heard.shape[1]
-        sums = block_sums(spikes.index_select(2, torch.tensor(heard.reshape(-1))), layer.weight[:, :width])
+    for layer, received in zip(layers[1:], inputs, strict=True):
+        width = received.shape[1]
+        sums = block_sums(spikes.index_select(2, torch.tensor(received.reshape(-1))), layer.weight[:, :width])
         if layer.weight.shape[1] > width:
             timed = torch.matmul(ticks, layer.weight[:, width:])
             sums = sums + timed.transpose(0, 1).reshape(steps, 1, -1)
@@ -310,14 +310,14 @@ def _spikes(layer: Rounded, sums: Tensor, surrogate: Surrogate) -> Tensor:
 def native_network(architecture: NativeArchitecture, arrays: Mapping[str, NDArray[np.float32]]) -> NativeNetwork:
     """Network of one tower from what `NativeNet.export_weights` returned."""
     channels = np.arange(architecture.taxels * architecture.channels)[None]
-    heard = [channels, *architecture.inputs()]
+    received = [channels, *architecture.inputs()]
     tower = tuple(
         Stage(
             name=name,
             inputs=inputs,
             **{what: arrays[f"{name}.{what}"].astype(np.int64) for what in ("level", "threshold", "floor", "leak")},
         )
-        for name, inputs in zip(architecture.layers, heard, strict=True)
+        for name, inputs in zip(architecture.layers, received, strict=True)
     )
     return NativeNetwork(
         taxels=architecture.taxels,

@@ -12,7 +12,7 @@ from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT
 from spikeloom.compiler.interpret import BoolArray
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.runtime.machines.loihi1 import engine
-from spikeloom.runtime.machines.loihi1.trace import aligned, heard
+from spikeloom.runtime.machines.loihi1.trace import aligned, comparable
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -93,7 +93,7 @@ def first_divergence(
     )
     layer = netlist.layers[index]
     ill_posed = bool(wide[index][sample, step, neuron] != reference[index][sample, step, neuron])
-    neuron = int(np.arange(layer.neurons)[heard(netlist, index)][neuron])
+    neuron = int(np.arange(layer.neurons)[comparable(netlist, index)][neuron])
     trace = engine.simulate(prepared, events[sample : sample + 1], membranes=True)
     assert trace.membranes is not None, "membranes were asked for"
     register = int(aligned(netlist, trace.membranes, index)[0, step, neuron])

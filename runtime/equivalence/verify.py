@@ -37,7 +37,7 @@ from spikeloom.runtime.equivalence.reference import (
 from spikeloom.runtime.equivalence.rounding import check_rounding
 from spikeloom.runtime.equivalence.verdict import LayerSpikes, Rung, Verdict
 from spikeloom.runtime.machines.loihi1 import engine, spec
-from spikeloom.runtime.machines.loihi1.trace import ENGINES, Trace, aligned, check_channels, heard
+from spikeloom.runtime.machines.loihi1.trace import ENGINES, Trace, aligned, check_channels, comparable
 from spikeloom.runtime.machines.votes import class_counts, readout_counts
 
 
@@ -158,7 +158,7 @@ def verify(
         fine_tuned=tuned,
     )
 
-    kept = [heard(netlist, layer) for layer in range(len(names))]
+    kept = [comparable(netlist, layer) for layer in range(len(names))]
 
     def compared(layers: Sequence[BoolArray]) -> list[BoolArray]:
         return [cut(spikes, lengths)[..., keep] for spikes, keep in zip(layers, kept, strict=True)]

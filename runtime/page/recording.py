@@ -26,7 +26,7 @@ from spikeloom.runtime.machines.loihi1.costs import cost
 from spikeloom.runtime.machines.loihi1.costs.estimate import Estimate, estimate
 from spikeloom.runtime.machines.loihi1.costs.result import cost_report
 from spikeloom.runtime.machines.loihi1.timing import DetailedTimes, SimpleTimes
-from spikeloom.runtime.machines.loihi1.trace import Counts, Trace, aligned, heard
+from spikeloom.runtime.machines.loihi1.trace import Counts, Trace, aligned, comparable
 from spikeloom.runtime.machines.votes import class_counts, predictions, readout_counts
 from spikeloom.runtime.report.encode import encode
 
@@ -76,7 +76,7 @@ def run_both(netlist: Netlist, asked: LoadedNetwork, events: npt.NDArray[np.uint
 
 def _heard_only(netlist: Netlist, layer: int, spikes: BoolArray) -> BoolArray:
     kept = np.zeros_like(spikes)
-    keep = heard(netlist, layer)
+    keep = comparable(netlist, layer)
     kept[:, keep] = spikes[:, keep]
     return kept
 

@@ -33,7 +33,7 @@ COPIES = tuple(WEIGHTS)
 """Axons of an input that can be asked for."""
 
 MOST_COPIES = 3
-"""Axons of an input of a layer that hears a clock: with four every type is an input's."""
+"""Axons of an input of a layer that receives a clock: with four every type is an input's."""
 
 EMPTYING = 4
 """Axons by which a clock empties neurons of partial sums: more than these can hold."""
@@ -157,7 +157,7 @@ def in_levels(network: Network, copies: int, chip: Target) -> LevelNetwork:
     network : Network
         A chain of layers.
     copies : int
-        Axons of an input, 2 to 4; layers that hear a clock take three at the most.
+        Axons of an input, 2 to 4; layers that receive a clock take three at the most.
     chip : Target
 
     Raises
@@ -168,16 +168,16 @@ def in_levels(network: Network, copies: int, chip: Target) -> LevelNetwork:
     if network.input.clocks.channels:
         raise ModelError("has clocks; sums in time are for networks without")
     if network.input.bins > 1:
-        raise ModelError(f"a step joins {network.input.bins} bins; sums in time are for networks that hear each")
+        raise ModelError(f"a step joins {network.input.bins} bins; sums in time are for networks of single bins")
     layers = []
     for index, population in enumerate(network.populations):
         if population.beta or population.alpha:
             what, kept = ("membranes", population.beta) if population.beta else ("currents", population.alpha)
             raise ModelError(f"{population.name}: keeps {kept:g} of its {what} a step, sums in time forget all")
-        heard = [projection for projection in network.projections if projection.post == index]
-        if [projection.pre for projection in heard] != [index - 1 if index else INPUT]:
-            raise ModelError(f"{population.name}: does not hear the layer before and nothing else")
-        layers.append(_layer(population, heard[0].weight.toarray(), copies, chip))
+        incoming = [projection for projection in network.projections if projection.post == index]
+        if [projection.pre for projection in incoming] != [index - 1 if index else INPUT]:
+            raise ModelError(f"{population.name}: does not receive from the layer before and nothing else")
+        layers.append(_layer(population, incoming[0].weight.toarray(), copies, chip))
     return LevelNetwork(
         taxels=network.input.taxels,
         polarities=network.input.polarities,
@@ -188,7 +188,7 @@ def in_levels(network: Network, copies: int, chip: Target) -> LevelNetwork:
 
 
 def _layer(population: Population, weight: FloatArray, copies: int, chip: Target) -> Layer:
-    """Levels of a layer: in as many copies as were asked for, if its inputs fit a core so and it hears no clock."""
+    """Levels of a layer: in as many copies as were asked for, if its inputs fit a core so and it receives no clock."""
     fan_in = int(np.count_nonzero(weight, axis=1).max(initial=0))
     for tried in dict.fromkeys((copies, min(copies, MOST_COPIES))):
         book = codebook(weight, tried)
@@ -250,15 +250,15 @@ def run_levels(network: LevelNetwork, events: npt.NDArray[np.uint8], *, most: in
 
     Partial sums count `most` at the most; on the chip that is ``MOST``.
     """
-    heard = (events > 0).T.astype(np.float64)  # whole numbers, so that the products are exact and fast
+    active = (events > 0).T.astype(np.float64)  # whole numbers, so that the products are exact and fast
     spikes, partial, saturated, largest = [], [], [], []
     for layer in network.layers:
-        sums = [heard[:, group] @ layer.level[:, group].T.astype(np.float64) for group in layer.groups]
+        sums = [active[:, group] @ layer.level[:, group].T.astype(np.float64) for group in layer.groups]
         split = layer.is_split
         partial.append(sum(part.size for part in sums) if split else 0)
         saturated.append(sum(int(np.count_nonzero(np.abs(part) > most)) for part in sums) if split else 0)
         largest.append(max(int(np.abs(part).max(initial=0)) for part in sums) if split else 0)
         total = sum(np.clip(part, -most, most) for part in sums) if split else sums[0]
         spikes.append(total >= layer.threshold)
-        heard = spikes[-1].astype(np.float64)
+        active = spikes[-1].astype(np.float64)
     return Run(spikes=tuple(spikes), partial=tuple(partial), saturated=tuple(saturated), largest=tuple(largest))

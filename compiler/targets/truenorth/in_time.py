@@ -127,7 +127,7 @@ class _Placing:
         return self._whole(depth, layer, ends)
 
     def _whole(self, depth: int, layer: Layer, ends: list[list[Place]] | None) -> list[list[Place]]:
-        """A layer whose inputs fit a core: a neuron for each axon that hears it, all in one tick."""
+        """A layer whose inputs fit a core: a neuron for each axon that it reaches, all in one tick."""
         inputs: list[list[Place]] = [[] for _ in range(layer.level.shape[1])]
         aims = [(n, end) for n in range(len(layer.level)) for end in ([None] if ends is None else ends[n])]
         types, start = _types(layer.copies), self.starts[depth]
@@ -244,14 +244,14 @@ class _Placing:
     def _packed(self, layer: Layer, aims: list[tuple[int, Place | None]]) -> Iterator[list[tuple[int, Place | None]]]:
         """Neurons in their order, as many to a core as their inputs leave room for, with an axon for a clock."""
         neurons, axons = self.chip.limit("core.neurons"), self.chip.limit("core.axons")
-        part, heard = list[tuple[int, Place | None]](), np.zeros(layer.level.shape[1], np.bool_)
+        part, used = list[tuple[int, Place | None]](), np.zeros(layer.level.shape[1], np.bool_)
         for n, end in aims:
-            more = heard | (layer.level[n] != 0)
+            more = used | (layer.level[n] != 0)
             if part and (len(part) == neurons or np.count_nonzero(more) * layer.copies >= axons):
                 yield part
                 part, more = [], layer.level[n] != 0
             part.append((n, end))
-            heard = more
+            used = more
         if part:
             yield part
 

@@ -1,8 +1,8 @@
 """A network of whole numbers that crossbar cores hold: what is trained for TrueNorth, before it is placed.
 
 A network is one or more *towers* side by side, whose votes add up. A tower is a chain of *stages*. A stage has blocks
-of neurons; all neurons of a block hear the same inputs, each input is heard by one block, and every stage but the
-first may hear the clocks, too. With levels ``k`` of a neuron for its inputs,
+of neurons; all neurons of a block receive the same inputs, each input reaches one block, and every stage but the
+first may receive the clocks, too. With levels ``k`` of a neuron for its inputs,
 
     ``m_t = c_{t-1} + UNIT * sum_i k_i x_i(t) + leak``,  ``s_t = m_t >= threshold``,
     ``c_t = 0`` after a spike, ``max(m_t, -floor)`` otherwise, from ``c = 0`` on:
@@ -56,8 +56,8 @@ def highest_level(copies: int) -> int:
 def steepest_leak(threshold: IntArray, depth: int) -> IntArray:
     """Largest leak at a depth: one that reaches neither threshold nor floor in the ticks before the first data.
 
-    A stage at depth d hears data from tick d on. Its membranes start at ``-d * leak``, and the leak alone brings them
-    to rest by then, on a way that must touch no limit; the floor is no nearer than the threshold.
+    A stage at depth d receives data from tick d on. Its membranes start at ``-d * leak``, and the leak alone brings
+    them to rest by then, on a way that must touch no limit; the floor is no nearer than the threshold.
     """
     reach = (threshold - 1) // max(1, depth - 1)
     found: IntArray = np.minimum(reach, LEAK_MOST)
@@ -73,9 +73,9 @@ class Stage:
     name : str
         Of the layer.
     inputs : (blocks, width) int64
-        Neurons of the stage before that each block hears; channels of the sensor in the first stage.
+        Neurons of the stage before that each block receives; channels of the sensor in the first stage.
     level : (blocks, width + clocks, size) int64
-        For each input of a block and for each clock, as far as the stage hears them; for each neuron.
+        For each input of a block and for each clock, as far as the stage receives them; for each neuron.
     threshold, floor, leak : (blocks * size,) int64
     """
 
@@ -103,7 +103,7 @@ class Stage:
 
     @property
     def clocks(self) -> int:
-        """Clocks that the stage hears."""
+        """Clocks that the stage receives."""
         return int(self.level.shape[1] - self.inputs.shape[1])
 
 
@@ -148,22 +148,24 @@ def faults(network: NativeNetwork) -> list[str]:
         return [f"{network.copies} copies of an input, allowed are {', '.join(map(str, BASES))}"]
     found = []
     for number, tower in enumerate(network.towers):
-        heard = network.taxels * network.polarities
+        fan_in = network.taxels * network.polarities
         for depth, stage in enumerate(tower):
-            found += [f"tower {number}, {stage.name}: {fault}" for fault in _stage_faults(network, stage, depth, heard)]
-            heard = stage.neurons
-        if not tower or heard % network.classes:
-            found.append(f"tower {number}: {heard} voting neurons for {network.classes} classes")
+            found += [
+                f"tower {number}, {stage.name}: {fault}" for fault in _stage_faults(network, stage, depth, fan_in)
+            ]
+            fan_in = stage.neurons
+        if not tower or fan_in % network.classes:
+            found.append(f"tower {number}: {fan_in} voting neurons for {network.classes} classes")
     return found if network.towers else ["no towers"]
 
 
-def _stage_faults(network: NativeNetwork, stage: Stage, depth: int, heard: int) -> Iterator[str]:
+def _stage_faults(network: NativeNetwork, stage: Stage, depth: int, fan_in: int) -> Iterator[str]:
     if stage.clocks not in ({0} if not depth else {0, network.clocks.channels}):
-        yield f"hears {stage.clocks} clocks of {network.clocks.channels}"
+        yield f"receives {stage.clocks} clocks of {network.clocks.channels}"
     inputs = stage.inputs.reshape(-1)
-    whole = np.array_equal(np.sort(inputs), np.arange(heard))
+    whole = np.array_equal(np.sort(inputs), np.arange(fan_in))
     if stage.inputs.shape[0] != stage.blocks or not whole:
-        yield f"{stage.blocks} blocks do not share {heard} inputs among them"
+        yield f"{stage.blocks} blocks do not share {fan_in} inputs among them"
     for name in ("threshold", "floor", "leak"):
         if getattr(stage, name).shape != (stage.neurons,):
             yield f"{len(getattr(stage, name))} values of {name} for {stage.neurons} neurons"

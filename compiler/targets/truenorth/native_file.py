@@ -51,7 +51,7 @@ class Trained:
     Parameters
     ----------
     network : NativeNetwork
-        Of the set that was asked for.
+        Of the set that was chosen.
     weights : str
         Name of that set.
     sets : tuple of str

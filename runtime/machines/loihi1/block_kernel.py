@@ -1,9 +1,11 @@
 """The chip step of :mod:`loihi1.spec` for 64 compartments at once; :mod:`loihi1.blocks` prepares what it reads.
 
+All of it stands in one file, since numba caches machine code by the stamp of the file that it was made from.
+
 A *block* is 64 neurons of one layer; who spiked in it is one 64-bit word. Its synapses are
 rows of 64 weights, one for each source that reaches it. In each step the rows of the sources that are active are added
 up in registers, and the 64 neurons integrate, compare and reset. A block runs through the whole recording before the
-next one starts, so that its rows and membranes stay in cache: no layer hears a later one.
+next one starts, so that its rows and membranes stay in cache: no layer receives from a later one.
 
 *Sixteen bits.* :mod:`loihi1.blocks` proves that the positive and the negative weights of a step each add up to 32,767
 at most (the accumulator's 21 bits hold them shifted left by six). A sum of some of both lies in between, in whatever
@@ -19,8 +21,7 @@ a product of two wide factors is then taken in two parts, as :mod:`loihi1.kernel
 synapses that reach it are all zero. Only those without a bias can be idle, the others are not looked at.
 
 *Vectors.* They are written in LLVM's own terms, as numba leaves no other way to hold 16-bit sums in registers and to
-turn 64 comparisons into one word. LLVM makes of them what the machine has. All of it stands in one file because the
-machine code is cached by the stamp of the file that it was made from.
+turn 64 comparisons into one word. LLVM makes of them what the machine has.
 """
 
 from __future__ import annotations
@@ -121,7 +122,7 @@ class ChargeRows(NamedTuple):
     width : int
         Sums, padded to a multiple of `CHARGES`; 0 if there are none.
     narrow : bool
-        Whether all events that a stage can hear in a step add up to less than 2**31 in each sum.
+        Whether all events that a stage can receive in a step add up to less than 2**31 in each sum.
     source : ((words of the inputs + blocks) * 64 * width,) int32
         What an event of each channel, then a spike of each position adds.
     everyone : (stages * width,) int64

@@ -52,7 +52,7 @@ def _in_range(netlist: Netlist) -> bool:
 
 
 def _is_pipeline(netlist: Netlist) -> bool:
-    """Whether every layer hears the layers of the depth before it only, so that none has to wait for another."""
+    """Whether every layer receives from the depth before it only, so that none has to wait for another."""
     depth = np.array([layer.depth for layer in netlist.layers])[netlist.layer]
     sent = np.append(np.full(netlist.n_inputs, -1), depth)
     for core in range(netlist.n_cores):
@@ -68,8 +68,8 @@ def lay_out_blocks(netlist: Netlist) -> Blocks | None:
     Returns
     -------
     Blocks or None
-        None where a register could overflow or saturate, a layer hears itself or others than the one before it, or
-        synapses are so scattered that rows of 64 would waste memory.
+        None where a register could overflow or saturate, a layer is recurrent or receives from others than the one
+        before it, or synapses are so scattered that rows of 64 would waste memory.
     """
     if not _is_pipeline(netlist) or not _in_range(netlist):
         return None
@@ -138,7 +138,7 @@ def lay_out_blocks(netlist: Netlist) -> Blocks | None:
 def obstacle(netlist: Netlist) -> str | None:
     """Why there are no blocks of a netlist; None if there are."""
     if not _is_pipeline(netlist):
-        return "a layer hears itself or others than the one before it"
+        return "a layer is recurrent or receives from others than the one before it"
     if not _in_range(netlist):
         return "a sum may leave 16 bits, or a membrane or current its register"
     if lay_out_blocks(netlist) is None:
@@ -230,9 +230,9 @@ def _rows(netlist: Netlist, seats: _Seats, pairs: list[IntArray], width: int) ->
     """Pairs of block and source that get a row, sorted, and whether those of a stage are all that there can be."""
     rows = np.unique(np.concatenate(pairs))
     blocks = np.diff(seats.stage)
-    heard = np.append(netlist.n_inputs, np.bincount(seats.depth[netlist.layer], minlength=len(blocks))[:-1])
+    channels = np.append(netlist.n_inputs, np.bincount(seats.depth[netlist.layer], minlength=len(blocks))[:-1])
     places = np.append(netlist.n_inputs, blocks[:-1] * LANES)
-    dense = np.diff(np.searchsorted(rows, seats.stage * width)) >= DENSE * blocks * heard
+    dense = np.diff(np.searchsorted(rows, seats.stage * width)) >= DENSE * blocks * channels
     filled = [
         (np.arange(seats.stage[s], seats.stage[s + 1])[:, None] * width + np.arange(places[s])).ravel()
         for s in np.flatnonzero(dense)

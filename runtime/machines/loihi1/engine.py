@@ -1,7 +1,7 @@
 """The fast twin of :mod:`loihi1.spec`: the same spikes, membranes and counts, bit for bit.
 
-There are two kernels. A network of layers that each hear the one before, in which no register can overflow or saturate,
-is run layer after layer in :mod:`loihi1.block_kernel`; whole recordings only.
+There are two kernels. A network of layers that each receive from the one before, in which no register can overflow or
+saturate, is run layer after layer in :mod:`loihi1.block_kernel`; whole recordings only.
 
 Any other network is run step after step in :mod:`loihi1.kernel`, which knows no recordings: :func:`advance` moves a
 state by any number of chip steps.

@@ -78,18 +78,17 @@ class Trace:
     counts : Counts
         What happened, summed over chip steps.
     spikes : (…, chip steps, compartments) bool, or None
-        Whether a compartment spiked in a chip step; None where it was not asked for.
+        Whether a compartment spiked in a chip step; None unless wanted.
     membranes : (…, chip steps, compartments) int32, or None
         The saturated membrane that was compared with the threshold, before a spike resets it, in 1/64 of a weight
-        unit; zero outside the layer's window. None where it was not asked for.
+        unit; zero outside the layer's window. None unless wanted.
     updated : (…, chip steps, compartments) bool, or None
-        Whether a compartment had work to do in a chip step, as ``Counts.updates`` counts it; None where it was not
-        asked for.
+        Whether a compartment had work to do in a chip step, as ``Counts.updates`` counts it; None unless wanted.
     charged : (…, chip steps, sums) int64, or None
         What the events of each chip step add up to under the charges that the engine was prepared with.
     packed : (…, chip steps, ceil(compartments / 64)) uint64, or None
         The spikes at a bit each: that of compartment c is bit ``c % 64`` of word ``c // 64``; see :func:`unpack`. None
-        where it was not asked for.
+        unless wanted.
     """
 
     counts: Counts
@@ -147,10 +146,10 @@ def aligned(netlist: Netlist, array: npt.NDArray[Any], layer: int) -> npt.NDArra
     return whole
 
 
-def heard(netlist: Netlist, layer: int) -> slice | IntArray:
-    """Neurons of a layer whose spikes can be compared: all but those left out because nobody hears them."""
-    unheard = netlist.layers[layer].unheard
-    return np.setdiff1d(np.arange(netlist.layers[layer].neurons), unheard) if unheard else slice(None)
+def comparable(netlist: Netlist, layer: int) -> slice | IntArray:
+    """Neurons of a layer whose spikes can be compared: all but those left out because no neuron receives them."""
+    unused = netlist.layers[layer].unheard
+    return np.setdiff1d(np.arange(netlist.layers[layer].neurons), unused) if unused else slice(None)
 
 
 def check_channels(netlist: Netlist, channels: int) -> None:

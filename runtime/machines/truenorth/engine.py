@@ -282,7 +282,7 @@ def simulate(
     events : (samples, n_inputs, T) uint8 or bool
         Input events; any value but zero is an event.
     lengths : (samples,) int64, optional
-        Data steps of each recording where some are shorter than T; what comes after them is not heard.
+        Data steps of each recording where some are shorter than T; what comes after them is not run.
     seed : int
         Of the random numbers; the same for all recordings, so that none depends on its neighbours.
     spikes, membranes : bool
@@ -312,11 +312,11 @@ def simulate(
     inputs, merged = np.zeros((samples, channels), np.int64), np.zeros(samples, np.int64)
 
     def one(sample: int) -> None:
-        heard = np.ascontiguousarray(events[sample, :, : steps[sample]].T).astype(np.uint8)
-        inputs[sample] = np.count_nonzero(heard, axis=0)
+        arriving = np.ascontiguousarray(events[sample, :, : steps[sample]].T).astype(np.uint8)
+        inputs[sample] = np.count_nonzero(arriving, axis=0)
         arrays = (axons, spiked, votes, overflows, raster, held)
         merged[sample] = kernel.run(
-            heard,
+            arriving,
             netlist.bin_ticks,
             netlist.ticks(int(steps[sample])),
             np.uint64(seed),

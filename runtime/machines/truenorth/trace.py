@@ -79,9 +79,9 @@ class Trace:
     ----------
     counts : Counts
     spikes : (…, ticks, neurons) bool, or None
-        Whether a neuron spiked in a tick; None where it was not asked for.
+        Whether a neuron spiked in a tick; None unless wanted.
     membranes : (…, ticks, neurons) int32, or None
-        Membranes at the end of each tick, after resets; None where they were not asked for. In a batch a shorter
+        Membranes at the end of each tick, after resets; None unless wanted. In a batch a shorter
         recording is filled up with zeros after its last tick.
     """
 

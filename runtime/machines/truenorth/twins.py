@@ -1,6 +1,6 @@
-"""Neurons that are alike and hear the same always spike together: the engine runs one of each kind.
+"""Neurons that are alike and receive the same always spike together: the engine runs one of each kind.
 
-A neuron of TrueNorth has one target, so a network has each of its neurons as often as there are axons that must hear
+A neuron of TrueNorth has one target, so a network has each of its neurons as often as there are axons that must receive
 it, and each of these axons brings its share of one weight. Found here from the inputs on, without knowing how the
 network was made: axons that only one thing leads to are of one kind if these are, neurons are of one kind if their
 registers are equal and the same weights reach them from the same kinds of axons. Positive and negative weights are
@@ -93,7 +93,7 @@ def _sources(netlist: CrossbarNetlist) -> tuple[IntArray, BoolArray]:
         netlist.axons_at(netlist.clock_core, netlist.clock_line),
         netlist.axons_at(netlist.cores_at(netlist.wire_x, netlist.wire_y), netlist.wire_line),
     )
-    told = (
+    columns_of = (
         (netlist.feed_channel, netlist.feed_tick),
         (netlist.clock_period, netlist.clock_phase),
         (netlist.wire_neuron, netlist.wire_delay),
@@ -101,7 +101,7 @@ def _sources(netlist: CrossbarNetlist) -> tuple[IntArray, BoolArray]:
     single = np.bincount(np.concatenate(aims), minlength=netlist.n_axons) == 1
     axons = np.arange(netlist.n_axons)
     sources = np.stack([np.full_like(axons, _ITSELF), axons, np.zeros_like(axons)], axis=1)
-    for what, (aim, columns) in enumerate(zip(aims, told, strict=True)):
+    for what, (aim, columns) in enumerate(zip(aims, columns_of, strict=True)):
         only = single[aim]
         sources[aim[only]] = np.stack([np.full(len(aim), what), *columns], axis=1)[only]
     return sources, single

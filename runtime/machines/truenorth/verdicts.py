@@ -120,7 +120,7 @@ def compare(
         channels = with_clocks(events, netlist.clocks)
         deep = index < spec_samples and spec_steps is None
         trace = engine.simulate(prepared, channels, spikes=True, membranes=deep)
-        assert trace.spikes is not None, "spikes were asked for"
+        assert trace.spikes is not None, "spikes are kept"
         expected = model(events[0])
         steps = events.shape[-1]
         for name, late in first.items():
@@ -149,7 +149,7 @@ def compare(
 
 def _against_spec(netlist: CrossbarNetlist, channels: Any, trace: Trace) -> int:
     """Spikes, membranes, and spikes on axons that differ between engine and specification."""
-    assert trace.spikes is not None, "spikes were asked for"
+    assert trace.spikes is not None, "spikes are kept"
     assert trace.membranes is not None, "and membranes"
     slow = spec.simulate(netlist, channels)
     pairs = (
