@@ -21,20 +21,13 @@ from spikeloom.compiler.ir import INPUT, Input, Network, Population, Projection,
 class Layer:
     """A spiking layer.
 
-    Parameters
-    ----------
-    name : str
-        For messages and as the population's name.
-    beta, theta : float
-        Decay and threshold.
-    bias : (neurons,) float64
-    sources : mapping of int to csr_array (neurons, neurons of the source)
-        Stages from other layers by their place in the sequence, or from ``INPUT``; from its own place the spikes of the
-        step before.
-    alpha : float
-        Share of the synaptic current that a step keeps.
-    relays : int
-        How many of the last neurons relay a channel that always has an event, see :mod:`compiler.dynamics`.
+    name: for messages and as the population's name.
+    beta, theta: decay and threshold.
+    bias: (neurons,) float64
+    sources: mapping of int to csr_array (neurons, neurons of the source); stages from other layers by their place
+        in the sequence, or from ``INPUT``; from its own place the spikes of the step before.
+    alpha: share of the synaptic current that a step keeps.
+    relays: how many of the last neurons relay a channel that always has an event, see :mod:`compiler.dynamics`.
     """
 
     name: str

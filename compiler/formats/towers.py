@@ -10,7 +10,7 @@ Neurons of the first layer count as in any network of the system, with the featu
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from hashlib import sha256
 from typing import Any
@@ -89,11 +89,11 @@ def join(checkpoints: Sequence[Checkpoint], names: Sequence[str]) -> Checkpoint:
     ModelError
         If they disagree in any of these; all of them are listed.
     """
-    differing = [
-        f"{what} ({names[0]}: {tell(checkpoints[0])}; {'; '.join(others)})"
-        for what, tell in FACTS.items()
-        if (others := _others(checkpoints, names, tell))
-    ]
+    facts = [_facts(checkpoint) for checkpoint in checkpoints]
+    differing = []
+    for what, first in facts[0].items():
+        others = [f"{name}: {found[what]}" for name, found in zip(names, facts, strict=True) if found[what] != first]
+        differing += [f"{what} ({names[0]}: {first}; {'; '.join(others)})"] if others else []
     if differing:
         raise ModelError(
             f"join: the networks differ in {', '.join(differing)}; give networks of one system, sensor and timing"
@@ -124,65 +124,34 @@ def _joined_forms(joined: Checkpoint, every: Sequence[Checkpoint]) -> tuple[Form
     return tuple(replace(form, threshold=thresholds[name]) for name, form in zip(joined.neurons, forms[0], strict=True))
 
 
-def _others(checkpoints: Sequence[Checkpoint], names: Sequence[str], tell: Callable[[Checkpoint], str]) -> list[str]:
-    first = tell(checkpoints[0])
-    told = zip(names[1:], map(tell, checkpoints[1:]), strict=True)
-    return [f"{name}: {found}" for name, found in told if found != first]
-
-
-def _sensor(checkpoint: Checkpoint) -> str:
-    grid = checkpoint.grid
-    held = f"{checkpoint.taxels} taxels x {checkpoint.hops.shape[2]}"
-    if grid is None:
-        return held
-    return (
-        f"{held} on a grid of {grid.rows} x {grid.columns}, stride {grid.stride}, padding {grid.padding}, "
-        f"cells #{_digest(grid.cells)}"
-    )
-
-
-def _graph(checkpoint: Checkpoint) -> str:
-    edges = np.zeros((0, 2), np.int64) if checkpoint.edges is None else checkpoint.edges
-    ordered = edges[np.lexsort(edges.T[::-1])]
-    return f"{len(ordered)} edges #{_digest(ordered)}"
-
-
 def _digest(values: IntArray) -> str:
     return sha256(np.ascontiguousarray(values, "<i8").tobytes()).hexdigest()[:8]
 
 
-def _layers(checkpoint: Checkpoint) -> str:
+def _facts(checkpoint: Checkpoint) -> dict[str, str]:
+    """What the networks of a joined one have in common, as text that tells them apart."""
+    grid, dynamics, forms = checkpoint.grid, checkpoint.dynamics, checkpoint.forms
+    sensor = f"{checkpoint.taxels} taxels x {checkpoint.hops.shape[2]}"
+    if grid is not None:
+        sensor += f" on a grid of {grid.rows} x {grid.columns}, stride {grid.stride}, padding {grid.padding}, "
+        sensor += f"cells #{_digest(grid.cells)}"
+    edges = np.zeros((0, 2), np.int64) if checkpoint.edges is None else checkpoint.edges
+    ordered = edges[np.lexsort(edges.T[::-1])]
     features = checkpoint.hops.shape[1] // checkpoint.towers
     sizes = [f"{stage.name} {len(stage.bias) // checkpoint.towers}" for stage in checkpoint.dense]
-    return ", ".join([f"{len(checkpoint.hops)} filters of {features} features", *sizes])
-
-
-def _decays(of: Callable[[Checkpoint, int], float]) -> Callable[[Checkpoint], str]:
-    return lambda checkpoint: ", ".join(f"{of(checkpoint, i)!r}" for i in range(1 + len(checkpoint.dense)))
-
-
-def _clocks(checkpoint: Checkpoint) -> str:
-    clocks = checkpoint.dynamics.clocks
-    return f"{clocks.channels} of {clocks.steps} steps" if clocks.channels else "none"
-
-
-def _storage(checkpoint: Checkpoint) -> str:
-    if checkpoint.forms is None:
-        return "none"
-    return ", ".join(f"{form.bits} bits with exponents {list(form.exponents)}" for form in checkpoint.forms)
-
-
-FACTS: Mapping[str, Callable[[Checkpoint], str]] = {
-    "system": lambda checkpoint: checkpoint.system,
-    "sensor": _sensor,
-    "graph": _graph,
-    "classes": lambda checkpoint: str(checkpoint.classes),
-    "layers": _layers,
-    "membrane decays": _decays(lambda checkpoint, layer: checkpoint.dynamics.beta(layer, checkpoint.beta)),
-    "current decays": _decays(lambda checkpoint, layer: checkpoint.dynamics.alpha(layer)),
-    "threshold": lambda checkpoint: repr(checkpoint.theta),
-    "clocks": _clocks,
-    "bins of a step": lambda checkpoint: str(checkpoint.bins),
-    "storage": _storage,
-}
-"""What the networks of a joined one have in common, as text that tells them apart."""
+    layers = range(1 + len(sizes))
+    clocks = dynamics.clocks
+    storage = [f"{form.bits} bits with exponents {list(form.exponents)}" for form in forms or ()]
+    return {
+        "system": checkpoint.system,
+        "sensor": sensor,
+        "graph": f"{len(ordered)} edges #{_digest(ordered)}",
+        "classes": str(checkpoint.classes),
+        "layers": ", ".join([f"{len(checkpoint.hops)} filters of {features} features", *sizes]),
+        "membrane decays": ", ".join(repr(dynamics.beta(layer, checkpoint.beta)) for layer in layers),
+        "current decays": ", ".join(repr(dynamics.alpha(layer)) for layer in layers),
+        "threshold": repr(checkpoint.theta),
+        "clocks": f"{clocks.channels} of {clocks.steps} steps" if clocks.channels else "none",
+        "bins of a step": str(checkpoint.bins),
+        "storage": ", ".join(storage) or "none",
+    }

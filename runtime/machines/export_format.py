@@ -13,20 +13,13 @@ from spikeloom.models.recordings.evtouch import Recordings
 class Request:
     """What a format is written from; options that were not given are None.
 
-    Parameters
-    ----------
-    source, output : str
-        File of the network, and the one to be written.
-    recordings : callable, optional
-        Reads recordings for a network of some classes, taxels and bins of a step, where a format has a use for them.
-    recording : int, optional
-        Which of them.
-    form : str, optional
-        Which form of the format.
-    dt : float, optional
-        Seconds of a step.
-    strict : bool
-        Whether to write nothing that had to be rounded.
+    source, output: file of the network, and the one to be written.
+    recordings: reads recordings for a network of some classes, taxels and bins of a step, where a format has a use
+        for them.
+    recording: which of them.
+    form: which form of the format.
+    dt: seconds of a step.
+    strict: whether to write nothing that had to be rounded.
     """
 
     source: str
@@ -56,14 +49,9 @@ class Export:
 class Format:
     """A format by its name on the command line.
 
-    Parameters
-    ----------
-    name, title : str
-        Value of ``--to``, and what it is.
-    write : callable
-        Raises OptionError and ModelError where the format cannot hold the network.
-    options : tuple of str
-        Options that it takes beside the network.
+    name, title: value of ``--to``, and what it is.
+    write: raises OptionError and ModelError where the format cannot hold the network.
+    options: options that it takes beside the network.
     """
 
     name: str

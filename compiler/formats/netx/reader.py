@@ -51,14 +51,9 @@ OWN = "spikeloom"
 class NetxNetwork:
     """A network, and what was found about the file that it is from.
 
-    Parameters
-    ----------
-    network : IntegerNetwork
-        Integer stage: the numbers of the file.
-    facts : tuple of str
-        What was read and what was assumed, for people.
-    sha256 : str
-        Of the file.
+    network: integer stage: the numbers of the file.
+    facts: what was read and what was assumed, for people.
+    sha256: of the file.
     """
 
     network: IntegerNetwork

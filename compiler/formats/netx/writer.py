@@ -38,26 +38,15 @@ MOST_SHIFT = 8
 class Block:
     """One dense layer of the file, ``dense_rec`` if it hears itself.
 
-    Parameters
-    ----------
-    name : str
-        Layer of the netlist.
-    weight : (neurons, inputs) int64
-        Whole weight steps.
-    own : (neurons, neurons) int64, or None
-        Likewise, from itself.
-    bias : (neurons,) int64
-        Whole weight steps, rounded.
-    threshold, decay_u, decay_v : int
-        Registers.
-    shift : int
-        Power of two that everything was multiplied by.
-    rounded : int
-        Biases that are no whole steps.
-    threshold_rounded : bool
-        Whether the threshold is none.
-    furthest : float
-        Largest change of a bias, in weight steps of the netlist.
+    name: layer of the netlist.
+    weight: (neurons, inputs) int64; whole weight steps.
+    own: (neurons, neurons) int64, or None; likewise, from itself.
+    bias: (neurons,) int64; whole weight steps, rounded.
+    threshold, decay_u, decay_v: registers.
+    shift: power of two that everything was multiplied by.
+    rounded: biases that are no whole steps.
+    threshold_rounded: whether the threshold is none.
+    furthest: largest change of a bias, in weight steps of the netlist.
     """
 
     name: str

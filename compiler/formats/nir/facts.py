@@ -20,18 +20,11 @@ from spikeloom.compiler.ir import Input
 class SpikingNode:
     """A spiking node in steps.
 
-    Parameters
-    ----------
-    node : Node
-        As the file has it.
-    value : Value
-        What it gets, scaled to its membrane.
-    neurons : Neurons
-        Its numbers.
-    groups : list of int64 array
-        Its neurons by their decays.
-    hears_itself : bool
-        Whether it is in a loop.
+    node: as the file has it.
+    value: what it gets, scaled to its membrane.
+    neurons: its numbers.
+    groups: its neurons by their decays.
+    hears_itself: whether it is in a loop.
     """
 
     node: Node

@@ -37,16 +37,10 @@ NESTING = 8
 class Node:
     """A node that is no graph.
 
-    Parameters
-    ----------
-    name : str
-        With the names of the graphs that it is in, ``a.b``.
-    type : str
-        ``LIF`` …
-    values : Tree
-        Its parameters.
-    metadata : Tree
-        What it says beside them.
+    name: with the names of the graphs that it is in, ``a.b``.
+    type: ``LIF`` …
+    values: its parameters.
+    metadata: what it says beside them.
     """
 
     name: str
@@ -112,18 +106,11 @@ class Node:
 class Graph:
     """Nodes by name, pairs of names, and what the file says about itself.
 
-    Parameters
-    ----------
-    nodes : mapping of str to Node
-        No graphs; of Input and Output one each.
-    edges : tuple of (str, str)
-        From, to.
-    version : str
-        Of the format.
-    metadata : Tree
-        Of the whole.
-    sha256 : str
-        Of the file.
+    nodes: no graphs; of Input and Output one each.
+    edges: tuple of (str, str); from, to.
+    version: of the format.
+    metadata: of the whole.
+    sha256: of the file.
     """
 
     nodes: Mapping[str, Node]

@@ -36,12 +36,8 @@ SPIKING = ("CubaLIF", "IF", "LIF", "Threshold")
 class Steps:
     """How time constants become decays.
 
-    Parameters
-    ----------
-    dt : float
-        Seconds of a step.
-    convention : {"euler", "exponential"}
-        See the module.
+    dt: seconds of a step.
+    convention: {"euler", "exponential"}; see the module.
     """
 
     dt: float

@@ -39,16 +39,10 @@ AXES, ELEMENTS = 8, 2**20
 class NirNetwork:
     """A network, and what was found about the file that it is from.
 
-    Parameters
-    ----------
-    network : Network
-        Float stage, in float64.
-    facts : tuple of str
-        What was read and what was assumed, for people.
-    sha256 : str
-        Of the file.
-    steps : Steps
-        How time constants were read.
+    network: float stage, in float64.
+    facts: what was read and what was assumed, for people.
+    sha256: of the file.
+    steps: how time constants were read.
     """
 
     network: Network

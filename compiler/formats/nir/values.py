@@ -18,18 +18,11 @@ from spikeloom.compiler.ir import Sparse
 class Value:
     """``f + bias`` with ``f <- alpha * f + (sum of terms) + held`` in every step.
 
-    Parameters
-    ----------
-    shape : tuple of int
-        Of one step; its elements lie flat in C order.
-    terms : mapping of int to csr_array (size, neurons of the source)
-        Weights of the spikes of each source.
-    bias : (size,) float64
-        What is added past the filter.
-    alpha : float
-        Share of the current that a step keeps; 0 without a filter.
-    held : (size,) float64
-        What flows into the filter in every step; zero without one.
+    shape: of one step; its elements lie flat in C order.
+    terms: mapping of int to csr_array (size, neurons of the source); weights of the spikes of each source.
+    bias: (size,) float64; what is added past the filter.
+    alpha: share of the current that a step keeps; 0 without a filter.
+    held: (size,) float64; what flows into the filter in every step; zero without one.
     """
 
     shape: tuple[int, ...]

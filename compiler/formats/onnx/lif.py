@@ -40,25 +40,15 @@ RESET = (
 class Neurons:
     """A layer in one step.
 
-    Parameters
-    ----------
-    membrane : int
-        Atom.
-    node : str
-        Operator that makes the membrane.
-    previous : int or None
-        Atom of the membrane, or of the state input, that it comes from.
-    gate : int or None
-        State input that holds the spikes of the step before, where there is one.
-    spike : int
-        Atom of its spikes.
-    beta, theta : float
-        Decay and threshold; no decay in a first step that starts at zero.
-    strict : bool
-        Fires above the threshold; else at it, too.
-    current : mapping of int to csr_array
-        What else it is made of, by atom.
-    bias : (neurons,) float64
+    membrane: atom.
+    node: operator that makes the membrane.
+    previous: atom of the membrane, or of the state input, that it comes from.
+    gate: state input that holds the spikes of the step before, where there is one.
+    spike: atom of its spikes.
+    beta, theta: decay and threshold; no decay in a first step that starts at zero.
+    strict: fires above the threshold; else at it, too.
+    current: what else it is made of, by atom.
+    bias: (neurons,) float64
     """
 
     membrane: int

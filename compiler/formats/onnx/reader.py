@@ -40,16 +40,10 @@ OPEN_STEPS = 3
 class OnnxNetwork:
     """A network, and what was found about the file that it is from.
 
-    Parameters
-    ----------
-    network : Network
-        Float stage, in float64.
-    steps : int
-        Steps that the file holds; 1 where state goes in and out.
-    facts : tuple of str
-        What was read and what was assumed, for people.
-    sha256 : str
-        Of the file and of its external data.
+    network: float stage, in float64.
+    steps: steps that the file holds; 1 where state goes in and out.
+    facts: what was read and what was assumed, for people.
+    sha256: of the file and of its external data.
     """
 
     network: Network

@@ -20,18 +20,13 @@ from spikeloom.compiler.ir import INPUT, Sparse
 class Unrolled:
     """Layers, each with its neurons in every step.
 
-    Parameters
-    ----------
-    layers : list of list of Neurons
-        By layer, then step; one step where state goes in and out of the graph.
-    data : int
-        Atom of the input that brings the events.
-    shape : tuple of int
-        Of that input in one step.
-    sources : list of mapping of int to csr_array
-        Stages into each layer by the place of the source or ``INPUT``; columns of the input are flat positions in it.
-    bias : list of (neurons,) float64
-    beta, theta : list of float
+    layers: by layer, then step; one step where state goes in and out of the graph.
+    data: atom of the input that brings the events.
+    shape: of that input in one step.
+    sources: stages into each layer by the place of the source or ``INPUT``; columns of the input are flat
+        positions in it.
+    bias: list of (neurons,) float64
+    beta, theta: list of float
     """
 
     layers: list[list[Neurons]]

@@ -40,20 +40,12 @@ INPUT_ATOM, MEMBRANE, SPIKE, PRODUCT = "input", "membrane", "spike", "product"
 class Atom:
     """Something that varies.
 
-    Parameters
-    ----------
-    kind : str
-        One of the four kinds.
-    label : str
-        Name of the value in the file, for messages.
-    eye : csr_array (size, size)
-        Its own coefficients.
-    binary : bool
-        Whether it is zeros and ones.
-    of : tuple of int
-        The two factors of a product; the point of a spike.
-    strict : bool
-        Of a spike: fires above the threshold, not at it.
+    kind: one of the four kinds.
+    label: name of the value in the file, for messages.
+    eye: csr_array (size, size); its own coefficients.
+    binary: whether it is zeros and ones.
+    of: the two factors of a product; the point of a spike.
+    strict: of a spike: fires above the threshold, not at it.
     """
 
     kind: str
@@ -73,12 +65,9 @@ class Atom:
 class Affine:
     """``sum_a terms[a] @ atom_a + bias``.
 
-    Parameters
-    ----------
-    shape : tuple of int
-        Of the tensor; everything else is flat.
-    terms : dict of int to csr_array (size, size of the atom)
-    bias : (size,) float64
+    shape: of the tensor; everything else is flat.
+    terms: dict of int to csr_array (size, size of the atom)
+    bias: (size,) float64
     """
 
     shape: tuple[int, ...]
@@ -90,11 +79,8 @@ class Affine:
 class Decision:
     """A value that each element takes by its membrane: below, at and above the threshold.
 
-    Parameters
-    ----------
-    point : int
-        Comparison that decides.
-    values : three arrays of equal shape
+    point: comparison that decides.
+    values: three arrays of equal shape
     """
 
     point: int
@@ -113,13 +99,9 @@ Value = Array | Affine | Decision
 class Point:
     """A comparison of a membrane with a threshold.
 
-    Parameters
-    ----------
-    node : str
-        Where it is, for messages.
-    membrane : int
-        Atom.
-    theta : (size,) float64
+    node: where it is, for messages.
+    membrane: atom.
+    theta: (size,) float64
     """
 
     node: str

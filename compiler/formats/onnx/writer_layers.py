@@ -38,12 +38,9 @@ Digit = tuple[npt.NDArray[np.int8], IntArray]
 class Source:
     """What a layer hears from another one, or from the input.
 
-    Parameters
-    ----------
-    pre : int
-        Index into ``netlist.layers``, or ``INPUT``.
-    positive, negative : (neurons of the source, neurons) int64
-        Sums of its positive and of its negative effective weights, as magnitudes.
+    pre: index into ``netlist.layers``, or ``INPUT``.
+    positive, negative: (neurons of the source, neurons) int64; sums of its positive and of its negative effective
+        weights, as magnitudes.
     """
 
     pre: int
@@ -59,30 +56,17 @@ class Source:
 class Layer:
     """One population as the graph computes it; arrays have an entry per compartment, ordered by neuron.
 
-    Parameters
-    ----------
-    index : int
-        Index into ``netlist.layers``.
-    name : str
-        Unique, without dots.
-    ids : (n,) int64
-        Compartments.
-    depth : int
-        Steps that it lags behind the data.
-    sources : tuple of Source
-        What it hears.
-    decay_u, decay_v, threshold, bias : (n,) int64
-        Registers; thresholds and biases in membrane units.
-    label : (n,) int64
-        Class of a vote, -1 for none.
-    remembers : bool
-        Whether a current outlasts its step.
-    checked : bool
-        Whether some input could make the synaptic sum or the current overflow.
-    saturates : bool
-        Whether some input could bring the membrane to the end of its register.
-    kind : type
-        int32 where no input brings any product or sum beyond it, int64 otherwise.
+    index: index into ``netlist.layers``.
+    name: unique, without dots.
+    ids: (n,) int64; compartments.
+    depth: steps that it lags behind the data.
+    sources: what it hears.
+    decay_u, decay_v, threshold, bias: (n,) int64; registers; thresholds and biases in membrane units.
+    label: (n,) int64; class of a vote, -1 for none.
+    remembers: whether a current outlasts its step.
+    checked: whether some input could make the synaptic sum or the current overflow.
+    saturates: whether some input could bring the membrane to the end of its register.
+    kind: int32 where no input brings any product or sum beyond it, int64 otherwise.
     """
 
     index: int

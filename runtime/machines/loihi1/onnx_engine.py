@@ -35,18 +35,11 @@ Runs = list[tuple[slice, slice]]
 class OnnxEngine:
     """A netlist in onnxruntime, made by :func:`prepare`.
 
-    Parameters
-    ----------
-    netlist : Netlist
-        What it was made from.
-    layers : tuple of Layer
-        Its layers, as the graph has them.
-    form : {"step", "scan"}
-        Of the graph.
-    session : onnxruntime.InferenceSession
-        The graph, loaded.
-    runs : mapping of str to Runs
-        Compartments of each layer, by its name.
+    netlist: what it was made from.
+    layers: its layers, as the graph has them.
+    form: {"step", "scan"}; of the graph.
+    session: the graph, loaded.
+    runs: compartments of each layer, by its name.
     """
 
     netlist: Netlist
@@ -60,14 +53,10 @@ class OnnxEngine:
 class OnnxTrace:
     """What it did.
 
-    Parameters
-    ----------
-    spikes : (recordings, chip steps, compartments) bool
-        As in :class:`trace.Trace`.
-    votes : (recordings, classes) int64
-        Spikes of the read-out, as the graph counts them.
-    membranes : (recordings, chip steps, compartments) int32, or None
-        After the reset: zero where a compartment spiked or its window is closed. Form ``step`` only.
+    spikes: (recordings, chip steps, compartments) bool; as in :class:`trace.Trace`.
+    votes: (recordings, classes) int64; spikes of the read-out, as the graph counts them.
+    membranes: (recordings, chip steps, compartments) int32, or None; after the reset: zero where a compartment
+        spiked or its window is closed. Form ``step`` only.
     """
 
     spikes: BoolArray
