@@ -84,7 +84,7 @@ def breakdowns(
 
 
 def _fallen(name: str, before: IntArray, after: IntArray, ids: IntArray) -> list[Breakdown]:
-    """Layers and neurons that only one side hears from."""
+    """Layers and neurons that fire on one side only."""
     total = int(before.sum())
     if total >= OFTEN and not after.any():
         text = f"{name} never fires on the chip; it fires {total:,} times in the float model"

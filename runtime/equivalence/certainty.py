@@ -47,7 +47,7 @@ class _Layer:
     Parameters
     ----------
     weight : (n_pre, n_post) float64
-        As expanded; a row for each neuron of the sources, then one for each of its own where it hears itself.
+        As expanded; a row for each neuron of the sources, then one for each of its own where it is recurrent.
     magnitude : (n_pre, n_post) float32
         Sum of the magnitudes of all products that make up a weight.
     bias : (n_post,) float64
@@ -268,7 +268,7 @@ def _recurrence(
 def _spikes(layer: _Layer, certain: BoolArray, open_: BoolArray | None) -> tuple[BoolArray, BoolArray]:
     """Certain and uncertain spikes of a layer from those of its sources."""
     if layer.own:
-        return _spikes_of_itself(layer, certain, np.zeros_like(certain) if open_ is None else open_)
+        return _recurrent_spikes(layer, certain, np.zeros_like(certain) if open_ is None else open_)
     centre, radius = _sums(layer, certain, open_)
     if layer.alpha:
         _outlast(layer, centre, radius)
@@ -276,8 +276,8 @@ def _spikes(layer: _Layer, certain: BoolArray, open_: BoolArray | None) -> tuple
     return _recurrence(layer.beta, layer.theta, centre, radius)
 
 
-def _spikes_of_itself(layer: _Layer, certain: BoolArray, open_: BoolArray) -> tuple[BoolArray, BoolArray]:
-    """The same of a layer that hears itself, one step at a time: what was uncertain in one is so in the next."""
+def _recurrent_spikes(layer: _Layer, certain: BoolArray, open_: BoolArray) -> tuple[BoolArray, BoolArray]:
+    """The same of a recurrent layer, one step at a time: what was uncertain in one is so in the next."""
     shape = len(certain), certain.shape[1], len(layer.bias)
     fired, doubt = np.zeros(shape, np.bool_), np.zeros(shape, np.bool_)
     membranes = _Membranes(layer.beta, layer.theta, shape[::2])

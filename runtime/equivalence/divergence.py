@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from spikeloom.compiler import Netlist
 from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT
 from spikeloom.compiler.interpret import BoolArray
-from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.trace import aligned, comparable
 
@@ -95,7 +95,7 @@ def first_divergence(
     ill_posed = bool(wide[index][sample, step, neuron] != reference[index][sample, step, neuron])
     neuron = int(np.arange(layer.neurons)[comparable(netlist, index)][neuron])
     trace = engine.simulate(prepared, events[sample : sample + 1], membranes=True)
-    assert trace.membranes is not None, "membranes were asked for"
+    assert trace.membranes is not None, "membranes were wanted"
     register = int(aligned(netlist, trace.membranes, index)[0, step, neuron])
     ids = netlist.compartments_of(index)
     held = ids[netlist.neuron[ids] == neuron]  # empty where the chip leaves the neuron out, which then stays at zero

@@ -22,10 +22,10 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
+from spikeloom.compiler import Netlist
 from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.interpret import DENORMAL
 from spikeloom.compiler.ir import INPUT, Network, Projection
-from spikeloom.compiler.targets.loihi1.netlist import Netlist
 
 Floats = npt.NDArray[np.float32]
 Words = npt.NDArray[np.uint64]
@@ -65,9 +65,9 @@ class Layer:
     Parameters
     ----------
     pres : tuple of int
-        Other populations that it hears, ``INPUT`` for the input; their neurons are numbered one after the other.
+        Other presynaptic populations, ``INPUT`` for the input; their neurons are numbered one after the other.
     runs, own : Runs
-        Weights from these, and from itself; the latter without a source if it does not hear itself.
+        Weights from these, and from itself; the latter without a source if it is not recurrent.
     bias : (neurons,) float32
     beta, theta, alpha : float
     depth, late : int
@@ -75,8 +75,8 @@ class Layer:
         cost it as many steps of its input.
     seat : (neurons,) int64
         Compartment of each neuron, or ``NOWHERE``.
-    heard : (neurons,) bool
-        Neurons that are compared with the chip's: all but those left out because nobody hears them.
+    compared : (neurons,) bool
+        Neurons that are compared with the chip's: all but those that it omits because no neuron receives them.
     """
 
     pres: tuple[int, ...]
@@ -89,7 +89,7 @@ class Layer:
     depth: int
     late: int
     seat: IntArray
-    heard: npt.NDArray[np.bool_]
+    compared: npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -133,10 +133,10 @@ def prepare(network: Network, netlist: Netlist) -> FloatEngine:
         itself = [p for p in network.projections if p.post == post == p.pre]
         pres = tuple(dict.fromkeys(projection.pre for projection in into))
         sizes = {pre: network.input.size if pre == INPUT else network.populations[pre].size for pre in pres}
-        seat, heard = np.full(population.size, NOWHERE), np.ones(population.size, np.bool_)
+        seat, compared = np.full(population.size, NOWHERE), np.ones(population.size, np.bool_)
         ids = netlist.compartments_of(post)
         seat[netlist.neuron[ids]] = ids
-        heard[list(netlist.layers[post].unheard)] = False
+        compared[list(netlist.layers[post].unheard)] = False
         before = max((-1 if pre == INPUT else depth[pre] for pre in pres), default=-1)
         layers.append(
             Layer(
@@ -150,7 +150,7 @@ def prepare(network: Network, netlist: Netlist) -> FloatEngine:
                 depth=depth[post],
                 late=depth[post] - before - 1,
                 seat=seat,
-                heard=heard,
+                compared=compared,
             )
         )
     return FloatEngine(
@@ -230,7 +230,7 @@ def _one(engine: FloatEngine, inputs: npt.NDArray[np.uint8], begin: int, found: 
     sent = {INPUT: _events(inputs)}
     widths = [len(layer.bias) for layer in engine.layers]
     for number, layer in enumerate(engine.layers):
-        source, bounds = _heard(layer.pres, sent, {INPUT: engine.inputs} | dict(enumerate(widths)))
+        source, bounds = _arrivals(layer.pres, sent, {INPUT: engine.inputs} | dict(enumerate(widths)))
         counts = np.zeros(widths[number], np.int64)
         sent[number] = _integrate_layer(
             source,
@@ -247,16 +247,16 @@ def _one(engine: FloatEngine, inputs: npt.NDArray[np.uint8], begin: int, found: 
             begin,
             counts,
         )
-        found.spikes[index, number] = counts[layer.heard].sum()
-        found.elsewhere[index, number] = counts[layer.heard & (layer.seat == NOWHERE)].sum()
+        found.spikes[index, number] = counts[layer.compared].sum()
+        found.elsewhere[index, number] = counts[layer.compared & (layer.seat == NOWHERE)].sum()
         if number == engine.voters:
             np.add.at(found.votes[index], engine.label, counts)
 
 
-def _heard(
+def _arrivals(
     pres: tuple[int, ...], sent: dict[int, tuple[AnyArray, IntArray]], sizes: dict[int, int]
 ) -> tuple[AnyArray, IntArray]:
-    """What a layer hears, step after step; of several populations, one after the other."""
+    """Spikes that reach a layer, step after step; of several populations, one after the other."""
     if len(pres) == 1:
         return sent[pres[0]]
     firsts = np.cumsum([0, *(sizes[pre] for pre in pres)]).tolist()

@@ -76,15 +76,15 @@ def _rows_scaled(weight: Sparse, factor: FloatArray) -> Sparse:
 
 
 def rungs(
-    network: Network, integer: IntegerNetwork, inputs: BoolArray, tell: Callable[[str], None]
+    network: Network, integer: IntegerNetwork, inputs: BoolArray, begin: Callable[[str], None]
 ) -> Iterator[tuple[str, tuple[BoolArray, ...] | None]]:
     """Spikes of the rungs between float64 and the chip; None for one that is proven to be the chip itself."""
     for stage, rung in zip(LADDER[1:4], realised(network, integer), strict=True):
-        tell(f"ladder: {stage}")
+        begin(f"ladder: {stage}")
         yield stage, run_float(rung, inputs).spikes
     if all(proof.holds for proof in prove_ranges(integer)):
-        tell("ladder: proven")  # no register leaves its range on any input: without limits the chip is the same
+        begin("ladder: proven")  # no register leaves its range on any input: without limits the chip is the same
         yield "rounding", None
     else:
-        tell("ladder: rounding")
+        begin("ladder: rounding")
         yield "rounding", run_integer(integer, inputs, saturates=False).spikes

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from spikeloom.compiler import Netlist
 from spikeloom.compiler.fixedpoint import IntArray
-from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.runtime.machines.loihi1 import onnx_engine
 from spikeloom.runtime.machines.loihi1.engine import EventArray
 from spikeloom.runtime.machines.loihi1.onnx_engine import OnnxEngine
@@ -58,7 +58,7 @@ def as_specified(check: Check, events: Sequence[EventArray], specified: Sequence
         assert expected.spikes is not None, "the specification keeps spikes"
         assert expected.membranes is not None, "the specification keeps membranes"
         found = onnx_engine.simulate(check.step, recording[None], membranes=True)
-        assert found.membranes is not None, "membranes were asked for"
+        assert found.membranes is not None, "membranes were wanted"
         votes = [expected.counts.spikes[netlist.readout_class == label].sum() for label in range(netlist.classes)]
         same = (
             np.array_equal(found.spikes[0], expected.spikes)

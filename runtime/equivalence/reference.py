@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from spikeloom.compiler import Netlist
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.dynamics import Clocks
 from spikeloom.compiler.errors import ModelError
@@ -12,7 +13,6 @@ from spikeloom.compiler.fixedpoint import FloatArray
 from spikeloom.compiler.interpret import BoolArray, channels_last, run_float
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.targets.loihi1.netlist import Netlist
 
 
 def require_match(netlist: Netlist, model: Checkpoint | Network) -> None:
@@ -67,7 +67,7 @@ def membranes_of(
     if isinstance(model, Network):
         inputs = channels_last(events, model.input.clocks)
         kept = run_float(model, inputs, dtype=np.float32, membranes=True).membranes
-        assert kept is not None, "membranes were asked for"
+        assert kept is not None, "membranes were wanted"
         return list(kept)
     assert adjacency is not None, "a checkpoint has a graph"
     return list(float_membranes(model, adjacency, events).values())

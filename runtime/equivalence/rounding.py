@@ -21,12 +21,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
+from spikeloom.compiler import Netlist
 from spikeloom.compiler.fixedpoint import BIAS_EXPONENT_MAX, BIAS_MANTISSA_MAX, MEMBRANE_SHIFT, encode_bias
 from spikeloom.compiler.interpret import BoolArray
 from spikeloom.compiler.ir import INPUT, IntegerNetwork, Network, Sparse
 from spikeloom.compiler.passes.prune import never_fires
 from spikeloom.compiler.targets.base import load_target
-from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import decay_registers, reach, step_units
 
 SLACK = 1 + 1e-9

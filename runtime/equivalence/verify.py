@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler import lift
+from spikeloom.compiler import Netlist, lift
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import DataError
@@ -20,7 +20,6 @@ from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.interpret import BoolArray, channels_last, cut, vote
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.systems import GRAPH_SYSTEMS
-from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.runtime.equivalence import onnx_check
 from spikeloom.runtime.equivalence.breakdowns import breakdowns
 from spikeloom.runtime.equivalence.certificates import certify
@@ -171,7 +170,7 @@ def verify(
     begin("chip")
     prepared = engine.prepare(netlist)
     trace = engine.simulate(prepared, flat, lengths=lengths, spikes=True)
-    assert trace.spikes is not None, "spikes were asked for"
+    assert trace.spikes is not None, "spikes were wanted"
     chip = [aligned(netlist, trace.spikes, layer)[..., keep] for layer, keep in enumerate(kept)]
 
     quantised_different = None

@@ -12,12 +12,10 @@ from difflib import get_close_matches
 
 import numpy as np
 
-from spikeloom.compiler import lift
+from spikeloom.compiler import Netlist, lift, read_netlist
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.interpret import channels_last
 from spikeloom.compiler.systems import GRAPH_SYSTEMS
-from spikeloom.compiler.targets.loihi1.netlist import Netlist
-from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.commands.options import add_network, add_recordings
 from spikeloom.runtime.equivalence.explanation.causes import Explanation, explain, observe

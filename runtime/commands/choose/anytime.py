@@ -7,13 +7,12 @@ import json
 
 import numpy as np
 
+from spikeloom.compiler import Netlist, read_netlist
 from spikeloom.compiler.atomic import write_atomically
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.targets.base import load_target
-from spikeloom.compiler.targets.loihi1.netlist import Netlist
-from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.commands.options import add_network, add_recordings
 from spikeloom.runtime.inputs.files import require_place

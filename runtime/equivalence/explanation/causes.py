@@ -17,11 +17,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from spikeloom.compiler import Netlist
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT, FloatArray, IntArray
 from spikeloom.compiler.interpret import Activity, BoolArray, run_float, step_late
 from spikeloom.compiler.ir import INPUT, IntegerNetwork, Network
-from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.runtime.equivalence.explanation.deviations import (
     LEFT_OUT,
     TIE,
@@ -61,8 +61,8 @@ class Observed:
 def observe(netlist: Netlist, prepared: Engine, events: npt.NDArray[np.uint8]) -> Observed:
     """What the simulator shows of one recording, (1, taxels, polarities, steps)."""
     trace = engine.simulate(prepared, with_clocks(events, netlist.clocks), spikes=True, membranes=True)
-    assert trace.spikes is not None, "spikes were asked for"
-    assert trace.membranes is not None, "membranes were asked for"
+    assert trace.spikes is not None, "spikes were wanted"
+    assert trace.membranes is not None, "membranes were wanted"
     layers = range(len(netlist.layers))
     return Observed(
         spikes=tuple(aligned(netlist, trace.spikes, layer)[0] for layer in layers),
@@ -185,7 +185,7 @@ def explain(
             continue
         inputs = []
         for pre in sources_into(network, integer, post):
-            # what the chip does not hold, it has no weights from: the float model's spikes tell what it lacks
+            # what the chip does not hold, it has no weights from: the float model's spikes say what it lacks
             sent = events if pre == INPUT else np.where(absent[pre], truth[pre], observed.spikes[pre])
             inputs.append(step_late(sent[None])[0] if pre == post else sent)
         compensated = rounding is not None and rounding.layers[population.name].compensated
@@ -223,7 +223,7 @@ class _Layer:
         self, roots: list[Root], arrived: FloatArray, ideal: Activity, seen: tuple[BoolArray, IntArray]
     ) -> list[RootCause]:
         """Causes of roots of this population, which are sorted by the length of what they remember."""
-        assert ideal.membranes is not None, "membranes were asked for"
+        assert ideal.membranes is not None, "membranes were wanted"
         rows = np.array([root.neuron for root in roots])
         steps = np.array([root.step for root in roots])
         begins = np.array([root.begin for root in roots])

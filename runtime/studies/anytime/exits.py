@@ -11,8 +11,8 @@ twice. A vote ends early
 
 *Calibration.* A network knows the recordings that it was trained on: their class leads from the start by far, which
 says nothing about others. What remains when the votes of the winner are taken away is a race for second place among
-classes that nobody trained to win here, with leads as narrow and as fickle as those of unknown recordings. Its outcome
-must not change in more than a given share of these races.
+classes that were not trained to win here, with leads as narrow and as fickle as those of unknown recordings. Its
+outcome must not change in more than a given share of these races.
 
 References
 ----------
@@ -91,7 +91,7 @@ def standing(votes: IntArray, lengths: IntArray) -> Standing:
 
 
 def least_interval(netlist: Netlist) -> IntArray:
-    """Least number of steps from one spike to the next of each output neuron, whatever it hears; 0 if it never spikes.
+    """Least number of steps from one spike to the next of each output neuron, whatever its input; 0 if it never spikes.
 
     Returns
     -------
@@ -178,7 +178,7 @@ def live(netlist: Netlist, bins: int, factor: float) -> Callable[[int, IntArray]
     Returns
     -------
     callable
-        Told a chip step, from 0, and the votes (classes,) after it, says whether the grasp may end.
+        Given a chip step, from 0, and the votes (classes,) after it, says whether the grasp may end.
     """
     most, depth = most_votes(netlist, bins), read_out_depth(netlist)
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from spikeloom.compiler import Netlist
 from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.interpret import BoolArray
-from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.models.recordings.eventfiles import UNLABELLED
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.machines.loihi1.costs.cumulative import Cumulative
@@ -139,7 +139,7 @@ class Anytime:
         Index of the rule that saves most with ``identical`` decisions, or with at most ``one_lost``.
     calibrated_on : str or None
     chosen : int or None
-        Index of the rule that was asked for.
+        Index of the rule that the user chose.
     """
 
     samples: int

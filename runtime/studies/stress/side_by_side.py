@@ -140,7 +140,7 @@ def _chip(prepared: engine.Engine, inputs: Inputs, threads: int) -> tuple[Words,
         trace = engine.simulate(
             prepared, inputs.events[part], lengths=inputs.lengths[part], packed=True, threads=threads
         )
-        assert trace.packed is not None, "spikes were asked for"
+        assert trace.packed is not None, "spikes were wanted"
         return trace.packed, trace.counts.saturations.sum(axis=1)
 
     stopped = np.zeros(len(inputs.events), np.bool_)

@@ -82,7 +82,7 @@ def votes_of(netlist: Netlist, events: engine.EventArray, lengths: IntArray) -> 
     """
     prepared = engine.prepare(netlist, charges=vote_charges(netlist))
     trace = engine.simulate(prepared, events, lengths=lengths)
-    assert trace.charged is not None, "votes were asked for"
+    assert trace.charged is not None, "votes were wanted"
     return _aligned(netlist, np.cumsum(trace.charged, axis=1), events.shape[2])
 
 
@@ -118,7 +118,7 @@ def run(netlist: Netlist, target: Target, events: engine.EventArray, lengths: In
     parts = [vote_charges(netlist), _event_charges(meter), *(simple_times.charges(clock) for clock in clocks)]
     prepared = engine.prepare(netlist, charges=simple_times.side_by_side(parts))
     trace = engine.simulate(prepared, events, lengths=lengths)
-    assert trace.charged is not None, "sums were asked for"
+    assert trace.charged is not None, "sums were wanted"
     ends = np.cumsum([part.spikes.shape[1] for part in parts])[:-1]
     votes, happened, *times = np.split(trace.charged, ends, axis=2)
     chip_steps = lengths + netlist.max_depth

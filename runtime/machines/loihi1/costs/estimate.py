@@ -1,4 +1,4 @@
-"""What a run costs, as deep as it was asked for: spikes alone, events and simple times, or every message of every step.
+"""What a run costs, as deep as wanted: spikes alone, events and simple times, or every message of every step.
 
 ==========  ==========================================================================================================
 ``spikes``  decisions only
@@ -86,7 +86,7 @@ def estimate(
     spikes : (samples, chip steps, compartments) bool, optional
         Array to fill, see :class:`trace.Trace`.
     progress : callable, optional
-        Told the number of recordings that are done.
+        Called with the number of recordings that are done.
 
     Raises
     ------
@@ -161,15 +161,15 @@ def _deep(
     for first in range(0, len(events), PART):
         part = slice(first, first + PART)
         trace = engine.simulate(prepared, events[part], lengths=steps[part], spikes=True, updated=True)
-        assert trace.spikes is not None, "spikes were asked for"
-        assert trace.updated is not None, "updates were asked for"
+        assert trace.spikes is not None, "spikes were wanted"
+        assert trace.updated is not None, "updates were wanted"
         counts.append(trace.counts)
         charged += [] if trace.charged is None else [trace.charged]
         updates.append(energy.updates_by_core(prepared.netlist, trace.updated))
         own = steps[part] + prepared.drain
-        heard = events[part] * (np.arange(events.shape[2]) < steps[part, None, None])  # nothing after a recording's end
+        given = events[part] * (np.arange(events.shape[2]) < steps[part, None, None])  # nothing after a recording's end
         for name, clock in clocks.items():
-            found[name].append(timing.detailed(clock, trace.spikes, trace.updated, heard, steps=own))
+            found[name].append(timing.detailed(clock, trace.spikes, trace.updated, given, steps=own))
         if spikes is not None:
             spikes[part] = trace.spikes
         if progress is not None:
