@@ -24,9 +24,10 @@ from spikeloom.compiler.systems import GRAPH_SYSTEMS, MLP
 from spikeloom.models.graphs import NEUTOUCH
 from spikeloom.models.recordings.events import BIN_S
 from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.models.training.kinds import kind_of, seen_by
 from spikeloom.models.training.train import train
 from spikeloom.runtime.cli import build_parser
-from spikeloom.runtime.commands.training.train import both_splits, planned
+from spikeloom.runtime.commands.training.train import both_splits, plan_jobs
 
 ORDERS = ("shuffled", "fixed", "listed")
 
@@ -58,7 +59,7 @@ def main() -> None:
             words = ["train", "--data", asked.recordings, "--system", asked.system, "--graph", "manual"]
             words = words if asked.system in GRAPH_SYSTEMS else words[:5]
             words += ["--seed", str(seed), "--epochs", str(asked.epochs), "-o", "none.pt"]
-            (job,) = planned(build_parser().parse_args(words), training, test)
+            (job,) = plan_jobs(build_parser().parse_args(words), training, test)
             order = order_of(kind, training, seed)
             with patch(
                 "numpy.random.default_rng", np.random.default_rng if order is None else lambda _seed, o=order: o
@@ -66,11 +67,11 @@ def main() -> None:
                 trained = train(
                     training,
                     test,
-                    job.propagation(),
-                    job.architecture(),
+                    seen_by(job.plan),
+                    kind_of(job.plan.system).architecture(job.plan),
                     epochs=job.epochs,
                     seed=seed,
-                    recipe=job.recipe,
+                    recipe=job.plan.recipe,
                 )
             right = [epoch.correct for epoch in trained.history]
             runs.append(

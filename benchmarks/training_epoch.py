@@ -28,7 +28,8 @@ from spikeloom.models.graphs import Graph, build_graph, normalised_adjacency
 from spikeloom.models.networks.networks import Architecture, SpikingNet
 from spikeloom.models.recordings.evtouch import Recordings, load_recordings
 from spikeloom.models.systems import HOPS, PADDINGS, filters_of, propagation_of, sensor_grid
-from spikeloom.models.training.train import Epoch, rate_loss, train
+from spikeloom.models.training.evaluate import rate_loss
+from spikeloom.models.training.train import Epoch, train
 
 TURNS, STEPS = 5, 6
 RATE = 1e-3

@@ -19,10 +19,11 @@ from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.formats.checkpoint import SIZE_LIMIT, read_checkpoint
 from spikeloom.compiler.formats.checkpoint_file import content_digest
 from spikeloom.models.graphs import Graph
-from spikeloom.models.networks.checkpoint import checkpoint_bytes, save_checkpoint, training_record
+from spikeloom.models.networks.checkpoint import checkpoint_bytes, save_checkpoint
 from spikeloom.models.networks.networks import Architecture
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.training.protocols import Reported
+from spikeloom.models.training.record import training_record
 from spikeloom.models.training.train import Epoch, Trained
 
 TAXELS, FEATURES, HOPS, SIZES, CLASSES = 6, 4, 3, (5, 7), 3
@@ -546,7 +547,7 @@ def test_training_record_tells_how_to_repeat_it():
         split="train",
         source="x.zip",
     )
-    record = training_record(reported, split, split, command="spikeloom train", seed=7)
+    record = training_record(reported, split, split, command="spikeloom train", seed=7).to_json()
     last = {"epoch": 2, "correct": 2, "accuracy": 0.5}
     assert record["last"] == last | {"chosen_on": "nothing"}
     assert record["best"] == {"epoch": 1, "correct": 3, "accuracy": 0.75, "chosen_on": "the test split"}

@@ -23,8 +23,9 @@ from spikeloom.models.networks.reference import float_membranes, float_spikes
 from spikeloom.models.networks.surrogate import FAST_SIGMOID, RECTANGLE, Surrogate
 from spikeloom.models.recordings.grasps import synthetic_grasps
 from spikeloom.models.recordings.release import write_released
+from spikeloom.models.training.evaluate import evaluate
 from spikeloom.models.training.recipes import RECIPES, RELEASED, TIMED, Recipe, check_recipe, decays_asked
-from spikeloom.models.training.train import evaluate, train
+from spikeloom.models.training.train import train
 from spikeloom.runtime.cli import main
 
 ADJACENCY = normalised_adjacency(GRAPH.edges, 39)

@@ -158,7 +158,7 @@ def test_a_fine_tuned_checkpoint_brings_its_own_storage(tmp_path):
             )
         assert str(caught.value) == (
             "compile: the checkpoint was fine-tuned for its own storage; omit --weight-bits, --planes, "
-            "--scale-groups, --spike-exact and --ranges away"
+            "--scale-groups, --spike-exact and --ranges"
         )
 
 
@@ -349,7 +349,7 @@ def test_what_cannot_be_fine_tuned(refusal, tmp_path, capsys):
         "--weight-bits four: not a number; give one, or one for each layer as in 8,4,4,8"
     )
     assert refusal("pretrained:grasps", "--weight-bits", "4", "--resume") == (
-        f"--resume: {tmp_path / 'out.pt.state'} does not exist, so nothing was interrupted; leave --resume away"
+        f"--resume: {tmp_path / 'out.pt.state'} does not exist, so nothing was interrupted; omit --resume"
     )
     (tmp_path / "out.pt.state").write_bytes(b"")
     assert refusal("pretrained:grasps", "--weight-bits", "4") == (

@@ -37,8 +37,9 @@ from spikeloom.models.systems import (
     taxels_alone,
     with_self_loops,
 )
+from spikeloom.models.training.evaluate import evaluate
 from spikeloom.models.training.finetune import finetune
-from spikeloom.models.training.train import evaluate, train
+from spikeloom.models.training.train import train
 from spikeloom.runtime.cli import main
 from spikeloom.runtime.equivalence.verify import verify
 

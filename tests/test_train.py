@@ -13,14 +13,16 @@ from numpy.testing import assert_allclose, assert_array_equal
 import spikeloom.models.training.train
 from spikeloom.compiler.errors import DataError, ModelError, OptionError
 from spikeloom.models.graphs import build_graph, normalised_adjacency
-from spikeloom.models.networks.checkpoint import checkpoint_bytes, training_record
+from spikeloom.models.networks.checkpoint import checkpoint_bytes
 from spikeloom.models.networks.networks import Architecture, SpikingNet
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.recordings.grasps import synthetic_grasps
+from spikeloom.models.training.evaluate import evaluate
 from spikeloom.models.training.protocols import state_files, train_both, validation_split
 from spikeloom.models.training.recipes import RELEASED, Recipe
+from spikeloom.models.training.record import training_record
 from spikeloom.models.training.schedule import DECAY_EPOCHS
-from spikeloom.models.training.train import Epoch, evaluate, train
+from spikeloom.models.training.train import Epoch, train
 
 GRAPH = build_graph("manual")
 ADJACENCY = normalised_adjacency(GRAPH.edges, 39)
@@ -34,7 +36,7 @@ def grasps(seed: int, per_class: int = 2, steps: int = 30) -> Recordings:
 def file_bytes(**options: object) -> bytes:
     training, test = grasps(0), grasps(1)
     reported = train_both(training, test, ADJACENCY, SMALL, **{"epochs": 1, "seed": 3} | options)
-    record = training_record(reported, training, test, command="spikeloom train", seed=3)
+    record = training_record(reported, training, test, command="spikeloom train", seed=3).to_json()
     trained = reported.trained
     return checkpoint_bytes(
         {"last": trained.last, "best": trained.best, "clean": trained.kept},
@@ -185,7 +187,7 @@ def test_recordings_that_the_network_was_not_made_for():
 
 def test_history_can_be_stored_as_json():
     reported = train_both(grasps(0), grasps(1), ADJACENCY, SMALL, epochs=1, seed=0)
-    record = training_record(reported, grasps(0), grasps(1), command="spikeloom train", seed=0)
+    record = training_record(reported, grasps(0), grasps(1), command="spikeloom train", seed=0).to_json()
     assert json.loads(json.dumps(record, allow_nan=False)) == record
     assert record["last"]["correct"] == reported.trained.history[-1].correct
 
@@ -304,7 +306,7 @@ def test_a_loss_that_is_no_number_stops_and_keeps_the_state(tmp_path, monkeypatc
     train(grasps(0), grasps(1), ADJACENCY, SMALL, epochs=1, state=state)
     kept = state.read_bytes()
     steps = iter((1.0, float("nan")))
-    monkeypatch.setattr(spikeloom.models.training.train, "rate_loss", lambda rates, _: rates.sum() * next(steps))
+    monkeypatch.setattr("spikeloom.models.training.evaluate.rate_loss", lambda rates, _: rates.sum() * next(steps))
     with pytest.raises(DataError) as stopped:
         train(grasps(0), grasps(1), ADJACENCY, SMALL, epochs=1, seed=1, state=state)
     assert str(stopped.value) == (

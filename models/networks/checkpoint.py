@@ -11,58 +11,17 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import torch
 
 from spikeloom.compiler.atomic import write_atomically
 from spikeloom.compiler.dynamics import PLAIN, Dynamics
 from spikeloom.compiler.ir import Form
 from spikeloom.compiler.formats.checkpoint_file import FORMAT, VERSION, content_digest
 from spikeloom.compiler.systems import TACTILESGNET, Grid
-from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.graphs import Graph
-from spikeloom.models.training.protocols import Reported, data_digest
 
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 
 Tensors = Mapping[str, npt.NDArray[np.float32]]
-
-
-CHOSEN_ON = {"last": "nothing", "best": "the test split", "clean": "a part of the training split"}
-"""What decided which epoch the weights of a set are from."""
-
-
-def training_record(
-    reported: Reported, training: Recordings, test: Recordings, *, command: str, seed: int
-) -> dict[str, Any]:
-    """Everything needed to repeat a training, and what it reached by both protocols; JSON values only.
-
-    The best epoch is chosen on the test split, as the published figures are; the clean one on a part of the training
-    split; the last one is not chosen at all.
-    """
-    history = reported.trained.history
-    chosen = {"last": len(history), "best": reported.trained.best_epoch, "clean": reported.clean_epoch}
-    validation = reported.validation.history[reported.clean_epoch - 1]
-    return {
-        "command": command,
-        "seed": seed,
-        "epochs": len(history),
-        "data": training.source,
-        "data_sha256": data_digest(training, test),
-        "test_samples": len(test),
-        **{
-            name: {
-                "epoch": epoch,
-                "correct": history[epoch - 1].correct,
-                "accuracy": history[epoch - 1].accuracy,
-                "chosen_on": CHOSEN_ON[name],
-            }
-            for name, epoch in chosen.items()
-        },
-        "validation": {"correct": validation.correct, "samples": validation.tested},
-        "history": [[e.training_loss, e.test_loss, e.correct] for e in history],
-        "torch": torch.__version__,
-        "numpy": np.__version__,
-    }
 
 
 def checkpoint_bytes(

@@ -138,7 +138,17 @@ class SpikeLinear(nn.Module):
         return spike_linear(spikes, weight, bias)
 
 
-class SpikingNet(nn.Module):
+class TrainedModule(nn.Module):
+    """A network that :mod:`training.train` trains: events (steps, samples, taxels, channels) to rates of classes."""
+
+    adjacency: Tensor
+
+    def export_weights(self) -> Weights:
+        """Weights as they are stored."""
+        raise NotImplementedError
+
+
+class SpikingNet(TrainedModule):
     """A first layer, dense layers and a spike-count vote; every layer is one of LIF neurons [1]_.
 
     Parameters

@@ -26,8 +26,8 @@ from spikeloom.compiler.fixedpoint import (
     ONE_STEP_SUM_MAX,
     encode_bias,
 )
-from spikeloom.compiler.targets.loihi1.storage.weight_storage import decay_registers, reach, round_steps, step_units
 from spikeloom.compiler.ir import Form
+from spikeloom.compiler.targets.storage import decay_registers, reach, round_steps, step_units
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.systems import in_order
 from spikeloom.compiler.formats.towers import members, side_by_side
@@ -239,7 +239,7 @@ def _chip_step(sums: Any, v: Any, bias: Any, threshold: Any, unit: Any, keep: An
 
 @numba.njit(cache=True)
 def _integrate_chip(sums: Any, bias: Any, threshold: Any, unit: Any, keep: Any, fired: Any, membrane: Any) -> None:
-    """Loihi's compartment without a current of its own, along the first axis; :mod:`loihi1.spec` defines it."""
+    """The chip's compartment without a current of its own, along the first axis; its ``spec`` module defines it."""
     v = np.zeros(sums.shape[1], np.int64)
     for t in range(len(sums)):
         _chip_step(sums[t], v, bias, threshold, unit, keep, fired[t], membrane[t])

@@ -35,12 +35,13 @@ from spikeloom.compiler.ir import Form, Network
 from spikeloom.compiler.passes.calibrate import Calibration, calibrate, evenly_spaced
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.targets.loihi1.storage.weight_storage import reach, step_units
+from spikeloom.compiler.targets.storage import reach, step_units
 from spikeloom.models.networks.networks import Weights
 from spikeloom.models.networks.quantised import QuantisedNet, time_first
 from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.models.training.evaluate import one_thread, rate_loss
 from spikeloom.models.training.resume import TrainingState, pack, read_state, unpack, write_state
-from spikeloom.models.training.train import one_thread, rate_loss, require_finite
+from spikeloom.models.training.train import require_finite
 
 BATCH = 4
 """Recordings per step of the optimizer: the weights are rounded anew for each."""

@@ -13,7 +13,7 @@ from typing import Any
 
 from spikeloom.compiler.dynamics import MOST_CLOCKS, Dynamics, clocks_over
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.targets.loihi1.storage.weight_storage import DECAY_ONE, decay_registers
+from spikeloom.compiler.targets.storage import DECAY_ONE, decay_registers
 from spikeloom.models.networks.surrogate import FAST_SIGMOID, RECTANGLE, Surrogate
 from spikeloom.models.systems import HOPS
 from spikeloom.models.training.schedule import DECAY_EPOCHS
@@ -126,21 +126,8 @@ TIMED = Recipe(
 )
 """For recordings that differ in when their events come: currents that last 20 steps, and clocks."""
 
-CROSSBARS = Recipe(
-    name="truenorth",
-    epochs=30,
-    batch=4,
-    loss=CROSS_ENTROPY,
-    gain=60.0,
-    surrogate=Surrogate(shape=FAST_SIGMOID, width=0.5, reset=False),
-    optimizer=ADAMW,
-    weight_decay=0.01,
-    learning_rate=3e-3,
-    schedule=COSINE,
-    features=16,
-    clocks=5,
-)
-"""For networks that TrueNorth holds, which have no other."""
+LAYERS = ("conv1", "fc1", "fc2", "fc3")
+"""Layers of the networks that are trained."""
 
 RECIPES = {recipe.name: recipe for recipe in (RELEASED, TIMED)}
 

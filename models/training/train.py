@@ -17,37 +17,51 @@ References
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 from tqdm import tqdm
 
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.formats.checkpoint_file import arrays_digest
-from spikeloom.models.networks.networks import Architecture, SpikingNet, Weights
+from spikeloom.models.networks.networks import SpikingNet, TrainedModule, Weights
+from spikeloom.models.networks.surrogate import Surrogate
 from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.models.training.evaluate import evaluate, loss_of, one_thread, time_first
 from spikeloom.models.training.optimizers import course_of, optimizer_of, set_rate
-from spikeloom.models.training.recipes import CROSS_ENTROPY, RELEASED, Recipe
+from spikeloom.models.training.recipes import RELEASED, Recipe
 from spikeloom.models.training.resume import TrainingState, pack, read_state, unpack, write_state
 from spikeloom.models.training.schedule import EPOCHS
-from spikeloom.models.truenorth.network import NativeArchitecture, NativeNet
 
-Sizes = Architecture | NativeArchitecture
-Network = SpikingNet | NativeNet
+
+class Sizes(Protocol):
+    """Sizes of a network that can be trained."""
+
+    @property
+    def taxels(self) -> int:
+        """Sensor points."""
+
+    @property
+    def channels(self) -> int:
+        """Inputs per taxel."""
+
+    @property
+    def classes(self) -> int:
+        """Outputs."""
+
+    def network(self, propagation: NDArray[np.float64], *, seed: int, surrogate: Surrogate) -> TrainedModule:
+        """An untrained network."""
+
 
 DEVICES = ("cpu", "cuda")
 
 MOST_SEED = 2**63 - 1
 """What a torch generator takes."""
-
-TEST_BATCH = 2  # larger batches outgrow the cache
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -86,7 +100,7 @@ class Trained:
 
     Parameters
     ----------
-    architecture : Architecture or NativeArchitecture
+    architecture : Sizes
         Of the network.
     last, best : dict of arrays
         Weights after the last epoch, and after the epoch with the most correct test recordings (the first such):
@@ -132,7 +146,7 @@ def train(
         Both splits; `test` is only looked at.
     propagation : (taxels, taxels) or (filters, places, taxels) float64
         What the first layer sees, see :func:`systems.propagation_of`.
-    architecture : Architecture or NativeArchitecture
+    architecture : Sizes
         Sizes.
     epochs : int
         Passes over the training recordings.
@@ -272,7 +286,7 @@ def require_finite(network: torch.nn.Module, loss: float, epoch: int, step: int)
 
 
 def _restore(
-    found: TrainingState, network: Network, optimizer: torch.optim.Optimizer, order: np.random.Generator
+    found: TrainingState, network: TrainedModule, optimizer: torch.optim.Optimizer, order: np.random.Generator
 ) -> tuple[list[Epoch], dict[str, Weights]]:
     """Put a state back; return its history and the weights that it kept."""
     unpack(found.arrays, network, optimizer, found.progress["rate"])
@@ -287,7 +301,7 @@ def _restore(
 
 def _state(
     options: Mapping[str, Any],
-    network: Network,
+    network: TrainedModule,
     optimizer: torch.optim.Optimizer,
     order: np.random.Generator,
     history: list[Epoch],
@@ -303,40 +317,8 @@ def _state(
     return TrainingState(options=options, progress=progress, arrays=arrays)
 
 
-def evaluate(network: Network, recordings: Recordings, recipe: Recipe = RELEASED) -> tuple[float, int]:
-    """Mean loss, and how many recordings are classified correctly; equal top rates count for the lowest class."""
-    loss, correct = 0.0, 0
-    with torch.no_grad():
-        for chosen, events in _batches(recordings):
-            labels = recordings.labels[chosen]
-            rates = _rates(network, events)
-            loss += float(_loss(recipe, rates, labels)) * len(labels)
-            correct += int(np.sum(rates.numpy().argmax(axis=1) == labels))
-    return loss / len(recordings), correct
-
-
-def predict(network: Network, recordings: Recordings) -> NDArray[np.int64]:
-    """Class of each recording; equal top rates count for the lowest one."""
-    found = []
-    with torch.no_grad(), one_thread():
-        for _, events in _batches(recordings):
-            found.append(_rates(network, events).numpy().argmax(axis=1))
-    return np.concatenate(found)
-
-
-def _batches(recordings: Recordings) -> Iterator[tuple[slice, NDArray[np.uint8]]]:
-    """All recordings in order, a few of one length at a time: where they stand, and their events without filling."""
-    start = 0
-    while start < len(recordings):
-        steps, stop = recordings.steps_of(start), start + 1
-        while stop < min(start + TEST_BATCH, len(recordings)) and recordings.steps_of(stop) == steps:
-            stop += 1
-        yield slice(start, stop), recordings.events[start:stop, ..., :steps]
-        start = stop
-
-
 def _train_epoch(
-    network: Network,
+    network: TrainedModule,
     optimizer: torch.optim.Optimizer,
     recordings: Recordings,
     order: NDArray[np.int64],
@@ -355,44 +337,19 @@ def _train_epoch(
         events = recordings.events[chosen][..., : lengths.max()]
         filled = lengths if lengths.min() < lengths.max() else None
         inside = None if filled is None else torch.tensor(filled, device=device)
-        shown = _time_first(events).to(device)
+        shown = time_first(events).to(device)
         if isinstance(network, SpikingNet) and recipe.penalty:
             layers = network.layers(shown)
-            loss = _loss(recipe, network.rates(layers, inside).cpu(), recordings.labels[chosen])
+            loss = loss_of(recipe, network.rates(layers, inside).cpu(), recordings.labels[chosen])
             loss = loss + recipe.penalty * network.activity(layers, inside)
         else:
-            loss = _loss(recipe, network(shown, inside).cpu(), recordings.labels[chosen])
+            loss = loss_of(recipe, network(shown, inside).cpu(), recordings.labels[chosen])
         found = float(loss.detach())
         loss.backward()  # type: ignore[no-untyped-call]
         require_finite(network, found, epoch, step)
         optimizer.step()
         total += found * len(chosen)
     return total / len(order)
-
-
-def _loss(recipe: Recipe, rates: Tensor, labels: NDArray[np.int64]) -> Tensor:
-    if recipe.loss == CROSS_ENTROPY:
-        wanted = torch.tensor(labels)
-        return torch.nn.functional.cross_entropy(recipe.gain * rates, wanted, label_smoothing=recipe.smoothing)
-    return rate_loss(rates, labels)
-
-
-def rate_loss(rates: Tensor, labels: NDArray[np.int64]) -> Tensor:
-    """Mean squared error of spike rates (samples, classes) against zeros and a one."""
-    target = torch.zeros_like(rates)
-    target[torch.arange(len(labels)), torch.tensor(labels)] = 1.0
-    return torch.nn.functional.mse_loss(rates, target)
-
-
-def _rates(network: Network, events: NDArray[np.uint8]) -> Tensor:
-    """Spike rates on the CPU, computed where the network is."""
-    rates: Tensor = network(_time_first(events).to(network.adjacency.device)).cpu()
-    return rates
-
-
-def _time_first(events: NDArray[np.uint8]) -> Tensor:
-    """(samples, taxels, channels, steps) uint8 to (steps, samples, taxels, channels) float32."""
-    return torch.from_numpy(events.transpose(3, 0, 1, 2).astype(np.float32, order="C"))
 
 
 def _check(recordings: Recordings, architecture: Sizes) -> None:
@@ -409,19 +366,3 @@ def _check(recordings: Recordings, architecture: Sizes) -> None:
             f"{where}: label {highest}, the network has {architecture.classes} classes "
             f"(0..{architecture.classes - 1}); train it with more classes"
         )
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """One torch thread, subnormal numbers flushed to zero (beta**t decays into them); both undone at the end."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    torch.set_flush_denormal(True)
-    # glibc hands large blocks back to the system when they are freed, and each step would fault them in anew.
-    # Having freed one of 30 MB it keeps blocks up to that size, see "dynamic mmap threshold" in mallopt(3).
-    torch.empty(30 << 20, dtype=torch.uint8)
-    try:
-        yield
-    finally:
-        torch.set_flush_denormal(False)
-        torch.set_num_threads(threads)

@@ -31,6 +31,7 @@ from spikeloom.compiler.targets.truenorth.native import (
     Stage,
     highest_level,
 )
+from spikeloom.models.networks.networks import TrainedModule
 from spikeloom.models.networks.surrogate import RECTANGLE, Surrogate
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.truenorth.neurons import block_sums, integrate
@@ -157,7 +158,7 @@ def sized(
     )
 
 
-class NativeNet(nn.Module):
+class NativeNet(TrainedModule):
     """See the module docstring; neurons of the convolution lie taxel by taxel, of the others group by group.
 
     Parameters

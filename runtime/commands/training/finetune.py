@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-from collections.abc import Callable
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from spikeloom.compiler import DEFAULT_TARGET
 from spikeloom.compiler.archive import is_netlist
 from spikeloom.compiler.atomic import remove_leftovers
 from spikeloom.compiler.checkpoint import Checkpoint
@@ -18,7 +19,7 @@ from spikeloom.compiler.formats.checkpoint import read_checkpoint
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.systems import GRAPH_SYSTEMS
 from spikeloom.compiler.targets.base import COMPARTMENTS, load_target
-from spikeloom.compiler.targets.loihi1.storage.quantize import round_to_forms
+from spikeloom.compiler.targets.storage import round_to_forms
 from spikeloom.models.graphs import Graph
 from spikeloom.models.recordings.events import joined_bins
 from spikeloom.models.recordings.grasps import SYNTHETIC
@@ -26,10 +27,55 @@ from spikeloom.runtime.commands.options import DATA_HELP, add_bin_option, add_mo
 from spikeloom.runtime.inputs.files import require_place, shipped
 from spikeloom.runtime.inputs.network import graph_words, load_checkpoint, load_graph, propagation
 from spikeloom.runtime.inputs.recordings import bin_words, recordings
-from spikeloom.runtime.report.tables import percent, table
+from spikeloom.runtime.report.numbers import percent
+from spikeloom.runtime.report.sections import Outcome, Section, Table, Text
 from spikeloom.runtime.studies.jobs import only_one
 
-Report = dict[str, Any]
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Before:
+    """Test recordings that are right with the weights rounded, before any training."""
+
+    correct: int
+    accuracy: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Tuned:
+    """Test recordings that are right after the last epoch."""
+
+    correct: int
+    accuracy: float
+    chosen_on: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FinetuneRecord:
+    """Everything needed to repeat a fine-tuning, and what it reached; the fields are the keys in the checkpoint.
+
+    `history` has the loss and the correct training recordings of each epoch.
+    """
+
+    command: str
+    fine_tuned_from: str
+    fine_tuned_weights: str
+    weight_bits: Sequence[int]
+    seed: int
+    epochs: int
+    data: str
+    data_sha256: str
+    test_samples: int
+    before: Before
+    last: Tuned
+    history: Sequence[Sequence[float]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Finetuned(FinetuneRecord):
+    """A fine-tuning and the checkpoint that holds it."""
+
+    file: str
+    sha256: str
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -38,7 +84,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_model(parser)
     parser.add_argument("--data", required=True, metavar="PATH", help=DATA_HELP)
     add_bin_option(parser)
-    parser.add_argument("--target", default="loihi1", help="chip (default: loihi1)")
+    parser.add_argument("--target", default=DEFAULT_TARGET, help=f"chip (default: {DEFAULT_TARGET})")
     parser.add_argument(
         "--weight-bits", required=True, metavar="N[,N]", help="storage width, one or one a layer: 2 to 6 or 8"
     )
@@ -76,13 +122,13 @@ def _state(output: Path, *, resume: bool) -> Path:
             f"{state}: an interrupted fine-tuning is kept there; go on with --resume, or delete the file to start anew"
         )
     if resume and not state.exists():
-        raise OptionError(f"--resume: {state} does not exist, so nothing was interrupted; leave --resume away")
+        raise OptionError(f"--resume: {state} does not exist, so nothing was interrupted; omit --resume")
     for file in (output, state):
         remove_leftovers(file)
     return state
 
 
-def run(arguments: argparse.Namespace) -> tuple[Report, Callable[[Report], str], int]:
+def run(arguments: argparse.Namespace) -> Outcome:
     """Fine-tune, write the checkpoint, report.
 
     Raises
@@ -94,10 +140,10 @@ def run(arguments: argparse.Namespace) -> tuple[Report, Callable[[Report], str],
     """
     require_place(arguments.output, "-o", arguments)
     with only_one(Path(arguments.output)):
-        return _finetuned(arguments, Path(arguments.output)), finetune_text, 0
+        return Outcome(_finetuned(arguments, Path(arguments.output)), finetune_sections)
 
 
-def _finetuned(arguments: argparse.Namespace, output: Path) -> Report:
+def _finetuned(arguments: argparse.Namespace, output: Path) -> Finetuned:
     """Fine-tune and write the checkpoint; return the report."""
     state = _state(output, resume=arguments.resume)
     target = load_target(arguments.target, COMPARTMENTS)
@@ -131,9 +177,10 @@ def _finetuned(arguments: argparse.Namespace, output: Path) -> Report:
         for split in ("train", "test")
     ]
     training, test = (joined_bins(each, checkpoint.bins) for each in found)
-    from spikeloom.models.networks.checkpoint import CHOSEN_ON, save_checkpoint
+    from spikeloom.models.networks.checkpoint import save_checkpoint
     from spikeloom.models.training.finetune import finetune as tune
     from spikeloom.models.training.protocols import data_digest
+    from spikeloom.models.training.record import CHOSEN_ON
 
     try:
         tuned = tune(
@@ -152,31 +199,27 @@ def _finetuned(arguments: argparse.Namespace, output: Path) -> Report:
     except KeyboardInterrupt:
         kept = f"the epochs so far are kept in {state}; go on with the same command and --resume"
         raise KeyboardInterrupt(kept if state.exists() else "") from None
-    record = {
-        "command": " ".join(_words(arguments, SYNTHETIC if arguments.data == SYNTHETIC else training.source)),
-        "fine_tuned_from": checkpoint.sha256,
-        "fine_tuned_weights": checkpoint.weights,
-        "weight_bits": widths,
-        "seed": arguments.seed,
-        "epochs": arguments.epochs,
-        "data": training.source,
-        "data_sha256": data_digest(*found),
-        "test_samples": len(test),
-        "before": {"correct": tuned.before, "accuracy": tuned.before / len(test)},
-        "last": {
-            "correct": tuned.after,
-            "accuracy": tuned.after / len(test),
-            "chosen_on": CHOSEN_ON[checkpoint.weights],
-        },
-        "history": [[epoch.loss, epoch.correct] for epoch in tuned.history],
-    }
+    record = FinetuneRecord(
+        command=" ".join(_words(arguments, SYNTHETIC if arguments.data == SYNTHETIC else training.source)),
+        fine_tuned_from=checkpoint.sha256,
+        fine_tuned_weights=checkpoint.weights,
+        weight_bits=widths,
+        seed=arguments.seed,
+        epochs=arguments.epochs,
+        data=training.source,
+        data_sha256=data_digest(*found),
+        test_samples=len(test),
+        before=Before(correct=tuned.before, accuracy=tuned.before / len(test)),
+        last=Tuned(correct=tuned.after, accuracy=tuned.after / len(test), chosen_on=CHOSEN_ON[checkpoint.weights]),
+        history=[[epoch.loss, epoch.correct] for epoch in tuned.history],
+    )
     save_checkpoint(
         output,
         {"last": tuned.weights},
         stored_graph(checkpoint, asked, name),
         beta=checkpoint.beta,
         theta=checkpoint.theta,
-        training=record,
+        training=asdict(record),
         forms=tuned.forms,
         system=checkpoint.system,
         grid=checkpoint.grid,
@@ -185,7 +228,8 @@ def _finetuned(arguments: argparse.Namespace, output: Path) -> Report:
     round_to_forms(expand(read_checkpoint(output), adjacency), tuned.forms)  # it compiles, or says why not
     state.unlink(missing_ok=True)
     sha256 = hashlib.sha256(output.read_bytes()).hexdigest()
-    return record | {"file": output.name, "sha256": sha256}
+    values = {each.name: getattr(record, each.name) for each in fields(record)}
+    return Finetuned(**values, file=output.name, sha256=sha256)
 
 
 def _words(arguments: argparse.Namespace, source: str) -> list[str]:
@@ -196,7 +240,7 @@ def _words(arguments: argparse.Namespace, source: str) -> list[str]:
         "--weights": arguments.weights,
         "--beta": arguments.beta,
         "--theta": arguments.theta,
-        "--target": None if arguments.target == "loihi1" else arguments.target,
+        "--target": None if arguments.target == DEFAULT_TARGET else arguments.target,
     }
     words += [word for option, value in given.items() if value is not None for word in (option, str(value))]
     words += ["--data", source, *bin_words(arguments.bin), "--weight-bits", arguments.weight_bits]
@@ -204,14 +248,13 @@ def _words(arguments: argparse.Namespace, source: str) -> list[str]:
     return [*words, "--seed", str(arguments.seed)]
 
 
-def finetune_text(report: Report) -> str:
+def finetune_sections(result: Finetuned) -> Iterable[Section]:
     """A finished fine-tuning for people."""
-    total = report["test_samples"]
-    first, last = report["history"][0], report["history"][-1]
+    total, first, last = result.test_samples, result.history[0], result.history[-1]
     rows = [
-        ["rounded", "", "", percent(report["before"]["correct"], total)],
+        ["rounded", "", "", percent(result.before.correct, total)],
         ["epoch 1", f"{first[0]:.5f}", f"{first[1]:,}", ""],
-        [f"epoch {report['epochs']}", f"{last[0]:.5f}", f"{last[1]:,}", percent(report["last"]["correct"], total)],
+        [f"epoch {result.epochs}", f"{last[0]:.5f}", f"{last[1]:,}", percent(result.last.correct, total)],
     ]
     head = ["on chip integers", "loss", "training right", "test"]
-    return f"{report['command']}\n{table(head, rows)}\n  written: {report['file']}"
+    yield Section("Fine-tuning", [Text(result.command), Table(head, rows), Text(f"  written: {result.file}")])

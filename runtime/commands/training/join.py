@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 from argparse import Namespace
-from collections.abc import Callable
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +16,14 @@ from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.formats.checkpoint import read_checkpoint
 from spikeloom.compiler.formats.towers import arrays_of
 from spikeloom.compiler.formats.towers import join as join_networks
-from spikeloom.compiler.targets.truenorth.native import SYSTEM as NATIVE
+from spikeloom.compiler.targets.native import SYSTEM as NATIVE
+from spikeloom.models.training.joined import Joined, joined_layers
 from spikeloom.runtime.commands.main_job.checkpoint_facts import tower_line
 from spikeloom.runtime.commands.training.finetune import stored_graph
 from spikeloom.runtime.inputs.files import require_place, shipped
 from spikeloom.runtime.machines.base import trained_for
-from spikeloom.runtime.report.tables import percent
-
-Report = dict[str, Any]
+from spikeloom.runtime.report.numbers import percent
+from spikeloom.runtime.report.sections import Outcome, Section, Text
 
 KEPT = ("command", "seed", "epochs", "recipe", "data", "data_sha256", "test_samples", "fine_tuned_from")
 """Parts of a network's training record that the joined one keeps, beside what the chosen weights reached."""
@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", required=True, metavar="OUT.pt")
 
 
-def run(arguments: Namespace) -> tuple[Report, Callable[[Report], str], int]:
+def run(arguments: Namespace) -> Outcome:
     """Join, write the checkpoint, report.
 
     Raises
@@ -51,9 +51,9 @@ def run(arguments: Namespace) -> tuple[Report, Callable[[Report], str], int]:
     """
     own = next(filter(None, map(trained_for, arguments.checkpoints)), None)
     if own is not None:
-        return own.join(arguments, join_text)  # type: ignore[no-any-return]
+        return Outcome(own.join(arguments), join_sections)
     if arguments.data is not None:
-        raise OptionError(f"--data {arguments.data}: is for {NATIVE}; leave it away, and measure with spikeloom run")
+        raise OptionError(f"--data {arguments.data}: is for {NATIVE}; omit it, and measure with spikeloom run")
     for name in arguments.checkpoints:
         require_place(arguments.output, "-o", Namespace(checkpoint=name))
     found = [_network(name, arguments.weights) for name in arguments.checkpoints]
@@ -64,7 +64,7 @@ def run(arguments: Namespace) -> tuple[Report, Callable[[Report], str], int]:
     joined = join_networks(found, arguments.checkpoints)
     words = [_shown(name) for name in arguments.checkpoints]
     words += [f"--weights {arguments.weights}"] if arguments.weights else []
-    record = {"command": f"spikeloom join {' '.join(words)}", "towers": towers}
+    record: dict[str, Any] = {"command": f"spikeloom join {' '.join(words)}", "towers": towers}
     from spikeloom.models.networks.checkpoint import save_checkpoint  # torch, so only here
 
     output = Path(arguments.output)
@@ -83,16 +83,17 @@ def run(arguments: Namespace) -> tuple[Report, Callable[[Report], str], int]:
         towers=joined.towers,
         bins=joined.bins,
     )
-    report = {
-        **record,
-        "system": joined.system,
-        "graph": joined.graph,
-        "classes": joined.classes,
-        "layers": [{"name": name, "neurons": neurons} for name, neurons in joined.neurons.items()],
-        "file": output.name,
-        "sha256": hashlib.sha256(output.read_bytes()).hexdigest(),
-    }
-    return report, join_text, 0
+    result = Joined(
+        command=record["command"],
+        towers=towers,
+        system=joined.system,
+        graph=joined.graph,
+        classes=joined.classes,
+        layers=joined_layers(joined.neurons),
+        file=output.name,
+        sha256=hashlib.sha256(output.read_bytes()).hexdigest(),
+    )
+    return Outcome(result, join_sections)
 
 
 def _network(name: str, weights: str | None) -> Checkpoint:
@@ -110,7 +111,7 @@ def _shown(name: str) -> str:
     return name if shipped(name) != name else Path(name).name
 
 
-def _records(name: str, checkpoint: Checkpoint) -> list[Report]:
+def _records(name: str, checkpoint: Checkpoint) -> list[dict[str, Any]]:
     """Where each tower of a checkpoint is from."""
     training = checkpoint.training or {}
     held = training.get("towers")
@@ -121,11 +122,10 @@ def _records(name: str, checkpoint: Checkpoint) -> list[Report]:
     return [origin | {key: training[key] for key in kept}] * checkpoint.towers
 
 
-def join_text(report: Report) -> str:
+def join_sections(result: Joined) -> Iterable[Section]:
     """A finished join for people."""
-    layers = ", ".join(f"{layer['name']} {layer['neurons']:,}" for layer in report["layers"])
-    lines = [f"{report['command']}", f"  {len(report['towers'])} towers: {layers}, {report['classes']} classes"]
-    lines += [f"    {index}: {tower_line(tower)}" for index, tower in enumerate(report["towers"])]
-    if "test" in report:
-        lines.append(f"  test: {percent(report['test']['correct'], report['test']['samples'])}")
-    return "\n".join([*lines, f"  written: {report['file']}"])
+    layers = ", ".join(f"{layer.name} {layer.neurons:,}" for layer in result.layers)
+    lines = [result.command, f"  {len(result.towers)} towers: {layers}, {result.classes} classes"]
+    lines += [f"    {index}: {tower_line(tower)}" for index, tower in enumerate(result.towers)]
+    lines += [] if result.test is None else [f"  test: {percent(result.test.correct, result.test.samples)}"]
+    yield Section("Joined", [Text("\n".join([*lines, f"  written: {result.file}"]))])

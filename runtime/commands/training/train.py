@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,24 +10,23 @@ from typing import Any
 from spikeloom.compiler.checkpoint import WEIGHTS
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.systems import GRAPH_SYSTEMS, GRID_CNN, TACTILESGNET, TITLES, Grid
-from spikeloom.compiler.targets.truenorth.native import BASES, USUAL_COPIES
-from spikeloom.compiler.targets.truenorth.native import SYSTEM as NATIVE
-from spikeloom.compiler.version import __version__
+from spikeloom.compiler.targets.native import BASES, USUAL_COPIES
+from spikeloom.compiler.targets.native import SYSTEM as NATIVE
 from spikeloom.models.graphs import CHOICES, Graph
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.recordings.grasps import SYNTHETIC
 from spikeloom.models.systems import PADDINGS, sensor_grid, taxels_alone
-from spikeloom.models.training.recipes import CROSSBARS, RECIPES, RELEASED, STEPS, Recipe, check_recipe, decays_asked
+from spikeloom.models.training.kinds import Plan
+from spikeloom.models.training.recipes import LAYERS, RECIPES, RELEASED, STEPS, Recipe, check_recipe, decays_asked
 from spikeloom.models.training.schedule import DECAY_EPOCHS
 from spikeloom.runtime.commands.options import DATA_HELP, add_bin_option, add_graph_options, add_system
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import graph_words, load_graph, sensor_places
 from spikeloom.runtime.inputs.recordings import bin_words, recordings, require_bins
 from spikeloom.runtime.report.console import progress
+from spikeloom.runtime.report.sections import Outcome
 from spikeloom.runtime.studies.training.picture import PICTURES, draw_training
-from spikeloom.runtime.studies.training.training import LAYERS, Job, check_seeds, output_of, summary, training_text
-
-Json = dict[str, Any]
+from spikeloom.runtime.studies.training.training import Job, output_of
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -43,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--padding",
         choices=PADDINGS,
-        help="of a grid-cnn's window: none, moving by 2 (default), or same, of which no Loihi core holds all neurons",
+        help="of a grid-cnn's window: none, moving by 2 (default), or same, of which no core holds all neurons",
     )
     add_graph_options(parser, "to train on")
     defaults = ", ".join(f"{recipe.epochs} ({name})" for name, recipe in RECIPES.items())
@@ -62,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--clocks", type=int, metavar="K", help="inputs that tell which K-th of the recording it is")
     parser.add_argument("--features", type=int, metavar="N", help="of the first layer, per place")
     parser.add_argument(
-        "--copies", type=int, choices=tuple(BASES), help=f"axons of an input on TrueNorth (default: {USUAL_COPIES})"
+        "--copies", type=int, choices=tuple(BASES), help=f"axons of an input of {NATIVE} (default: {USUAL_COPIES})"
     )
     parser.add_argument("--batch", type=int, metavar="N", help="recordings to a step of the optimizer")
     parser.add_argument(
@@ -89,11 +87,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", required=True, metavar="OUT.pt")
 
 
-def run(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int]:
-    """Run the command: the report, how to print it, and the exit code."""
-    from spikeloom.runtime.studies.training.seeds import train_seeds  # processes, so only here
+def run(arguments: argparse.Namespace) -> Outcome:
+    """Train every seed, write the checkpoints, report."""
+    from spikeloom.runtime.studies.training.parallel import train_seeds  # processes, so only here
+    from spikeloom.runtime.studies.training.report import TrainingReport, summary, training_sections
 
-    check_seeds(arguments.seeds)
+    if arguments.seeds < 1:
+        raise OptionError(f"--seeds {arguments.seeds}: at least 1 is needed; give a positive number")
     require_bins(arguments.join)
     require_place(arguments.output, "-o", arguments)
     if arguments.picture is not None:
@@ -103,15 +103,14 @@ def run(arguments: argparse.Namespace) -> tuple[Json, Callable[[Json], str], int
         for seed in range(arguments.seed, arguments.seed + arguments.seeds):
             if output_of(arguments.output, seed, arguments.seeds).absolute() == Path(arguments.picture).absolute():
                 raise OptionError(f"--picture {arguments.picture}: is a network that -o names; give another name")
-    sensor = _sensor(arguments)
-    training, test = both_splits(arguments.data, sensor[0].n_taxels, arguments.bin)
-    jobs = _jobs(arguments, sensor, training, test)
-    results = train_seeds(jobs, resume=arguments.resume)
+    graph, _ = _sensor(arguments)
+    training, test = both_splits(arguments.data, graph.n_taxels, arguments.bin)
+    results = train_seeds(plan_jobs(arguments, training, test), resume=arguments.resume)
     records = [record for record, _ in results]
     if arguments.picture is not None:
         decided = [predicted for _, predicted in results if predicted is not None]
         draw_training(arguments.picture, records, test.labels, decided)
-    return {"runs": records, "protocols": summary(records)}, training_text, 0
+    return Outcome(TrainingReport(runs=records, protocols=summary(records)), training_sections)
 
 
 def both_splits(data: str, taxels: int, bin_s: float) -> tuple[Recordings, Recordings]:
@@ -132,29 +131,14 @@ def both_splits(data: str, taxels: int, bin_s: float) -> tuple[Recordings, Recor
         where = f"{test.source}: {test.split}/{test.files[first]}"
         raise DataError(
             f"{where}: label {test.labels[first]}, the training recordings have 0..{known}; add some of it to them, or "
-            "leave it out of the test split"
+            "omit it from the test split"
         )
     return training, test
 
 
-def planned(arguments: argparse.Namespace, training: Recordings, test: Recordings) -> list[Job]:
-    """What the command would train, for whoever has read the recordings already.
-
-    Parameters
-    ----------
-    arguments : Namespace
-        Parsed options of ``train``.
-    training, test : Recordings
-        Both splits of its data.
-    """
-    return _jobs(arguments, _sensor(arguments), training, test)
-
-
-def _jobs(
-    arguments: argparse.Namespace, sensor: tuple[Graph, Grid | None], training: Recordings, test: Recordings
-) -> list[Job]:
-    """One job for each seed."""
-    graph, grid = sensor
+def plan_jobs(arguments: argparse.Namespace, training: Recordings, test: Recordings) -> list[Job]:
+    """One job for each seed that the options ask for, on recordings of their data."""
+    graph, grid = _sensor(arguments)
     system = arguments.system or TACTILESGNET
     data = arguments.data if arguments.data == SYNTHETIC else training.source
     words = [
@@ -166,27 +150,30 @@ def _jobs(
     recipe = _recipe(arguments)
     epochs = recipe.epochs if arguments.epochs is None else arguments.epochs
     command = " ".join(filter(None, [*words, _recipe_words(arguments), f"--epochs {epochs}"]))
-    keep = tuple(dict.fromkeys(arguments.keep or WEIGHTS))
+    plan = Plan(
+        system=system,
+        graph=graph,
+        grid=grid,
+        recipe=recipe,
+        copies=arguments.copies,
+        bins=arguments.join,
+        classes=int(training.labels.max()) + 1,
+        steps=training.steps,
+    )
     return [
         Job(
+            plan=plan,
             training=training,
             test=test,
-            graph=graph,
             epochs=epochs,
             seed=seed,
             device=arguments.device,
             resume=arguments.resume,
             output=output_of(arguments.output, seed, arguments.seeds),
-            keep=keep,
+            keep=tuple(dict.fromkeys(arguments.keep or WEIGHTS)),
             command=f"{command} --seed {seed}",
-            facts={"spikeloom": __version__, "device": arguments.device},
             draws=arguments.picture is not None,
             position=position,
-            system=system,
-            grid=grid,
-            recipe=recipe,
-            copies=arguments.copies or USUAL_COPIES,
-            bins=arguments.join,
         )
         for position, seed in enumerate(range(arguments.seed, arguments.seed + arguments.seeds))
     ]
@@ -204,7 +191,7 @@ def _recipe(arguments: argparse.Namespace) -> Recipe:
     if arguments.decay_epochs is not None and recipe.schedule != STEPS:
         raise OptionError(
             f"--decay-epochs {arguments.decay_epochs}: the recipe {recipe.name} lowers its learning rate all along; "
-            "leave it away"
+            "omit it"
         )
     if arguments.spike_penalty is not None:
         recipe = replace(recipe, penalty=arguments.spike_penalty)
@@ -217,27 +204,21 @@ def _recipe(arguments: argparse.Namespace) -> Recipe:
 
 
 def _named_recipe(arguments: argparse.Namespace) -> Recipe:
-    """What was named, or the only one that a network for TrueNorth has."""
-    if arguments.system != NATIVE:
-        if arguments.copies is not None:
-            raise OptionError(f"--copies {arguments.copies}: is for --system {NATIVE}; leave it away")
-        return RECIPES[arguments.recipe]
-    for name, usual in (("recipe", RELEASED.name), ("current_decay", None), ("membrane_decay", None)):
-        if getattr(arguments, name) != usual:
-            raise OptionError(
-                f"--{name.replace('_', '-')} {getattr(arguments, name)}: a network for TrueNorth has a recipe of its "
-                "own, and nothing in it decays; leave it away"
-            )
-    if arguments.join != 1:
-        raise OptionError(
-            f"--join {arguments.join}: {NATIVE} hears bins as they are; leave it away, or train on what spikeloom data "
-            "convert --join makes"
-        )
-    if arguments.device != "cpu":
-        raise OptionError(f"--device {arguments.device}: {NATIVE} is trained on the CPU; leave it away")
-    if arguments.spike_penalty is not None:
-        raise OptionError(f"--spike-penalty {arguments.spike_penalty:g}: {NATIVE} is trained without; leave it away")
-    return CROSSBARS
+    """What was named, or the only one of a system that has its own."""
+    from spikeloom.models.training.kinds import kind_of
+
+    usual = {
+        "recipe": RELEASED.name,
+        "current_decay": None,
+        "membrane_decay": None,
+        "join": 1,
+        "device": "cpu",
+        "spike_penalty": None,
+        "copies": None,
+    }
+    given = {name: getattr(arguments, name) for name, value in usual.items() if getattr(arguments, name) != value}
+    options = {f"--{name.replace('_', '-')}": value for name, value in given.items()}
+    return kind_of(arguments.system or TACTILESGNET).recipe_for(arguments.recipe, options)
 
 
 def _recipe_words(arguments: argparse.Namespace) -> str:
@@ -259,7 +240,7 @@ def _sensor(arguments: argparse.Namespace) -> tuple[Graph, Grid | None]:
     if system == NATIVE:
         system = TACTILESGNET  # and the same graphs
     if arguments.padding is not None and system != GRID_CNN:
-        raise OptionError(f"--padding: is for grid-cnn, {TITLES[system]} has no window; leave it away")
+        raise OptionError(f"--padding: is for grid-cnn, {TITLES[system]} has no window; omit it")
     graph = load_graph(arguments, system)
     if system not in GRAPH_SYSTEMS:
         places = sensor_places(arguments.taxels)

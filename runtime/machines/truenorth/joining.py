@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -12,18 +12,16 @@ import numpy as np
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.targets.truenorth.native import SYSTEM, NativeNetwork, joined
 from spikeloom.compiler.targets.truenorth.native_file import Trained, read_trained, write_trained
+from spikeloom.models.training.joined import Joined, JoinedTest, joined_layers
 from spikeloom.runtime.inputs.files import require_place, shipped
 from spikeloom.runtime.inputs.recordings import recordings
 from spikeloom.runtime.report.console import progress
-
-Report = dict[str, Any]
-Outcome = tuple[Report, Callable[[Report], str], int]
 
 KEPT = ("command", "seed", "epochs", "recipe", "data", "data_sha256", "test_samples")
 """Parts of a network's training record that the joined one keeps, beside what the chosen weights reached."""
 
 
-def join(arguments: argparse.Namespace, as_text: Callable[[Report], str]) -> Outcome:
+def join(arguments: argparse.Namespace) -> Joined:
     """Put the towers of several networks into one file.
 
     Raises
@@ -50,25 +48,28 @@ def join(arguments: argparse.Namespace, as_text: Callable[[Report], str]) -> Out
     words = [name if shipped(name) != name else Path(name).name for name in arguments.checkpoints]
     words += [f"--weights {arguments.weights}"] if arguments.weights else []
     words += ["--data", Path(arguments.data).name] if arguments.data is not None else []
-    record: Report = {"command": f"spikeloom join {' '.join(words)}", "towers": towers}
+    record: dict[str, Any] = {"command": f"spikeloom join {' '.join(words)}", "towers": towers}
+    measured = None
     if arguments.data is not None:
-        record["test"] = _measured(arguments.data, network, {tower.get("data_sha256") for tower in towers})
+        measured = _measured(arguments.data, network, {tower.get("data_sha256") for tower in towers})
+        record["test"] = asdict(measured)
     sha256 = write_trained(
         arguments.output, {"last": network}, graph=found[0].graph, edges=found[0].edges, training=record
     )
-    report = {
-        **record,
-        "system": SYSTEM,
-        "graph": found[0].graph,
-        "classes": network.classes,
-        "layers": [{"name": name, "neurons": neurons} for name, neurons in network.neurons.items()],
-        "file": Path(arguments.output).name,
-        "sha256": sha256,
-    }
-    return report, as_text, 0
+    return Joined(
+        command=str(record["command"]),
+        towers=towers,
+        test=measured,
+        system=SYSTEM,
+        graph=found[0].graph,
+        classes=network.classes,
+        layers=joined_layers(network.neurons),
+        file=Path(arguments.output).name,
+        sha256=sha256,
+    )
 
 
-def _measured(path: str, network: NativeNetwork, trained_on: set[str | None]) -> Report:
+def _measured(path: str, network: NativeNetwork, trained_on: set[str | None]) -> JoinedTest:
     """What the joined network reaches on the test split of the data that all its towers were trained on."""
     from spikeloom.models.training.protocols import data_digest  # torch, so only here
     from spikeloom.models.truenorth.network import predict
@@ -82,10 +83,10 @@ def _measured(path: str, network: NativeNetwork, trained_on: set[str | None]) ->
         raise OptionError(f"--data {path}: the networks were trained on other recordings; give those")
     progress("measuring")
     correct = int(np.count_nonzero(predict(network, test) == test.labels))
-    return {"correct": correct, "samples": len(test), "accuracy": correct / len(test), "data": Path(path).name}
+    return JoinedTest(correct=correct, samples=len(test), accuracy=correct / len(test), data=Path(path).name)
 
 
-def _records(name: str, trained: Trained) -> list[Report]:
+def _records(name: str, trained: Trained) -> list[dict[str, Any]]:
     """Where each tower of a file is from."""
     training, count = trained.training, len(trained.network.towers)
     held = training.get("towers")

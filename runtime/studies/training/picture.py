@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,19 +10,20 @@ import numpy as np
 
 from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.models.training.recipes import MSE
+from spikeloom.models.training.record import TrainingRecord
 
 PICTURES = (".png", ".svg", ".pdf")
 """Kinds of picture that `draw_training` writes."""
 
 
-def draw_training(path: str, records: list[dict[str, Any]], labels: IntArray, predictions: list[IntArray]) -> None:
+def draw_training(path: str, records: Sequence[TrainingRecord], labels: IntArray, predictions: list[IntArray]) -> None:
     """Draw learning curves of all seeds and the confusion matrix of their last epochs, summed.
 
     Parameters
     ----------
     path : str
         PNG, SVG or PDF to write, whole or not at all.
-    records : list of dict
+    records : sequence of TrainingRecord
         Training records.
     labels : (samples,) int64
         True classes.
@@ -40,24 +42,24 @@ def draw_training(path: str, records: list[dict[str, Any]], labels: IntArray, pr
     confusion = np.zeros((classes, classes), np.int64)
     for predicted in predictions:
         np.add.at(confusion, (labels, predicted), 1)
-    samples = records[0]["test_samples"]
+    samples = records[0].test_samples
     figure, (left, middle, right) = plt.subplots(
         1, 3, figsize=(13, 4.2), layout="constrained", width_ratios=(1, 1, 1.05)
     )
     for index, record in enumerate(records):
-        history = np.array(record["history"])
+        history = np.array(record.history)
         epochs = np.arange(1, len(history) + 1)
         colour, marker = f"C{index}", "." if len(history) == 1 else ""  # a line of one point is none
-        left.semilogy(epochs, history[:, 0], marker=marker, color=colour, label=f"seed {record['seed']}")
+        left.semilogy(epochs, history[:, 0], marker=marker, color=colour, label=f"seed {record.seed}")
         left.semilogy(epochs, history[:, 1], marker=marker, color=colour, linestyle="--")
-        middle.plot(epochs, 100 * history[:, 2] / samples, color=colour, label=f"seed {record['seed']}")
-        clean = record["clean"]
-        middle.plot(clean["epoch"], 100 * clean["accuracy"], "o", color=colour, markeredgecolor="black")
-    loss = (records[0].get("recipe") or {}).get("loss", MSE)
+        middle.plot(epochs, 100 * history[:, 2] / samples, color=colour, label=f"seed {record.seed}")
+        clean = record.clean
+        middle.plot(clean.epoch, 100 * clean.accuracy, "o", color=colour, markeredgecolor="black")
+    loss = (records[0].recipe or {}).get("loss", MSE)
     measured = "squared error of spike rates" if loss == MSE else loss
     left.set(xlabel="epoch", ylabel=measured, title="loss: training solid, test dashed")
     middle.set(xlabel="epoch", ylabel="test accuracy (%)", title="accuracy; circle: epoch of the clean protocol")
-    longest = max(len(record["history"]) for record in records)
+    longest = max(len(record.history) for record in records)
     for axes in (left, middle):
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         if longest == 1:

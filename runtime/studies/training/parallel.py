@@ -6,16 +6,16 @@ import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
 
 from spikeloom.compiler.atomic import remove_leftovers
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.runtime.studies import jobs as processes
 from spikeloom.runtime.studies.jobs import ProcessDied, ended_by_signal, only_one
+from spikeloom.runtime.studies.training.report import Finished
 from spikeloom.runtime.studies.training.training import Job, recall, run_job, state_of
 
-Result = tuple[dict[str, Any], IntArray | None]
+Result = tuple[Finished, IntArray | None]
 
 
 def train_seeds(jobs: Sequence[Job], *, resume: bool) -> list[Result]:
@@ -96,7 +96,7 @@ def _require_right_start(jobs: Sequence[Job], *, resume: bool, some_finished: bo
     if resume and not kept and not some_finished:
         raise OptionError(
             f"--resume: nothing was interrupted, neither {jobs[0].output} nor {state_of(jobs[0])[0]} exists; "
-            "leave --resume away"
+            "omit --resume"
         )
 
 

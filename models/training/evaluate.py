@@ -1,0 +1,91 @@
+"""What a network decides and by how much it misses, a few recordings at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from spikeloom.models.networks.networks import TrainedModule
+from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.models.training.recipes import CROSS_ENTROPY, RELEASED, Recipe
+
+TEST_BATCH = 2  # larger batches outgrow the cache
+
+
+def evaluate(network: TrainedModule, recordings: Recordings, recipe: Recipe = RELEASED) -> tuple[float, int]:
+    """Mean loss, and how many recordings are classified correctly; equal top rates count for the lowest class."""
+    loss, correct = 0.0, 0
+    with torch.no_grad():
+        for chosen, events in _batches(recordings):
+            labels = recordings.labels[chosen]
+            rates = _rates(network, events)
+            loss += float(loss_of(recipe, rates, labels)) * len(labels)
+            correct += int(np.sum(rates.numpy().argmax(axis=1) == labels))
+    return loss / len(recordings), correct
+
+
+def predict(network: TrainedModule, recordings: Recordings) -> NDArray[np.int64]:
+    """Class of each recording; equal top rates count for the lowest one."""
+    found = []
+    with torch.no_grad(), one_thread():
+        for _, events in _batches(recordings):
+            found.append(_rates(network, events).numpy().argmax(axis=1))
+    return np.concatenate(found)
+
+
+def _batches(recordings: Recordings) -> Iterator[tuple[slice, NDArray[np.uint8]]]:
+    """All recordings in order, a few of one length at a time: where they stand, and their events without filling."""
+    start = 0
+    while start < len(recordings):
+        steps, stop = recordings.steps_of(start), start + 1
+        while stop < min(start + TEST_BATCH, len(recordings)) and recordings.steps_of(stop) == steps:
+            stop += 1
+        yield slice(start, stop), recordings.events[start:stop, ..., :steps]
+        start = stop
+
+
+def loss_of(recipe: Recipe, rates: Tensor, labels: NDArray[np.int64]) -> Tensor:
+    """Loss of spike rates (samples, classes) by a recipe, without its penalty on spikes."""
+    if recipe.loss == CROSS_ENTROPY:
+        wanted = torch.tensor(labels)
+        return torch.nn.functional.cross_entropy(recipe.gain * rates, wanted, label_smoothing=recipe.smoothing)
+    return rate_loss(rates, labels)
+
+
+def rate_loss(rates: Tensor, labels: NDArray[np.int64]) -> Tensor:
+    """Mean squared error of spike rates (samples, classes) against zeros and a one."""
+    target = torch.zeros_like(rates)
+    target[torch.arange(len(labels)), torch.tensor(labels)] = 1.0
+    return torch.nn.functional.mse_loss(rates, target)
+
+
+def _rates(network: TrainedModule, events: NDArray[np.uint8]) -> Tensor:
+    """Spike rates on the CPU, computed where the network is."""
+    rates: Tensor = network(time_first(events).to(network.adjacency.device)).cpu()
+    return rates
+
+
+def time_first(events: NDArray[np.uint8]) -> Tensor:
+    """(samples, taxels, channels, steps) uint8 to (steps, samples, taxels, channels) float32."""
+    return torch.from_numpy(events.transpose(3, 0, 1, 2).astype(np.float32, order="C"))
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """One torch thread, subnormal numbers flushed to zero (beta**t decays into them); both undone at the end."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    torch.set_flush_denormal(True)
+    # glibc hands large blocks back to the system when they are freed, and each step would fault them in anew.
+    # Having freed one of 30 MB it keeps blocks up to that size, see "dynamic mmap threshold" in mallopt(3).
+    torch.empty(30 << 20, dtype=torch.uint8)
+    try:
+        yield
+    finally:
+        torch.set_flush_denormal(False)
+        torch.set_num_threads(threads)

@@ -1,0 +1,116 @@
+"""The kinds of network that are trained: what sizes each has, how it is stored, read back and asked for decisions.
+
+The usual kind is :mod:`training.usual`; a chip that needs its own has a module ``models/CHIP/kind.py``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from pkgutil import iter_modules
+from typing import TYPE_CHECKING, Any, Protocol, cast
+
+from spikeloom import models
+from spikeloom.compiler.fixedpoint import FloatArray, IntArray
+from spikeloom.compiler.systems import SYSTEMS, TACTILESGNET, Grid
+from spikeloom.models.graphs import Graph
+from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.models.systems import HOPS, filters_of, propagation_of
+from spikeloom.models.training.recipes import Recipe
+
+if TYPE_CHECKING:
+    from spikeloom.models.training.train import Sizes
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Plan:
+    """What decides a network before it is trained.
+
+    Parameters
+    ----------
+    grid : Grid, optional
+        Of a grid-based CNN.
+    copies : int, optional
+        Axons of an input, on a chip that may have several.
+    bins : int
+        Bins of the recordings that a step joins.
+    classes, steps : int
+        Of the training recordings, in their own bins.
+    """
+
+    system: str
+    graph: Graph
+    grid: Grid | None
+    recipe: Recipe
+    copies: int | None
+    bins: int
+    classes: int
+    steps: int
+
+
+class Stored(Protocol):
+    """A checkpoint of any kind."""
+
+    @property
+    def training(self) -> Mapping[str, Any] | None:
+        """Its training record."""
+
+    @property
+    def sets(self) -> tuple[str, ...]:
+        """Epochs that it holds."""
+
+
+class Kind(Protocol):
+    """What a module of a kind offers."""
+
+    SYSTEMS: tuple[str, ...]
+    COPIES: tuple[int, ...]
+
+    def recipe_for(self, name: str, given: Mapping[str, Any]) -> Recipe:
+        """The recipe of that name; refuses options, by name and value, that the kind does not take."""
+
+    def architecture(self, plan: Plan) -> Sizes:
+        """Sizes of the network."""
+
+    def save(self, path: Path, kept: Mapping[str, Any], plan: Plan, record: Mapping[str, Any]) -> None:
+        """Write the weights of some epochs, and how they were trained."""
+
+    def read(self, path: Path) -> Stored:
+        """Read what `save` wrote."""
+
+    def differing(self, found: Any, plan: Plan) -> list[str]:
+        """In what a checkpoint is of another plan."""
+
+    def predict_stored(self, found: Any, plan: Plan, test: Recordings) -> IntArray:
+        """Decisions of the last epoch in a checkpoint."""
+
+    def predict(self, weights: Mapping[str, Any], plan: Plan, test: Recordings) -> IntArray:
+        """Decisions of weights that `train` returned."""
+
+
+def kinds() -> list[Kind]:
+    """All kinds, the usual one first."""
+    names = [f"{models.__name__}.{each.name}.kind" for each in iter_modules(models.__path__) if each.ispkg]
+    found = [f"{models.__name__}.training.usual", *filter(find_spec, names)]
+    return [cast(Kind, import_module(name)) for name in found]
+
+
+def kind_of(system: str) -> Kind:
+    """The kind of network that a system is."""
+    return next(kind for kind in kinds() if system in kind.SYSTEMS)
+
+
+def seen_by(plan: Plan) -> FloatArray:
+    """What the first layer sees; systems of a single chip convolve as TactileSGNet does."""
+    taxels, system = plan.graph.n_taxels, plan.system if plan.system in SYSTEMS else TACTILESGNET
+    return propagation_of(system, plan.graph.edges, taxels, plan.grid, filters_of(system, taxels, HOPS))
+
+
+def same_graph(found: Any, plan: Plan) -> bool:
+    """Whether a checkpoint was trained on the graph of the plan, edge for edge."""
+    if found.graph != plan.graph.name or found.edges is None:
+        return False
+    return found.edges.shape == plan.graph.edges.shape and bool((found.edges == plan.graph.edges).all())

@@ -1,0 +1,95 @@
+"""Networks of floats, for chips whose compiler rounds them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from spikeloom.compiler import systems
+from spikeloom.compiler.checkpoint import Checkpoint
+from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.fixedpoint import IntArray
+from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.formats.towers import arrays_of
+from spikeloom.models.networks.checkpoint import save_checkpoint
+from spikeloom.models.networks.networks import Architecture, SpikingNet
+from spikeloom.models.recordings.events import joined_bins
+from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.models.training import evaluate
+from spikeloom.models.training.kinds import Plan, same_graph, seen_by
+from spikeloom.models.training.recipes import LAYERS, RECIPES, Recipe
+
+SYSTEMS = systems.SYSTEMS
+COPIES: tuple[int, ...] = ()
+
+
+def recipe_for(name: str, given: Mapping[str, Any]) -> Recipe:
+    """The recipe of that name.
+
+    Raises
+    ------
+    OptionError
+        If copies of inputs are wanted.
+    """
+    if "--copies" in given:
+        raise OptionError(f"--copies {given['--copies']}: is for chips whose inputs have copies; omit it")
+    return RECIPES[name]
+
+
+def architecture(plan: Plan) -> Architecture:
+    """Sizes, and decays and clocks of the recipe."""
+    plain = Architecture(
+        taxels=plan.graph.n_taxels,
+        classes=plan.classes,
+        system=plan.system,
+        features=plan.recipe.features,
+        hops=plan.recipe.hops,
+    )
+    return replace(plain, dynamics=plan.recipe.dynamics(LAYERS, plain.beta, -(-plan.steps // plan.bins)))
+
+
+def save(path: Path, kept: Mapping[str, Any], plan: Plan, record: Mapping[str, Any]) -> None:
+    """Write a checkpoint."""
+    sizes = architecture(plan)
+    save_checkpoint(
+        path,
+        kept,
+        plan.graph,
+        beta=sizes.beta,
+        theta=sizes.theta,
+        training=record,
+        system=plan.system,
+        grid=plan.grid,
+        dynamics=sizes.dynamics,
+        bins=plan.bins,
+    )
+
+
+def read(path: Path) -> Checkpoint:
+    """Read a checkpoint."""
+    return read_checkpoint(path)
+
+
+def differing(found: Checkpoint, plan: Plan) -> list[str]:
+    """In what a checkpoint is of another plan."""
+    ours, theirs = (None if grid is None else grid.to_json() for grid in (plan.grid, found.grid))
+    same = {
+        "graph": same_graph(found, plan),
+        "system": found.system == plan.system and ours == theirs,
+        "bins": found.bins == plan.bins,
+    }
+    return [name for name, equal in same.items() if not equal]
+
+
+def predict_stored(found: Checkpoint, plan: Plan, test: Recordings) -> IntArray:
+    """Decisions of the last epoch in a checkpoint."""
+    return predict(arrays_of(found), plan, test)
+
+
+def predict(weights: Mapping[str, Any], plan: Plan, test: Recordings) -> IntArray:
+    """Decisions of some weights."""
+    network = SpikingNet(architecture(plan), seen_by(plan))
+    network.load_weights(weights)
+    return evaluate.predict(network, joined_bins(test, plan.bins))

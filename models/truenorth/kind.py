@@ -1,0 +1,84 @@
+"""Networks of whole numbers, trained as crossbar cores hold them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from spikeloom.compiler.dynamics import clocks_over
+from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.fixedpoint import IntArray
+from spikeloom.compiler.targets.truenorth.native import BASES, SYSTEM, USUAL_COPIES
+from spikeloom.compiler.targets.truenorth.native_file import Trained, read_trained, write_trained
+from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.models.training.kinds import Plan, same_graph
+from spikeloom.models.training.recipes import Recipe
+from spikeloom.models.truenorth import network
+from spikeloom.models.truenorth.recipe import CROSSBARS
+
+SYSTEMS = (SYSTEM,)
+COPIES = tuple(BASES)
+
+REFUSED = {
+    "--recipe": "has a recipe of its own",
+    "--current-decay": "has no currents that decay",
+    "--membrane-decay": "has no membranes that decay",
+    "--join": "takes bins as they are; train on what spikeloom data convert --join makes",
+    "--device": "is trained on the CPU",
+    "--spike-penalty": "is trained without",
+}
+
+
+def recipe_for(name: str, given: Mapping[str, Any]) -> Recipe:  # noqa: ARG001 -- there is one
+    """The only recipe.
+
+    Raises
+    ------
+    OptionError
+        If an option is given that such networks do not take.
+    """
+    for option, reason in REFUSED.items():
+        if option in given:
+            raise OptionError(f"{option} {given[option]}: a network of system {SYSTEM} {reason}; omit it")
+    return CROSSBARS
+
+
+def architecture(plan: Plan) -> network.NativeArchitecture:
+    """Sizes that fill the axons of a core."""
+    return network.sized(
+        taxels=plan.graph.n_taxels,
+        classes=plan.classes,
+        hops=plan.recipe.hops,
+        features=plan.recipe.features,
+        copies=plan.copies or USUAL_COPIES,
+        clocks=clocks_over(plan.recipe.clocks, plan.steps),
+    )
+
+
+def save(path: Path, kept: Mapping[str, Any], plan: Plan, record: Mapping[str, Any]) -> None:
+    """Write the whole numbers of each epoch."""
+    sizes = architecture(plan)
+    networks = {which: network.native_network(sizes, arrays) for which, arrays in kept.items()}
+    write_trained(path, networks, graph=plan.graph.name, edges=plan.graph.edges, training=record)
+
+
+def read(path: Path) -> Trained:
+    """Read a file."""
+    return read_trained(path)
+
+
+def differing(found: Trained, plan: Plan) -> list[str]:
+    """In what a file is of another plan."""
+    same = {"graph": same_graph(found, plan), "copies": found.network.copies == (plan.copies or USUAL_COPIES)}
+    return [name for name, equal in same.items() if not equal]
+
+
+def predict_stored(found: Trained, plan: Plan, test: Recordings) -> IntArray:  # noqa: ARG001 -- the file knows it all
+    """Decisions of the last epoch in a file."""
+    return network.predict(found.network, test)
+
+
+def predict(weights: Mapping[str, Any], plan: Plan, test: Recordings) -> IntArray:
+    """Decisions of some weights."""
+    return network.predict(network.native_network(architecture(plan), weights), test)
