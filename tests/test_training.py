@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -318,7 +318,7 @@ def test_one_process_works_on_a_file(data, capsys):
         assert Path("x.pt.lock").exists()
         for options in ([], ["--resume"]):
             assert refused(capsys, "--epochs", "1", "-o", "x.pt", *options) == (
-                "x.pt: another process is working on it; wait for that one, or give another -o"
+                "x.pt: another process is working on it; wait for it, or give another output"
             )
         as_json(capsys, *WORDS, "--epochs", "1", "-o", "y.pt")
     Path("x.pt.lock").write_bytes(b"")  # as a killed process leaves it
@@ -367,6 +367,11 @@ def test_what_a_killed_training_left_half_written_goes(data, capsys):
     assert [file.name for file in data.glob(".*")] == [".xy.pt.abcd_123.part"]
 
 
+@dataclass(frozen=True)
+class Named:
+    output: Path
+
+
 def dies(_job):
     os._exit(9)
 
@@ -375,12 +380,13 @@ def fails(_job):
     raise DataError("epoch 1: the loss is nan")
 
 
+@pytest.mark.filterwarnings("ignore")  # of tasks that joblib cancels
 @pytest.mark.parametrize(
     ("run", "error", "told"), [(dies, OptionError, "go on with --resume"), (fails, DataError, "the loss is nan")]
 )
 def test_a_worker_that_fails_ends_all(run, error, told, monkeypatch):
     monkeypatch.setattr(parallel, "run_job", run)
-    job = SimpleNamespace(output=Path("x.pt"))
+    job = Named(output=Path("x.pt"))
     with pytest.raises(error, match=told):
         parallel._side_by_side([job, job], [0, 1], {})
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 
 from spikeloom.compiler.atomic import remove_leftovers
@@ -112,7 +113,8 @@ def _kept(done: Sequence[Job], jobs: Sequence[Job]) -> str:
 
 def _side_by_side(jobs: Sequence[Job], waiting: Sequence[int], results: dict[int, Result]) -> None:
     """Run jobs in processes of their own; whatever ends this ends them all."""
-    for place, found in processes.side_by_side([jobs[index] for index in waiting], run_job):
+    there = [replace(jobs[index], output=jobs[index].output.absolute()) for index in waiting]
+    for place, found in processes.side_by_side(there, run_job):
         if isinstance(found, ProcessDied):
             raise OptionError(f"{found}; go on with --resume, and with fewer --seeds")
         if isinstance(found, Exception):
