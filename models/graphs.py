@@ -30,6 +30,8 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 CHOICES = "manual, knn:K (K 1..8) or mst:SIGMA (mm, 0 = tree only), each also as released:NAME"
+MAX_TAXELS = 4096  # twice what fills a chip with 64 features each
+
 MAX_NEIGHBOURS = 8
 
 _LAYOUT = tomllib.loads(Path(__file__).with_name("neutouch.toml").read_text(encoding="utf-8"))

@@ -14,13 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spikeloom.compiler.errors import DataError, OptionError
-from spikeloom.models.graphs import CHOICES, Graph, build_graph
+from spikeloom.models.graphs import CHOICES, MAX_TAXELS, Graph, build_graph
 from spikeloom.models.recordings.csvtable import Table, read_table
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-MAX_TAXELS = 4096  # twice what fills a chip with 64 features each
 MAX_MILLIMETRES = 1e6
 
 _SHOWN = 8  # numbers that a warning lists

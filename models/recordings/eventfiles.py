@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spikeloom.compiler.errors import DataError
+from spikeloom.models.graphs import MAX_TAXELS
 from spikeloom.models.recordings.csvtable import FloatArray, read_table
 from spikeloom.models.recordings.evtouch import opened
 from spikeloom.models.recordings.npy import parse_npy, read_bounded
-from spikeloom.models.sensors import MAX_TAXELS
 
 SUFFIXES = (".csv", ".npz")
 MAX_LABEL = 999_999
