@@ -1,21 +1,37 @@
-"""Sections of the page, each from its own part of the report: HTML with figures, and a table behind every figure."""
+"""The page of a network: chapters with figures, each table laid out once for page and terminal."""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
-from spikeloom.runtime.equivalence.divergence import Divergence
-from spikeloom.runtime.equivalence.sections import divergence_text
-from spikeloom.runtime.page import figures as report_figures
-from spikeloom.runtime.page.text import confusions, sender, trace_spikes, trace_title
-from spikeloom.runtime.page.traces import drawn, membranes, raster
-from spikeloom.runtime.report import svg
-from spikeloom.runtime.report.markup import facts, figure, paragraph, table, unfold
-from spikeloom.runtime.report.tables import percent, si
+import numpy as np
 
-Json = dict[str, Any]
+from spikeloom.runtime.equivalence.sections import ladder_table
+from spikeloom.runtime.equivalence.sections import sections as verdict_sections
+from spikeloom.runtime.machines.loihi1 import description
+from spikeloom.runtime.machines.loihi1.costs.result import CostReport
+from spikeloom.runtime.machines.loihi1.costs.sections import sections as cost_sections
+from spikeloom.runtime.page import pictures, stress
+from spikeloom.runtime.page.results import LayerSpikes, Provenance, Recording, Report, Trace
+from spikeloom.runtime.report import drawing
+from spikeloom.runtime.report.drawing import Drawing
+from spikeloom.runtime.report.numbers import percent, si
+from spikeloom.runtime.report.sections import Block, Code, Details, Facts, Figure, Section, Table, Text
+from spikeloom.runtime.studies.chart.sections import figures, saved, taken
 
-RUNGS = {
+LISTED = 10
+"""Rows that a terminal shows of a table that is sorted by weight."""
+
+SPIKES = 200
+"""Differing spikes of a layer that a table lists; ``--json`` has them all."""
+
+ROWS = 3000
+"""Rows of a raster, at most; a screen shows fewer."""
+
+STAGES = {
     "float64": "float64 instead of float32",
     "beta": "+ decay of 12 bits",
     "weights": "+ weights as stored",
@@ -25,262 +41,381 @@ RUNGS = {
 }
 """Rungs of the ladder in words."""
 
-LISTED = 200
-"""Differing spikes of a layer that a table lists; ``--json`` has them all."""
+
+def sections(report: Report) -> list[Section]:
+    """Chapters of the page."""
+    chapters = [
+        Section("Verdict", _verdict(report)),
+        Section("Decisions", _decisions(report)),
+        Section("Cores", [*description.sections(report.netlist), *_cores(report)]),
+        Section("Taxels", _taxels(report)),
+        Section("One recording", _recording(report.recording)),
+        Section("Energy and time", [*cost_sections(report.costs), *_costs(report.costs), *_by_step(report.recording)]),
+        Section("Stability", [] if report.stress is None else stress.sections(report.stress)),
+        Section("Configurations", _configurations(report)),
+        Section("Provenance", _provenance(report.provenance)),
+    ]
+    return [Section(each.title, each.blocks, chapter=True) for each in chapters if each.blocks]
 
 
-# -- verdict -----------------------------------------------------------------------------------------------------------
-
-
-def verdict(report: Json) -> list[str]:
-    """Levels, breakdowns, the ladder and what is certain."""
-    found, costs = report["verify"], report["costs"]
-    samples = found["samples"]
-    energy = costs["per_inference"]["energy_j"]
-    right = {side: round(share * samples) for side, share in found["accuracy"].items()}
-    equal = round(found["decision_agreement"] * samples)
-    times = [entry for entry in costs["time"] if entry["model"] == "simple"]
-    cards = {f"{side} accuracy": _split(percent(count, samples)) for side, count in right.items()}
-    cards["decisions equal"] = f"{equal} of {samples}", "chip and float model"
-    cards["specification = engine"] = (
-        "yes" if found["spec_equals_engine"] else "NO",
-        f"every spike, membrane and count of {found['spec_samples']} recordings",
+def about(report: Report) -> str:
+    """The page in a sentence."""
+    net, origin = report.netlist, report.provenance.checkpoint
+    graph = f", graph {origin.graph}" if report.taxels.graph else ""
+    return (
+        f"A {origin.system or 'network'}{graph}: {net.neurons:,} neurons and {net.synapses:,} synapses on "
+        f"{net.cores} cores of {net.target}, compared with its float model on {report.provenance.data.samples} "
+        "recordings."
     )
+
+
+# -- verdict and decisions ---------------------------------------------------------------------------------------------
+
+
+def _verdict(report: Report) -> list[Block]:
+    verdict = report.verify
+    blocks: list[Block] = [Facts(_cards(report))]
+    rungs = {STAGES.get(rung.stage, rung.stage): [float(sum(rung.different.values()))] for rung in verdict.ladder}
+    title = "Spikes that differ from the float32 model, rung by rung"
+    for section in verdict_sections(verdict):
+        if section.title == "Ladder":
+            caption = "Which deviation costs how many spikes: each rung adds one to those above, the last is the chip."
+            draw = partial(drawing.bars, title, rungs, ["differing spikes"])
+            blocks.append(Section("Ladder", [Figure("ladder", draw, caption, [ladder_table(verdict)])]))
+        else:
+            blocks.append(section)
+    return blocks
+
+
+def _cards(report: Report) -> dict[str, tuple[str, str]]:
+    verdict, costs = report.verify, report.costs
+    cards = {}
+    for side, share in verdict.accuracy.items():
+        value, _, note = percent(round(share * verdict.samples), verdict.samples).partition(" (")
+        cards[f"{side} accuracy"] = value, note.removesuffix(")")
+    equal = round(verdict.decision_agreement * verdict.samples)
+    cards["decisions equal"] = f"{equal} of {verdict.samples}", "chip and float model"
+    exact = f"every spike, membrane and count of {verdict.spec_samples} recordings"
+    cards["specification = engine"] = "yes" if verdict.spec_equals_engine else "NO", exact
+    energy = costs.per_inference.energy_j
     if energy:
-        ends = sorted(energy.items(), key=lambda entry: entry[1])
-        shown = dict.fromkeys(si(value, "J") for _, value in ends)
+        shown = dict.fromkeys(si(value, "J") for value in sorted(energy.values()))
         cards["energy an inference"] = (
             " … ".join(dict.fromkeys([next(iter(shown)), list(shown)[-1]])),
             ", ".join(energy),
         )
+    times = [entry for entry in costs.time if entry.model == "simple"]
     if times:
-        mean = times[0]["inference_s"]["mean"]
-        cards["time an inference"] = si(mean, "s"), f"at full speed, {times[0]['table']}, simple model"
-    cards["cores"] = f"{report['netlist']['cores']}", f"{report['netlist']['compartments']:,} neurons on the chip"
-    first = found["first_divergence"]
-    levels = [
-        [level["name"], "–" if level["share"] is None else f"{100 * level['share']:.2f}\xa0%", level["text"]]
-        for level in found["levels"]
-    ]
-    names = list(found["spikes"])
-    rungs = {rung["stage"]: [rung["different"][name] for name in names] for rung in found["ladder"]}
-    ladder = table(
-        "Spikes that differ from the float32 model, with one deviation more on each rung",
-        ["rung", *names],
-        [[RUNGS.get(stage, stage), *(f"{count:,}" for count in counts)] for stage, counts in rungs.items()],
-    )
-    spikes = [
-        [name, *(f"{layer[key]:,}" for key in ("float", "chip", "different", "ill_posed"))]
-        for name, layer in found["spikes"].items()
-    ]
-    certified = found["certificate"]
-    proof = [
-        [name, *(f"{layer[key]:,}" for key in ("entries", "equal", "different", "undecided"))]
-        for name, layer in certified["layers"].items()
-    ]
-    overflow = ", ".join(certified["unproven"])
-    return [
-        facts(cards),
-        table("Levels of equivalence", ["level", "reached", "what was found"], levels, left=True),
-        *(paragraph(f"Breakdown: {breakdown['text']}") for breakdown in found["breakdowns"]),
-        paragraph(
-            "No spike differs." if first is None else f"First divergence: {divergence_text(Divergence(**first))}."
-        ),
-        "<h3>Equivalence ladder</h3>",
-        figure(
-            svg.bars(
-                "ladder",
-                "Spikes that differ from the float32 model, rung by rung",
-                {RUNGS.get(stage, stage): [float(sum(counts))] for stage, counts in rungs.items()},
-                ["differing spikes"],
-                "",
-                left=230,
-            ),
-            "Which deviation costs how many spikes: each rung adds one to those above, the last is the chip.",
-            ladder,
-        ),
-        table("Spikes over all recordings", ["layer", "float", "chip", "different", "ill-posed"], spikes),
-        table("Certified in any order of sums", ["layer", "entries", "equal", "different", "undecided"], proof),
-        paragraph(
-            f"{certified['decisions']} of {certified['samples']} decisions are certified equal. "
-            + (
-                f"Some input may overflow a register of {overflow}."
-                if overflow
-                else "No register overflows for any input."
-            )
-        ),
-    ]
+        mean = si(times[0].inference_s["mean"], "s")
+        cards["time an inference"] = mean, f"at full speed, {times[0].table}, simple model"
+    net = report.netlist
+    return cards | {"cores": (f"{net.cores}", f"{net.compartments:,} neurons on the chip")}
 
 
-def _split(text: str) -> tuple[str, str]:
-    value, _, note = text.partition(" (")
-    return value, note.removesuffix(")")
-
-
-# -- decisions ---------------------------------------------------------------------------------------------------------
-
-
-def decisions(report: Json) -> list[str]:
-    """Confusion matrices."""
-    found = report["decisions"]
-    wrong = [[f"{label} as {decided}", str(ours), str(chip)] for label, decided, ours, chip in confusions(found)]
-    matrices = found["matrices"]
+def _decisions(report: Report) -> list[Block]:
+    found = report.decisions
+    ours, chip = found.matrices.model, found.matrices.chip
+    wrong = [[f"{label} as {decided}", str(a), str(b)] for label, decided, a, b in found.confusions()]
     classes = [
-        [str(k), str(sum(matrices["float"][k])), str(matrices["float"][k][k]), str(matrices["chip"][k][k])]
-        for k in range(found["classes"])
-        if sum(matrices["float"][k])
+        [str(k), str(ours[k].sum()), str(ours[k, k]), str(chip[k, k])] for k in range(found.classes) if ours[k].any()
     ]
     moved = [
-        [file, str(label), str(ours), str(chip)]
-        for file, label, ours, chip in zip(found["files"], found["labels"], found["float"], found["chip"], strict=True)
-        if ours != chip
+        [file, *map(str, decided)]
+        for file, *decided in zip(found.files, found.labels, found.model, found.chip, strict=True)
+        if decided[1] != decided[2]
     ]
-    numbers = table("Right decisions by class", ["class", "recordings", "float", "chip"], classes)
+    title = "Confusion matrices of the float model and of the chip"
+    figure = Figure(
+        "confusion",
+        partial(drawing.matrices, title, {"float model": ours, "chip": chip}),
+        "Rows are labels, columns decisions; right ones lie on the diagonal, the others are of another colour.",
+        [Table(["class", "recordings", "float", "chip"], classes, "Right decisions by class", most=0)],
+    )
+    blocks: list[Block] = [figure]
     if wrong:
-        numbers += table("Wrong decisions", ["label decided as", "float", "chip"], wrong)
-    parts = [
-        figure(
-            report_figures.confusion(found),
-            "Rows are labels, columns decisions; right ones lie on the diagonal, the others are of another colour.",
-            numbers,
-        )
-    ]
+        blocks.append(Table(["label decided as", "float", "chip"], wrong, "Wrong decisions", most=LISTED))
+    else:
+        blocks.append(Text("no recording is decided wrongly, by either side"))
     if moved:
-        head = ["recording", "label", "float model", "chip"]
-        return [*parts, table("Recordings that the two decide differently", head, moved)]
-    return [*parts, paragraph("The two decide every recording alike.")]
+        caption = "Recordings that the two decide differently"
+        table = Table(["recording", "label", "float model", "chip"], moved, caption, most=LISTED)
+        return [*blocks, Section("", [Text(f"{len(moved)} decided differently:"), table])]
+    return [*blocks, Text("the two decide every recording alike")]
 
 
-# -- cores -------------------------------------------------------------------------------------------------------------
+# -- cores and taxels --------------------------------------------------------------------------------------------------
 
 
-def cores(report: Json) -> list[str]:
-    """Map of the mesh, fill and traffic."""
-    found = report["cores"]
-    limits = list(dict.fromkeys(name for core in found["cores"] for name in core["fill"]))
+def _cores(report: Report) -> list[Block]:
+    found = report.cores
+    limits = list(dict.fromkeys(name for core in found.cores for name in core.fill))
+    short = [name.removeprefix("core.").replace("_", " ") for name in limits]
+    places = [
+        [
+            str(core.core),
+            str(core.tile),
+            " ".join(core.layers),
+            f"{core.compartments:,}",
+            core.fullest,
+            f"{100 * core.fill[core.fullest].share:.0f} %",
+        ]
+        for core in found.cores
+    ]
     fill = [
-        [str(core["core"]), str(core["tile"]), " ".join(core["layers"])]
-        + [f"{core['fill'][name]['used']:,} ({100 * core['fill'][name]['share']:.0f} %)" for name in limits]
-        for core in found["cores"]
+        [str(core.core), *(f"{core.fill[name].used:,} ({100 * core.fill[name].share:.0f} %)" for name in limits)]
+        for core in found.cores
     ]
     ways = [
+        [way.sender, str(way.to), f"{way.packets:,.0f}", f"{way.axons:,}", "" if way.hops is None else str(way.hops)]
+        for way in sorted(found.traffic, key=lambda way: -way.packets)
+    ]
+    mesh, tiles, chips = found.mesh, {core.tile for core in found.cores}, {core.chip for core in found.cores}
+    figure = Figure(
+        "cores-map",
+        partial(pictures.mesh, found),
+        "A core is filled as far as the fullest of its compartments, synaptic memory and axons; lines are packets in a "
+        "mean recording.",
         [
-            sender(way),
-            str(way["to"]),
-            f"{way['packets']:,.0f}",
-            f"{way['axons']:,}",
-            "" if way["hops"] is None else str(way["hops"]),
-        ]
-        for way in found["traffic"]
-    ]
-    short = [name.removeprefix("core.").replace("_", " ") for name in limits]
-    mesh, tiles = found["mesh"], len({core["tile"] for core in found["cores"]})
-    chips = len({core["chip"] for core in found["cores"]})
+            Table(["core", "tile", "layers", "compartments", "fullest limit", "fill"], places, "Cores"),
+            Table(["core", *short], fill, "What each core uses of each limit", most=0),
+            Table(
+                ["from core", "to core", "packets", "axons", "hops"], ways, "Packets in a mean recording", most=LISTED
+            ),
+        ],
+    )
+    used = (
+        f"{len(found.cores)} cores on {len(tiles)} of {len(chips) * mesh.width * mesh.height} tiles (a chip has "
+        f"{mesh.width} by {mesh.height}, of {mesh.tile_cores} cores each); only the used part is drawn"
+    )
+    return [Section("", [Text(used), figure])]
+
+
+def _taxels(report: Report) -> list[Block]:
+    found = report.taxels
+    order = np.argsort(-found.events, kind="stable").tolist()
+    edges = found.edges.tolist()
+    head = ["taxel", "neighbours", "events (mean)", *([] if found.spikes is None else [f"{found.layer} spikes (mean)"])]
+    rows = []
+    for taxel in order[: pictures.DETAILED]:
+        near = len({b for a, b in edges if a == taxel})
+        spikes = [] if found.spikes is None else [f"{found.spikes[taxel]:,.1f}"]
+        rows.append([str(taxel), str(near), f"{found.events[taxel]:,.1f}", *spikes])
+    graph = "no taxel graph" if found.graph is None else f"graph {found.graph} with {len(edges)} edges"
+    where = "" if found.positions_mm is not None else "; their positions are not known, so they are drawn on a circle"
+    caption = "Discs grow with what a taxel sends, and with what its first-layer neurons fire where there is a graph."
+    table = Table(head, rows, "Activity in a mean recording, the busiest first", most=LISTED)
     return [
-        paragraph(
-            f"Cores: {len(found['cores'])}, on {tiles} of {chips * mesh['width'] * mesh['height']} tiles (a chip has "
-            f"{mesh['width']} by {mesh['height']}, of {mesh['tile_cores']} cores each); only the used part is drawn."
-        ),
-        figure(
-            report_figures.core_map(found),
-            "A core is filled as far as the fullest of its compartments, synaptic memory and axons; lines are packets "
-            "in a mean recording.",
-            table("What each core uses of each limit", ["core", "tile", "layers", *short], fill)
-            + table("Packets in a mean recording", ["from core", "to core", "packets", "axons", "hops"], ways),
-        ),
-    ]
-
-
-# -- taxels ------------------------------------------------------------------------------------------------------------
-
-
-def taxels(report: Json) -> list[str]:
-    """The sensor, its graph and its activity."""
-    found = report["taxels"]
-    neighbours = [len({b for a, b in found["edges"] if a == taxel}) for taxel in range(len(found["events"]))]
-    head = ["taxel", "neighbours", "input events"]
-    rows = [[str(i), str(near), f"{found['events'][i]:,.1f}"] for i, near in enumerate(neighbours)]
-    if found["spikes"] is not None:
-        head.append(f"{found['layer']} spikes on the chip")
-        rows = [[*row, f"{value:,.1f}"] for row, value in zip(rows, found["spikes"], strict=True)]
-    sensor = f"{found['sensor'] or 'Sensor'}: {len(rows)} taxels"
-    graph = "no taxel graph" if found["graph"] is None else f"graph {found['graph']} with {len(found['edges'])} edges"
-    where = "" if found["positions_mm"] else " Their positions are not known, so they are drawn on a circle."
-    title = "Activity of each taxel in a mean recording"
-    if len(rows) > report_figures.DETAILED:
-        order = sorted(range(len(rows)), key=lambda taxel: -found["events"][taxel])[: report_figures.DETAILED]
-        rows, title = [rows[taxel] for taxel in order], f"Activity of the {len(order):,} busiest taxels"
-    return [
-        paragraph(f"{sensor}, {graph}.{where}"),
-        figure(
-            report_figures.fingertip(found),
-            "Discs grow with what a taxel sends"
-            + (", and with what its first-layer neurons fire." if found["spikes"] is not None else "."),
-            table(title, head, rows),
-        ),
+        Text(f"{found.sensor or 'sensor'}: {len(order)} taxels, {graph}{where}; the busiest:"),
+        Figure("taxels-map", partial(pictures.fingertip, found), caption, [table]),
     ]
 
 
 # -- one recording -----------------------------------------------------------------------------------------------------
 
 
-def recording(report: Json) -> list[str]:
-    """Rasters of both sides, membranes where they part."""
-    found = report["recording"]
-    decided, steps = found["decision"], found["steps"]
+def _recording(found: Recording) -> list[Block]:
+    decided = found.decision
     votes = [
         [str(k), str(ours), str(chip)]
-        for k, (ours, chip) in enumerate(zip(found["votes"]["float"], found["votes"]["chip"], strict=True))
+        for k, (ours, chip) in enumerate(zip(found.votes.model, found.votes.chip, strict=True))
         if ours or chip
     ]
     counts = [
-        [layer["name"], f"{len(layer['active']):,} of {layer['neurons']:,}"]
-        + [f"{layer[key]:,}" for key in ("float_spikes", "chip_spikes", "different")]
-        for layer in found["layers"]
+        [layer.name, f"{len(layer.active):,} of {layer.neurons:,}"]
+        + [f"{count:,}" for count in (layer.float_spikes, layer.chip_spikes, layer.different)]
+        for layer in found.layers
     ]
-    sent = {"name": "input", "both": found["input"], "float_only": [], "chip_only": [], "different": 0}
-    sent |= {"active": sorted({channel for _, channel in found["input"]})}
-    layers = [sent, *found["layers"]]
-    shown = next((layer["name"] for layer in found["layers"] if layer["different"]), found["layers"][0]["name"])
-    options = "".join(
-        f"<option{' selected' if layer['name'] == shown else ''}>{layer['name']}</option>" for layer in layers
+    nothing = np.zeros((0, 2), np.int64)
+    sent = LayerSpikes(
+        name="input",
+        neurons=0,
+        active=np.unique(found.input[:, 1]),
+        float_spikes=len(found.input),
+        chip_spikes=len(found.input),
+        different=0,
+        both=found.input,
+        float_only=nothing,
+        chip_only=nothing,
     )
+    shown = next((layer for layer in found.layers if layer.different), found.layers[0])
+    rasters = [
+        Details(layer.name, [_raster(layer, found.steps)], "raster", layer is shown) for layer in (sent, *found.layers)
+    ]
+    head = ["layer", "neurons that fire", "float spikes", "chip spikes", "different"]
+    voted = Table(["class", "float", "chip"], votes, "Votes") if votes else Text("No neuron votes.")
+    first, *others = found.membranes
+    near = [_membrane_rows(first)[step - first.first_step] for step in _near(first)]
     return [
-        paragraph(
-            f"{found['file']}, {steps} steps: label {found['label']}, decided {decided['float']} by the float model "
-            f"and {decided['chip']} by the chip. Choose another with --recording."
+        Text(
+            f"{found.file}, {found.steps} steps: label {found.label}, decided {decided.model} by the float model and "
+            f"{decided.chip} by the chip"
         ),
-        table("Spikes by layer", ["layer", "neurons that fire", "float", "chip", "different"], counts),
-        unfold("Votes", table("Votes", ["class", "float", "chip"], votes)) if votes else paragraph("Nobody votes."),
-        "<h3>Spikes</h3>",
-        f'<label class="choose">Layer <select id="layer">{options}</select></label>',
-        *(_raster(layer, steps) for layer in layers),
-        "<h3>Membranes</h3>",
-        figure(
-            membranes(found["membranes"]),
-            "Membranes before the reset, in the float model's units, around the first spike of each layer that "
-            "differs, which is shaded. Where no spike differs: of the neuron whose membranes lie furthest apart.",
-            "".join(_trace(trace) for trace in found["membranes"]),
+        Table(head, counts, "Spikes by layer"),
+        Details("Votes", [voted]),
+        Section("Spikes", rasters),
+        Section(
+            "Membranes",
+            [
+                Text(first.title),
+                Table(MEMBRANE, near, "Around the first of them"),
+                Figure(
+                    "membranes",
+                    partial(pictures.membranes, found.membranes),
+                    "Membranes before the reset, in the float model's units, around the first spike of each layer that "
+                    "differs, which is shaded. Where none differs: of the neuron whose membranes lie furthest apart.",
+                    [_membrane_table(trace) for trace in (first, *others)],
+                ),
+            ],
         ),
     ]
 
 
-def _raster(layer: Json, steps: int) -> str:
-    channels = "channels with an event" if layer["name"] == "input" else "neurons that fire on either side"
-    all_or_some = f"{len(drawn(layer)):,} of " if len(drawn(layer)) < len(layer["active"]) else ""
-    caption = f"{layer['name']}: rows are {all_or_some}the {len(layer['active']):,} {channels}, in order."
-    entries = sorted((step, neuron, side) for side in ("float", "chip") for step, neuron in layer[f"{side}_only"])
-    rows = [[str(step), str(neuron), f"{side} only"] for step, neuron, side in entries[:LISTED]]
-    title = f"{layer['name']}: spikes of one side only"
-    title += f", the first {LISTED:,} of {len(entries):,} (--json has all)" if len(entries) > LISTED else ""
-    numbers = table(title, ["step", "neuron", "fires"], rows) if rows else ""
-    return figure(raster(f"raster-{layer['name']}", layer, steps), caption, numbers, raster=layer["name"])
+MEMBRANE = ["step", "float membrane", "chip membrane", "fires"]
 
 
-def _trace(trace: Json) -> str:
+def _near(trace: Trace) -> range:
+    """Steps next to the divergence."""
+    end = trace.first_step + len(trace.model)
+    return range(max(trace.first_step, trace.step - LISTED // 2), min(end, trace.step + LISTED // 2 + 1))
+
+
+def _membrane_rows(trace: Trace) -> list[list[str]]:
+    return [
+        [str(step), f"{ours:.6f}", f"{chip:.6f}", trace.fires(step)]
+        for step, (ours, chip) in enumerate(zip(trace.model, trace.chip, strict=True), trace.first_step)
+    ]
+
+
+def _membrane_table(trace: Trace) -> Table:
+    title = f"{trace.title}; threshold {trace.theta:g}, on the chip {trace.chip_theta:.6f}"
+    return Table(MEMBRANE, _membrane_rows(trace), title, most=0)
+
+
+def _raster(layer: LayerSpikes, steps: int) -> Figure:
+    kind = "channel" if layer.name == "input" else "neuron"
+    active = layer.active.tolist()
+    rows = [active[i * len(active) // ROWS] for i in range(ROWS)] if len(active) > ROWS else active
+    what = "channels with an event" if kind == "channel" else "neurons that fire on either side"
+    some = f"{len(rows):,} of " if len(rows) < len(active) else ""
+    spikes = {"both": layer.both, "float": layer.float_only, "chip": layer.chip_only}
+    entries = sorted((*pair, side) for side in ("float", "chip") for pair in spikes[side].tolist())
+    listed = [[str(step), str(neuron), f"{side} only"] for step, neuron, side in entries[:SPIKES]]
+    more = f", the first {SPIKES:,} of {len(entries):,} (--json has all)" if len(entries) > SPIKES else ""
+    numbers = [Table(["step", kind, "fires"], listed, f"Spikes of one side only{more}", most=0)] if listed else []
+    title = f"Spikes of {layer.name}, float model and chip"
+    return Figure(
+        f"raster-{layer.name}",
+        partial(drawing.raster, title, rows, steps, spikes, kind),
+        f"{layer.name}: rows are {some}the {len(active):,} {what}, in order.",
+        numbers,
+    )
+
+
+# -- energy and time ---------------------------------------------------------------------------------------------------
+
+
+def _costs(found: CostReport) -> list[Block]:
+    """Energy by layer and part, time by core."""
+    tables = list(found.per_inference.energy_j)
+    blocks: list[Block] = []
+    if tables:
+        layers = {layer.name: list(layer.amounts.energy_j.values()) for layer in found.layers}
+        title, caption = "Energy of a mean inference by layer", "Synapses belong to the layer that receives."
+        blocks.append(_bars("energy-layers", title, layers, tables, "J", caption))
+        parts = next(iter(found.energy_by_part_j.values()))
+        shares = {part: [found.energy_by_part_j[name][part] for name in tables] for part in parts}
+        title = "Energy of a mean inference by part of the chip"
+        caption = "Synapse: visited entries; soma: neuron updates and spikes; network: packets and hops."
+        blocks.append(_bars("energy-parts", title, shares, tables, "J", caption))
+    if found.time:
+        first = found.time[0].table
+        cores = {f"core {core.core}": [core.sweep_s[first], core.receive_s[first]] for core in found.cores}
+        title = "Time of a mean inference by core"
+        caption = "Both go on at once; a step lasts as long as the slowest core."
+        blocks.append(_bars("time-cores", title, cores, ["sweep and send", "receive"], "s", caption))
+    return blocks
+
+
+def _bars(
+    name: str, title: str, rows: Mapping[str, Sequence[float]], series: Sequence[str], unit: str, caption: str
+) -> Figure:
+    cells = [[label, *(si(value, unit) for value in values)] for label, values in rows.items()]
+    numbers = [Table(["", *series], cells, title, most=0)]
+    return Figure(name, partial(drawing.bars, title, rows, series, unit), f"{title}. {caption}", numbers)
+
+
+def _by_step(recording: Recording) -> list[Block]:
+    """Energy by core, energy and time by step of the recording that is drawn."""
+    found, cores = recording.by_step, recording.costs.cores
+    times = {**found.time_s, **{f"mean of all, {name}": each for name, each in found.mean_time_s.items()}}
     rows = [
-        [str(trace["first_step"] + i), f"{ours:.6f}", f"{chip:.6f}", trace_spikes(trace, trace["first_step"] + i)]
-        for i, (ours, chip) in enumerate(zip(trace["float"], trace["chip"], strict=True))
+        [f"{what}, {name}", si(float(each.mean()), unit), si(float(each.max()), unit), str(int(each.argmax()))]
+        for what, unit, series in (("energy", "J", found.energy_j), ("time", "s", found.time_s))
+        for name, each in series.items()
     ]
-    title = f"{trace_title(trace)}; threshold {trace['theta']:g}, on the chip {trace['chip_theta']:.6f}"
-    return table(title, ["step", "float membrane", "chip membrane", "fires"], rows)
+    blocks: list[Block] = [Table(["by chip step", "mean", "most", "at step"], rows, f"Chip steps of {recording.file}")]
+    tables = list(cores[0].energy_j)
+    if tables:
+        energy = {f"core {core.core}": list(core.energy_j.values()) for core in cores}
+        caption = "It is the one that is drawn above, simulated message by message."
+        blocks.append(_bars("energy-cores", "Energy of this recording by core", energy, tables, "J", caption))
+    for name, title, series, unit in (
+        ("energy-steps", "Energy of each chip step of this recording", found.energy_j, "J"),
+        ("time-steps", "Time of each chip step of this recording", times, "s"),
+    ):
+        if series:
+            longest = max(len(values) for values in series.values())
+            cells = [
+                [str(step), *(si(float(v[step]), unit) if step < len(v) else "" for v in series.values())]
+                for step in range(longest)
+            ]
+            draw: Callable[[], Drawing] = partial(drawing.lines, title, series, "chip step", unit)
+            numbers = [Table(["chip step", *series], cells, title, most=0)]
+            blocks.append(Figure(name, draw, f"{title}: one line for each table.", numbers))
+    return [Section("Step by step", blocks)]
+
+
+# -- the rest ----------------------------------------------------------------------------------------------------------
+
+
+def _configurations(report: Report) -> list[Block]:
+    """What a chart of this network and others found."""
+    chart = report.chart
+    return [] if chart is None else [*figures(chart, "pareto"), *taken(chart), saved(chart)]
+
+
+def _provenance(made: Provenance) -> list[Block]:
+    """Files, hashes, versions, options, seeds; and what to type to get all of it again."""
+    files = [
+        ["netlist", made.netlist.file, made.netlist.sha256],
+        ["checkpoint", made.checkpoint.file, made.checkpoint.sha256],
+        ["data", f"{made.data.name}, {made.data.split} split", made.data.sha256],
+    ]
+    facts: dict[str, Mapping[str, Any] | None] = {
+        "How the netlist was compiled": made.netlist.compiled,
+        "Decays by layer, and clocks": made.checkpoint.dynamics,
+        "Steps": {"bins that one joins": made.checkpoint.bins} if made.checkpoint.bins > 1 else None,
+        "How the network was trained": made.checkpoint.training,
+        "Versions": made.versions,
+        "Energy tables": made.chip.energy_tables,
+        "Time tables": made.chip.time_tables,
+    }
+    tables = [
+        Table(
+            ["", "value"],
+            [[name, value if isinstance(value, str) else json.dumps(value)] for name, value in found.items()],
+            caption,
+            words=True,
+            most=0,
+        )
+        for caption, found in facts.items()
+        if found
+    ]
+    versions = ", ".join(f"{name} {number}" for name, number in made.versions.items())
+    commands = [block for line in made.commands for block in (Text(f"{line.what}:"), Code([line.command]))]
+    return [
+        Table(["", "name", "sha256"], files, "Files; the hash of recordings is over events and labels", words=True),
+        *tables,
+        Text(f"versions: {versions}"),
+        Section("Commands that repeat this page", commands),
+    ]

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal, ParamSpec
 import numpy as np
 import numpy.typing as npt
 
+from spikeloom.compiler.fixedpoint import FloatArray
 from spikeloom.runtime.report.numbers import counted, si
 
 if TYPE_CHECKING:
@@ -166,14 +167,14 @@ def bars(title: str, rows: Mapping[str, Sequence[float]], series: Sequence[str],
 
 
 @styled
-def lines(title: str, series: Mapping[str, Sequence[float]], label: str, unit: str = "") -> Drawing:
+def lines(title: str, series: Mapping[str, Sequence[float] | FloatArray], label: str, unit: str = "") -> Drawing:
     """Lines over steps, each in a colour and a dash of its own."""
     drawing = sheet(title, 2.8)
     drawing.along = "x"
     axes = drawing.figure.subplots()
     for index, (name, values) in enumerate(series.items()):
         axes.plot(values, color=COLOURS[index % len(COLOURS)], ls=DASHES[index % len(DASHES)], lw=1.3, label=name)
-    most = max((max(values, default=0.0) for values in series.values()), default=0.0) or 1.0
+    most = max((float(np.max(values, initial=0.0)) for values in series.values()), default=0.0) or 1.0
     for step in range(max(map(len, series.values()))):
         there = {name: values[step] for name, values in series.items() if step < len(values)}
         told = ", ".join(f"{si(value, unit)} {name}" for name, value in there.items())
@@ -238,7 +239,9 @@ def raster(
     for side, colour, marker in (("float", FLOAT, "_"), ("chip", CHIP, "|")):
         own = places(side)
         name = "float model" if side == "float" else side
-        axes.plot(own[:, 0], own[:, 1], marker, color=colour, ms=6, mew=1.4, label=f"{name} only")
+        axes.plot(
+            own[:, 0], own[:, 1], marker, color=colour, ms=3 if len(neurons) > 150 else 6, mew=1.2, label=f"{name} only"
+        )
         found += [(x, y, f"{kind} {neurons[y]}, step {x}: only the {name} fires") for x, y in own.tolist()]
     drawing.tips += [(axes, x, y, tip) for x, y, tip in sorted(found)]
     drawing.cells = axes, [f"{kind} {neuron}" for neuron in neurons]

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-from collections.abc import Callable
+from dataclasses import replace
 from difflib import get_close_matches
-from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from spikeloom.compiler.atomic import write_atomically
 from spikeloom.compiler.dynamics import with_clocks
@@ -20,19 +19,18 @@ from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.commands.options import add_explain_cost, add_network, add_recordings
 from spikeloom.runtime.costs.simulated import Account
-from spikeloom.runtime.equivalence.sections import sections
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.machines.base import machine_of
 from spikeloom.runtime.machines.loihi1.description import describe
 from spikeloom.runtime.machines.loihi1.trace import check_channels
-from spikeloom.runtime.page.text import report_text
-from spikeloom.runtime.report.encode import encode
-from spikeloom.runtime.report.sections import Outcome, Section, Text, terminal
+from spikeloom.runtime.report import html
+from spikeloom.runtime.report.sections import Outcome, Section, Text
 from spikeloom.runtime.studies.chart.files import read_chart
 
-Json = dict[str, Any]
+if TYPE_CHECKING:
+    from spikeloom.runtime.page.results import Report
 
 NOTES = """\
 The page opens from disk and loads nothing; its figures are inline SVG, each with its numbers as a table. What is
@@ -68,31 +66,36 @@ def run(arguments: argparse.Namespace) -> Outcome:
     SpikeloomError
         If an option, the netlist, the checkpoint or the recordings cannot be used, or do not belong together.
     """
-    from spikeloom.runtime.page.page import page
+    from spikeloom.runtime.page import stress
+    from spikeloom.runtime.page.sections import about, sections
 
     require_place(arguments.output, "-o", arguments)
     netlist = read_netlist(arguments.netlist)
-    stability: Json = {}
+    battery = None
     if arguments.stress is not None:
-        from spikeloom.runtime.page.stress import read_stress
-
         sha256 = hashlib.sha256(Path(arguments.netlist).read_bytes()).hexdigest()
-        stability = {"stress": read_stress(arguments.stress, arguments.netlist, sha256)}
-    asked = load_network(arguments.checkpoint, arguments, netlist)
-    _require_origin(arguments, netlist, asked)
-    chart = None if arguments.chart is None else read_chart(arguments.chart, asked.sha256, arguments.checkpoint)
+        battery = stress.read_stress(arguments.stress, arguments.netlist, sha256)
+    loaded = load_network(arguments.checkpoint, arguments, netlist)
+    _require_origin(arguments, netlist, loaded)
+    chart = None if arguments.chart is None else read_chart(arguments.chart, loaded.sha256, arguments.checkpoint)
     data = load_recordings(arguments, netlist, labels_for="report")
     check_channels(netlist, data.events.shape[1] * data.events.shape[2] + netlist.clocks.channels)
     chosen = None if arguments.recording is None else find_recording(data, arguments.recording)
-    found, as_text, code = _facts(arguments, netlist, asked, data, chosen)
-    found |= stability
-    found |= {} if chart is None else {"chart": chart}
+    report = replace(_report(arguments, netlist, loaded, data, chosen), stress=battery, chart=chart)
+    made = report.provenance
+    title = f"{made.netlist.file} on {made.data.name}"
     with write_atomically(arguments.output) as file:
-        file.write(page(found).encode())
-    return Outcome(found | {"output": arguments.output}, lambda result: [Section("", [Text(as_text(result))])], code)
+        file.write(html.page(title, about(report), sections(report)).encode())
+    return Outcome(report, _printed, 1 if report.verify.missed else 0)
 
 
-def _require_origin(arguments: argparse.Namespace, netlist: Netlist, asked: LoadedNetwork) -> None:
+def _printed(report: Report) -> list[Section]:
+    from spikeloom.runtime.page.sections import sections
+
+    return [*sections(report), Section("", [Text(f"page: {report.output}")])]
+
+
+def _require_origin(arguments: argparse.Namespace, netlist: Netlist, loaded: LoadedNetwork) -> None:
     """Refuse a netlist that says that it is from another network; the page would blame the chip for it.
 
     Raises
@@ -102,17 +105,17 @@ def _require_origin(arguments: argparse.Namespace, netlist: Netlist, asked: Load
     """
     from spikeloom.runtime.equivalence.reference import require_match
 
-    require_match(netlist, asked.model)
+    require_match(netlist, loaded.model)
     made, where = netlist.provenance, arguments.netlist
-    own = asked.sha256
+    own = loaded.sha256
     if made.get("checkpoint_sha256", own) != own:
         raise ModelError(
             f"{where}: compiled from a checkpoint of sha256 {made['checkpoint_sha256'][:12]}…, {arguments.checkpoint} "
             f"has {own[:12]}…; give the one that it was compiled from"
         )
-    if asked.checkpoint is None:
+    if loaded.checkpoint is None:
         return
-    told = {"graph": asked.graph, "weights": asked.checkpoint.weights, "run": arguments.run}
+    told = {"graph": loaded.graph, "weights": loaded.checkpoint.weights, "run": arguments.run}
     for name, value in told.items():
         if made.get(name, value) != value:
             raise ModelError(f"{where}: compiled for {name} {made[name]}, this is {value}; give --{name} {made[name]}")
@@ -138,27 +141,28 @@ def find_recording(data: Recordings, asked: str) -> int:
     )
 
 
-def _facts(
-    arguments: argparse.Namespace, netlist: Netlist, asked: LoadedNetwork, data: Recordings, chosen: int | None
-) -> tuple[Json, Callable[[Json], str], int]:
-    """All that the page shows, as JSON values, how to print them, and the exit code."""
+def _report(
+    arguments: argparse.Namespace, netlist: Netlist, loaded: LoadedNetwork, data: Recordings, chosen: int | None
+) -> Report:
+    """All that the page shows, but for what other commands found."""
     from spikeloom.runtime.equivalence.verify import verify
     from spikeloom.runtime.machines.loihi1.costs.estimate import estimate
     from spikeloom.runtime.machines.loihi1.costs.result import cost_report
-    from spikeloom.runtime.machines.loihi1.costs.sections import sections as cost_sections
-    from spikeloom.runtime.page import facts as report_facts
-    from spikeloom.runtime.page.recording import recording_json
+    from spikeloom.runtime.page import facts
+    from spikeloom.runtime.page.provenance import provenance
+    from spikeloom.runtime.page.recording import recording
+    from spikeloom.runtime.page.results import Report
 
     account = Account(machine_of(netlist), data, checked=arguments.spec_samples)
-    target = load_target(netlist.target)
+    target, bin_s = load_target(netlist.target), arguments.bin * netlist.bins
     verdict = verify(
         netlist,
-        asked.model,
-        asked.adjacency,
+        loaded.model,
+        loaded.adjacency,
         data.events,
         data.labels,
         data.files,
-        sha256=asked.sha256,
+        sha256=loaded.sha256,
         spec_samples=arguments.spec_samples,
         lengths=data.lengths,
         required={"E0": 1.0},
@@ -168,20 +172,17 @@ def _facts(
         chosen = 0 if verdict.first_divergence is None else data.files.index(verdict.first_divergence.file)
     account.begin("costs")
     counts, costs = estimate(netlist, target, with_clocks(data.events, netlist.clocks), lengths=data.lengths)
-    priced = cost_report(netlist, target, costs, bin_s=arguments.bin * netlist.bins)
     account.begin("the recording")
-    provenance = report_facts.provenance_json(arguments, netlist, target, asked, data, data.files[chosen])
-    found = {
-        "verify": encode(verdict),
-        "decisions": report_facts.decisions_json(verdict, netlist.classes),
-        "netlist": encode(describe(netlist, measure(netlist, target), provenance["netlist"]["sha256"])),
-        "cores": report_facts.cores_json(netlist, target, counts),
-        "taxels": report_facts.taxels_json(netlist, asked, data, counts, arguments.taxels),
-        "recording": recording_json(netlist, target, asked, data, chosen, costs, bin_s=arguments.bin * netlist.bins),
-        "costs": encode(priced),
-        "provenance": provenance,
-    }
-    if arguments.explain_cost:
-        found["explained_cost"] = encode(account.explained(True))
-    shown = partial(report_text, verdict=terminal(sections(verdict)), costs=terminal(cost_sections(priced)))
-    return found, shown, 1 if verdict.missed else 0
+    origin = provenance(arguments, netlist, target, loaded, data, data.files[chosen])
+    report = Report(
+        verify=verdict,
+        decisions=facts.decisions(verdict, netlist.classes),
+        netlist=describe(netlist, measure(netlist, target), origin.netlist.sha256),
+        cores=facts.cores(netlist, target, counts),
+        taxels=facts.taxels(netlist, loaded, data, counts, arguments.taxels),
+        recording=recording(netlist, target, loaded, data, chosen, costs, bin_s=bin_s),
+        costs=cost_report(netlist, target, costs, bin_s=bin_s),
+        provenance=origin,
+        output=arguments.output,
+    )
+    return replace(report, explained_cost=account.explained(True)) if arguments.explain_cost else report

@@ -1,0 +1,127 @@
+"""Where a page is from: files and their hashes, versions, and the commands that repeat it."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import platform
+from collections.abc import Mapping
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from spikeloom import __version__
+from spikeloom.compiler.targets.base import Target
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.runtime.inputs import repeat
+from spikeloom.runtime.inputs.network import LoadedNetwork
+from spikeloom.runtime.page.results import (
+    CheckpointOrigin,
+    ChipOrigin,
+    Command,
+    DataOrigin,
+    NetlistOrigin,
+    Provenance,
+)
+
+PACKAGES = ("numpy", "scipy", "torch", "numba", "networkx")
+"""Packages whose versions may move a float spike."""
+
+
+def provenance(
+    arguments: argparse.Namespace,
+    netlist: Netlist,
+    target: Target,
+    loaded: LoadedNetwork,
+    data: Recordings,
+    recording: str,
+) -> Provenance:
+    """Where everything is from; `recording` is the one that is drawn.
+
+    File names are those of the files, without their folders; the page is always called ``report.html``.
+    """
+    checkpoint = loaded.checkpoint
+    digest = hashlib.sha256()
+    for name, array in data.identity().items():
+        digest.update(f"{name} {array.shape} {array.dtype.str}".encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return Provenance(
+        netlist=NetlistOrigin(
+            file=Path(arguments.netlist).name,
+            sha256=hashlib.sha256(Path(arguments.netlist).read_bytes()).hexdigest(),
+            compiled=dict(netlist.provenance),
+        ),
+        checkpoint=CheckpointOrigin(
+            file=Path(arguments.checkpoint).name,
+            sha256=loaded.sha256,
+            system=None if checkpoint is None else checkpoint.system,
+            weights=None if checkpoint is None else checkpoint.weights,
+            graph=loaded.graph,
+            dynamics=None if checkpoint is None or checkpoint.dynamics.is_plain else checkpoint.dynamics.to_json(),
+            bins=netlist.bins,
+            training=None if checkpoint is None or checkpoint.training is None else dict(checkpoint.training),
+        ),
+        data=DataOrigin(
+            name=Path(data.source).name,
+            split=data.split,
+            samples=len(data),
+            bin_s=arguments.bin,
+            sha256=digest.hexdigest(),
+        ),
+        chip=ChipOrigin(
+            name=target.name,
+            energy_tables={table.name: table.title for table in target.energy},
+            time_tables={table.name: table.title for table in target.time},
+        ),
+        versions={"spikeloom": __version__, "python": platform.python_version()}
+        | {name: metadata.version(name) for name in PACKAGES},
+        commands=_commands(arguments, netlist, recording),
+    )
+
+
+def _commands(arguments: argparse.Namespace, netlist: Netlist, recording: str) -> tuple[Command, ...]:
+    """What to type, and what each is for."""
+
+    def name(given: Any) -> str:
+        path = "" if given is None else str(getattr(given, "source", given))  # recordings that Python handed over
+        return Path(path).name or path
+
+    net, checkpoint, data = name(arguments.netlist), name(arguments.checkpoint), name(arguments.data)
+    options = repeat.given(arguments, repeat.NETWORK)
+    options |= {option: name(options[option]) or None for option in ("taxels", "edges")}
+    model = repeat.words(options | {"polarities": arguments.polarities})
+    if arguments.polarities_first is not None:
+        model.append("--polarities-first" if arguments.polarities_first else "--polarities-last")
+    split = None if arguments.split == "test" else arguments.split
+    read = ["--data", data, *repeat.words({"split": split, "limit": arguments.limit, "bin": arguments.bin})]
+    spec = repeat.words({"spec_samples": None if arguments.spec_samples == 3 else arguments.spec_samples})
+    both = [net, "--checkpoint", checkpoint, *model, *read]
+    lines = {
+        "verdict and ladder": ["verify", *both, *spec],
+        "energy and time": ["estimate", net, *read],
+        "why this recording differs": ["explain", *both, "--sample", recording],
+        "this page": ["report", *both, *spec, "--recording", recording, "-o", "report.html"],
+    }
+    if "weight_bits" in netlist.provenance:
+        compiled = repeat.words(_compile_options(netlist.provenance, data))
+        lines = {"the netlist": ["compile", checkpoint, *model, *compiled, "-o", net]} | lines
+    return tuple(Command(what=what, command=repeat.command(*words)) for what, words in lines.items())
+
+
+def _compile_options(made: Mapping[str, Any], data: str) -> dict[str, Any]:
+    """Options of the compilation as far as the netlist remembers them."""
+    options: dict[str, Any] = {}
+    for key, usual in (("weight_bits", 8), ("planes", 1), ("scale_groups", 1)):
+        value = made.get(key, usual)
+        if value != usual and not made.get("fine_tuned"):
+            options[key] = ",".join(map(str, value)) if isinstance(value, list) else value
+    options |= {key: made.get(key) or None for key in ("spike_exact", "keep_all", "prune_unused")}
+    if made.get("ranges", "proven") != "proven":
+        options |= {"ranges": made["ranges"], "margin": f"{made['margin']:g}"}
+    if made.get("cores_for"):
+        options["cores_for"] = ",".join(f"{name}={count}" for name, count in made["cores_for"].items())
+    options |= {key: made.get(key) for key in ("chips", "optimize")}
+    return options | {"calibrate": data if made.get("calibrated") else None}
