@@ -245,7 +245,7 @@ def test_what_is_done_to_recordings_is_done_before_they_are_joined():
 def test_sums_in_time_are_for_networks_that_hear_each_bin(report, refusal):
     report("train", "--data", "fine", "--join", "3", *TRAINED, "--membrane-decay", NO_MEMORY, "-o", "now.pt")
     line = refusal("compile", "now.pt", "--target", "truenorth", "--in-time", "2", "-o", "now.loom")
-    assert line.startswith("spikeloom: now.pt: a step joins 3 bins; sums in time are for networks that hear each")
+    assert line.startswith("spikeloom: now.pt: a step joins 3 bins; sums in time are for networks of single bins")
     assert main(["compile", "x.pt", "--target", "truenorth", "--calibrate", "fine", "-o", "y.loom", "--json"]) == 2
 
 

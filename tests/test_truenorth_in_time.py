@@ -137,7 +137,7 @@ def test_what_cannot_be_in_levels():
     skipping = replace(network, projections=(first, replace(second_projection, pre=-1)))
     with pytest.raises(ModelError) as caught:
         in_levels(skipping, 3, CHIP)
-    assert str(caught.value) == "fc2: does not hear the layer before and nothing else"
+    assert str(caught.value) == "fc2: does not receive from the layer before and nothing else"
     clocked = replace(network, input=replace(network.input, clocks=Clocks(channels=2, steps=5)))
     with pytest.raises(ModelError) as caught:
         in_levels(clocked, 3, CHIP)

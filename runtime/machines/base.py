@@ -15,7 +15,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from pkgutil import iter_modules
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -69,6 +69,55 @@ class Price:
     time_s: Mapping[str, FloatArray]
     step_s: Mapping[str, float]
     outcome: Outcome
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Step:
+    """What one chip step brought.
+
+    Parameters
+    ----------
+    index : int
+        Chip step, from 0; while events come in, also the index of the bin.
+    spikes : tuple of (neurons,) bool
+        Who spiked in this chip step: one array for each layer, ordered by neuron; read-only.
+    counts : (classes,) int64
+        Votes for each class since the grasp began; read-only.
+    """
+
+    index: int
+    spikes: tuple[BoolArray, ...]
+    counts: IntArray
+
+    @property
+    def decision(self) -> int:
+        """Class with the most votes so far, the lowest on a tie; 0 before the first vote."""
+        return int(vote(self.counts[None])[0])
+
+    @property
+    def margin(self) -> int:
+        """Votes by which the decision is ahead of the next class; all its votes if there is no other class."""
+        if len(self.counts) == 1:
+            return int(self.counts[0])
+        second, first = np.partition(self.counts, -2)[-2:]
+        return int(first - second)
+
+
+class Stream(Protocol):
+    """State of one grasp on one sensor."""
+
+    @property
+    def index(self) -> int:
+        """Chip steps run so far in this grasp."""
+
+    def step(self, events: npt.ArrayLike) -> Step:
+        """Run the chip step of one bin: events (taxels, polarities) or (taxels * polarities,), 0 and 1."""
+
+    def finish(self) -> tuple[Step, ...]:
+        """End the grasp: the steps by which the slowest layer lags behind the data."""
+
+    def reset(self) -> None:
+        """Begin the next grasp, from rest."""
 
 
 @dataclass(frozen=True)
@@ -183,7 +232,7 @@ class Machine(ABC):
         """Layers, cores, and how full each limit is; `sha256` is the file's."""
 
     @abstractmethod
-    def stream(self) -> Any:
+    def stream(self) -> Stream:
         """State of one grasp that runs bin after bin.
 
         Raises

@@ -66,8 +66,9 @@ class ChipModule(nn.Module):
 
     Notes
     -----
-    ``layers`` holds what NeuroBench looks for: a Linear for each layer that a layer receives from, its weights in weight
-    units, and :class:`ChipNeurons`. What a recurrent layer receives from itself is what it fired in the step before.
+    ``layers`` holds what NeuroBench looks for: a Linear for each layer that a layer receives from, its weights in
+    weight units, and :class:`ChipNeurons`. What a recurrent layer receives from itself is what
+    it fired in the step before.
     """
 
     def __init__(self, netlist: Netlist) -> None:

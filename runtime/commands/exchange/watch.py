@@ -19,17 +19,20 @@ import math
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from decimal import Decimal, InvalidOperation
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from spikeloom.compiler.errors import DataError, ModelError, OptionError
 from spikeloom.models.recordings.eventlines import Event, EventLines, Mark
+from spikeloom.runtime.report.encode import OPTIONAL
+from spikeloom.runtime.report.sections import Outcome, Section, Text
 
 if TYPE_CHECKING:
     from spikeloom.compiler.fixedpoint import IntArray
-    from spikeloom.runtime.machines.loihi1.stream import Step, Stream
+    from spikeloom.runtime.machines.base import Step, Stream
 
 NOTES = """\
 Lines come in the order of their times: an event whose bin is over, since a later one came, is counted as late and not
@@ -89,8 +92,8 @@ class Display:
             self._write(self._result("grasp", grasp, bins, last, {} if early is None else {"early": early}))
         else:
             seconds = f"{self._bin_s * bins:f}"
-            told = ", sure" if early else ""
-            self._write(f"grasp {grasp}: {_standing(last)}{told}, after {_number(bins, 'bin')} ({seconds} s)")
+            sure = ", sure" if early else ""
+            self._write(f"grasp {grasp}: {_standing(last)}{sure}, after {_number(bins, 'bin')} ({seconds} s)")
 
     def _result(self, kind: str, grasp: int, bins: int, step: Step, more: dict[str, bool] | None = None) -> str:
         return json.dumps(
@@ -254,7 +257,31 @@ class Watch:
         self._display.grasp(self.grasps, bins, last, early=None if self._may_end is None else early)
 
 
-def run(arguments: argparse.Namespace) -> tuple[dict[str, Any], Callable[[dict[str, Any]], str], int]:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StepTime:
+    """Median and 99th percentile of the time of a step, also as a share of a bin."""
+
+    median_ms: float
+    p99_ms: float
+    p99_share_of_bin: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Summary:
+    """All grasps together; `early` counts those that ended before their length, where they may."""
+
+    kind: str = "end"
+    grasps: int
+    bins: int
+    events: int
+    repeated: int
+    late: int
+    interrupted: bool
+    early: int | None = field(default=None, metadata=OPTIONAL)
+    step: StepTime | None = field(default=None, metadata=OPTIONAL)
+
+
+def run(arguments: argparse.Namespace) -> Outcome:
     """Run the command; its result is the summary, everything else was printed before.
 
     Raises
@@ -302,20 +329,17 @@ def run(arguments: argparse.Namespace) -> tuple[dict[str, Any], Callable[[dict[s
         interrupted = session.run()
     if not session.events and not interrupted:
         raise DataError(f"{name}: empty stream, no event found; give lines 'time_s,taxel,polarity'")
-    report: dict[str, Any] = {
-        "kind": "end",
-        "grasps": session.grasps,
-        "bins": session.bins,
-        "events": session.events,
-        "repeated": session.repeated,
-        "late": session.late,
-        "interrupted": interrupted,
-    }
-    if factor is not None:
-        report["early"] = session.early
-    if arguments.timing:
-        report["step"] = _timing(session.step_s, float(bin_s))
-    return report, _summary, 0
+    summary = Summary(
+        grasps=session.grasps,
+        bins=session.bins,
+        events=session.events,
+        repeated=session.repeated,
+        late=session.late,
+        interrupted=interrupted,
+        early=None if factor is None else session.early,
+        step=_timing(session.step_s, float(bin_s)) if arguments.timing else None,
+    )
+    return Outcome(summary, sections)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -385,18 +409,18 @@ def _standing(step: Step) -> str:
     return f"class {step.decision}, {_number(int(step.counts.max()), 'vote')}, {ahead}"
 
 
-def _timing(step_s: list[float], bin_s: float) -> dict[str, float]:
-    """Median and 99th percentile of the time of a step, also as a share of a bin."""
+def _timing(step_s: list[float], bin_s: float) -> StepTime:
     median, late = np.percentile(step_s or [0.0], [50, 99]).tolist()
-    return {"median_ms": 1e3 * median, "p99_ms": 1e3 * late, "p99_share_of_bin": late / bin_s}
+    return StepTime(median_ms=1e3 * median, p99_ms=1e3 * late, p99_share_of_bin=late / bin_s)
 
 
-def _summary(report: dict[str, Any]) -> str:
-    parts = [_number(report["grasps"], "grasp"), _number(report["bins"], "bin"), _number(report["events"], "event")]
-    parts += [f"{report['repeated']} repeated within a bin", f"{report['late']} late"]
-    text = ", ".join([*parts, *([f"{report['early']} ended early"] if "early" in report else [])])
-    if "step" in report:
-        step = report["step"]
-        share = f"{100 * step['p99_share_of_bin']:.2g} % of a bin"
-        text += f"\nstep: median {step['median_ms']:.3f} ms, 99th percentile {step['p99_ms']:.3f} ms ({share})"
-    return text + ("\ninterrupted" if report["interrupted"] else "")
+def sections(found: Summary) -> list[Section]:
+    """The summary for people."""
+    parts = [_number(found.grasps, "grasp"), _number(found.bins, "bin"), _number(found.events, "event")]
+    parts += [f"{found.repeated} repeated within a bin", f"{found.late} late"]
+    text = ", ".join([*parts, *([] if found.early is None else [f"{found.early} ended early"])])
+    if found.step is not None:
+        step = found.step
+        share = f"{100 * step.p99_share_of_bin:.2g} % of a bin"
+        text += f"\nstep: median {step.median_ms:.3f} ms, 99th percentile {step.p99_ms:.3f} ms ({share})"
+    return [Section("Watched", [Text(text + ("\ninterrupted" if found.interrupted else ""))])]

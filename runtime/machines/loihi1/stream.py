@@ -24,48 +24,14 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler.errors import DataError, NumericRangeError
-from spikeloom.compiler.fixedpoint import IntArray
-from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
+from spikeloom.runtime.machines.base import Step
 from spikeloom.runtime.machines.loihi1.engine import Engine, advance, prepare, start, tables_of
-from spikeloom.runtime.machines.loihi1.trace import BoolArray
 from spikeloom.runtime.machines.votes import class_counts
 
 NO_END = 2**62
 """Length of a recording of which nobody knows yet where it ends."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Step:
-    """What one chip step brought.
-
-    Parameters
-    ----------
-    index : int
-        Chip step, from 0; while events come in, also the index of the bin.
-    spikes : tuple of (neurons,) bool
-        Who spiked in this chip step: one array for each of ``netlist.layers``, ordered by neuron; read-only.
-    counts : (classes,) int64
-        Votes for each class since the grasp began; read-only.
-    """
-
-    index: int
-    spikes: tuple[BoolArray, ...]
-    counts: IntArray
-
-    @property
-    def decision(self) -> int:
-        """Class with the most votes so far, the lowest on a tie; 0 before the first vote."""
-        return int(vote(self.counts[None])[0])
-
-    @property
-    def margin(self) -> int:
-        """Votes by which the decision is ahead of the next class; all its votes if there is no other class."""
-        if len(self.counts) == 1:
-            return int(self.counts[0])
-        second, first = np.partition(self.counts, -2)[-2:]
-        return int(first - second)
 
 
 class Stream:
