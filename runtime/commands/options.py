@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 
 from spikeloom.compiler.checkpoint import WEIGHTS
-from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.formats.nir.neurons import CONVENTIONS
 from spikeloom.compiler.systems import SYSTEMS
 from spikeloom.models.graphs import CHOICES
@@ -26,21 +25,6 @@ MODEL: dict[str, object] = {
     "run": 0,
 }
 """Options of :func:`add_model`, and what they are where they are not given."""
-
-ROUNDING: dict[str, object] = {
-    "weight_bits": None,
-    "planes": None,
-    "scale_groups": None,
-    "spike_exact": False,
-    "prune_unused": False,
-    "ranges": "proven",
-    "margin": None,
-    "dump_after": [],
-}
-"""Options of ``compile`` that say how a float network is stored on Loihi, likewise."""
-
-PLACING: dict[str, object] = {"keep_all": False, "cores_for": None, "chips": 1, "optimize": "cores"}
-"""Options of ``compile`` that say where integers go, likewise."""
 
 DATA_HELP = "recordings: released layout, event files (csv, npz), one recording, 'synthetic', 'objects' or 'containers'"
 
@@ -159,29 +143,3 @@ def add_steps(parser: argparse.ArgumentParser) -> None:
         choices=CONVENTIONS,
         help=f"a step keeps 1 - dt/tau (euler) or exp(-dt/tau) (exponential) of a state (default: {CONVENTIONS[0]})",
     )
-
-
-def parse_cores(words: str | None) -> dict[str, int]:
-    """Least number of cores by layer, from the words of ``--cores-for``.
-
-    Examples
-    --------
-    >>> parse_cores("conv1=8,fc1=6")
-    {'conv1': 8, 'fc1': 6}
-
-    Raises
-    ------
-    OptionError
-        If they are none.
-    """
-    if words is None:
-        return {}
-    found: dict[str, int] = {}
-    for word in words.split(","):
-        layer, _, count = word.strip().partition("=")
-        if not layer or not (count.isascii() and count.isdecimal()) or int(count) == 0:
-            raise OptionError(f"--cores-for {words}: {word!r} is not LAYER=N, N from 1; write for example fc1=6")
-        if layer in found:
-            raise OptionError(f"--cores-for {words}: names {layer} twice; give it once")
-        found[layer] = int(count)
-    return found

@@ -21,8 +21,8 @@ from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist
 from spikeloom.compiler.version import __version__
 from spikeloom.models.recordings.counts import number
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.runtime.commands.main_job.compile import storage
 from spikeloom.runtime.commands.options import add_network, add_recordings
+from spikeloom.runtime.inputs.compilation import storage
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import recordings

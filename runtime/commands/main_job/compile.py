@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Mapping
-from typing import Any
 
-from spikeloom.compiler import Compilation, Options, Recipe, compile_network, write_netlist
-from spikeloom.compiler.checkpoint import Checkpoint
+from spikeloom.compiler import Compilation, Options, compile_network, write_netlist
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.layout.choose import require_goal
 from spikeloom.compiler.targets.loihi1.options import GOALS, MARGIN, RANGES
-from spikeloom.compiler.version import __version__
 from spikeloom.runtime.commands.main_job.integers import brings_integers, compile_integers
-from spikeloom.runtime.commands.options import add_bin_option, add_network, parse_cores
+from spikeloom.runtime.commands.options import add_bin_option, add_network
+from spikeloom.runtime.inputs.compilation import margin_of, parse_cores, parse_recipes, provenance
 from spikeloom.runtime.inputs.files import require_place
-from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
+from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.inputs.recordings import recordings
 from spikeloom.runtime.machines.base import chip_commands, trained_for
 from spikeloom.runtime.machines.loihi1 import compiled
@@ -125,7 +122,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
             prune_unused=arguments.prune_unused,
             training_events=training,
             ranges=arguments.ranges,
-            margin=_margin(arguments),
+            margin=margin_of(arguments),
             cores_for=cores_for,
             chips=arguments.chips,
             optimize=arguments.optimize,
@@ -136,84 +133,3 @@ def run(arguments: argparse.Namespace) -> Outcome:
     )
     sha256 = write_netlist(compilation.netlist, arguments.output)
     return Outcome(compiled.facts_of(compilation, sha256, asked.facts), compiled.sections)
-
-
-def provenance(arguments: argparse.Namespace, asked: LoadedNetwork, *, calibrated: bool) -> Mapping[str, Any]:
-    """What a netlist remembers of its compilation.
-
-    Parameters
-    ----------
-    arguments : Namespace
-        Options of ``compile``.
-    asked : LoadedNetwork
-        The network.
-    calibrated : bool
-        Whether recordings chose its scales.
-    """
-    checkpoint, cores_for = asked.checkpoint, parse_cores(arguments.cores_for)
-    return {
-        "spikeloom": __version__,
-        "checkpoint_sha256": asked.sha256,
-        **asked.origin(arguments.run),
-        **({"towers": checkpoint.towers} if checkpoint is not None and checkpoint.towers > 1 else {}),
-        **storage(parse_recipes(arguments), checkpoint),
-        "spike_exact": arguments.spike_exact,
-        "keep_all": arguments.keep_all,
-        "prune_unused": arguments.prune_unused,
-        "ranges": arguments.ranges,
-        "margin": _margin(arguments),
-        "calibrated": calibrated,
-        **({"cores_for": cores_for} if cores_for else {}),
-        **({"chips": arguments.chips} if arguments.chips != 1 else {}),
-        **({"optimize": arguments.optimize} if arguments.optimize != "cores" else {}),
-    }
-
-
-def _margin(arguments: argparse.Namespace) -> float:
-    return float(MARGIN if arguments.margin is None else arguments.margin)
-
-
-def _numbers(text: str, option: str) -> list[int]:
-    try:
-        return [int(part) for part in text.split(",")]
-    except ValueError:
-        raise OptionError(f"{option} {text}: not a number; give one, or one for each layer as in 8,4,4,8") from None
-
-
-def parse_recipes(arguments: argparse.Namespace) -> tuple[Recipe, ...] | None:
-    """Storage that the options of ``compile`` ask for, or None where they do not.
-
-    Raises
-    ------
-    OptionError
-        If they are no numbers, or disagree about the number of layers.
-    """
-    if not (arguments.weight_bits or arguments.planes or arguments.scale_groups):
-        return None
-    asked = {
-        "--weight-bits": _numbers(arguments.weight_bits or "8", "--weight-bits"),
-        "--planes": _numbers(arguments.planes or "1", "--planes"),
-        "--scale-groups": _numbers(arguments.scale_groups or "1", "--scale-groups"),
-    }
-    layers = max(len(values) for values in asked.values())
-    for option, values in asked.items():
-        if len(values) not in (1, layers):
-            raise OptionError(f"{option}: {len(values)} numbers, another option gives {layers}; give as many, or one")
-    columns = [values if len(values) == layers else values * layers for values in asked.values()]
-    return tuple(Recipe(bits=b, planes=p, groups=g) for b, p, g in zip(*columns, strict=True))
-
-
-def storage(recipes: tuple[Recipe, ...] | None, checkpoint: Checkpoint | None) -> Mapping[str, Any]:
-    """The same for the provenance of a netlist."""
-    if checkpoint is not None and checkpoint.forms is not None:
-        return {"weight_bits": _one_or_list([form.bits for form in checkpoint.forms]), "fine_tuned": True}
-    known = recipes or (Recipe(),)
-    return {
-        "weight_bits": _one_or_list([recipe.bits for recipe in known]),
-        "planes": _one_or_list([recipe.planes for recipe in known]),
-        "scale_groups": _one_or_list([recipe.groups for recipe in known]),
-    }
-
-
-def _one_or_list(values: list[int]) -> int | list[int]:
-    return values[0] if len(set(values)) == 1 else values

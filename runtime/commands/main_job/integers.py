@@ -12,7 +12,8 @@ from spikeloom.compiler.formats.netx.layout import SUFFIX
 from spikeloom.compiler.formats.netx.reader import read_netx
 from spikeloom.compiler.invariants import verify
 from spikeloom.compiler.version import __version__
-from spikeloom.runtime.commands.options import MODEL, ROUNDING, parse_cores
+from spikeloom.runtime.commands.options import MODEL
+from spikeloom.runtime.inputs.compilation import ROUNDING, parse_cores
 from spikeloom.runtime.machines.loihi1 import description
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.encode import INLINE

@@ -26,8 +26,7 @@ from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist
 from spikeloom.models.recordings.events import joined_bins
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.recordings.windows import first_part, steps_of
-from spikeloom.runtime.commands.main_job.compile import parse_recipes, provenance
-from spikeloom.runtime.commands.options import PLACING, ROUNDING, parse_cores
+from spikeloom.runtime.inputs.compilation import PLACING, ROUNDING, parse_cores, parse_recipes, provenance
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import recordings
 from spikeloom.runtime.machines.base import DEFAULT, Machine, chip_chart, machine_for

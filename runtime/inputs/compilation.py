@@ -1,0 +1,136 @@
+"""What the options of ``compile`` ask for: storage of each layer, cores, and what a netlist remembers of it."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from typing import Any
+
+from spikeloom.compiler.checkpoint import Checkpoint
+from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.targets.loihi1.options import MARGIN, Recipe
+from spikeloom.compiler.version import __version__
+from spikeloom.runtime.inputs.network import LoadedNetwork
+
+ROUNDING: dict[str, object] = {
+    "weight_bits": None,
+    "planes": None,
+    "scale_groups": None,
+    "spike_exact": False,
+    "prune_unused": False,
+    "ranges": "proven",
+    "margin": None,
+    "dump_after": [],
+}
+"""Options of ``compile`` that say how a float network is stored, likewise."""
+
+PLACING: dict[str, object] = {"keep_all": False, "cores_for": None, "chips": 1, "optimize": "cores"}
+"""Options of ``compile`` that say where integers go, likewise."""
+
+
+def provenance(arguments: argparse.Namespace, asked: LoadedNetwork, *, calibrated: bool) -> Mapping[str, Any]:
+    """What a netlist remembers of its compilation.
+
+    Parameters
+    ----------
+    arguments : Namespace
+        Options of ``compile``.
+    asked : LoadedNetwork
+        The network.
+    calibrated : bool
+        Whether recordings chose its scales.
+    """
+    checkpoint, cores_for = asked.checkpoint, parse_cores(arguments.cores_for)
+    return {
+        "spikeloom": __version__,
+        "checkpoint_sha256": asked.sha256,
+        **asked.origin(arguments.run),
+        **({"towers": checkpoint.towers} if checkpoint is not None and checkpoint.towers > 1 else {}),
+        **storage(parse_recipes(arguments), checkpoint),
+        "spike_exact": arguments.spike_exact,
+        "keep_all": arguments.keep_all,
+        "prune_unused": arguments.prune_unused,
+        "ranges": arguments.ranges,
+        "margin": margin_of(arguments),
+        "calibrated": calibrated,
+        **({"cores_for": cores_for} if cores_for else {}),
+        **({"chips": arguments.chips} if arguments.chips != 1 else {}),
+        **({"optimize": arguments.optimize} if arguments.optimize != "cores" else {}),
+    }
+
+
+def margin_of(arguments: argparse.Namespace) -> float:
+    """Share to add to observed ranges."""
+    return float(MARGIN if arguments.margin is None else arguments.margin)
+
+
+def _numbers(text: str, option: str) -> list[int]:
+    try:
+        return [int(part) for part in text.split(",")]
+    except ValueError:
+        raise OptionError(f"{option} {text}: not a number; give one, or one for each layer as in 8,4,4,8") from None
+
+
+def parse_recipes(arguments: argparse.Namespace) -> tuple[Recipe, ...] | None:
+    """Storage that the options of ``compile`` ask for, or None where they do not.
+
+    Raises
+    ------
+    OptionError
+        If they are no numbers, or disagree about the number of layers.
+    """
+    if not (arguments.weight_bits or arguments.planes or arguments.scale_groups):
+        return None
+    asked = {
+        "--weight-bits": _numbers(arguments.weight_bits or "8", "--weight-bits"),
+        "--planes": _numbers(arguments.planes or "1", "--planes"),
+        "--scale-groups": _numbers(arguments.scale_groups or "1", "--scale-groups"),
+    }
+    layers = max(len(values) for values in asked.values())
+    for option, values in asked.items():
+        if len(values) not in (1, layers):
+            raise OptionError(f"{option}: {len(values)} numbers, another option gives {layers}; give as many, or one")
+    columns = [values if len(values) == layers else values * layers for values in asked.values()]
+    return tuple(Recipe(bits=b, planes=p, groups=g) for b, p, g in zip(*columns, strict=True))
+
+
+def storage(recipes: tuple[Recipe, ...] | None, checkpoint: Checkpoint | None) -> Mapping[str, Any]:
+    """The same for the provenance of a netlist."""
+    if checkpoint is not None and checkpoint.forms is not None:
+        return {"weight_bits": _one_or_list([form.bits for form in checkpoint.forms]), "fine_tuned": True}
+    known = recipes or (Recipe(),)
+    return {
+        "weight_bits": _one_or_list([recipe.bits for recipe in known]),
+        "planes": _one_or_list([recipe.planes for recipe in known]),
+        "scale_groups": _one_or_list([recipe.groups for recipe in known]),
+    }
+
+
+def _one_or_list(values: list[int]) -> int | list[int]:
+    return values[0] if len(set(values)) == 1 else values
+
+
+def parse_cores(words: str | None) -> dict[str, int]:
+    """Least number of cores by layer, from the words of ``--cores-for``.
+
+    Examples
+    --------
+    >>> parse_cores("conv1=8,fc1=6")
+    {'conv1': 8, 'fc1': 6}
+
+    Raises
+    ------
+    OptionError
+        If they are none.
+    """
+    if words is None:
+        return {}
+    found: dict[str, int] = {}
+    for word in words.split(","):
+        layer, _, count = word.strip().partition("=")
+        if not layer or not (count.isascii() and count.isdecimal()) or int(count) == 0:
+            raise OptionError(f"--cores-for {words}: {word!r} is not LAYER=N, N from 1; write for example fc1=6")
+        if layer in found:
+            raise OptionError(f"--cores-for {words}: names {layer} twice; give it once")
+        found[layer] = int(count)
+    return found
