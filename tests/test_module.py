@@ -188,7 +188,7 @@ REFUSED = {
     "module: returns a tuple, wanted one tensor, the spikes of its classes": Pair,
     "module: its output is no count of the spikes of its last LIF layer; return these spikes, or their sum over a "
     "group of neurons for each class": lambda: nn.Sequential(nn.Linear(4, 3), LIF(), nn.Linear(3, 2)),
-    "layer lif_c: listens to the input and lif_a and lif_b, which lie differently deep; a spike takes one step on the "
+    "layer lif_c: receives the input and lif_a and lif_b, which lie differently deep; a spike takes one step on the "
     "chip and would arrive too early, so put a spiking layer into the shorter way": lambda: TwoWays(skip=True),
     "layer 1: keeps 1.5 of its membrane in a step, allowed are 0 to 1; train it again": lambda: nn.Sequential(
         nn.Linear(4, 2), LIF(beta=1.5)

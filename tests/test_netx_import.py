@@ -147,7 +147,7 @@ def test_a_block_that_hears_itself(tmp_path, most):
     assert np.count_nonzero(hidden != lif(first, 0, given_, u=4096, v=1024, threshold=25)) > 20
     assert_array_equal(ours[0][0], hidden)
     assert_array_equal(ours[1][0], lif(last, 0, hidden, u=4096, v=1024, threshold=25))
-    assert found.facts[2].split("; ")[1] == "it hears its own spikes of the step before"
+    assert found.facts[2].split("; ")[1] == "it is recurrent, fed by its own spikes of the step before"
     placed = compile_network(found.network).netlist
     fast = engine.simulate(placed, given_.T[None].astype(np.uint8), spikes=True)
     ids = placed.compartments_of(0)

@@ -84,8 +84,8 @@ def test_one_of_each_package_on_the_chip(name):
 def test_what_recurrence_means_is_said():
     facts = read_nir(FILES / "snntorch_recurrent.nir", dt=1e-4).facts
     assert facts[5] == (
-        "1.lif: hears its own spikes of the step before; snnTorch's RLeaky with reset 'zero' means this with "
-        "reset_delay=False, else it loses the input of the step after each spike"
+        "1.lif: is recurrent, fed by its own spikes of the step before; snnTorch's RLeaky with reset 'zero' means "
+        "this with reset_delay=False, else it loses the input of the step after each spike"
     )
 
 

@@ -64,12 +64,12 @@ def class_of_each(counts: Sparse) -> IntArray | None:
 
 
 def in_order(layers: Sequence[Layer]) -> list[int]:
-    """Places of the layers, each after the others that it listens to.
+    """Places of the layers, each after the others that feed it.
 
     Raises
     ------
     ModelError
-        If some listen to each other in a circle.
+        If some feed each other in a circle.
     """
     placed: list[int] = []
     while len(placed) < len(layers):
@@ -81,8 +81,8 @@ def in_order(layers: Sequence[Layer]) -> list[int]:
         if not ready:
             stuck = [printable(layer.name) for index, layer in enumerate(layers) if index not in placed]
             raise ModelError(
-                f"layers {', '.join(stuck)} listen to each other in a circle; a layer may listen to itself, but to no "
-                "other that listens to it"
+                f"layers {', '.join(stuck)} feed each other in a circle; a layer may feed itself, but no "
+                "layer that feeds it"
             )
         placed += ready
     return placed
@@ -159,10 +159,10 @@ def _require_reach(network: Network) -> None:
     for post, name in enumerate(names):
         sources = [p.pre for p in network.projections if p.post == post != p.pre]
         if not sources:
-            raise ModelError(f"layer {name}: listens to nothing, so it is not reached from the input; leave it away")
+            raise ModelError(f"layer {name}: receives nothing, so the input does not reach it; remove it")
         if len({depth[source] for source in sources}) > 1:
-            heard = " and ".join("the input" if source == INPUT else names[source] for source in sources)
+            received = " and ".join("the input" if source == INPUT else names[source] for source in sources)
             raise ModelError(
-                f"layer {name}: listens to {heard}, which lie differently deep; a spike takes one step on the chip and "
-                "would arrive too early, so put a spiking layer into the shorter way"
+                f"layer {name}: receives {received}, which lie differently deep; a spike takes one step on the chip "
+                "and would arrive too early, so put a spiking layer into the shorter way"
             )

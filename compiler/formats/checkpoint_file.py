@@ -253,8 +253,8 @@ def _own_faults(arrays: Arrays, taxels: int, classes: int, kind: tuple[str, Grid
     if not faults:
         assert isinstance(features, int)
         faults = taxel_faults(arrays, features, dynamics.clocks.channels)
-        heard = arrays["fc1.weight"].shape[1] - dynamics.clocks.channels
-        places, made_classes = heard // features, len(arrays[f"fc{stages}.bias"])
+        received = arrays["fc1.weight"].shape[1] - dynamics.clocks.channels
+        places, made_classes = received // features, len(arrays[f"fc{stages}.bias"])
         faults = faults or shape_faults(system, len(arrays["conv1.hops"]), places, taxels, grid)
         made_for = places if system in GRAPH_SYSTEMS else taxels, made_classes
         if not faults and made_for != (taxels, classes):

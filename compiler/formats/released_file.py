@@ -5,11 +5,11 @@ A ``.t7`` file is a dict whose ``net_list`` holds the state dicts, with the weig
 kinds in torch's zip and in its older format, with the keys of current torch_geometric (``conv1.lins.0.weight`` …) or
 of old releases (``conv1.lin.weight``, the filters of all hops side by side).
 
-The other systems are told by their keys: ``fc0.weight`` of an MLP (inputs ``taxel * 2 + polarity``), a
+The other systems are known by their keys: ``fc0.weight`` of an MLP (inputs ``taxel * 2 + polarity``), a
 ``conv1.lin.weight`` with ``conv1.bias`` of a GCN (with self loops), ``conv1.weight`` of a grid-based CNN, whose picture
 is flattened channel by channel.
 
-torch is imported here only, late, and always told ``weights_only=True``: files that hold code are refused.
+torch is imported here only, late, and always with ``weights_only=True``: files that hold code are refused.
 """
 
 from __future__ import annotations

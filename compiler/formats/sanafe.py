@@ -8,7 +8,7 @@ What the file says and what the chip does differ in a few points:
   but their messages, and are silent until they are given ``spikes``.
 * A neuron names one unit for all of its synapses. A neuron that both dense and sparse lists reach names the one with
   more of its synapses (:func:`dense_neurons`).
-* A neuron sends one message to a core, however many lists there listen to it.
+* A neuron sends one message to a core, however many lists there receive it.
 * A current that the step before left is no work to a neuron.
 * A current that outlasts its step is a float there, cut to nothing; the chip cuts it to a whole 64th of a weight unit
   in every step. Spikes of such layers may differ, and of no others: :func:`floating_layers` names them.

@@ -1,7 +1,7 @@
 """Several trained networks as one: towers that lie side by side and add up their votes.
 
 A joined network has the filters of all its towers in its first layer, and fully connected layers that are blocks: a
-neuron hears its own tower, and the relays of clocks, of which there is one set for all. Each tower therefore spikes
+neuron receives its own tower, and the relays of clocks, of which there is one set for all. Each tower therefore spikes
 as it does alone. Its last layer has a neuron for every class and tower, ``tower * classes + class``; the class whose
 neurons spike most wins.
 

@@ -153,7 +153,7 @@ def _input_shape(blocks: Sequence[Block]) -> tuple[int, ...]:
 
 
 def _synapses(block: Block, shape: tuple[int, ...]) -> tuple[Sparse, tuple[int, ...]]:
-    """Weights of a layer, csr_array (neurons, what it hears) int64, and the shape of its neurons."""
+    """Weights of a layer, csr_array (neurons, what it receives) int64, and the shape of its neurons."""
     delay = block.entries.get("delay")
     if isinstance(delay, np.ndarray) and np.any(block.integers("delay")):
         raise block.fail("has synaptic delays, allowed are none here; train without")
@@ -174,13 +174,13 @@ def _synapses(block: Block, shape: tuple[int, ...]) -> tuple[Sparse, tuple[int, 
     raise block.fail(f"is of a type that is not known, allowed are {ALLOWED}; export it again")
 
 
-def _matrix(block: Block, key: str, neurons: int, heard: int) -> IntArray:
+def _matrix(block: Block, key: str, neurons: int, received: int) -> IntArray:
     weight = block.integers(key)
-    weight = weight.reshape(neurons, -1) if weight.ndim == 1 and weight.size == neurons * heard else weight
-    if weight.shape != (neurons, heard):
-        turned = " (it looks transposed)" if weight.shape == (heard, neurons) else ""
+    weight = weight.reshape(neurons, -1) if weight.ndim == 1 and weight.size == neurons * received else weight
+    if weight.shape != (neurons, received):
+        turned = " (it looks transposed)" if weight.shape == (received, neurons) else ""
         raise block.fail(
-            f"{key} has the shape {list(weight.shape)}, wanted {[neurons, heard]}{turned}; the shapes disagree, "
+            f"{key} has the shape {list(weight.shape)}, wanted {[neurons, received]}{turned}; the shapes disagree, "
             f"{REMEDY}"
         )
     return weight
@@ -242,7 +242,7 @@ def _with(weight: Sparse, data: IntArray) -> Sparse:
 def _population(block: Block, size: int, shape: tuple[int, ...]) -> IntegerPopulation:
     neuron = block.inner("neuron")
     if neuron is None:
-        raise block.fail("has no neuron, so its membranes are the result, and a chip counts spikes; leave it away")
+        raise block.fail("has no neuron, so its membranes are the result, and a chip counts spikes; remove it")
     kind = neuron.get("type")
     if kind not in NEURONS:
         raise block.fail(
@@ -335,5 +335,5 @@ def _fact(block: Block, population: IntegerPopulation, planes: int) -> str:
     if block.type == "input":
         told += "; it turns events into currents"
     if block.type == "dense_rec":
-        told += "; it hears its own spikes of the step before"
+        told += "; it is recurrent, fed by its own spikes of the step before"
     return told + ("; odd weights are stored twice" if planes > 1 else "")

@@ -1,7 +1,7 @@
 """A netlist as a lava-dl ``.net`` file, whose limits are narrower than the chip's, and what they change.
 
 The format keeps one threshold for a layer, weights of 8 bits without an exponent, and biases in whole weight steps,
-where the chip counts 64ths of them. Layers follow each other and may hear themselves; convolutions are written out as
+where the chip counts 64ths of them. Layers follow each other and may be recurrent; convolutions are written out as
 dense layers. A layer whose weights are stored with an exponent is rescaled by a power of two, its threshold with it.
 
 What netx does not read, but our own reader does, is in a group of its own: sensor, clocks and the classes that neurons
@@ -36,7 +36,7 @@ MOST_SHIFT = 8
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Block:
-    """One dense layer of the file, ``dense_rec`` if it hears itself.
+    """One dense layer of the file, ``dense_rec`` if it is recurrent.
 
     name: layer of the netlist.
     weight: (neurons, inputs) int64; whole weight steps.
@@ -82,8 +82,10 @@ def blocks_for(network: IntegerNetwork) -> tuple[Block, ...]:
         if any(projection.pre not in (before, post) for projection in into) or network.readout.population + 1 != len(
             network.populations
         ):
-            raise ModelError(f"{population.name}: hears more than the layer before it; netx has layers in a row only")
-        # side by side from the layer before and, where it hears itself, from its own neurons
+            raise ModelError(
+                f"{population.name}: receives more than the layer before it; netx has layers in a row only"
+            )
+        # side by side from the layer before and, where it is recurrent, from its own neurons
         sources = {before: network.input.size if before == INPUT else network.populations[before].size}
         sources |= {post: population.size} if any(projection.pre == post for projection in into) else {}
         parts = {pre: np.zeros((population.size, size), np.int64) for pre, size in sources.items()}
@@ -91,8 +93,8 @@ def blocks_for(network: IntegerNetwork) -> tuple[Block, ...]:
             parts[projection.pre] += projection.effective().toarray()
         weight = np.concatenate(list(parts.values()), axis=1)
         # Neurons that the chip leaves out have no synapses and no bias, and fire at no threshold.
-        heard = np.any(weight, axis=1) | (population.bias != 0)
-        thresholds = np.unique(population.threshold[heard])
+        received = np.any(weight, axis=1) | (population.bias != 0)
+        thresholds = np.unique(population.threshold[received])
         if len(thresholds) > 1:
             raise ModelError(
                 f"{population.name}: has {len(thresholds)} thresholds, netx has one for a layer; compile with "

@@ -24,14 +24,14 @@ class SpikingNode:
     value: what it gets, scaled to its membrane.
     neurons: its numbers.
     groups: its neurons by their decays.
-    hears_itself: whether it is in a loop.
+    recurrent: whether it is in a loop.
     """
 
     node: Node
     value: Value
     neurons: Neurons
     groups: list[IntArray]
-    hears_itself: bool
+    recurrent: bool
 
 
 def stated_step(graph: Graph) -> float | None:
@@ -91,10 +91,10 @@ def _drifts(graph: Graph, steps: Steps, spiking: Sequence[SpikingNode], sensor: 
         facts.append(
             "a reset leaves currents as they are, as NIR says; snnTorch's Synaptic with reset 'zero' clears them"
         )
-    if looped := [printable(one.node.name) for one in spiking if one.hears_itself]:
+    if looped := [printable(one.node.name) for one in spiking if one.recurrent]:
         facts.append(
-            f"{', '.join(looped)}: hears its own spikes of the step before; snnTorch's RLeaky with reset 'zero' means "
-            "this with reset_delay=False, else it loses the input of the step after each spike"
+            f"{', '.join(looped)}: is recurrent, fed by its own spikes of the step before; snnTorch's RLeaky with "
+            "reset 'zero' means this with reset_delay=False, else it loses the input of the step after each spike"
         )
     written = _written(graph)
     if written is not None and not math.isclose(written, steps.dt, rel_tol=1e-4):

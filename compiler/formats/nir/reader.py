@@ -75,8 +75,8 @@ def read_nir(
     Raises
     ------
     ModelError
-        If the file cannot be read, or holds something else than a network that spikes, feed-forward but for layers that
-        hear themselves; the message names the node.
+        If the file cannot be read, or holds something else than a network that spikes, feed-forward but for recurrent
+        layers; the message names the node.
     OptionError
         If there is no time step, or an option has no such value.
     """
@@ -117,9 +117,9 @@ def network_of(
 
 def _walk(graph: Graph, steps: Steps, shape: tuple[int, ...]) -> tuple[list[SpikingNode], Value]:
     """All spiking nodes in order, and what the output gets."""
-    heard: dict[str, list[str]] = {name: [] for name in graph.nodes}
+    received: dict[str, list[str]] = {name: [] for name in graph.nodes}
     for source, target in graph.edges:
-        heard[target].append(source)
+        received[target].append(source)
     values: dict[str, Value] = {}
     forward: dict[str, Value] = {}
     spiking: list[SpikingNode] = []
@@ -128,11 +128,11 @@ def _walk(graph: Graph, steps: Steps, shape: tuple[int, ...]) -> tuple[list[Spik
     for name in nodes_in_order(graph, late):
         node = graph.nodes[name]
         if node.type == "Input":
-            if heard[name]:
-                raise node.fail("gets values from other nodes; leave these edges away")
+            if received[name]:
+                raise node.fail("gets values from other nodes; remove these edges")
             values[name] = spikes_of(INPUT, shape)
             continue
-        value = _added(node, [values[source] for source in heard[name] if source not in late.get(name, ())])
+        value = _added(node, [values[source] for source in received[name] if source not in late.get(name, ())])
         if node.type in SPIKING:
             values[name] = spikes_of(len(spiking), value.shape)
             spiking.append(_spiking(node, value, steps))
@@ -149,10 +149,10 @@ def _walk(graph: Graph, steps: Steps, shape: tuple[int, ...]) -> tuple[list[Spik
         name = one.node.name
         if name in late:
             value = _added(one.node, [forward[name], *(values[source] for source in late[name])])
-            spiking[place] = replace(_spiking(one.node, value, steps), hears_itself=True)
+            spiking[place] = replace(_spiking(one.node, value, steps), recurrent=True)
             if len(one.groups) > 1:
                 raise one.node.fail(
-                    f"hears itself and has {len(one.groups)} membrane time constants, which are layers of their own; "
+                    f"is recurrent and has {len(one.groups)} membrane time constants, which are layers of their own; "
                     "give it one"
                 )
     return spiking, result
@@ -185,7 +185,7 @@ def _spiking(node: Node, value: Value, steps: Steps) -> SpikingNode:
             "fewer"
         )
     groups = [np.flatnonzero(decays == decay) for decay in different]
-    return SpikingNode(node=node, value=own, neurons=neurons, groups=groups, hears_itself=False)
+    return SpikingNode(node=node, value=own, neurons=neurons, groups=groups, recurrent=False)
 
 
 def _layers(spiking: Sequence[SpikingNode], positions: IntArray) -> tuple[list[Layer], list[FloatArray]]:

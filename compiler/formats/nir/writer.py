@@ -4,13 +4,13 @@ Numbers are in weight units, so that weights and thresholds are the chip's integ
 decays are the registers' own. What remains different is rounding: a register is cut to a whole number in every step, a
 float is not.
 
-* A layer is an Affine or Linear for each layer that it hears, and a LIF; an IF where it keeps its whole membrane, a
+* A layer is an Affine or Linear for each layer that feeds it, and a LIF; an IF where it keeps its whole membrane, a
   CubaLIF where its current outlasts a step. A CubaLIF's bias, which the chip adds past the current, is a leak voltage.
 * Time constants are those of the forward Euler method for the step given: ``1 - dt / tau`` is what a step keeps, and
   ``r = tau / dt`` makes a step add its input as it is.
 * Inputs are one flat axis, ``taxel * polarities + polarity``, then the clocks. A vote of several neurons is a Linear.
 
-Neurons that the chip leaves out are there and hear nothing.
+Neurons that the chip leaves out are there and receive nothing.
 """
 
 from __future__ import annotations

@@ -124,7 +124,7 @@ def shapes_of(node: Node, table: Table, operands: Operands) -> list[tuple[int, .
     Raises
     ------
     ModelError
-        If one of them is too large, before anything is allocated for it, or not to be told, or operands and
+        If one of them is too large, before anything is allocated for it, or unknown, or operands and
         attributes do not fit each other.
     """
     from onnx import defs, helper, numpy_helper, shape_inference

@@ -36,21 +36,10 @@ NESTING = 8
 """Nodes of a file, dimensions of a value, and graphs within graphs that are read."""
 
 BOOL, DOUBLE = 9, 11
-_STORED = {
-    1: ("<f4", "float_data"),
-    2: ("u1", "int32_data"),
-    3: ("i1", "int32_data"),
-    4: ("<u2", "int32_data"),
-    5: ("<i2", "int32_data"),
-    6: ("<i4", "int32_data"),
-    7: ("<i8", "int64_data"),
-    BOOL: ("?", "int32_data"),
-    10: ("<f2", "int32_data"),
-    DOUBLE: ("<f8", "double_data"),
-    12: ("<u4", "uint64_data"),
-    13: ("<u8", "uint64_data"),
-}
-"""Element types by their number in the format: numpy's name, and the field that holds them where not raw."""
+NUMBERS = range(1, 14)
+"""Element types by their number in the format."""
+
+STRING = 8
 
 SAME = {"MatMulInteger": "MatMul"}
 """Operators that are another one once their numbers are widened."""
@@ -279,35 +268,26 @@ def _node(proto: Any, content: _Content, left: list[int], nesting: int) -> Node:
 
 
 def _array(proto: Any, content: _Content) -> Array:
-    """A tensor, widened to float64, int64 or bool."""
+    """A tensor, widened to float64, int64 or bool; its declared size is held against what the file has."""
+    from onnx import helper, numpy_helper
+
     what = f"tensor {printable(_text(proto.name)) or '(no name)'}"
-    if proto.data_type not in _STORED:
+    if proto.data_type not in NUMBERS or proto.data_type == STRING:
         raise ModelError(f"{what}: has element type {proto.data_type}, allowed are numbers and truth values; {DAMAGED}")
-    stored, field = _STORED[proto.data_type]
-    shape = tuple(int(size) for size in proto.dims)
-    kind = np.dtype(stored)
+    kind, shape = helper.tensor_dtype_to_np_dtype(proto.data_type), tuple(int(size) for size in proto.dims)
     if len(shape) > DIMENSIONS or any(size < 0 for size in shape):
         raise ModelError(f"{what}: has an impossible shape {shape[:DIMENSIONS]}; {DAMAGED}")
     if proto.data_location == _EXTERNAL:
-        data = content.external(_text(proto.name), proto.external_data)
-    elif proto.raw_data:
-        data = proto.raw_data
-    else:
-        listed = getattr(proto, field)
-        data = None
-    held = len(listed) if data is None else len(data) / kind.itemsize
+        proto.raw_data = content.external(_text(proto.name), proto.external_data)
+        proto.data_location = 0
+    listed = getattr(proto, helper.tensor_dtype_to_field(proto.data_type))
+    held = len(proto.raw_data) / kind.itemsize if proto.HasField("raw_data") else len(listed)
     if math.prod(shape) != held:
         raise ModelError(f"{what}: claims {math.prod(shape)} values, the file holds {held:g}; {DAMAGED}")
-    if data is None:
-        try:
-            # Half floats lie in their field as the integers that their bits spell.
-            array = np.array(listed, np.uint16 if stored == "<f2" else None).astype("<u2" if stored == "<f2" else kind)
-            array = array.view(kind) if stored == "<f2" else array
-        except (OverflowError, ValueError) as error:
-            raise ModelError(f"{what}: holds numbers that its type cannot; {DAMAGED}") from error
-    else:
-        array = np.frombuffer(data, kind)
-    return widened(array.reshape(shape), what)
+    try:
+        return widened(numpy_helper.to_array(proto), what)
+    except (OverflowError, TypeError, ValueError) as error:
+        raise ModelError(f"{what}: holds numbers that its type cannot; {DAMAGED}") from error
 
 
 def widened(array: Array, what: str) -> Array:

@@ -121,18 +121,18 @@ def _chains(table: Table, neurons: Sequence[Neurons]) -> list[list[Neurons]]:
 def _data(table: Table, neurons: Sequence[Neurons]) -> int:
     """The one input that is no state."""
     states = {atom for n in neurons for atom in (n.previous, n.gate)}
-    heard = {atom: n for n in reversed(neurons) for atom in n.current}
-    data = sorted(atom for atom in heard if table.atoms[atom].kind == INPUT_ATOM)
+    received = {atom: n for n in reversed(neurons) for atom in n.current}
+    data = sorted(atom for atom in received if table.atoms[atom].kind == INPUT_ATOM)
     mixed = [atom for atom in data if atom in states]
     if mixed:
         label = printable(table.atoms[mixed[0]].label)
         raise ModelError(
-            f"{heard[mixed[0]].node}: takes the state {label} of a layer as its input, a recurrent connection, "
+            f"{received[mixed[0]].node}: takes the state {label} of a layer as its input, a recurrent connection, "
             "which is not read from ONNX; export the network as NIR"
         )
     if len(data) != 1:
         named = ", ".join(f"{printable(table.atoms[atom].label)} ({table.atoms[atom].size})" for atom in data)
-        where = f"{heard[data[-1]].node}: " if data else ""
+        where = f"{received[data[-1]].node}: " if data else ""
         raise ModelError(
             f"{where}{len(data)} inputs are no state of a neuron{f': {named}' if named else ''}; one must bring the "
             "events, and every other be a membrane or its spikes"
@@ -187,7 +187,7 @@ def _sources(
             layer, when = step_of[atom]
             if when != step:
                 raise ModelError(
-                    f"{n.node}: listens to {printable(table.atoms[atom].label)} of another step; only spikes of the "
+                    f"{n.node}: receives {printable(table.atoms[atom].label)} of another step; only spikes of the "
                     "same step can be lowered"
                 )
             found[layer] = weight
@@ -236,8 +236,8 @@ def readout(table: Table, found: Unrolled, outputs: Mapping[str, Affine]) -> tup
     ModelError
         If no output is a count of the spikes of the last layer, or several count them differently.
     """
-    heard = {source for sources in found.sources for source in sources}
-    ends = [index for index in range(len(found.layers)) if index not in heard]
+    received = {source for sources in found.sources for source in sources}
+    ends = [index for index in range(len(found.layers)) if index not in received]
     votes: list[tuple[int, IntArray, str]] = []
     for index in ends:
         spikes = [n.spike for n in found.layers[index]]

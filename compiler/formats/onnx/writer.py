@@ -10,7 +10,7 @@ Form ``step``: one chip step. Feed every output ``X_next`` back as input ``X``; 
 ``events``             (batch, channels)  input, uint8; channel ``taxel * polarities + polarity``, zeros after the end
 ``length``             ()                 input, int64: data steps of the recordings; run ``length + max_depth`` steps
 ``step``               ()                 int64, counts chip steps
-``LAYER.spikes``       (batch, neurons)   uint8; heard by others one step later
+``LAYER.spikes``       (batch, neurons)   uint8; received by others one step later
 ``LAYER.membrane``     (batch, neurons)   after the reset
 ``LAYER.current``      (batch, neurons)   only where a current outlasts its step
 ``votes``              (batch, classes)   int32, summed up; only where a layer votes
@@ -29,7 +29,7 @@ layer did with data step ``t``, in chip step ``t + depth``.
 ``overflow``           (batch,)                bool, only where ranges are not proven: the chip would have stopped
 ====================== ======================= ========================================================================
 
-A network in which each layer hears the one before it only, with proven ranges, is run layer after layer: one product
+A network in which each layer receives the one before it only, with proven ranges, is run layer after layer: one product
 over all steps (in wide layers one a step), then a ``Scan`` of the recurrence. Any other is a ``Scan`` over the form
 ``step``.
 """
@@ -120,7 +120,7 @@ def export(netlist: Netlist, form: str) -> bytes:
 
 
 def timing_words(clocks: Clocks, bins: int) -> str:
-    """What an input hears beside the events of a bin, for the metadata of a file."""
+    """What an input receives beside the events of a bin, for the metadata of a file."""
     words = f"; a step joins {bins} bins of the recordings" if bins > 1 else ""
     if not clocks.channels:
         return words
@@ -173,18 +173,18 @@ def _scan_model(netlist: Netlist, layers: tuple[Layer, ...]) -> Model:
 
 def _layerwise(graph: Nodes, layers: tuple[Layer, ...]) -> None:
     """Each layer over all steps: its products, then a loop over the recurrence."""
-    heard = {INPUT: "events"}
+    received = {INPUT: "events"}
     for layer in layers:
         name, body = layer.name, graph.inner()
-        heard[layer.index] = f"{name}.spikes"
-        spikes = [heard[source.pre] for source in layer.sources]
+        received[layer.index] = f"{name}.spikes"
+        spikes = [received[source.pre] for source in layer.sources]
         size = ("batch", layer.size)
         # a current that lasts must not take the bias along
         early = layer.size < WIDE and not layer.remembers
         if early:
             sums = gathered(graph, layer, products(graph, layer, spikes, f"{name}/product"), name)
             sums = bias(graph, layer, sums, f"{name}/inflow")
-            assert sums is not None, "a layer of a pipeline hears the one before"
+            assert sums is not None, "a layer of a pipeline receives the one before"
             inflow: str | None = f"{name}/now"
             given = [(sums, Port(name=f"{name}/now", kind=layer.kind, shape=size))]
         else:

@@ -101,17 +101,17 @@ def _steps(
     nodes: Nodes, checkpoint: Checkpoint, adjacency: FloatArray, sizes: dict[str, int], channels: int
 ) -> tuple[list[Port], list[Port]]:
     inputs = [Port(name="events", kind=np.uint8, shape=("batch", channels))]
-    outputs, heard = [], ""
+    outputs, received = [], ""
     for name, size in sizes.items():
-        current = _current(nodes, checkpoint, adjacency, name, heard, [nodes.constant("rows", [-1], np.int64)], size)
+        current = _current(nodes, checkpoint, adjacency, name, received, [nodes.constant("rows", [-1], np.int64)], size)
         fired = _integrate(nodes, checkpoint, name, current)
         trains = Port(name=f"{name}.spikes", kind=np.uint8, shape=("batch", size))
         nodes.cast(fired, trains.name, np.uint8)
-        heard = trains.name
+        received = trains.name
         inputs.append(Port(name=f"{name}.membrane", kind=np.float32, shape=("batch", size)))
         outputs += [trains, Port(name=f"{name}.membrane_next", kind=np.float32, shape=("batch", size))]
     votes = Port(name="votes", kind=np.int32, shape=("batch", checkpoint.classes))
-    more = nodes.cast(heard, "votes/more", np.int32)
+    more = nodes.cast(received, "votes/more", np.int32)
     nodes.add("Add", ["votes", _by_class(nodes, checkpoint, more, "votes/classes")], "votes_next")
     return [*inputs, votes], [*outputs, Port(name="votes_next", kind=np.int32, shape=votes.shape)]
 
@@ -120,9 +120,9 @@ def _recordings(
     nodes: Nodes, checkpoint: Checkpoint, adjacency: FloatArray, sizes: dict[str, int], channels: int
 ) -> tuple[list[Port], list[Port]]:
     read_sizes(nodes)
-    outputs, heard = [], ""
+    outputs, received = [], ""
     for name, size in sizes.items():
-        current = _current(nodes, checkpoint, adjacency, name, heard, ["duration", "batch"], size)
+        current = _current(nodes, checkpoint, adjacency, name, received, ["duration", "batch"], size)
         body, shape = nodes.inner(), ("batch", size)
         membrane = Port(name=f"{name}.membrane", kind=np.float32, shape=shape)
         fired = Port(name=_integrate(body, checkpoint, name, f"{name}/now"), kind=np.bool_, shape=shape)
@@ -133,7 +133,7 @@ def _recordings(
             [(fired, f"{name}/trains")],
             f"{name}/scan",
         )
-        heard = nodes.cast(f"{name}/trains", f"{name}.spikes", np.uint8)
+        received = nodes.cast(f"{name}/trains", f"{name}.spikes", np.uint8)
         outputs += counted(nodes, name, size)
     if checkpoint.towers > 1:
         _by_class(nodes, checkpoint, outputs[-1].name, "votes")
@@ -152,7 +152,7 @@ def _by_class(nodes: Nodes, checkpoint: Checkpoint, counts: str, name: str) -> s
 
 
 def _current(
-    nodes: Nodes, checkpoint: Checkpoint, adjacency: FloatArray, name: str, heard: str, rows: list[str], size: int
+    nodes: Nodes, checkpoint: Checkpoint, adjacency: FloatArray, name: str, received: str, rows: list[str], size: int
 ) -> str:
     """Input current of a layer, (…, neurons) with the leading sizes `rows`."""
     if name == "conv1":
@@ -161,7 +161,7 @@ def _current(
         return nodes.add("Reshape", [total, form], "conv1/current")
     layer, dense = next((i, dense) for i, dense in enumerate(checkpoint.dense, 1) if dense.name == name)
     weight = dense.weight if checkpoint.towers == 1 else expand_dense(checkpoint, layer).toarray()
-    spikes = nodes.cast(heard, f"{name}/spikes", np.float32)
+    spikes = nodes.cast(received, f"{name}/spikes", np.float32)
     product = nodes.add("MatMul", [spikes, nodes.constant(f"{name}/weight", weight.T, np.float32)], f"{name}/product")
     return nodes.add("Add", [product, nodes.constant(f"{name}/bias", dense.bias, np.float32)], f"{name}/current")
 

@@ -36,7 +36,7 @@ Digit = tuple[npt.NDArray[np.int8], IntArray]
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Source:
-    """What a layer hears from another one, or from the input.
+    """What a layer receives from another one, or from the input.
 
     pre: index into ``netlist.layers``, or ``INPUT``.
     positive, negative: (neurons of the source, neurons) int64; sums of its positive and of its negative effective
@@ -60,7 +60,7 @@ class Layer:
     name: unique, without dots.
     ids: (n,) int64; compartments.
     depth: steps that it lags behind the data.
-    sources: what it hears.
+    sources: what it receives.
     decay_u, decay_v, threshold, bias: (n,) int64; registers; thresholds and biases in membrane units.
     label: (n,) int64; class of a vote, -1 for none.
     remembers: whether a current outlasts its step.
@@ -218,12 +218,12 @@ def _gathered(sources: tuple[Source, ...]) -> int:
 
 
 def is_pipeline(netlist: Netlist, layers: tuple[Layer, ...]) -> bool:
-    """Whether every layer hears layers of the depth before it, the first ones the input, and nobody else.
+    """Whether every layer receives layers of the depth before it, the first ones the input, and no other.
 
     Then none has to wait for another: each runs over the whole recording, aligned with the data.
     """
-    heard = [
+    received = [
         {-1 if source.pre == INPUT else netlist.layers[source.pre].depth for source in layer.sources}
         for layer in layers
     ]
-    return all(depths == {layer.depth - 1} for layer, depths in zip(layers, heard, strict=True))
+    return all(depths == {layer.depth - 1} for layer, depths in zip(layers, received, strict=True))

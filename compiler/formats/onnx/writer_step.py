@@ -43,7 +43,7 @@ def products(graph: Nodes, layer: Layer, spikes: Sequence[str], name: str, sign:
     graph : Nodes
         Where to append.
     layer : Layer
-        Which hears.
+        Which receives.
     spikes : sequence of str
         Of each of its sources, (…, neurons) uint8.
     name : str
@@ -52,16 +52,16 @@ def products(graph: Nodes, layer: Layer, spikes: Sequence[str], name: str, sign:
         All weights, or magnitudes of the positive or the negative ones.
     """
     found: list[tuple[str, str]] = []
-    for heard, source in zip(spikes, layer.sources, strict=True):
+    for received, source in zip(spikes, layer.sources, strict=True):
         for digit, factor in digits(source.weight(sign)):
             own = f"{name}/{len(found)}"
-            product = graph.add("MatMulInteger", [heard, graph.constant(f"{own}/weight", digit, np.int8)], own)
+            product = graph.add("MatMulInteger", [received, graph.constant(f"{own}/weight", digit, np.int8)], own)
             found.append((product, graph.column(f"{own}/unit", factor << MEMBRANE_SHIFT, layer.kind)))
     return tuple(found)
 
 
 def gathered(graph: Nodes, layer: Layer, found: Products, name: str) -> str | None:
-    """Add up products to synaptic sums in membrane units; None where the layer hears nobody."""
+    """Add up products to synaptic sums in membrane units; None where nothing feeds the layer."""
     total: str | None = None
     for i, (product, unit) in enumerate(found):
         wide = product if layer.kind is np.int32 else graph.cast(product, f"{name}/wide{i}", layer.kind)
@@ -194,14 +194,14 @@ def chip_step(graph: Nodes, layers: tuple[Layer, ...], classes: int, prefix: str
     It reads ``events`` and ``length`` beside the states; where ranges are not proven it also leaves ``overflow``.
     `prefix` goes before all names that are not a layer's.
     """
-    heard = {INPUT: f"{prefix}events"} | {layer.index: f"{layer.name}.spikes" for layer in layers}
+    received = {INPUT: f"{prefix}events"} | {layer.index: f"{layer.name}.spikes" for layer in layers}
     graph.add("Add", [f"{prefix}step", graph.constant("increment", 1, np.int64)], f"{prefix}step_next")
     windows = {depth: _window(graph, depth, prefix) for depth in sorted({layer.depth for layer in layers})}
     flags: list[str] = []
     for layer in layers:
         name, is_open = layer.name, windows[layer.depth]
         window = graph.cast(is_open, f"{name}/window", layer.kind)
-        inflow, signed = _arrived(graph, layer, [heard[source.pre] for source in layer.sources])
+        inflow, signed = _arrived(graph, layer, [received[source.pre] for source in layer.sources])
         state = f"{name}.membrane", f"{name}.current" if layer.remembers else None
         fired = integrate(graph, layer, inflow, state, window=window)
         if fired.current is not None:
@@ -237,6 +237,6 @@ def _arrived(graph: Nodes, layer: Layer, spikes: list[str]) -> tuple[str | None,
     signed = []
     for sign, word in ((1, "positive"), (-1, "negative")):
         total = gathered(graph, layer, products(graph, layer, spikes, f"{name}/{word}", sign), f"{name}/{word}")
-        assert total is not None, "a layer that hears nobody overflows nothing"
+        assert total is not None, "a layer that receives nothing overflows nothing"
         signed.append(total)
     return graph.add("Sub", signed, f"{name}/sum"), signed
