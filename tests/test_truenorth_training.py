@@ -306,12 +306,9 @@ def test_joined_towers_vote_together(data, capsys):
 def test_mistakes_are_told_in_one_line(data, capsys):
     as_json(capsys, "train", *SMALL, "-o", "x.pt")
     as_json(capsys, "compile", "x.pt", "--target", "truenorth", "-o", "x.loom")
-    assert mistake(capsys, "train", *SMALL, "--recipe", "timed", "-o", "y.pt") == (
-        "--recipe timed: a network for TrueNorth has a recipe of its own, and nothing in it decays; leave it away"
-    )
-    assert mistake(capsys, "train", "--data", "data", "--graph", "manual", "--copies", "2", "-o", "y.pt") == (
-        "--copies 2: is for --system tactilesgnet-truenorth; leave it away"
-    )
+    for option, value in (("--recipe", "timed"), ("--current-decay", "fc1=0.9"), ("--spike-penalty", "0.5")):
+        told = mistake(capsys, "train", *SMALL, option, value, "-o", "y.pt")
+        assert told.startswith(f"{option} {value}: a network of system tactilesgnet-truenorth")
     assert mistake(capsys, "train", *SMALL, "--seed", "1", "--resume", "-o", "x.pt") == (
         "x.pt: holds another training (other seed); give its options, or another -o"
     )
