@@ -23,8 +23,7 @@ from spikeloom.compiler.formats.onnx.file import BOOL, DOUBLE, Declared, Graph, 
 from spikeloom.compiler.formats.onnx.gates import as_affine
 from spikeloom.compiler.formats.onnx.lif import Neurons, is_output, neurons_of
 from spikeloom.compiler.formats.onnx.operators import require_finite
-from spikeloom.compiler.formats.onnx.order import inner
-from spikeloom.compiler.formats.onnx.run import run
+from spikeloom.compiler.formats.onnx.run import inner, run
 from spikeloom.compiler.formats.onnx.steps import Unrolled, group, readout
 from spikeloom.compiler.formats.onnx.values import INPUT_ATOM, Affine, Table
 from spikeloom.compiler.ir import INPUT, Network, Sparse
