@@ -23,14 +23,8 @@ CHIP, FLOAT = "chip integers", "float"
 class Kind(NamedTuple):
     """A part of a command.
 
-    Parameters
-    ----------
-    arithmetic : str
-        What it computes in; parts in ``CHIP`` run on the engine.
-    over : {"all", "checked", "one", "none"}
-        Recordings: all, those that the specification runs, one of them, or none since it was not needed.
-    why : str
-        What it is for.
+    Its arithmetic (``CHIP`` is the engine's), what it is for, and over which recordings it runs: all, those that the
+    specification runs (checked), one, or none since it was not needed.
     """
 
     arithmetic: str

@@ -62,12 +62,8 @@ NOT_COUNTED = "memory, instructions, clock and leakage (arithmetic alone; a lowe
 class SynapticOperations:
     """Non-zero weights that meet a non-zero input, per recording.
 
-    Parameters
-    ----------
-    effective_macs, effective_acs : float
-        Multiply-accumulates where a step's input is not in {-1, 0, 1}, else accumulations.
-    dense : float
-        The same with all inputs and weights set to one.
+    Multiply-accumulates where a step's input is not in {-1, 0, 1}, else accumulations; and the same with all inputs and
+    weights set to one.
     """
 
     effective_macs: float = field(metadata=key("Effective_MACs"))
@@ -79,15 +75,8 @@ class SynapticOperations:
 class NeuroBench:
     """NeuroBench's metrics, means over recordings as its harness gives them for batches of one.
 
-    Parameters
-    ----------
-    footprint : int
-        Bytes of weights and biases in float32, the matrix of the convolution and its zeros included; no state.
-    connection_sparsity : float
-        Share of weights that are zero, rounded to four digits as the package does.
-    activation_sparsity : float
-        Share of neurons and steps without a spike.
-    synaptic_operations : SynapticOperations
+    The footprint is bytes of weights and biases in float32, the convolution's matrix and its zeros included; sparsities
+    are shares of weights that are zero (to four digits, as the package does) and of neurons and steps without a spike.
     """
 
     footprint: int
@@ -98,17 +87,7 @@ class NeuroBench:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Arithmetic:
-    """Operations per recording and their energy in one number format.
-
-    Parameters
-    ----------
-    what : str
-        What computes.
-    numbers : {"float32", "int8"}
-        Format; products of int8 are summed in 32 bits.
-    macs, acs : float
-        Multiply-accumulates and accumulations per recording, decays of membranes among the former.
-    """
+    """Operations per recording in one number format, ``float32`` or ``int8``; decays of membranes count as macs."""
 
     what: str
     numbers: str
@@ -126,20 +105,7 @@ class Arithmetic:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Yardsticks:
-    """Both yardsticks of a network on some recordings.
-
-    Parameters
-    ----------
-    samples : int
-        Recordings.
-    neurobench : NeuroBench
-    arithmetic : tuple of Arithmetic
-        Dense, with the convolution in its factors, and effective; each in float32 and int8.
-    graph : str, optional
-        Name of the network's graph.
-    prices_pj, source, not_counted
-        What the energies rest on.
-    """
+    """Both yardsticks of a network on some recordings, and what the energies rest on."""
 
     samples: int
     neurobench: NeuroBench

@@ -27,19 +27,11 @@ LISTED = 3
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Breakdown:
-    """A failure that was found.
+    """A known failure.
 
-    Parameters
-    ----------
-    kind : str
-        ``silent layer``, ``silenced neurons``, ``woken neurons``, ``one class``, ``no vote``, ``tied votes`` or
-        ``nearly empty``.
-    layer : str or None
-        Where it is in one layer.
-    count : int
-        Spikes of the float model, neurons or recordings that it concerns.
-    text : str
-        One line for people.
+    Its kind (``silent layer``, ``silenced neurons``, ``woken neurons``, ``one class``, ``no vote``, ``tied votes`` or
+    ``nearly empty``), the layer if it is in one, how many spikes of the float model, neurons or recordings it concerns,
+    and a line for people.
     """
 
     kind: str

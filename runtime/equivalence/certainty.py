@@ -42,26 +42,11 @@ SLACK = np.float32(1.01)
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Layer:
-    """A layer's weights, transposed.
+    """A layer's weights, transposed, (n_pre, n_post); a row for each neuron of the sources, then for each of its own.
 
-    Parameters
-    ----------
-    weight : (n_pre, n_post) float64
-        As expanded; a row for each neuron of the sources, then one for each of its own where it is recurrent.
-    magnitude : (n_pre, n_post) float32
-        Sum of the magnitudes of all products that make up a weight.
-    bias : (n_post,) float64
-        Bias.
-    roundings : int
-        Roundings in a current, beside one for each input spike where `per_spike`.
-    per_spike : bool
-        Whether the current is one plain sum over input spikes; a product with a zero is exact and adds exactly.
-    alpha, beta, theta : float
-        Decays of current and membrane, and threshold.
-    sources : tuple of int
-        Other populations whose neurons lie side by side in the rows, ``INPUT`` among them.
-    own : int
-        How often its own neurons follow: once for each projection to itself.
+    `magnitude` sums the magnitudes of all products that make up a weight. A current has `roundings`, and one more for
+    each input spike if it is one plain sum over them (`per_spike`): a product with a zero is exact and adds exactly.
+    `own` is the number of projections to itself.
     """
 
     weight: FloatArray
@@ -202,15 +187,7 @@ def _with_bias(
 
 
 class _Membranes:
-    """Membranes of a layer as centre and radius, step after step.
-
-    Parameters
-    ----------
-    beta, theta : float
-        Decay and threshold.
-    shape : tuple of int
-        Samples, neurons.
-    """
+    """Membranes of a layer, (samples, neurons), as centre and radius, step after step."""
 
     def __init__(self, beta: float, theta: float, shape: tuple[int, ...]) -> None:
         self._beta, self._grown = beta, beta * (1 + 8 * UNIT)

@@ -26,14 +26,7 @@ from spikeloom.runtime.machines.votes import readout_counts
 class LayerCertificate:
     """Entries (recording, step, neuron) of one layer.
 
-    Parameters
-    ----------
-    entries : int
-        All of them.
-    equal : int
-        Chip and float model have the same spike, or the same silence, in whatever order the float model adds.
-    different : int
-        They differ in whatever order. The rest is undecided.
+    Those that are equal, or differ, in whatever order the float model adds.
     """
 
     entries: int
@@ -50,18 +43,10 @@ class LayerCertificate:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Certificate:
-    """What is proven, of the recordings and of any input.
+    """What is proven.
 
-    Parameters
-    ----------
-    layers : mapping of str to LayerCertificate
-        Spikes of each layer on the recordings.
-    samples : int
-        Recordings.
-    decisions : int
-        Of these, how many float decisions are the chip's in whatever order the float model adds.
-    unproven : tuple of str
-        Layers that may bring a register out of its range on some input; empty if none can.
+    Of the recordings' spikes, layer by layer, and decisions, in whatever order the float model adds; and of any input:
+    `unproven` layers may bring a register out of its range.
     """
 
     layers: Mapping[str, LayerCertificate]

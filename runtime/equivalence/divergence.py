@@ -19,26 +19,9 @@ from spikeloom.runtime.machines.loihi1.trace import aligned, comparable
 class Divergence:
     """The first entry in which chip and float model differ: first recording, then step, layer, neuron.
 
-    Parameters
-    ----------
-    file : str
-        Recording.
-    step : int
-        Data step.
-    layer : str
-        Layer.
-    neuron : int
-        Neuron of the layer.
-    taxel, feature : int or None
-        The same in a graph convolution's own terms.
-    float_membrane, chip_membrane : float
-        Membranes before the comparison, in the float model's units.
-    chip_register : int
-        Membrane register before the comparison.
-    theta, chip_theta : float
-        Thresholds in the float model's units.
-    ill_posed : bool
-        Whether the float64 model sides with the chip.
+    Membranes before the comparison and thresholds are in the float model's units, the register is as it stands. Taxel
+    and feature are the neuron in a graph convolution's own terms. It is ill-posed if the float64 model sides with the
+    chip.
     """
 
     file: str

@@ -36,15 +36,10 @@ NOWHERE = -1
 
 
 class Runs(NamedTuple):
-    """Weights by source, as stretches of neighbouring targets.
+    """Weights by source.
 
-    Parameters
-    ----------
-    run : (sources + 1,) int64
-        Bounds of each source's runs; a run is a stretch of neighbouring targets.
-    target, offset : (runs,) int64, (runs + 1,) int64
-        First target of each run, and where its weights begin; a run is as long as its weights.
-    weight : (synapses,) float32
+    The bounds of each source's runs, (sources + 1,); the first target of each run, a stretch of neighbouring targets,
+    and where its weights begin; float32 weights, (synapses,).
     """
 
     run: IntArray
@@ -62,21 +57,10 @@ NO_RUNS = Runs(_NONE, _NONE, _NONE, _NONE.astype(np.float32))
 class Layer:
     """One population, prepared.
 
-    Parameters
-    ----------
-    pres : tuple of int
-        Other presynaptic populations, ``INPUT`` for the input; their neurons are numbered one after the other.
-    runs, own : Runs
-        Weights from these, and from itself; the latter without a source if it is not recurrent.
-    bias : (neurons,) float32
-    beta, theta, alpha : float
-    depth, late : int
-        Chip steps that it lags behind the data; how many of them beyond the one that follows the layer before, which
-        cost it as many steps of its input.
-    seat : (neurons,) int64
-        Compartment of each neuron, or ``NOWHERE``.
-    compared : (neurons,) bool
-        Neurons that are compared with the chip's: all but those that it omits because no neuron receives them.
+    `pres` are its other presynaptic populations, ``INPUT`` for the input, whose neurons are numbered one after the
+    other in `runs`; `own` are its recurrent weights. It lags `depth` chip steps behind the data, `late` of them beyond
+    the one that follows the layer before, which cost it as many steps of its input. `seat` is each neuron's compartment
+    or ``NOWHERE``; those that no neuron receives are not `compared` with the chip's.
     """
 
     pres: tuple[int, ...]
@@ -109,13 +93,8 @@ class FloatEngine:
 class FloatRun:
     """What recordings brought.
 
-    Parameters
-    ----------
-    votes : (recordings, classes) int64
-    spikes, elsewhere : (recordings, layers) int64
-        Spikes that are compared with the chip's; those of them by neurons that it does not hold.
-    packed : (recordings, chip steps, words) uint64
-        Spikes, laid out as ``Trace.packed``.
+    Votes (recordings, classes); spikes (recordings, layers) that are compared with the chip's, and those of them by
+    neurons that it does not hold (`elsewhere`); all spikes (recordings, chip steps, words), as in ``Trace.packed``.
     """
 
     votes: IntArray

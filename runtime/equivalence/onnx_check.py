@@ -44,14 +44,7 @@ def differing(check: Check, events: EventArray, lengths: IntArray | None, spikes
 def as_specified(check: Check, events: Sequence[EventArray], specified: Sequence[Trace]) -> bool:
     """Whether the form ``step`` has every spike, membrane and vote of the specification's runs.
 
-    Parameters
-    ----------
-    check : Check
-        Network.
-    events : sequence of (n_inputs, T) uint8
-        Recordings, each of its own length.
-    specified : sequence of Trace
-        What the specification made of them.
+    Recordings are (n_inputs, T) uint8, each of its own length; `specified` is what the specification made of them.
     """
     netlist = check.step.netlist
     for recording, expected in zip(events, specified, strict=True):

@@ -44,18 +44,10 @@ the nearest."""
 class LayerRounding:
     """What a layer stores, against its checkpoint.
 
-    Parameters
-    ----------
-    weights : int
-        Weights between neurons that the chip holds, those that are zero on both sides not counted.
-    nearest : int
-        Those of them that are the nearest on the layer's grid.
-    farthest_steps : float
-        Largest distance of a weight from the checkpoint's, in steps of the grid, clipped weights from their limit.
-    compensated : bool
-        Whether it was rounded so that errors cancel: weights, and biases with them, need not be the nearest.
-    faults : tuple of str
-        What is not as rounding the checkpoint gives it.
+    Of its `weights` (between neurons that the chip holds, not zero on both sides) so many are the `nearest` on the
+    layer's grid; the farthest is so many steps of the grid off, clipped weights from their limit. A layer is
+    `compensated` if it was rounded so that errors cancel: weights, and biases with them, need not be the nearest.
+    `faults` says what is not as rounding the checkpoint gives it.
     """
 
     weights: int

@@ -20,14 +20,8 @@ from spikeloom.runtime.report.encode import HIDDEN, OPTIONAL
 class LayerSpikes:
     """Spikes of one layer over all recordings.
 
-    Parameters
-    ----------
-    float, chip : int
-        Spikes of the float32 reference and of the chip.
-    different : int
-        Entries (recording, step, neuron) in which they differ.
-    ill_posed : int
-        Entries in which the float64 model differs from the float32 one.
+    `different` counts entries (recording, step, neuron) in which float32 reference and chip differ, `ill_posed` those
+    in which float64 and float32 do.
     """
 
     float: int
@@ -46,17 +40,7 @@ class Rung:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Level:
-    """What was reached on one of :data:`levels.LEVELS`.
-
-    Parameters
-    ----------
-    name : str
-        One of ``LEVELS``.
-    share : float or None
-        From 0 to 1; None where the level does not apply.
-    text : str
-        For people.
-    """
+    """What was reached on one of :data:`levels.LEVELS`; the share is None where the level does not apply."""
 
     name: str
     share: float | None
@@ -67,48 +51,12 @@ class Level:
 class Verdict:
     """Everything that verify finds.
 
-    Parameters
-    ----------
-    files : tuple of str
-        Recordings.
-    labels, float_predictions, chip_predictions : (samples,) int64
-        Classes.
-    float_counts, chip_counts : (samples, classes) int64
-        Votes per class.
-    spikes : mapping of str to LayerSpikes
-        Per layer.
-    spec_samples : int
-        Recordings on which the specification was run beside the engine.
-    spec_equals_engine : bool
-        Whether every spike, membrane and count was equal there; with onnxruntime beside, whether its spikes, its
-        membranes after the reset and its votes were so too, and its spikes those of our engine on all recordings.
-    weights : Rounding
-        Whether the netlist holds the rounding of the checkpoint.
-    first_divergence : Divergence or None
-        None if no spike differs.
-    ladder : tuple of Rung
-        Differences from the float32 reference with one deviation more on each rung.
-    same_checkpoint : bool
-        Whether the netlist was compiled from this very checkpoint file and epoch.
-    quantised_different : int or None
-        Spikes of all layers in which a fine-tuned checkpoint's torch model, on chip integers, and the chip differ;
-        None where the checkpoint was not fine-tuned.
-    breakdowns : tuple of Breakdown
-        Known failures.
-    not_compared : mapping of str to int
-        Neurons of each layer that the chip leaves out because no neuron receives them, where there are any.
-    certificate : Certificate
-        What of all this holds in whatever order the float model adds, and of registers for any input.
-    engine : str
-        One of ``ENGINES``.
-    engine_different : int or None
-        Spikes in which the further engine differs from ours, on all recordings; None where there is no further one.
-    levels : tuple of Level
-        Summary on four levels.
-    missed : tuple of str
-        What was required and is not reached.
-    explained_cost : tuple of Part, optional
-        What was simulated for all this.
+    Predictions are (samples,) int64 and votes (samples, classes) int64. The specification ran beside the engine on
+    `spec_samples` recordings; `spec_equals_engine` says whether every spike, membrane and count was equal there, and,
+    with onnxruntime beside, whether its spikes, membranes after the reset and votes were so too, and its spikes our
+    engine's on all recordings: `engine_different` counts those that are not. `quantised_different` counts spikes in
+    which a fine-tuned checkpoint's torch model, on chip integers, and the chip differ. `not_compared` are neurons of
+    each layer that the chip omits because no neuron receives them. `missed` is what was required and is not reached.
     """
 
     files: tuple[str, ...] = field(metadata=HIDDEN)

@@ -46,12 +46,7 @@ UNDECIDED = 256 * float(np.finfo(np.float64).eps)
 class Observed:
     """What a machine did on one recording, aligned with the data.
 
-    Parameters
-    ----------
-    spikes : tuple of (steps, neurons) bool
-        One array per population.
-    membranes : tuple of (steps, neurons) int
-        Membrane registers before the reset.
+    Of each population spikes and, before the reset, membrane registers, (steps, neurons).
     """
 
     spikes: tuple[BoolArray, ...]
@@ -74,28 +69,10 @@ def observe(netlist: Netlist, prepared: Engine, events: npt.NDArray[np.uint8]) -
 class RootCause:
     """A root, and why it differs.
 
-    Parameters
-    ----------
-    root : Root
-        Where it is.
-    cause : str
-        One of ``CAUSES``; or ``LEFT_OUT``, or ``UNKNOWN``.
-    held : bool
-        Whether the chip holds the neuron at all.
-    clipped : bool
-        Whether the float model's spike would be there if no weight were cut off by the range.
-    sufficient : tuple of str
-        Causes each of which, if it alone were gone, would give the float model's spike.
-    moved : tuple of (str, float)
-        How far each cause moved the chip's membrane against its threshold; the float model's units, largest first.
-    float_fires : bool
-        Whether it is the float model that fires, and not the chip.
-    float_membrane, chip_membrane : float
-        Membranes before the comparison, in the float model's units.
-    theta, chip_theta : float
-        Thresholds in the float model's units.
-    chip_register, chip_threshold : int
-        Membrane and threshold as the chip compares them.
+    Membranes before the comparison and thresholds are in the float model's units, registers as the chip compares them.
+    Each of the `sufficient` causes, if it alone were gone, would give the float model's spike, and so would weights
+    that the range does not cut off if `clipped`. `moved` says how far each cause moved the chip's membrane against its
+    threshold, largest first. The chip may not even have `held` the neuron.
     """
 
     root: Root
@@ -117,12 +94,8 @@ class RootCause:
 class Explanation:
     """Why one recording differs.
 
-    Parameters
-    ----------
-    float_spikes, chip_spikes, different : tuple of int
-        Entries of each population that fire in the float64 model, on the chip, in one of them only.
-    roots : tuple of RootCause
-        Those that drag most along first.
+    Entries of each population that fire in the float64 model, on the chip, in one of them only; and the roots, those
+    first that drag most along.
     """
 
     float_spikes: tuple[int, ...]

@@ -28,13 +28,8 @@ CAUSES = (WEIGHTS, BIAS, THRESHOLD, BETA, TRUNCATION, SATURATION, TIE)
 class Registers:
     """Parameters of one layer in membrane units (1/64 of a weight unit), as real numbers.
 
-    Parameters
-    ----------
-    weight : (neurons, sources) float64
-        Dense; sources are those of :func:`sources_into`, side by side.
-    bias, threshold : (neurons,) float64
-    keep_u, keep_v : float
-        Shares of current and membrane that a step keeps.
+    Weights are (neurons, sources), those of :func:`sources_into` side by side; a step keeps the shares `keep_u` of the
+    current and `keep_v` of the membrane.
     """
 
     weight: FloatArray
@@ -48,13 +43,8 @@ class Registers:
 class LayerValues:
     """One layer as it is stored, and as the checkpoint has it at the same scale.
 
-    Parameters
-    ----------
-    stored, ideal : Registers
-    clipped : (neurons, sources) bool
-        Weights that the range cuts off.
-    compensated : bool
-        Whether weights, and biases with them, were rounded so that their errors cancel.
+    The range cuts `clipped` weights off; in a `compensated` layer weights, and biases with them, were rounded so that
+    their errors cancel.
     """
 
     stored: Registers

@@ -32,20 +32,8 @@ STORED, UNROUNDED, UNCLIPPED = range(3)
 class Variant:
     """A replay: the stored neurons without one deviation.
 
-    Parameters
-    ----------
-    cause : str
-        What deviation is gone.
-    weights : int
-        STORED, UNROUNDED or UNCLIPPED.
-    bias, threshold : (neurons,) float64
-        Membrane units.
-    keep_u, keep_v : float
-        Shares of current and membrane that a step keeps.
-    limit : float
-        Of the membrane register.
-    rounds : bool
-        Whether decayed registers are rounded toward zero.
+    Weights are STORED, UNROUNDED or UNCLIPPED; bias and threshold (neurons,) and the membrane's limit are in membrane
+    units; `keep_u` and `keep_v` are what a step keeps of current and membrane, rounded toward zero if `rounds`.
     """
 
     cause: str

@@ -29,16 +29,8 @@ Sources = tuple[tuple[tuple[int, BoolArray], ...], ...]
 class Root:
     """A divergence that arises although all inputs of the neuron agreed.
 
-    Parameters
-    ----------
-    layer, neuron, step : int
-        The entry; the step counts data steps.
-    begin : int
-        First step that the neuron remembers: the one after its last common reset, 0 if there was none.
-    dragged : int
-        Later entries that follow from it, perhaps among others.
-    alone : int
-        Those of them that follow from nothing else.
+    The step counts data steps; the neuron remembers from step `begin`, the one after its last common reset. Of later
+    entries `dragged` follow from it, perhaps among others, and `alone` of them from nothing else.
     """
 
     layer: int

@@ -78,28 +78,11 @@ class RootEntry:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Explained:
-    """Why chip and float model differ on one recording.
+    """Why chip and float model differ on one recording, its number counted from 0.
 
-    Parameters
-    ----------
-    sample, split : str
-    recording, searched : int
-        Its number, and how many were searched for a difference.
-    steps : int
-    graph : str or None
-    reference : str
-        Arithmetic of the float model.
-    different, roots : int
-        Entries that differ, and those of them that follow from no other.
-    diagnosis : str or None
-        The cause of most roots.
-    layers : tuple of LayerRoots
-    causes : tuple of CauseRoots
-        Most frequent first.
-    faults : tuple of str
-        Where the netlist is not the rounding of the checkpoint at all.
-    top : tuple of RootEntry
-        Roots that drag most along.
+    So many recordings were `searched` for a difference. Of the `different` entries `roots` follow from no other; the
+    `diagnosis` is the cause of most. `faults` says where the netlist is not the rounding of the checkpoint at all;
+    `top` are the roots that drag most along.
     """
 
     sample: str

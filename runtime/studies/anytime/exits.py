@@ -43,16 +43,10 @@ LONGEST = 4096
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Standing:
-    """Where votes stand after each step of the read-out.
+    """Where votes stand after each step of the read-out, (samples, steps).
 
-    Parameters
-    ----------
-    leader : (samples, steps) int64
-        Class with most votes, the lowest on a tie.
-    lead : (samples, steps) int64
-        Votes by which it is ahead of the next; all its votes if there is no other class.
-    left : (samples, steps) int64
-        Steps that are still to come; 0 from a recording's end on.
+    The class with most votes, the lowest on a tie; the votes by which it is ahead of the next; and the steps that are
+    still to come, 0 from a recording's end on.
     """
 
     leader: IntArray
@@ -195,18 +189,10 @@ def live(netlist: Netlist, bins: int, factor: float) -> Callable[[int, IntArray]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Calibrated:
-    """A factor and what it rests on.
+    """A factor, in votes per root of a step left, and what it rests on.
 
-    Parameters
-    ----------
-    allowed : float
-        Share of races that might end otherwise.
-    factor : float
-        Votes per root of a step left.
-    races, differ : int
-        Races that it was chosen on, and how many of them end otherwise.
-    bound : float
-        Upper bound of the share of other such races that end otherwise, with the confidence of ``CONFIDENCE`` [1]_.
+    So many races may end otherwise (`allowed`, a share), and so many `differ`; of other such races at most the share
+    `bound` does, with the confidence of ``CONFIDENCE`` [1]_.
     """
 
     allowed: float

@@ -71,18 +71,9 @@ class Samples:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rule:
-    """A rule and what it comes to; of the proof, which rests on no races, the first five fields are None.
+    """A rule, see :class:`exits.Calibrated`, and what it comes to; of the proof the first five fields are None.
 
-    Parameters
-    ----------
-    allowed, factor, races, races_differ, bound
-        See :class:`exits.Calibrated`.
-    mean, saved : Costs
-        Up to the stop, and the shares that are saved.
-    changes : Changes
-    samples : Samples
-    model : FloatStops or None
-        Of the float model, where there is one.
+    `mean` is what is spent up to the stop, `saved` the shares that are not.
     """
 
     allowed: float | None
@@ -119,27 +110,10 @@ class Window:
 class Anytime:
     """How early decisions could be taken.
 
-    Parameters
-    ----------
-    samples, labelled : int
-        Recordings, and those with a label.
-    source, split : str
-    bins : int
-        Of the longest recording.
-    least_interval : int
-        Least steps from one spike of an output neuron to its next.
-    full : Full
-    windows : tuple of Window
-        Empty without labels.
-    files, labels, decisions, chip_steps
-        Of every recording.
-    rules : tuple of Rule
-        The proof first.
-    savings : mapping of str to int
-        Index of the rule that saves most with ``identical`` decisions, or with at most ``one_lost``.
-    calibrated_on : str or None
-    chosen : int or None
-        Index of the rule that the user chose.
+    `bins` are those of the longest recording, `least_interval` the least steps from one spike of an output neuron to
+    its next. Windows are empty without labels; the first rule is the proof; `savings` is the index of the rule that
+    saves most with ``identical`` decisions, or with at most ``one_lost``; `chosen` that of the rule that the user
+    chose.
     """
 
     samples: int

@@ -31,14 +31,7 @@ STOPPED = -1
 class Ready:
     """A pair, prepared to run.
 
-    Parameters
-    ----------
-    chip : Engine
-    model : FloatEngine
-    masks : (layers, words) uint64
-        Bits of each layer's compartments in ``Trace.packed``.
-    voters, label : (voters,) int64
-        Compartments that vote, and for which class.
+    Bits of each layer's compartments in ``Trace.packed``, (layers, words); compartments that vote, and for which class.
     """
 
     chip: engine.Engine
@@ -50,14 +43,7 @@ class Ready:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Inputs:
-    """Recordings as channels of a network.
-
-    Parameters
-    ----------
-    events : (recordings, channels, T) uint8
-    lengths, begin : (recordings,) int64
-        Steps of each, and the first that counts.
-    """
+    """Recordings (recordings, channels, T) as channels of a network; steps of each, and the first that counts."""
 
     events: npt.NDArray[np.uint8]
     lengths: IntArray
@@ -68,16 +54,8 @@ class Inputs:
 class Outcome:
     """What both sides did.
 
-    Parameters
-    ----------
-    votes : dict of str to (recordings, classes) int64
-        By side.
-    spikes : (recordings, layers, 3) int64
-        Of the float network, of the chip, and those in which they differ.
-    stopped : (recordings,) bool
-        Where a register of the chip would overflow.
-    saturated : (recordings,) int64
-        Membranes that were clipped.
+    Votes (recordings, classes) by side; spikes (recordings, layers, 3) of the float network, of the chip, and those in
+    which they differ; where a register of the chip would overflow; membranes that were clipped.
     """
 
     votes: dict[str, IntArray]

@@ -53,23 +53,11 @@ BETWEEN_CHIPS = "packet_between_chips"
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Costs:
-    """Counts per recording and layer, and energies.
+    """Counts per recording and layer, (samples, layers), and energies.
 
-    Parameters
-    ----------
-    events : mapping of str to (samples, layers) float64
-        Amount of each event in ``EVENTS``. Synaptic operations belong to the layer that receives them, packets and
-        hops to the layer that sends them.
-    zeros : (samples, layers) float64
-        Synaptic operations on stored zeros.
-    between_chips : (samples, layers) float64
-        Packets that leave their chip.
-    steps : int
-        Chip steps of the longest recording.
-    energy : mapping of str to (samples, layers) float64
-        Joules per table.
-    unpriced : mapping of str to tuple of str
-        Tables that cannot price the run, and the events that they lack.
+    Synaptic operations belong to the layer that receives them, packets and hops to the layer that sends them; `zeros`
+    are operations on stored zeros, `between_chips` packets that leave their chip. `steps` are the chip steps of the
+    longest recording; joules are by table, and `unpriced` are the tables that lack events which happened.
     """
 
     events: Mapping[str, FloatArray]
@@ -126,18 +114,8 @@ def _routes(netlist: Netlist, target: Target) -> FloatArray:
 class Meter:
     """What one event of each source causes, prepared by :func:`prepare` for any number of runs.
 
-    Parameters
-    ----------
-    netlist : Netlist
-        What runs.
-    target : Target
-        Its chip.
-    names : tuple of str
-        Events, ``BETWEEN_CHIPS``, and ``zeros`` for visited zeros.
-    caused : (sources, names * layers) float64
-        Amount of each of these for each layer by a spike of each source: input channels, then compartments.
-    neurons : (layers,) float64
-        Compartments of each layer.
+    `caused` is (sources, names * layers): amount of each event of `names` for each layer by a spike of each source,
+    input channels first; `neurons` are the compartments of each layer.
     """
 
     netlist: Netlist

@@ -26,22 +26,9 @@ from spikeloom.runtime.machines.loihi1.trace import Charges
 class Cumulative:
     """Sums over chip steps up to and with each; after a recording's end they stay as they are.
 
-    Parameters
-    ----------
-    votes : (samples, steps, classes) int64
-        After each step of the read-out, which lags `depth` chip steps behind the data.
-    depth : int
-        Of the layer that votes.
-    lengths : (samples,) int64
-        Data steps of each recording.
-    chip_steps : (samples,) int64
-        Chip steps of each recording.
-    operations : (samples, chip steps) float64
-        Synaptic operations.
-    energy : mapping of energy table to (samples, chip steps) float64
-        Joules; without tables that cannot price the run.
-    time : mapping of time table to (samples, chip steps) float64
-        Seconds by the simple model; empty for several chips.
+    Votes (samples, steps, classes) are those after each step of the read-out, which lags `depth` chip steps behind the
+    data; operations, joules by table and seconds by table and the simple model are (samples, chip steps). Tables that
+    cannot price the run are missing, and all times for several chips.
     """
 
     votes: IntArray

@@ -36,19 +36,8 @@ PART = 16
 class Estimate:
     """Costs of a batch of recordings.
 
-    Parameters
-    ----------
-    costs : Costs
-        Events and energies by layer.
-    parts : mapping of table to mapping of part to (samples, layers) float64
-        Joules.
-    steps : (samples,) int64
-        Data steps of each recording.
-    simple : mapping of time table to SimpleTimes
-    detailed : mapping of time table to DetailedTimes
-        Empty unless the detail is ``cycle``.
-    cores : mapping of energy table to (samples, cores) float64
-        Joules; empty unless the detail is ``cycle``.
+    Events and energies by layer; joules by table and part, (samples, layers); data steps; times by table; and, in
+    detail ``cycle`` only, detailed times and joules by table and core.
     """
 
     costs: Costs

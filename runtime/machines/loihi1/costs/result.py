@@ -135,21 +135,8 @@ class Static:
 class CostReport:
     """Costs of a batch of recordings.
 
-    Parameters
-    ----------
-    samples, chip_steps : int
-        Recordings, and steps of the longest.
-    detail : {"counts", "cycle"}
-    per_inference, min, max : Amounts
-        Means and extremes over recordings, each amount for itself.
-    energy_by_part_j : mapping of table to mapping of part to float
-        Of the mean inference.
-    energy_range_j : EnergyRange or None
-        Where tables disagree.
-    layers, cores, time, pace, static
-        See these classes.
-    not_modelled, not_priced : tuple of str
-        What is missing from all this.
+    The mean inference and, each amount for itself, the extremes; where energy and time go; and what is missing from all
+    this. `chip_steps` are those of the longest recording.
     """
 
     samples: int
