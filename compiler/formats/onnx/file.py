@@ -11,7 +11,7 @@ import hashlib
 import math
 import os
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -264,7 +264,9 @@ def _node(proto: Any, content: _Content, left: list[int], nesting: int) -> Node:
                     f"{node}: attribute {printable(_text(entry.name))} is of a kind that is not known; {DAMAGED}"
                 )
         attributes[_text(entry.name)] = value
-    return Node(name=node.name, op=node.op, inputs=node.inputs, outputs=node.outputs, attributes=attributes)
+    if node.op == "Dropout":  # passes on what it gets, outside training
+        return replace(node, op="Identity", inputs=node.inputs[:1], outputs=node.outputs[:1])
+    return replace(node, attributes=attributes)
 
 
 def _array(proto: Any, content: _Content) -> Array:
