@@ -137,7 +137,9 @@ def add_network(parser: argparse.ArgumentParser) -> None:
 def add_steps(parser: argparse.ArgumentParser) -> None:
     """Add the options that say how the time constants of a NIR file become decays."""
     options = group(parser, "network")
-    options.add_argument("--dt", type=float, metavar="SECONDS", help="time step that a NIR file is read in")
+    options.add_argument(
+        "--dt", type=float, metavar="SECONDS", help="time step that a NIR file is read in (default: its own)"
+    )
     options.add_argument(
         "--convention",
         choices=CONVENTIONS,
