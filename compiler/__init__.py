@@ -12,14 +12,18 @@ if TYPE_CHECKING:
     from spikeloom.compiler.targets.loihi1.lift import lift
     from spikeloom.compiler.targets.loihi1.netlist import Netlist
     from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist, write_netlist
-    from spikeloom.compiler.targets.loihi1.options import Options, Recipe
+    from spikeloom.compiler.targets.loihi1.options import GOALS, MARGIN, MAX_PLANES, Options, Recipe, check_recipes
     from spikeloom.compiler.targets.loihi1.passes import lay_out_again, store, without
 
 __all__ = [
+    "GOALS",
+    "MARGIN",
+    "MAX_PLANES",
     "Compilation",
     "Netlist",
     "Options",
     "Recipe",
+    "check_recipes",
     "compile_network",
     "lay_out_again",
     "lift",
@@ -32,10 +36,14 @@ __all__ = [
 DEFAULT_TARGET = "loihi1"
 
 _PLACES = {
+    "GOALS": "options",
+    "MARGIN": "options",
+    "MAX_PLANES": "options",
     "Compilation": "compilation",
     "Netlist": "netlist",
     "Options": "options",
     "Recipe": "options",
+    "check_recipes": "options",
     "lay_out_again": "passes",
     "lift": "lift",
     "read_netlist": "netlist_file",

@@ -110,7 +110,7 @@ def test_a_mistake_is_pointed_at(text, at, what):
 def test_an_empty_grid(text):
     with pytest.raises(OptionError) as caught:
         parsed(text)
-    assert str(caught.value) == "--grid: is empty; name an axis as in bits=2-6,8, or leave --grid away"
+    assert str(caught.value) == "--grid: is empty; name an axis as in bits=2-6,8, or omit --grid"
 
 
 def test_a_grid_that_nobody_waits_for():

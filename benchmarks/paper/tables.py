@@ -13,8 +13,8 @@ from spreads import MARGIN, PROTOCOLS, READINGS, Line, Spread, lines_of, rank_co
 
 from spikeloom.compiler.atomic import write_atomically
 from spikeloom.models.training.schedule import DECAY_EPOCHS
+from spikeloom.runtime.report.numbers import si
 from spikeloom.runtime.report.sections import Section, Table, markdown
-from spikeloom.runtime.report.tables import si
 
 ENERGIES = ("davies2018", "sanafe")
 FIRST_LAYER = ("neurons", "cannot_fire", "unheard", "quiet_in_training", "quiet_in_both")

@@ -31,8 +31,8 @@ from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.systems import GCN, TACTILESGNET
 from spikeloom.compiler.targets.base import Quantity
 from spikeloom.runtime.report.encode import key
+from spikeloom.runtime.report.numbers import si
 from spikeloom.runtime.report.sections import Section, Table, Text
-from spikeloom.runtime.report.tables import si
 
 SpikeTrain = npt.NDArray[np.bool_]
 

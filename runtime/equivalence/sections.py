@@ -5,8 +5,8 @@ from __future__ import annotations
 from spikeloom.runtime.equivalence.certificates import Certificate
 from spikeloom.runtime.equivalence.divergence import Divergence
 from spikeloom.runtime.equivalence.verdict import Verdict
+from spikeloom.runtime.report.numbers import percent
 from spikeloom.runtime.report.sections import Section, Table, Text
-from spikeloom.runtime.report.tables import percent
 
 
 def sections(verdict: Verdict) -> list[Section]:

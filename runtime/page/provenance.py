@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from spikeloom import __version__
+from spikeloom.compiler import Netlist
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.network import LoadedNetwork

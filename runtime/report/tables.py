@@ -4,10 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from spikeloom.runtime.report.numbers import percent, si
-
-__all__ = ["percent", "si", "table"]
-
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Align columns: the first to the left, the others to the right.

@@ -19,8 +19,8 @@ from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.targets.base import EnergyTable, Target
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
 from spikeloom.runtime.machines.truenorth.trace import Counts
+from spikeloom.runtime.report.numbers import si
 from spikeloom.runtime.report.sections import Outcome, Section, Table, Text
-from spikeloom.runtime.report.tables import si
 
 NOT_PRICED = (
     "injection of input events and clocks, read-out of votes (no public figure per event)",

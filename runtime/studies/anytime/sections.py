@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
+from spikeloom.runtime.report.numbers import percent, si
 from spikeloom.runtime.report.sections import Section, Table, Text
-from spikeloom.runtime.report.tables import percent, si
 from spikeloom.runtime.studies.anytime.study import Anytime, Costs, Right, Rule
 
 SHOWN = (5, 10, 25, 50, 75, 90, 100)

@@ -11,9 +11,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from spikeloom.compiler import GOALS, MAX_PLANES
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.targets.loihi1.options import GOALS, MAX_PLANES
 from spikeloom.models.recordings.windows import WHOLE
 
 WINDOW_STEP = 25
@@ -77,13 +77,14 @@ def parse_grid(text: str, target: Target) -> Grid:
 
     Examples
     --------
+    >>> from spikeloom.compiler import DEFAULT_TARGET
     >>> from spikeloom.compiler.targets.base import load_target
-    >>> found = parse_grid("bits=2-3,8+4+4+8,window=50-100%", load_target("loihi1"))
+    >>> found = parse_grid("bits=2-3,8+4+4+8,window=50-100%", load_target(DEFAULT_TARGET))
     >>> found.bits, found.window
     (((2,), (3,), (8, 4, 4, 8)), (50, 75, 100))
     """
     if not text.strip():
-        raise OptionError("--grid: is empty; name an axis as in bits=2-6,8, or leave --grid away")
+        raise OptionError("--grid: is empty; name an axis as in bits=2-6,8, or omit --grid")
     readers = _readers(target)
     found: dict[str, dict[Any, None]] = {}
     axis: str | None = None

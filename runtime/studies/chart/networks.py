@@ -10,13 +10,13 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+from spikeloom.compiler import Recipe, check_recipes
 from spikeloom.compiler.archive import is_netlist
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.formats.checkpoint_file import arrays_digest
 from spikeloom.compiler.formats.onnx.reader import SUFFIX
 from spikeloom.compiler.ir import Form
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.targets.loihi1.options import Recipe, check_recipes
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.files import PRETRAINED, shipped

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from spikeloom.runtime.report.tables import percent, si, table
+from spikeloom.runtime.report.numbers import percent, si
+from spikeloom.runtime.report.tables import table
 
 Json = dict[str, Any]
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from spikeloom.runtime.report.tables import percent, table
+from spikeloom.runtime.report.numbers import percent
+from spikeloom.runtime.report.tables import table
 from spikeloom.runtime.studies.stress.verdicts import SIDES, shown
 
 Json = dict[str, Any]

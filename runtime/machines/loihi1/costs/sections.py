@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from spikeloom.runtime.machines.loihi1.costs.result import Amounts, CostReport
+from spikeloom.runtime.report.numbers import si
 from spikeloom.runtime.report.sections import Section, Table, Text
-from spikeloom.runtime.report.tables import si
 
 COUNTED = (
     "synaptic_operations",
