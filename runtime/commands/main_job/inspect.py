@@ -32,7 +32,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
             value = getattr(arguments, name)
             if value is not None and (name, value) != ("run", 0):
                 raise OptionError(f"--{name} {value}: is for checkpoints, {arguments.path} is a netlist; omit it")
-        sha256 = hashlib.sha256(Path(arguments.path).read_bytes()).hexdigest()
-        return machine_for(arguments.path).describe(sha256)
+        machine = machine_for(arguments.path)
+        return machine.describe(hashlib.sha256(Path(arguments.path).read_bytes()).hexdigest())
     given = tuple(name for name in ("beta", "theta") if getattr(arguments, name) is not None)
     return Outcome(facts_of(load_checkpoint(arguments.path, arguments), given), sections)

@@ -1,0 +1,438 @@
+"""Every mistake that a user can make: one clear line on standard error, exit code 2, nothing half-written.
+
+One table: what is typed, and the words that the line must hold: the option or file, the value, what is allowed.
+"""
+
+import contextlib
+import errno
+import io
+import json
+import os
+import pickle
+import shlex
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from made_files import CLASSES, TAXELS, events, own_file, recordings_folder, released, state_dict
+from made_files import weights as made_weights
+
+from spikeloom.compiler.archive import digest, read_members
+from spikeloom.compiler.errors import FormatError
+from spikeloom.compiler.targets.loihi1 import netlist_file
+from spikeloom.runtime import cli
+
+GOOD = events(2)[0].astype(np.float32)
+
+
+class Evil:
+    """Would make a folder if it were unpickled."""
+
+    def __reduce__(self):
+        return os.mkdir, ("unpickled",)
+
+
+def one_recording(folder, array, name="sample_0_label_0.npy", split="test"):
+    (folder / split).mkdir(parents=True)
+    np.save(folder / split / name, array)
+
+
+def checkpoint(path, change):
+    state = state_dict(made_weights())
+    change(state)
+    torch.save(state, path)
+
+
+def zipped(path, name, content, method=zipfile.ZIP_DEFLATED):
+    with zipfile.ZipFile(path, "w", method) as archive:
+        archive.writestr(name, content)
+
+
+def rewritten(source, path, change, *, sign=True):
+    """A netlist after `change` was applied to its manifest and members; with a fitting hash if `sign`."""
+    members = read_members(source)
+    manifest = json.loads(str(members["manifest"]))
+    stated = members.pop("sha256")
+    change(manifest, members)
+    members["manifest"] = np.array(json.dumps(manifest, sort_keys=True))
+    if sign:
+        held = {name: members[name] for name in netlist_file.ARRAYS if name in members}
+        stated = np.array(digest({"manifest": members["manifest"], **held}))
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, array in (members | {"sha256": stated}).items():
+            content = io.BytesIO()
+            np.lib.format.write_array(content, array, allow_pickle=False)
+            archive.writestr(f"{name}.npy", content.getvalue())
+
+
+def set_layer(key, value):
+    return lambda manifest, _: manifest["layers"][0].update({key: value})
+
+
+WRONG_NETLISTS = {
+    "version": (lambda m, _: m.update(version=99), "has format version 99"),
+    "format": (lambda m, _: m.update(format="x"), "is not a netlist"),
+    "target": (lambda m, _: m.update(target="loihi9"), "is for 'loihi9', this program knows loihi1"),
+    "notarget": (lambda m, _: m.pop("target"), "no usable target"),
+    "taxels": (lambda m, _: m.update(taxels="6"), "no usable taxels"),
+    "layers": (lambda m, _: m.update(layers=[]), "no usable layers"),
+    "neurons": (set_layer("neurons", -1), "no usable layers"),
+    "depth": (set_layer("depth", -1), "no usable layers"),
+    "missing": (lambda _, a: a.pop("threshold"), "missing or unknown members (threshold)"),
+    "floats": (lambda _, a: a.update(threshold=a["threshold"] / 2), "threshold is no list of integers"),
+    "exponent": (lambda _, a: a.update(format_exponent=a["format_exponent"] - 9), "outside -1 … 7"),
+    "beyond": (lambda _, a: a.update(synapse_target=a["synapse_target"].astype(int) + 99), "points beyond its core"),
+}
+ALTERED = {
+    "thresholds": lambda _, a: a.update(threshold=a["threshold"] + 1),
+    "graph": lambda m, _: m["provenance"].update(graph="manual"),
+}
+ARRAYS = {
+    "taxels": (GOOD[:5], "has 5 taxels|the network has 6"),
+    "pressures": (GOOD * 0.5, "value 0.5 at taxel 0, polarity 0, step 3|allowed are 0 and 1"),
+    "nan": (np.where(GOOD > 0, np.nan, 0), "value nan|allowed are 0 and 1"),
+    "pickled": (np.array([os.mkdir]), "objects"),
+    "flat": (GOOD[0], "shape (2, 24)|allowed is (taxels, 2, steps)"),
+    "polarity": (GOOD[:, :1], "shape (6, 1, 24)|allowed is (taxels, 2, steps)"),
+}
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """A folder with recordings, checkpoints and netlists, good ones and damaged ones."""
+    at = tmp_path_factory.mktemp("bad")
+    recordings_folder(at / "data")
+    own_file(at / "net.pt")
+    assert cli.main(["compile", f"{at}/net.pt", "-o", f"{at}/net.loom"]) == 0
+    torch.save(state_dict(made_weights()), at / "bare.pt")
+    torch.save(released(*[state_dict(made_weights(run)) for run in range(3)]), at / "net.t7")
+    torch.save(state_dict(made_weights(taxels=39, sizes=(3, 3, 3))), at / "finger.pt")
+    assert cli.main(["compile", f"{at}/finger.pt", "--graph", "knn:1", "-o", f"{at}/finger.loom"]) == 0
+    own_file(at / "other.pt", last=made_weights(sizes=(9, 7, CLASSES)))
+    (at / "empty.pt").touch()
+    (at / "words.pt").write_text("hello")
+    (at / "words.txt").write_text("hello")
+    (at / "cut.pt").write_bytes((at / "net.pt").read_bytes()[:2000])
+    (at / "cut.t7").write_bytes((at / "net.t7").read_bytes()[:2000])
+    content = (at / "net.pt").read_bytes()
+    with zipfile.ZipFile(io.BytesIO(content)) as old, zipfile.ZipFile(at / "altered.pt", "w") as new:
+        for name in old.namelist():
+            new.writestr(name, old.read(name).replace(b'"beta": 0.2', b'"beta": 0.3'))
+    zipped(at / "newer.pt", "manifest.json", json.dumps({"format": "spikeloom-checkpoint", "version": 99}), 0)
+    zipped(at / "bomb.pt", "manifest.json", bytes(1 << 20))
+    zipped(at / "notes.zip", "a/b/notes.txt", "hello")
+    for name in ("events", "grasp_label_1"):
+        np.savez(at / f"{name}.npz", time_s=np.zeros(1), taxel=np.zeros(1), polarity=np.ones(1))
+    for new in (True, False):
+        evil = released({"fc1.weight": Evil()})
+        torch.save(evil, at / f"evil{int(new)}.t7", _use_new_zipfile_serialization=new)
+    (at / "plain.pkl").write_bytes(pickle.dumps({"net_list": [Evil()]}))
+    checkpoint(at / "keys.pt", lambda s: (s.pop("fc2.bias"), s.update({"fc3.weight": torch.zeros(CLASSES, 99)})))
+    checkpoint(at / "nan.pt", lambda s: s["fc1.weight"][0, :3].fill_(float("nan")))
+    for name, (array, _) in ARRAYS.items():
+        one_recording(at / name, array)
+    one_recording(at / "label", GOOD, f"sample_0_label_{CLASSES}.npy")
+    one_recording(at / "train_only", GOOD, split="train")
+    recordings_folder(at / "lengths")
+    np.save(at / "lengths" / "test" / "sample_1_label_1.npy", GOOD[:, :, :20])
+    recordings_folder(at / "five", train=events(taxels=5), test=events(taxels=5))
+    (at / "none" / "test").mkdir(parents=True)
+    for name, length in (("short", -7), ("header", 50), ("nothing", 0)):
+        one_recording(at / name, GOOD)
+        file = at / name / "test" / "sample_0_label_0.npy"
+        file.write_bytes(file.read_bytes()[:length])
+    sample = (at / "data" / "test" / "sample_0_label_0.npy").read_bytes()
+    zipped(at / "cut.zip", "test/sample_0_label_0.npy", sample)
+    (at / "cut.zip").write_bytes((at / "cut.zip").read_bytes()[:-30])
+    zipped(at / "bomb.zip", "test/sample_0_label_0.npy", bytes((64 << 20) + 1))
+    (at / "empty.loom").touch()
+    (at / "half.loom").write_bytes((at / "net.loom").read_bytes()[:900])
+    zipped(at / "notes.loom", "notes.txt", b"hello")
+    for name, (change, _) in WRONG_NETLISTS.items():
+        rewritten(at / "net.loom", at / f"{name}.loom", change)
+    for name, change in ALTERED.items():
+        rewritten(at / "net.loom", at / f"altered_{name}.loom", change, sign=False)
+    return at
+
+
+COMPILE = "compile {} -o out.loom"
+RUN = "run net.loom --data {}"
+VERIFY = "verify net.loom --checkpoint net.pt --data data {}"
+
+TABLE = [
+    # commands and options
+    ("fly", "fly: no command|spikeloom --help"),
+    ("compile net.pt", "arguments are required: -o/--output"),
+    (COMPILE.format("net.pt more"), "unrecognized arguments: more"),
+    ("inspect net.loom --beta 0.3", "--beta 0.3: is for checkpoints|net.loom is a netlist"),
+    ("inspect net.loom --weights best", "--weights best|net.loom is a netlist"),
+    (COMPILE.format("net.pt --margin 0.2"), "--margin 0.2|--ranges observed"),
+    (COMPILE.format("net.pt --dump-after nope"), "--dump-after nope|expand, calibrate"),
+    (VERIFY.format("--require E0 --min-agreement 0.9"), "--min-agreement 0.9|E3=0.9"),
+    (RUN.format("data --bin 0.05"), "--bin 0.05: data holds bins"),
+    ("estimate net.loom --data synthetic --bin 0.05", "--bin 0.05: synthetic holds bins"),
+    (VERIFY.format("--min-agreement 1.1"), "--min-agreement 1.1|from 0 to 1"),
+    (VERIFY.format("--min-agreement nan"), "--min-agreement nan|from 0 to 1"),
+    (VERIFY.format("--spec-samples 0"), "--spec-samples 0|at least 1"),
+    # checkpoints
+    *((f"{command} missing.pt", "missing.pt: no such file") for command in ("inspect", "compile -o out.loom")),
+    ("inspect empty.pt", "empty.pt: is not a checkpoint"),
+    ("inspect words.pt", "words.pt: is not a checkpoint"),
+    ("inspect data", "data: is a folder|spikeloom data describe"),
+    ("inspect notes.zip", "notes.zip: holds a/b/notes.txt"),
+    ("inspect events.npz", "events.npz: holds polarity.npy, taxel.npy, time_s.npy|spikeloom data describe"),
+    ("inspect cut.pt", "cut.pt: is truncated or damaged"),
+    ("inspect cut.t7", "cut.t7: is truncated or damaged"),
+    (COMPILE.format("altered.pt"), "altered.pt: its content does not match its hash"),
+    ("inspect newer.pt", "newer.pt: has format version 99|update spikeloom"),
+    ("inspect bomb.pt", "bomb.pt|claim to hold 1048576"),
+    (COMPILE.format("evil0.t7 --graph manual"), "evil0.t7: is a pickle that calls posix.mkdir"),
+    (COMPILE.format("evil1.t7 --graph manual"), "evil1.t7: is a pickle that calls posix.mkdir"),
+    ("inspect plain.pkl", "plain.pkl: is pickled with protocol 4|torch.save"),
+    (COMPILE.format("keys.pt --graph manual"), "fc2.bias is missing|fc3.weight is (4, 99), wanted (4, 8)"),
+    (COMPILE.format("nan.pt --graph manual"), "fc1.weight has 3 of 270 values NaN"),
+    ("inspect net.t7 --run 3", "--run 3|runs 0 to 2"),
+    ("inspect net.t7 --run -1", "--run -1|runs 0 to 2"),
+    ("inspect net.t7 --weights best", "--weights best|last epoch only"),
+    ("inspect net.pt --weights best", "--weights best: the file holds last"),
+    ("inspect net.pt --run 1", "--run 1|only run 0"),
+    *((f"inspect net.t7 --beta {text}", f"beta {text}|0 <= beta < 1") for text in ("1.5", "1", "-0.1", "nan")),
+    *((f"inspect net.t7 --theta {text}", f"theta {text}|above 0") for text in ("0", "-1", "nan", "inf")),
+    ("inspect pretrained:nope", "pretrained:nope: no such shipped|pretrained:grasps"),
+    # graphs, targets, storage
+    (COMPILE.format("bare.pt"), "bare.pt: the graph is not in this file|--graph: manual"),
+    (COMPILE.format("bare.pt --graph manual"), f"the graph has 39 taxels, fc1 was trained on {TAXELS}"),
+    (COMPILE.format("net.pt --graph manual"), "net.pt|trained on ring, --graph says manual"),
+    (COMPILE.format("finger.pt --graph nope"), "graph 'nope': unknown; choose manual"),
+    (COMPILE.format("finger.pt --graph knn:9"), "K is '9'|1..8"),
+    (COMPILE.format("finger.pt --graph released:mst:-1"), "SIGMA is '-1'|from 0"),
+    (COMPILE.format("net.pt --target loihi2"), "--target loihi2: not modelled|allowed: loihi1, truenorth"),
+    (COMPILE.format("net.pt --target ../loihi1"), "--target ../loihi1: unknown|loihi1, truenorth"),
+    *((COMPILE.format(f"net.pt --weight-bits {n}"), f"--weight-bits {n}|2, 3, 4, 5, 6, 8") for n in (7, 1, 9, 0, -8)),
+    (COMPILE.format("net.pt --weight-bits 8.0"), "--weight-bits 8.0: not a number|8,4,4,8"),
+    (COMPILE.format("net.pt --ranges observed"), "--ranges observed: nothing was observed; give --calibrate"),
+    (COMPILE.format("net.pt --ranges nope"), "--ranges nope: unknown|proven, observed"),
+    *((COMPILE.format(f"net.pt --ranges observed --margin {x}"), f"--margin {x}|from 0") for x in ("-0.1", "nan")),
+    (COMPILE.format("net.pt --calibrate nowhere"), "nowhere: no such folder or file|train/ and test/"),
+    # places to write
+    *(
+        (f"{command} {where!r}", f"{command.split()[-1]} {where}: {why}")
+        for command in ("compile net.pt -o", "run net.loom --data data --spikes", "train --data data --graph manual -o")
+        for where, why in (
+            ("nowhere/out", "the folder does not exist"),
+            ("data", "is not a regular file"),
+            ("/dev/null", "is not a regular file"),
+            ("", "is not a regular file"),
+        )
+    ),
+    ("compile net.pt -o net.pt", "-o net.pt: is an input of this command"),
+    ("run net.loom --data data --spikes net.loom", "--spikes net.loom: is an input"),
+    ("train --data words.txt --graph manual -o words.txt", "-o words.txt: is an input"),
+    ("data convert grasp_label_1.npz -o grasp_label_1.npz", "-o grasp_label_1.npz: is an input"),
+    ("watch net.loom --input no.csv", "--input no.csv: No such file"),
+    ("watch net.loom --input data", "--input data: Is a directory"),
+    # what does not belong together
+    ("verify net.loom --data data --checkpoint bare.pt", "bare.pt: the graph is not in this file"),
+    ("verify net.loom --data data --checkpoint other.pt", "the netlist has taxels 6|fc2 8|fc2 7"),
+    (VERIFY.format("--graph manual"), "trained on ring, --graph says manual"),
+    # recordings
+    *((RUN.format(name), f"{name}: test/sample_0_label_0.npy: |{words}") for name, (_, words) in ARRAYS.items()),
+    (RUN.format("five"), "five: test/sample_0_label_0.npy: has 5 taxels, the network has 6"),
+    (COMPILE.format("net.pt --calibrate five"), "five: train/sample_0_label_0.npy: has 5 taxels, the network has 6"),
+    ("estimate net.loom --data five", "five: test/|has 5 taxels"),
+    ("verify net.loom --checkpoint net.pt --data five", "five: test/|has 5 taxels"),
+    ("estimate net.loom --data lengths", "test/sample_1_label_1.npy: shape (6, 2, 20)|(6, 2, 24)"),
+    (RUN.format("label"), "label 4, the network has 4 classes (0..3)"),
+    (RUN.format("short"), "1145 bytes of data, its header announces 1152"),
+    (RUN.format("header"), "not an npy file, or a damaged one"),
+    (RUN.format("nothing"), "not an npy file"),
+    (RUN.format("cut.zip"), "cut.zip: neither a folder nor a whole zip"),
+    (RUN.format("bomb.zip"), "more than 67108864 bytes"),
+    (RUN.format("nowhere"), "nowhere: no such folder or file"),
+    (RUN.format("none"), "none: no recordings"),
+    (RUN.format("train_only"), "split 'test' is missing or empty|train"),
+    (RUN.format("net.loom"), "net.loom: no recordings"),
+    (RUN.format("words.txt"), "words.txt: not a recording|.csv, .npz or .npy"),
+    (RUN.format("data --limit 0"), "--limit 0: at least 1"),
+    (RUN.format("data --limit two"), "--limit: invalid int value: 'two'"),
+    (RUN.format("data --split ../data/test"), "split '../data/test' is missing|test, train"),
+    (RUN.format("synthetic --limit 0"), "--limit 0: at least 1"),
+    (RUN.format("synthetic --split nope"), "--split nope|train, test"),
+    (RUN.format("synthetic --limit 1"), "synthetic|has 39 taxels, the network has 6"),
+    ("run finger.loom --data synthetic --limit 4", "synthetic|label 3, the network has 3 classes"),
+    # netlists
+    ("run data --data data", "data: is not a file|spikeloom compile"),
+    *(
+        (f"{command} {name}.loom", f"{name}.loom: |{words}")
+        for command in ("inspect", "run --data data", "estimate --data data")
+        for name, words in (
+            ("nowhere", "no such file; write one with spikeloom compile"),
+            ("empty", "is truncated or not a netlist"),
+            ("half", "is truncated or not a netlist"),
+            *((f"altered_{name}", "its content does not match its hash") for name in ALTERED),
+            *((name, words) for name, (_, words) in WRONG_NETLISTS.items()),
+        )
+    ),
+    ("run net.t7 --data data", "net.t7: "),
+    ("inspect notes.loom", "has compressed members"),
+]
+
+
+@pytest.fixture
+def refusal(capsys, place, monkeypatch):
+    """Run a command in that folder that must fail; returns its only line."""
+    monkeypatch.chdir(place)
+    before = sorted(path.name for path in place.iterdir())
+
+    def command(*words):
+        capsys.readouterr()
+        code = cli.main([str(word) for word in words])
+        out, err = capsys.readouterr()
+        assert (code, out) == (2, "")
+        assert err.startswith("spikeloom: ")
+        assert err.count("\n") == 1
+        return err.removeprefix("spikeloom: ").removesuffix("\n")
+
+    yield command
+    assert sorted(path.name for path in place.iterdir()) == before
+
+
+@pytest.mark.parametrize(("words", "telling"), TABLE, ids=[words for words, _ in TABLE])
+def test_refusals(refusal, words, telling):
+    line = refusal(*shlex.split(words))
+    for part in telling.split("|"):
+        assert part in line
+
+
+@pytest.fixture
+def link(place):
+    (place / "link.pt").symlink_to(place / "net.pt")
+    yield "./link.pt"
+    (place / "link.pt").unlink()
+
+
+def test_an_input_behind_a_link_is_kept(link, refusal):
+    assert f"-o {link}: is an input" in refusal("compile", "net.pt", "-o", link)
+
+
+def test_flipped_bits_of_a_netlist(refusal, tmp_path, place):
+    whole, path = bytearray((place / "net.loom").read_bytes()), tmp_path / "net.loom"
+    rng, refused = np.random.default_rng(0), 0
+    for position in rng.integers(len(whole), size=40).tolist():
+        flipped = bytearray(whole)
+        flipped[position] ^= 1 << int(rng.integers(8))
+        path.write_bytes(flipped)
+        with contextlib.suppress(FormatError):
+            # read: then it was a bit that says nothing, such as the creation date of a member
+            assert netlist_file.netlist_bytes(netlist_file.read_netlist(path)) == bytes(whole), position
+            continue
+        assert refusal("run", "--data", "data", path).startswith(f"{path}: ")
+        refused += 1
+    assert refused > 30
+
+
+def test_a_netlist_that_announces_more_than_it_has(refusal, tmp_path):
+    path, header = tmp_path / "net.loom", io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "<i8", "fortran_order": False, "shape": (10**15,)})
+    zipped(path, "manifest.npy", header.getvalue(), zipfile.ZIP_STORED)
+    assert "is truncated or not a netlist (" in refusal("inspect", path)
+
+
+def test_recordings_of_another_number_of_channels(refusal, tmp_path):
+    arrays = made_weights()  # an own checkpoint may have any number of channels; recordings have two polarities
+    arrays["conv1.hops"] = arrays["conv1.hops"][:, :, :1]
+    own_file(tmp_path / "one.pt", last=arrays)
+    assert cli.main(["compile", f"{tmp_path}/one.pt", "-o", f"{tmp_path}/one.loom"]) == 0
+    for words in (["run"], ["estimate"], ["verify", "--checkpoint", tmp_path / "one.pt"]):
+        assert "12 input channels found, the netlist has 6" in refusal(*words, tmp_path / "one.loom", "--data", "data")
+    line = refusal("compile", tmp_path / "one.pt", "--calibrate", "data", "-o", "out.loom")
+    assert "the recordings have 12 channels, the network has 6" in line
+
+
+def test_overflow_on_the_chip_names_neuron_step_and_recording(refusal, tmp_path):
+    recordings_folder(tmp_path / "quiet", train=events(rate=0.01), test=events(3, rate=1.0))
+    words = ["--calibrate", tmp_path / "quiet", "--ranges", "observed", "--margin", "0", "-o", tmp_path / "net.loom"]
+    assert cli.main(["compile", "net.pt", *map(str, words)]) == 0
+    line = refusal("run", tmp_path / "net.loom", "--data", tmp_path / "quiet")
+    for part in ("conv1 neuron ", "on core 0, chip step 0", "2097151 allowed", "recording 0 of 6"):
+        assert part in line
+
+
+@pytest.mark.parametrize(("features", "limits"), [(128, ["axons_in"]), (424, ["axons_in", "synapse_words"])])
+def test_every_violated_limit_is_listed(place, capsys, tmp_path, features, limits):
+    arrays = made_weights(taxels=39, features=features, sizes=(2, 2, 2))
+    signs = {name: np.where(array >= 0, 0.5, -0.5).astype(np.float32) for name, array in arrays.items()}
+    torch.save(state_dict(signs), tmp_path / "wide.pt")
+    words = ["compile", f"{tmp_path}/wide.pt", "--graph", "mst:0", "--keep-all", "-o", f"{tmp_path}/out.loom"]
+    assert cli.main(words) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == len(limits)
+    for line, limit in zip(lines, limits, strict=True):
+        assert f"fc1 neuron 0: {39 * features} used" in line
+        assert f"(loihi1.core.{limit})" in line
+    assert not (tmp_path / "out.loom").exists()
+
+
+# -- unreadable files, interrupts and full disks -----------------------------------------------------------------------
+
+
+def test_unreadable_files(refusal, monkeypatch):
+    as_ever = Path.open
+
+    def denied(path, *words, **options):
+        if path.stem == "net":
+            raise PermissionError(errno.EACCES, "Permission denied", "secret")
+        return as_ever(path, *words, **options)
+
+    monkeypatch.setattr(Path, "open", denied)
+    assert "net.pt: cannot be read (Permission denied)" in refusal("inspect", "net.pt")
+    assert "secret: Permission denied" in refusal("run", "net.loom", "--data", "data")
+
+
+class FullDisk(io.FileIO):
+    """Takes a few bytes."""
+
+    def write(self, content):
+        if self.tell() + len(content) > 1000:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return super().write(content)
+
+
+def interrupt(*_words, **_options):
+    raise KeyboardInterrupt
+
+
+def exhausted(*_words, **_options):
+    raise MemoryError("Unable to allocate 9.9 TiB")
+
+
+def almost_full(path, mode="r", *options, whole=Path.open, **more):
+    return io.BufferedWriter(FullDisk(path, mode)) if mode == "xb" else whole(path, mode, *options, **more)
+
+
+@pytest.mark.parametrize("old", [b"an older result", None], ids=["over an older file", "new"])
+@pytest.mark.parametrize("words", [["compile", "net.pt", "-o"], ["run", "net.loom", "--data", "data", "--spikes"]])
+@pytest.mark.parametrize(
+    ("patched", "replacement", "line"),
+    [("pathlib.Path.open", almost_full, "No space left on device"), ("os.fsync", interrupt, "nothing was written")],
+    ids=["full disk", "interrupt"],
+)
+def test_an_older_file_stays_intact(refusal, tmp_path, monkeypatch, old, words, patched, replacement, line):
+    path = tmp_path / "result"
+    if old is not None:
+        path.write_bytes(old)
+    monkeypatch.setattr(patched, replacement)
+    assert line in refusal(*words, path)
+    monkeypatch.undo()
+    assert [file.name for file in tmp_path.iterdir()] == ([] if old is None else ["result"])
+    assert old is None or path.read_bytes() == old
+
+
+@pytest.mark.parametrize(
+    ("trouble", "line"), [(interrupt, "nothing was written"), (exhausted, "out of memory (Unable to allocate 9.9 TiB)")]
+)
+def test_trouble_while_the_engine_runs(refusal, monkeypatch, trouble, line):
+    monkeypatch.setattr("spikeloom.runtime.machines.loihi1.engine.simulate", trouble)
+    assert line in refusal("verify", "net.loom", "--checkpoint", "net.pt", "--data", "data")
