@@ -93,7 +93,7 @@ ARRAYS = {
     "taxels": (GOOD[:5], "has 5 taxels|the network has 6"),
     "pressures": (GOOD * 0.5, "value 0.5 at taxel 0, polarity 0, step 3|allowed are 0 and 1"),
     "nan": (np.where(GOOD > 0, np.nan, 0), "value nan|allowed are 0 and 1"),
-    "pickled": (np.array([os.mkdir]), "objects"),
+    "pickled": (np.array([os.mkdir]), "dtype '|allowed are numbers"),
     "flat": (GOOD[0], "shape (2, 24)|allowed is (taxels, 2, steps)"),
     "polarity": (GOOD[:, :1], "shape (6, 1, 24)|allowed is (taxels, 2, steps)"),
 }
@@ -230,7 +230,7 @@ TABLE = [
     ("compile net.pt -o net.pt", "-o net.pt: is an input of this command"),
     ("run net.loom --data data --spikes net.loom", "--spikes net.loom: is an input"),
     ("train --data words.txt --graph manual -o words.txt", "-o words.txt: is an input"),
-    ("data convert grasp_label_1.npz -o grasp_label_1.npz", "-o grasp_label_1.npz: is an input"),
+    ("data convert grasp_label_1.npz -o grasp_label_1.npz", "-o grasp_label_1.npz: exists already"),
     ("watch net.loom --input no.csv", "--input no.csv: No such file"),
     ("watch net.loom --input data", "--input data: Is a directory"),
     # what does not belong together
