@@ -130,7 +130,7 @@ def test_a_trace_that_does_not_belong_to_the_netlist(small):
     netlist, recordings = small
     clock = timing.prepare(netlist, LOIHI, LOIHI.time[0])
     trace = engine.simulate(engine.prepare(netlist, charges=charges(clock)), recordings, spikes=True, updated=True)
-    n, steps, inputs, cores = netlist.n_compartments, 30 + netlist.max_depth, netlist.n_inputs, netlist.n_cores
+    n, inputs, cores = netlist.n_compartments, netlist.n_inputs, netlist.n_cores
     less = trace.spikes[..., :-1]
     for spikes, updated, given in (
         (less, less, recordings),
@@ -140,20 +140,14 @@ def test_a_trace_that_does_not_belong_to_the_netlist(small):
     ):
         with pytest.raises(DataError, match=f"updates .* found, the netlist has {n} compartments and {inputs} input"):
             timing.detailed(clock, spikes, updated, given)
-    with pytest.raises(DataError) as caught:
+    with pytest.raises(DataError, match=rf"{2 * cores - 1}\) of 4 recordings found, the netlist has {cores} cores"):
         simple_from(clock, trace.charged[..., :-1], LENGTHS)
-    assert str(caught.value) == (
-        f"trace: sums (4, {steps}, {2 * cores - 1}) of 4 recordings found, the netlist has {cores} cores; give "
-        "(recordings, chip steps, twice the cores), charged for this netlist"
-    )
     counts = dataclasses.replace(trace.counts, spikes=trace.counts.spikes[:, 1:])
     layers = len(netlist.layers)
-    with pytest.raises(DataError) as caught:
+    with pytest.raises(
+        DataError, match=rf"{n - 1} compartments and {layers} layers found, the netlist has {inputs}, {n} "
+    ):
         cost_of.estimate(cost_of.prepare(netlist, LOIHI), counts, 30)
-    assert str(caught.value) == (
-        f"trace: counts of {inputs} channels, {n - 1} compartments and {layers} layers found, the netlist has "
-        f"{inputs}, {n} and {layers}; give counts of a run of this netlist"
-    )
 
 
 def test_a_chip_without_tables(small):

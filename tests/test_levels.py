@@ -96,20 +96,15 @@ def test_requirements_are_read_and_held_against_levels():
 @pytest.mark.parametrize(
     ("words", "why"),
     [
-        ("E4", "'E4': give each of E0, E1, E2=SHARE, E3=SHARE once at most, with commas between"),
-        ("E0,E0", "'E0': give each of E0, E1, E2=SHARE, E3=SHARE once at most, with commas between"),
-        ("", "'': give each of E0, E1, E2=SHARE, E3=SHARE once at most, with commas between"),
-        ("E2", "'E2': needs a share, as in E2=0.98"),
-        ("E0=1", "'E0=1': takes no share"),
-        ("E3=2", "'E3=2': not a share; give a number from 0 to 1"),
-        ("E3=much", "'E3=much': not a share; give a number from 0 to 1"),
-        ("E3=nan", "'E3=nan': not a share; give a number from 0 to 1"),
+        *((words, "give each of E0, E1, E2=SHARE, E3=SHARE once at most") for words in ("E4", "E0,E0", "")),
+        ("E2", "needs a share, as in E2=0.98"),
+        ("E0=1", "takes no share"),
+        *((f"E3={share}", "give a number from 0 to 1") for share in ("2", "much", "nan")),
     ],
 )
 def test_gates_that_cannot_be_read(words, why):
-    with pytest.raises(OptionError) as refused:
+    with pytest.raises(OptionError, match=f"^--require {words}: '{words.split(',')[-1]}': .*{why}"):
         parse_requirements(words)
-    assert str(refused.value) == f"--require {words}: {why}"
 
 
 def test_gates_on_the_command_line(tmp_path, monkeypatch, capsys):
