@@ -1,0 +1,147 @@
+"""The one interface of all chips: what it returns is the simulator's, and a further chip is a folder."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from native_networks import random_network
+from random_netlists import large_netlist
+
+from spikeloom.compiler import targets
+from spikeloom.compiler.dynamics import with_clocks
+from spikeloom.compiler.errors import FormatError, OptionError
+from spikeloom.compiler.fixedpoint import read_only
+from spikeloom.compiler.targets.base import load_target, shipped
+from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist
+from spikeloom.compiler.targets.truenorth.netlist_file import write_crossbars
+from spikeloom.runtime import machines
+from spikeloom.runtime.machines.base import machine_for, machine_of, trained_for
+from spikeloom.runtime.machines.loihi1 import engine
+from spikeloom.runtime.machines.truenorth import engine as crossbar_engine
+from spikeloom.runtime.machines.votes import class_counts
+from spikeloom.runtime.report.encode import encode
+from spikeloom.runtime.report.sections import terminal
+
+
+def compartments():
+    netlist = large_netlist(10, proved=True)
+    votes = read_only(np.arange(netlist.n_compartments) % 4 - 1)
+    return replace(netlist, taxels=10, polarities=2, classes=3, readout_class=votes)
+
+
+def crossbars():
+    return load_target("truenorth").compile(random_network(0, taxels=10, classes=3)).netlist
+
+
+WRITERS = {"loihi1": (compartments, write_netlist), "truenorth": (crossbars, write_crossbars)}
+
+
+@pytest.fixture(params=WRITERS)
+def machine(request, tmp_path):
+    make, write = WRITERS[request.param]
+    write(make(), tmp_path / "net.loom")
+    return machine_for(tmp_path / "net.loom")
+
+
+def grasps(machine, samples=5, steps=12):
+    shape = samples, machine.netlist.taxels, machine.netlist.polarities, steps
+    return (np.random.default_rng(0).random(shape) < 0.3).astype(np.uint8)
+
+
+def test_runs_and_prices_are_the_simulators(machine):
+    events, lengths = grasps(machine), np.array([12, 5, 12, 1, 9])
+    netlist = machine.netlist
+    assert machine.target.name == netlist.target
+    machine.legal()
+    channels = with_clocks(events, netlist.clocks)
+    if netlist.target == "loihi1":
+        votes = engine.simulate(netlist, channels, lengths=lengths).counts.spikes
+    else:
+        votes = crossbar_engine.simulate(netlist, channels, lengths=lengths).counts.votes
+    done = machine.run(events, lengths=lengths, spikes=True)
+    np.testing.assert_array_equal(done.votes, class_counts(netlist, votes))
+    np.testing.assert_array_equal(done.decisions, done.votes.argmax(axis=1))
+    assert tuple(done.spikes) == machine.layers
+    for detail in machine.details:
+        again, price = machine.price(events, lengths=lengths, bin_s=0.02, detail=detail, spikes=True)
+        np.testing.assert_array_equal(again.votes, done.votes)
+        for name, spikes in done.spikes.items():
+            np.testing.assert_array_equal(again.spikes[name], spikes)
+        each = [price.synaptic_operations, *price.energy_j.values(), *price.time_s.values()]
+        assert {np.shape(values) for values in each} == {(5,)}
+        assert set(price.energy_j) == {table.name for table in machine.target.energy}
+        assert set(price.step_s) == set(price.time_s)
+        shown = encode(price.outcome.result)
+        assert shown["per_inference"]["energy_j"] == {
+            name: pytest.approx(values.mean()) for name, values in price.energy_j.items()
+        }
+        assert "per inference" in terminal(price.outcome.sections(price.outcome.result))
+    with pytest.raises(OptionError, match=f"--detail none: .* allowed: {', '.join(machine.details)}"):
+        machine.price(events, bin_s=0.02, detail="none")
+
+
+def test_descriptions(machine):
+    found = machine.describe("some hash")
+    shown = encode(found.result)
+    assert (shown["target"], shown["sha256"]) == (machine.netlist.target, "some hash")
+    assert [layer["name"] for layer in shown["layers"]] == list(machine.layers)
+    assert terminal(found.sections(found.result)).startswith(f"{machine.netlist.target}: ")
+
+
+def test_streams(machine):
+    if machine.netlist.target == "truenorth":
+        with pytest.raises(OptionError, match="runs whole recordings"):
+            machine.stream()
+        return
+    (events,) = grasps(machine, samples=1)
+    stream = machine.stream()
+    for column in np.moveaxis(events, -1, 0):
+        stream.step(column)
+    np.testing.assert_array_equal(stream.finish()[-1].counts, machine.run(events[None]).votes[0])
+
+
+def test_what_is_no_netlist(tmp_path):
+    (tmp_path / "x.loom").write_bytes(b"nothing")
+    with pytest.raises(FormatError):
+        machine_for(tmp_path / "x.loom")
+    assert trained_for(str(tmp_path / "x.loom")) is None
+
+
+TOY = """
+from spikeloom.runtime.machines.loihi1.machine import Loihi
+from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
+
+class Toy(Loihi):
+    details = ("counts",)
+
+def machine_of(netlist):
+    return Toy(netlist)
+
+def load(path):
+    return Toy(read_netlist(path))
+"""
+
+
+def test_a_third_chip_is_a_folder(tmp_path, monkeypatch):
+    (tmp_path / "machines" / "toy").mkdir(parents=True)
+    (tmp_path / "machines" / "toy" / "machine.py").write_text(TOY)
+    (tmp_path / "targets" / "toy").mkdir(parents=True)
+    limits = (Path(targets.__path__[0]) / "loihi1" / "chip.toml").read_text("utf-8")
+    (tmp_path / "targets" / "toy" / "chip.toml").write_text(limits.replace('"loihi1"', '"toy"'))
+    monkeypatch.setattr(targets, "__path__", [*targets.__path__, str(tmp_path / "targets")])
+    monkeypatch.setattr(machines, "__path__", [*machines.__path__, str(tmp_path / "machines")])
+    shipped.cache_clear()
+    try:
+        write_netlist(replace(compartments(), target="toy"), tmp_path / "net.loom")
+        machine = machine_for(tmp_path / "net.loom")
+        assert (type(machine).__name__, machine.target.name) == ("Toy", "toy")
+        events = grasps(machine)
+        np.testing.assert_array_equal(machine.run(events).votes, machine_of(compartments()).run(events).votes)
+        with pytest.raises(OptionError, match="toy has no such price model; allowed: counts"):
+            machine.price(events, bin_s=0.02, detail="cycle")
+    finally:
+        shipped.cache_clear()
+        for name in [name for name in sys.modules if name.startswith("spikeloom.runtime.machines.toy")]:
+            del sys.modules[name]
