@@ -23,7 +23,8 @@ from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.models.networks.checkpoint import save_checkpoint
 from spikeloom.models.networks.quantised import QuantisedNet, quantised_spikes, time_first
 from spikeloom.models.recordings.evtouch import Recordings, load_recordings
-from spikeloom.models.training.finetune import finetune, initial_forms
+from spikeloom.models.training.finetune import finetune
+from spikeloom.models.training.initial_storage import initial_forms
 from spikeloom.runtime.cli import main
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.trace import aligned, comparable

@@ -336,7 +336,7 @@ def test_a_gpu_that_is_absent_or_unknown_is_refused():
     if torch.cuda.is_available():
         pytest.skip("this machine has a GPU")
     for device, message in (
-        ("cuda", "--device cuda: this machine has no usable GPU; leave --device away"),
+        ("cuda", "--device cuda: this machine has no usable GPU; omit --device"),
         ("tpu", "--device tpu: unknown; allowed: cpu, cuda"),
     ):
         with pytest.raises(OptionError) as refused:

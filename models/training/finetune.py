@@ -9,7 +9,6 @@ References
 ----------
 .. [1] Y. Bengio, N. Léonard, A. Courville, "Estimating or propagating gradients through stochastic neurons for
    conditional computation", 2013, arXiv:1308.3432: the straight-through estimator.
-.. [2] F. Li, B. Zhang, B. Liu, "Ternary weight networks", 2016, arXiv:1605.04711: scales nearest to the weights.
 """
 
 from __future__ import annotations
@@ -26,37 +25,27 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from spikeloom.compiler.checkpoint import Checkpoint
-from spikeloom.compiler.errors import ModelError, OptionError
-from spikeloom.compiler.fixedpoint import BIAS_EXPONENT_MAX, BIAS_MANTISSA_MAX, MEMBRANE_SHIFT, THRESHOLD_MANTISSA_MAX
+from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.formats.checkpoint_file import arrays_digest
 from spikeloom.compiler.formats.towers import arrays_of
 from spikeloom.compiler.interpret import channels_last
-from spikeloom.compiler.ir import Form, Network
-from spikeloom.compiler.passes.calibrate import Calibration, calibrate, evenly_spaced
+from spikeloom.compiler.ir import Form
+from spikeloom.compiler.passes.calibrate import calibrate, evenly_spaced
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.targets.storage import reach, step_units
 from spikeloom.models.networks.networks import Weights
 from spikeloom.models.networks.quantised import QuantisedNet, time_first
 from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.models.training.checks import require_finite
 from spikeloom.models.training.evaluate import one_thread, rate_loss
+from spikeloom.models.training.initial_storage import initial_forms
 from spikeloom.models.training.resume import TrainingState, pack, read_state, unpack, write_state
-from spikeloom.models.training.train import require_finite
 
 BATCH = 4
 """Recordings per step of the optimizer: the weights are rounded anew for each."""
 
 LEARNING_RATE = 1e-3
 """At the start; it falls to zero along half a cosine."""
-
-QUIET = 1e-4
-"""Spike rate that an input without spikes is given, so that its weights still count."""
-
-COARSEST = 12
-"""Least threshold, in weight units: a coarser one would be off by more than the weights."""
-
-SHARES = 40
-"""Scales that are tried for each neuron."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -110,78 +99,6 @@ def check_bits(bits: Sequence[int], layers: int, target: Target) -> tuple[int, .
                 f"allowed: {', '.join(map(str, allowed))}"
             )
     return tuple(bits) if len(bits) == layers else tuple(bits) * layers
-
-
-def initial_forms(
-    network: Network, calibration: Calibration, bits: Sequence[int], groups: int, exponents: tuple[int, ...]
-) -> tuple[Form, ...]:
-    """Storage whose rounded weights are nearest to the trained ones, neurons grouped by scale.
-
-    Parameters
-    ----------
-    network : Network
-        Float stage.
-    calibration : Calibration
-        Spikes, for the rate of each input.
-    bits : sequence of int
-        Width of each layer.
-    groups : int
-        Scales of a layer, at most.
-    exponents : tuple of int
-        That the chip has.
-
-    Raises
-    ------
-    ModelError
-        If no exponent gives a threshold and biases that the registers hold.
-    """
-    forms = []
-    for post, (population, width) in enumerate(zip(network.populations, bits, strict=True)):
-        incoming = [p for p in network.projections if p.post == post]
-        weight = np.concatenate([p.weight.toarray() for p in incoming], axis=1)
-        rate = np.concatenate([calibration.source(p.pre, p.post).mean(axis=(0, 1)) for p in incoming]) + QUIET
-        step = _grouped(_nearest_steps(weight, rate, reach(width, (0,))), groups)  # model units in one step
-        for exponent in sorted(exponents):
-            threshold = np.rint(population.theta * step_units(width, (exponent,)) / step).astype(np.int64)
-            if threshold.min() >= COARSEST:
-                break
-        largest = np.abs(threshold * population.bias).max(initial=0) / population.theta * (1 << MEMBRANE_SHIFT)
-        if threshold.max() > THRESHOLD_MANTISSA_MAX or largest > BIAS_MANTISSA_MAX << BIAS_EXPONENT_MAX:
-            raise ModelError(
-                f"{population.name}: its weights are too small for its threshold or biases at {width} bits: the "
-                "registers overflow; give it more bits"
-            )
-        forms.append(Form(bits=width, exponents=(exponent,), threshold=np.maximum(threshold, 1)))
-    return tuple(forms)
-
-
-def _nearest_steps(weight: NDArray[np.float64], rate: NDArray[np.float64], codes: int) -> NDArray[np.float64]:
-    """Step of each neuron at which its rounded weights are nearest, in squares weighted by `rate`; shape (neurons,)."""
-    peak = np.maximum(np.abs(weight).max(axis=1), 1e-9)
-    best = np.full(len(weight), np.inf)
-    chosen: NDArray[np.float64] = peak / codes
-    for share in np.geomspace(1, 1 / 30, SHARES):
-        step = peak * share / codes
-        rounded = np.clip(np.rint(weight / step[:, None]), -codes, codes) * step[:, None]
-        error = (rate * (weight - rounded) ** 2).sum(axis=1)
-        better = error < best
-        best[better], chosen[better] = error[better], step[better]
-    unheard = ~weight.any(axis=1)  # where a window sees no taxel any step will do
-    if not unheard.all():
-        chosen[unheard] = np.exp(np.log(chosen[~unheard]).mean())
-    return chosen
-
-
-def _grouped(values: NDArray[np.float64], groups: int) -> NDArray[np.float64]:
-    """Replace each value by the geometric mean of its group; groups by Lloyd's rule from quantiles."""
-    logs = np.log(values)
-    centres = np.quantile(logs, (np.arange(groups) + 0.5) / groups)
-    nearest = np.zeros(len(logs), np.int64)
-    for _ in range(50):
-        nearest = np.abs(logs[:, None] - centres).argmin(axis=1)
-        centres = np.array([logs[nearest == g].mean() if np.any(nearest == g) else centres[g] for g in range(groups)])
-    shared: NDArray[np.float64] = np.exp(centres[nearest])
-    return shared
 
 
 def finetune(

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from spikeloom.compiler.errors import DataError
 from spikeloom.compiler.formats.checkpoint_file import arrays_digest
 from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.models.training.checks import Sizes
 from spikeloom.models.training.recipes import RELEASED, Recipe
-from spikeloom.models.training.train import Sizes, Trained, train
+from spikeloom.models.training.train import Trained, train
 
 VALIDATION_SHARE = 0.2
 """Share of each class that the first training leaves out, rounded down to whole recordings."""

@@ -16,52 +16,25 @@ References
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.formats.checkpoint_file import arrays_digest
 from spikeloom.models.networks.networks import SpikingNet, TrainedModule, Weights
-from spikeloom.models.networks.surrogate import Surrogate
 from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.models.training.checks import Sizes, require_finite, require_options, require_suited
 from spikeloom.models.training.evaluate import evaluate, loss_of, one_thread, time_first
 from spikeloom.models.training.optimizers import course_of, optimizer_of, set_rate
 from spikeloom.models.training.recipes import RELEASED, Recipe
 from spikeloom.models.training.resume import TrainingState, pack, read_state, unpack, write_state
 from spikeloom.models.training.schedule import EPOCHS
-
-
-class Sizes(Protocol):
-    """Sizes of a network that can be trained."""
-
-    @property
-    def taxels(self) -> int:
-        """Sensor points."""
-
-    @property
-    def channels(self) -> int:
-        """Inputs per taxel."""
-
-    @property
-    def classes(self) -> int:
-        """Outputs."""
-
-    def network(self, propagation: NDArray[np.float64], *, seed: int, surrogate: Surrogate) -> TrainedModule:
-        """An untrained network."""
-
-
-DEVICES = ("cpu", "cuda")
-
-MOST_SEED = 2**63 - 1
-"""What a torch generator takes."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -175,9 +148,9 @@ def train(
     DataError
         If recordings and architecture disagree, or the loss is no longer a number.
     """
-    _check_options(epochs, recipe.decay_epochs, seed, device)
+    require_options(epochs, recipe.decay_epochs, seed, device)
     for recordings in (training, test):
-        _check(recordings, architecture)
+        require_suited(recordings, architecture)
     options = {
         "architecture": repr(architecture),
         "graph": arrays_digest({"adjacency": propagation}),
@@ -240,49 +213,6 @@ def train(
         kept=weights.get("kept"),
         history=tuple(history),
     )
-
-
-def _check_options(epochs: int, decay_epochs: int, seed: int, device: str) -> None:
-    for name, value, least in (("epochs", epochs, 1), ("decay-epochs", decay_epochs, 1), ("seed", seed, 0)):
-        if value < least:
-            raise OptionError(f"--{name} {value}: allowed are {least} or more; choose another")
-    if seed > MOST_SEED:
-        raise OptionError(f"--seed {seed}: allowed are 0 to {MOST_SEED}; choose another")
-    require_device(device)
-
-
-def require_device(device: str) -> None:
-    """Refuse a device that is unknown or not there.
-
-    Raises
-    ------
-    OptionError
-        Saying which are allowed.
-    """
-    if device not in DEVICES:
-        raise OptionError(f"--device {device}: unknown; allowed: {', '.join(DEVICES)}")
-    if device == "cuda" and not torch.cuda.is_available():
-        raise OptionError("--device cuda: this machine has no usable GPU; leave --device away")
-
-
-def require_finite(network: torch.nn.Module, loss: float, epoch: int, step: int) -> None:
-    """Stop before the weights are touched.
-
-    Spikes hide a weight that is no number, since it exceeds no threshold and leaves the loss finite; the gradients of
-    the layers before it show it.
-
-    Raises
-    ------
-    DataError
-        If the loss or a gradient is no longer a number.
-    """
-    gradients = [parameter.grad for parameter in network.parameters() if parameter.grad is not None]
-    for name, found in (("loss", loss), ("gradient", sum(float(each.sum()) for each in gradients))):
-        if not math.isfinite(found):
-            raise DataError(
-                f"epoch {epoch}, step {step}: the {name} is {found}, a finite number is needed; the state of the epoch "
-                "before is kept"
-            )
 
 
 def _restore(
@@ -350,19 +280,3 @@ def _train_epoch(
         optimizer.step()
         total += found * len(chosen)
     return total / len(order)
-
-
-def _check(recordings: Recordings, architecture: Sizes) -> None:
-    where = f"{recordings.source}: split {recordings.split!r}"
-    found, wanted = recordings.events.shape[1:3], (architecture.taxels, architecture.channels)
-    if found != wanted:
-        raise DataError(
-            f"{where}: {found[0]} taxels and {found[1]} polarities, the network has {wanted[0]} and {wanted[1]}; "
-            "use the graph of this sensor"
-        )
-    highest = int(recordings.labels.max())
-    if highest >= architecture.classes:
-        raise DataError(
-            f"{where}: label {highest}, the network has {architecture.classes} classes "
-            f"(0..{architecture.classes - 1}); train it with more classes"
-        )
