@@ -42,10 +42,7 @@ class Layer:
 def class_of_each(counts: Sparse) -> IntArray | None:
     """Class that each neuron votes for, where the output adds up spikes so, else None.
 
-    Parameters
-    ----------
-    counts : csr_array (classes, neurons)
-        What the output is, in terms of spikes.
+    counts: csr_array (classes, neurons); what the output is, in terms of spikes.
 
     Examples
     --------
@@ -66,10 +63,7 @@ def class_of_each(counts: Sparse) -> IntArray | None:
 def in_order(layers: Sequence[Layer]) -> list[int]:
     """Places of the layers, each after the others that feed it.
 
-    Raises
-    ------
-    ModelError
-        If some feed each other in a circle.
+    Raises ModelError if some feed each other in a circle.
     """
     placed: list[int] = []
     while len(placed) < len(layers):
@@ -91,22 +85,13 @@ def in_order(layers: Sequence[Layer]) -> list[int]:
 def assemble(layers: Sequence[Layer], sensor: Input, voters: int, label: IntArray) -> Network:
     """Network of the layers.
 
-    Parameters
-    ----------
-    layers : sequence of Layer
-        In any order.
-    sensor : Input
-        Where the events come from.
-    voters : int
-        Layer whose spikes are counted.
-    label : (neurons,) int64
-        Class that each of its neurons votes for.
+    layers: in any order.
+    sensor: where the events come from.
+    voters: layer whose spikes are counted.
+    label: (neurons,) int64; class that each of its neurons votes for.
 
-    Raises
-    ------
-    ModelError
-        If the layers are in a circle, some are not reached from the input, skip a layer, or have constants or weights
-        that no chip's neuron has.
+    Raises ModelError if the layers are in a circle, some are not reached from the input, skip a layer, or have
+    constants or weights that no chip's neuron has.
     """
     order = in_order(layers)
     place = {INPUT: INPUT} | {old: new for new, old in enumerate(order)}

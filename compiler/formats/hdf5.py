@@ -101,10 +101,7 @@ def read_hdf5(path: Path, what: str, remedy: str) -> File:
 def try_reading(content: bytes) -> None:
     """Read a file in a process of its own.
 
-    Raises
-    ------
-    ModelError
-        If that does not end well: the library spun, crashed, or ran out of its memory.
+    Raises ModelError if that does not end well: the library spun, crashed, or ran out of its memory.
     """
     try:
         done = subprocess.run(  # noqa: S603
@@ -124,10 +121,7 @@ def try_reading(content: bytes) -> None:
 def tree_of(content: bytes) -> Tree:
     """Content of a file as a tree.
 
-    Raises
-    ------
-    ModelError
-        If it is damaged, or holds what may not be read.
+    Raises ModelError if it is damaged, or holds what may not be read.
     """
     import h5py  # slow to load, so only where it is used
 

@@ -47,10 +47,7 @@ def places(
     >>> places((5, 4), (3, 2), (2, 1), [(1, 1), (0, 0)], (1, 1))
     (3, 3)
 
-    Raises
-    ------
-    ModelError
-        If it takes none.
+    Raises ModelError if it takes none.
     """
     numbers = [*kernel, *stride, *dilation]
     pads = [zeros for pair in padding for zeros in pair]

@@ -80,10 +80,7 @@ def dense_neurons(netlist: Netlist) -> BoolArray:
 def input_tiles(netlist: Netlist, target: Target) -> tuple[int, ...]:
     """Tiles for cores that hold nothing but input channels: those in use that have room, then the others.
 
-    Raises
-    ------
-    ModelError
-        If the chip has no room for them.
+    Raises ModelError if the chip has no room for them.
     """
     room = target.limit("mesh.tile_cores")
     tiles = np.arange(target.limit("mesh.width") * target.limit("mesh.height"))
@@ -103,10 +100,7 @@ def cores(netlist: Netlist, target: Target) -> tuple[str, ...]:
 
     SANA-FE counts tiles column by column.
 
-    Raises
-    ------
-    OptionError
-        If the netlist takes several chips.
+    Raises OptionError if the netlist takes several chips.
     """
     require_one_chip(netlist.core_tile, target, "--to sanafe")
     width, height = target.limit("mesh.width"), target.limit("mesh.height")

@@ -58,10 +58,7 @@ class Block:
     def integers(self, key: str, within: Tree | None = None) -> IntArray:
         """An entry as int64, of its own shape.
 
-        Raises
-        ------
-        ModelError
-            If there is none, or it holds other numbers.
+        Raises ModelError if there is none, or it holds other numbers.
         """
         found = (self.entries if within is None else within).get(key)
         if not isinstance(found, np.ndarray):
@@ -101,10 +98,7 @@ class Block:
 def read_blocks(path: Path) -> tuple[list[Block], Tree, str]:
     """Layers of a file, what else it holds, and its hash.
 
-    Raises
-    ------
-    ModelError
-        If it is none; without the path.
+    Raises ModelError if it is none; without the path.
     """
     file = read_hdf5(path, "netx file", REMEDY)
     return blocks_of(file.tree), file.tree, file.sha256

@@ -296,10 +296,7 @@ def _bias(block: Block, size: int, shape: tuple[int, ...]) -> IntArray:
 def _own(tree: Tree, inputs: int, voters: int) -> tuple[Input, IntArray] | None:
     """Sensor and vote that our own writer tells beside the layers, or None.
 
-    Raises
-    ------
-    ModelError
-        If they do not fit the layers.
+    Raises ModelError if they do not fit the layers.
     """
     entries = tree.get(OWN)
     if not isinstance(entries, dict):

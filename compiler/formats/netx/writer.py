@@ -70,10 +70,7 @@ class Block:
 def blocks_for(network: IntegerNetwork) -> tuple[Block, ...]:
     """Layers of the file.
 
-    Raises
-    ------
-    ModelError
-        If the format cannot hold the network.
+    Raises ModelError if the format cannot hold the network.
     """
     found = []
     for post, population in enumerate(network.populations):

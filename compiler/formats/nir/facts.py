@@ -57,18 +57,11 @@ def _written(graph: Graph) -> float | None:
 def facts_of(graph: Graph, steps: Steps, spiking: Sequence[SpikingNode], sensor: str, clocked: Input) -> list[str]:
     """Lines for people.
 
-    Parameters
-    ----------
-    graph : Graph
-        The file.
-    steps : Steps
-        How it was read.
-    spiking : sequence of SpikingNode
-        Its layers.
-    sensor : str
-        What its input was taken for.
-    clocked : Input
-        The network's input.
+    graph: the file.
+    steps: how it was read.
+    spiking: its layers.
+    sensor: what its input was taken for.
+    clocked: the network's input.
     """
     version = printable(graph.version) or "of no version"
     facts = [f"NIR {version}, read in steps of {steps.dt:g} s ({steps.convention})", sensor]

@@ -62,10 +62,7 @@ class Node:
     def numbers(self, key: str) -> FloatArray:
         """A parameter as float64, of its own shape.
 
-        Raises
-        ------
-        ModelError
-            If there is none, or it is no finite numbers.
+        Raises ModelError if there is none, or it is no finite numbers.
         """
         found = self.values.get(key)
         if found is None:
@@ -81,10 +78,7 @@ class Node:
     def whole(self, key: str, length: int | None = None) -> tuple[int, ...]:
         """A parameter as integers, flat; a single one is repeated to `length`.
 
-        Raises
-        ------
-        ModelError
-            If it is something else.
+        Raises ModelError if it is something else.
         """
         array = self.numbers(key).ravel()
         if not array.size or np.any(array != np.rint(array)) or np.any(np.abs(array) > 2**31):
@@ -122,10 +116,7 @@ class Graph:
     def one(self, kind: str) -> Node:
         """The only node of a type.
 
-        Raises
-        ------
-        ModelError
-            If there are none or several.
+        Raises ModelError if there are none or several.
         """
         found = [node for node in self.nodes.values() if node.type == kind]
         if len(found) != 1:
@@ -137,10 +128,7 @@ class Graph:
 def read_graph(path: Path) -> Graph:
     """Read a file.
 
-    Raises
-    ------
-    ModelError
-        If it is none, or inconsistent; without the path.
+    Raises ModelError if it is none, or inconsistent; without the path.
     """
     file = read_hdf5(path, "NIR file", DAMAGED)
     return graph_of(file.tree, file.sha256)

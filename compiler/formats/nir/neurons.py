@@ -46,10 +46,7 @@ class Steps:
     def keeps(self, node: Node, key: str, size: int, shape: tuple[int, ...]) -> FloatArray:
         """Share that a step keeps, of a time constant; shape (size,).
 
-        Raises
-        ------
-        ModelError
-            If there is none in this convention.
+        Raises ModelError if there is none in this convention.
         """
         tau = spread(node, key, size, shape)
         if np.any(tau <= 0):
@@ -103,10 +100,7 @@ def written_for(node: Node) -> float | None:
 def spread(node: Node, key: str, size: int, shape: tuple[int, ...]) -> FloatArray:
     """A parameter for each neuron, (size,): one for all, one each, or one that broadcasts against `shape`.
 
-    Raises
-    ------
-    ModelError
-        If it has another number.
+    Raises ModelError if it has another number.
     """
     values = node.numbers(key)
     if values.size == 1:
@@ -140,10 +134,7 @@ class Neurons:
 def neurons_of(node: Node, size: int, shape: tuple[int, ...], steps: Steps) -> Neurons:
     """Neurons of a node of a type in ``SPIKING``.
 
-    Raises
-    ------
-    ModelError
-        If its parameters are none of a neuron that the chip has.
+    Raises ModelError if its parameters are none of a neuron that the chip has.
     """
     _require_reset(node)
     none = np.zeros(size)
@@ -179,10 +170,7 @@ def _leaky(node: Node, size: int, shape: tuple[int, ...], steps: Steps) -> Neuro
 def one(node: Node, key: str, decay: FloatArray) -> float:
     """The decay that all neurons of a node share.
 
-    Raises
-    ------
-    ModelError
-        If they have several.
+    Raises ModelError if they have several.
     """
     if np.ptp(decay) > TOLERANCE:
         raise node.fail(
@@ -203,10 +191,7 @@ def _require_reset(node: Node) -> None:
 def require_steps(dt: float) -> None:
     """Refuse a time step that is none.
 
-    Raises
-    ------
-    ModelError
-        Saying what is allowed.
+    Raises ModelError saying what is allowed.
     """
     if not 0 < dt < math.inf:
         raise ModelError(f"--dt {dt:g}: is no time step; give seconds above 0")

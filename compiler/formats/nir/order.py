@@ -27,10 +27,7 @@ Late = Mapping[str, tuple[str, ...]]
 def loops(graph: Graph) -> Late:
     """Recurrent nodes.
 
-    Raises
-    ------
-    ModelError
-        If some feed each other in a circle that is no recurrent layer.
+    Raises ModelError if some feed each other in a circle that is no recurrent layer.
     """
     every = set(graph.edges)
     found: dict[str, tuple[str, ...]] = {}
@@ -65,10 +62,7 @@ def loops(graph: Graph) -> Late:
 def in_order(graph: Graph, late: Late) -> tuple[str, ...]:
     """Names of the nodes, each after those that feed it, apart from what comes a step late.
 
-    Raises
-    ------
-    ModelError
-        If some receive nothing at all.
+    Raises ModelError if some receive nothing at all.
     """
     received: dict[str, set[str]] = {name: set() for name in graph.nodes}
     for source, target in graph.edges:

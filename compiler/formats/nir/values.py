@@ -71,10 +71,7 @@ def shifted(value: Value, bias: FloatArray) -> Value:
 def added(values: Sequence[Value]) -> Value:
     """The sum of several, as a node with several edges gets.
 
-    Raises
-    ------
-    ModelError
-        If their shapes or their filters differ.
+    Raises ModelError if their shapes or their filters differ.
     """
     first = values[0]
     if len(values) == 1:
@@ -101,10 +98,7 @@ def added(values: Sequence[Value]) -> Value:
 def filtered(value: Value, alpha: float, gain: FloatArray, drive: FloatArray) -> Value:
     """The state of a leaky integrator: ``f <- alpha * f + gain * value + drive``; `gain` and `drive` are (size,).
 
-    Raises
-    ------
-    ModelError
-        If the value went through one before.
+    Raises ModelError if the value went through one before.
     """
     if value.alpha:
         raise ModelError("filters a current that is filtered before; a neuron of the chip has one current")

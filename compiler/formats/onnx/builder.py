@@ -79,19 +79,12 @@ class Nodes:
     ) -> None:
         """Append a loop over the first axis.
 
-        Parameters
-        ----------
-        body : Nodes
-            What one iteration does.
-        states : sequence of (start, port, next, last)
-            What goes from one iteration to the next: its first value, what the body calls it, what the body leaves,
-            and the name of what the last iteration leaves.
-        given : sequence of (array, port)
-            Arrays that are cut along the first axis, and what the body calls a slice.
-        kept : sequence of (port, array)
-            What the body yields, and the name of all of them stacked.
-        name : str
-            Of the node and its body.
+        body: what one iteration does.
+        states: sequence of (start, port, next, last); what goes from one iteration to the next: its first value, what
+            the body calls it, what the body leaves, and the name of what the last iteration leaves.
+        given: sequence of (array, port); arrays that are cut along the first axis, and what the body calls a slice.
+        kept: sequence of (port, array); what the body yields, and the name of all of them stacked.
+        name: of the node and its body.
         """
         onnx = onnx_package()
         inputs = [value(port) for _, port, _, _ in states] + [value(port) for _, port in given]
@@ -112,10 +105,7 @@ class Nodes:
 def package(name: str) -> Any:
     """Import ``onnx`` or ``onnxruntime``, which load slowly, when it is first needed.
 
-    Raises
-    ------
-    OptionError
-        If it is not installed.
+    Raises OptionError if it is not installed.
     """
     try:
         return importlib.import_module(name)
@@ -141,10 +131,7 @@ def value(port: Port) -> Proto:
 def require_room(size: int) -> None:
     """Refuse weights that no file of this format can hold.
 
-    Raises
-    ------
-    ModelError
-        If they are more than ``SIZE_LIMIT`` bytes.
+    Raises ModelError if they are more than ``SIZE_LIMIT`` bytes.
     """
     if size > SIZE_LIMIT:
         raise ModelError(
@@ -158,16 +145,10 @@ def model_bytes(
 ) -> bytes:
     """Content of a model file; it has passed the checker of the ``onnx`` package.
 
-    Parameters
-    ----------
-    graph : Nodes
-        Nodes and constants.
-    inputs, outputs : sequence of Port
-        What the model takes and gives.
-    name, about : str
-        Of the graph; what it says about itself.
-    facts : mapping
-        JSON values for the metadata, beside the version of this program.
+    graph: nodes and constants.
+    inputs, outputs: what the model takes and gives.
+    name, about: of the graph; what it says about itself.
+    facts: JSON values for the metadata, beside the version of this program.
     """
     onnx = onnx_package()
     model = onnx.helper.make_model(

@@ -74,10 +74,7 @@ SMALL = 64
 def evaluate(node: Node, table: Table, operands: Operands) -> list[Array]:
     """Results of an operator in ``NUMERIC`` on numbers, in float64, int64 or bool.
 
-    Raises
-    ------
-    ModelError
-        If a result is too large, or operands and attributes do not fit each other.
+    Raises ModelError if a result is too large, or operands and attributes do not fit each other.
     """
     if node.op == "Cast" and operands[0] is not None:
         to = int(node.attributes["to"])
@@ -121,11 +118,8 @@ def _of_onnx() -> Iterator[None]:
 def shapes_of(node: Node, table: Table, operands: Operands) -> list[tuple[int, ...]]:
     """Shapes of an operator's results, as ONNX infers them.
 
-    Raises
-    ------
-    ModelError
-        If one of them is too large, before anything is allocated for it, or unknown, or operands and
-        attributes do not fit each other.
+    Raises ModelError if one of them is too large, before anything is allocated for it, or unknown, or operands and
+    attributes do not fit each other.
     """
     from onnx import defs, helper, numpy_helper, shape_inference
 

@@ -162,10 +162,8 @@ class _Content:
 def read_model(path: Path) -> Model:
     """Read a file.
 
-    Raises
-    ------
-    ModelError
-        If it is no ONNX file, or names, sizes, types or places in it cannot be right; the message lacks the path.
+    Raises ModelError if it is no ONNX file, or names, sizes, types or places in it cannot be right; the message lacks
+    the path.
     """
     from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
     from onnx import ModelProto

@@ -34,9 +34,7 @@ NOT_AFFINE = "is not affine in its input; only affine operators between two spik
 def present(value: Value | None) -> Value:
     """An operand that must be there.
 
-    Raises
-    ------
-    ModelError
+    Raises ModelError.
     """
     if value is None:
         raise ModelError("lacks an operand; export it again")
@@ -46,10 +44,7 @@ def present(value: Value | None) -> Value:
 def as_affine(table: Table, value: Value) -> Affine:
     """A value that varies as an affine one: a choice by a threshold becomes a multiple of the spikes.
 
-    Raises
-    ------
-    ModelError
-        If it has a third value at the threshold itself.
+    Raises ModelError if it has a third value at the threshold itself.
     """
     if isinstance(value, Affine):
         return value

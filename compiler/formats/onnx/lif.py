@@ -66,17 +66,10 @@ class Neurons:
 def neurons_of(table: Table, outputs: Mapping[str, Affine]) -> list[Neurons]:
     """Every layer in every step, in the order in which a graph computes them.
 
-    Parameters
-    ----------
-    table : Table
-        After the graph was run.
-    outputs : mapping
-        Its outputs by name.
+    table: after the graph was run.
+    outputs: its outputs by name.
 
-    Raises
-    ------
-    ModelError
-        Naming the operator of the first membrane that is none of such neurons, and why.
+    Raises ModelError naming the operator of the first membrane that is none of such neurons, and why.
     """
     found = []
     for membrane, definition in table.definitions.items():

@@ -62,10 +62,7 @@ CONSTANT = "is computed from constants by an operator that is not known here; fo
 def apply(node: Node, table: Table, operands: Sequence[Value | None]) -> list[Value]:  # noqa: PLR0911 a kind each
     """Results of an operator, whatever its operands are.
 
-    Raises
-    ------
-    ModelError
-        If it is not known, or not affine in what varies; without its name.
+    Raises ModelError if it is not known, or not affine in what varies; without its name.
     """
     if not any(isinstance(operand, Affine | Decision) for operand in operands):
         return _constant(node, table, operands)
@@ -268,9 +265,7 @@ def _affine_map(node: Node, table: Table, values: Sequence[Value | None]) -> Val
 def require_finite(value: Affine) -> None:
     """Refuse coefficients that are not finite numbers.
 
-    Raises
-    ------
-    ModelError
+    Raises ModelError.
     """
     if not all(np.all(np.isfinite(part)) for part in (value.bias, *(own.data for own in value.terms.values()))):
         raise ModelError("has coefficients that are not finite; train it again")

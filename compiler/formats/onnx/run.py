@@ -37,20 +37,12 @@ _SHIFTS = frozenset(("Add", "Cast", "Div", "Identity", "Mul", "Sub"))
 def run(graph: Graph, outer: Mapping[str, Value], given: Mapping[str, Value], table: Table) -> list[Value]:
     """Values of a graph's outputs.
 
-    Parameters
-    ----------
-    graph : Graph
-    outer : mapping
-        Values around it, where it is inside another graph.
-    given : mapping
-        Values of its inputs.
-    table : Table
-        Takes the membranes and comparisons that are met.
+    graph: Graph
+    outer: values around it, where it is inside another graph.
+    given: values of its inputs.
+    table: takes the membranes and comparisons that are met.
 
-    Raises
-    ------
-    ModelError
-        Naming the operator that cannot be evaluated, or is not affine, and why.
+    Raises ModelError naming the operator that cannot be evaluated, or is not affine, and why.
     """
     values: dict[str, Value] = {**outer, **graph.constants, **given}
     order = ordered(graph, values)
@@ -227,10 +219,7 @@ def _makers(graph: Graph) -> dict[str, Node]:
 def ordered(graph: Graph, known: Container[str]) -> list[Node]:
     """Operators that the outputs need, each after those that it needs itself; `known` are values from outside.
 
-    Raises
-    ------
-    ModelError
-        If a value is made twice, not at all, or from itself.
+    Raises ModelError if a value is made twice, not at all, or from itself.
     """
     makers = _makers(graph)
     order: list[Node] = []

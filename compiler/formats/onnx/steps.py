@@ -41,18 +41,12 @@ class Unrolled:
 def group(table: Table, neurons: Sequence[Neurons], shapes: Mapping[int, tuple[int, ...]]) -> Unrolled:
     """Bring steps together.
 
-    Parameters
-    ----------
-    table : Table
-    neurons : sequence of Neurons
-        In every step, in order.
-    shapes : mapping of int to tuple of int
-        Shape of each input of the graph by its atom.
+    table: Table
+    neurons: in every step, in order.
+    shapes: shape of each input of the graph by its atom.
 
-    Raises
-    ------
-    ModelError
-        If there are no neurons, steps are unlike each other, or it is not clear which input brings the events.
+    Raises ModelError if there are no neurons, steps are unlike each other, or it is not clear which input brings the
+    events.
     """
     if not neurons:
         raise ModelError(f"holds no spiking layer: no membrane is compared with a threshold; {RESET}")
@@ -231,10 +225,7 @@ def _equal(first: Sparse, second: Sparse) -> bool:
 def readout(table: Table, found: Unrolled, outputs: Mapping[str, Affine]) -> tuple[int, IntArray, str]:
     """Layer that votes, the class of each of its neurons, and the output that counts them.
 
-    Raises
-    ------
-    ModelError
-        If no output is a count of the spikes of the last layer, or several count them differently.
+    Raises ModelError if no output is a count of the spikes of the last layer, or several count them differently.
     """
     received = {source for sources in found.sources for source in sources}
     ends = [index for index in range(len(found.layers)) if index not in received]

@@ -122,10 +122,7 @@ def _digits(weight: IntArray, unit: IntArray) -> tuple[Digit, ...]:
 def plan(netlist: Netlist) -> tuple[Layer, ...]:
     """Layers that have compartments, in the order of their depth.
 
-    Raises
-    ------
-    ModelError
-        If their weights as dense matrices are more than a file holds.
+    Raises ModelError if their weights as dense matrices are more than a file holds.
     """
     names = plain_names([layer.name for layer in netlist.layers], taken=["input"])
     inner = netlist.axon_source >= netlist.n_inputs

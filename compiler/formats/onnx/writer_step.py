@@ -38,18 +38,11 @@ class Fired:
 def products(graph: Nodes, layer: Layer, spikes: Sequence[str], name: str, sign: int = 0) -> Products:
     """Multiply spikes with the digits of weights.
 
-    Parameters
-    ----------
-    graph : Nodes
-        Where to append.
-    layer : Layer
-        Which receives.
-    spikes : sequence of str
-        Of each of its sources, (…, neurons) uint8.
-    name : str
-        Of the results, before a number.
-    sign : {0, 1, -1}
-        All weights, or magnitudes of the positive or the negative ones.
+    graph: where to append.
+    layer: which receives.
+    spikes: of each of its sources, (…, neurons) uint8.
+    name: of the results, before a number.
+    sign: {0, 1, -1}; all weights, or magnitudes of the positive or the negative ones.
     """
     found: list[tuple[str, str]] = []
     for received, source in zip(spikes, layer.sources, strict=True):
@@ -89,20 +82,12 @@ def integrate(
 ) -> Fired:
     """Append one step of the neurons.
 
-    Parameters
-    ----------
-    graph : Nodes
-        Where to append.
-    layer : Layer
-        Whose neurons.
-    inflow : str or None
-        Synaptic sums in membrane units, (batch, n), or None for none.
-    state : (membrane, current)
-        Registers after the step before; None where no current outlasts its step.
-    window : str, optional
-        Scalar, 1 while the layer integrates and 0 while it is held at zero.
-    biased : bool
-        Whether biases are in `inflow` already.
+    graph: where to append.
+    layer: whose neurons.
+    inflow: synaptic sums in membrane units, (batch, n), or None for none.
+    state: (membrane, current); registers after the step before; None where no current outlasts its step.
+    window: scalar, 1 while the layer integrates and 0 while it is held at zero.
+    biased: whether biases are in `inflow` already.
     """
     name, (membrane, current) = layer.name, state
     if current is not None:
@@ -139,18 +124,11 @@ def _decayed(graph: Nodes, layer: Layer, register: str, lost: IntArray, name: st
 def overflow(graph: Nodes, layer: Layer, signed: Sequence[str], current: str | None, is_open: str) -> str:
     """Whether the chip would stop at this step; (batch,) int32, 0 or 1.
 
-    Parameters
-    ----------
-    graph : Nodes
-        Where to append.
-    layer : Layer
-        Whose registers.
-    signed : sequence of str
-        Sums of positive and of negative weights as magnitudes, membrane units.
-    current : str or None
-        Current register of this step, where it outlasts the step.
-    is_open : str
-        Bool scalar: the layer integrates.
+    graph: where to append.
+    layer: whose registers.
+    signed: sums of positive and of negative weights as magnitudes, membrane units.
+    current: current register of this step, where it outlasts the step.
+    is_open: bool scalar: the layer integrates.
     """
     name, kind = f"{layer.name}/overflow", np.dtype(layer.kind).name
     found = [(register, graph.constant(f"sum/{kind}", ACCUMULATOR_MAX, layer.kind)) for register in signed]
