@@ -104,13 +104,6 @@ def test_the_netlist_is_that_one_but_for_the_bins(place):
     assert netlist_bytes(replace(own, bins=1, provenance={})) == netlist_bytes(replace(plain, provenance={}))
 
 
-def test_files_of_other_networks_are_as_before(place):
-    with np.load(place / "plain.loom") as archive:
-        manifest = json.loads(str(archive["manifest"]))
-    assert manifest["version"] == 2
-    assert "bins" not in manifest
-
-
 @pytest.mark.parametrize("bins", [1, 0, 2.5, True, "3", None, 2**20 + 1])
 def test_a_netlist_of_unusable_bins_is_refused(place, tmp_path, monkeypatch, bins):
     monkeypatch.setattr("spikeloom.compiler.targets.loihi1.netlist_file.manifest_of", _with_bins(bins))

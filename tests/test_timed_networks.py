@@ -13,7 +13,7 @@ from random_networks import chain, integer_population
 from timed_networks import TIMING, events_of, written
 
 from spikeloom.compiler import Options, Recipe, compile_network, lift
-from spikeloom.compiler.dynamics import NO_CLOCKS, PLAIN, Clocks, Dynamics, with_clocks
+from spikeloom.compiler.dynamics import Clocks, Dynamics, with_clocks
 from spikeloom.compiler.errors import DataError, ModelError, NumericRangeError
 from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, MEMBRANE_MAX, ONE_STEP_SUM_MAX, read_only
 from spikeloom.compiler.formats.checkpoint import read_checkpoint
@@ -303,23 +303,6 @@ def test_a_netlist_survives_its_file(compiled, tmp_path):
     assert netlist_text(back) == netlist_text(compiled.netlist)
     assert "(input 39 taxels x 2, 3 clocks of 4 steps)" in netlist_text(back)
     assert "(alpha 0.95)" in netlist_text(back)
-    assert version_of(compiled.netlist) == 3
-
-
-def version_of(netlist):
-    import io
-
-    with np.load(io.BytesIO(netlist_bytes(netlist)), allow_pickle=False) as file:
-        return json.loads(str(file["manifest"]))["version"]
-
-
-def test_a_netlist_without_dynamics_keeps_its_version(tmp_path):
-    _, _, network = float_network(tmp_path, dynamics=PLAIN)
-    netlist = compile_network(network).netlist
-    assert (version_of(netlist), netlist.clocks) == (2, NO_CLOCKS)
-    assert "alpha" not in netlist_text(netlist)
-    _, _, network = float_network(tmp_path, dynamics=Dynamics(betas=TIMING.betas))
-    assert version_of(compile_network(network).netlist) == 2  # decays of membranes were always by compartment
 
 
 def test_a_netlist_of_other_clocks_does_not_match(timed, compiled, tmp_path):

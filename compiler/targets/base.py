@@ -1,12 +1,15 @@
-"""Chips as data: every number of a target stands once, in its TOML file, with unit and source."""
+"""Chips: what a chip is, and the registry that finds each by its folder.
+
+A target is a folder with ``chip.toml``, every number once with unit and source, and a module ``passes`` with ``PASSES``
+(from what is trained to a netlist), ``Options`` and ``start(source, options, target)``, which gives what the passes
+begin with and those that are due. Nothing else knows which chips there are.
+"""
 
 from __future__ import annotations
 
-import math
 import os
-import tomllib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -15,37 +18,13 @@ from typing import Any
 from spikeloom.compiler import targets
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.pipeline import Passes, run
-from spikeloom.compiler.targets.price_tables import (
-    BARRIER,
-    CROSSBAR_EVENTS,
-    EVENTS,
-    FLOOR,
-    LATENCIES,
-    LINK_BUFFER,
-    PICOSECONDS,
-    POWER_UNIT,
-    PRICE_UNIT,
-    TIME_UNIT,
-    EnergyTable,
-    Quantity,
-    TimeTable,
-)
+from spikeloom.compiler.targets.chip_file import COMPARTMENTS, CROSSBARS, Numbers, read_cost_tables, read_numbers
+from spikeloom.compiler.targets.price_tables import PICOSECONDS, EnergyTable, Quantity, TimeTable
 
 __all__ = [
-    "BARRIER",
-    "CHOICES",
     "COMPARTMENTS",
     "CROSSBARS",
-    "CROSSBAR_EVENTS",
-    "CROSSBAR_LIMITS",
-    "EVENTS",
-    "LATENCIES",
-    "LIMITS",
-    "LINK_BUFFER",
     "PICOSECONDS",
-    "POWER_UNIT",
-    "PRICE_UNIT",
-    "TIME_UNIT",
     "EnergyTable",
     "Quantity",
     "Target",
@@ -57,30 +36,6 @@ __all__ = [
 ]
 
 _NOT_MODELLED = {"loihi2": "not modelled; no public per-event energies"}
-
-COMPARTMENTS, CROSSBARS = "compartments", "crossbars"
-"""What cores are made of: lists of weighted synapses onto compartments (Loihi), or a binary crossbar (TrueNorth)."""
-
-CONFIDENCE = ("agreed", "read", "secondary", "derived", "unverified")
-"""How sure a number is, where its entry says so: sources agree, one primary source, notes on one, arithmetic, none."""
-
-LIMITS = (
-    *(f"core.{what}" for what in ("compartments", "axons_in", "axons_out", "synapse_words", "threshold_slots")),
-    *("core.synapse_formats", "core.compartment_configs", "core.dense_base", "chip.cores"),
-    *("synapse.block", "synapse.block_header_bits", "synapse.word_bits"),
-    *("mesh.tile_cores", "mesh.width", "mesh.height"),
-)
-"""What a target of compartments must limit."""
-
-CROSSBAR_LIMITS = (
-    *("core.axons", "core.neurons", "core.axon_types", "chip.cores", "mesh.width", "mesh.height", "mesh.reach"),
-    *(f"neuron.{what}_bits" for what in ("weight", "leak", "threshold", "mask", "reset", "membrane")),
-    *("neuron.targets", "neuron.delay", "tick.length"),
-)
-"""What a target of crossbars must limit."""
-
-CHOICES = ("synapse.weight_bits", "synapse.index_bits", "synapse.exponent")
-"""Of what a target must list the permitted values."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -138,44 +93,6 @@ class Target:
         return run(passes, work, after)
 
 
-def _entries(table: Any, leaf: str, prefix: str, faults: list[str]) -> dict[str, dict[str, Any]]:
-    """Entries by their dotted names; an entry is a table that holds `leaf`, and what holds none is a fault."""
-    if not isinstance(table, dict):
-        faults.append(f"{prefix}: is {table!r}, not an entry with {leaf}, unit and source")
-        return {}
-    if leaf in table or {"unit", "source"} & table.keys():
-        return {prefix: table}
-    flat: dict[str, dict[str, Any]] = {}
-    for key, entry in table.items():
-        flat |= _entries(entry, leaf, f"{prefix}.{key}" if prefix else key, faults)
-    return flat
-
-
-def _is_number(value: Any) -> bool:
-    return type(value) in (int, float) and math.isfinite(value) and value >= 0
-
-
-def _check_entry(name: str, entry: Mapping[str, Any], leaf: str, faults: list[str]) -> None:
-    """Every entry says its amount, its unit and where it was read, and nothing else."""
-    keys = (leaf, "unit", "source")
-    missing = [key for key in keys if key not in entry]
-    if missing:
-        faults.append(f"{name}: lacks {' and '.join(missing)}; give {', '.join(keys)}")
-    odd = [key for key in entry if key not in (*keys, "confidence")]
-    faults += [f"{name}: unknown key {key!r}, allowed are {', '.join(keys)}" for key in odd]
-    if entry.get("confidence", CONFIDENCE[0]) not in CONFIDENCE:
-        faults.append(f"{name}: confidence is {entry['confidence']!r}, allowed are {', '.join(CONFIDENCE)}")
-    for key in ("unit", "source"):
-        if key in entry and not (isinstance(entry[key], str) and entry[key].strip()):
-            faults.append(f"{name}: {key} is {entry[key]!r}, a text is needed")
-    if leaf == "value" and "value" in entry and not _is_number(entry["value"]):
-        faults.append(f"{name}: value is {entry['value']!r}, a finite number from 0 is needed")
-    if leaf == "values" and "values" in entry:
-        values = entry["values"]
-        if not (isinstance(values, list) and values and all(type(value) is int for value in values)):
-            faults.append(f"{name}: values are {values!r}, a list of whole numbers is needed")
-
-
 def read_target(path: str | os.PathLike[str]) -> Target:
     """Read and check a target file.
 
@@ -184,28 +101,8 @@ def read_target(path: str | os.PathLike[str]) -> Target:
     OptionError
         If it cannot be read, or entries are wrong: one line for each.
     """
-    raw = _read(path, "a target file")
-    faults = _head_faults(raw)
-    crossbars = raw.get("cores") == CROSSBARS
-    limits = _rules(raw, "limits", "value", CROSSBAR_LIMITS if crossbars else LIMITS, faults)
-    choices = {} if crossbars else _rules(raw, "choices", "values", CHOICES, faults)
-    energy, time = _cost_tables(raw, faults, CROSSBAR_EVENTS if crossbars else EVENTS)
-    static = _entries(raw.get("static", {}), "value", "", faults)
-    for name, entry in static.items():
-        _check_entry(f"static.{name}", entry, "value", faults)
-        _check_unit(f"static.{name}", entry, POWER_UNIT, faults)
-    if faults:
-        raise OptionError("\n".join(f"{path}: {fault}" for fault in faults))
-    return Target(
-        name=raw["name"],
-        title=raw["title"],
-        limits={rule: Quantity(**entry) for rule, entry in limits.items()},
-        choices={rule: tuple(entry["values"]) for rule, entry in choices.items()},
-        energy=energy,
-        time=time,
-        static={name: Quantity(**entry) for name, entry in static.items()},
-        cores=raw.get("cores", COMPARTMENTS),
-    )
+    numbers = read_numbers(path)
+    return Target(**{field.name: getattr(numbers, field.name) for field in fields(Numbers)})
 
 
 def with_tables(target: Target, name: str) -> Target:
@@ -227,148 +124,11 @@ def with_tables(target: Target, name: str) -> Target:
     energy = tuple(table for table in target.energy if table.name == name)
     time = tuple(table for table in target.time if table.name == name)
     if not energy and not time:
-        names = sorted({table.name for table in target.energy} | {table.name for table in target.time})
         if not name.endswith(".toml"):
+            names = sorted({table.name for table in target.energy} | {table.name for table in target.time})
             raise OptionError(f"--table {name}: unknown; allowed: {', '.join(names)}, or a file that ends in .toml")
-        raw = _read(name, "a file of tables")
-        crossbars = target.cores == CROSSBARS
-        kinds = ("energy",) if crossbars else ("energy", "time")
-        faults = [f"unknown key {key!r}, allowed are {', '.join(kinds)}" for key in raw if key not in kinds]
-        if not set(kinds) & raw.keys():
-            sections = " or ".join(f"[{kind}.NAME]" for kind in kinds)
-            faults.append(f"holds no table; give {sections} with title and entries")
-        energy, time = _cost_tables(raw, faults, CROSSBAR_EVENTS if crossbars else EVENTS)
-        if faults:
-            raise OptionError("\n".join(f"{name}: {fault}" for fault in faults))
+        energy, time = read_cost_tables(name, target.cores)
     return replace(target, energy=energy or target.energy, time=time or target.time)
-
-
-def _read(path: str | os.PathLike[str], what: str) -> dict[str, Any]:
-    try:
-        return tomllib.loads(Path(path).read_text("utf-8"))
-    except OSError as error:
-        raise OptionError(f"{path}: cannot be read ({error.strerror or error}); give {what}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise OptionError(f"{path}: is not TOML ({error}); mend it") from error
-
-
-def _cost_tables(
-    raw: Mapping[str, Any], faults: list[str], events: tuple[str, ...]
-) -> tuple[tuple[EnergyTable, ...], tuple[TimeTable, ...]]:
-    """Energy tables of these events and time tables; none of a kind that has a fault."""
-    energy, time = raw.get("energy", {}), raw.get("time", {})
-    before = len(faults)
-    prices, latencies = _prices(energy, events, faults), _latencies(time, faults)
-    if len(faults) > before:
-        return (), ()
-    return tuple(
-        EnergyTable(
-            name=key,
-            title=energy[key]["title"],
-            prices={event: Quantity(**price) for event, price in found.items()},
-        )
-        for key, found in prices.items()
-    ), tuple(
-        TimeTable(
-            name=key,
-            title=time[key]["title"],
-            latencies={event: Quantity(**found[event]) for event in LATENCIES},
-            barriers={int(rule[len(BARRIER) :]): Quantity(**found[rule]) for rule in found if _is_barrier(rule)},
-            link_buffer=Quantity(**found[LINK_BUFFER]),
-        )
-        for key, found in latencies.items()
-    )
-
-
-def _head_faults(raw: Mapping[str, Any]) -> list[str]:
-    known: tuple[str, ...] = ("name", "title", "limits", "energy")
-    if raw.get("cores") != CROSSBARS:
-        known = ("name", "title", "limits", "choices", "energy", "time")
-    faults = [f"{key}: is missing" for key in known if key not in raw]
-    if raw.get("cores", COMPARTMENTS) not in (COMPARTMENTS, CROSSBARS):
-        faults.append(f"cores: is {raw['cores']!r}, allowed are {COMPARTMENTS}, {CROSSBARS}")
-    allowed = (*known, "static", *(["cores"] if "cores" in raw else []))
-    faults += [f"unknown key {key!r}, allowed are {', '.join(allowed)}" for key in raw if key not in allowed]
-    texts = [key for key in ("name", "title") if not isinstance(raw.get(key, ""), str)]
-    return faults + [f"{key}: is {raw[key]!r}, a text is needed" for key in texts]
-
-
-def _rules(
-    raw: Mapping[str, Any], kind: str, leaf: str, wanted: tuple[str, ...], faults: list[str]
-) -> dict[str, dict[str, Any]]:
-    """Limits or choices by their names, all of those that are wanted and no others."""
-    found = _entries(raw.get(kind, {}), leaf, "", faults)
-    faults += [f"{kind}.{name}: is missing" for name in wanted if kind in raw and name not in found]
-    faults += [f"{kind}.{name}: unknown, allowed are {', '.join(wanted)}" for name in found if name not in wanted]
-    for name, entry in found.items():
-        _check_entry(f"{kind}.{name}", entry, leaf, faults)
-        value: Any = entry.get("value")
-        if leaf == "value" and _is_number(value) and value != int(value):
-            faults.append(f"{kind}.{name}: value is {value!r}, a whole number is needed")
-    return found
-
-
-def _tables(raw: Any, kind: str, contents: str, faults: list[str]) -> dict[str, dict[str, dict[str, Any]]]:
-    """Entries by table and name; every table has a title."""
-    tables: dict[str, dict[str, dict[str, Any]]] = {}
-    for key, table in raw.items() if isinstance(raw, dict) else [("", raw)]:
-        if not isinstance(table, dict) or not isinstance(table.get("title"), str):
-            faults.append(f"{kind}.{key}: lacks its title; give title and {contents}")
-            continue
-        entries = {name: entry for name, entry in table.items() if name != "title"}
-        own: list[str] = []
-        tables[key] = _entries(entries, "value", "", own)
-        faults += [f"{kind}.{key}.{fault}" for fault in own]
-    return tables
-
-
-def _prices(energy: Any, events: tuple[str, ...], faults: list[str]) -> dict[str, dict[str, dict[str, Any]]]:
-    """Prices by table and event."""
-    prices = _tables(energy, "energy", "prices", faults)
-    for key, found in prices.items():
-        if events is CROSSBAR_EVENTS and events[0] not in found:
-            faults.append(f"energy.{key}: has no price of {events[0]}; give it")
-        for event, price in found.items():
-            where = f"energy.{key}.{event}"
-            _check_entry(where, price, "value", faults)
-            if event not in events:
-                faults.append(f"{where}: unknown event, allowed are {', '.join(events)}")
-            _check_unit(where, price, POWER_UNIT if event == FLOOR else PRICE_UNIT, faults)
-    return prices
-
-
-def _is_barrier(rule: str) -> bool:
-    """Whether `rule` is a barrier and says from how many tiles on it holds."""
-    tiles = rule.removeprefix(BARRIER)
-    return rule.startswith(BARRIER) and tiles.isdecimal() and tiles.isascii() and not tiles.startswith("0")
-
-
-def _latencies(time: Any, faults: list[str]) -> dict[str, dict[str, dict[str, Any]]]:
-    """Latencies, barriers and link buffers by table; nothing may be missing, for no latency is zero unless it says."""
-    latencies = _tables(time, "time", "latencies", faults)
-    wanted = (*LATENCIES, LINK_BUFFER, f"{BARRIER}1")
-    allowed = ", ".join((*LATENCIES, LINK_BUFFER, f"{BARRIER}N with a number of tiles N"))
-    for key, found in latencies.items():
-        faults += [f"time.{key}.{rule}: is missing" for rule in wanted if rule not in found]
-        for rule, entry in found.items():
-            where = f"time.{key}.{rule}"
-            _check_entry(where, entry, "value", faults)
-            if rule not in wanted and not _is_barrier(rule):
-                faults.append(f"{where}: unknown, allowed are {allowed}")
-            value: Any = entry.get("value")
-            if rule == LINK_BUFFER:
-                if _is_number(value) and value != int(value):
-                    faults.append(f"{where}: value is {value!r}, a whole number is needed")
-                continue
-            _check_unit(where, entry, TIME_UNIT, faults)
-            if _is_number(value) and abs(value * PICOSECONDS - round(value * PICOSECONDS)) > 1e-6:
-                faults.append(f"{where}: value is {value!r}, a multiple of {1 / PICOSECONDS} is needed")
-    return latencies
-
-
-def _check_unit(where: str, entry: Mapping[str, Any], unit: str, faults: list[str]) -> None:
-    if isinstance(entry.get("unit"), str) and entry["unit"] != unit:
-        faults.append(f"{where}: unit is {entry['unit']!r}, allowed is {unit!r}")
 
 
 @cache

@@ -1,15 +1,13 @@
 """Netlist to one file and back: an uncompressed ``.npz`` that numpy alone can read, without pickle.
 
-Members, format version 2
+Members, format version 5
 -------------------------
 ``manifest``
     JSON text (0-d string): ``format`` ("spikeloom-netlist"), ``version``, ``target``, ``taxels``, ``polarities``,
-    ``classes``, ``layers`` (one object per :class:`netlist.Layer`) and ``provenance``.
+    ``classes``, ``layers`` (one object per :class:`netlist.Layer`), ``clocks`` (``channels`` and ``steps``, see
+    :mod:`compiler.dynamics`), ``bins`` (of the recordings, to a step) and ``provenance``.
 ``sha256``
     Hex digest (0-d string) over all other members in the order below: name, dtype, shape and bytes of each.
-Version 3 is for networks with currents that outlast their step, or with clocks: each layer has ``alpha``, and the
-manifest ``clocks`` (``channels`` and ``steps``), see :mod:`compiler.dynamics`. Version 4 is for networks whose steps
-join bins of the recordings: as version 3, and ``bins``.
 
 every array field of :class:`netlist.Netlist`
     Under its own name and meaning, in the narrowest little-endian signed type that holds it; ``scale`` as float64.
@@ -21,7 +19,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
@@ -29,15 +27,13 @@ from typing import Any
 import numpy as np
 
 from spikeloom.compiler.archive import Array, archive_bytes, read_archive, write_archive
-from spikeloom.compiler.dynamics import MOST_CLOCKS, MOST_STEPS, NO_CLOCKS, Clocks
+from spikeloom.compiler.dynamics import MOST_CLOCKS, MOST_STEPS, Clocks
 from spikeloom.compiler.errors import FormatError
 from spikeloom.compiler.fixedpoint import frozen, read_only, read_only_float
 from spikeloom.compiler.targets.base import COMPARTMENTS, known_targets
 from spikeloom.compiler.targets.loihi1.netlist import Layer, Netlist
 
-FORMAT = "spikeloom-netlist"
-VERSIONS = (2, 3, 4)
-"""Of a usual netlist, of one with current decay or clocks, and of one whose steps join bins."""
+FORMAT, VERSION = "spikeloom-netlist", 5
 
 LARGE = frozenset({"synapse_target", "synapse_weight"})
 """Arrays that stay in the type that they are stored in."""
@@ -52,25 +48,14 @@ ARRAYS = tuple(field.name for field in fields(Netlist) if field.name not in _SCA
 
 def manifest_of(netlist: Netlist) -> dict[str, Any]:
     """What a netlist says beside its arrays, as JSON values."""
-    timed = bool(netlist.clocks.channels or any(layer.alpha for layer in netlist.layers))
-    manifest: dict[str, Any] = {
+    values = {name: getattr(netlist, name) for name in ("target", "taxels", "polarities", "classes", "bins")}
+    return values | {
         "format": FORMAT,
-        "version": VERSIONS[2] if netlist.bins > 1 else VERSIONS[timed],
-        "target": netlist.target,
-        "taxels": netlist.taxels,
-        "polarities": netlist.polarities,
-        "classes": netlist.classes,
+        "version": VERSION,
         "layers": [asdict(layer) for layer in netlist.layers],
+        "clocks": asdict(netlist.clocks),
         "provenance": dict(netlist.provenance),
     }
-    if netlist.bins > 1:
-        manifest["bins"] = netlist.bins
-    if timed or netlist.bins > 1:
-        manifest["clocks"] = asdict(netlist.clocks)
-    else:
-        for layer in manifest["layers"]:
-            del layer["alpha"]
-    return manifest
 
 
 def netlist_bytes(netlist: Netlist) -> bytes:
@@ -95,78 +80,47 @@ def read_netlist(path: str | os.PathLike[str]) -> Netlist:
     Raises
     ------
     FormatError
-        If it is missing, truncated, altered, from a newer version or inconsistent.
+        If it is missing, truncated, altered, of another version or inconsistent.
     OSError
         If it cannot be read.
     """
     path = Path(path)
-    return netlist_of(path, *read_archive(path, FORMAT, VERSIONS, ARRAYS))
-
-
-def netlist_of(path: Path, manifest: dict[str, Any], members: Mapping[str, Array]) -> Netlist:
-    """Put a netlist together from what a file holds, and check it.
-
-    Parameters
-    ----------
-    path : Path
-        For messages.
-    manifest : JSON object
-        As :func:`manifest_of` gives it; format and version are known to be ours.
-    members : mapping of str to array
-        Every one of ``ARRAYS``.
-
-    Raises
-    ------
-    FormatError
-        If it is inconsistent.
-    """
-    if manifest["version"] == VERSIONS[0]:
-        manifest = _widened(manifest)
-    if manifest["version"] < VERSIONS[2]:
-        manifest = manifest | {"bins": 1}
-    faults = _type_faults(manifest, members)
-    if faults:
+    manifest, members = read_archive(path, FORMAT, (VERSION,), ARRAYS)
+    if faults := _type_faults(manifest, members):
         raise FormatError(f"{path}: {'; '.join(faults)}; compile it again")
     if manifest["target"] not in known_targets(COMPARTMENTS):
         known = ", ".join(known_targets(COMPARTMENTS))
         raise FormatError(f"{path}: is for {manifest['target']!r}, this program knows {known}; update spikeloom")
+    stated = {name: manifest[name] for name in ("target", "taxels", "polarities", "classes", "bins", "provenance")}
+    arrays: dict[str, Any] = {
+        name: (frozen if name in LARGE else read_only)(members[name]) for name in ARRAYS if name not in FLOATS
+    }
     netlist = Netlist(
-        target=manifest["target"],
-        taxels=manifest["taxels"],
-        polarities=manifest["polarities"],
-        classes=manifest["classes"],
+        **stated,
         layers=tuple(Layer(**(layer | {"unheard": tuple(layer["unheard"])})) for layer in manifest["layers"]),
-        provenance=manifest["provenance"],
         clocks=Clocks(**manifest["clocks"]),
-        bins=manifest["bins"],
         scale=read_only_float(members["scale"]),
-        **{name: (frozen if name in LARGE else read_only)(members[name]) for name in ARRAYS if name not in FLOATS},
+        **arrays,
     )
-    faults = inconsistencies(netlist)
-    if faults:
+    if faults := inconsistencies(netlist):
         raise FormatError(f"{path}: {'; '.join(faults)}; compile it again")
     return netlist
 
 
-def _widened(manifest: dict[str, Any]) -> dict[str, Any]:
-    """A manifest of the first version with what the second adds."""
-    layers = manifest.get("layers")
-    if isinstance(layers, list):
-        layers = [layer | {"alpha": 0.0} if isinstance(layer, dict) else layer for layer in layers]
-    return manifest | {"clocks": asdict(NO_CLOCKS), "layers": layers}
-
-
-def _type_faults(manifest: dict[str, Any], members: Mapping[str, Array]) -> list[str]:
-    """Say which entries of the manifest or which arrays are missing or of another kind than :class:`Netlist` asks."""
-    layers = manifest.get("layers")
+def _type_faults(manifest: Mapping[str, Any], members: Mapping[str, Array]) -> list[str]:
+    """Entries of the manifest or arrays that are missing or of another kind than :class:`Netlist` has."""
+    layers, clocks = manifest.get("layers"), manifest.get("clocks")
     entries = {
         "target": isinstance(manifest.get("target"), str),
         "provenance": isinstance(manifest.get("provenance"), dict),
         "layers": isinstance(layers, list) and bool(layers) and all(map(_is_layer, layers)),
-        "clocks": _are_clocks(manifest.get("clocks")),
-        "bins": _is(manifest.get("bins"), "int", 1) and manifest["bins"] <= MOST_STEPS,
+        "clocks": isinstance(clocks, dict)
+        and set(clocks) == {"channels", "steps"}
+        and _is_whole(clocks["channels"], 0, MOST_CLOCKS)
+        and _is_whole(clocks["steps"], 1, MOST_STEPS),
+        "bins": _is_whole(manifest.get("bins"), 1, MOST_STEPS),
     }
-    entries |= {name: _is(manifest.get(name), "int", 1) for name in ("taxels", "polarities", "classes")}
+    entries |= {name: _is_whole(manifest.get(name), 1) for name in ("taxels", "polarities", "classes")}
     faults = [f"the manifest has no usable {name}" for name, good in entries.items() if not good]
     return faults + [
         f"{name} is no list of {'numbers' if name in FLOATS else 'integers'}"
@@ -175,29 +129,25 @@ def _type_faults(manifest: dict[str, Any], members: Mapping[str, Array]) -> list
     ]
 
 
-def _is(value: Any, kind: str, least: float = -math.inf) -> bool:
-    """Whether a JSON value is of a kind (a number where a float is asked for may be whole) and finite."""
-    if kind == "str":
-        return isinstance(value, str)
-    numbers = (int, float) if kind == "float" else (int,)
-    return isinstance(value, numbers) and not isinstance(value, bool) and least <= value < math.inf
-
-
-def _are_clocks(entry: Any) -> bool:
-    if not isinstance(entry, dict) or set(entry) != {"channels", "steps"}:
-        return False
-    channels, steps = entry["channels"], entry["steps"]
-    return _is(channels, "int", 0) and _is(steps, "int", 1) and channels <= MOST_CLOCKS and steps <= MOST_STEPS
+def _is_whole(value: Any, least: int, most: float = math.inf) -> bool:
+    return type(value) is int and least <= value <= most
 
 
 def _is_layer(entry: Any) -> bool:
-    wanted = {field.name: str(field.type) for field in fields(Layer)}
-    if not isinstance(entry, dict) or set(entry) != set(wanted):
+    kinds = {field.name: str(field.type) for field in fields(Layer)}
+    if not isinstance(entry, dict) or set(entry) != set(kinds):
         return False
+    good: dict[str, Callable[[Any], bool]] = {
+        "str": lambda value: isinstance(value, str),
+        "int": lambda value: _is_whole(value, 0),
+        "float": lambda value: type(value) in (int, float) and 0 <= value < math.inf,
+    }
     listed = entry["unheard"]
-    if not isinstance(listed, list) or not all(_is(neuron, "int", 0) for neuron in listed):
-        return False
-    return all(_is(entry[name], kind, 0) for name, kind in wanted.items() if name != "unheard")
+    return (
+        isinstance(listed, list)
+        and all(_is_whole(neuron, 0) for neuron in listed)
+        and all(good[kind](entry[name]) for name, kind in kinds.items() if name != "unheard")
+    )
 
 
 def _bounds_fault(name: str, bounds: Array, parts: int, total: int) -> str | None:
