@@ -15,8 +15,8 @@ import time
 import numpy as np
 
 from spikeloom.models.recordings.evtouch import load_recordings
+from spikeloom.runtime.machines.base import Stream, machine_for
 from spikeloom.runtime.machines.loihi1.engine import simulate
-from spikeloom.runtime.machines.loihi1.stream import Stream, load
 from spikeloom.runtime.machines.votes import class_counts
 
 
@@ -56,7 +56,7 @@ def main() -> None:
     parser.add_argument("--bin", type=float, default=0.02)
     arguments = parser.parse_args()
 
-    live = load(arguments.netlist)
+    live = machine_for(arguments.netlist)
     events = load_recordings(arguments.recordings, arguments.split, limit=arguments.limit).events
     begun = time.perf_counter()
     stream = live.stream()
@@ -64,7 +64,7 @@ def main() -> None:
     timed_grasp(stream, events[0], 0)
     grasps = [timed_grasp(stream, recording, 0) for recording in events]
     paced, _ = timed_grasp(stream, events[0], arguments.bin)
-    whole = simulate(live.engine, events.reshape(len(events), live.netlist.n_inputs, -1)).counts.spikes
+    whole = simulate(live.netlist, events.reshape(len(events), live.netlist.n_inputs, -1)).counts.spikes
     print(
         json.dumps(
             {

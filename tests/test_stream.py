@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from random_netlists import Axon, Neuron, build, large_netlist, netlists, recordings
 
 from spikeloom.compiler import compile_network
-from spikeloom.compiler.errors import DataError, FormatError, NumericRangeError
+from spikeloom.compiler.errors import DataError, NumericRangeError
 from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.formats.checkpoint import read_checkpoint
 from spikeloom.compiler.passes.expand import expand
@@ -21,8 +21,9 @@ from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist
 from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.models.recordings.evtouch import load_recordings
+from spikeloom.runtime.machines.base import machine_for
 from spikeloom.runtime.machines.loihi1 import engine
-from spikeloom.runtime.machines.loihi1.stream import Step, Stream, load, open_stream
+from spikeloom.runtime.machines.loihi1.stream import Step, Stream, open_stream
 from spikeloom.runtime.machines.votes import class_counts
 
 
@@ -107,7 +108,7 @@ def released_netlist(released_checkpoint: Path) -> Netlist:
 @pytest.mark.recordings
 def test_the_released_network_on_its_recordings(released_netlist, objects_zip, tmp_path):
     write_netlist(released_netlist, tmp_path / "net.loom")
-    live = load(tmp_path / "net.loom")
+    live = machine_for(tmp_path / "net.loom")
     data = load_recordings(objects_zip, "test", limit=3).events
     # three grasps at the same time, in turns
     streams = [live.stream() for _ in data]
@@ -269,12 +270,6 @@ def test_an_overflow_ends_the_stream_until_reset():
             again()
     stream.reset()
     assert stream.step([0, 1]).spikes[0].tolist() == [True]
-
-
-def test_load_refuses_what_is_no_netlist(tmp_path):
-    (tmp_path / "net.loom").write_bytes(b"hello")
-    with pytest.raises(FormatError):
-        load(tmp_path / "net.loom")
 
 
 def test_streams_do_not_load_torch():

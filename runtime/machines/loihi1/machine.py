@@ -38,6 +38,11 @@ class Loihi(Machine):
     def _engine(self) -> engine.Engine:
         return engine.prepare(self.netlist)
 
+    @cached_property
+    def _stepwise(self) -> engine.Engine:
+        """Shared by all streams."""
+        return engine.prepare(self.netlist, stepwise=True)
+
     @property
     def layers(self) -> tuple[str, ...]:
         """Names of the layers."""
@@ -111,7 +116,7 @@ class Loihi(Machine):
 
     def stream(self) -> Stream:
         """One grasp, bin after bin."""
-        return open_stream(self.netlist)
+        return open_stream(self._stepwise)
 
     def _run(self, counts: IntArray, spikes: BoolArray | None) -> Run:
         layers = self.netlist.layers

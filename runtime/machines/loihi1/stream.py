@@ -1,7 +1,6 @@
 """Live use: one bin of events in, the spikes of one chip step and the votes so far out.
 
-    netlist = load("net.loom")
-    stream = netlist.stream()
+    stream = machine_for("net.loom").stream()
     for events in bins:                     # each (taxels, polarities), values 0 and 1
         step = stream.step(events)
         print(step.decision, step.margin)
@@ -17,15 +16,11 @@ by step, all spikes and counts equal those of :func:`engine.simulate` on the who
 
 from __future__ import annotations
 
-import os
-from dataclasses import dataclass
-
 import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler.errors import DataError, NumericRangeError
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
-from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.runtime.machines.base import Step
 from spikeloom.runtime.machines.loihi1.engine import Engine, advance, prepare, start, tables_of
 from spikeloom.runtime.machines.votes import class_counts
@@ -135,39 +130,6 @@ class Stream:
         counts = class_counts(netlist, state.spikes[None])[0]
         spikes.flags.writeable = counts.flags.writeable = False
         return Step(index=index, spikes=tuple([spikes[begin:end] for begin, end in self._bounds]), counts=counts)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LiveNetlist:
-    """A netlist that is ready to be stepped; made by :func:`load`.
-
-    Parameters
-    ----------
-    engine : Engine
-        The prepared network, shared by all streams.
-    """
-
-    engine: Engine
-
-    @property
-    def netlist(self) -> Netlist:
-        """The placed network."""
-        return self.engine.netlist
-
-    def stream(self) -> Stream:
-        """Open one more stream, at rest."""
-        return Stream(self.engine)
-
-
-def load(path: str | os.PathLike[str]) -> LiveNetlist:
-    """Read a netlist file and prepare it.
-
-    Raises
-    ------
-    FormatError
-        As :func:`netlist_file.read_netlist` does.
-    """
-    return LiveNetlist(engine=prepare(read_netlist(path), stepwise=True))
 
 
 def open_stream(netlist: Netlist | Engine) -> Stream:
