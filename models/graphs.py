@@ -1,4 +1,4 @@
-"""Tactile graphs: which taxels hear each other, and with what weight.
+"""Tactile graphs: which taxels exchange events, and with what weight.
 
 A graph is a list of directed edges over taxels with coordinates. The released code builds three kinds (a
 hand-drawn one, nearest neighbours, a spanning tree with or without all pairs nearer than sigma) and lists some

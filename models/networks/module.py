@@ -218,14 +218,14 @@ def module_network(
         layers.append(
             Layer(name=name, beta=float(layer.beta), theta=float(layer.theta), bias=bias[index], sources=sources)
         )
-    heard = [source for source, part in enumerate(weights[-1]) if part.nnz]
-    label = class_of_each(weights[-1][heard[0]]) if len(heard) == 1 and heard[0] > 0 else None
-    if label is None or np.ptp(bias[-1]) > 0 or any(heard[0] - 1 in layer.sources for layer in layers):
+    given = [source for source, part in enumerate(weights[-1]) if part.nnz]
+    label = class_of_each(weights[-1][given[0]]) if len(given) == 1 and given[0] > 0 else None
+    if label is None or np.ptp(bias[-1]) > 0 or any(given[0] - 1 in layer.sources for layer in layers):
         raise ModelError(
             "module: its output is no count of the spikes of its last LIF layer; return these spikes, or their sum "
             "over a group of neurons for each class"
         )
-    return assemble(layers, sensor, heard[0] - 1, label)
+    return assemble(layers, sensor, given[0] - 1, label)
 
 
 def compile_module(

@@ -186,8 +186,8 @@ class SpikingNet(TrainedModule):
         self.places = propagation.shape[-2]
         generator = torch.Generator().manual_seed(seed)
         self.conv1 = _first_layer(architecture, generator)
-        heard = self.places * architecture.features + architecture.dynamics.clocks.channels
-        sizes = (heard, *architecture.hidden, architecture.classes)
+        inputs = self.places * architecture.features + architecture.dynamics.clocks.channels
+        sizes = (inputs, *architecture.hidden, architecture.classes)
         self.dense = tuple(f"fc{i}" for i in range(1, len(sizes)))
         for name, inputs, outputs in zip(self.dense, sizes[:-1], sizes[1:], strict=True):
             self.add_module(name, SpikeLinear(inputs, outputs, generator))

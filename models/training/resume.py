@@ -68,7 +68,7 @@ def read_state(path: str | os.PathLike[str], options: Mapping[str, Any]) -> Trai
     """
     path = Path(path)
     if not path.is_file():
-        raise ModelError(f"{path}: no interrupted training to resume; leave --resume away")
+        raise ModelError(f"{path}: no interrupted training to resume; omit --resume")
     if path.stat().st_size > SIZE_LIMIT:
         raise ModelError(f"{path}: {path.stat().st_size} bytes, {SIZE_LIMIT} allowed; this is no training state")
     damaged = f"{path}: is not a training state or is damaged; delete it and train anew"
