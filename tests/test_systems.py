@@ -484,7 +484,7 @@ def test_released_style_files_on_the_command_line(data, capsys, system):
             "--graph: is for taxel graphs, an MLP has none; leave it away",
         ),
         ("--system gcn", "train: no graph; name it with --graph: "),
-        ("--system mlp --padding same", "--padding: is for grid-cnn, an MLP has no window; leave it away"),
+        ("--system mlp --padding same", "--padding: is for grid-cnn, an MLP has no window; omit it"),
         ("--system rnn", "argument --system: invalid choice: 'rnn' (choose from "),
         ("--system grid-cnn --taxels 39", "grid-cnn: positions have 1 numbers each, a grid needs x and y; "),
         ("--graph knn:9", "graph 'knn:9': K is '9', allowed are whole numbers 1..8; choose another K"),
