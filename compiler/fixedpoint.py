@@ -110,41 +110,6 @@ def weight_step(bits: int) -> int:
     return 1 << (9 - bits)
 
 
-def quantise_weights(weight: FloatArray, scale: float, bits: int) -> IntArray:
-    """Round to mixed-sign mantissas: multiples of the step of `bits`, symmetric range.
-
-    Parameters
-    ----------
-    weight : FloatArray
-        Real weights, any shape.
-    scale : float
-        Mantissa units per real unit.
-    bits : int
-        Storage width, 2 to 8.
-
-    Returns
-    -------
-    IntArray
-        Mantissas, same shape as `weight`.
-
-    Notes
-    -----
-    The range of a width is ``-256 … 256 - step``. The negative end has no mirror and is left unused, so that a
-    network and its negation quantise alike: 8 bits hold -254 … 254, 2 bits the three values -128, 0, 128.
-
-    Examples
-    --------
-    >>> quantise_weights(np.array([1.0, -1.0, 0.5, 0.003]), 254.0, 8).tolist()
-    [254, -254, 128, 0]
-    >>> quantise_weights(np.array([1.0, -1.0, 0.4]), 128.0, 2).tolist()
-    [128, -128, 0]
-    """
-    step = weight_step(bits)
-    limit = 256 - step
-    rounded: IntArray = round_half_even(np.asarray(weight) * (scale / step)) * step
-    return saturate(rounded, limit)
-
-
 def encode_bias(bias: FloatArray) -> tuple[IntArray, IntArray]:
     """Round biases to mantissa and exponent, the smallest exponent that holds each.
 

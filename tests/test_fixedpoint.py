@@ -17,11 +17,11 @@ from spikeloom.compiler.fixedpoint import (
     THRESHOLD_MANTISSA_MAX,
     decay,
     encode_bias,
-    quantise_weights,
     round_half_even,
     saturate,
     weight_step,
 )
+from spikeloom.compiler.targets.loihi1.storage.weight_storage import round_steps
 
 # Published for decay_v = 3277, factor 819/4096.
 PUBLISHED = [
@@ -40,6 +40,11 @@ PUBLISHED = [
     (-8388607, -1677311),
 ]
 BITS = (2, 3, 4, 5, 6, 8)
+
+
+def mantissas(weight, scale, bits):
+    """Weights rounded to one plane of a width."""
+    return round_steps(weight, scale, bits, (0,)) * weight_step(bits)
 
 
 def test_registers_have_their_published_widths():
@@ -92,23 +97,23 @@ def test_round_half_even_goes_to_the_even_neighbour():
 def test_each_width_has_its_step_and_largest_mantissa(bits, step, largest):
     assert weight_step(bits) == step
     ends = np.array([largest, largest + step / 2, largest + step, 1e6, -largest, -largest - step, -1e6])
-    assert quantise_weights(ends, 1.0, bits).tolist() == [largest] * 4 + [-largest] * 3
+    assert mantissas(ends, 1.0, bits).tolist() == [largest] * 4 + [-largest] * 3
 
 
 @pytest.mark.parametrize("bits", BITS)
 def test_weights_at_half_a_step_and_just_beyond(bits):
     step = weight_step(bits)
     values = np.array([step / 2, -step / 2, step / 2 + 1e-6, -step / 2 - 1e-6])
-    assert quantise_weights(values, 1.0, bits).tolist() == [0, 0, step, -step]
+    assert mantissas(values, 1.0, bits).tolist() == [0, 0, step, -step]
 
 
 @given(st.sampled_from(BITS), st.lists(st.floats(-3, 3), min_size=1, max_size=5), st.floats(0.1, 300))
 def test_weights_are_the_nearest_of_their_grid_and_symmetric(bits, weights, scale):
     step, weight = weight_step(bits), np.array(weights)
-    mantissa = quantise_weights(weight, scale, bits)
+    mantissa = mantissas(weight, scale, bits)
     grid = np.arange(-(256 - step), 256, step)
     assert set(mantissa.tolist()) <= set(grid.tolist())
-    assert np.array_equal(quantise_weights(-weight, scale, bits), -mantissa)
+    assert np.array_equal(mantissas(-weight, scale, bits), -mantissa)
     nearest = np.abs(grid[:, None] - weight * scale).min(axis=0)
     np.testing.assert_allclose(np.abs(mantissa - weight * scale), nearest, rtol=0, atol=1e-9)
 

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_networks import BITS, chain, float_networks
 
-from spikeloom.compiler.fixedpoint import quantise_weights, weight_step
+from spikeloom.compiler.fixedpoint import weight_step
 from spikeloom.compiler.invariants import verify
 from spikeloom.compiler.ir import Form, IntegerNetwork
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import (
@@ -14,7 +14,6 @@ from spikeloom.compiler.targets.loihi1.storage.weight_storage import (
     plane_distance,
     reach,
     round_population,
-    round_steps,
     scales,
     split_planes,
 )
@@ -59,13 +58,6 @@ def test_the_distance_of_planes_is_the_largest_without_a_gap(bits):
         steps = np.arange(reach(bits, (0,)) + 2**distance)
         planes = split_planes(steps, bits, (0, distance))
         assert (np.abs(planes[0]).max() > 256 - weight_step(bits)) == gap
-
-
-@given(st.sampled_from(BITS), st.floats(0.01, 1e4), st.integers(0, 2**31))
-def test_one_plane_rounds_as_the_mantissas_do(bits, scale, seed):
-    weight = np.random.default_rng(seed).normal(0, 1, 50)
-    steps = round_steps(weight, scale, bits, (0,))
-    np.testing.assert_array_equal(steps * weight_step(bits), quantise_weights(weight, scale, bits))
 
 
 @settings(deadline=None, max_examples=50)
