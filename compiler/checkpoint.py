@@ -110,8 +110,8 @@ class Checkpoint:
     @property
     def places(self) -> int:
         """Number of places that the first fully connected stage was trained on."""
-        heard = self.dense[0].weight.shape[1] - self.dynamics.clocks.channels
-        return int(heard * self.towers // self.hops.shape[1])
+        inputs = self.dense[0].weight.shape[1] - self.dynamics.clocks.channels
+        return int(inputs * self.towers // self.hops.shape[1])
 
     @property
     def taxels(self) -> int:

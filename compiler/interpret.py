@@ -234,7 +234,7 @@ def run_integer(
 def _own_weights(
     network: Network | IntegerNetwork, weight_of: Callable[[Any], Sparse], dtype: npt.DTypeLike
 ) -> list[Floating | None]:
-    """Weights of each population to itself, (from, to), all planes together; None if it does not hear itself."""
+    """Weights of each population to itself, (from, to), all planes together; None if it is not recurrent."""
     found: list[Floating | None] = [None] * len(network.populations)
     for p in network.projections:
         if p.pre == p.post:

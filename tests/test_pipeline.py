@@ -57,7 +57,7 @@ def test_the_passes_run_in_order_and_hand_on_what_they_make():
     assert tuple(done.netlist.core_tile) == done.placement.tiles
     assert (done.core_bound, done.netlist.n_cores) == (1, 1)
     assert all(use.used <= use.allowed for use in done.uses)
-    assert done.netlist.provenance == {}
+    assert done.netlist.provenance == {"compensated": []}
     assert (done.layout, done.layout.expected) == (done.usual, None)
 
 

@@ -1,4 +1,4 @@
-"""Leave out what provably does nothing: neurons that can never fire, neurons that nobody hears.
+"""Leave out what provably does nothing: neurons that can never fire, neurons that no neuron receives.
 
 The bounds hold for any input, so every spike that is left is as before. A neuron that cannot fire in the float model
 is taken out before rounding: its weights then no longer take room in the accumulators of its listeners, whose scales
@@ -73,7 +73,7 @@ def never_fires(network: Network) -> Masks:
 def _grown(network: Network | IntegerNetwork, post: int, judge: Callable[[Mask], Mask]) -> Mask:
     """Neurons of a population that `judge` finds to do nothing, given those of them that are known to do nothing.
 
-    What it finds is known from then on, until nothing more is found; at once where the population does not hear itself.
+    What it finds is known from then on, until nothing more is found; at once where the population is not recurrent.
     """
     found = judge(np.zeros(network.populations[post].size, np.bool_))
     if any(p.pre == p.post == post for p in network.projections):
@@ -89,11 +89,11 @@ def _never_fires(network: Network, post: int, silent: Mapping[int, Mask]) -> Mas
     inputs = 0
     for p in network.projections:
         if p.post == post:
-            heard = (~silent[p.pre]).astype(np.float64)
+            fires = (~silent[p.pre]).astype(np.float64)
             for rows in row_parts(p.weight):
                 weight = p.weight[rows]
-                up[rows] += weight.maximum(0) @ heard
-                total[rows] += abs(weight) @ heard
+                up[rows] += weight.maximum(0) @ fires
+                total[rows] += abs(weight) @ fires
             inputs += p.weight.shape[1]
     lasts = population.alpha * (1 + 8 * FLOAT32_ROUNDING)
     gathered = np.inf if lasts >= 1 else 1 / (1 - lasts)
@@ -141,7 +141,7 @@ def disconnect(network: Network, gone: Masks) -> Network:
 
 
 def removable(network: IntegerNetwork) -> tuple[Masks, Masks]:
-    """Neurons that the chip need not hold: those that no input can make fire, and others that nobody hears.
+    """Neurons that the chip need not hold: those that no input can make fire, and others that no neuron receives.
 
     Neurons that vote are never among them, and every population keeps one neuron.
 
@@ -186,15 +186,15 @@ def _silent(network: IntegerNetwork, post: int, silent: Mapping[int, Mask]) -> M
 
 def _unreceived(network: IntegerNetwork, pre: int, silent: Mapping[int, Mask], unreceived: Mapping[int, Mask]) -> Mask:
     """Neurons of one population, not silent, without a vote or a synapse to one that is neither."""
-    heard = np.full(network.populations[pre].size, pre == network.readout.population)
+    received = np.full(network.populations[pre].size, pre == network.readout.population)
     for p in network.projections:
         if p.pre == pre:
             listens = ~(silent[p.post] | unreceived[p.post])
             for rows in row_parts(p.weight):
                 weight = p.weight[rows]
                 counts = np.repeat(listens[rows], np.diff(weight.indptr)) & (weight.data != 0)
-                heard[weight.indices[counts]] = True
-    return ~heard & ~silent[pre]
+                received[weight.indices[counts]] = True
+    return ~received & ~silent[pre]
 
 
 def _cannot_reach(population: IntegerPopulation, inflow: npt.NDArray[np.float64]) -> Mask:

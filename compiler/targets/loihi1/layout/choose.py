@@ -235,5 +235,5 @@ def _least_energy(forecast: Forecast, parts: Partition) -> float:
 def _cost(forecast: Forecast, chunk: Chunk) -> float:
     """Joules of a step that the synapses of a chunk on a core of its own and the packets to it cost."""
     _, spent = forecast.listening(chunk, 0, lean=forecast.needs.lean((chunk,)))
-    packets = sum(float(forecast.rates[pre] @ axons) for pre, axons in forecast.needs.heard([chunk]).items())
+    packets = sum(float(forecast.rates[pre] @ axons) for pre, axons in forecast.needs.source_axons([chunk]).items())
     return spent + forecast.joule("packet") * packets

@@ -198,7 +198,7 @@ class Needs:
         """Charge no source with any output axon."""
         self.out_axons = [np.zeros(population.size, np.int64) for population in self.network.populations]
 
-    def heard(self, chunks: Iterable[Chunk]) -> dict[int, IntArray]:
+    def source_axons(self, chunks: Iterable[Chunk]) -> dict[int, IntArray]:
         """Output axons that the sources of chunks need, one for each of their lists, by population."""
         axons: dict[int, IntArray] = {}
         for chunk in chunks:
@@ -210,7 +210,7 @@ class Needs:
 
     def listen(self, chunks: Iterable[Chunk]) -> None:
         """Charge the sources of chunks with these."""
-        for pre, axons in self.heard(chunks).items():
+        for pre, axons in self.source_axons(chunks).items():
             self.out_axons[pre] += axons
 
 

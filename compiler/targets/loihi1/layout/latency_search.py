@@ -93,7 +93,7 @@ class _Cut:
 
     chunks: list[Chunk]
     slowest: FloatArray
-    heard: dict[int, IntArray]
+    source_axons: dict[int, IntArray]
 
 
 def _useful(size: int, most: int) -> list[int]:
@@ -128,11 +128,11 @@ class _Search:
             self._cuts[key] = None
             if chunks:
                 slowest = np.max([_busy(self.forecast, (chunk,)) for chunk in chunks], axis=0)
-                self._cuts[key] = _Cut(chunks=chunks, slowest=slowest, heard=needs.heard(chunks))
+                self._cuts[key] = _Cut(chunks=chunks, slowest=slowest, source_axons=needs.source_axons(chunks))
         return self._cuts[key]
 
     def _listen(self, found: _Cut) -> None:
-        for pre, axons in found.heard.items():
+        for pre, axons in found.source_axons.items():
             self.forecast.needs.out_axons[pre] += axons
 
     def attempt(self, least: dict[int, int]) -> _Trial | None:

@@ -74,7 +74,7 @@ def _charged(needs: Needs, population: int, again: Callable[[], Cut]) -> Cut:
         while True:
             needs.out_axons[population] = others + charged
             chunks, why = again()
-            own = needs.heard(chunks).get(population, charged)
+            own = needs.source_axons(chunks).get(population, charged)
             if why or np.all(own <= charged):
                 return chunks, why
             charged = np.maximum(charged, own)
