@@ -47,14 +47,7 @@ SEARCHED = np.linspace(0.1, 1.0, 19)
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Levels:
-    """Weights as whole multiples of a step of each neuron.
-
-    Parameters
-    ----------
-    level : (neurons, inputs) float32
-        Whole numbers.
-    step : (neurons,) float32
-    """
+    """Weights as whole multiples, `level` (neurons, inputs), of a `step` (neurons,) of each neuron; float32."""
 
     level: npt.NDArray[np.float32]
     step: npt.NDArray[np.float32]
@@ -87,17 +80,9 @@ def codebook(weight: FloatArray, copies: int) -> Levels:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Layer:
-    """Neurons that spike where the sum of their levels reaches their threshold.
+    """Neurons that spike where the sum of their levels (neurons, inputs) reaches their threshold (neurons,).
 
-    Parameters
-    ----------
-    name : str
-    level : (neurons, inputs) int64
-    threshold : (neurons,) int64
-    copies : int
-        Axons of an input.
-    width : int
-        Inputs that are added up together; fewer than there are where the sum travels in time.
+    An input has `copies` axons; `width` inputs are added up together, fewer than all where the sum travels in time.
     """
 
     name: str
@@ -120,15 +105,7 @@ class Layer:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LevelNetwork:
-    """A chain of history-free layers in whole numbers.
-
-    Parameters
-    ----------
-    taxels, polarities, classes : int
-    layers : tuple of Layer
-    label : (voters,) int64
-        Class that each neuron of the last layer votes for.
-    """
+    """A chain of history-free layers in whole numbers; `label` (voters,) is what each of the last votes for."""
 
     taxels: int
     polarities: int
@@ -138,14 +115,7 @@ class LevelNetwork:
 
 
 def group_width(copies: int, chip: Target) -> int:
-    """Inputs of a group, with the axons of a clock beside.
-
-    Examples
-    --------
-    >>> from spikeloom.compiler.targets.base import load_target
-    >>> [group_width(copies, load_target("truenorth")) for copies in (2, 3)]
-    [126, 84]
-    """
+    """Inputs of a group, with the axons of a clock beside: 126 with two axons each, 84 with three."""
     return (chip.limit("core.axons") - EMPTYING) // copies
 
 
@@ -227,17 +197,7 @@ def gate_axons(groups: int, least: int = 0) -> tuple[int, int]:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Run:
-    """What a network in levels does.
-
-    Parameters
-    ----------
-    spikes : tuple of (steps, neurons) bool
-        By layer.
-    partial, saturated : tuple of int
-        Partial sums of each layer that travel in time, and those beyond what can be sent.
-    largest : tuple of int
-        Largest magnitude of one.
-    """
+    """Spikes (steps, neurons) by layer; its partial sums that travel in time, those that saturate, the largest."""
 
     spikes: tuple[BoolArray, ...]
     partial: tuple[int, ...]

@@ -48,22 +48,9 @@ PART = 4
 class Engine:
     """A netlist prepared for the kernel by :func:`prepare`; holds no state and can be shared by threads.
 
-    Parameters
-    ----------
-    netlist : Netlist
-        What it was made from.
-    blocks : Blocks or None
-        What the kernel of layers reads.
-    tables : Tables or None
-        What the kernel of steps reads; None where the other one does.
-    negative : (entries,) like the tables' weights, or None
-        Packed magnitudes of negative weights; None where no register can overflow, whatever the input.
-    drain : int
-        Chip steps that a recording takes beyond its data steps.
-    charges : Charges or None
-        What events add to sums of each chip step.
-    rows : ChargeRows or None
-        The same for the kernel of layers.
+    The kernel of layers reads `blocks` and `rows`, that of steps `tables`, `negative` (packed magnitudes of negative
+    weights; None where no register can overflow) and `charges`, what events add to sums of each chip step. A recording
+    takes `drain` chip steps beyond its data steps.
     """
 
     netlist: Netlist

@@ -33,11 +33,6 @@ class Stream:
     """State of one grasp on one sensor; made by :func:`open_stream`.
 
     Streams of one engine share nothing that changes: several may take turns, or run in a thread each.
-
-    Parameters
-    ----------
-    engine : Engine
-        The prepared network.
     """
 
     __slots__ = ("_bounds", "_column", "_ended", "_engine", "_place", "_state")

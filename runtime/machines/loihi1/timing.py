@@ -45,16 +45,8 @@ EAST, WEST, NORTH, SOUTH, PORTS = range(5)
 class Clock:
     """A netlist prepared for the time models by :func:`prepare`.
 
-    Parameters
-    ----------
-    netlist : Netlist
-        What it was made from.
-    tables : Tables
-        What the kernels read.
-    core_tile : (cores,) int64
-        Tiles of the netlist's cores, then of those that hold input channels.
-    barrier : int
-        Picoseconds that end each step.
+    `core_tile` has the tiles of the netlist's cores, then of those that hold input channels; `barrier` are the
+    picoseconds that end each step.
     """
 
     netlist: Netlist
@@ -149,12 +141,8 @@ def prepare(
 
     Parameters
     ----------
-    netlist : Netlist
-        The placed network.
-    target : Target
-        Its chip.
-    table : TimeTable
-        One of the chip's time tables.
+    netlist, target, table
+        The placed network, its chip, and one of that chip's time tables.
     input_tiles : tuple of int
         Tiles of cores that hold the input channels, as many on each as it has room for; empty if no core holds them.
     dense : (synapses,) bool, optional
@@ -259,7 +247,6 @@ def simple_times(clock: Clock, sums: IntArray, sweep: IntArray, steps: IntArray)
     Parameters
     ----------
     clock : Clock
-        The prepared netlist.
     sums : (samples, chip steps, 2 * cores) int64
         Picoseconds of each core's sweep and sending, then of its receiving.
     sweep : (cores,) int64
@@ -289,7 +276,6 @@ def detailed(
     Parameters
     ----------
     clock : Clock
-        The prepared netlist.
     spikes, updated : (samples, chip steps, compartments) bool
         What a simulator found, see :class:`trace.Trace`.
     events : (samples, n_inputs, T) uint8 or bool
