@@ -22,8 +22,7 @@ from spikeloom.models.recordings.release import write_event_lines, write_release
 from spikeloom.runtime.cli import main
 from spikeloom.runtime.inputs.recordings import require_bins
 from spikeloom.runtime.studies.chart import work as chart_work
-from spikeloom.runtime.studies.stress import disturbances
-from spikeloom.runtime.studies.stress import runs as stress_runs
+from spikeloom.runtime.studies.stress import bench, disturbances
 
 BINS = 3
 
@@ -229,7 +228,7 @@ def test_what_is_done_to_recordings_is_done_before_they_are_joined():
     events = np.zeros((1, 1, 2, 7), np.uint8)
     events[..., 4] = 1
     netlist = SimpleNamespace(bins=3, clocks=NO_CLOCKS)
-    late = stress_runs.whole(disturbances.start_late(events, 2), netlist, np.array([7]))
+    late = bench.whole(disturbances.start_late(events, 2), netlist, np.array([7]))
     assert late.events.tolist() == [[[0, 0, 1]] * 2]
     assert late.lengths.tolist() == [3]
 

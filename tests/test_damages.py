@@ -19,7 +19,7 @@ from spikeloom.runtime.equivalence import float_engine
 from spikeloom.runtime.machines.loihi1 import engine, spec
 from spikeloom.runtime.machines.loihi1.blocks import lay_out_blocks
 from spikeloom.runtime.studies.stress import damages, other_networks
-from spikeloom.runtime.studies.stress.damages import Pair
+from spikeloom.runtime.studies.stress.pair import Pair
 
 
 def made(seed=0, recipe=None, taxels=6):
@@ -309,4 +309,4 @@ def test_a_bias_that_no_register_holds_is_said(monkeypatch):
     with pytest.raises(OptionError) as caught:
         other_networks.stored_alike(pair, replace(pair.network, populations=populations))
     assert str(caught.value).startswith("conv1: ")
-    assert str(caught.value).endswith("; leave this perturbation away")
+    assert str(caught.value).endswith("; omit this perturbation")

@@ -15,6 +15,7 @@ from spikeloom.runtime.machines.loihi1.costs.result import CostReport
 from spikeloom.runtime.machines.loihi1.description import NetlistFacts
 from spikeloom.runtime.report.encode import OPTIONAL, key
 from spikeloom.runtime.studies.chart.results import Chart
+from spikeloom.runtime.studies.stress.results import Stress
 
 Floats = npt.NDArray[np.floating]
 
@@ -282,7 +283,7 @@ class Report:
     recording: Recording
     costs: CostReport
     provenance: Provenance
-    stress: Any = field(default=None, metadata=OPTIONAL)
+    stress: Stress | None = field(default=None, metadata=OPTIONAL)
     chart: Chart | None = field(default=None, metadata=OPTIONAL)
     explained_cost: Any = field(default=None, metadata=OPTIONAL)
     output: str

@@ -14,13 +14,14 @@ from spikeloom.runtime.equivalence.sections import sections as verdict_sections
 from spikeloom.runtime.machines.loihi1 import description
 from spikeloom.runtime.machines.loihi1.costs.result import CostReport
 from spikeloom.runtime.machines.loihi1.costs.sections import sections as cost_sections
-from spikeloom.runtime.page import pictures, stress
+from spikeloom.runtime.page import pictures
 from spikeloom.runtime.page.results import LayerSpikes, Provenance, Recording, Report, Trace
 from spikeloom.runtime.report import drawing
 from spikeloom.runtime.report.drawing import Drawing
 from spikeloom.runtime.report.numbers import percent, si
 from spikeloom.runtime.report.sections import Block, Code, Details, Facts, Figure, Section, Table, Text
 from spikeloom.runtime.studies.chart.sections import figures, saved, taken
+from spikeloom.runtime.studies.stress.sections import stability
 
 LISTED = 10
 """Rows that a terminal shows of a table that is sorted by weight."""
@@ -51,7 +52,7 @@ def sections(report: Report) -> list[Section]:
         Section("Taxels", _taxels(report)),
         Section("One recording", _recording(report.recording)),
         Section("Energy and time", [*cost_sections(report.costs), *_costs(report.costs), *_by_step(report.recording)]),
-        Section("Stability", [] if report.stress is None else stress.sections(report.stress)),
+        Section("Stability", [] if report.stress is None else stability(report.stress)),
         Section("Configurations", _configurations(report)),
         Section("Provenance", _provenance(report.provenance)),
     ]

@@ -394,8 +394,8 @@ LOOKS: Mapping[str, tuple[str, str, Any]] = {"float": (FLOAT, "s", (0, (5, 2))),
 @styled
 def curves(title: str, panels: Sequence[Curves], *, across: int = 3, names: int = 6) -> Drawing:
     """Panels of curves with intervals; at most so many `names` of levels below each."""
-    across = min(across, len(panels))
-    down = -(-len(panels) // across)
+    across = max(min(across, len(panels)), 1)
+    down = max(-(-len(panels) // across), 1)
     drawing = sheet(title, 2.3 * down + 0.4, width=max(WIDTH, 3.2 * across))
     rows = drawing.figure.subplots(down, across, squeeze=False, sharey=True)
     for axes in rows.flat[len(panels) :]:

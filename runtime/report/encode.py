@@ -97,7 +97,8 @@ def decode(kind: type[Result], value: Any) -> Result:
 def _decoded(kind: Any, value: Any) -> Any:
     origin, inner = get_origin(kind), get_args(kind)
     if origin in (Union, UnionType):
-        return None if value is None else _decoded(next(each for each in inner if each is not NoneType), value)
+        known = value is None or type(value) in inner
+        return value if known else _decoded(next(each for each in inner if each is not NoneType), value)
     if is_dataclass(kind):
         return decode(kind, value)  # type: ignore[arg-type]
     if isinstance(origin, type) and issubclass(origin, Mapping):

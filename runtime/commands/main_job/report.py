@@ -66,15 +66,15 @@ def run(arguments: argparse.Namespace) -> Outcome:
     SpikeloomError
         If an option, the netlist, the checkpoint or the recordings cannot be used, or do not belong together.
     """
-    from spikeloom.runtime.page import stress
     from spikeloom.runtime.page.sections import about, sections
+    from spikeloom.runtime.studies.stress.results import read_stress
 
     require_place(arguments.output, "-o", arguments)
     netlist = read_netlist(arguments.netlist)
     battery = None
     if arguments.stress is not None:
         sha256 = hashlib.sha256(Path(arguments.netlist).read_bytes()).hexdigest()
-        battery = stress.read_stress(arguments.stress, arguments.netlist, sha256)
+        battery = read_stress(arguments.stress, arguments.netlist, sha256)
     loaded = load_network(arguments.checkpoint, arguments, netlist)
     _require_origin(arguments, netlist, loaded)
     chart = None if arguments.chart is None else read_chart(arguments.chart, loaded.sha256, arguments.checkpoint)

@@ -1,39 +1,152 @@
-"""What ``stress`` works on, from its options: netlist, float network, sensor and recordings."""
+"""What ``stress`` works on: netlist and float network, sensor and recordings; and how recordings become inputs."""
 
 from __future__ import annotations
 
 import argparse
 import hashlib
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
+from spikeloom.compiler import Netlist, read_netlist
+from spikeloom.compiler.checkpoint import Checkpoint
+from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.systems import GRAPH_SYSTEMS
-from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
-from spikeloom.compiler.version import __version__
 from spikeloom.models.graphs import NEUTOUCH
+from spikeloom.models.recordings.events import join_bins
 from spikeloom.models.sensors import read_layout, sensor_graph
 from spikeloom.runtime.equivalence.reference import require_match
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import load_recordings
-from spikeloom.runtime.studies.stress.damages import Pair
-from spikeloom.runtime.studies.stress.perturbation import Sensor
-from spikeloom.runtime.studies.stress.runs import Bench
-from spikeloom.runtime.studies.stress.side_by_side import ready
+from spikeloom.runtime.studies.stress.disturbances import Events
+from spikeloom.runtime.studies.stress.pair import Inputs, Pair, Ready, ready
 
-Json = dict[str, Any]
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Sensor:
+    """What perturbations must know beside the network.
+
+    Parameters
+    ----------
+    distance : (taxels, taxels) float64
+        In millimetres, or in steps on the graph where positions are not known.
+    places : (taxels, dimensions) float64, or None
+        Positions in millimetres.
+    edges : (edges, 2) int64, or None
+        Graph that the network was trained on.
+    checkpoint : Checkpoint or None
+        What the network was made from; None for an ONNX or NIR file.
+    """
+
+    distance: FloatArray
+    places: FloatArray | None
+    edges: IntArray | None
+    checkpoint: Checkpoint | None
+
+    @property
+    def taxels(self) -> int:
+        """Number of taxels."""
+        return len(self.distance)
+
+    def digest(self) -> str:
+        """Hash over distances and edges."""
+        edges = b"" if self.edges is None else self.edges.tobytes()
+        return hashlib.sha256(self.distance.tobytes() + edges).hexdigest()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Bench:
+    """What is stressed, and on what.
+
+    Parameters
+    ----------
+    pair : Pair
+        As compiled.
+    ready : Ready
+        The same, prepared.
+    sensor : Sensor
+    events : (recordings, taxels, polarities, T) uint8
+        In the bins of the recordings, which are disturbed before a network joins them.
+    labels : (recordings,) int64
+    files : tuple of str
+    lengths : (recordings,) int64
+        Bins of each.
+    """
+
+    pair: Pair
+    ready: Ready
+    sensor: Sensor
+    events: Events
+    labels: IntArray
+    files: tuple[str, ...]
+    lengths: IntArray
+
+    def steps(self) -> tuple[Events, IntArray]:
+        """Recordings in steps of the network, and how many steps each has."""
+        bins = self.pair.netlist.bins
+        return join_bins(self.events, bins), -(-self.lengths // bins)
+
+
+# -- inputs ------------------------------------------------------------------------------------------------------------
+
+
+def whole(events: Events, netlist: Netlist, lengths: IntArray) -> Inputs:
+    """Recordings from their first bin on."""
+    joined = with_clocks(join_bins(events, netlist.bins), netlist.clocks)
+    return Inputs(events=joined, lengths=-(-lengths // netlist.bins), begin=np.zeros_like(lengths))
+
+
+def by_length(events: Events, lengths: IntArray, change: Callable[[Events], Events]) -> Events:
+    """Disturb recordings of equal length together, none beyond its own."""
+    changed = np.zeros_like(events)
+    for length in np.unique(lengths).tolist():
+        those = np.flatnonzero(lengths == length)
+        changed[those, ..., :length] = change(events[those, ..., :length])
+    return changed
+
+
+def after_others(bench: Bench, before: int, rng: np.random.Generator) -> Inputs:
+    """Each recording after some others without a reset; clocks start again with each."""
+    steps, lengths = bench.steps()
+    flat = with_clocks(steps, bench.pair.netlist.clocks)
+    order = np.stack([rng.permutation(len(flat)) for _ in range(before)] + [np.arange(len(flat))], axis=1)
+    length = lengths[order].sum(axis=1)
+    events = np.zeros((len(flat), flat.shape[1], int(length.max())), np.uint8)
+    for i, parts in enumerate(order.tolist()):
+        one = np.concatenate([flat[part, :, : lengths[part]] for part in parts], axis=1)
+        events[i, :, : one.shape[1]] = one
+    return Inputs(events=events, lengths=length, begin=length - lengths)
+
+
+def going_round(bench: Bench, rounds: int) -> Inputs:
+    """Each recording again and again without a reset; clocks run on and end, as they would."""
+    steps, lengths = bench.steps()
+    events = np.zeros((*steps.shape[:3], steps.shape[3] * rounds), np.uint8)
+    for i, length in enumerate(lengths.tolist()):
+        events[i, ..., : length * rounds] = np.tile(steps[i, ..., :length], rounds)
+    begin = lengths * (rounds - 1)
+    return Inputs(events=with_clocks(events, bench.pair.netlist.clocks), lengths=lengths * rounds, begin=begin)
+
+
+# -- from files --------------------------------------------------------------------------------------------------------
 
 
 def bench_of(arguments: argparse.Namespace) -> tuple[Bench, LoadedNetwork, str]:
-    """Everything that is stressed, the float network, and a hash of the recordings."""
+    """Everything that is stressed, the float network, and a hash of the recordings.
+
+    Raises
+    ------
+    SpikeloomError
+        If a file cannot be used, or they do not belong together.
+    """
     netlist = read_netlist(arguments.netlist)
-    asked = load_network(arguments.checkpoint, arguments, netlist)
-    require_match(netlist, asked.model)
+    loaded = load_network(arguments.checkpoint, arguments, netlist)
+    require_match(netlist, loaded.model)
     data = load_recordings(arguments, netlist, labels_for="stress", joined=False)
-    pair = Pair(netlist=netlist, network=asked.network)
-    places, edges = _places(arguments, netlist.taxels), _edges(arguments, asked)
+    pair = Pair(netlist=netlist, network=loaded.network)
+    places, edges = _places(arguments, netlist.taxels), _edges(arguments, loaded.checkpoint)
     digest = hashlib.sha256()
     for array in data.identity().values():
         digest.update(np.ascontiguousarray(array).tobytes())
@@ -41,14 +154,14 @@ def bench_of(arguments: argparse.Namespace) -> tuple[Bench, LoadedNetwork, str]:
         pair=pair,
         ready=ready(pair),
         sensor=Sensor(
-            distance=distances(netlist.taxels, places, edges), places=places, edges=edges, checkpoint=asked.checkpoint
+            distance=distances(netlist.taxels, places, edges), places=places, edges=edges, checkpoint=loaded.checkpoint
         ),
         events=data.events,
         labels=data.labels,
         files=data.files,
         lengths=np.full(len(data), data.steps) if data.lengths is None else np.asarray(data.lengths),
     )
-    return bench, asked, digest.hexdigest()
+    return bench, loaded, digest.hexdigest()
 
 
 def _places(arguments: argparse.Namespace, taxels: int) -> FloatArray | None:
@@ -58,9 +171,8 @@ def _places(arguments: argparse.Namespace, taxels: int) -> FloatArray | None:
     return NEUTOUCH if taxels == len(NEUTOUCH) and not arguments.edges else None
 
 
-def _edges(arguments: argparse.Namespace, asked: LoadedNetwork) -> IntArray | None:
+def _edges(arguments: argparse.Namespace, checkpoint: Checkpoint | None) -> IntArray | None:
     """Edges of the taxel graph, where there is one."""
-    checkpoint = asked.checkpoint
     if checkpoint is None or checkpoint.system not in GRAPH_SYSTEMS:
         return None
     if checkpoint.edges is not None:
@@ -86,21 +198,5 @@ def distances(taxels: int, places: FloatArray | None, edges: IntArray | None) ->
         hops: FloatArray = csgraph.shortest_path(graph, directed=False, unweighted=True)
         return hops
     where = np.arange(float(taxels))[:, None] if places is None else places
-    found: FloatArray = np.linalg.norm(where[:, None] - where, axis=2)
-    return found
-
-
-def facts_of(arguments: argparse.Namespace, asked: LoadedNetwork, data: str) -> Json:
-    """What the runs depend on beside perturbation, level and seed."""
-    return {
-        "spikeloom": __version__,
-        "netlist_sha256": hashlib.sha256(Path(arguments.netlist).read_bytes()).hexdigest(),
-        "checkpoint_sha256": asked.sha256,
-        **asked.read_as,
-        "graph": asked.graph,
-        "data_sha256": data,
-        "netlist": Path(arguments.netlist).name,
-        "checkpoint": Path(arguments.checkpoint).name,
-        "data": Path(arguments.data).name,
-        "split": arguments.split,
-    }
+    apart: FloatArray = np.linalg.norm(where[:, None] - where, axis=2)
+    return apart

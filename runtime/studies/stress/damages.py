@@ -7,13 +7,14 @@ neuron that the chip does not hold stays as it is in the float network.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
+from spikeloom.compiler import Netlist
 from spikeloom.compiler.fixedpoint import (
     DECAY_BITS,
     THRESHOLD_MANTISSA_MAX,
@@ -25,18 +26,10 @@ from spikeloom.compiler.fixedpoint import (
     weight_step,
 )
 from spikeloom.compiler.ir import INPUT, Network, Population, Projection
-from spikeloom.compiler.targets.loihi1.netlist import Netlist, in_units
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import decay_registers
+from spikeloom.runtime.studies.stress.pair import Pair
 
 Mask = npt.NDArray[np.bool_]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Pair:
-    """A netlist and the float network beside it, of the same populations."""
-
-    netlist: Netlist
-    network: Network
 
 
 # -- weights -----------------------------------------------------------------------------------------------------------
@@ -48,10 +41,10 @@ def with_weights(pair: Pair, weight: npt.NDArray[Any]) -> Pair:
     Entries in which nothing changes keep their float weight, bit for bit.
     """
     netlist, network = pair.netlist, pair.network
+    stored = replace(netlist, synapse_weight=frozen(weight.astype(netlist.synapse_weight.dtype)))
     moved = np.flatnonzero(weight != netlist.synapse_weight)
     axon = netlist.axon_of_synapse()[moved]
-    exponent = netlist.format_exponent[netlist.axon_format[axon]]
-    units = in_units(weight[moved], exponent) - in_units(netlist.synapse_weight[moved], exponent)
+    units = stored.effective_weight()[moved] - netlist.effective_weight()[moved]
     target = netlist.synapse_compartment()[moved]
     source = netlist.axon_source[axon]
     inner = source >= netlist.n_inputs
@@ -64,10 +57,7 @@ def with_weights(pair: Pair, weight: npt.NDArray[Any]) -> Pair:
         own = (post == projection.post) & (pre == projection.pre)
         more = sparse.csr_array((step[own], (row[own], column[own])), shape=projection.weight.shape)
         projections.append(replace(projection, weight=projection.weight + more if own.any() else projection.weight))
-    stored = frozen(weight.astype(netlist.synapse_weight.dtype))
-    return Pair(
-        netlist=replace(netlist, synapse_weight=stored), network=replace(network, projections=tuple(projections))
-    )
+    return Pair(netlist=stored, network=replace(network, projections=tuple(projections)))
 
 
 def _codes(netlist: Netlist) -> tuple[IntArray, IntArray]:
@@ -117,7 +107,7 @@ def hidden(pair: Pair) -> IntArray:
 
 
 def stick_neurons(pair: Pair, share: float, rng: np.random.Generator, *, firing: bool) -> Pair:
-    """Some hidden neurons never fire, or fire in every step, whatever they hear."""
+    """Some hidden neurons never fire, or fire in every step, whatever reaches them."""
     netlist = pair.netlist
     among = hidden(pair)
     stuck = np.zeros(netlist.n_compartments, np.bool_)
@@ -192,7 +182,7 @@ def shorten_decay(pair: Pair, factor: float) -> Pair:
 
 
 def open_late(pair: Pair, steps: int) -> Pair:
-    """All layers but the first open their windows later: they miss the first steps of what they hear.
+    """All layers but the first open their windows later: they miss the first steps of their input.
 
     The float network needs no change: :func:`float_engine.prepare` takes depths from the netlist.
     """
@@ -209,7 +199,7 @@ def _neurons(netlist: Netlist, flags: Mask, layer: int) -> Mask:
 
 
 def _rows_scaled(network: Network, factors: list[FloatArray]) -> Network:
-    """Multiply what each neuron hears by a factor of its own."""
+    """Multiply the input of each neuron by a factor of its own."""
 
     def scaled(projection: Projection) -> Projection:
         weight = projection.weight.copy()

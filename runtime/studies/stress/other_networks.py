@@ -1,29 +1,19 @@
 """Another float network stored on the scales of a netlist: on a taxel graph that went wrong, or with outlier weights.
 
 Compiling anew would choose other scales and cores; here nothing changes but what the other network changes. The result
-is a netlist to simulate, not one to load: it is not cut to the size of cores.
+is a netlist to simulate, not one to load: its cores may need more than there is.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
-from scipy import sparse
 
+from spikeloom.compiler import Netlist
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.fixedpoint import (
-    ONE_STEP_SUM_MAX,
-    IntArray,
-    frozen,
-    read_only,
-    read_only_float,
-    round_half_even,
-)
+from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX, IntArray, round_half_even
 from spikeloom.compiler.ir import (
-    INPUT,
     Form,
     IntegerNetwork,
     IntegerPopulation,
@@ -32,9 +22,12 @@ from spikeloom.compiler.ir import (
     Population,
     Projection,
 )
-from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.targets.base import load_target
+from spikeloom.compiler.targets.loihi1.emit import emit
+from spikeloom.compiler.targets.loihi1.layout.core_needs import Chunk
+from spikeloom.compiler.targets.loihi1.layout.partition import Partition
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import loads, round_population
-from spikeloom.runtime.studies.stress.damages import Pair
+from spikeloom.runtime.studies.stress.pair import Pair
 
 
 def stored_alike(pair: Pair, network: Network, *, coarser: int = 1) -> Pair:
@@ -65,7 +58,7 @@ def stored_alike(pair: Pair, network: Network, *, coarser: int = 1) -> Pair:
         try:
             integer, planes = _fitted(population, into, form)
         except ValueError as error:
-            raise OptionError(f"{population.name}: {error}; leave this perturbation away") from error
+            raise OptionError(f"{population.name}: {error}; omit this perturbation") from error
         populations.append(integer)
         projections += planes
     whole = IntegerNetwork(
@@ -92,59 +85,16 @@ def _fitted(
 
 
 def unplaced(network: IntegerNetwork, like: Netlist) -> Netlist:
-    """A netlist to simulate, not to load: each population on a core of its own, whatever a core holds.
-
-    Parameters
-    ----------
-    network : IntegerNetwork
-        Integer stage.
-    like : Netlist
-        Whose layers, depths and provenance it takes.
-    """
-    sizes = [population.size for population in network.populations]
-    first = np.cumsum([0, *sizes])
-    axons: list[tuple[IntArray, IntArray, int]] = []
-    parts: dict[str, list[npt.NDArray[Any]]] = {"target": [], "weight": []}
-    forms: dict[tuple[int, int], int] = {}
-    per_core = np.zeros(len(sizes), np.int64)
-    for projection in sorted(network.projections, key=lambda p: p.post):
-        columns = sparse.csc_array(projection.weight)
-        length = np.diff(columns.indptr)
-        source = np.flatnonzero(length)
-        per_core[projection.post] += len(source)
-        form = forms.setdefault((projection.bits, projection.exponent), len(forms))
-        base = 0 if projection.pre == INPUT else network.input.size + first[projection.pre]
-        axons.append((source + base, length[source], form))
-        parts["target"].append(columns.indices.astype(np.int32))
-        parts["weight"].append(columns.data.astype(np.int16))
-    populations = network.populations
-    votes = np.full(first[-1], -1)
-    votes[first[network.readout.population] :][: len(network.readout.label)] = network.readout.label
-    lengths = np.concatenate([length for _, length, _ in axons])
-    return replace(
-        like,
-        layers=tuple(replace(layer, unheard=()) for layer in like.layers),
-        core_tile=read_only(range(len(sizes))),
-        core_compartments=read_only(first),
-        core_axons=read_only(np.append(0, np.cumsum(per_core))),
-        layer=read_only(np.repeat(np.arange(len(sizes)), sizes)),
-        neuron=read_only(np.concatenate([np.arange(size) for size in sizes])),
-        decay_u=read_only(np.repeat([population.decay_u for population in populations], sizes)),
-        decay_v=read_only(np.repeat([population.decay_v for population in populations], sizes)),
-        threshold=read_only(np.concatenate([population.threshold for population in populations])),
-        bias_mantissa=read_only(np.concatenate([population.bias_mantissa for population in populations])),
-        bias_exponent=read_only(np.concatenate([population.bias_exponent for population in populations])),
-        scale=read_only_float(np.concatenate([population.scale for population in populations])),
-        readout_class=read_only(votes),
-        axon_source=read_only(np.concatenate([source for source, _, _ in axons])),
-        axon_format=read_only(np.concatenate([np.full(len(source), form) for source, _, form in axons])),
-        axon_synapses=read_only(np.append(0, np.cumsum(lengths))),
-        synapse_target=frozen(np.concatenate(parts["target"])),
-        synapse_weight=frozen(np.concatenate(parts["weight"])),
-        format_weight_bits=read_only([bits for bits, _ in forms]),
-        format_exponent=read_only([exponent for _, exponent in forms]),
-        format_index_bits=read_only([1] * len(forms)),
+    """A netlist to simulate, not to load: cores hold as many compartments as they can, whatever these need."""
+    target = load_target(like.target)
+    most = target.limit("core.compartments")
+    cores = tuple(
+        (Chunk(population=post, first=first, last=min(first + most, population.size)),)
+        for post, population in enumerate(network.populations)
+        for first in range(0, population.size, most)
     )
+    partition = Partition(cores=cores, bound=len(cores))
+    return emit(network, partition, tuple(range(len(cores))), target, like.provenance)
 
 
 def add_outliers(pair: Pair, factor: int, rng: np.random.Generator) -> Pair:

@@ -1,4 +1,4 @@
-"""Float network and chip on the same recordings, both at the engines' pace, compared spike by spike.
+"""A float network and the netlist beside it on the same recordings, compared spike by spike.
 
 What is counted is what spikes after `begin`, so that recordings may follow others without a reset.
 """
@@ -12,12 +12,13 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
+from spikeloom.compiler import Netlist
 from spikeloom.compiler.errors import NumericRangeError
 from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.interpret import vote
+from spikeloom.compiler.ir import Network
 from spikeloom.runtime.equivalence import float_engine
 from spikeloom.runtime.machines.loihi1 import engine
-from spikeloom.runtime.studies.stress.damages import Pair
 
 Words = npt.NDArray[np.uint64]
 
@@ -28,22 +29,25 @@ STOPPED = -1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Ready:
-    """A pair, prepared to run.
+class Pair:
+    """A netlist and the float network beside it, of the same populations."""
 
-    Bits of each layer's compartments in ``Trace.packed``, (layers, words); compartments that vote, and for which class.
-    """
+    netlist: Netlist
+    network: Network
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Ready:
+    """A pair, prepared to run; `masks` (layers, words) uint64 has the bits of a layer's compartments."""
 
     chip: engine.Engine
     model: float_engine.FloatEngine
     masks: Words
-    voters: IntArray
-    label: IntArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Inputs:
-    """Recordings (recordings, channels, T) as channels of a network; steps of each, and the first that counts."""
+    """Channels (recordings, channels, T) uint8; steps of each recording, and the first that counts, (recordings,)."""
 
     events: npt.NDArray[np.uint8]
     lengths: IntArray
@@ -54,8 +58,16 @@ class Inputs:
 class Outcome:
     """What both sides did.
 
-    Votes (recordings, classes) by side; spikes (recordings, layers, 3) of the float network, of the chip, and those in
-    which they differ; where a register of the chip would overflow; membranes that were clipped.
+    Parameters
+    ----------
+    votes : dict of str to (recordings, classes) int64
+        By side.
+    spikes : (recordings, layers, 3) int64
+        Of the float network, of the chip, and those in which they differ.
+    stopped : (recordings,) bool
+        Where a register of the chip would overflow.
+    saturated : (recordings,) int64
+        Membranes that were clipped.
     """
 
     votes: dict[str, IntArray]
@@ -65,60 +77,41 @@ class Outcome:
 
     def decisions(self, side: str) -> IntArray:
         """Class of each recording."""
-        found = vote(self.votes[side])
-        return np.where(self.stopped, STOPPED, found) if side == "chip" else found
+        decided = vote(self.votes[side])
+        return np.where(self.stopped, STOPPED, decided) if side == "chip" else decided
 
 
 def ready(pair: Pair) -> Ready:
     """Prepare a pair for runs."""
     netlist = pair.netlist
     masks = np.zeros((len(netlist.layers), -(-netlist.n_compartments // 64)), np.uint64)
-    seat = np.arange(netlist.n_compartments)
-    np.bitwise_or.at(masks, (netlist.layer, seat // 64), np.left_shift(np.uint64(1), (seat % 64).astype(np.uint64)))
-    voters = np.flatnonzero(netlist.readout_class >= 0)
-    return Ready(
-        chip=engine.prepare(netlist),
-        model=float_engine.prepare(pair.network, netlist),
-        masks=masks,
-        voters=voters,
-        label=netlist.readout_class[voters],
-    )
+    ids = np.arange(netlist.n_compartments)
+    np.bitwise_or.at(masks, (netlist.layer, ids // 64), np.left_shift(np.uint64(1), (ids % 64).astype(np.uint64)))
+    return Ready(chip=engine.prepare(netlist), model=float_engine.prepare(pair.network, netlist), masks=masks)
 
 
-def evaluate(prepared: Ready, inputs: Inputs, *, threads: int = 1) -> Outcome:
+def evaluate(prepared: Ready, inputs: Inputs) -> Outcome:
     """Run both sides from rest."""
     netlist = prepared.chip.netlist
-    model = float_engine.run(prepared.model, inputs.events, lengths=inputs.lengths, begin=inputs.begin, threads=threads)
-    packed, stopped, saturated = _chip(prepared.chip, inputs, threads)
+    model = float_engine.run(prepared.model, inputs.events, lengths=inputs.lengths, begin=inputs.begin, threads=1)
+    packed, stopped, saturated = _chip(prepared.chip, inputs)
     spikes = np.zeros((len(inputs.events), len(netlist.layers), 3), np.int64)
     votes = np.zeros((len(inputs.events), netlist.classes), np.int64)
     depth = np.array([layer.depth for layer in netlist.layers])
-    _tally(
-        packed,
-        model.packed,
-        prepared.masks,
-        depth,
-        inputs.begin,
-        inputs.lengths,
-        prepared.voters,
-        depth[netlist.layer[prepared.voters]],
-        prepared.label,
-        spikes,
-        votes,
-    )
+    voters = np.flatnonzero(netlist.readout_class >= 0)
+    voting = voters, depth[netlist.layer[voters]], netlist.readout_class[voters]
+    _tally(packed, model.packed, prepared.masks, depth, inputs.begin, inputs.lengths, *voting, spikes, votes)
     spikes[:, :, 0] = model.spikes
     spikes[:, :, 2] += model.elsewhere
     return Outcome(votes={"float": model.votes, "chip": votes}, spikes=spikes, stopped=stopped, saturated=saturated)
 
 
-def _chip(prepared: engine.Engine, inputs: Inputs, threads: int) -> tuple[Words, npt.NDArray[np.bool_], IntArray]:
+def _chip(prepared: engine.Engine, inputs: Inputs) -> tuple[Words, npt.NDArray[np.bool_], IntArray]:
     """Packed spikes, which recordings stopped the simulator, and clipped membranes."""
 
     def simulate(part: slice) -> tuple[Words, IntArray]:
-        trace = engine.simulate(
-            prepared, inputs.events[part], lengths=inputs.lengths[part], packed=True, threads=threads
-        )
-        assert trace.packed is not None, "spikes were wanted"
+        trace = engine.simulate(prepared, inputs.events[part], lengths=inputs.lengths[part], packed=True, threads=1)
+        assert trace.packed is not None, "packed spikes"
         return trace.packed, trace.counts.saturations.sum(axis=1)
 
     stopped = np.zeros(len(inputs.events), np.bool_)

@@ -1,0 +1,166 @@
+"""What ``stress`` returns, and how it is read back."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from spikeloom.compiler.errors import DataError
+from spikeloom.runtime.report.encode import OPTIONAL, decode, key
+from spikeloom.runtime.studies.stress.battery import Level
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Run:
+    """Counts over all recordings under one draw of a perturbation.
+
+    Parameters
+    ----------
+    seed : int or None
+        None for the clean recordings.
+    right : mapping
+        Right decisions by side.
+    equal : int
+        Decisions that are the same on both sides.
+    layers : mapping
+        Of each layer: spikes of the float network and of the chip, those in which they differ, entries.
+    signs : mapping
+        Recordings with a sign of breakdown (``no vote``, ``one class``) by side and sign.
+    most : mapping
+        Class that is decided most often by side, and how often.
+    stopped, saturated : int
+        Recordings that overflow a register of the chip, and membranes that it clips.
+    """
+
+    seed: int | None
+    right: Mapping[str, int]
+    equal: int
+    layers: Mapping[str, tuple[int, int, int, int]]
+    signs: Mapping[str, Mapping[str, int]]
+    most: Mapping[str, tuple[int, int]]
+    stopped: int
+    saturated: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Spread:
+    """Mean accuracy over seeds, its 95 % interval, and the accuracy of each seed."""
+
+    mean: float
+    low: float
+    high: float
+    values: tuple[float, ...]
+
+    def meets(self, other: Spread) -> bool:
+        """Whether the intervals overlap."""
+        return max(self.low, other.low) <= min(self.high, other.high)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Point:
+    """One level: accuracies, share of equal decisions, share of spikes in common by layer, and reasons by side."""
+
+    level: Level
+    seeds: tuple[int, ...]
+    model: Spread = field(metadata=key("float"))
+    chip: Spread
+    equal: float
+    common: Mapping[str, float]
+    stopped: int
+    saturated: int
+    why: Mapping[str, tuple[str, ...]]
+
+    def spread(self, side: str) -> Spread:
+        """Accuracy of a side."""
+        return self.chip if side == "chip" else self.model
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Breaks:
+    """First level at which a side leaves the clean interval, and comes down to chance."""
+
+    leaves: Level | None
+    chance: Level | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Curve:
+    """One perturbation from mild to harsh; `breaks` by side."""
+
+    what: str
+    unit: str
+    seeded: bool
+    levels: tuple[Point, ...]
+    breaks: Mapping[str, Breaks]
+    same_place: bool
+    verdict: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Provenance:
+    """What the runs depend on beside perturbation, level and seed: versions, hashes, names of files."""
+
+    spikeloom: str
+    netlist_sha256: str
+    checkpoint_sha256: str
+    dt: float | None = field(default=None, metadata=OPTIONAL)
+    convention: str | None = field(default=None, metadata=OPTIONAL)
+    graph: str | None
+    data_sha256: str
+    netlist: str
+    checkpoint: str
+    data: str
+    split: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Stress:
+    """Where float network and chip break: curves by perturbation, and why others were not measured."""
+
+    recordings: int
+    classes: int
+    seeds: int
+    full: bool
+    clean: Run
+    perturbations: Mapping[str, Curve]
+    not_applicable: Mapping[str, str]
+    required: tuple[str, ...]
+    missed: tuple[str, ...]
+    provenance: Provenance
+
+
+def shown(level: Level) -> str:
+    """A level as it is typed.
+
+    Examples
+    --------
+    >>> shown(3), shown(0.25), shown(1e-4), shown("knn:4")
+    ('3', '0.25', '0.0001', 'knn:4')
+    """
+    return level if isinstance(level, str) else f"{level:g}"
+
+
+def read_stress(path: str, netlist: str, sha256: str) -> Stress:
+    """Read what ``stress -o`` wrote about a netlist of this name and hash.
+
+    Raises
+    ------
+    DataError
+        If the file is not there, something else, or about another netlist.
+    """
+    place = Path(path)
+    if not place.is_file():
+        raise DataError(f"--stress {path}: no such file; write it with spikeloom stress -o")
+    try:
+        result = decode(Stress, json.loads(place.read_bytes()))
+    except (ValueError, TypeError, KeyError) as error:
+        raise DataError(f"--stress {path}: is not what spikeloom stress -o writes; give such a file") from error
+    about = result.provenance.netlist_sha256
+    if about != sha256:
+        raise DataError(
+            f"--stress {path}: is about a netlist of sha256 {about[:12]}…, {netlist} has {sha256[:12]}…; "
+            "stress that one, or report the other"
+        )
+    return result

@@ -1,0 +1,169 @@
+"""What ``stress`` has to say, laid out for terminals and for the page of a network, and its figure."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+
+from spikeloom.runtime.report import drawing
+from spikeloom.runtime.report.intervals import wilson
+from spikeloom.runtime.report.numbers import percent
+from spikeloom.runtime.report.sections import Block, Figure, Section, Table, Text
+from spikeloom.runtime.studies.stress.pair import SIDES
+from spikeloom.runtime.studies.stress.results import Curve, Point, Spread, Stress, shown
+
+ACROSS = 10
+"""Levels side by side at most."""
+
+NONE = "–"
+
+KEY = (
+    "leaves: first level below the clean interval; chance: first level no better than chance; least: fewest decisions "
+    "equal"
+)
+
+CURVE_KEY = """\
+curves in per cent: accuracy ± 95 % interval of the mean over seeds; equal decisions; spikes in common in the layer that
+has fewest of them"""
+
+
+def sections(result: Stress) -> list[Section]:
+    """Clean accuracy, verdicts, every curve, what was not measured, and requirements."""
+    clean, recordings = result.clean, result.recordings
+    lines = [f"{side} accuracy, clean: {percent(clean.right[side], recordings)}" for side in SIDES]
+    lines.append(f"decisions equal, clean: {clean.equal} of {recordings}; chance {100 / result.classes:.1f} %")
+    return [
+        Section("Clean", [Text("\n".join(lines))]),
+        Section("Verdicts", [verdicts(result)]),
+        Section("Key", [Text(f"{KEY}\n{CURVE_KEY}")]),
+        *(
+            Section(name, [Text(_title(name, each)), *curve_tables(each)])
+            for name, each in result.perturbations.items()
+        ),
+        *(Section(name, [Text(text)]) for name, text in _not_measured(result).items()),
+        Section("Required", [Text("\n".join(_required(result)))]),
+    ]
+
+
+def stability(result: Stress) -> list[Section]:
+    """The same for the page of a network: verdicts, and the curves as a figure with their numbers."""
+    recordings = result.recordings
+    clean = {side: 100 * count / recordings for side, count in result.clean.right.items()}
+    title = "Accuracy under each perturbation"
+    numbers = [
+        Table(["", *map(_level, each.levels)], _rows(each.levels), f"{_title(name, each)}, in per cent", most=0)
+        for name, each in result.perturbations.items()
+    ]
+    blocks: list[Block] = [
+        Text(
+            f"{len(result.perturbations)} perturbations on {recordings} recordings, {result.seeds} seeds of each that "
+            f"is left to chance; without any, the float model decides {clean['float']:.1f} % right, the chip "
+            f"{clean['chip']:.1f} %"
+        ),
+        verdicts(result),
+        Text(KEY),
+    ]
+    if numbers:
+        caption = (
+            f"{title} over its level, from mild to harsh, with 95 % intervals. Grey: interval of the clean accuracy on "
+            "the chip; dotted: chance; vertical lines: where the mean leaves the clean interval."
+        )
+        blocks.append(Figure("stress", partial(figure, result, title), caption, numbers))
+    return [Section("", [*blocks, *map(Text, _not_measured(result).values())])]
+
+
+def figure(result: Stress, title: str = "", *, across: int = 3) -> drawing.Drawing:
+    """A panel for each perturbation."""
+    panels = [_panel(result, name, each) for name, each in result.perturbations.items()]
+    return drawing.curves(title, panels, across=across)
+
+
+def picture(result: Stress) -> bytes:
+    """The figure as a PNG that says by itself what it is of."""
+    about, seeds = result.provenance, f"{result.seeds} seed{'s' if result.seeds > 1 else ''}"
+    title = f"{about.netlist} on {result.recordings} recordings of {about.data}, {seeds}; accuracy in per cent"
+    drawn = figure(result, title, across=5)
+    drawn.figure.suptitle(title)
+    return drawn.file("png")
+
+
+def verdicts(result: Stress) -> Table:
+    """One line for each perturbation."""
+    head = ["perturbation", "verdict", "leaves, float", "chip", "chance, float", "chip", "least", "why"]
+    rows = []
+    for name, each in result.perturbations.items():
+        breaks = [each.breaks[side] for side in SIDES]
+        places = [*(one.leaves for one in breaks), *(one.chance for one in breaks)]
+        least = min(point.equal for point in each.levels)
+        shown_places = [NONE if place is None else shown(place) for place in places]
+        rows.append([name, each.verdict, *shown_places, f"{100 * least:.0f} %", why(each)])
+    return Table(head, rows, "Where they break and why", words=True)
+
+
+def why(curve: Curve) -> str:
+    """What is to be seen on the chip where it leaves, or at chance where that says more; on which side it breaks."""
+    chip, words = curve.breaks["chip"], []
+    if not curve.same_place:
+        order = [point.level for point in curve.levels]
+        places = {side: curve.breaks[side].leaves for side in SIDES}
+        ranks = {side: len(order) if place is None else order.index(place) for side, place in places.items()}
+        words.append("chip first" if ranks["chip"] < ranks["float"] else "float first")
+    for place in (chip.chance, chip.leaves):
+        seen = next((point.why["chip"] for point in curve.levels if point.level == place), ())
+        if seen:
+            return "; ".join([*words, *seen])
+    return "; ".join([*words, *([] if chip.leaves is None else ["other spikes, as many"])])
+
+
+def curve_tables(curve: Curve) -> list[Table]:
+    """Levels side by side, accuracies of both sides, equal decisions and common spikes below."""
+    parts = [curve.levels[i : i + ACROSS] for i in range(0, len(curve.levels), ACROSS)]
+    return [Table(["", *map(_level, part)], _rows(part)) for part in parts]
+
+
+def _title(name: str, curve: Curve) -> str:
+    return f"{name}: {curve.what} ({curve.unit})"
+
+
+def _not_measured(result: Stress) -> dict[str, str]:
+    return {name: f"{name}: not measured, {why}" for name, why in result.not_applicable.items()}
+
+
+def _required(result: Stress) -> list[str]:
+    missed = {text.partition(": ")[0]: text for text in result.missed}
+    return [f"required {missed.get(words, f'{words}: kept')}" for words in result.required]
+
+
+def _level(point: Point) -> str:
+    return shown(point.level)
+
+
+def _rows(levels: Sequence[Point]) -> list[list[str]]:
+    rows = [[side, *(_accuracy(point.spread(side)) for point in levels)] for side in SIDES]
+    rows.append(["equal", *(f"{100 * point.equal:.0f}" for point in levels)])
+    rows.append(["spikes", *(f"{100 * min(point.common.values()):.0f}" for point in levels)])
+    return rows
+
+
+def _accuracy(spread: Spread) -> str:
+    """Per cent, with the reach of the interval where there are several seeds."""
+    mean = f"{100 * spread.mean:.0f}"
+    if len(spread.values) == 1:
+        return mean
+    return f"{mean}±{100 * max(spread.high - spread.mean, spread.mean - spread.low):.0f}"
+
+
+def _panel(result: Stress, name: str, curve: Curve) -> drawing.Curves:
+    low, high = wilson(result.clean.right["chip"], result.recordings)
+    order = [point.level for point in curve.levels]
+    ends = {side: [point.spread(side) for point in curve.levels] for side in SIDES}
+    leaves = {side: curve.breaks[side].leaves for side in SIDES}
+    return drawing.Curves(
+        title=f"{name}: {curve.verdict}",
+        axis=curve.unit,
+        levels=[_level(point) for point in curve.levels],
+        sides={side: [(100 * e.low, 100 * e.mean, 100 * e.high) for e in each] for side, each in ends.items()},
+        leaves={side: None if place is None else order.index(place) for side, place in leaves.items()},
+        band=(100 * low, 100 * high),
+        chance=100 / result.classes,
+    )

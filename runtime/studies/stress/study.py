@@ -1,0 +1,313 @@
+"""The study: every perturbation at every level, once for each seed, on both sides at once."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import os
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import redirect_stderr
+from dataclasses import asdict, dataclass, fields, replace
+from functools import lru_cache
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.version import __version__
+from spikeloom.runtime.equivalence.breakdowns import undecided
+from spikeloom.runtime.inputs.network import LoadedNetwork
+from spikeloom.runtime.report.console import progress
+from spikeloom.runtime.report.encode import decode, encode
+from spikeloom.runtime.studies.jobs import Point, content_key
+from spikeloom.runtime.studies.stress.battery import NAMES, TAXELS, Level, levels_of, why_not
+from spikeloom.runtime.studies.stress.bench import Bench, bench_of, by_length, whole
+from spikeloom.runtime.studies.stress.pair import SIDES, Inputs, Outcome, evaluate, ready
+from spikeloom.runtime.studies.stress.results import Provenance, Run, Stress, shown
+from spikeloom.runtime.studies.stress.verdicts import Requirement, curve, unmet
+
+CHUNK = 5
+"""Seeds that a process measures at a time."""
+
+FILES = ("netlist", "checkpoint", "data", "taxels", "edges")
+"""Options that name files."""
+
+Sweep = Callable[[Sequence[Point]], Mapping[str, Any]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Request:
+    """Files and how they are read: the options of the command that decide a run."""
+
+    netlist: str
+    checkpoint: str
+    data: str
+    bin: float
+    split: str
+    limit: int | None
+    graph: str | None
+    taxels: str | None
+    edges: str | None
+    directed: bool
+    system: str | None
+    run: int
+    weights: str | None
+    beta: float | None
+    theta: float | None
+    polarities: int | None
+    polarities_first: bool | None
+    dt: float | None
+    convention: str | None
+
+    @classmethod
+    def of(cls, arguments: argparse.Namespace) -> Request:
+        """The part of a command's options."""
+        return cls(**{field.name: getattr(arguments, field.name) for field in fields(cls)})
+
+    def load(self) -> tuple[Bench, LoadedNetwork, str]:
+        """Read it all, see :func:`bench.bench_of`."""
+        return bench_of(argparse.Namespace(**asdict(self)))
+
+    def from_anywhere(self) -> Request:
+        """The same for a process that works in another folder."""
+        options = asdict(self)
+        named = {name: options[name] for name in FILES if options[name] and Path(options[name]).exists()}
+        return Request(**options | {name: str(Path(path).resolve()) for name, path in named.items()})
+
+    def readings(self) -> dict[str, Any]:
+        """All but the files, which are known by their hashes."""
+        return {name: value for name, value in asdict(self).items() if name not in FILES}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """Perturbations in the battery's order, what is required of them, and how densely they are measured."""
+
+    names: tuple[str, ...]
+    requirements: tuple[Requirement, ...]
+    seeds: int
+    full: bool
+
+
+def study(request: Request, plan: Plan, sweep: Sweep | None = None) -> Stress:
+    """Measure a plan and judge it.
+
+    Parameters
+    ----------
+    request : Request
+    plan : Plan
+    sweep : callable, optional
+        Measures points by :func:`measure_task`; without one they are measured in threads here.
+
+    Raises
+    ------
+    SpikeloomError
+        If a file cannot be used, or a requirement cannot be held against this network.
+    """
+    bench, loaded, data = request.load()
+    reasons = {name: why_not(name, bench.pair, bench.sensor) for name in plan.names}
+    _require_measurable(plan, reasons, bench.sensor.taxels)
+    progress("clean recordings")
+    reference, undisturbed = clean(bench)
+    known = _provenance(request, loaded, data)
+    tasks = [
+        Task(
+            request=request.from_anywhere(),
+            name=name,
+            level=level,
+            seeds=tuple(range(plan.seeds if NAMES[name].seeded else 1)),
+        )
+        for name in plan.names
+        if reasons[name] is None
+        for level in levels_of(
+            name,
+            bench.sensor.taxels,
+            full=plan.full,
+            also=[wanted.level for wanted in plan.requirements if wanted.name == name],
+        )
+    ]
+    if sweep is None:
+        runs = _in_threads(tasks, bench, reference)
+    else:
+        facts = encode(known) | {"options": request.readings(), "sensor": bench.sensor.digest()}
+        runs = _in_processes(tasks, facts, sweep)
+    found, classes = len(bench.labels), bench.pair.netlist.classes
+    curves = {
+        name: curve(
+            name,
+            [(t.level, each) for t, each in zip(tasks, runs, strict=True) if t.name == name],
+            undisturbed,
+            found,
+            classes,
+        )
+        for name in dict.fromkeys(task.name for task in tasks)
+    }
+    return Stress(
+        recordings=found,
+        classes=classes,
+        seeds=plan.seeds,
+        full=plan.full,
+        clean=undisturbed,
+        perturbations=curves,
+        not_applicable={name: reason for name, reason in reasons.items() if reason is not None},
+        required=tuple(map(str, plan.requirements)),
+        missed=unmet(plan.requirements, curves),
+        provenance=known,
+    )
+
+
+def _require_measurable(plan: Plan, reasons: Mapping[str, str | None], taxels: int) -> None:
+    for wanted in plan.requirements:
+        if reasons[wanted.name] is not None:
+            raise OptionError(f"--require {wanted}: does not apply, {reasons[wanted.name]}; omit it")
+        if NAMES[wanted.name].scale is TAXELS and float(wanted.level) > taxels:
+            raise OptionError(f"--require {wanted}: the sensor has {taxels} taxels; give a smaller level")
+
+
+def _provenance(request: Request, loaded: LoadedNetwork, data: str) -> Provenance:
+    return Provenance(
+        spikeloom=__version__,
+        netlist_sha256=hashlib.sha256(Path(request.netlist).read_bytes()).hexdigest(),
+        checkpoint_sha256=loaded.sha256,
+        **loaded.read_as,
+        graph=loaded.graph,
+        data_sha256=data,
+        netlist=Path(request.netlist).name,
+        checkpoint=Path(request.checkpoint).name,
+        data=Path(request.data).name,
+        split=request.split,
+    )
+
+
+# -- where points are measured -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Task:
+    """A perturbation at a level, and the seeds to draw it with."""
+
+    request: Request
+    name: str
+    level: Level
+    seeds: tuple[int, ...]
+
+
+def _in_threads(tasks: Sequence[Task], bench: Bench, reference: Outcome) -> list[list[Run]]:
+    """Runs of each task, several tasks at a time in this process."""
+    pool = ThreadPoolExecutor(os.cpu_count())
+    try:
+        waiting = [pool.submit(measure, bench, task.name, task.level, task.seeds, reference) for task in tasks]
+        for done, finished in enumerate(as_completed(waiting), 1):
+            finished.result()
+            progress(f"stress: {done} of {len(tasks)} points")
+    finally:
+        pool.shutdown(cancel_futures=True)
+    return [each.result() for each in waiting]
+
+
+def _in_processes(tasks: Sequence[Task], facts: Mapping[str, Any], sweep: Sweep) -> list[list[Run]]:
+    """Runs of each task, a few seeds at a time; kept by all that decides them."""
+    points = [
+        [_keyed(replace(task, seeds=task.seeds[i : i + CHUNK]), facts) for i in range(0, len(task.seeds), CHUNK)]
+        for task in tasks
+    ]
+    results = sweep([point for each in points for point in each])
+    return [[decode(Run, run) for point in each for run in results[point.key]["runs"]] for each in points]
+
+
+def _keyed(task: Task, facts: Mapping[str, Any]) -> Point:
+    about = {"perturbation": task.name, "level": task.level, "seeds": task.seeds}
+    return Point(key=content_key({**facts, **about}), label=f"{task.name} {shown(task.level)}", payload=task)
+
+
+def measure_task(task: Task) -> dict[str, Any]:
+    """JSON values of a task's runs, in a process of its own."""
+    bench, reference = _loaded(task.request)
+    return {"runs": encode(measure(bench, task.name, task.level, task.seeds, reference))}
+
+
+@lru_cache(maxsize=1)
+def _loaded(request: Request) -> tuple[Bench, Outcome]:
+    """The bench of a process, and what its clean recordings do."""
+    with redirect_stderr(StringIO()):  # the command has said it
+        bench, _, _ = request.load()
+    return bench, clean(bench)[0]
+
+
+# -- one point ---------------------------------------------------------------------------------------------------------
+
+
+def generator(name: str, seed: int) -> np.random.Generator:
+    """Source of a perturbation's chance: the same for all levels, so that a harsher one contains a milder one."""
+    return np.random.default_rng([seed, zlib.crc32(name.encode())])
+
+
+def clean(bench: Bench) -> tuple[Outcome, Run]:
+    """Nothing is wrong."""
+    inputs = whole(bench.events, bench.pair.netlist, bench.lengths)
+    outcome = evaluate(bench.ready, inputs)
+    return outcome, _run(bench, outcome, None, slice(None), inputs, outcome)
+
+
+def measure(bench: Bench, name: str, level: Level, seeds: Sequence[int], reference: Outcome) -> list[Run]:
+    """One perturbation at one level, once for each seed; one seed is enough for what has no part in chance.
+
+    Seeds run together where only recordings differ. `reference` is of the clean recordings.
+    """
+    damage, count = NAMES[name].damage, len(bench.events)
+    if damage is not None:
+        runs = []
+        for seed in seeds:
+            damaged = damage(bench.pair, level, bench.sensor, generator(name, seed))
+            inputs = whole(bench.events, damaged.netlist, bench.lengths)
+            outcome = evaluate(ready(damaged), inputs)
+            runs.append(_run(bench, outcome, seed, slice(None), inputs, reference))
+        return runs
+    many = [_inputs(bench, name, level, generator(name, seed)) for seed in seeds]
+    longest = max(inputs.events.shape[2] for inputs in many)
+    filled = [np.pad(each.events, ((0, 0), (0, 0), (0, longest - each.events.shape[2]))) for each in many]
+    inputs = Inputs(
+        events=np.concatenate(filled),
+        lengths=np.concatenate([inputs.lengths for inputs in many]),
+        begin=np.concatenate([inputs.begin for inputs in many]),
+    )
+    outcome = evaluate(bench.ready, inputs)
+    parts = [slice(i * count, (i + 1) * count) for i in range(len(seeds))]
+    return [_run(bench, outcome, seed, part, inputs, reference) for seed, part in zip(seeds, parts, strict=True)]
+
+
+def _inputs(bench: Bench, name: str, level: Level, rng: np.random.Generator) -> Inputs:
+    disturb, replay = NAMES[name].disturb, NAMES[name].replay
+    if replay is not None:
+        return replay(bench, level, rng)
+    assert disturb is not None, "no damage either"
+    events = by_length(bench.events, bench.lengths, lambda part: disturb(part, level, bench.sensor, rng))
+    return whole(events, bench.pair.netlist, bench.lengths)
+
+
+def _run(bench: Bench, outcome: Outcome, seed: int | None, part: slice, inputs: Inputs, reference: Outcome) -> Run:
+    """Counts over the recordings of one seed."""
+    netlist = bench.pair.netlist
+    decided = {side: outcome.decisions(side)[part] for side in SIDES}
+    spikes = outcome.spikes[part].sum(axis=0).tolist()
+    steps = int((inputs.lengths - inputs.begin)[part].sum())
+    held = np.bincount(netlist.layer, minlength=len(netlist.layers)).tolist()
+    kinds = {side: np.unique_counts(values) for side, values in decided.items()}
+    signs = {side: undecided(reference.votes[side], outcome.votes[side][part], bench.files) for side in SIDES}
+    return Run(
+        seed=seed,
+        right={side: int(np.count_nonzero(values == bench.labels)) for side, values in decided.items()},
+        equal=int(np.count_nonzero(decided["float"] == decided["chip"])),
+        layers={
+            layer.name: (*counts, neurons * steps)
+            for layer, counts, neurons in zip(netlist.layers, spikes, held, strict=True)
+        },
+        signs={side: {sign.kind: sign.count for sign in each} for side, each in signs.items()},
+        most={side: (int(k.values[np.argmax(k.counts)]), int(k.counts.max())) for side, k in kinds.items()},
+        stopped=int(np.count_nonzero(outcome.stopped[part])),
+        saturated=int(outcome.saturated[part].sum()),
+    )
