@@ -12,7 +12,7 @@ def test_the_square_sensor_example_reaches_a_decision(tmp_path):
     # `spikeloom` is whatever this interpreter runs, installed or not
     command = tmp_path / "bin" / "spikeloom"
     command.parent.mkdir()
-    command.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m runtime "$@"\n')
+    command.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m spikeloom "$@"\n')
     command.chmod(0o755)
     environment = os.environ | {
         "PATH": f"{command.parent}{os.pathsep}{os.environ['PATH']}",

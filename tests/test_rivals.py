@@ -158,15 +158,14 @@ def test_workers_run_in_pairs_and_those_that_cannot_are_skipped(module, task):
 
     entries = [
         entry("ours", "spikes"),
-        entry("ours alone", "counts"),
         entry("rival", "totals", "spikes"),
         entry("odd", "fastest", "counts"),
     ]
-    found = rivals.measure(task.path, entries, {}, rounds=2)
+    found = rivals.measure(task.path, entries, {}, rounds=1)
     assert found["odd"]["skipped"].startswith("there is no mode fastest")
     assert found["rival"]["against"] == "ours"
     assert found["ours"]["differing_spikes"] == found["rival"]["differing_spikes"] == [0, 0, 0, 0]
-    assert [found[name]["laps"] for name in ("ours", "ours alone", "rival")] == [2, 2, 2]
+    assert [found[name]["laps"] for name in ("ours", "rival")] == [1, 1]
     assert 0 < found["rival"]["ratio"]["min"] <= found["rival"]["ratio"]["median"] <= found["rival"]["ratio"]["max"]
     assert found["rival"]["peak_mb"] > 1
     assert "odd: skipped, there is no mode fastest" in rivals.text(
