@@ -12,34 +12,28 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from spikeloom.compiler import Compilation, without
+from spikeloom.compiler import Compilation, Netlist, without
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.fixedpoint import DECAY_BITS, ONE_STEP_SUM_MAX, FloatArray, IntArray, read_only
+from spikeloom.compiler.interpret import BoolArray
 from spikeloom.compiler.ir import Form, IntegerNetwork
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.passes.prune import deaf_to
-from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.storage.quantize import incoming
 from spikeloom.compiler.targets.loihi1.storage.scales import rounded
 from spikeloom.models.recordings.events import join_bins
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.machines.loihi1 import engine
-from spikeloom.runtime.machines.loihi1.trace import BoolArray
+from spikeloom.runtime.machines.loihi1.costs.estimate import estimate
 from spikeloom.runtime.machines.votes import predictions
+from spikeloom.runtime.studies.pruning.results import Costs
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Scene:
-    """Recordings of a split as a network's input.
-
-    Parameters
-    ----------
-    flat : (samples, n_inputs, T) uint8
-        Events of its channels, clocks among them.
-    labels : (samples,) int64
-    lengths : (samples,) int64, or None
-    """
+    """Recordings of a split as channels of a network (samples, n_inputs, T), clocks among them."""
 
     flat: engine.EventArray
     labels: IntArray
@@ -51,9 +45,27 @@ def scene(data: Recordings, netlist: Netlist) -> Scene:
     return Scene(flat=with_clocks(data.events, netlist.clocks), labels=data.labels, lengths=data.lengths)
 
 
+def spikes_of(netlist: Netlist, of: Scene) -> IntArray:
+    """Spikes of each compartment in each recording; (samples, compartments)."""
+    return engine.simulate(netlist, of.flat, lengths=of.lengths).counts.spikes
+
+
 def decisions(netlist: Netlist, of: Scene) -> IntArray:
     """Class of each recording."""
-    return predictions(netlist, engine.simulate(netlist, of.flat, lengths=of.lengths).counts.spikes)
+    return predictions(netlist, spikes_of(netlist, of))
+
+
+def priced(netlist: Netlist, of: Scene) -> tuple[IntArray, Costs]:
+    """Class of each recording, and what an inference costs."""
+    counts, found = estimate(netlist, load_target(netlist.target), of.flat, lengths=of.lengths)
+    return predictions(netlist, counts.spikes), Costs(
+        operations=float(found.costs.synaptic_operations.sum(axis=1).mean()),
+        energy_j={name: float(each.sum(axis=1).mean()) for name, each in found.costs.energy.items()},
+        time_s={name: float(each.duration_ns.sum(axis=1).mean() * 1e-9) for name, each in found.simple.items()},
+        cores=netlist.n_cores,
+        neurons=netlist.n_compartments,
+        synapses=netlist.n_synapses,
+    )
 
 
 def silenced(netlist: Netlist, sources: BoolArray) -> Netlist:
@@ -64,15 +76,9 @@ def silenced(netlist: Netlist, sources: BoolArray) -> Netlist:
 
 
 def effects(netlist: Netlist, spikes: IntArray) -> FloatArray:
-    """Share that each compartment has in what its layer sends to listeners; shape (compartments,).
+    """Share that each compartment has in what its layer sends on; shape (compartments,).
 
-    Parameters
-    ----------
-    netlist : Netlist
-        What ran.
-    spikes : (compartments,) int64
-        Spikes of each on the training recordings. They count by the weights that they meet, in thresholds; those that
-        vote have the share infinity.
+    Spikes (compartments,) count by the weights that they meet, in thresholds; those that vote have the share infinity.
     """
     met = np.zeros(netlist.n_inputs + netlist.n_compartments)
     for core in range(netlist.n_cores):
@@ -86,7 +92,7 @@ def effects(netlist: Netlist, spikes: IntArray) -> FloatArray:
 
 
 def most_spared(order: IntArray, least: int, fits: Callable[[IntArray], bool]) -> IntArray:
-    """Bisect for a longest beginning of `order` that fits; of one shorter than `least` nothing is asked.
+    """Bisect for a longest beginning of `order` that fits; one shorter than `least` is not tried.
 
     Examples
     --------
@@ -105,20 +111,9 @@ def most_spared(order: IntArray, least: int, fits: Callable[[IntArray], bool]) -
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Trial:
-    """A compiled network, and what may be taken from it.
+    """A compiled network, what is left of it, and training recordings.
 
-    Parameters
-    ----------
-    compilation : Compilation
-        As it was compiled.
-    integer : IntegerNetwork
-        What of it is left; at first all.
-    training : Scene
-        Recordings on which is chosen.
-    wanted : (samples,) int64
-        Decisions on them that are to be kept.
-    allowed : int
-        How many of them may change.
+    At most so many of the `wanted` decisions (samples,) are `allowed` to change on them.
     """
 
     compilation: Compilation
@@ -181,7 +176,7 @@ def without_taxels(integer: IntegerNetwork, netlist: Netlist, taxels: IntArray) 
     return deaf_to(integer, sources_of(netlist, taxels)[: netlist.n_inputs])
 
 
-def alone(netlist: Netlist, of: Scene, wanted: IntArray) -> IntArray:
+def changed_alone(netlist: Netlist, of: Scene, wanted: IntArray) -> IntArray:
     """Decisions that change without each taxel; shape (taxels,)."""
     prepared, changed = engine.prepare(netlist), np.zeros(netlist.taxels, np.int64)
     for taxel in range(netlist.taxels):

@@ -1,0 +1,102 @@
+"""What ``lean`` prints: what is used, what may go, and what that changes and saves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from spikeloom.runtime.report.numbers import percent, si
+from spikeloom.runtime.report.sections import Section, Table, Text
+from spikeloom.runtime.studies.pruning.results import Lean, Removed, TaxelUse
+
+
+def sections(result: Lean) -> list[Section]:
+    """Candidates, use of layers and taxels, every row, and what is taken."""
+    samples, whole, taken = result.samples, result.rows[0], result.rows[result.taken]
+    layers = [[e.name, *(f"{n:,}" for n in (e.neurons, e.on_chip, e.never_fired))] for e in result.layers]
+    lines = [f"without {name}: not tried, what is left could leave a register" for name in result.overflowing]
+    last = [f"least energy in training: {taken.name}", *_removed(taken.removed)]
+    return [
+        *([_candidates(result)] if result.candidates else []),
+        Section(
+            "Accuracy",
+            [
+                Text(
+                    f"chip accuracy: {percent(whole.test.right, samples.test)} on {result.split}, "
+                    f"{whole.training.right} of {samples.training} in training"
+                )
+            ],
+        ),
+        Section(
+            "Use",
+            [Table(["layer", "neurons", "on chip", "never fired in training"], layers), Text(_taxels(result.taxels))],
+        ),
+        Section("Without", [_rows(result), Text("\n".join(lines))]),
+        Section(
+            "Taken",
+            [Text("\n".join(last + ([] if result.output is None else [f"written without them: {result.output}"])))],
+        ),
+    ]
+
+
+def _candidates(result: Lean) -> Section:
+    samples, tables = result.samples, list(result.candidates[0].costs.energy_j)
+    rows = [
+        [
+            each.name,
+            each.graph or "",
+            f"{each.training_right} of {samples.training}",
+            f"{each.test_right} of {samples.test}",
+            f"{each.costs.operations:,.0f}",
+            *(si(joules, "J") for joules in each.costs.energy_j.values()),
+            str(each.costs.cores),
+        ]
+        for each in result.candidates
+    ]
+    head = ["network", "graph", "right in training", "right", "operations", *tables, "cores"]
+    return Section("Networks", [Table(head, rows), Text(f"taken: {result.chosen}")])
+
+
+def _taxels(taxels: Sequence[TaxelUse]) -> str:
+    """Taxels without which nothing changes, and the one that matters most."""
+    silent = [str(i) for i, taxel in enumerate(taxels) if not taxel.events]
+    free = [str(i) for i, taxel in enumerate(taxels) if taxel.events and not taxel.training_differ]
+    most = max(range(len(taxels)), key=lambda i: taxels[i].training_differ)
+    return (
+        f"{len(silent)} of {len(taxels)} taxels without an event in training{_listed(silent)}\n"
+        f"{len(free)} more without which, one at a time, no training decision changes{_listed(free)}\n"
+        f"taxel {most} matters most: {taxels[most].training_differ} training decisions change without it"
+    )
+
+
+def _listed(names: Sequence[str]) -> str:
+    return f" ({', '.join(names)})" if names else ""
+
+
+def _rows(result: Lean) -> Table:
+    samples, whole = result.samples, result.rows[0].costs
+    head = ["without", "differ in training", "differ", "right", "operations", "saved"]
+    head += [word for name in whole.energy_j for word in (name, "saved")]
+    head += [*(f"time, {name}" for name in whole.time_s), "neurons", "cores"]
+    body = []
+    for index, row in enumerate(result.rows):
+        costs = row.costs
+        cells = ["nothing" if index == 0 else row.name]
+        cells += [f"{row.training.differ} of {samples.training}", f"{row.test.differ} of {samples.test}"]
+        cells += [str(row.test.right), f"{costs.operations:,.0f}", _saved(costs.operations, whole.operations)]
+        for name, joules in costs.energy_j.items():
+            cells += [si(joules, "J"), _saved(joules, whole.energy_j[name])]
+        cells += [si(each, "s") for each in costs.time_s.values()]
+        body.append([*cells, f"{costs.neurons:,}", str(costs.cores)])
+    return Table(head, body)
+
+
+def _saved(left: float, whole: float) -> str:
+    return f"{100 * (1 - left / whole):.1f} %" if whole else ""
+
+
+def _removed(gone: Removed) -> list[str]:
+    """What went together."""
+    neurons = [f"{name} {count:,}" for name, count in (gone.neurons or {}).items()]
+    parts = {"hops": map(str, gone.hops or ()), "taxels": map(str, gone.taxels or ()), "neurons": neurons}
+    words = {what: ", ".join(names) for what, names in parts.items()}
+    return [f"{what} that went: {names}" for what, names in words.items() if names]

@@ -1,0 +1,286 @@
+"""The study: neurons, taxels, hops and bins are taken from a network, alone and together, and it is measured again."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from spikeloom.compiler import Compilation, Netlist, Options, compile_network
+from spikeloom.compiler.fixedpoint import IntArray
+from spikeloom.compiler.systems import TACTILESGNET
+from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.runtime.inputs.network import LoadedNetwork
+from spikeloom.runtime.report.console import progress
+from spikeloom.runtime.studies.pruning.results import (
+    Candidate,
+    Changed,
+    LayerUse,
+    Lean,
+    Removed,
+    Row,
+    Samples,
+    TaxelUse,
+    Tested,
+)
+from spikeloom.runtime.studies.pruning.trials import (
+    Scene,
+    Trial,
+    changed_alone,
+    coarse_netlist,
+    coarser,
+    decisions,
+    priced,
+    scene,
+    spikes_of,
+    without_hops,
+    without_taxels,
+)
+
+BINS = (2, 4)
+"""Bins that are joined."""
+
+
+def study(
+    networks: Mapping[str, LoadedNetwork], training: Recordings, test: Recordings, differ: float, output: str | None
+) -> tuple[Lean, Netlist]:
+    """Choose the cheapest of several networks on the training split and take from it what that split does not need.
+
+    Parameters
+    ----------
+    networks : mapping of str to LoadedNetwork
+        By file; for the same recordings.
+    training, test : Recordings
+        On which is chosen, and what is reported.
+    differ : float
+        Share of training decisions that may change.
+    output : str or None
+        Where the netlist will be written.
+
+    Returns
+    -------
+    Lean, Netlist
+        The result, and the network without what is taken.
+    """
+    made = {path: _candidate(path, loaded, training, test) for path, loaded in networks.items()}
+    candidates = [candidate for candidate, _ in made.values()]
+    chosen = _cheapest(candidates)
+    whole = _Whole(networks[chosen], made[chosen][1], training, test, int(differ * len(training) + 1e-9))
+    left = list(whole.everything())
+    kept = [each for each in left if each.offered and each.row.training.differ <= whole.loose.allowed]
+    taken = min(kept, key=lambda each: priced(each.netlist, whole.training)[1].least)
+    return Lean(
+        taken=left.index(taken),
+        samples=Samples(training=len(training), test=len(test)),
+        layers=whole.layers(),
+        taxels=whole.taxels(),
+        rows=tuple(each.row for each in left),
+        overflowing=tuple(whole.overflowing),
+        source=test.source,
+        split=test.split,
+        differ=differ,
+        candidates=tuple(candidates) if len(candidates) > 1 else (),
+        chosen=chosen,
+        output=output,
+    ), taken.netlist
+
+
+def _candidate(
+    path: str, loaded: LoadedNetwork, training: Recordings, test: Recordings
+) -> tuple[Candidate, Compilation]:
+    """A checkpoint on the chip: decisions and costs."""
+    progress(f"compiling {path}")
+    forms = None if loaded.checkpoint is None else loaded.checkpoint.forms
+    compilation = compile_network(loaded.network, Options(forms=forms, training_events=training.events))
+    netlist = compilation.netlist
+    decided, cost = priced(netlist, scene(training, netlist))
+    decided_test, cost_test = priced(netlist, scene(test, netlist))
+    return Candidate(
+        costs=cost_test,
+        name=path,
+        graph=loaded.graph,
+        training_operations=cost.operations,
+        training_right=int(np.count_nonzero(decided == training.labels)),
+        test_right=int(np.count_nonzero(decided_test == test.labels)),
+    ), compilation
+
+
+def _cheapest(candidates: list[Candidate]) -> str:
+    """The one of fewest operations in training among those within one training recording of the best."""
+    least = max(each.training_right for each in candidates) - 1
+    fitting = [each for each in candidates if each.training_right >= least]
+    return min(fitting, key=lambda each: each.training_operations).name
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Left:
+    """What is left of a network; it may be written if it is offered."""
+
+    row: Row
+    netlist: Netlist
+    offered: bool
+
+
+class _Whole:
+    """A compiled network on both splits, from which parts are taken."""
+
+    def __init__(
+        self, loaded: LoadedNetwork, compilation: Compilation, training: Recordings, test: Recordings, allowed: int
+    ) -> None:
+        self.loaded, self.compilation, self.netlist = loaded, compilation, compilation.netlist
+        self.training, self.test = scene(training, self.netlist), scene(test, self.netlist)
+        self.spikes = spikes_of(self.netlist, self.training).sum(axis=0)
+        self.wanted, self.wanted_test = decisions(self.netlist, self.training), decisions(self.netlist, self.test)
+        self.strict = Trial(
+            compilation=compilation,
+            integer=compilation.integer,
+            training=self.training,
+            wanted=self.wanted,
+            allowed=0,
+        )
+        self.loose = replace(self.strict, allowed=allowed)
+        self.trials = (self.strict, self.loose) if allowed else (self.strict,)
+        self.overflowing: list[str] = []
+        progress("taxels, one at a time")
+        self.changed = changed_alone(self.netlist, self.training, self.wanted)
+        self.changed_test = changed_alone(self.netlist, self.test, self.wanted_test)
+
+    def everything(self) -> Iterator[_Left]:
+        """All that is tried."""
+        yield self._left("everything", Removed(), self.netlist)
+        progress("neurons")
+        yield from self._neurons()
+        progress("taxels")
+        for trial in self.trials:
+            spared = trial.spare_taxels(self.netlist, self.changed)
+            deaf = replace(trial, integer=without_taxels(trial.integer, self.netlist, spared)).built()
+            yield self._left(f"taxels, {_allowed(trial)}", Removed(taxels=_numbers(spared)), deaf, offered=True)
+        cheapest: tuple[float, tuple[int, ...]] = np.inf, ()
+        for hops, left in self._hops():
+            yield left
+            if left.row.training.differ <= self.loose.allowed:
+                cheapest = min(cheapest, (left.row.costs.operations, hops))
+        yield from self._bins()
+        progress("all of it together")
+        yield self._together(cheapest[1])
+
+    def _left(
+        self,
+        name: str,
+        removed: Removed,
+        netlist: Netlist,
+        scenes: tuple[Scene, Scene] | None = None,
+        *,
+        offered: bool = False,
+    ) -> _Left:
+        """Measure what is left, on scenes of its own if it needs such."""
+        training, test = scenes or (self.training, self.test)
+        decided = decisions(netlist, training)
+        tested, costs = priced(netlist, test)
+        before, after = self.wanted_test == test.labels, tested == test.labels
+        row = Row(
+            name=name,
+            removed=removed,
+            training=Changed(
+                differ=int(np.count_nonzero(decided != self.wanted)),
+                right=int(np.count_nonzero(decided == training.labels)),
+            ),
+            test=Tested(
+                differ=int(np.count_nonzero(tested != self.wanted_test)),
+                right=int(np.count_nonzero(after)),
+                gained=int(np.count_nonzero(~before & after)),
+                lost=int(np.count_nonzero(before & ~after)),
+            ),
+            costs=costs,
+        )
+        return _Left(row, netlist, offered)
+
+    def _neurons(self) -> Iterator[_Left]:
+        netlist = self.netlist
+        never = np.flatnonzero((self.spikes == 0) & (netlist.readout_class < 0))
+        removed = Removed(neurons=_by_layer(netlist, never))
+        yield self._left("neurons that never fired in training", removed, self.strict.built(never, netlist))
+        for trial in self.trials:
+            spared = trial.spare_neurons(netlist, self.spikes)
+            removed = Removed(neurons=_by_layer(netlist, spared))
+            yield self._left(f"neurons, {_allowed(trial)}", removed, trial.built(spared, netlist), offered=True)
+
+    def _hops(self) -> Iterator[tuple[tuple[int, ...], _Left]]:
+        """Every hop alone and all from one on."""
+        checkpoint, adjacency = self.loaded.checkpoint, self.loaded.adjacency
+        if checkpoint is None or adjacency is None or checkpoint.system != TACTILESGNET or len(checkpoint.hops) < 2:
+            return
+        count = len(checkpoint.hops)
+        for hops in [(hop,) for hop in range(count)] + [tuple(range(hop, count)) for hop in range(1, count - 1)]:
+            progress(f"without hops {', '.join(map(str, hops))}")
+            integer = without_hops(self.compilation, checkpoint, adjacency, hops)
+            name = f"hop {hops[0]}" if len(hops) == 1 else f"hops {hops[0]} to {hops[-1]}"
+            if integer is None:
+                self.overflowing.append(name)
+            else:
+                built = replace(self.strict, integer=integer).built()
+                yield hops, self._left(name, Removed(hops=hops), built, offered=True)
+
+    def _bins(self) -> Iterator[_Left]:
+        """Join bins, with the decays as they are and with those of as many steps."""
+        for bins in BINS:
+            progress(f"{bins} bins joined")
+            scenes = coarser(self.training, self.netlist, bins), coarser(self.test, self.netlist, bins)
+            for adapted, how in ((False, "decays as they are"), (True, "decays of as many steps")):
+                netlist = coarse_netlist(self.netlist, bins, adapted=adapted)
+                yield self._left(f"{bins} bins joined, {how}", Removed(bins=bins), netlist, scenes)
+
+    def _together(self, hops: tuple[int, ...]) -> _Left:
+        """Hops, then taxels, then neurons, as long as no more training decisions change than may."""
+        trial, checkpoint, adjacency = self.loose, self.loaded.checkpoint, self.loaded.adjacency
+        if hops and checkpoint is not None and adjacency is not None:
+            fewer = without_hops(self.compilation, checkpoint, adjacency, hops)
+            assert fewer is not None, "it was tried before"
+            trial = replace(trial, integer=fewer)
+        built = trial.built()
+        taxels = trial.spare_taxels(built, self.changed)
+        trial = replace(trial, integer=without_taxels(trial.integer, built, taxels))
+        built = trial.built()
+        spared = trial.spare_neurons(built, spikes_of(built, self.training).sum(axis=0))
+        removed = Removed(hops=hops or None, taxels=_numbers(taxels), neurons=_by_layer(built, spared))
+        return self._left(f"together, {_allowed(trial)}", removed, trial.built(spared, built), offered=True)
+
+    def layers(self) -> tuple[LayerUse, ...]:
+        """Neurons of each layer by what they do."""
+        held = [self.netlist.compartments_of(index) for index in range(len(self.netlist.layers))]
+        return tuple(
+            LayerUse(
+                name=layer.name,
+                neurons=layer.neurons,
+                on_chip=len(ids),
+                never_fired=int(np.count_nonzero(self.spikes[ids] == 0)),
+            )
+            for layer, ids in zip(self.netlist.layers, held, strict=True)
+        )
+
+    def taxels(self) -> tuple[TaxelUse, ...]:
+        """Events of each taxel and what its absence changes."""
+        netlist = self.netlist
+        sensor = self.training.flat[:, : netlist.taxels * netlist.polarities]
+        events = sensor.reshape(len(sensor), netlist.taxels, -1).sum(axis=(0, 2), dtype=np.int64)
+        return tuple(
+            TaxelUse(events=count, training_differ=here, test_differ=there)
+            for count, here, there in zip(
+                events.tolist(), self.changed.tolist(), self.changed_test.tolist(), strict=True
+            )
+        )
+
+
+def _allowed(trial: Trial) -> str:
+    return "no training decision changed" if not trial.allowed else f"{trial.allowed} training decisions may change"
+
+
+def _numbers(ids: IntArray) -> tuple[int, ...]:
+    return tuple(sorted(ids.tolist()))
+
+
+def _by_layer(netlist: Netlist, gone: IntArray) -> dict[str, int]:
+    """How many neurons of each layer."""
+    counts = np.bincount(netlist.layer[gone], minlength=len(netlist.layers)).tolist()
+    return {layer.name: count for layer, count in zip(netlist.layers, counts, strict=True) if count}
