@@ -37,8 +37,8 @@ from spikeloom.runtime.studies.stress.bench import (
 )
 from spikeloom.runtime.studies.stress.pair import Pair, evaluate, ready
 from spikeloom.runtime.studies.stress.results import Provenance, Run, Spread, Stress
+from spikeloom.runtime.studies.stress.runs import clean, generator, measure
 from spikeloom.runtime.studies.stress.sections import sections
-from spikeloom.runtime.studies.stress.study import clean, generator, measure
 from spikeloom.runtime.studies.stress.verdicts import curve, parse_requirement, reasons, spread, unmet
 
 REPORT = ("report", "net.loom", "--checkpoint", "net.pt", "--data", "data")

@@ -33,19 +33,7 @@ MOST_STEPS = 100_000
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """Levels of a perturbation.
-
-    Parameters
-    ----------
-    unit : str
-        What they count.
-    levels, full : tuple of int, float or str
-        From mild to harsh; with ``--full``.
-    least, most : float
-        Levels that make sense.
-    whole : bool
-        Whether only whole levels do.
-    """
+    """What levels count, those to measure from mild to harsh (`full` with ``--full``), and which make sense."""
 
     unit: str
     levels: tuple[Level, ...]
@@ -57,19 +45,11 @@ class Scale:
 
 @dataclass(frozen=True, slots=True)
 class Perturbation:
-    """One kind of trouble; its functions get the level as it stands in the scale, and a source of chance.
+    """One kind of trouble: its name, a line for people, its levels, and one of three functions that bring it about.
 
-    Parameters
-    ----------
-    name, what : str
-        As typed, and one line for people.
-    scale : Scale
-    disturb, damage, replay : callable, optional
-        One of them: what happens to the events, to netlist and float network, or how recordings follow each other.
-    seeded : bool
-        Whether chance has a part in it.
-    obstacle : callable, optional
-        Why it makes no sense for a network, or None where it does.
+    `disturb` changes events, `damage` netlist and float network, `replay` how recordings follow each other. They get
+    the level as it stands in the scale, and a source of chance unless it has no part in it (`seeded`). `obstacle` says
+    why the perturbation makes no sense for a network, or None.
     """
 
     name: str

@@ -54,9 +54,9 @@ def with_weights(pair: Pair, weight: npt.NDArray[Any]) -> Pair:
     post, row, step = netlist.layer[target], netlist.neuron[target], units / netlist.scale[target]
     projections = []
     for projection in network.projections:
-        own = (post == projection.post) & (pre == projection.pre)
-        more = sparse.csr_array((step[own], (row[own], column[own])), shape=projection.weight.shape)
-        projections.append(replace(projection, weight=projection.weight + more if own.any() else projection.weight))
+        here = (post == projection.post) & (pre == projection.pre)
+        more = sparse.csr_array((step[here], (row[here], column[here])), shape=projection.weight.shape)
+        projections.append(replace(projection, weight=projection.weight + more if here.any() else projection.weight))
     return Pair(netlist=stored, network=replace(network, projections=tuple(projections)))
 
 
@@ -102,8 +102,8 @@ def hidden(pair: Pair) -> IntArray:
     """Compartments that neither vote nor relay a clock; (…,) int64."""
     netlist = pair.netlist
     relays = np.array([population.size - population.relays for population in pair.network.populations])
-    found: IntArray = np.flatnonzero((netlist.readout_class < 0) & (netlist.neuron < relays[netlist.layer]))
-    return found
+    ids: IntArray = np.flatnonzero((netlist.readout_class < 0) & (netlist.neuron < relays[netlist.layer]))
+    return ids
 
 
 def stick_neurons(pair: Pair, share: float, rng: np.random.Generator, *, firing: bool) -> Pair:
@@ -192,10 +192,10 @@ def open_late(pair: Pair, steps: int) -> Pair:
 
 def _neurons(netlist: Netlist, flags: Mask, layer: int) -> Mask:
     """Flags of compartments as those of a layer's neurons."""
-    found = np.zeros(netlist.layers[layer].neurons, np.bool_)
+    neurons = np.zeros(netlist.layers[layer].neurons, np.bool_)
     ids = netlist.compartments_of(layer)
-    found[netlist.neuron[ids]] = flags[ids]
-    return found
+    neurons[netlist.neuron[ids]] = flags[ids]
+    return neurons
 
 
 def _rows_scaled(network: Network, factors: list[FloatArray]) -> Network:

@@ -25,10 +25,7 @@ def chosen(taxels: int, count: int, rng: np.random.Generator) -> IntArray:
 def neighbours(distance: FloatArray, count: int, rng: np.random.Generator) -> IntArray:
     """A taxel at random and those nearest to it, it among them; (count,) int64.
 
-    Parameters
-    ----------
-    distance : (taxels, taxels) float64
-        In any unit; of equal ones the lower number is nearer.
+    Distances (taxels, taxels) are in any unit; of equal ones the lower number is nearer.
     """
     centre = int(rng.integers(len(distance)))
     order = np.argsort(distance[centre], kind="stable")
@@ -37,16 +34,16 @@ def neighbours(distance: FloatArray, count: int, rng: np.random.Generator) -> In
 
 def silence(events: Events, taxels: IntArray) -> Events:
     """Dead taxels: no events."""
-    found = events.copy()
-    found[:, taxels] = 0
-    return found
+    silent = events.copy()
+    silent[:, taxels] = 0
+    return silent
 
 
 def stick(events: Events, taxels: IntArray) -> Events:
     """Stuck taxels: an event of either polarity in every step."""
-    found = events.copy()
-    found[:, taxels] = 1
-    return found
+    stuck = events.copy()
+    stuck[:, taxels] = 1
+    return stuck
 
 
 def lose(events: Events, share: float, rng: np.random.Generator) -> Events:
@@ -62,30 +59,27 @@ def invent(events: Events, share: float, rng: np.random.Generator) -> Events:
 def jitter(events: Events, sigma: float, rng: np.random.Generator) -> Events:
     """Each event moves by a normal number of steps, rounded; not beyond the ends. What meets becomes one event.
 
-    Parameters
-    ----------
-    sigma : float
-        Standard deviation, steps.
+    `sigma` is the standard deviation in steps.
     """
     sample, taxel, polarity, step = np.nonzero(events)
     moved = step + np.rint(sigma * rng.standard_normal(len(step))).astype(np.int64)
-    found = np.zeros_like(events)
-    found[sample, taxel, polarity, np.clip(moved, 0, events.shape[3] - 1)] = 1
-    return found
+    changed = np.zeros_like(events)
+    changed[sample, taxel, polarity, np.clip(moved, 0, events.shape[3] - 1)] = 1
+    return changed
 
 
 def start_late(events: Events, steps: int) -> Events:
     """The grasp begins later than the recording: silence first, the end is cut off."""
-    found = np.zeros_like(events)
-    found[..., steps:] = events[..., : max(events.shape[3] - steps, 0)]
-    return found
+    changed = np.zeros_like(events)
+    changed[..., steps:] = events[..., : max(events.shape[3] - steps, 0)]
+    return changed
 
 
 def start_early(events: Events, steps: int) -> Events:
     """The grasp began before the recording: its first steps are missing, silence at the end."""
-    found = np.zeros_like(events)
-    found[..., : max(events.shape[3] - steps, 0)] = events[..., steps:]
-    return found
+    changed = np.zeros_like(events)
+    changed[..., : max(events.shape[3] - steps, 0)] = events[..., steps:]
+    return changed
 
 
 def play(events: Events, speed: float) -> Events:
@@ -97,16 +91,16 @@ def play(events: Events, speed: float) -> Events:
     sample, taxel, polarity, step = np.nonzero(events)
     moved = (step / speed).astype(np.int64)
     kept = moved < events.shape[3]
-    found = np.zeros_like(events)
-    found[sample[kept], taxel[kept], polarity[kept], moved[kept]] = 1
-    return found
+    changed = np.zeros_like(events)
+    changed[sample[kept], taxel[kept], polarity[kept], moved[kept]] = 1
+    return changed
 
 
 def swap_polarity(events: Events, taxels: IntArray) -> Events:
-    """Some taxels tell rise from fall the wrong way round; done twice it is undone."""
-    found = events.copy()
-    found[:, taxels] = events[:, taxels, ::-1]
-    return found
+    """Some taxels report rise as fall and fall as rise; done twice it is undone."""
+    changed = events.copy()
+    changed[:, taxels] = events[:, taxels, ::-1]
+    return changed
 
 
 def thin(events: Events, density: float, rng: np.random.Generator) -> Events:
@@ -125,8 +119,8 @@ def _filled(events: Events, density: float, rng: np.random.Generator, *, keep: b
     wanted = int(np.floor(density * flat.shape[1]) if keep else np.ceil(density * flat.shape[1]))
     # entries that hold an event come first, each kind in random order: the first `wanted` ones hold an event then
     order = np.argsort(rng.random(flat.shape, np.float32) - flat, axis=1, kind="stable")
-    found = np.zeros_like(flat)
-    for row, ranked, own in zip(found, order, flat, strict=True):
-        there = int(np.count_nonzero(own))
+    changed = np.zeros_like(flat)
+    for row, ranked, before in zip(changed, order, flat, strict=True):
+        there = int(np.count_nonzero(before))
         row[ranked[: min(there, wanted) if keep else max(there, wanted)]] = 1
-    return found.reshape(events.shape)
+    return changed.reshape(events.shape)

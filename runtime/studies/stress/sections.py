@@ -83,7 +83,7 @@ def picture(result: Stress) -> bytes:
     about, seeds = result.provenance, f"{result.seeds} seed{'s' if result.seeds > 1 else ''}"
     title = f"{about.netlist} on {result.recordings} recordings of {about.data}, {seeds}; accuracy in per cent"
     drawn = figure(result, title, across=5)
-    drawn.figure.suptitle(title)
+    drawn.figure.supxlabel(title, fontsize=9)
     return drawn.file("png")
 
 
