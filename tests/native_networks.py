@@ -24,7 +24,7 @@ def random_stage(rng, name, inputs, size, depth, *, copies, clocks) -> Stage:
 def random_network(
     seed, *, copies=3, towers=1, blocks=2, taxels=4, features=2, hidden=(6, 4), classes=3, clocks=2, steps=12
 ) -> NativeNetwork:
-    """Towers of a first stage, hidden ones in blocks that hear a random half each, and two voters a class."""
+    """Towers of a first stage, hidden ones in blocks that receive a random half each, and two voters a class."""
     rng = np.random.default_rng(seed)
     made = []
     for _ in range(towers):

@@ -1,11 +1,16 @@
-"""Networks of crossbar cores drawn by hypothesis, and how traces are compared."""
+"""Networks of crossbar cores, by hand and drawn by hypothesis, and how traces are compared."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 from hypothesis import strategies as st
 
+from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.truenorth.builder import Draft, Neuron
+from spikeloom.runtime.machines.truenorth import engine, spec
+from spikeloom.runtime.machines.truenorth.trace import Counts, Trace
+
+CHIP = load_target("truenorth")
 
 WEIGHTS = st.one_of(st.integers(-256, 255), st.integers(-3, 3))
 NEURONS = st.builds(
@@ -21,6 +26,25 @@ NEURONS = st.builds(
     negative_saturates=st.booleans(),
     initial=st.one_of(st.just(0), st.integers(-(2**19), 2**19 - 1)),
 )
+
+
+def with_limit(rule: str, value: int):
+    """The chip with another limit."""
+    return replace(CHIP, limits={**CHIP.limits, rule: replace(CHIP.limits[rule], value=value)})
+
+
+def relays(*, delay: int = 1, tick: int = 0, first: int = 0) -> Draft:
+    """Two cores; an input reaches neuron 0 of core 0, whose spikes reach neuron 0 of core 1, which votes."""
+    draft = Draft()
+    for x in (0, 1):
+        draft.core(x, 0)
+        draft.axon(x)
+        draft.neuron(x, Neuron(), layer=f"layer{x}")
+        draft.connect(x, 0, [0])
+    draft.feed(0, 0, 0, tick=tick)
+    draft.wire((0, 0), 1, 0, delay)
+    draft.vote((1, 0), 0, first=first)
+    return draft
 
 
 @st.composite
@@ -59,6 +83,21 @@ def events(draw_seed: int, channels: int, steps: int, *, samples: int | None = N
     """Recordings of a third of all events."""
     shape = (channels, steps) if samples is None else (samples, channels, steps)
     return (np.random.default_rng(draw_seed).random(shape) < 1 / 3).astype(np.uint8)
+
+
+def recording_of(batch: Trace, sample: int = 0) -> Trace:
+    """One recording of a batch, cut to its own ticks."""
+    counts = Counts(**{field.name: getattr(batch.counts, field.name)[sample] for field in fields(Counts)})
+    ticks = int(counts.ticks)
+    return Trace(counts=counts, spikes=batch.spikes[sample, :ticks], membranes=batch.membranes[sample, :ticks])
+
+
+def both(netlist, recording, *, seed=0) -> Trace:
+    """What the specification makes of a recording, after the engine made the same of it."""
+    expected = spec.simulate(netlist, recording, seed=seed)
+    found = engine.simulate(netlist, recording[None], seed=seed, spikes=True, membranes=True)
+    assert_same(expected, recording_of(found))
+    return expected
 
 
 def assert_same(one, other) -> None:

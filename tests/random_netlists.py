@@ -1,6 +1,6 @@
 """Netlists built by hand or drawn by hypothesis, for the tests of the two simulators."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from hypothesis import strategies as st
@@ -9,6 +9,9 @@ from spikeloom.compiler.fixedpoint import read_only, read_only_float
 from spikeloom.compiler.targets.loihi1.netlist import Layer, Netlist
 from spikeloom.runtime.machines.loihi1 import engine, spec
 from spikeloom.runtime.machines.loihi1.trace import Counts, Trace
+
+KEPT = {"spikes": True, "membranes": True, "updated": True}
+"""Options of a run that keeps all it can."""
 
 MEMORYLESS = 4095
 """decay_u of a current that forgets everything in one step."""
@@ -179,18 +182,27 @@ def large_netlist(seed: int, *, proved: bool) -> Netlist:
     return build(neurons, axons, n_inputs=n_inputs, depths=depths)
 
 
+def voting(netlist: Netlist, classes: int = 3) -> Netlist:
+    """Let compartments vote for the classes in turn, and every so often for none."""
+    votes = np.arange(netlist.n_compartments) % (classes + 1) - 1
+    return replace(netlist, classes=classes, readout_class=read_only(votes))
+
+
+def lively() -> Netlist:
+    """Some hundred compartments, 10 taxels with two polarities, three classes, a lag of three steps."""
+    return replace(voting(large_netlist(10, proved=True)), taxels=10, polarities=2)
+
+
 def recording_of(batch: Trace, index: int) -> Trace:
     """One recording of a batch that kept all it can, as the plain simulator would hand it back."""
     counts = Counts(**{field.name: getattr(batch.counts, field.name)[index] for field in fields(Counts)})
-    kept = {name: getattr(batch, name)[index] for name in ("spikes", "membranes", "updated")}
-    return Trace(counts=counts, **kept)
+    return Trace(counts=counts, **{name: getattr(batch, name)[index] for name in KEPT})
 
 
 def by_engine(netlist: Netlist, events: np.ndarray, **options: bool) -> Trace:
     """Run one recording through the fast simulator."""
     prepared = engine.prepare(netlist, **options)
-    kept = {"spikes": True, "membranes": True, "updated": True}
-    return recording_of(engine.simulate(prepared, events[None], threads=1, **kept), 0)
+    return recording_of(engine.simulate(prepared, events[None], threads=1, **KEPT), 0)
 
 
 def by_checked_engine(netlist: Netlist, events: np.ndarray) -> Trace:
@@ -209,7 +221,7 @@ SIMULATORS = [spec.simulate, by_engine, by_steps, by_checked_engine]
 
 def assert_equal(left: Trace, right: Trace) -> None:
     """Every spike, membrane and count of two traces is the same."""
-    for name in ("spikes", "membranes", "updated"):
+    for name in KEPT:
         np.testing.assert_array_equal(getattr(left, name), getattr(right, name), err_msg=name, strict=True)
     for field in fields(left.counts):
         pair = (getattr(trace.counts, field.name) for trace in (left, right))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from random_netlists import Axon, Neuron, assert_equal, build, by_engine, by_steps, recording_of
+from random_netlists import KEPT, Axon, Neuron, assert_equal, build, by_engine, by_steps, recording_of
 
 from spikeloom.compiler import Options, Recipe, compile_network
 from spikeloom.compiler.errors import NumericRangeError
@@ -17,8 +17,6 @@ from spikeloom.runtime.machines.loihi1.trace import Charges, pack, unpack
 
 REPEATABLE = settings(max_examples=60, deadline=None, derandomize=True)
 
-KEPT = {"spikes": True, "membranes": True, "updated": True}
-
 
 def pipeline(
     seed: int,
@@ -30,34 +28,29 @@ def pipeline(
     biases: float = 0.7,
     lasting: float = 0.0,
 ) -> Netlist:
-    """Layers of `sizes`, some at each depth, on random cores; each neuron hears the depth before."""
+    """Layers of `sizes`, some at each depth, on random cores; each neuron receives the depth before."""
     rng = np.random.default_rng(seed)
-    neurons, depths, axons, number = [], [], [], 0
+    neurons, depths, axons = [], [], []
     cores = int(rng.integers(1, 4))
-    placed: list[tuple[int, int, int]] = []  # layer, core, number in build order
+    placed: list[tuple[int, int]] = []  # layer, core
     for depth, layers in enumerate(sizes):
         for size in layers:
-            for core in np.sort(rng.integers(0, cores, size)):
-                placed.append((len(depths), int(core), number))
-                number += 1
+            placed += [(len(depths), int(core)) for core in np.sort(rng.integers(0, cores, size))]
             depths.append(depth)
-    for layer, core, _ in placed:
-        neurons.append(
-            Neuron(
-                layer=layer,
-                core=core,
-                decay_u=int(rng.choice([0, 204, 2047, 4094])) if rng.random() < lasting else 4095,
-                decay_v=int(rng.choice([3277, 3277, 3277, 4096, 2048])),
-                threshold=int(rng.integers(0, 12 * largest)),
-                bias=int(rng.integers(-300, 300)) if rng.random() < biases else 0,
-            )
-        )
+    for layer, core in placed:
+        drawn = {
+            "decay_u": int(rng.choice([0, 204, 2047, 4094])) if rng.random() < lasting else 4095,
+            "decay_v": int(rng.choice([3277, 3277, 3277, 4096, 2048])),
+            "threshold": int(rng.integers(0, 12 * largest)),
+            "bias": int(rng.integers(-300, 300)) if rng.random() < biases else 0,
+        }
+        neurons.append(Neuron(layer=layer, core=core, **drawn))
     order = sorted(range(len(neurons)), key=lambda i: neurons[i].core)
     compartment = {index: c for c, index in enumerate(order)}
     first_of_core = {core: sum(n.core < core for n in neurons) for core in range(cores)}
     for depth in range(len(sizes)):
-        heard = range(inputs) if depth == 0 else [i for i, n in enumerate(neurons) if depths[n.layer] == depth - 1]
-        for source in heard:
+        sources = range(inputs) if depth == 0 else [i for i, n in enumerate(neurons) if depths[n.layer] == depth - 1]
+        for source in sources:
             for core in range(cores):
                 targets = [
                     (compartment[i] - first_of_core[core], int(rng.integers(-largest, largest + 1)))
@@ -161,12 +154,15 @@ def test_recordings_of_any_length_together():
         np.testing.assert_array_equal(found.counts.spikes, expected.counts.spikes)
 
 
-def test_events_of_any_type_and_layout():
-    netlist = pipeline(5, inputs=20, sizes=SHAPES[3], density=0.5)
+@pytest.mark.parametrize("stepwise", [False, True])
+def test_events_of_any_type_and_layout(stepwise):
+    prepared = engine.prepare(pipeline(5, inputs=20, sizes=SHAPES[3], density=0.5), stepwise=stepwise)
     events = (np.random.default_rng(6).random((3, 20, 16)) < 0.2).astype(np.uint8)
-    expected = engine.simulate(netlist, events, spikes=True)
-    for same in (events * 7, events.astype(bool), np.asfortranarray(events)):
-        np.testing.assert_array_equal(engine.simulate(netlist, same, spikes=True).spikes, expected.spikes)
+    events.flags.writeable = False
+    expected = engine.simulate(prepared, events, **KEPT)
+    transposed = np.ascontiguousarray(events.transpose(2, 1, 0)).transpose(2, 1, 0)
+    for same in (events * 7, events.astype(bool), np.asfortranarray(events), transposed):
+        assert_equal(engine.simulate(prepared, same, **KEPT), expected)
 
 
 # --- the ends of the ranges -------------------------------------------------------------------------------------------
@@ -196,10 +192,9 @@ def test_a_sum_beyond_sixteen_bits_takes_the_other_kernel():
     netlist = one_neuron([*FULL, 1])
     assert lay_out_blocks(netlist) is None
     events = np.ones((131, 2), np.uint8)
-    with pytest.raises(NumericRangeError, match="synaptic sum"):
-        spec.simulate(netlist, events)
-    with pytest.raises(NumericRangeError, match="synaptic sum"):
-        engine.simulate(netlist, events[None])
+    for simulate in (spec.simulate, by_engine):
+        with pytest.raises(NumericRangeError, match="synaptic sum"):
+            simulate(netlist, events)
 
 
 @pytest.mark.parametrize(
@@ -226,7 +221,7 @@ def test_membranes_at_the_end_of_32_bits(neuron, fits):
     assert_equal(by_engine(netlist, events), spec.simulate(netlist, events))
 
 
-def test_who_hears_more_than_the_depth_before_takes_the_other_kernel():
+def test_what_receives_more_than_the_depth_before_takes_the_other_kernel():
     neurons = [Neuron(layer=0), Neuron(layer=1)]
     for source, depths in ((1, [0, 0]), (0, [0, 1]), (2, [0, 1]), (1, [0, 2])):  # same depth, input, itself, skipped
         axons = [Axon(source=0, targets=((0, 10),)), Axon(source=source, targets=((1, 10),))]

@@ -66,9 +66,8 @@ def test_currents_and_clocks(timed):
 
 def test_without_the_package(timed, monkeypatch):
     monkeypatch.setitem(sys.modules, "neurobench.models", None)
-    with pytest.raises(OptionError) as caught:
+    with pytest.raises(OptionError, match="neurobench: is not installed; pip install neurobench"):
         neurobench_model(read_netlist(timed))
-    assert str(caught.value) == "neurobench: is not installed; pip install neurobench"
 
 
 HARNESS = """

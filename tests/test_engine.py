@@ -6,9 +6,10 @@ import sys
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from random_netlists import (
+    KEPT,
     Axon,
     Neuron,
     assert_equal,
@@ -49,26 +50,18 @@ def assert_twins_agree(netlist, events, *, gated=True) -> None:
             assert_equal(found, expected)
 
 
+@pytest.mark.parametrize(
+    ("exponents", "length", "gated"),
+    # few with small exponents overflow, so traces are compared and not messages
+    [((-1, 0, 0, 0, 1, 3, 7), 10, True), ((-1, 0, 0, 0, 1, 3, 7), 10, False), ((-1, 0), 20, True)],
+    ids=["any", "without windows", "small exponents"],
+)
 @REPEATABLE
-@given(st.data())
-def test_any_network(data):
-    netlist = data.draw(netlists())
-    assert_twins_agree(netlist, data.draw(recordings(netlist)))
-
-
-@REPEATABLE
-@given(st.data())
-def test_any_network_without_windows(data):
-    netlist = data.draw(netlists())
-    assert_twins_agree(netlist, data.draw(recordings(netlist)), gated=False)
-
-
-@REPEATABLE
-@given(st.data())
-def test_any_network_without_large_exponents(data):
-    # few of these overflow, so traces are compared and not messages
-    netlist = data.draw(netlists(weight_exponents=(-1, 0)))
-    assert_twins_agree(netlist, data.draw(recordings(netlist, max_length=20)))
+@given(data=st.data())
+def test_any_network(data, exponents, length, gated):
+    netlist = data.draw(netlists(weight_exponents=exponents))
+    events = data.draw(recordings(netlist, max_length=length))
+    assert_twins_agree(netlist, events, gated=gated)
 
 
 @pytest.mark.parametrize("proved", [True, False])
@@ -162,34 +155,23 @@ def test_threads_and_batches_do_not_matter(proved):
     netlist = large_netlist(7, proved=proved)
     prepared = engine.prepare(netlist)
     events = random_batch(8, netlist.n_inputs)
-    one = engine.simulate(prepared, events, spikes=True, membranes=True, updated=True, threads=1)
-    three = engine.simulate(netlist, events.astype(np.bool_), spikes=True, membranes=True, updated=True, threads=3)
+    one = engine.simulate(prepared, events, **KEPT, threads=1)
+    three = engine.simulate(netlist, events.astype(np.bool_), **KEPT, threads=3)
     assert_equal(one, three)
     for index in range(len(events)):  # each alone, so nothing leaks from one into the next
-        alone = engine.simulate(prepared, events[index : index + 1], spikes=True, membranes=True, updated=True)
+        alone = engine.simulate(prepared, events[index : index + 1], **KEPT)
         assert_equal(recording_of(one, index), recording_of(alone, 0))
-    repeated = engine.simulate(prepared, events[[0, 0, 0]], spikes=True, membranes=True, updated=True, threads=1)
+    repeated = engine.simulate(prepared, events[[0, 0, 0]], **KEPT, threads=1)
     for index in range(3):
         assert_equal(recording_of(repeated, index), recording_of(one, 0))
-
-
-def test_events_of_any_layout():
-    netlist = large_netlist(7, proved=True)
-    events = random_batch(8, netlist.n_inputs)
-    transposed = np.ascontiguousarray(events.transpose(2, 1, 0)).transpose(2, 1, 0) * 3
-    transposed.flags.writeable = False
-    expected = engine.simulate(netlist, events, spikes=True, membranes=True, updated=True)
-    assert_equal(engine.simulate(netlist, transposed, spikes=True, membranes=True, updated=True), expected)
 
 
 def test_only_what_is_asked_for_is_kept():
     netlist = large_netlist(7, proved=True)
     events = random_batch(8, netlist.n_inputs)
-    everything = engine.simulate(netlist, events, spikes=True, membranes=True, updated=True)
+    everything = engine.simulate(netlist, events, **KEPT)
     counted = engine.simulate(netlist, events)
-    assert counted.spikes is None
-    assert counted.membranes is None
-    assert counted.updated is None
+    assert all(getattr(counted, name) is None for name in KEPT)
     assert everything.spikes.dtype == np.bool_
     assert everything.membranes.dtype == np.int32
     np.testing.assert_array_equal(counted.counts.spikes, everything.spikes.sum(axis=1))
@@ -202,13 +184,14 @@ def test_only_what_is_asked_for_is_kept():
 
 @settings(REPEATABLE, max_examples=25)
 @given(st.booleans(), st.lists(st.integers(0, 33), max_size=8), st.integers(0, 100))
+@example(True, list(range(34)), 11)
+@example(False, list(range(34)), 11)
 def test_any_split_into_steps_is_the_batch(proved, cuts, seed):
     netlist = large_netlist(9, proved=proved)
     events = random_batch(seed, netlist.n_inputs, size=1)
     prepared = engine.prepare(netlist, stepwise=True)
-    whole = engine.simulate(prepared, events, spikes=True, membranes=True, updated=True)
-    chip_length = 30 + netlist.max_depth
-    bounds = sorted({0, *cuts, chip_length})
+    whole = engine.simulate(prepared, events, **KEPT)
+    bounds = sorted({0, *cuts, 30 + netlist.max_depth})
     assert_equal(in_pieces(prepared, events[0], bounds), recording_of(whole, 0))
 
 
@@ -216,32 +199,13 @@ def in_pieces(prepared: engine.Engine, events: np.ndarray, bounds: list[int]) ->
     """Run a recording in calls that stop at `bounds`."""
     n = prepared.netlist.n_compartments
     state = engine.start(prepared)
-    spikes = np.zeros((bounds[-1], n), np.bool_)
-    membranes = np.zeros((bounds[-1], n), np.int32)
-    updated = np.zeros((bounds[-1], n), np.bool_)
+    kept = {name: np.zeros((bounds[-1], n), np.int32 if name == "membranes" else np.bool_) for name in KEPT}
     for begin, end in itertools.pairwise(bounds):
-        engine.advance(
-            prepared,
-            state,
-            events[:, begin:end],
-            length=events.shape[1],
-            steps=end - begin,
-            spikes=spikes[begin:end],
-            membranes=membranes[begin:end],
-            updated=updated[begin:end],
-        )
+        part = {name: array[begin:end] for name, array in kept.items()}
+        engine.advance(prepared, state, events[:, begin:end], length=events.shape[1], steps=end - begin, **part)
         assert state.clock[0] == end
     counts = Counts(inputs=state.inputs, spikes=state.spikes, updates=state.updates, saturations=state.saturations)
-    return Trace(counts=counts, spikes=spikes, membranes=membranes, updated=updated)
-
-
-@pytest.mark.parametrize("proved", [True, False])
-def test_one_step_at_a_time_is_the_batch(proved):
-    netlist = large_netlist(10, proved=proved)
-    events = random_batch(11, netlist.n_inputs, size=1)
-    prepared = engine.prepare(netlist, stepwise=True)
-    whole = engine.simulate(prepared, events, spikes=True, membranes=True, updated=True)
-    assert_equal(in_pieces(prepared, events[0], list(range(30 + netlist.max_depth + 1))), recording_of(whole, 0))
+    return Trace(counts=counts, **kept)
 
 
 def test_a_stream_without_end():
@@ -282,9 +246,6 @@ def test_the_kernel_compiles_where_nothing_can_be_cached(monkeypatch):
 
 
 def test_simulators_do_not_load_torch():
-    code = (
-        "import sys, spikeloom.runtime.machines.loihi1.engine, "
-        "spikeloom.runtime.machines.loihi1.spec; "
-        "sys.exit('torch' in sys.modules)"
-    )
+    names = ("machines.loihi1.engine", "machines.loihi1.spec", "machines.loihi1.stream", "commands.exchange.watch")
+    code = f"import sys, {', '.join(f'spikeloom.runtime.{name}' for name in names)}; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -7,12 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from native_networks import random_network
-from random_netlists import large_netlist
+from random_netlists import lively
 
 from spikeloom.compiler import targets
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import FormatError, OptionError
-from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.targets.base import load_target, shipped
 from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist
 from spikeloom.compiler.targets.truenorth.netlist_file import write_crossbars
@@ -25,17 +24,11 @@ from spikeloom.runtime.report.encode import encode
 from spikeloom.runtime.report.sections import terminal
 
 
-def compartments():
-    netlist = large_netlist(10, proved=True)
-    votes = read_only(np.arange(netlist.n_compartments) % 4 - 1)
-    return replace(netlist, taxels=10, polarities=2, classes=3, readout_class=votes)
-
-
 def crossbars():
     return load_target("truenorth").compile(random_network(0, taxels=10, classes=3)).netlist
 
 
-WRITERS = {"loihi1": (compartments, write_netlist), "truenorth": (crossbars, write_crossbars)}
+WRITERS = {"loihi1": (lively, write_netlist), "truenorth": (crossbars, write_crossbars)}
 
 
 @pytest.fixture(params=WRITERS)
@@ -134,11 +127,11 @@ def test_a_third_chip_is_a_folder(tmp_path, monkeypatch):
     monkeypatch.setattr(machines, "__path__", [*machines.__path__, str(tmp_path / "machines")])
     shipped.cache_clear()
     try:
-        write_netlist(replace(compartments(), target="toy"), tmp_path / "net.loom")
+        write_netlist(replace(lively(), target="toy"), tmp_path / "net.loom")
         machine = machine_for(tmp_path / "net.loom")
         assert (type(machine).__name__, machine.target.name) == ("Toy", "toy")
         events = grasps(machine)
-        np.testing.assert_array_equal(machine.run(events).votes, machine_of(compartments()).run(events).votes)
+        np.testing.assert_array_equal(machine.run(events).votes, machine_of(lively()).run(events).votes)
         with pytest.raises(OptionError, match="toy has no such price model; allowed: counts"):
             machine.price(events, bin_s=0.02, detail="cycle")
     finally:

@@ -32,22 +32,13 @@ def spikes(trace: Trace, compartment: int = 0) -> list[int]:
     return np.flatnonzero(trace.spikes[:, compartment]).tolist()
 
 
-DECAY_VECTORS = [
-    (1, 0),
-    (5, 0),
-    (6, 1),
-    (-5, 0),
-    (-6, -1),
-    (64, 12),
-    (-64, -12),
-    (3840, 767),
-    (-1920, -383),
-    (8128, 1625),
-    (-8191, -1637),
-]
-
-
-@pytest.mark.parametrize(("value", "kept"), DECAY_VECTORS)
+@pytest.mark.parametrize(
+    ("value", "kept"),
+    [
+        *((1, 0), (5, 0), (6, 1), (-5, 0), (-6, -1), (64, 12), (-64, -12)),
+        *((3840, 767), (-1920, -383), (8128, 1625), (-8191, -1637)),
+    ],
+)
 def test_membrane_decay_vectors(simulate, value, kept):
     # the bias and one event make `value` in the first step; in the second one only the bias is added
     bias = value if abs(value) <= 4095 else value % 64
@@ -221,24 +212,39 @@ def test_an_empty_recording(simulate):
     assert trace.counts.updates.tolist() == [0]
 
 
-def test_positive_sum_overflow(simulate):
-    netlist = build(
-        [Neuron(layer=1), Neuron(layer=0, core=1)],
-        [
-            Axon(core=1, source=0, exponent=7, targets=((0, 254),)),
-            Axon(core=1, source=1, exponent=0, targets=((0, 254), (0, 2))),
-            Axon(core=1, source=1, exponent=7, targets=((0, -254),)),  # in another order the sum would hold
-        ],
-        n_inputs=2,
-        depths=[0, 1],
-    )
-    # 254 * 128 + 254 is 32766, the largest even sum that holds; the other 2 are too many
-    with pytest.raises(NumericRangeError) as caught:
-        simulate(netlist, events("0101", "0001"))
-    assert str(caught.value) == (
-        "layer0 neuron 0 on core 1, chip step 3: synaptic sum 2097152 found, magnitudes up to 2097151 allowed; "
-        "compile with a smaller scale for layer0"
-    )
+def two_layers() -> Netlist:
+    """254 * 128 + 254 is 32766, the largest even sum that holds; the other 2 of channel 1 are too many."""
+    axons = [
+        Axon(core=1, source=0, exponent=7, targets=((0, 254),)),
+        Axon(core=1, source=1, exponent=0, targets=((0, 254), (0, 2))),
+        Axon(core=1, source=1, exponent=7, targets=((0, -254),)),  # in another order the sum would hold
+    ]
+    return build([Neuron(layer=1), Neuron(layer=0, core=1)], axons, n_inputs=2, depths=[0, 1])
+
+
+@pytest.mark.parametrize(
+    ("netlist", "channels", "found"),
+    [
+        (two_layers(), ("0101", "0001"), "core 1, chip step 3: synaptic sum 2097152 found, magnitudes up to 2097151"),
+        (single(Neuron(), (-254, 7), (-256, 0), (254, 7)), "111", "core 0, chip step 0: synaptic sum -2097152 found"),
+        # the current is -8320024 after four steps
+        (
+            single(Neuron(decay_u=0), (-254, 7)),
+            ("111111",),
+            "core 0, chip step 4: current -10398760 found, magnitudes up to 8388607",
+        ),
+        # a sum is checked before a current
+        (
+            single(Neuron(decay_u=0), (254, 7), (254, 7)),
+            ("11111", "00001"),
+            "core 0, chip step 4: synaptic sum 4161536 found",
+        ),
+    ],
+    ids=["positive sum", "negative sum", "current", "sum before current"],
+)
+def test_overflows(simulate, netlist, channels, found):
+    with pytest.raises(NumericRangeError, match=f"layer0 neuron 0 on {found}.*smaller scale for layer0"):
+        simulate(netlist, events(*channels))
 
 
 def test_largest_sums_hold(simulate):
@@ -246,27 +252,6 @@ def test_largest_sums_hold(simulate):
     netlist = single(neuron, (254, 7), (254, 0), (2, -1), (-254, 7), (-254, 0), (-2, -1))
     trace = simulate(netlist, events("10", "10", "10", "01", "01", "01"))
     assert membranes(trace) == [2097088, -2097088 + 419315]
-
-
-def test_negative_sum_overflow(simulate):
-    netlist = single(Neuron(), (-254, 7), (-256, 0), (254, 7))
-    with pytest.raises(NumericRangeError) as caught:
-        simulate(netlist, events("1", "1", "1"))
-    assert str(caught.value) == (
-        "layer0 neuron 0 on core 0, chip step 0: synaptic sum -2097152 found, magnitudes up to 2097151 allowed; "
-        "compile with a smaller scale for layer0"
-    )
-
-
-def test_current_overflow(simulate):
-    netlist = single(Neuron(decay_u=0), (-254, 7))
-    with pytest.raises(NumericRangeError) as caught:
-        simulate(netlist, events("111111"))
-    # the current is -8320024 after four steps
-    assert str(caught.value) == (
-        "layer0 neuron 0 on core 0, chip step 4: current -10398760 found, magnitudes up to 8388607 allowed; "
-        "compile with a smaller scale for layer0"
-    )
 
 
 def test_first_overflow_is_reported(simulate):
@@ -279,24 +264,17 @@ def test_first_overflow_is_reported(simulate):
         Axon(source=2, exponent=7, targets=((0, 254), (0, 254))),
     ]
     netlist = build(neurons, axons, n_inputs=3, depths=[0, 0, 0, 0])
-    with pytest.raises(NumericRangeError, match="layer2 neuron 0 on core 0, chip step 4: current 10398760 found"):
-        simulate(netlist, events("111110", "000010", "000001"))
-    with pytest.raises(NumericRangeError, match="layer1 neuron 0 on core 0, chip step 4: synaptic sum 4161536 found"):
-        simulate(netlist, events("011110", "000010", "000001"))
-    with pytest.raises(NumericRangeError, match="layer3 neuron 0 on core 0, chip step 5: synaptic sum 4161536 found"):
-        simulate(netlist, events("011110", "000001", "000001"))
-
-
-def test_sum_is_checked_before_current(simulate):
-    netlist = single(Neuron(decay_u=0), (254, 7), (254, 7))
-    with pytest.raises(NumericRangeError, match="chip step 4: synaptic sum 4161536 found"):
-        simulate(netlist, events("11111", "00001"))
+    for channels, layer, step, found in (
+        (("111110", "000010", "000001"), 2, 4, "current 10398760"),
+        (("011110", "000010", "000001"), 1, 4, "synaptic sum 4161536"),
+        (("011110", "000001", "000001"), 3, 5, "synaptic sum 4161536"),
+    ):
+        with pytest.raises(
+            NumericRangeError, match=f"layer{layer} neuron 0 on core 0, chip step {step}: {found} found"
+        ):
+            simulate(netlist, events(*channels))
 
 
 def test_wrong_number_of_channels(simulate):
-    with pytest.raises(DataError) as caught:
+    with pytest.raises(DataError, match="2 input channels found, the netlist has 1"):
         simulate(single(Neuron()), np.zeros((2, 3), np.uint8))
-    assert str(caught.value) == (
-        "recordings: 2 input channels found, the netlist has 1; "
-        "use recordings of the sensor that the network was compiled for"
-    )

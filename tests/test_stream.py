@@ -1,41 +1,19 @@
 """A live stream is a run of the whole recording, bit for bit, chip step by chip step; and its own promises."""
 
-import subprocess
-import sys
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import FrozenInstanceError, replace
-from pathlib import Path
+from dataclasses import FrozenInstanceError
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_netlists import Axon, Neuron, build, large_netlist, netlists, recordings
+from random_netlists import Axon, Neuron, build, large_netlist, lively, netlists, recordings, voting
 
-from spikeloom.compiler import compile_network
 from spikeloom.compiler.errors import DataError, NumericRangeError
-from spikeloom.compiler.fixedpoint import read_only
-from spikeloom.compiler.formats.checkpoint import read_checkpoint
-from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
-from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist
-from spikeloom.models.graphs import build_graph, normalised_adjacency
-from spikeloom.models.recordings.evtouch import load_recordings
-from spikeloom.runtime.machines.base import machine_for
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.stream import Step, Stream, open_stream
 from spikeloom.runtime.machines.votes import class_counts
-
-
-def voting(netlist: Netlist, classes: int = 3) -> Netlist:
-    """Let compartments vote for the classes in turn, and every so often for none."""
-    votes = np.arange(netlist.n_compartments) % (classes + 1) - 1
-    return replace(netlist, classes=classes, readout_class=read_only(votes))
-
-
-def lively() -> Netlist:
-    """Some hundred compartments, 10 taxels with two polarities, a lag of three steps."""
-    return replace(voting(large_netlist(10, proved=True)), taxels=10, polarities=2)
 
 
 def events_of(netlist: Netlist, seed: int, length: int = 30) -> np.ndarray:
@@ -98,30 +76,6 @@ def test_large_networks(proved):
     assert all(any(step.spikes[layer].any() for step in steps) for layer in range(4))
 
 
-@pytest.fixture(scope="module")
-def released_netlist(released_checkpoint: Path) -> Netlist:
-    graph = build_graph("manual")
-    adjacency = normalised_adjacency(graph.edges, graph.n_taxels)
-    return compile_network(expand(read_checkpoint(str(released_checkpoint)), adjacency)).netlist
-
-
-@pytest.mark.recordings
-def test_the_released_network_on_its_recordings(released_netlist, objects_zip, tmp_path):
-    write_netlist(released_netlist, tmp_path / "net.loom")
-    live = machine_for(tmp_path / "net.loom")
-    data = load_recordings(objects_zip, "test", limit=3).events
-    # three grasps at the same time, in turns
-    streams = [live.stream() for _ in data]
-    steps = [[] for _ in data]
-    for t in range(data.shape[-1]):
-        for stream, taken, recording in zip(streams, steps, data, strict=True):
-            taken.append(stream.step(recording[:, :, t]))
-    for stream, taken, recording in zip(streams, steps, data, strict=True):
-        taken.extend(stream.finish())
-        assert_is_run(released_netlist, taken, recording.reshape(released_netlist.n_inputs, -1))
-    assert all(taken[-1].counts.sum() > 10 for taken in steps)
-
-
 def test_reset_forgets_everything():
     netlist = lively()
     stream = open_stream(netlist)
@@ -146,36 +100,26 @@ def test_streams_in_threads_share_nothing():
             assert_is_run(netlist, steps, events)
 
 
-@pytest.mark.parametrize("form", [list, np.float32, np.bool_, np.int64, "sensor", "fortran"])
+FORMS = {
+    "list": lambda column: column.tolist(),
+    "float32": lambda column: column.astype(np.float32),
+    "bool": lambda column: column.astype(np.bool_),
+    "int64": lambda column: column.astype(np.int64),
+    "sensor": lambda column: column.reshape(10, 2),
+    "fortran": lambda column: np.asfortranarray(column.reshape(10, 2)),
+}
+
+
+@pytest.mark.parametrize("form", FORMS.values(), ids=FORMS)
 def test_forms_of_events(form):
     netlist = lively()
     events = events_of(netlist, 4)
-    shape = (netlist.taxels, netlist.polarities)
-    stream = open_stream(netlist)
-    steps = []
+    stream, steps = open_stream(netlist), []
     for column in events.T:
-        if form is list:
-            given_events = column.tolist()
-        elif form == "sensor":
-            given_events = column.reshape(shape)
-        elif form == "fortran":
-            given_events = np.asfortranarray(column.reshape(shape))
-        else:
-            given_events = column.astype(form)
+        given_events = form(column)
         steps.append(stream.step(given_events))
-    assert_is_run(netlist, [*steps, *stream.finish()], events)
-
-
-def test_events_are_not_kept():
-    netlist = lively()
-    events = events_of(netlist, 5)
-    stream = open_stream(netlist)
-    steps = []
-    reused = np.zeros(netlist.n_inputs, np.uint8)
-    for column in events.T:
-        reused[:] = column
-        steps.append(stream.step(reused))
-        reused[:] = 1
+        if isinstance(given_events, np.ndarray) and not np.shares_memory(given_events, events):
+            given_events[:] = 1  # is not kept
     assert_is_run(netlist, [*steps, *stream.finish()], events)
 
 
@@ -213,33 +157,27 @@ def test_a_grasp_without_events_ends_like_a_run():
     assert len(steps) == 3
 
 
-SHAPES = "allowed are (10, 2) (taxels, polarities) and (20,); give the events of one bin of this network's sensor"
-
-
 @pytest.mark.parametrize(
-    ("events", "message"),
+    ("events", "found"),
     [
-        (np.zeros(19), f"stream: a bin of shape (19,) found, {SHAPES}"),
-        (np.zeros((2, 10)), f"stream: a bin of shape (2, 10) found, {SHAPES}"),
-        (np.zeros((20, 1)), f"stream: a bin of shape (20, 1) found, {SHAPES}"),
-        (1, f"stream: a bin of shape () found, {SHAPES}"),
-        ([[1, 0], [1]], "stream: a bin with rows of unequal length found; give one row per taxel"),
-        (["1"] * 20, "stream: a bin of type <U1 found, allowed are numbers and bool; give 0 and 1"),
-        ([None] * 20, "stream: a bin of type object found, allowed are numbers and bool; give 0 and 1"),
-        ([0] * 19 + [2], "stream: a bin with the value 2 found, "),
-        ([0] * 19 + [-1], "stream: a bin with the value -1 found, "),
-        ([0] * 19 + [0.5], "stream: a bin with the value 0.5 found, "),
-        ([0] * 19 + [np.nan], "stream: a bin with the value nan found, "),
+        (np.zeros(19), r"shape \(19,\) found, allowed are \(10, 2\) \(taxels, polarities\) and \(20,\)"),
+        (np.zeros((2, 10)), r"shape \(2, 10\) found"),
+        (np.zeros((20, 1)), r"shape \(20, 1\) found"),
+        (1, r"shape \(\) found"),
+        ([[1, 0], [1]], "rows of unequal length found"),
+        (["1"] * 20, "type <U1 found, allowed are numbers and bool"),
+        ([None] * 20, "type object found"),
+        ([0] * 19 + [2], "the value 2 found, allowed are 0 and 1"),
+        ([0] * 19 + [-1], "the value -1 found"),
+        ([0] * 19 + [0.5], "the value 0.5 found"),
+        ([0] * 19 + [np.nan], "the value nan found"),
     ],
 )
-def test_events_that_are_none(events, message):
-    if message.endswith("found, "):
-        message += "allowed are 0 and 1; give 1 for any number of events of a channel"
+def test_events_that_are_none(events, found):
     netlist = lively()
     stream = open_stream(netlist)
-    with pytest.raises(DataError) as caught:
+    with pytest.raises(DataError, match=f"stream: a bin .*{found}"):
         stream.step(events)
-    assert str(caught.value) == message
     # nothing has happened: the grasp goes on
     good = events_of(netlist, 6)
     assert_is_run(netlist, play(stream, good), good)
@@ -248,15 +186,10 @@ def test_events_that_are_none(events, message):
 def test_nothing_after_the_end():
     stream = open_stream(lively())
     stream.finish()
-    with pytest.raises(DataError) as caught:
+    with pytest.raises(DataError, match=r"a step after the end found.*call reset\(\)"):
         stream.step(np.zeros(20))
-    assert str(caught.value) == (
-        "stream: a step after the end found, finish() or an overflow ends a stream; "
-        "call reset() to begin the next grasp"
-    )
-    with pytest.raises(DataError) as caught:
+    with pytest.raises(DataError, match=r"a second end found.*call reset\(\)"):
         stream.finish()
-    assert str(caught.value) == ("stream: a second end found, a grasp has one; call reset() to begin the next grasp")
 
 
 def test_an_overflow_ends_the_stream_until_reset():
@@ -270,12 +203,3 @@ def test_an_overflow_ends_the_stream_until_reset():
             again()
     stream.reset()
     assert stream.step([0, 1]).spikes[0].tolist() == [True]
-
-
-def test_streams_do_not_load_torch():
-    code = (
-        "import sys, spikeloom.runtime.machines.loihi1.stream, "
-        "spikeloom.runtime.commands.exchange.watch; "
-        "sys.exit('torch' in sys.modules)"
-    )
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -90,15 +90,13 @@ DETAILED = [1058.8, 1068.7, 1039.7, 1058.8, 1068.7, 1078.4]
 SIMPLE = [1047.2, 1054.5, 1039.7, 1047.2, 1054.5, 1054.5]
 
 
-def test_the_published_run_to_the_decimal():
+def test_the_published_times_to_the_decimal():
     netlist, events, trace = six_steps()
     assert np.argwhere(trace.spikes).tolist() == [[1, 0], [2, 2], [4, 0], [5, 1], [5, 2]]
-    assert trace.membranes[1:5, 1].tolist() == [3840, -1153, -230, 3795]
     simple, detailed = both(netlist, trace, events, input_tiles=(0,))
     assert detailed.duration_ns[0].round(1).tolist() == DETAILED
     assert simple.duration_ns[0].tolist() == SIMPLE
     assert detailed.duration_ns.sum() == pytest.approx(6373.1, abs=0.05)
-    assert simple.duration_ns.sum() == pytest.approx(6297.6, abs=0.05)
     assert_as_defined(netlist, trace, events, input_tiles=(0,))
 
 
@@ -115,20 +113,13 @@ def test_the_published_energies_to_the_decimal():
     sent = np.column_stack([events[:, 1:], np.zeros(2, np.uint8)]).T
     counts = replace(trace.counts, inputs=sent, spikes=trace.spikes.astype(np.int64))
     updated = sanafe_counts.updates(netlist, events[None], trace.spikes[None], trace.membranes[None])[0]
+    # o fired in step 2 on what arrived; its current still holds that in step 3, and nothing else happens to it
+    assert np.argwhere(trace.updated & ~updated).tolist() == [[3, 2]]
     updates = energy.updates_by_core(netlist, updated[:, None])
     amounts = energy.count_by_core(netlist, LOIHI, counts, updates, 1, input_tiles=(0,))
     (fit,) = (entry for entry in LOIHI.energy if entry.name == "sanafe")
     parts = energy.by_part(fit, amounts)
     assert {part: (1e12 * joules.sum(axis=1)).round(1).tolist() for part, joules in parts.items()} == ENERGY_PJ
-    assert 1e12 * sum(joules.sum() for joules in parts.values()) == pytest.approx(3093.0, abs=0.05)
-
-
-def test_updates_as_the_reference_counts_them():
-    netlist, events, trace = six_steps()
-    seen = sanafe_counts.updates(netlist, events[None], trace.spikes[None], trace.membranes[None])[0]
-    # o fired in step 2 on what arrived; its current still holds that in step 3, and nothing else happens to it
-    assert np.argwhere(trace.updated & ~seen).tolist() == [[3, 2]]
-    assert not np.any(seen & ~trace.updated)
 
 
 @settings(deadline=None, max_examples=60)
@@ -142,9 +133,9 @@ def test_updates_of_the_reference_by_hand(data):
     for t, c in np.ndindex(*trace.spikes.shape):
         active = set(np.flatnonzero(events[:, t]).tolist())
         active |= {netlist.n_inputs + int(other) for other in np.flatnonzero(trace.spikes[t - 1])} if t else set()
-        heard = set(netlist.axon_source[axon[netlist.synapse_compartment() == c]].tolist())
+        sources = set(netlist.axon_source[axon[netlist.synapse_compartment() == c]].tolist())
         rests = t == 0 or trace.spikes[t - 1, c] or trace.membranes[t - 1, c] == 0
-        assert seen[t, c] == bool(netlist.bias_mantissa[c] or not rests or active & heard)
+        assert seen[t, c] == bool(netlist.bias_mantissa[c] or not rests or active & sources)
         assert trace.updated[t, c] >= seen[t, c]
 
 
@@ -192,9 +183,8 @@ def test_kernels_and_definition_agree_exactly(case, seed):
     netlist, events, times, input_tiles = case
     steps = events.shape[1] + 2
     rng = np.random.default_rng(seed)
-    # any spikes will do: the models do not ask where they come from
     spikes = rng.random((steps, netlist.n_compartments)) < 0.5
-    trace = replace(by_engine(netlist, events[:, :0]), spikes=spikes, updated=spikes | (rng.random(spikes.shape) < 0.5))
+    trace = forced(netlist, spikes, spikes | (rng.random(spikes.shape) < 0.5))
     assert_as_defined(netlist, trace, events, times=times, input_tiles=input_tiles)
 
 
@@ -205,7 +195,7 @@ def test_kernels_and_definition_agree_on_a_crowded_mesh(link_buffer, input_tiles
     rng = np.random.default_rng(2)
     spikes = rng.random((3, netlist.n_compartments)) < 0.3
     events = (rng.random((netlist.n_inputs, 3)) < 0.5).astype(np.uint8)
-    trace = replace(by_engine(netlist, events[:, :0]), spikes=spikes, updated=spikes | (rng.random(spikes.shape) < 0.5))
+    trace = forced(netlist, spikes, spikes | (rng.random(spikes.shape) < 0.5))
     wanted = assert_as_defined(netlist, trace, events, times=table(link_buffer), input_tiles=input_tiles)
     assert (max(step.blocked for step in wanted) > 0) == (link_buffer < 16)
 
@@ -221,11 +211,16 @@ def pipe(tiles, targets=1, senders=1):
     return replace(netlist, core_tile=read_only(tiles))
 
 
+def forced(netlist, spikes, updated):
+    """A trace with any spikes and updates: the models of time do not depend on where they come from."""
+    nothing = by_engine(netlist, np.zeros((netlist.n_inputs, 0), np.uint8))
+    return replace(nothing, spikes=spikes, updated=updated)
+
+
 def fire(netlist, slots):
-    """One step in which these compartments fire and nobody else has work to do."""
-    spikes = np.zeros((1, netlist.n_compartments), np.bool_)
-    spikes[0, slots] = True
-    return replace(by_engine(netlist, np.zeros((netlist.n_inputs, 0), np.uint8)), spikes=spikes, updated=spikes.copy())
+    """One step in which these compartments fire and no other has work to do."""
+    spikes = np.isin(np.arange(netlist.n_compartments), slots)[None]
+    return forced(netlist, spikes, spikes.copy())
 
 
 NOTHING = np.zeros((1, 1), np.uint8)
@@ -291,9 +286,8 @@ def test_input_cores_go_where_there_is_room():
     wide = replace(full, taxels=3000)
     assert sanafe.input_tiles(wide, LOIHI) == (0, 0, 0)
     everywhere = replace(netlist, core_tile=read_only(list(range(32)) * 4))
-    with pytest.raises(ModelError) as caught:
+    with pytest.raises(ModelError, match="input channels: 1 cores needed, the chip has 0 left"):
         sanafe.input_tiles(everywhere, LOIHI)
-    assert str(caught.value) == "input channels: 1 cores needed, the chip has 0 left; compile for fewer cores"
 
 
 def test_input_channels_spread_over_their_cores():

@@ -19,52 +19,64 @@ NATIVE, LOIHI = "native.pt", "ring.pt"
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory):
-    """A folder with recordings, a checkpoint and a network for TrueNorth."""
+    """A folder with recordings, a checkpoint and two networks for TrueNorth, one of unknown origin."""
+    chart_work.both_splits.cache_clear()
     folder = tmp_path_factory.mktemp("chart")
     train = np.concatenate([events(1, samples=12), events(3, samples=4, rate=0.05)])
     recordings_folder(folder / "data", train=train, test=events(2, samples=8))
     digest = data_digest(load_recordings(folder / "data", "train"), load_recordings(folder / "data", "test"))
     known = {"data_sha256": digest, "validation": {"correct": 3, "samples": 4}, "command": "spikeloom train …"}
     own_file(folder / LOIHI, training=known)
-    shape = {"taxels": TAXELS, "classes": CLASSES, "steps": STEPS}
     for name, seed, training in ((NATIVE, 4, known), ("unknown.pt", 5, {})):
-        network = random_network(seed, **shape)
+        network = random_network(seed, taxels=TAXELS, classes=CLASSES, steps=STEPS)
         write_trained(folder / name, {"last": network}, graph="ring", edges=np.zeros((0, 2), int), training=training)
     return folder
 
 
-@pytest.fixture(autouse=True)
-def nothing_kept():
-    chart_work.both_splits.cache_clear()
-
-
 @pytest.fixture
 def made(spikeloom, place):
-    """A chart of both, made once."""
-    if not (place / "out" / "chart.json").exists():
-        grid = "bits=2,8,window=50-100%:50"
-        code, _, err = spikeloom("chart", LOIHI, NATIVE, "--data", "data", "--grid", grid, "--jobs", "1", "-o", "out")
-        assert (code, err) == (0, "")
-    return json.loads((place / "out" / "chart.json").read_text())
+    """A chart of both, made once, its points on TrueNorth, and what was printed."""
+    grid = "bits=2,8,window=50-100%:50"
+    code, out, err = spikeloom("chart", LOIHI, NATIVE, "--data", "data", "--grid", grid, "--jobs", "1", "-o", "out")
+    assert (code, err) == (0, "")
+    report = json.loads((place / "out" / "chart.json").read_text())
+    return report, [point for point in report["points"] if point["target"] == "truenorth"], out
 
 
-def native_points(report):
-    return [point for point in report["points"] if point["target"] == "truenorth"]
-
-
-def test_a_network_for_truenorth_has_a_point_for_each_window(made):
-    assert [(point["storage"], point["window"]) for point in native_points(made)] == [
-        ("7 levels", 50),
-        ("7 levels", 100),
-    ]
-    assert len(made["points"]) == 6
-    assert made["target"] == "loihi1"
-    assert set(made["tables"]["energy"]) == {"davies2018", "sanafe", "all_in", "marginal"}
-    assert set(made["tables"]["time"]) == {"sanafe", "tick"}
+def test_a_network_for_truenorth_has_a_point_for_each_window(made, place):
+    report, points, out = made
+    assert [(point["storage"], point["window"]) for point in points] == [("7 levels", 50), ("7 levels", 100)]
+    assert (len(report["points"]), report["target"]) == (6, "loihi1")
+    assert set(report["tables"]["energy"]) == {"davies2018", "sanafe", "all_in", "marginal"}
+    assert set(report["tables"]["time"]) == {"sanafe", "tick"}
+    for point in points:  # chip and model decide alike, in every part of a recording
+        assert [point[split]["equal"] for split in ("train", "test")] == [16, 8]
+        assert point["test"]["float"]["accuracy"] == point["test"]["accuracy"]
+    # choices and fronts are of the chip of the first network
+    assert not any(any(point["front"].values()) for point in points)
+    chosen = {*report["recommended"].values(), report["saving"]["chosen"]["point"]}
+    assert not chosen & {point["number"] for point in points}
+    assert report["networks"][1]["expected"] == 0.75
+    for point in points:
+        kept = point["train"]["accuracy"] / report["networks"][1]["float_training"]
+        assert point["expected"] == pytest.approx(0.75 * kept)
+    # every file, and the text, names its prices
+    page = (place / "out" / "chart.html").read_text()
+    assert "energy of a mean inference (davies2018; truenorth: all_in)" in page
+    assert "time of a mean inference on the chip (sanafe; truenorth: tick)" in page
+    with (place / "out" / "chart.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if row["network"] == "native"]
+    assert [row["test_energy_j_davies2018"] for row in rows] == ["", ""]
+    assert all(float(row["test_energy_j_all_in"]) > 0 for row in rows)
+    head, *lines = out.partition("on truenorth, whose prices are others (no choice, no front):\n")[2].splitlines()
+    assert "energy (all_in)" in head
+    assert "time (tick)" in head
+    assert "native 7 levels, 50 %" in lines[0]
+    assert "native 7 levels, 100 %" in lines[1]
 
 
 def test_its_commands_give_its_netlist_and_its_figures(made, spikeloom, place):
-    for point in native_points(made):
+    for point in made[1]:
         compiled, ran = (shlex.split(command) for command in point["commands"])
         assert spikeloom(*compiled[1:])[0] == 0
         assert (place / compiled[-1]).read_bytes() == (place / "out" / point["netlist"]).read_bytes()
@@ -80,44 +92,6 @@ def test_its_commands_give_its_netlist_and_its_figures(made, spikeloom, place):
         assert point["test"]["step_s"] == {"tick": pytest.approx(1e-3)}
 
 
-def test_chip_and_model_decide_alike_in_every_part_of_a_recording(made):
-    for point in native_points(made):
-        assert [point[split]["equal"] for split in ("train", "test")] == [16, 8]
-        assert point["test"]["float"]["accuracy"] == point["test"]["accuracy"]
-
-
-def test_choices_and_fronts_are_of_the_chip_of_the_first_network(made):
-    numbers = {point["number"] for point in native_points(made)}
-    assert not any(any(point["front"].values()) for point in native_points(made))
-    assert not numbers & {*made["recommended"].values(), made["saving"]["chosen"]["point"]}
-    assert made["networks"][1]["expected"] == 0.75
-    for point in native_points(made):
-        kept = point["train"]["accuracy"] / made["networks"][1]["float_training"]
-        assert point["expected"] == pytest.approx(0.75 * kept)
-
-
-def test_every_file_of_a_chart_names_its_prices(made, place):
-    page = (place / "out" / "chart.html").read_text()
-    assert "energy of a mean inference (davies2018; truenorth: all_in)" in page
-    assert "time of a mean inference on the chip (sanafe; truenorth: tick)" in page
-    assert "Points of another chip stand at their own prices" in page
-    with (place / "out" / "chart.csv").open() as file:
-        rows = [row for row in csv.DictReader(file) if row["network"] == "native"]
-    assert [row["test_energy_j_davies2018"] for row in rows] == ["", ""]
-    assert all(float(row["test_energy_j_all_in"]) > 0 for row in rows)
-
-
-def test_the_text_lists_them_under_their_own_prices(spikeloom, made):
-    del made  # figures are kept, so this one only prints
-    grid = "bits=2,8,window=50-100%:50"
-    code, out, _ = spikeloom("chart", LOIHI, NATIVE, "--data", "data", "--grid", grid, "--jobs", "1", "-o", "out")
-    assert code == 0
-    tail = out.partition("on truenorth, whose prices are others (no choice, no front):\n")[2].splitlines()
-    assert "energy (all_in)" in tail[0]
-    assert "time (tick)" in tail[0]
-    assert ["native 7 levels, 50 %" in tail[1], "native 7 levels, 100 %" in tail[2]] == [True, True]
-
-
 def test_a_chart_of_truenorth_alone_chooses_there(spikeloom, place):
     words = ("chart", NATIVE, "unknown.pt", "--data", "data", "--jobs", "1", "-o", "alone")
     code, _, err = spikeloom(*words, "--table", "marginal", "--budget", "latency=20ms")
@@ -131,14 +105,17 @@ def test_a_chart_of_truenorth_alone_chooses_there(spikeloom, place):
     assert {point["window"] for point in report["points"]} == {25, 50, 75, 100}
 
 
-def test_axes_of_loihi_are_refused_where_there_is_nothing_for_loihi(spikeloom):
-    code, _, err = spikeloom("chart", NATIVE, "--data", "data", "--grid", "bits=4", "-o", "no")
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--grid", "bits=4"), ["--grid bits: is for loihi1, networks for truenorth"]),
+        (("--table", "sanafe"), ["--table sanafe", "all_in or marginal"]),
+    ],
+)
+def test_axes_of_loihi_are_refused_where_there_is_nothing_for_loihi(spikeloom, words, said):
+    code, _, err = spikeloom("chart", NATIVE, "--data", "data", *words, "-o", "no")
     assert code == 2
-    assert "--grid bits: is for loihi1, networks for truenorth" in err
-    code, _, err = spikeloom("chart", NATIVE, "--data", "data", "--table", "sanafe", "-o", "no")
-    assert code == 2
-    assert "--table sanafe" in err
-    assert "all_in or marginal" in err
+    assert all(word in err for word in said)
 
 
 @pytest.mark.parametrize("command", [("run",), ("estimate",), ("verify", "--checkpoint", NATIVE)], ids=lambda c: c[0])
@@ -152,4 +129,4 @@ def test_a_part_of_every_recording(spikeloom, command):
         assert found["per_inference"]["ticks"] == STEPS // 2 + 3
     code, out, err = spikeloom(name, "n.loom", *words, "--data", "data", "--window", "0%", "--json")
     assert (code, out) == (2, "")
-    assert err == ("spikeloom: --window 0%: not a part of a recording; give whole per cent from 1% to 100%\n")
+    assert "--window 0%: not a part of a recording" in err

@@ -6,42 +6,20 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_crossbars import assert_same, crossbars, events
+from random_crossbars import CHIP, assert_same, both, crossbars, events, recording_of, relays
 
 from spikeloom.compiler.errors import DataError, NumericRangeError
-from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.truenorth.builder import Draft, Neuron, history_free
 from spikeloom.compiler.targets.truenorth.legalize import faults
 from spikeloom.compiler.targets.truenorth.netlist import RESET_LINEAR, RESET_NONE, RESET_TO
 from spikeloom.runtime.machines.truenorth import engine, spec
-from spikeloom.runtime.machines.truenorth.trace import Counts, Trace
-
-CHIP = load_target("truenorth")
-
-
-def one(batch: Trace, sample: int = 0) -> Trace:
-    """One recording of a batch, cut to its own ticks."""
-    counts = Counts(**{field.name: getattr(batch.counts, field.name)[sample] for field in fields(Counts)})
-    ticks = int(counts.ticks)
-    return Trace(counts=counts, spikes=batch.spikes[sample, :ticks], membranes=batch.membranes[sample, :ticks])
-
 
 # -- one neuron --------------------------------------------------------------------------------------------------------
 
 
 def lives(neuron: Neuron, arrivals: list[int]) -> tuple[list[int], list[int]]:
     """Membranes at the ends of ticks and ticks with spikes of a neuron to which weights of type 0 arrive."""
-    state = spec.Neuron(
-        neuron.leak,
-        neuron.leak_reversal,
-        neuron.threshold,
-        neuron.mask_bits,
-        neuron.reset_mode,
-        neuron.reset,
-        neuron.negative_threshold,
-        neuron.negative_saturates,
-        neuron.initial,
-    )
+    state = spec.Neuron(**{each.name: getattr(neuron, each.name, neuron.initial) for each in fields(spec.Neuron)})
     held, spikes = [], []
     for tick, arrived in enumerate(arrivals):
         spiked, _ = spec.neuron_tick(state, max(arrived, 0), max(-arrived, 0), 0, 20)
@@ -76,12 +54,7 @@ def lives(neuron: Neuron, arrivals: list[int]) -> tuple[list[int], list[int]]:
         (history_free((1, 0, 0, 0), 3, bias=1), [2, 1, 0], [0] * 3, [0]),
         # the register saturates at both ends
         (Neuron(threshold=2**18 - 1, reset_mode=RESET_NONE, initial=2**19 - 1), [5, -3], [524287, 524284], [0, 1]),
-        (
-            Neuron(threshold=9, negative_threshold=2**18 - 1, reset_mode=RESET_NONE, initial=-(2**19)),
-            [-5],
-            [-524288],
-            [],
-        ),
+        (Neuron(negative_threshold=2**18 - 1, reset_mode=RESET_NONE, initial=-(2**19)), [-5], [-524288], []),
     ],
 )
 def test_a_neuron_by_hand(neuron, arrivals, held, spikes):
@@ -98,38 +71,18 @@ def test_a_register_that_some_order_would_leave_is_counted():
 # -- ticks, delays, clocks ---------------------------------------------------------------------------------------------
 
 
-def chain(delay: int, *, bin_ticks: int = 1, tick: int = 0, first: int = 0):
-    """An input, a relay, and a voter that hears it `delay` ticks later."""
-    draft = Draft()
-    for x in (0, 1):
-        draft.core(x, 0)
-        draft.axon(x)
-        draft.neuron(x, Neuron(), layer=f"layer{x}")
-        draft.connect(x, 0, [0])
-    draft.feed(0, 0, 0, tick=tick)
-    draft.wire((0, 0), 1, 0, delay)
-    draft.vote((1, 0), 0, first=first)
-    return draft.netlist(taxels=1, polarities=1, classes=1, bin_ticks=bin_ticks)
-
-
 @pytest.mark.parametrize("delay", [1, 2, 15])
-@pytest.mark.parametrize("run", ["spec", "engine"])
-def test_when_spikes_arrive(delay, run):
-    netlist, recording = chain(delay, bin_ticks=3, tick=2, first=20), np.array([[1, 0, 1]], np.uint8)
-    trace = (
-        spec.simulate(netlist, recording)
-        if run == "spec"
-        else one(engine.simulate(netlist, recording[None], spikes=True, membranes=True))
-    )
+def test_when_spikes_arrive(delay):
+    netlist = relays(delay=delay, tick=2, first=20).netlist(taxels=1, polarities=1, classes=1, bin_ticks=3)
+    trace = both(netlist, np.array([[1, 0, 1]], np.uint8))
     assert int(trace.counts.ticks) == 3 * 3 + 20
     assert [np.flatnonzero(row).tolist() for row in trace.spikes.T] == [[2, 8], [2 + delay, 8 + delay]]
 
 
-def test_votes_count_in_their_window_only():
-    recording = np.array([[1, 0, 1, 1]], np.uint8)
-    for first, votes in ((0, 2), (1, 3), (2, 2), (3, 2), (4, 1), (5, 0)):
-        found = spec.simulate(chain(1, first=first), recording).counts.votes
-        assert found.tolist() == [0, votes], first
+@pytest.mark.parametrize(("first", "votes"), [(0, 2), (1, 3), (2, 2), (3, 2), (4, 1), (5, 0)])
+def test_votes_count_in_their_window_only(first, votes):
+    netlist = relays(first=first).netlist(taxels=1, polarities=1, classes=1)
+    assert both(netlist, np.array([[1, 0, 1, 1]], np.uint8)).counts.votes.tolist() == [0, votes]
 
 
 def test_spikes_that_meet_on_an_axon_are_one():
@@ -142,7 +95,7 @@ def test_spikes_that_meet_on_an_axon_are_one():
     draft.feed(1, 0, 0)
     draft.clock(0, 0, period=2, phase=1)
     netlist = draft.netlist(taxels=2, polarities=1, classes=1)
-    trace = spec.simulate(netlist, np.array([[1, 1, 0, 0], [1, 0, 0, 0]], np.uint8))
+    trace = both(netlist, np.array([[1, 1, 0, 0], [1, 0, 0, 0]], np.uint8))
     assert trace.counts.axons.tolist() == [3]
     assert int(trace.counts.merged) == 2
     assert np.flatnonzero(trace.spikes[:, 0]).tolist() == [1]
@@ -163,7 +116,7 @@ def test_a_splitter_costs_one_tick():
         draft.vote((x, 0), 0, first=2)
     netlist = draft.netlist(taxels=1, polarities=1, classes=1)
     assert faults(netlist, CHIP) == ()
-    trace = spec.simulate(netlist, np.array([[1, 0]], np.uint8))
+    trace = both(netlist, np.array([[1, 0]], np.uint8))
     assert [np.flatnonzero(row).tolist() for row in trace.spikes.T] == [[0], [2], [2], [1], [1]]
 
 
@@ -174,9 +127,7 @@ def test_a_splitter_costs_one_tick():
 @given(crossbars(), st.integers(0, 2**31))
 def test_engine_equals_specification(netlist, seed):
     assert faults(netlist, CHIP) == ()
-    recording = events(seed, 3, 20)
-    expected = spec.simulate(netlist, recording, seed=seed)
-    assert_same(expected, one(engine.simulate(netlist, recording[None], seed=seed, spikes=True, membranes=True)))
+    both(netlist, events(seed, 3, 20), seed=seed)
 
 
 @settings(max_examples=15, deadline=None)
@@ -185,7 +136,7 @@ def test_recordings_of_a_batch_do_not_depend_on_each_other(netlist, seed):
     recordings, lengths = events(seed, 3, 12, samples=3), np.array([12, 7, 1])
     batch = engine.simulate(netlist, recordings, lengths=lengths, spikes=True, membranes=True)
     for sample, steps in enumerate(lengths):
-        assert_same(spec.simulate(netlist, recordings[sample, :, :steps]), one(batch, sample))
+        assert_same(spec.simulate(netlist, recordings[sample, :, :steps]), recording_of(batch, sample))
 
 
 def large():
@@ -215,9 +166,7 @@ def large():
 def test_full_cores_and_many_ticks():
     netlist, recording = large(), (np.random.default_rng(1).random((78, 60)) < 0.05).astype(np.uint8)
     assert faults(netlist, CHIP) == ()
-    expected = spec.simulate(netlist, recording)
-    assert 1000 < expected.counts.spikes.sum() < 2500 * 60
-    assert_same(expected, one(engine.simulate(netlist, recording[None], spikes=True, membranes=True)))
+    assert 1000 < both(netlist, recording).counts.spikes.sum() < 2500 * 60
 
 
 @pytest.mark.parametrize("most", [0, 1 << 15])
@@ -230,25 +179,17 @@ def test_neurons_work_when_they_are_reached_or_all_at_once(most, monkeypatch):
     assert_same(expected, engine.simulate(prepared, recording[None], spikes=True, membranes=True))
 
 
-def climbing(weight):
+def test_a_membrane_that_climbs_to_the_end_of_its_register():
     """A neuron that is given more in every tick than a spike takes from it."""
     draft = Draft()
     draft.core(0, 0)
-    line = draft.axon(0)
-    neuron = Neuron(weights=(weight, 0, 0, 0), reset_mode=RESET_LINEAR, negative_saturates=True)
-    number = draft.neuron(0, neuron, layer="layer0")
-    draft.connect(0, line, [number])
-    draft.vote((0, number), 0)
-    draft.clock(0, line, period=1)
-    return draft.netlist(taxels=1, polarities=1, classes=1)
-
-
-def test_a_membrane_that_climbs_to_the_end_of_its_register():
-    netlist = climbing(255)
-    recording = np.zeros((1, 2100), np.uint8)
-    expected = spec.simulate(netlist, recording)
-    assert expected.counts.overflows.sum() > 0  # 254 a tick, 2**19 after 2,064
-    assert_same(expected, one(engine.simulate(netlist, recording[None], spikes=True, membranes=True)))
+    draft.axon(0)
+    draft.neuron(0, Neuron(weights=(255, 0, 0, 0), reset_mode=RESET_LINEAR, negative_saturates=True), layer="layer0")
+    draft.connect(0, 0, [0])
+    draft.vote((0, 0), 0)
+    draft.clock(0, 0, period=1)
+    netlist = draft.netlist(taxels=1, polarities=1, classes=1)
+    assert both(netlist, np.zeros((1, 2100), np.uint8)).counts.overflows.sum() > 0  # 254 a tick, 2**19 after 2,064
     assert engine.prepare(netlist).wiring.steady.shape[1] == 1
     assert engine.prepare(netlist, careful=True).wiring.steady.shape[1] == 0
 
@@ -273,12 +214,9 @@ def test_a_network_at_rest_does_nothing_and_loses_nothing():
 
 
 def test_recordings_of_another_sensor_or_too_long():
-    with pytest.raises(DataError) as caught:
-        engine.simulate(chain(1), np.zeros((1, 2, 3), np.uint8))
-    expected = "recordings have 2 input channels, the network has 1; use recordings of its sensor"
-    assert str(caught.value) == expected
-    with pytest.raises(DataError, match=f"^{expected}$"):
-        spec.simulate(chain(1), np.zeros((2, 3), np.uint8))
-    with pytest.raises(NumericRangeError) as much:
-        engine.simulate(chain(1, bin_ticks=2**20), np.zeros((1, 1, 2**11), np.uint8))
-    assert str(much.value) == "recordings of 2048 data steps take 2147483648 ticks, 2147483647 can be counted"
+    netlist = relays().netlist(taxels=1, polarities=1, classes=1, bin_ticks=2**20)
+    for simulate, shape in ((engine.simulate, (1, 2, 3)), (spec.simulate, (2, 3))):
+        with pytest.raises(DataError, match=r"2 input channels, the network has 1"):
+            simulate(netlist, np.zeros(shape, np.uint8))
+    with pytest.raises(NumericRangeError, match="2048 data steps take 2147483648 ticks, 2147483647 can"):
+        engine.simulate(netlist, np.zeros((1, 1, 2**11), np.uint8))

@@ -2,12 +2,14 @@
 
 import json
 import os
+import re
 import subprocess
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from made_files import recordings_folder
 from random_crossbars import WEIGHTS, crossbars, events
 
 from spikeloom.compiler.errors import ModelError
@@ -101,9 +103,8 @@ def test_schema():
     ],
 )
 def test_what_ranc_has_not(changes, what):
-    with pytest.raises(ModelError) as caught:
+    with pytest.raises(ModelError, match=f"RANC has no {re.escape(what)}"):
         list(ranc.export(small(**changes)))
-    assert str(caught.value) == f"--to ranc: RANC has no {what}; leave them out of the network"
 
 
 def test_saturation_that_is_a_reset_is_written():
@@ -112,14 +113,11 @@ def test_saturation_that_is_a_reset_is_written():
 
 def test_the_command(tmp_path, capsys):
     write_crossbars(small(), tmp_path / "net.loom")
-    np.savez(tmp_path / "one.npz", np.zeros(1))
-    words = ["export", f"{tmp_path}/net.loom", "--to", "ranc", "-o", f"{tmp_path}/net.json"]
-    assert cli.main(words) == 0
+    assert cli.main(["export", f"{tmp_path}/net.loom", "--to", "ranc", "-o", f"{tmp_path}/net.json"]) == 0
     assert json.loads((tmp_path / "net.json").read_text("utf-8"))["packets"] == [[]]
-    assert capsys.readouterr().out.splitlines() == [
-        f"{tmp_path}/net.json: 3 neurons and 3 synapses for ranc, {(tmp_path / 'net.json').stat().st_size} bytes",
-        f"run: ranc_sim {tmp_path}/net.json {tmp_path}/net.out {tmp_path}/net.json TICKS (no recording, add packets)",
-    ]
+    first, second = capsys.readouterr().out.splitlines()
+    assert "3 neurons and 3 synapses for ranc" in first
+    assert second.startswith(f"run: ranc_sim {tmp_path}/net.json {tmp_path}/net.out {tmp_path}/net.json TICKS")
 
 
 def test_the_command_with_a_recording(tmp_path, capsys):
@@ -130,30 +128,18 @@ def test_the_command_with_a_recording(tmp_path, capsys):
     draft.connect(0, 0, [0])
     draft.feed(3, 0, 0)
     draft.vote((0, 0), 0, first=2)
-    write_crossbars(draft.netlist(taxels=2, polarities=2, classes=1), tmp_path / "net.loom")
-    (tmp_path / "data" / "test").mkdir(parents=True)
-    (tmp_path / "data" / "train").mkdir()
-    for sample in range(2):
-        recording = np.zeros((2, 2, 5), np.float32)
-        recording[1, 1, [sample, 4]] = 1
-        np.save(tmp_path / "data" / "test" / f"sample_{sample}_label_0.npy", recording)
-        np.save(tmp_path / "data" / "train" / f"sample_{sample}_label_0.npy", recording)
-    words = [
-        "export",
-        f"{tmp_path}/net.loom",
-        "--to",
-        "ranc",
-        "-o",
-        f"{tmp_path}/net.json",
-        "--data",
-        f"{tmp_path}/data",
-    ]
-    assert cli.main([*words, "--recording", "1", "--json"]) == 0
+    write_crossbars(draft.netlist(taxels=2, polarities=2, classes=2), tmp_path / "net.loom")
+    recordings = np.zeros((2, 2, 2, 5), np.uint8)
+    recordings[0, 1, 1, [0, 4]] = recordings[1, 1, 1, [1, 4]] = 1
+    recordings_folder(tmp_path / "data", train=recordings, test=recordings)
+    words = ["export", f"{tmp_path}/net.loom", "--to", "ranc", "-o", f"{tmp_path}/net.json"]
+    words += ["--data", f"{tmp_path}/data", "--json", "--recording"]
+    assert cli.main([*words, "1"]) == 0
     assert json.loads(capsys.readouterr().out)["ticks"] == 5 + 2 + 1
     packets = json.loads((tmp_path / "net.json").read_text("utf-8"))["packets"]
     assert [len(tick) for tick in packets] == [0, 1, 0, 0, 1, 0, 0]
-    assert cli.main([*words, "--recording", "2"]) == 2
-    assert capsys.readouterr().err == "spikeloom: --recording 2: --data has recordings 0 to 1\n"
+    assert cli.main([*words, "2"]) == 2
+    assert "--recording 2: --data has recordings 0 to 1" in capsys.readouterr().err
 
 
 @pytest.fixture(scope="module")

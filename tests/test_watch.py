@@ -4,6 +4,7 @@ import argparse
 import io
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -14,7 +15,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from random_netlists import Axon, Neuron, build, large_netlist
+from random_netlists import Axon, Neuron, build
+from random_netlists import lively as lively_netlist
 
 from spikeloom.compiler import compile_network
 from spikeloom.compiler.errors import DataError, ModelError, OptionError
@@ -37,16 +39,12 @@ from spikeloom.runtime.studies.anytime import exits
 HEADER = "time_s,taxel,polarity"
 
 
-def parser() -> argparse.ArgumentParser:
-    options = argparse.ArgumentParser()
-    options.add_argument("--json", action="store_true")
-    watch.add_arguments(options)
-    return options
-
-
 def command(*words: object) -> tuple[dict, str]:
     """Run the command; its summary as values and as text."""
-    found = watch.run(parser().parse_args([str(word) for word in words]))
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--json", action="store_true")
+    watch.add_arguments(parser)
+    found = watch.run(parser.parse_args([str(word) for word in words]))
     assert found.code == 0
     return encode(found.result), terminal(found.sections(found.result))
 
@@ -65,10 +63,7 @@ def objects(capsys):
 
 @pytest.fixture(scope="module")
 def lively() -> Netlist:
-    """Some hundred compartments, 10 taxels with two polarities, a lag of three steps."""
-    netlist = large_netlist(10, proved=True)
-    votes = read_only(np.arange(netlist.n_compartments) % 4 - 1)
-    return replace(netlist, taxels=10, polarities=2, classes=3, readout_class=votes)
+    return lively_netlist()
 
 
 @pytest.fixture(scope="module")
@@ -81,12 +76,8 @@ def lively_file(lively, tmp_path_factory) -> Path:
 @pytest.fixture
 def pair_file(tmp_path) -> Path:
     """One taxel; every event of polarity p in a bin is one vote for class p, at once."""
-    netlist = build(
-        [Neuron(), Neuron()],
-        [Axon(source=0, targets=((0, 110),)), Axon(source=1, targets=((1, 110),))],
-        n_inputs=2,
-        depths=[0],
-    )
+    axons = [Axon(source=polarity, targets=((polarity, 110),)) for polarity in (0, 1)]
+    netlist = build([Neuron(), Neuron()], axons, n_inputs=2, depths=[0])
     netlist = replace(netlist, taxels=1, polarities=2, classes=2, readout_class=read_only([0, 1]))
     write_netlist(netlist, tmp_path / "pair.loom")
     return tmp_path / "pair.loom"
@@ -94,12 +85,12 @@ def pair_file(tmp_path) -> Path:
 
 @pytest.fixture
 def lines(tmp_path):
-    """Write event lines to a file."""
+    """Write event lines to a file; the option that reads it."""
 
-    def write(content: str | bytes) -> Path:
+    def write(content: str | bytes) -> str:
         path = tmp_path / "events.csv"
         path.write_bytes(content if isinstance(content, bytes) else content.encode())
-        return path
+        return f"--input={path}"
 
     return write
 
@@ -136,21 +127,21 @@ def random_events(seed: int, length: int = 40) -> np.ndarray:
 def test_any_recording_is_a_run(lively, lively_file, lines, objects, low, inside):
     for seed in range(5):
         events = random_events(seed)
-        found = objects(lively_file, "--input", lines(as_lines(events, seed, low=low, inside=inside)))
+        found = objects(lively_file, lines(as_lines(events, seed, low=low, inside=inside)))
         assert [grasp["counts"] for grasp in found["grasp"]] == [votes_of_run(lively, events)]
         assert len(found["bin"]) == 40
         total = {"kind": "end", "grasps": 1, "bins": 40, "events": int(events.sum()), "repeated": 0, "late": 0}
         assert found["end"] == [total | {"interrupted": False}]
 
 
-def test_every_bin_is_told(lively, lively_file, lines, objects):
+def test_every_bin_is_printed(lively, lively_file, lines, objects):
     events = random_events(7)
-    found = objects(lively_file, "--input", lines(as_lines(events)))
+    found = objects(lively_file, lines(as_lines(events)))
     trace = engine.simulate(lively, events.reshape(1, 20, -1), spikes=True, threads=1)
     counts = class_counts(lively, np.cumsum(trace.spikes[0], axis=0))
-    for t, told in enumerate(found["bin"]):
+    for t, shown in enumerate(found["bin"]):
         best = np.sort(counts[t])
-        assert told == {
+        assert shown == {
             "kind": "bin",
             "grasp": 1,
             "bins": t + 1,
@@ -169,10 +160,10 @@ def test_several_grasps_are_runs_of_their_own(lively, lively_file, lines, object
         f"\ufeff# first\n\n# {header}# {header}{first}\n{header}{second}# pause\nreset\n\n   \nreset\n{third.rstrip()}"
     )
     for text in (content, content.replace("\n", "\r\n"), content.replace(",", " ,  ")):
-        found = objects(lively_file, "--input", lines(text))
-        assert [grasp["counts"] for grasp in found["grasp"]] == [votes_of_run(lively, events) for events in grasps]
-        assert [grasp["bins"] for grasp in found["grasp"]] == [40, 25, 33]
-        assert [grasp["grasp"] for grasp in found["grasp"]] == [1, 2, 3]
+        found = objects(lively_file, lines(text))
+        shown = [(grasp["grasp"], grasp["bins"], grasp["counts"]) for grasp in found["grasp"]]
+        votes = [votes_of_run(lively, events) for events in grasps]
+        assert shown == list(zip([1, 2, 3], [40, 25, 33], votes, strict=True))
 
 
 @pytest.mark.recordings
@@ -183,18 +174,17 @@ def test_the_released_network_on_its_recordings(released_checkpoint, objects_zip
     write_netlist(netlist, tmp_path / "net.loom")
     data = load_recordings(objects_zip, "test", limit=3).events
     path = lines("\n".join(as_lines(recording, inside=19_999) for recording in data))
-    found = objects(tmp_path / "net.loom", "--input", path, "--bins", data.shape[-1])
+    found = objects(tmp_path / "net.loom", path, "--bins", data.shape[-1])
     assert [grasp["counts"] for grasp in found["grasp"]] == [votes_of_run(netlist, recording) for recording in data]
-    assert [grasp["bins"] for grasp in found["grasp"]] == [250, 250, 250]
     assert found["end"][0]["events"] == data.sum()
 
 
 def test_exact_edges_of_bins(pair_file, lines, objects):
     # 0.58 / 0.02 is below 29 in binary floating point
-    found = objects(pair_file, "--input", lines("0.579999,0,0\n0.58,0,0\n5.8e-1,0,1\n0.60,0,1\n"))
-    assert [told["counts"] for told in found["bin"][28:]] == [[1, 0], [2, 1], [2, 2]]
-    found = objects(pair_file, "--bin", "0.003", "--input", lines("0.0089,0,0\n0.009,0,1\n"))
-    assert [told["counts"] for told in found["bin"]] == [[0, 0], [0, 0], [1, 0], [1, 1]]
+    found = objects(pair_file, lines("0.579999,0,0\n0.58,0,0\n5.8e-1,0,1\n0.60,0,1\n"))
+    assert [each["counts"] for each in found["bin"][28:]] == [[1, 0], [2, 1], [2, 2]]
+    found = objects(pair_file, "--bin", "0.003", lines("0.0089,0,0\n0.009,0,1\n"))
+    assert [each["counts"] for each in found["bin"]] == [[0, 0], [0, 0], [1, 0], [1, 1]]
 
 
 def test_a_file_is_read_as_recordings_are(lively, lively_file, lines, objects):
@@ -202,8 +192,8 @@ def test_a_file_is_read_as_recordings_are(lively, lively_file, lines, objects):
     rng = np.random.default_rng(0)
     rows = sorted((k * 0.01 * (1 - e), *rng.integers([10, 2])) for k in range(200) for e in (0, 1e-15, 1e-10, 1e-7))
     path = lines("taxel,time_s,label,polarity\n" + "".join(f"{x},{t!r},4,{p}  # {p}\n" for t, x, p in rows))
-    read, _ = load_data(path, taxels=10)
-    found = objects(lively_file, "--input", path)
+    read, _ = load_data(path.removeprefix("--input="), taxels=10)
+    found = objects(lively_file, path)
     assert found["grasp"][0]["bins"] == read.steps == 100
     assert found["grasp"][0]["counts"] == votes_of_run(lively, read.events[0])
     assert found["end"][0]["late"] == 0
@@ -215,7 +205,7 @@ def test_late_and_repeated_events_are_counted_and_not_used(lively, lively_file, 
     rows.insert(len(rows) // 2, "0.0,3,1")
     rows.insert(len(rows) * 3 // 4, "0.01,3,0")
     rows[-1:] = rows[-1:] * 3
-    found = objects(lively_file, "--input", lines("\n".join(rows)))
+    found = objects(lively_file, lines("\n".join(rows)))
     assert found["grasp"][0]["counts"] == votes_of_run(lively, events)
     end = found["end"][0]
     assert (end["late"], end["repeated"], end["events"]) == (2, 2, events.sum() + 4)
@@ -224,7 +214,7 @@ def test_late_and_repeated_events_are_counted_and_not_used(lively, lively_file, 
 def test_grasps_of_a_given_length(lively, lively_file, lines, objects):
     long, short = random_events(5, 40), random_events(6, 20)
     path = lines(as_lines(long) + "\n" + as_lines(short))
-    found = objects(lively_file, "--input", path, "--bins", 30)
+    found = objects(lively_file, path, "--bins", 30)
     padded = np.concatenate([short, np.zeros((10, 2, 10), np.uint8)], axis=2)
     assert [grasp["counts"] for grasp in found["grasp"]] == [
         votes_of_run(lively, long[:, :, :30]),
@@ -239,20 +229,20 @@ def test_origin(lively, lively_file, lines, objects):
     events[0, 0, 0] = 1
     moved = np.concatenate([np.zeros((10, 2, 50), np.uint8), events], axis=2)
     path = lines(as_lines(moved))
-    counts = [objects(lively_file, "--input", path, "--origin", o)["grasp"][0]["counts"] for o in ("zero", "first")]
+    counts = [objects(lively_file, path, "--origin", o)["grasp"][0]["counts"] for o in ("zero", "first")]
     assert counts == [votes_of_run(lively, moved), votes_of_run(lively, events)]
     assert counts[0] != counts[1]
 
 
 def test_times_before_the_first_event_are_late(pair_file, lines, objects):
-    found = objects(pair_file, "--origin", "first", "--input", lines("7.005,0,1\n7.0049,0,0\n7.0249,0,1\n7.025,0,0\n"))
-    assert [told["counts"] for told in found["bin"]] == [[0, 1], [1, 1]]
+    found = objects(pair_file, "--origin", "first", lines("7.005,0,1\n7.0049,0,0\n7.0249,0,1\n7.025,0,0\n"))
+    assert [each["counts"] for each in found["bin"]] == [[0, 1], [1, 1]]
     assert (found["end"][0]["late"], found["end"][0]["repeated"]) == (1, 1)
 
 
-def test_text(pair_file, lines, capsys):
+def test_text(pair_file, lines, capsys, tmp_path):
     content = "0.0,0,1\n0.02,0,1\n0.04,0,0\n0.06,0,0\n0.08,0,0\n0.06,0,1\n\n0.1,0,1\n0.1,0,1\n"
-    _, summary = command(pair_file, "--input", lines(content))
+    _, summary = command(pair_file, lines(content))
     assert capsys.readouterr().out.splitlines() == [
         "    0.02 s  class 1, 1 vote, 1 ahead",
         "    0.08 s  class 0, 2 votes, a tie",
@@ -261,19 +251,16 @@ def test_text(pair_file, lines, capsys):
         "grasp 2: class 1, 1 vote, 1 ahead, after 6 bins (0.12 s)",
     ]
     assert summary == "2 grasps, 11 bins, 8 events, 1 repeated within a bin, 1 late"
-
-
-def test_a_grasp_without_votes(lively_file, lines, capsys, tmp_path):
-    netlist = build([Neuron()], [], n_inputs=2, depths=[2])
-    write_netlist(replace(netlist, taxels=1, polarities=2, readout_class=read_only([0])), tmp_path / "mute.loom")
-    command(tmp_path / "mute.loom", "--input", lines("0.01,0,1"))
+    mute = build([Neuron()], [], n_inputs=2, depths=[2])
+    write_netlist(replace(mute, taxels=1, polarities=2, readout_class=read_only([0])), tmp_path / "mute.loom")
+    command(tmp_path / "mute.loom", lines("0.01,0,1"))
     assert capsys.readouterr().out == "grasp 1: class 0, no votes, after 1 bin (0.02 s)\n"
 
 
 def test_terminal(pair_file, lines, capsys, monkeypatch):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     monkeypatch.setattr(watch, "REFRESH_S", 0.0)
-    command(pair_file, "--input", lines("0.0,0,1\n0.02,0,1\n"))
+    command(pair_file, lines("0.0,0,1\n0.02,0,1\n"))
     captured = capsys.readouterr()
     assert (
         captured.out
@@ -282,21 +269,16 @@ def test_terminal(pair_file, lines, capsys, monkeypatch):
     assert captured.err == "\r\x1b[K\r\x1b[K    0.04 s  class 1, 2 votes, 2 ahead\r\x1b[K"
 
 
-def test_timing(lively_file, lines, objects):
-    found = objects(lively_file, "--timing", "--input", lines(as_lines(random_events(1))))
-    step = found["end"][0]["step"]
-    assert 0 < step["median_ms"] <= step["p99_ms"]
-    assert step["p99_share_of_bin"] == pytest.approx(step["p99_ms"] / 20)
-    _, summary = command(lively_file, "--timing", "--input", lines("0,0,0"))
-    assert summary.splitlines()[1].startswith("step: median 0.")
-
-
 def test_real_time_decides_alike(lively, lively_file, lines, objects):
     events = random_events(2, 15)
     path = lines(as_lines(events, inside=19_999) + "\n" + as_lines(events))
-    found = objects(lively_file, "--input", path, "--speed", "real")
+    found = objects(lively_file, path, "--speed", "real", "--timing")
     assert [grasp["counts"] for grasp in found["grasp"]] == [votes_of_run(lively, events)] * 2
-    assert found["end"][0]["late"] == 0
+    (end,) = found["end"]
+    assert end["late"] == 0
+    assert 0 < end["step"]["median_ms"] <= end["step"]["p99_ms"]
+    assert end["step"]["p99_share_of_bin"] == pytest.approx(end["step"]["p99_ms"] / 20)
+    assert "\nstep: median 0." in command(lively_file, "--timing", lines("0,0,0"))[1]
 
 
 def feed(descriptor: int, *parts: tuple[str, float]) -> threading.Thread:
@@ -355,45 +337,43 @@ def test_silence(pair_file, objects, speed):
     ],
 )
 def test_bad_lines(lively_file, lines, content, line, said):
-    path = lines(content)
-    with pytest.raises(DataError) as caught:
-        command(lively_file, "--input", path)
-    assert str(caught.value).startswith(f"{path}, line {line}: ")
-    assert said in str(caught.value)
+    with pytest.raises(DataError, match=rf"events\.csv, line {line}: .*{re.escape(said)}"):
+        command(lively_file, lines(content))
 
 
 @pytest.mark.parametrize("content", ["", "\n\n", "# nothing\n", "time_s,taxel,polarity\n", "reset"])
 def test_empty_stream(lively_file, lines, content):
-    path = lines(content)
-    with pytest.raises(DataError) as caught:
-        command(lively_file, "--input", path)
-    assert str(caught.value).startswith(f"{path}: empty stream")
+    with pytest.raises(DataError, match=r"events\.csv: empty stream"):
+        command(lively_file, lines(content))
 
 
 def test_numbers_as_programs_write_them(pair_file, lines, objects):
     content = "0.000000000000000000e+00,0.000e+00,1.000e+00\n+0.02,+0,+1\n4E-2,0,-1\n"
-    assert objects(pair_file, "--input", lines(content))["grasp"][0]["counts"] == [1, 2]
+    assert objects(pair_file, lines(content))["grasp"][0]["counts"] == [1, 2]
 
 
 @pytest.mark.parametrize(
-    "option", [*(f"--bin={v}" for v in ("0", "-0.02", "nan", "inf", "20ms", "1e-7", "1001")), "--bins=0"]
+    ("words", "error", "said"),
+    [
+        (["--input", "none.csv"], DataError, r"none\.csv: No such file"),
+        (["--until-sure"], OptionError, r"--until-sure: .* --bins"),
+        (["--bins", 5, "--until-sure", "-1"], OptionError, "--until-sure -1: "),
+        *(
+            ([f"--{option}", value], OptionError, f"^--{option} {value}: ")
+            for option, value in (*(("bin", v) for v in ("0", "nan", "inf", "20ms", "1e-7", "1001")), ("bins", "0"))
+        ),
+        (["--bin=-0.02"], OptionError, "^--bin -0.02: "),
+    ],
 )
-def test_bad_options(lively_file, lines, option):
-    with pytest.raises(OptionError, match=f"^{option.replace('=', ' ')}: "):
-        command(lively_file, "--input", lines("0,0,0"), option)
+def test_what_cannot_be_watched(lively_file, lines, words, error, said):
+    with pytest.raises(error, match=said):
+        command(lively_file, lines("0,0,1\n"), *words)
 
 
-def test_what_cannot_be_watched(lively, lively_file, lines, tmp_path):
-    path = tmp_path / "net.loom"
-    write_netlist(replace(lively, taxels=20, polarities=1), path)
+def test_sensors_without_two_polarities(lively, lines, tmp_path):
+    write_netlist(replace(lively, taxels=20, polarities=1), tmp_path / "net.loom")
     with pytest.raises(ModelError, match="1 polarities per taxel found"):
-        command(path, "--input", lines("0,0,0"))
-    with pytest.raises(DataError, match=r"none\.csv: No such file"):
-        command(lively_file, "--input", tmp_path / "none.csv")
-    with pytest.raises(OptionError, match=r"--until-sure: .* --bins"):
-        command(lively_file, "--input", lines("0,0,1\n"), "--until-sure")
-    with pytest.raises(OptionError, match="--until-sure -1: "):
-        command(lively_file, "--input", lines("0,0,1\n"), "--bins", 5, "--until-sure", "-1")
+        command(tmp_path / "net.loom", lines("0,0,0"))
 
 
 @pytest.mark.parametrize(
@@ -402,7 +382,7 @@ def test_what_cannot_be_watched(lively, lively_file, lines, tmp_path):
 def test_headers_may_have_capitals(lively, lively_file, lines, objects, header):
     events = random_events(4, 20)
     rows = [row + ",1" if header.endswith("Label") else row for row in as_lines(events).splitlines()]
-    found = objects(lively_file, "--input", lines("\n".join([header, *rows, ""])))
+    found = objects(lively_file, lines("\n".join([header, *rows, ""])))
     assert found["grasp"][0]["counts"] == votes_of_run(lively, events)
 
 
@@ -413,53 +393,35 @@ def test_a_reader_that_goes_away_ends_it(pair_file, lines, monkeypatch):
 
     path = lines("0,0,0\n0.02,0,0\nnot reached\n")
     monkeypatch.setattr(sys, "stdout", Gone())
-    report, _ = command(pair_file, "--input", path)
+    report, _ = command(pair_file, path)
     assert report["interrupted"]
-
-
-SCRIPT = """
-import argparse, signal, sys
-from spikeloom.runtime.commands.exchange import watch
-from spikeloom.runtime.report.sections import terminal
-signal.signal(signal.SIGINT, signal.default_int_handler)  # jobs in the background start with interrupts ignored
-parser = argparse.ArgumentParser()
-parser.add_argument("--json", action="store_true")
-watch.add_arguments(parser)
-found = watch.run(parser.parse_args())
-print(terminal(found.sections(found.result)))
-sys.exit(found.code)
-"""
 
 
 @pytest.mark.parametrize("end", [signal.SIGINT, None])
 def test_standard_input_and_interruption(pair_file, end):
-    process = subprocess.Popen(
-        [sys.executable, "-c", SCRIPT, pair_file],
+    code = "import signal, sys; from spikeloom.runtime import cli; signal.signal(2, signal.default_int_handler); "
+    process = subprocess.Popen(  # jobs in the background start with interrupts ignored
+        [sys.executable, "-c", f"{code}sys.exit(cli.main(['watch', sys.argv[1]]))", pair_file],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        cwd=Path(watch.__file__).parents[1],
     )
     with process:
         process.stdin.write("0.00,0,0\n0.02,0,1\n0.04,0,1\n0.06,0,1\n")
         process.stdin.flush()
-        told = [process.stdout.readline() for _ in range(2)]
+        lines = [process.stdout.readline() for _ in range(2)]
         if end is not None:
             process.send_signal(end)
         out, err = process.communicate(timeout=60)
-    assert told == ["    0.02 s  class 0, 1 vote, 1 ahead\n", "    0.06 s  class 1, 2 votes, 1 ahead\n"]
+    assert lines == ["    0.02 s  class 0, 1 vote, 1 ahead\n", "    0.06 s  class 1, 2 votes, 1 ahead\n"]
     assert (process.returncode, err) == (0, "")
-    if end is None:
-        assert out == (
-            "grasp 1: class 1, 3 votes, 2 ahead, after 4 bins (0.08 s)\n"
-            "1 grasp, 4 bins, 4 events, 0 repeated within a bin, 0 late\n"
-        )
-    else:  # the open bin does not count
-        assert out == (
-            "grasp 1: class 1, 2 votes, 1 ahead, after 3 bins (0.06 s)\n"
-            "1 grasp, 3 bins, 4 events, 0 repeated within a bin, 0 late\ninterrupted\n"
-        )
+    # where it is interrupted, the open bin does not count
+    votes, ahead, bins, last = ("2 votes", 1, 3, "interrupted\n") if end else ("3 votes", 2, 4, "")
+    assert out == (
+        f"grasp 1: class 1, {votes}, {ahead} ahead, after {bins} bins (0.0{2 * bins} s)\n"
+        f"1 grasp, {bins} bins, 4 events, 0 repeated within a bin, 0 late\n{last}"
+    )
 
 
 @pytest.mark.parametrize("factor", [None, 1.5, 0.0])
@@ -468,8 +430,7 @@ def test_a_grasp_ends_as_soon_as_it_is_sure(lively, lively_file, lines, objects,
     for seed in range(3):
         events = random_events(seed)
         given = () if factor is None else (factor,)
-        words = (lively_file, "--input", lines(as_lines(events, seed)), "--bins", 40, "--until-sure", *given)
-        found = objects(*words)
+        found = objects(lively_file, lines(as_lines(events, seed)), "--bins", 40, "--until-sure", *given)
         votes = cumulative.votes_of(lively, events.reshape(1, 20, 40), np.array([40]))
         at = exits.standing(votes, np.array([40]))
         sure = exits.proven(votes, at, exits.most_votes(lively, 40))
@@ -486,7 +447,7 @@ def test_a_grasp_ends_as_soon_as_it_is_sure(lively, lively_file, lines, objects,
 
 
 def test_a_sure_grasp_in_words(pair_file, lines, capsys):
-    _, text = command(pair_file, "--input", lines("0,0,1\n0.02,0,1\n0.04,0,1\n0.06,0,0\n"), "--bins", 5, "--until-sure")
+    _, text = command(pair_file, lines("0,0,1\n0.02,0,1\n0.04,0,1\n0.06,0,0\n"), "--bins", 5, "--until-sure")
     out = capsys.readouterr().out.splitlines()
     assert out[-1] == "grasp 1: class 1, 3 votes, 3 ahead, sure, after 3 bins (0.06 s)"
     assert text == "1 grasp, 3 bins, 4 events, 0 repeated within a bin, 1 late, 1 ended early"

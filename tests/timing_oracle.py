@@ -21,18 +21,10 @@ Link = tuple[int, int, str]
 
 @dataclass(slots=True, kw_only=True)
 class Message:
-    """What a core does up to the end of one message, or after its last one; that has no destination.
+    """What a core does up to the end of one message, or after its last one, whose destination is -1.
 
-    Parameters
-    ----------
-    source, destination : int
-        Cores; the destination is -1 where nothing is sent.
-    generation : int
-        Work of the sender since its message before.
-    processing : int
-        Work of the receiver.
-    sent, received : float
-        Times within the step.
+    `generation` is the work of the sender since its message before, `processing` that of the receiver; `sent` and
+    `received` are times within the step.
     """
 
     source: int
@@ -95,22 +87,16 @@ class Chip:
         """Links from core to core: the sender's own port, then the one by which each further tile is entered."""
         (x, y), (to_x, to_y) = self.place(source), self.place(destination)
         links: list[Link] = [(x, y, f"core {source}")]
-        while x != to_x:
-            step = 1 if to_x > x else -1
-            x += step
-            links.append((x, y, f"x {step}"))
-        while y != to_y:
-            step = 1 if to_y > y else -1
-            y += step
-            links.append((x, y, f"y {step}"))
+        step_x, step_y = (1 if to_x > x else -1), (1 if to_y > y else -1)
+        links += [(column, y, f"x {step_x}") for column in range(x + step_x, to_x + step_x, step_x)]
+        links += [(to_x, row, f"y {step_y}") for row in range(y + step_y, to_y + step_y, step_y)]
         return links
 
     def flight(self, source: int, destination: int) -> int:
         """Least time from core to core."""
         (x, y), (to_x, to_y) = self.place(source), self.place(destination)
-        return abs(x - to_x) * self.table.picoseconds("hop_east_west") + abs(y - to_y) * self.table.picoseconds(
-            "hop_north_south"
-        )
+        east_west, north_south = (self.table.picoseconds(f"hop_{way}") for way in ("east_west", "north_south"))
+        return abs(x - to_x) * east_west + abs(y - to_y) * north_south
 
     def messages(self, core: int, fired: set[int], worked: set[int]) -> list[Message]:
         """What one core sends in a step, in order."""
@@ -119,31 +105,21 @@ class Chip:
             0 if is_input else self.table.picoseconds(event) for event in ("neuron_access", "neuron_update", "spike")
         )
         messages = []
-        spent = 0
+        since = 0
         for source in self.sweep[core]:
-            spent += access
-            if source in worked:
-                spent += update
+            since += access + update * (source in worked)
             if source in fired:
-                spent += spike
+                since += spike
                 for destination, work in self.deliveries.get(source, []):
-                    spent += self.table.picoseconds("axon_out")
-                    messages.append(Message(source=core, destination=destination, generation=spent, processing=work))
-                    spent = 0
-        if spent:
-            messages.append(Message(source=core, destination=-1, generation=spent, processing=0))
+                    since += self.table.picoseconds("axon_out")
+                    messages.append(Message(source=core, destination=destination, generation=since, processing=work))
+                    since = 0
+        if since:
+            messages.append(Message(source=core, destination=-1, generation=since, processing=0))
         return messages
 
     def step(self, fired: set[int], worked: set[int], injected: set[int]) -> StepTimes:
-        """Time one step.
-
-        Parameters
-        ----------
-        fired, worked : set of int
-            Sources on cores that fire and that have work to do.
-        injected : set of int
-            Input channels on no core that have an event.
-        """
+        """Time a step in which sources on cores `fired` or `worked`, and channels on no core were `injected`."""
         cores = range(len(self.tile))
         waiting = [self.messages(core, fired, worked) for core in cores]
         barrier = self.table.barrier(len(set(self.tile)))
