@@ -45,24 +45,15 @@ NEUTOUCH.flags.writeable = False
 class Graph:
     """Taxels and the directed edges between them.
 
-    Parameters
-    ----------
-    name : str
-        For humans and for provenance, for example ``released:knn:3``.
-    coordinates : (n, d) float64
-        Positions in millimetres.
-    edges : (e, 2) int64
-        Source and target taxel of each edge; a repeated row counts twice.
-
     Raises
     ------
     ModelError
         If the coordinates or the edges are malformed.
     """
 
-    name: str
-    coordinates: FloatArray
-    edges: IntArray
+    name: str  # For humans and for provenance, for example ``released:knn:3``
+    coordinates: FloatArray  # (n, d) float64; positions in millimetres
+    edges: IntArray  # (e, 2) int64; source and target taxel of each edge; a repeated row counts twice
 
     def __post_init__(self) -> None:
         coordinates = check_coordinates(self.coordinates).copy()

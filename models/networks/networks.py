@@ -31,38 +31,20 @@ Weights = dict[str, NDArray[np.float32]]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Architecture:
-    """Sizes and neuron constants of a `SpikingNet`; the defaults are those of [1]_.
+    """Sizes and neuron constants of a `SpikingNet`; the defaults are those of [1]_."""
 
-    Parameters
-    ----------
-    taxels, classes : int
-        Sensor points and output neurons.
-    channels : int
-        Inputs per taxel (polarities).
-    hops : int
-        K of the graph convolution of a TactileSGNet, which has K + 1 filters.
-    features : int
-        Outputs of the first layer per place.
-    hidden : tuple of int
-        Neurons of each dense layer before the last.
-    beta, theta : float
-        Membrane decay per step and firing threshold of every neuron.
-    system : str
-        One of :data:`spikeloom.compiler.systems.SYSTEMS`.
-    dynamics : Dynamics
-        Decays of single layers, and clocks.
-    """
-
+    # taxels, classes: Sensor points and output neurons
     taxels: int
     classes: int
-    channels: int = 2
-    hops: int = HOPS
-    features: int = 64
-    hidden: tuple[int, ...] = (128, 256)
+    channels: int = 2  # Inputs per taxel (polarities)
+    hops: int = HOPS  # K of the graph convolution of a TactileSGNet, which has K + 1 filters
+    features: int = 64  # Outputs of the first layer per place
+    hidden: tuple[int, ...] = (128, 256)  # Neurons of each dense layer before the last
+    # beta, theta: Membrane decay per step and firing threshold of every neuron
     beta: float = 0.2
     theta: float = 0.5
-    system: str = TACTILESGNET
-    dynamics: Dynamics = PLAIN
+    system: str = TACTILESGNET  # One of :data:`spikeloom.compiler.systems.SYSTEMS`
+    dynamics: Dynamics = PLAIN  # Decays of single layers, and clocks
 
     def network(self, propagation: NDArray[np.float64], *, seed: int = 0, surrogate: Surrogate) -> SpikingNet:
         """An untrained network."""

@@ -43,28 +43,15 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Integers:
-    """One layer in chip integers, rounded once per step of the optimizer.
+    """One layer in chip integers, rounded once per step of the optimizer."""
 
-    Parameters
-    ----------
-    units : (inputs, neurons) float32
-        Weights in weight units, whole numbers (halves of a step never occur).
-    real : (neurons, inputs) float32
-        The same in the float model's units.
-    bias, threshold : (neurons,) int64
-        In membrane units.
-    unit : (neurons,) float64
-        Membrane of the float model in one membrane unit.
-    keep : int
-        What a membrane keeps in a step, in 1/4096.
-    """
-
-    units: Array
-    real: Array
+    units: Array  # (inputs, neurons) float32; weights in weight units, whole numbers (halves of a step never occur)
+    real: Array  # (neurons, inputs) float32; the same in the float model's units
+    # bias, threshold: (neurons,) int64; in membrane units
     bias: Array
     threshold: Array
-    unit: Array
-    keep: int
+    unit: Array  # (neurons,) float64; membrane of the float model in one membrane unit
+    keep: int  # What a membrane keeps in a step, in 1/4096
 
 
 class QuantisedNet(nn.Module):

@@ -11,30 +11,15 @@ GAP_S = 0.5
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EventCounts:
-    """What was counted while recordings were put into bins.
+    """What was counted while recordings were put into bins."""
 
-    Parameters
-    ----------
-    events : int
-        Events read, duplicates included.
-    out_of_order : int
-        Events with a time before that of an event that came earlier.
-    duplicates : int
-        Events whose taxel already had one of the same polarity in the same bin; they count once.
-    gaps : int
-        Silences longer than `GAP_S` between two events of a recording.
-    steps : tuple of int
-        Bins of each recording.
-    notes : tuple of str
-        What is worth a second look: times that look like another unit, taxels that seem to count from 1, a table of
-        labels.
-    """
-
-    events: int
-    out_of_order: int
-    duplicates: int
-    gaps: int
-    steps: tuple[int, ...]
+    events: int  # Events read, duplicates included
+    out_of_order: int  # Events with a time before that of an event that came earlier
+    duplicates: int  # Events whose taxel already had one of the same polarity in the same bin; they count once
+    gaps: int  # Silences longer than `GAP_S` between two events of a recording
+    steps: tuple[int, ...]  # Bins of each recording
+    # What is worth a second look: times that look like another unit, taxels that seem to count from 1, a table of
+    # labels
     notes: tuple[str, ...] = ()
 
 

@@ -25,21 +25,11 @@ MAX_TABLE_BYTES = 256 << 20  # some 15 million events
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Table:
-    """Columns of numbers and where they stood.
+    """Columns of numbers and where they stood."""
 
-    Parameters
-    ----------
-    where : str
-        The file, for messages.
-    columns : mapping of str to (rows,) float64
-        Optional columns that the file does not have are absent.
-    lines : sequence of int
-        Line of each row.
-    """
-
-    where: str
-    columns: Mapping[str, FloatArray]
-    lines: Sequence[int]
+    where: str  # The file, for messages
+    columns: Mapping[str, FloatArray]  # Optional columns that the file does not have are absent
+    lines: Sequence[int]  # Line of each row
 
     def at(self, row: int) -> str:
         """Place of a row, for messages: ``events.csv: line 7``."""

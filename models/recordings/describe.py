@@ -24,33 +24,18 @@ RULES = {
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Description:
-    """Statistics of one split; polarity 0 is falling, 1 is rising.
+    """Statistics of one split; polarity 0 is falling, 1 is rising."""
 
-    Parameters
-    ----------
-    recordings, events : int
-        How many; events that share taxel, polarity and bin count once.
-    bin_s : float
-        Width of a bin, seconds.
-    duration_s : (float, float, float)
-        Shortest, median and longest recording, seconds.
-    classes : mapping of int to int
-        Recordings of each label.
-    rate : (taxels, 2) float64
-        Events per second, over the time that was recorded.
-    course : (steps, 2) float64
-        Events per second of the whole sensor, mean over the recordings that last so long.
-    dead, one_sided, hot : tuple of int
-        Taxels that look broken, see `RULES`.
-    """
-
+    # recordings, events: How many; events that share taxel, polarity and bin count once
     recordings: int
     events: int
-    bin_s: float
-    duration_s: tuple[float, float, float]
-    classes: Mapping[int, int]
-    rate: FloatArray
+    bin_s: float  # Width of a bin, seconds
+    duration_s: tuple[float, float, float]  # (float, float, float); shortest, median and longest recording, seconds
+    classes: Mapping[int, int]  # Recordings of each label
+    rate: FloatArray  # (taxels, 2) float64; events per second, over the time that was recorded
+    # (steps, 2) float64; events per second of the whole sensor, mean over the recordings that last so long
     course: FloatArray
+    # dead, one_sided, hot: Taxels that look broken, see `RULES`
     dead: tuple[int, ...]
     one_sided: tuple[int, ...]
     hot: tuple[int, ...]

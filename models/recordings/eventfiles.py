@@ -38,30 +38,14 @@ _LABEL = re.compile(r"_label_([0-9]{1,6})(?![0-9])")
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class EventStream:
-    """The events of one recording, as they came.
+    """The events of one recording, as they came."""
 
-    Parameters
-    ----------
-    name : str
-        Of the file.
-    time_s : (events,) float64
-        Seconds from the start of the recording, 0 or more, in any order.
-    taxel : (events,) int64
-        Below `MAX_TAXELS`.
-    polarity : (events,) uint8
-        1 for rising, 0 for falling.
-    label : int
-        Class of the recording, `UNLABELLED` where nothing says it.
-    at : callable
-        Place of an event by its index, for messages.
-    """
-
-    name: str
-    time_s: FloatArray
-    taxel: NDArray[np.int64]
-    polarity: NDArray[np.uint8]
-    label: int
-    at: Callable[[int], str]
+    name: str  # Of the file
+    time_s: FloatArray  # (events,) float64; seconds from the start of the recording, 0 or more, in any order
+    taxel: NDArray[np.int64]  # (events,) int64; below `MAX_TAXELS`
+    polarity: NDArray[np.uint8]  # (events,) uint8; 1 for rising, 0 for falling
+    label: int  # Class of the recording, `UNLABELLED` where nothing says it
+    at: Callable[[int], str]  # Place of an event by its index, for messages
 
 
 def read_stream(path: str | os.PathLike[str], *, taxels: int | None = None, where: str | None = None) -> EventStream:

@@ -32,29 +32,17 @@ Members = Mapping[str, Callable[[], IO[bytes]]]
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Recordings:
-    """Event recordings of one split, in one array: shorter ones are filled up with silence that does not count.
+    """Event recordings of one split, in one array: shorter ones are filled up with silence that does not count."""
 
-    Parameters
-    ----------
-    events : (samples, taxels, 2, steps) uint8
-        1 where a taxel sent an event of that polarity in that step; C-contiguous, read-only.
-    labels : (samples,) int64
-        Class of each recording; read-only.
-    files : tuple of str
-        File name of each recording.
-    split : str
-        For example ``test``.
-    source : str
-        Name of the folder, zip or generator.
-    lengths : (samples,) int64, or None
-        Steps of each recording; read-only. None where all have as many as the array, as in the released layout.
-    """
-
+    # (samples, taxels, 2, steps) uint8; 1 where a taxel sent an event of that polarity in that step; C-contiguous,
+    # read-only
     events: NDArray[np.uint8]
-    labels: NDArray[np.int64]
-    files: tuple[str, ...]
-    split: str
-    source: str
+    labels: NDArray[np.int64]  # (samples,) int64; class of each recording; read-only
+    files: tuple[str, ...]  # File name of each recording
+    split: str  # For example ``test``
+    source: str  # Name of the folder, zip or generator
+    # (samples,) int64, or None; steps of each recording; read-only. None where all have as many as the array, as in the
+    # released layout.
     lengths: NDArray[np.int64] | None = None
 
     def __post_init__(self) -> None:

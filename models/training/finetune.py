@@ -59,22 +59,12 @@ class TunedEpoch:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Tuned:
-    """What a fine-tuning left.
+    """What a fine-tuning left."""
 
-    Parameters
-    ----------
-    weights : dict of arrays
-        As a checkpoint holds them; rounded by `forms` they are the chip's.
-    forms : tuple of Form
-        Storage of each layer.
-    history : tuple of TunedEpoch
-    before, after : int
-        Test recordings decided right on the chip's integers, before the first epoch and after the last.
-    """
-
-    weights: Weights
-    forms: tuple[Form, ...]
+    weights: Weights  # As a checkpoint holds them; rounded by `forms` they are the chip's
+    forms: tuple[Form, ...]  # Storage of each layer
     history: tuple[TunedEpoch, ...]
+    # before, after: Test recordings decided right on the chip's integers, before the first epoch and after the last
     before: int
     after: int
 

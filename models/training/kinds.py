@@ -27,26 +27,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Plan:
-    """What decides a network before it is trained.
-
-    Parameters
-    ----------
-    grid : Grid, optional
-        Of a grid-based CNN.
-    copies : int, optional
-        Axons of an input, on a chip that may have several.
-    bins : int
-        Bins of the recordings that a step joins.
-    classes, steps : int
-        Of the training recordings, in their own bins.
-    """
+    """What decides a network before it is trained."""
 
     system: str
     graph: Graph
-    grid: Grid | None
+    grid: Grid | None  # Of a grid-based CNN
     recipe: Recipe
-    copies: int | None
-    bins: int
+    copies: int | None  # Axons of an input, on a chip that may have several
+    bins: int  # Bins of the recordings that a step joins
+    # classes, steps: Of the training recordings, in their own bins
     classes: int
     steps: int
 

@@ -26,21 +26,11 @@ VALIDATION_SHARE = 0.2
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Reported:
-    """A training and what both protocols say of it.
+    """A training and what both protocols say of it."""
 
-    Parameters
-    ----------
-    trained : Trained
-        On the whole training split; ``kept`` holds the weights of the clean epoch.
-    validation : Trained
-        The training that chose the clean epoch; its "test" figures are those of the left-out part.
-    clean_epoch : int
-        Counted from 1.
-    """
-
-    trained: Trained
-    validation: Trained
-    clean_epoch: int
+    trained: Trained  # On the whole training split; ``kept`` holds the weights of the clean epoch
+    validation: Trained  # The training that chose the clean epoch; its "test" figures are those of the left-out part
+    clean_epoch: int  # Counted from 1
 
 
 def validation_split(training: Recordings) -> tuple[Recordings, Recordings]:

@@ -28,61 +28,35 @@ Decays = tuple[tuple[str, float], ...]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Recipe:
-    """Everything that decides a training, beside data, system, graph and seed.
+    """Everything that decides a training, beside data, system, graph and seed."""
 
-    Parameters
-    ----------
-    name : str
-        Which of ``RECIPES`` it is, or came from.
-    epochs : int
-        Unless the user says otherwise.
-    batch : int
-        Recordings to a step of the optimizer.
-    loss : {"mse", "cross-entropy"}
-        Squared error of the spike rates against zeros and a one, or cross-entropy of `gain` times the rates.
-    gain, smoothing : float
-        Of the cross-entropy: factor before the softmax, and share of the label that goes to all classes alike.
-    surrogate : Surrogate
-        Derivative of a spike.
-    optimizer : {"adam", "adamw"}
-        Both with amsgrad.
-    weight_decay : float
-        Of AdamW.
-    learning_rate : float
-        At the start.
-    schedule : {"steps", "cosine"}
-        A tenth every `decay_epochs`, or half a cosine down to zero over all epochs.
-    decay_epochs : int
-        Of steps; the first epoch of each such block still has the old rate.
-    features, hops : int
-        Outputs of the first layer per place; K of a graph convolution.
-    betas, alphas : pairs of layer and decay
-        Membrane decays of single layers, all others have the common one; current decays that are not zero. With the
-        first, every layer's is rounded to what the chip holds.
-    clocks : int
-        Clock channels, see :mod:`compiler.dynamics`.
-    penalty : float
-        Added to the loss for each synapse that carries a spike in every step: this times the share of the synapses
-        behind neurons that do so, mean over steps and recordings.
-    """
-
-    name: str
-    epochs: int = 100
-    batch: int = 1
+    name: str  # Which of ``RECIPES`` it is, or came from
+    epochs: int = 100  # Unless the user says otherwise
+    batch: int = 1  # Recordings to a step of the optimizer
+    # {"mse", "cross-entropy"}; squared error of the spike rates against zeros and a one, or cross-entropy of `gain`
+    # times the rates
     loss: str = MSE
+    # gain, smoothing: Of the cross-entropy: factor before the softmax, and share of the label that goes to all classes
+    # alike
     gain: float = 1.0
     smoothing: float = 0.0
-    surrogate: Surrogate = RECTANGLE
-    optimizer: str = ADAM
-    weight_decay: float = 0.0
-    learning_rate: float = 1e-3
+    surrogate: Surrogate = RECTANGLE  # Derivative of a spike
+    optimizer: str = ADAM  # {"adam", "adamw"}; both with amsgrad
+    weight_decay: float = 0.0  # Of AdamW
+    learning_rate: float = 1e-3  # At the start
+    # {"steps", "cosine"}; A tenth every `decay_epochs`, or half a cosine down to zero over all epochs
     schedule: str = STEPS
-    decay_epochs: int = DECAY_EPOCHS
+    decay_epochs: int = DECAY_EPOCHS  # Of steps; the first epoch of each such block still has the old rate
+    # features, hops: Outputs of the first layer per place; K of a graph convolution
     features: int = 64
     hops: int = HOPS
+    # betas, alphas: Membrane decays of single layers, all others have the common one; current decays that are not zero.
+    # With the first, every layer's is rounded to what the chip holds.
     betas: Decays = ()
     alphas: Decays = ()
-    clocks: int = 0
+    clocks: int = 0  # Clock channels, see :mod:`compiler.dynamics`
+    # Added to the loss for each synapse that carries a spike in every step: this times the share of the synapses behind
+    # neurons that do so, mean over steps and recordings
     penalty: float = 0.0
 
     def to_json(self) -> dict[str, Any]:

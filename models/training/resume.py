@@ -32,21 +32,13 @@ DAMAGES = (
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TrainingState:
-    """What an epoch hands to the next.
+    """What an epoch hands to the next."""
 
-    Parameters
-    ----------
-    options : mapping
-        JSON values that must be equal to go on: digests of data and graph, architecture, epochs, seed, rates.
-    progress : mapping
-        JSON values, as the training sees fit: history, state of the order's generator, learning rate.
-    arrays : mapping of str to arrays
-        Parameters, optimizer moments, weights of epochs that are kept.
-    """
-
+    # JSON values that must be equal to go on: digests of data and graph, architecture, epochs, seed, rates
     options: Mapping[str, Any]
+    # JSON values, as the training sees fit: history, state of the order's generator, learning rate
     progress: Mapping[str, Any]
-    arrays: Mapping[str, NDArray[Any]]
+    arrays: Mapping[str, NDArray[Any]]  # Parameters, optimizer moments, weights of epochs that are kept
 
 
 def write_state(path: str | os.PathLike[str], state: TrainingState) -> None:

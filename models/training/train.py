@@ -39,25 +39,15 @@ from spikeloom.models.training.schedule import EPOCHS
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Epoch:
-    """Figures of one epoch.
+    """Figures of one epoch."""
 
-    Parameters
-    ----------
-    epoch : int
-        Counted from 1.
-    learning_rate : float
-        When it began.
-    training_loss, test_loss : float
-        The recipe's loss, by default the mean squared error of the spike rates against zeros and a one; mean over the
-        recordings. A penalty on spikes counts in training only.
-    correct, tested : int
-        Test recordings classified correctly after it, and all of them.
-    """
-
-    epoch: int
-    learning_rate: float
+    epoch: int  # Counted from 1
+    learning_rate: float  # When it began
+    # training_loss, test_loss: The recipe's loss, by default the mean squared error of the spike rates against zeros
+    # and a one; mean over the recordings. A penalty on spikes counts in training only.
     training_loss: float
     test_loss: float
+    # correct, tested: Test recordings classified correctly after it, and all of them
     correct: int
     tested: int
 
@@ -69,29 +59,16 @@ class Epoch:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Trained:
-    """What a training left.
+    """What a training left."""
 
-    Parameters
-    ----------
-    architecture : Sizes
-        Of the network.
-    last, best : dict of arrays
-        Weights after the last epoch, and after the epoch with the most correct test recordings (the first such):
-        the latter is chosen on test data, as the published figures are.
-    best_epoch : int
-        Counted from 1.
-    kept : dict of arrays, or None
-        Weights after the epoch that was asked for.
-    history : tuple of Epoch
-        All epochs.
-    """
-
-    architecture: Sizes
+    architecture: Sizes  # Of the network
+    # last, best: Weights after the last epoch, and after the epoch with the most correct test recordings (the first
+    # such): the latter is chosen on test data, as the published figures are
     last: Weights
     best: Weights
-    best_epoch: int
-    kept: Weights | None
-    history: tuple[Epoch, ...]
+    best_epoch: int  # Counted from 1
+    kept: Weights | None  # Weights after the epoch that was asked for
+    history: tuple[Epoch, ...]  # All epochs
 
 
 def train(

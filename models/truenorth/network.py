@@ -61,43 +61,20 @@ Arrays = dict[str, NDArray[np.float32]]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NativeArchitecture:
-    """Sizes of a `NativeNet`.
+    """Sizes of a `NativeNet`."""
 
-    Parameters
-    ----------
-    taxels, classes : int
-        Sensor points and classes.
-    channels : int
-        Inputs per taxel (polarities).
-    hops : int
-        K of the graph convolution.
-    features : int
-        Of the convolution, per taxel; a multiple of `groups`.
-    groups : int
-        Blocks of each dense layer.
-    hidden : tuple of int
-        Neurons of each group before the last layer; multiples of `groups`.
-    voters : int
-        Output neurons of a class in each group.
-    copies : int
-        Axons of an input, see :mod:`truenorth.native`.
-    clocks : Clocks
-        That the dense layers receive.
-    floor : float
-        Lowest membrane, in thresholds below zero, at least 1.
-    """
-
+    # taxels, classes: Sensor points and classes
     taxels: int
     classes: int
-    channels: int = 2
-    hops: int = 3
-    features: int = 16
-    groups: int = 8
-    hidden: tuple[int, ...] = (80, 80)
-    voters: int = 2
-    copies: int = 3
-    clocks: Clocks = NO_CLOCKS
-    floor: float = 1.0
+    channels: int = 2  # Inputs per taxel (polarities)
+    hops: int = 3  # K of the graph convolution
+    features: int = 16  # Of the convolution, per taxel; a multiple of `groups`
+    groups: int = 8  # Blocks of each dense layer
+    hidden: tuple[int, ...] = (80, 80)  # Neurons of each group before the last layer; multiples of `groups`
+    voters: int = 2  # Output neurons of a class in each group
+    copies: int = 3  # Axons of an input, see :mod:`truenorth.native`
+    clocks: Clocks = NO_CLOCKS  # That the dense layers receive
+    floor: float = 1.0  # Lowest membrane, in thresholds below zero, at least 1
 
     @property
     def layers(self) -> tuple[str, ...]:
@@ -258,16 +235,10 @@ class NativeNet(TrainedModule):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Rounded:
-    """A layer as the chip holds it, in float32 that holds whole numbers.
+    """A layer as the chip holds it, in float32 that holds whole numbers."""
 
-    Parameters
-    ----------
-    weight : (blocks, inputs, size)
-        Multiples of ``UNIT``.
-    leak, threshold, floor : (blocks * size,)
-    """
-
-    weight: Tensor
+    weight: Tensor  # (blocks, inputs, size); multiples of ``UNIT``
+    # leak, threshold, floor: (blocks * size,)
     leak: Tensor
     threshold: Tensor
     floor: Tensor

@@ -38,35 +38,18 @@ FORMATS = {ONNX: "ONNX", NIR: "NIR"}
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LoadedNetwork:
-    """A float network and where it is from.
+    """A float network and where it is from."""
 
-    Parameters
-    ----------
-    network : Network
-        Float stage.
-    checkpoint : Checkpoint or None
-        Where it is from one.
-    adjacency : (taxels, taxels) or (filters, places, taxels) float64, or None
-        What its first layer sees, likewise; see :func:`expand.stack_of`.
-    graph : str or None
-        Its name, likewise.
-    facts : tuple of str
-        What was read from an ONNX or NIR file and what was assumed.
-    sha256 : str
-        Of the file.
-    format : str
-        ``checkpoint``, ``onnx`` or ``nir``.
-    read_as : JSON values
-        How it was read, beyond what it says: the time step of a NIR file.
-    """
-
-    network: Network
-    checkpoint: Checkpoint | None
+    network: Network  # Float stage
+    checkpoint: Checkpoint | None  # Where it is from one
+    # (taxels, taxels) or (filters, places, taxels) float64, or None; what its first layer sees, likewise; see
+    # :func:`expand.stack_of`
     adjacency: FloatArray | None
-    graph: str | None
-    facts: tuple[str, ...]
-    sha256: str
-    format: str = "checkpoint"
+    graph: str | None  # Its name, likewise
+    facts: tuple[str, ...]  # What was read from an ONNX or NIR file and what was assumed
+    sha256: str  # Of the file
+    format: str = "checkpoint"  # ``checkpoint``, ``onnx`` or ``nir``
+    # How it was read, beyond what it says: the time step of a NIR file
     read_as: Mapping[str, Any] = field(default_factory=dict)
 
     def origin(self, run: int) -> dict[str, Any]:

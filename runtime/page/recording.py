@@ -36,22 +36,13 @@ AROUND = 25
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class BothSides:
-    """What float32 model and chip do on one recording, layer by layer and aligned with the data.
+    """What float32 model and chip do on one recording, layer by layer and aligned with the data."""
 
-    Parameters
-    ----------
-    float_spikes, chip_spikes : tuple of (steps, neurons) bool
-        Silent where neurons are left out because no neuron receives them.
-    float_membranes : tuple of (steps, neurons) floating
-        Before the comparison.
-    trace : Trace
-        Of the chip, one recording: spikes, membranes and updates.
-    """
-
+    # float_spikes, chip_spikes: Silent where neurons are left out because no neuron receives them
     float_spikes: tuple[BoolArray, ...]
     chip_spikes: tuple[BoolArray, ...]
-    float_membranes: tuple[npt.NDArray[np.floating], ...]
-    trace: machine_trace.Trace
+    float_membranes: tuple[npt.NDArray[np.floating], ...]  # Before the comparison
+    trace: machine_trace.Trace  # Of the chip, one recording: spikes, membranes and updates
 
 
 def run_both(netlist: Netlist, loaded: LoadedNetwork, events: npt.NDArray[np.uint8]) -> BothSides:

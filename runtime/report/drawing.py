@@ -57,25 +57,15 @@ Options = ParamSpec("Options")
 
 @dataclass(eq=False)
 class Drawing:
-    """A Matplotlib figure and the values that pointer and keys read from it.
-
-    Parameters
-    ----------
-    figure : Figure
-    title : str
-        What screen readers say.
-    along : {"", "x", "y"}
-        Direction in which the pointer seeks the nearest value; both by default.
-    tips : list of (Axes, float, float, str)
-        Panel, place in it, and what is said there, in the order in which keys visit them.
-    cells : tuple of (Axes, sequence of str), optional
-        A panel whose rows have names and whose columns are steps: there the pointer reads every cell.
-    """
+    """A Matplotlib figure and the values that pointer and keys read from it."""
 
     figure: Figure
-    title: str
+    title: str  # What screen readers say
+    # {"", "x", "y"}; direction in which the pointer seeks the nearest value; both by default
     along: Literal["", "x", "y"] = ""
+    # Panel, place in it, and what is said there, in the order in which keys visit them
     tips: list[tuple[Axes, float, float, str]] = field(default_factory=list)
+    # A panel whose rows have names and whose columns are steps: there the pointer reads every cell
     cells: tuple[Axes, Sequence[str]] | None = None
 
     def svg(self, name: str) -> str:
@@ -364,26 +354,15 @@ def log_ticks(low: float, high: float) -> list[float]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Curves:
-    """One panel of curves of float model and chip in per cent over named levels.
-
-    Parameters
-    ----------
-    title, axis : str
-    levels : sequence of str
-    sides : mapping of str to sequence of (float, float, float)
-        ``float`` and ``chip``: low end, mean and high end at each level.
-    leaves : mapping of str to (int or None)
-        Level at which a side leaves the grey band.
-    band : (float, float)
-    chance : float
-    """
+    """One panel of curves of float model and chip in per cent over named levels."""
 
     title: str
     axis: str
     levels: Sequence[str]
+    # ``float`` and ``chip``: low end, mean and high end at each level
     sides: Mapping[str, Sequence[tuple[float, float, float]]]
-    leaves: Mapping[str, int | None]
-    band: tuple[float, float]
+    leaves: Mapping[str, int | None]  # Level at which a side leaves the grey band
+    band: tuple[float, float]  # (float, float)
     chance: float
 
 

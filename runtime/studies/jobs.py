@@ -34,21 +34,11 @@ CONNECT_S = 5.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Point:
-    """One measurement of a sweep.
+    """One measurement of a sweep."""
 
-    Parameters
-    ----------
-    key : str
-        Of everything that decides the result, see `content_key`.
-    label : str
-        For messages.
-    payload : picklable
-        What is measured: absolute paths and options, no arrays; it may travel to another machine.
-    """
-
-    key: str
-    label: str
-    payload: Any
+    key: str  # Of everything that decides the result, see `content_key`
+    label: str  # For messages
+    payload: Any  # What is measured: absolute paths and options, no arrays; it may travel to another machine
 
 
 class ProcessDied(Exception):  # noqa: N818 - it is handed over, not raised

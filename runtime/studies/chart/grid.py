@@ -25,31 +25,18 @@ MOST = 100_000
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Grid:
-    """Values of every axis, in the order in which they were given; each once.
+    """Values of every axis, in the order in which they were given; each once."""
 
-    Parameters
-    ----------
-    bits : tuple of tuple of int
-        Storage widths: one number for all layers, or one for each.
-    planes, groups : tuple of int
-        Times that a synapse is stored, and scales in a layer.
-    prune : tuple of int
-        Whether neurons that never fired on training recordings are left out: 0 or 1.
-    cores : tuple of str
-        What the layout is for, as ``--optimize`` names it, or least cores as in ``fc1:6+conv1:4``.
-    window : tuple of int
-        Per cent of each recording.
-    graph : tuple of str
-        Graphs that networks were trained on; empty: of all that are given.
-    """
-
+    # Storage widths: one number for all layers, or one for each
     bits: tuple[tuple[int, ...], ...] = ((2,), (3,), (4,), (5,), (6,), (8,))
+    # planes, groups: Times that a synapse is stored, and scales in a layer
     planes: tuple[int, ...] = (1,)
     groups: tuple[int, ...] = (1,)
-    prune: tuple[int, ...] = (0,)
+    prune: tuple[int, ...] = (0,)  # Whether neurons that never fired on training recordings are left out: 0 or 1
+    # What the layout is for, as ``--optimize`` names it, or least cores as in ``fc1:6+conv1:4``
     cores: tuple[str, ...] = ("cores",)
-    window: tuple[int, ...] = (25, 50, 75, WHOLE)
-    graph: tuple[str, ...] = ()
+    window: tuple[int, ...] = (25, 50, 75, WHOLE)  # Per cent of each recording
+    graph: tuple[str, ...] = ()  # Graphs that networks were trained on; empty: of all that are given
 
 
 class _BadValueError(Exception):

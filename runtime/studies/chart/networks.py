@@ -34,50 +34,24 @@ STORAGE_AXES = ("bits", "planes", "groups", "prune", "cores")
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Given:
-    """A network of a chart.
+    """A network of a chart."""
 
-    Parameters
-    ----------
-    source : Source
-        As typed, with the options that suit it.
-    name : str
-        Short, and no other network of the chart has it.
-    target : str
-        Chip that it is compiled for.
-    graph : str
-        That it was trained on; ``none`` of systems without.
-    sees : str
-        Hash over what its first layer sees.
-    sha256, weights, system : str
-        Of the file, and what of it is taken.
-    taxels, classes : int
-    layers : tuple of str
-        Names.
-    training : mapping
-        JSON values, as far as the file knows them.
-    forms : tuple of Form, optional
-        Storage that it was fine-tuned for.
-    levels : int, optional
-        Levels of its weights, of a network that was trained in whole numbers for its chip.
-    bins : int
-        Bins of the recordings that a step joins.
-    """
-
-    source: Source
-    name: str
-    target: str
-    graph: str
-    sees: str
+    source: Source  # As typed, with the options that suit it
+    name: str  # Short, and no other network of the chart has it
+    target: str  # Chip that it is compiled for
+    graph: str  # That it was trained on; ``none`` of systems without
+    sees: str  # Hash over what its first layer sees
+    # sha256, weights, system: Of the file, and what of it is taken
     sha256: str
     weights: str
     system: str
     taxels: int
     classes: int
-    layers: tuple[str, ...]
-    training: Mapping[str, Any]
-    forms: tuple[Form, ...] | None = None
-    levels: int | None = None
-    bins: int = 1
+    layers: tuple[str, ...]  # Names
+    training: Mapping[str, Any]  # JSON values, as far as the file knows them
+    forms: tuple[Form, ...] | None = None  # Storage that it was fine-tuned for
+    levels: int | None = None  # Levels of its weights, of a network that was trained in whole numbers for its chip
+    bins: int = 1  # Bins of the recordings that a step joins
 
     @property
     def validation(self) -> float | None:

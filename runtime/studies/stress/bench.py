@@ -26,24 +26,13 @@ from spikeloom.runtime.studies.stress.pair import Inputs, Pair, Ready, ready
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Sensor:
-    """What perturbations must know beside the network.
+    """What perturbations must know beside the network."""
 
-    Parameters
-    ----------
-    distance : (taxels, taxels) float64
-        In millimetres, or in steps on the graph where positions are not known.
-    places : (taxels, dimensions) float64, or None
-        Positions in millimetres.
-    edges : (edges, 2) int64, or None
-        Graph that the network was trained on.
-    checkpoint : Checkpoint or None
-        What the network was made from; None for an ONNX or NIR file.
-    """
-
+    # (taxels, taxels) float64; in millimetres, or in steps on the graph where positions are not known
     distance: FloatArray
-    places: FloatArray | None
-    edges: IntArray | None
-    checkpoint: Checkpoint | None
+    places: FloatArray | None  # (taxels, dimensions) float64, or None; positions in millimetres
+    edges: IntArray | None  # (edges, 2) int64, or None; graph that the network was trained on
+    checkpoint: Checkpoint | None  # What the network was made from; None for an ONNX or NIR file
 
     @property
     def taxels(self) -> int:
@@ -58,30 +47,17 @@ class Sensor:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Bench:
-    """What is stressed, and on what.
+    """What is stressed, and on what."""
 
-    Parameters
-    ----------
-    pair : Pair
-        As compiled.
-    ready : Ready
-        The same, prepared.
-    sensor : Sensor
-    events : (recordings, taxels, polarities, T) uint8
-        In the bins of the recordings, which are disturbed before a network joins them.
-    labels : (recordings,) int64
-    files : tuple of str
-    lengths : (recordings,) int64
-        Bins of each.
-    """
-
-    pair: Pair
-    ready: Ready
+    pair: Pair  # As compiled
+    ready: Ready  # The same, prepared
     sensor: Sensor
+    # (recordings, taxels, polarities, T) uint8; in the bins of the recordings, which are disturbed before a network
+    # joins them
     events: Events
-    labels: IntArray
+    labels: IntArray  # (recordings,) int64
     files: tuple[str, ...]
-    lengths: IntArray
+    lengths: IntArray  # (recordings,) int64; bins of each
 
     def steps(self) -> tuple[Events, IntArray]:
         """Recordings in steps of the network, and how many steps each has."""

@@ -56,24 +56,12 @@ class Inputs:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Outcome:
-    """What both sides did.
+    """What both sides did."""
 
-    Parameters
-    ----------
-    votes : dict of str to (recordings, classes) int64
-        By side.
-    spikes : (recordings, layers, 3) int64
-        Of the float network, of the chip, and those in which they differ.
-    stopped : (recordings,) bool
-        Where a register of the chip would overflow.
-    saturated : (recordings,) int64
-        Membranes that were clipped.
-    """
-
-    votes: dict[str, IntArray]
-    spikes: IntArray
-    stopped: npt.NDArray[np.bool_]
-    saturated: IntArray
+    votes: dict[str, IntArray]  # By side
+    spikes: IntArray  # (recordings, layers, 3) int64; of the float network, of the chip, and those in which they differ
+    stopped: npt.NDArray[np.bool_]  # (recordings,) bool; where a register of the chip would overflow
+    saturated: IntArray  # (recordings,) int64; membranes that were clipped
 
     def decisions(self, side: str) -> IntArray:
         """Class of each recording."""

@@ -14,32 +14,17 @@ from spikeloom.runtime.studies.stress.battery import Level
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Run:
-    """Counts over all recordings under one draw of a perturbation.
+    """Counts over all recordings under one draw of a perturbation."""
 
-    Parameters
-    ----------
-    seed : int or None
-        None for the clean recordings.
-    right : mapping
-        Right decisions by side.
-    equal : int
-        Decisions that are the same on both sides.
-    layers : mapping
-        Of each layer: spikes of the float network and of the chip, those in which they differ, entries.
-    signs : mapping
-        Recordings with a sign of breakdown (``no vote``, ``one class``) by side and sign.
-    most : mapping
-        Class that is decided most often by side, and how often.
-    stopped, saturated : int
-        Recordings that overflow a register of the chip, and membranes that it clips.
-    """
-
-    seed: int | None
-    right: Mapping[str, int]
-    equal: int
+    seed: int | None  # None for the clean recordings
+    right: Mapping[str, int]  # Right decisions by side
+    equal: int  # Decisions that are the same on both sides
+    # Of each layer: spikes of the float network and of the chip, those in which they differ, entries
     layers: Mapping[str, tuple[int, int, int, int]]
+    # Recordings with a sign of breakdown (``no vote``, ``one class``) by side and sign
     signs: Mapping[str, Mapping[str, int]]
-    most: Mapping[str, tuple[int, int]]
+    most: Mapping[str, tuple[int, int]]  # Class that is decided most often by side, and how often
+    # stopped, saturated: Recordings that overflow a register of the chip, and membranes that it clips
     stopped: int
     saturated: int
 

@@ -20,19 +20,7 @@ from spikeloom.runtime.studies.training.report import Finished
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Job:
-    """One seed of a training; crosses process borders.
-
-    Parameters
-    ----------
-    keep : tuple of str
-        Which of ``last``, ``best`` and ``clean`` to write.
-    command : str
-        That repeats it.
-    draws : bool
-        Whether predictions are needed, for a picture.
-    position : int
-        Row of the progress bar.
-    """
+    """One seed of a training; crosses process borders."""
 
     plan: Plan
     training: Recordings
@@ -42,10 +30,10 @@ class Job:
     device: str
     resume: bool
     output: Path
-    keep: tuple[str, ...]
-    command: str
-    draws: bool
-    position: int
+    keep: tuple[str, ...]  # Which of ``last``, ``best`` and ``clean`` to write
+    command: str  # That repeats it
+    draws: bool  # Whether predictions are needed, for a picture
+    position: int  # Row of the progress bar
 
     @property
     def state(self) -> Path:
