@@ -59,14 +59,17 @@ def test_neighbours_are_the_nearest_ones_the_lower_number_first():
 
 @REPEATABLE
 @given(recordings(), SEEDS, st.floats(0, 1), st.floats(0, 1))
-def test_lost_events_were_there_and_are_lost_again_at_a_higher_rate(events, seed, share, other):
-    low, high = sorted((share, other))
-    some, more = (d.lose(events, rate, drawn(seed)) for rate in (low, high))
-    assert np.all(some <= events)
-    assert np.all(more <= some)
-    assert some.dtype == np.uint8
-    assert not d.lose(events, 1.0, drawn(seed)).any()
-    assert_array_equal(d.lose(events, 0.0, drawn(seed)), events)
+def test_a_higher_rate_loses_and_invents_what_a_lower_one_does_and_more(events, seed, share, other):
+    rates = (0.0, *sorted((share, other)), 1.0)
+    kept = [d.lose(events, rate, drawn(seed)) for rate in rates]
+    made = [d.invent(events, rate, drawn(seed)) for rate in rates]
+    assert_array_equal(kept[0], events)
+    assert_array_equal(made[0], events)
+    assert not kept[3].any()
+    assert made[3].all()
+    for milder, harsher in ((0, 1), (1, 2)):
+        assert np.all(kept[harsher] <= kept[milder])
+        assert np.all(made[harsher] >= made[milder])
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
@@ -75,17 +78,6 @@ def test_rates_are_those_that_were_asked_for(share):
     spread = 5 * np.sqrt(share * (1 - share) * full.size)  # five standard deviations of a binomial number
     assert abs(full.sum() - d.lose(full, share, drawn(1)).sum(dtype=int) - share * full.size) < spread
     assert abs(d.invent(none, share, drawn(1)).sum(dtype=int) - share * full.size) < spread
-
-
-@REPEATABLE
-@given(recordings(), SEEDS, st.floats(0, 1), st.floats(0, 1))
-def test_invented_events_are_added_to_those_that_were_there(events, seed, share, other):
-    low, high = sorted((share, other))
-    some, more = (d.invent(events, rate, drawn(seed)) for rate in (low, high))
-    assert np.all(some >= events)
-    assert np.all(more >= some)
-    assert d.invent(events, 1.0, drawn(seed)).all()
-    assert_array_equal(d.invent(events, 0.0, drawn(seed)), events)
 
 
 @REPEATABLE

@@ -45,18 +45,25 @@ REPORT = ("report", "net.loom", "--checkpoint", "net.pt", "--data", "data")
 FEW = ("--seeds", "2", "--only", "taxels_dead,events_lost,warm_state,longer,weight_bit_flips,other_graph,fewer_bits")
 
 
-def bench_of(network, netlist, recordings, labels=None, *, checkpoint=None, edges=None, lengths=None, places=None):
-    taxels = recordings.shape[1]
+def bench_of(network, netlist, recordings, *, checkpoint=None, edges=None, places=None):
+    count, taxels, _, steps = recordings.shape
     pair = Pair(netlist=netlist, network=network)
     return Bench(
         pair=pair,
         ready=ready(pair),
         sensor=Sensor(distance=distances(taxels, places, edges), places=places, edges=edges, checkpoint=checkpoint),
         events=recordings,
-        labels=np.arange(len(recordings)) % netlist.classes if labels is None else labels,
-        files=tuple(f"r{i}" for i in range(len(recordings))),
-        lengths=np.full(len(recordings), recordings.shape[3]) if lengths is None else lengths,
+        labels=np.arange(count) % netlist.classes,
+        files=tuple(f"r{i}" for i in range(count)),
+        lengths=np.full(count, steps),
     )
+
+
+def timed_bench(folder):
+    """A network with clocks and lasting currents."""
+    _, seen = written(folder / "net.pt")
+    network = expand(read_checkpoint(folder / "net.pt"), seen)
+    return bench_of(network, compile_network(network).netlist, events_of(3))
 
 
 @pytest.fixture(scope="module")
@@ -64,15 +71,8 @@ def bench(tmp_path_factory):
     """A small TactileSGNet, labelled as its float model decides."""
     checkpoint, adjacency = small_checkpoint(tmp_path_factory.mktemp("small"))
     network = expand(checkpoint, adjacency)
-    recordings = events(2, samples=8)
-    made = bench_of(
-        network,
-        compile_network(network).netlist,
-        recordings,
-        checkpoint=checkpoint,
-        edges=checkpoint.edges,
-        places=np.arange(float(TAXELS))[:, None],
-    )
+    known = {"checkpoint": checkpoint, "edges": checkpoint.edges, "places": np.arange(float(TAXELS))[:, None]}
+    made = bench_of(network, compile_network(network).netlist, events(2, samples=8), **known)
     found, _ = clean(made)
     return replace(made, labels=found.decisions("float"))
 
@@ -147,19 +147,9 @@ def test_recordings_after_others_without_a_reset_are_one_long_run_of_the_specifi
         assert_array_equal(inputs.events[i, :, 2 * STEPS :], with_clocks(bench.events, bench.pair.netlist.clocks)[i])
 
 
-def test_cold_recordings_are_those_of_the_specification_each_from_rest(bench):
-    inputs = whole(bench.events, bench.pair.netlist, bench.lengths)
-    found = evaluate(bench.ready, inputs)
-    for i in range(3):
-        slow = spec.simulate(bench.pair.netlist, inputs.events[i])
-        assert_array_equal(found.votes["chip"][i], class_counts(bench.pair.netlist, slow.counts.spikes[None])[0])
-
-
 def test_state_that_is_left_over_matters_where_membranes_last(tmp_path):
     """With lasting currents the recordings before are to be seen; it is the specification that says how."""
-    _, seen = written(tmp_path / "net.pt")
-    network = expand(read_checkpoint(tmp_path / "net.pt"), seen)
-    made = bench_of(network, compile_network(network).netlist, events_of(3))
+    made = timed_bench(tmp_path)
     warm = evaluate(made.ready, after_others(made, 1, generator("warm_state", 1)))
     cold, _ = clean(made)
     for side in (0, 1):
@@ -181,10 +171,8 @@ def test_ten_times_as_long_is_ten_recordings_of_which_the_last_counts(bench):
 
 def test_clocks_are_no_taxels(tmp_path):
     """Whatever happens to taxels, clocks tick: again with each recording, and to their end in a longer one."""
-    _, seen = written(tmp_path / "net.pt")
-    network = expand(read_checkpoint(tmp_path / "net.pt"), seen)
-    netlist = compile_network(network).netlist
-    made = bench_of(network, netlist, events_of(3))
+    made = timed_bench(tmp_path)
+    netlist = made.pair.netlist
     ticks = netlist.clocks.events(15)
     sensor = netlist.taxels * netlist.polarities
     silent = NAMES["taxels_dead"].disturb(made.events, 39, made.sensor, generator("taxels_dead", 0))
@@ -218,18 +206,10 @@ def test_recordings_of_different_length_are_disturbed_within_their_own(bench):
 
 def test_an_overflow_stops_its_recording_and_no_other(bench):
     netlist = bench.pair.netlist
-    target = netlist.synapse_compartment()
-    first = netlist.compartments_of(0)[0]
-    heavy = replace(netlist, format_exponent=np.full_like(netlist.format_exponent, 7))
-    assert np.any(target == first)
-    recordings = bench.events.copy()
-    recordings[1:] = 0
+    heavy = replace(netlist, format_exponent=np.full_like(netlist.format_exponent, 12))
+    recordings = np.zeros_like(bench.events)
     recordings[0] = 1
-    made = bench_of(bench.pair.network, heavy, recordings)
-    found, counted = clean(made)
-    if not found.stopped.any():  # not enough weight in this small network: make it more
-        heavier = replace(heavy, format_exponent=np.full_like(netlist.format_exponent, 12))
-        found, counted = clean(bench_of(bench.pair.network, heavier, recordings))
+    found, counted = clean(bench_of(bench.pair.network, heavy, recordings))
     assert found.stopped.tolist() == [True] + [False] * 7
     assert counted.stopped == 1
     assert found.decisions("chip")[0] == -1
