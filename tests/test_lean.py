@@ -101,20 +101,8 @@ def test_what_is_written_decides_and_costs_as_reported(spikeloom):
             assert other["training"]["differ"] == 0
 
 
-def test_rows_and_facts(spikeloom):
+def test_taxels_and_layers(spikeloom):
     report = json.loads(spikeloom(*WORDS, "--differ", "0", "--json")[1])
-    names = [row["name"] for row in report["rows"]]
-    hops = ["hop 0", "hop 1", "hop 2", "hop 3", "hops 1 to 3", "hops 2 to 3"]
-    strict = "no training decision changed"
-    bins = [f"{n} bins joined, {how}" for n in (2, 4) for how in ("decays as they are", "decays of as many steps")]
-    assert names == [
-        "everything",
-        "neurons that never fired in training",
-        *(f"{part}, {strict}" for part in ("neurons", "taxels")),
-        *hops,
-        *bins,
-        f"together, {strict}",
-    ]
     data = load_data("data", "train")[0]
     assert [taxel["events"] for taxel in report["taxels"]] == data.events.sum(axis=(0, 2, 3), dtype=int).tolist()
     assert report["taxels"][3] == {"events": 0, "training_differ": 0, "test_differ": 0}
@@ -123,13 +111,12 @@ def test_rows_and_facts(spikeloom):
 
 
 def test_the_cheapest_of_several_networks_within_a_recording_of_the_best(spikeloom):
-    report = json.loads(spikeloom("lean", "net.pt", "thin.pt", "--data", "data", "--json")[1])
+    words = ("lean", "net.pt", "thin.pt", "--data", "data")
+    report = json.loads(spikeloom(*words, "--json")[1])
     right = [entry["training_right"] for entry in report["candidates"]]
     fitting = [entry for entry in report["candidates"] if entry["training_right"] >= max(right) - 1]
     assert report["chosen"] == min(fitting, key=lambda entry: entry["training_operations"])["name"]
-    code, out, _ = spikeloom("lean", "net.pt", "thin.pt", "--data", "data")
-    assert code == 0
-    assert f"taken: {report['chosen']}" in out.splitlines()
+    assert f"taken: {report['chosen']}" in spikeloom(*words)[1].splitlines()
 
 
 def test_silenced_is_as_if_it_were_gone(compiled):
@@ -269,14 +256,8 @@ def test_a_network_from_nir_remembers_how_it_was_read(spikeloom):
     assert spikeloom("compile", "net.pt", "-o", "nir.loom")[0] == 0
     assert spikeloom("export", "nir.loom", "--to", "nir", "--dt", "0.01", "-o", "net.nir")[0] == 0
     assert spikeloom("lean", "net.nir", "--data", "data", "-o", "lean_nir.loom")[0] == 0
-    assert spikeloom("compile", "net.nir", "--dt", "0.01", "-o", "again.loom")[0] == 0
-    for path in ("lean_nir.loom", "again.loom"):
-        remembered = read_netlist(path).provenance
-        assert {name: remembered[name] for name in ("format", "dt", "convention")} == {
-            "format": "nir",
-            "dt": 0.01,
-            "convention": "euler",
-        }
+    remembered = read_netlist("lean_nir.loom").provenance
+    assert [remembered[name] for name in ("format", "dt", "convention")] == ["nir", 0.01, "euler"]
 
 
 @pytest.mark.parametrize(
