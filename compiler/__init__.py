@@ -14,6 +14,14 @@ if TYPE_CHECKING:
     from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist, write_netlist
     from spikeloom.compiler.targets.loihi1.options import GOALS, MARGIN, MAX_PLANES, Options, Recipe, check_recipes
     from spikeloom.compiler.targets.loihi1.passes import lay_out_again, store, without
+    from spikeloom.compiler.targets.loihi1.storage.quantize import round_to_forms
+    from spikeloom.compiler.targets.loihi1.storage.width_search import (
+        WidthPoint,
+        WidthSearch,
+        check_widths,
+        search_widths,
+        widths_front,
+    )
 
 __all__ = [
     "GOALS",
@@ -23,12 +31,18 @@ __all__ = [
     "Netlist",
     "Options",
     "Recipe",
+    "WidthPoint",
+    "WidthSearch",
     "check_recipes",
+    "check_widths",
     "compile_network",
     "lay_out_again",
     "lift",
     "read_netlist",
+    "round_to_forms",
+    "search_widths",
     "store",
+    "widths_front",
     "without",
     "write_netlist",
 ]
@@ -43,11 +57,17 @@ _PLACES = {
     "Netlist": "netlist",
     "Options": "options",
     "Recipe": "options",
+    "WidthPoint": "storage.width_search",
+    "WidthSearch": "storage.width_search",
     "check_recipes": "options",
+    "check_widths": "storage.width_search",
     "lay_out_again": "passes",
     "lift": "lift",
     "read_netlist": "netlist_file",
+    "round_to_forms": "storage.quantize",
+    "search_widths": "storage.width_search",
     "store": "passes",
+    "widths_front": "storage.width_search",
     "without": "passes",
     "write_netlist": "netlist_file",
 }

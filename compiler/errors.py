@@ -67,7 +67,7 @@ class Violation:
     owner : str
         Who breaks it, for example ``core 3 (fc1)``.
     rule : str
-        Name of the limit in the target file, for example ``loihi1.core.axons_in``.
+        Name of the limit in the target file, the chip's before it: ``CHIP.core.axons_in``.
     used, allowed : int or str
         What was found and what is allowed: amounts, or words where the rule is no amount.
     remedy : str

@@ -1,12 +1,12 @@
-"""Loihi's integer arithmetic: decay, saturation, bias encoding. Exact and small; int64 in, int64 out.
+"""Integer arithmetic of the registers: decay, saturation, planes, bias encoding. Exact and small; int64 in, int64 out.
 
-Every rounding that a chip register performs is written here once, for arrays. (:mod:`loihi1.spec` states the same
+Every rounding that a chip register performs is written here once, for arrays. (A machine's ``spec`` states the same
 rules a second time in plain Python integers, on purpose: the tests hold the two together.)
 
 References
 ----------
-.. [1] M. Davies et al., "Loihi: A Neuromorphic Manycore Processor with On-Chip Learning", IEEE Micro 38(1), 2018.
-.. [2] nengo-loihi, ``builder/discretize.py`` and ``emulator/interface.py``; lava, ``proc/lif/models.py``.
+.. [1] M. Davies et al., IEEE Micro 38(1), 82-99, 2018, doi:10.1109/MM.2018.112130359.
+.. [2] nengo, ``builder/discretize.py`` and ``emulator/interface.py`` of its back-end; lava, ``proc/lif/models.py``.
 """
 
 from __future__ import annotations
@@ -21,6 +21,9 @@ FloatArray = npt.NDArray[np.float64]
 
 DECAY_BITS = 12
 """Decay registers count in 1/4096."""
+
+DECAY_ONE = 1 << DECAY_BITS
+"""All of a current or membrane."""
 
 MEMBRANE_SHIFT = 6
 """A weight of one adds 2**6 to the membrane; a threshold mantissa is worth 2**6 too, a bias is not shifted."""
@@ -108,6 +111,91 @@ def weight_step(bits: int) -> int:
     [2, 8, 32, 128]
     """
     return 1 << (9 - bits)
+
+
+def decay_registers(beta: float, alpha: float = 0.0) -> tuple[int, int]:
+    """Registers ``decay_u`` and ``decay_v`` nearest to a current decay and a membrane decay.
+
+    The chip's current loses one part in 4096 more than its register says. So it can forget all, which a membrane
+    cannot, and cannot keep all.
+
+    Examples
+    --------
+    >>> decay_registers(0.2)
+    (4095, 3277)
+    >>> decay_registers(0.2, 0.95)
+    (204, 3277)
+    """
+    return min(4095, max(0, round(4096 * (1 - alpha)) - 1)), min(4095, max(0, round(4096 * (1 - beta))))
+
+
+def plane_distance(bits: int) -> int:
+    """Largest difference of exponents at which two planes leave no gap between their values.
+
+    Examples
+    --------
+    >>> [plane_distance(bits) for bits in (8, 4, 2)]
+    [7, 3, 1]
+    """
+    codes = (256 - weight_step(bits)) // weight_step(bits)
+    return (2 * codes + 1).bit_length() - 1
+
+
+def reach(bits: int, exponents: tuple[int, ...]) -> int:
+    """Largest magnitude that planes hold together, in steps of the finest one.
+
+    Examples
+    --------
+    >>> reach(8, (0,)), reach(8, (-1, 6)), reach(2, (0, 1))
+    (127, 16383, 3)
+    """
+    codes = (256 - weight_step(bits)) // weight_step(bits)
+    return codes * sum(1 << (exponent - exponents[0]) for exponent in exponents)
+
+
+def step_units(bits: int, exponents: tuple[int, ...]) -> float:
+    """Weight units of one step of the finest plane."""
+    return float(weight_step(bits) * 2.0 ** exponents[0])
+
+
+def round_steps(weight: FloatArray, scale: FloatArray | float, bits: int, exponents: tuple[int, ...]) -> IntArray:
+    """Round weights to whole steps of the finest plane and clip them to what the planes hold.
+
+    Parameters
+    ----------
+    weight : (...) float64
+        Real weights.
+    scale : (...) float64
+        Weight units per real unit; broadcasts against `weight`.
+
+    Examples
+    --------
+    >>> round_steps(np.array([1.0, -0.3, 100.0]), 254.0, 8, (0,)).tolist()
+    [127, -38, 127]
+    """
+    limit = reach(bits, exponents)
+    return np.clip(round_half_even(weight * (scale / step_units(bits, exponents))), -limit, limit)
+
+
+def split_planes(steps: IntArray, bits: int, exponents: tuple[int, ...]) -> list[IntArray]:
+    """Mantissas of each plane, finest first, which add up to given steps of the finest one.
+
+    A coarser plane is zero wherever the finer ones hold the value.
+
+    Examples
+    --------
+    >>> [plane.tolist() for plane in split_planes(np.array([5, 127, 128, -300]), 8, (-1, 6))]
+    [[10, 254, 0, -88], [0, 0, 2, -4]]
+    """
+    codes = (256 - weight_step(bits)) // weight_step(bits)
+    rest, mantissas = steps, []
+    for k in range(len(exponents) - 1, 0, -1):
+        ratio = 1 << (exponents[k] - exponents[0])
+        code = np.clip(round_half_even(rest / ratio), -codes, codes)
+        code = np.where(np.abs(rest) <= reach(bits, exponents[:k]), 0, code)
+        rest = rest - code * ratio
+        mantissas.append(code * weight_step(bits))
+    return [rest * weight_step(bits), *reversed(mantissas)]
 
 
 def encode_bias(bias: FloatArray) -> tuple[IntArray, IntArray]:

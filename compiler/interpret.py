@@ -157,7 +157,7 @@ def integer_recurrence(
     membranes: bool = False,
     saturates: bool = True,
 ) -> tuple[BoolArray, IntArray | None]:
-    """Loihi's compartment on given synaptic sums (in weight units); :mod:`loihi1.spec` holds the definition.
+    """The chip's compartment on given synaptic sums (in weight units); the machine's ``spec`` holds the definition.
 
     Runs in float64, exactly: registers times a 12-bit factor stay below 2**36, a product with 2**-12 only moves the
     point, and truncation is the chip's rounding toward zero. With `saturates` off the membrane has no limits, which

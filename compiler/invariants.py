@@ -1,7 +1,7 @@
 """Every rule of the intermediate representation, one function each, grouped by stage.
 
 A broken rule is a defect of a pass, not of the user: :class:`errors.VerifyError`. What a user can cause is
-refused by the front-ends and by :mod:`loihi1.legalize` before it gets here.
+refused by the front-ends and by the target's ``legalize`` before it gets here.
 """
 
 from __future__ import annotations

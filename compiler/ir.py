@@ -149,7 +149,7 @@ class Form:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class IntegerPopulation:
-    """The same neurons in Loihi's registers; units as in :class:`netlist.Netlist`.
+    """The same neurons in the chip's registers; units as in :class:`netlist.Netlist`.
 
     Parameters
     ----------

@@ -15,6 +15,7 @@ from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist, write_netlist
 from spikeloom.models.recordings.events import load_data
 from spikeloom.runtime import cli
+from spikeloom.runtime.machines.integer import integer_machine_of
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.costs import cost, cumulative, estimate
 from spikeloom.runtime.machines.loihi1.trace import Counts
@@ -121,7 +122,7 @@ def test_recordings_of_different_length_end_on_their_own(place, monkeypatch):
     lengths = np.array([60, 1, 7, 24, 33, 2, 50, 59, 60, 60, 3, 40])
     ran = cumulative.run(netlist, load_target("loihi1"), with_clocks(data.events, netlist.clocks), lengths)
     at = exits.standing(ran.votes, lengths)
-    sure = exits.proven(ran.votes, at, exits.most_votes(netlist, STEPS))
+    sure = exits.proven(ran.votes, at, exits.most_votes(integer_machine_of(netlist), STEPS))
     ends = exits.exits(sure, at)
     assert np.all(ends < lengths)
     for i, length in enumerate(lengths):

@@ -9,7 +9,7 @@ import pytest
 from made_files import TAXELS, events, own_file, recordings_folder, weights
 
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
-from spikeloom.compiler.targets.loihi1.storage.width_search import Point, WidthSearch
+from spikeloom.compiler.targets.loihi1.storage.width_search import WidthPoint, WidthSearch
 from spikeloom.models.recordings.fetch import data_folder
 from spikeloom.runtime import cli
 from spikeloom.runtime.commands.choose import bits
@@ -81,7 +81,7 @@ def test_its_figures_are_those_of_the_netlist(spikeloom):
 def test_another_share_is_answered_from_the_cache(spikeloom, monkeypatch):
     _, first, _ = spikeloom(*COMMAND, "--agreement", "0.5", "--json")
     _, anew, _ = spikeloom(*COMMAND, "--accuracy", "0.4", "--no-cache", "--json")
-    monkeypatch.setattr(bits, "search", refuse_search)
+    monkeypatch.setattr(bits, "search_widths", refuse_search)
     _, again, _ = spikeloom(*COMMAND, "--agreement", "0.5", "--json")
     _, other, err = spikeloom(*COMMAND, "--accuracy", "0.4", "--json")
     first, anew, again, other = (json.loads(out) for out in (first, anew, again, other))
@@ -132,8 +132,8 @@ def test_a_cache_that_cannot_be_written_is_no_mistake(spikeloom, place):
 
 
 def test_a_search_survives_its_file(place):
-    points = tuple(Point(bits=(2, b), words=b * 10, equal=b, right=None) for b in (2, 4))
-    built = (Point(bits=(2, 4), words=39, equal=3, right=None, cores=2),)
+    points = tuple(WidthPoint(bits=(2, b), words=b * 10, equal=b, right=None) for b in (2, 4))
+    built = (WidthPoint(bits=(2, 4), words=39, equal=3, right=None, cores=2),)
     made = WidthSearch(samples=5, float_right=None, points=points, built=built)
     bits.write_search(place / "one.json", made)
     assert bits.read_search(place / "one.json") == made

@@ -15,8 +15,8 @@ from random_networks import (
 
 from spikeloom.compiler import Recipe
 from spikeloom.compiler.interpret import run_integer
+from spikeloom.compiler.range_proof import prove_ranges
 from spikeloom.compiler.targets.loihi1.storage.quantize import quantize
-from spikeloom.compiler.targets.loihi1.storage.range_proof import prove_ranges
 
 
 def with_registers(network, **changes):

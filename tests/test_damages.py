@@ -11,9 +11,9 @@ from timed_networks import written
 
 from spikeloom.compiler import Options, Recipe, compile_network, lift
 from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.fixedpoint import decay_registers
 from spikeloom.compiler.formats.checkpoint import read_checkpoint
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.targets.loihi1.storage.weight_storage import decay_registers
 from spikeloom.models.graphs import normalised_adjacency
 from spikeloom.runtime.equivalence import float_engine
 from spikeloom.runtime.machines.loihi1 import engine, spec

@@ -17,10 +17,10 @@ from spikeloom.compiler.interpret import channels_last, run_float
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.models.networks.reference import float_membranes, float_spikes
 from spikeloom.runtime import cli
-from spikeloom.runtime.equivalence import verify as equivalence
 from spikeloom.runtime.equivalence.ladder import LADDER, realised
 from spikeloom.runtime.equivalence.verify import verify
 from spikeloom.runtime.machines.loihi1 import engine, spec
+from spikeloom.runtime.machines.loihi1.machine import Loihi
 from spikeloom.runtime.machines.votes import class_counts, predictions
 from spikeloom.runtime.report.intervals import wilson
 
@@ -242,7 +242,7 @@ def test_a_single_wrong_bit_is_found_out(small, monkeypatch, field):
         return trace
 
     assert verify(netlist, checkpoint, adjacency, events(2), LABELS, FILES, spec_samples=1).spec_equals_engine
-    monkeypatch.setattr(equivalence.engine, "simulate", wrong)
+    monkeypatch.setattr(engine, "simulate", wrong)
     assert not verify(netlist, checkpoint, adjacency, events(2), LABELS, FILES, spec_samples=1).spec_equals_engine
 
 
@@ -254,7 +254,7 @@ def test_every_asked_for_recording_is_compared(small, monkeypatch):
         seen.append(recording)
         return plain(given, recording)
 
-    monkeypatch.setattr(equivalence.spec, "simulate", watched)
+    monkeypatch.setattr(spec, "simulate", watched)
     for asked, compared in ((1, 1), (4, 4), (9, 6)):
         seen.clear()
         found = verify(netlist, checkpoint, adjacency, events(2), LABELS, FILES, spec_samples=asked)
@@ -269,7 +269,7 @@ def test_a_disagreement_ends_with_exit_code_one(tmp_path, monkeypatch, capsys):
     assert cli.main(["compile", "net.pt", "-o", "net.loom"]) == 0
     words = ["verify", "net.loom", "--checkpoint", "net.pt", "--data", "data", "--min-agreement", "0"]
     assert cli.main(words) == 0
-    monkeypatch.setattr(equivalence, "_same_run", lambda *_: False)
+    monkeypatch.setattr(Loihi, "check", lambda *_, **_options: 1)
     capsys.readouterr()
     assert cli.main([*words, "--json"]) == 1
     out, err = capsys.readouterr()

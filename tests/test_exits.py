@@ -19,6 +19,7 @@ from spikeloom.compiler.passes.expand import expand
 from spikeloom.models.graphs import normalised_adjacency
 from spikeloom.models.recordings.evtouch import load_recordings
 from spikeloom.runtime.inputs.files import shipped
+from spikeloom.runtime.machines.integer import LONGEST, integer_machine_of
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.costs import cumulative
 from spikeloom.runtime.machines.votes import predictions
@@ -138,8 +139,8 @@ def test_how_often_an_output_neuron_can_spike():
         Neuron(threshold=150, decay_u=2047),  # the current adds up to twice the weight
         Neuron(threshold=1, bias=-101, bias_exponent=6),
     )
-    assert exits.least_interval(netlist).tolist() == [1, 2, 2, 4, 0, 3, 1, 0]
-    most = exits.most_votes(netlist, 5)
+    assert integer_machine_of(netlist).least_intervals.tolist() == [1, 2, 2, 4, 0, 3, 1, 0]
+    most = exits.most_votes(integer_machine_of(netlist), 5)
     assert most[0].tolist() == [0, 1, 2, 3, 4, 5]
     assert most[1].tolist() == [0, 1, 1, 2, 2, 3]
     assert most[3].tolist() == [0, 1, 1, 1, 1, 2]
@@ -149,7 +150,7 @@ def test_how_often_an_output_neuron_can_spike():
 def test_slow_neurons_are_looked_at_only_so_far():
     netlist = two_classes(Neuron(threshold=2**17 - 1, decay_v=0), Neuron(threshold=1))
     quiet = replace(netlist, bias_mantissa=read_only([0, 0]), synapse_weight=read_only([2, 2]))
-    assert exits.least_interval(quiet).tolist() == [exits.LONGEST, 1]
+    assert integer_machine_of(quiet).least_intervals.tolist() == [LONGEST, 1]
 
 
 @settings(deadline=None)
@@ -164,7 +165,7 @@ def test_no_output_neuron_spikes_more_often(data):
     except NumericRangeError:
         return
     voters = np.flatnonzero(netlist.readout_class >= 0)
-    for voter, interval in zip(voters, exits.least_interval(netlist), strict=True):
+    for voter, interval in zip(voters, integer_machine_of(netlist).least_intervals, strict=True):
         times = np.flatnonzero(spikes[:, voter])
         assert interval or not len(times)
         assert np.all(np.diff(times) >= interval)
@@ -172,7 +173,7 @@ def test_no_output_neuron_spikes_more_often(data):
     if length:
         counted = cumulative.votes_of(netlist, events[None], np.array([length]))
         at = exits.standing(counted, np.array([length]))
-        sure = exits.proven(counted, at, exits.most_votes(netlist, length))
+        sure = exits.proven(counted, at, exits.most_votes(integer_machine_of(netlist), length))
         assert np.all(at.leader[sure] == at.decision[0])
 
 
@@ -183,11 +184,11 @@ def test_live_and_recorded_votes_end_alike():
     lengths = np.full(6, 40)
     votes = cumulative.votes_of(netlist, events, lengths)
     at = exits.standing(votes, lengths)
-    sure = exits.proven(votes, at, exits.most_votes(netlist, 40))
-    depth = exits.read_out_depth(netlist)
+    sure = exits.proven(votes, at, exits.most_votes(integer_machine_of(netlist), 40))
+    depth = integer_machine_of(netlist).read_out_lag
     assert depth == 3
     for factor in (np.inf, 2.0, 0.0):
-        may_end = exits.live(netlist, 40, factor)
+        may_end = exits.live(integer_machine_of(netlist), 40, factor)
         assert not may_end(depth - 1, votes[0, 0])
         for i, end in enumerate(exits.exits(sure, at, factor)):
             told = [may_end(step + depth, votes[i, step]) for step in range(40)]
@@ -203,7 +204,7 @@ def test_no_recording_is_decided_otherwise_by_proof(which, split, shipped_netlis
     lengths = np.full(len(data), data.steps)
     votes = cumulative.votes_of(netlist, with_clocks(data.events, netlist.clocks), lengths)
     at = exits.standing(votes, lengths)
-    sure = exits.proven(votes, at, exits.most_votes(netlist, data.steps))
+    sure = exits.proven(votes, at, exits.most_votes(integer_machine_of(netlist), data.steps))
     ends = exits.exits(sure, at)
     assert_array_equal(at.leader[np.arange(len(data)), ends], at.decision)
     counts = engine.simulate(netlist, with_clocks(data.events, netlist.clocks)).counts.spikes

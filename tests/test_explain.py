@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from made_files import CLASSES, FEATURES, STEPS, TAXELS, own_file, recordings_folder, weights
 
-from spikeloom.compiler import Options, Recipe, compile_network, lift
+from spikeloom.compiler import Options, Recipe, compile_network
 from spikeloom.compiler.formats.checkpoint import read_checkpoint
 from spikeloom.compiler.interpret import channels_last, run_float
 from spikeloom.compiler.passes.expand import expand
@@ -29,7 +29,7 @@ from spikeloom.runtime.equivalence.explanation.deviations import (
 )
 from spikeloom.runtime.equivalence.explanation.roots import Root
 from spikeloom.runtime.equivalence.explanation.summary import remedy
-from spikeloom.runtime.equivalence.rounding import absent_neurons
+from spikeloom.runtime.machines.integer import integer_machine_of
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.trace import aligned
 
@@ -217,14 +217,14 @@ def test_a_released_recording_is_explained(released_checkpoint, objects_zip):
     adjacency = normalised_adjacency(build_graph("manual").edges, checkpoint.taxels)
     netlist = compile_network(expand(checkpoint, adjacency), Options(recipes=(Recipe(),))).netlist
     recording = load_data(objects_zip, "test", limit=4)[0].events[3:4]
-    network, prepared = expand(checkpoint, adjacency), engine.prepare(netlist)
+    network, machine = expand(checkpoint, adjacency), integer_machine_of(netlist)
     found = explain(
         network,
-        lift(netlist),
+        machine.integer,
         channels_last(recording)[0],
-        observe(netlist, prepared, recording),
-        absent=absent_neurons(netlist),
-        unused=[np.isin(np.arange(layer.neurons), layer.unheard) for layer in netlist.layers],
+        observe(machine, recording),
+        absent=machine.absent,
+        unused=machine.unused,
     )
     assert sum(found.different) > 1000
     assert {root.cause for root in found.roots} <= set(CAUSES)

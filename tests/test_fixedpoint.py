@@ -18,10 +18,10 @@ from spikeloom.compiler.fixedpoint import (
     decay,
     encode_bias,
     round_half_even,
+    round_steps,
     saturate,
     weight_step,
 )
-from spikeloom.compiler.targets.loihi1.storage.weight_storage import round_steps
 
 # Published for decay_v = 3277, factor 819/4096.
 PUBLISHED = [

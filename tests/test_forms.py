@@ -6,17 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_networks import BITS, chain, float_networks
 
-from spikeloom.compiler.fixedpoint import weight_step
+from spikeloom.compiler.fixedpoint import plane_distance, reach, split_planes, weight_step
 from spikeloom.compiler.invariants import verify
 from spikeloom.compiler.ir import Form, IntegerNetwork
-from spikeloom.compiler.targets.loihi1.storage.weight_storage import (
-    one_sided_sums,
-    plane_distance,
-    reach,
-    round_population,
-    scales,
-    split_planes,
-)
+from spikeloom.compiler.targets.loihi1.storage.weight_storage import one_sided_sums, round_population, scales
 
 
 @st.composite

@@ -13,12 +13,12 @@ from spikeloom.compiler.interpret import channels_last, run_float, run_integer, 
 from spikeloom.compiler.ir import fan_in
 from spikeloom.compiler.passes.expand import Factored, expand
 from spikeloom.compiler.pipeline import run
+from spikeloom.compiler.range_proof import prove_ranges
 from spikeloom.compiler.targets import base
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.netlist import one_step_bounds
 from spikeloom.compiler.targets.loihi1.netlist_file import netlist_bytes, read_netlist, write_netlist
 from spikeloom.compiler.targets.loihi1.passes import start
-from spikeloom.compiler.targets.loihi1.storage.range_proof import prove_ranges
 from spikeloom.compiler.text import text
 from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.models.recordings.evtouch import load_recordings

@@ -8,16 +8,16 @@ from random_networks import BITS, LOIHI, chain, dense_weights, float_networks, r
 
 from spikeloom.compiler import Recipe
 from spikeloom.compiler.errors import DataError, ModelError, OptionError
-from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX, weight_step
+from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX, decay_registers, weight_step
 from spikeloom.compiler.interpret import run_float, run_integer
 from spikeloom.compiler.invariants import verify
 from spikeloom.compiler.ir import INPUT, Form
 from spikeloom.compiler.passes.calibrate import calibrate, evenly_spaced
+from spikeloom.compiler.range_proof import prove_ranges
 from spikeloom.compiler.targets.loihi1.storage import quantize as quantize_module
 from spikeloom.compiler.targets.loihi1.storage.quantize import quantize
-from spikeloom.compiler.targets.loihi1.storage.range_proof import prove_ranges
-from spikeloom.compiler.targets.loihi1.storage.weight_storage import decay_registers, round_population
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import one_sided_sums as proven_sums
+from spikeloom.compiler.targets.loihi1.storage.weight_storage import round_population
 from spikeloom.compiler.text import text
 
 

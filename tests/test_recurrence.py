@@ -36,7 +36,7 @@ from spikeloom.compiler.targets.loihi1.emit import emit
 from spikeloom.compiler.targets.loihi1.layout.partition import partition
 from spikeloom.compiler.targets.loihi1.legalize import require_legal
 from spikeloom.compiler.targets.loihi1.storage.quantize import quantize
-from spikeloom.compiler.targets.loihi1.storage.width_search import search
+from spikeloom.compiler.targets.loihi1.storage.width_search import search_widths
 from spikeloom.runtime.cli import main
 from spikeloom.runtime.equivalence.certainty import float_certainty
 from spikeloom.runtime.equivalence.verify import verify
@@ -367,7 +367,7 @@ def test_netx_has_the_loop_in_a_block_of_its_own(files, capsys):
 
 
 def test_widths_are_searched_with_loops_too():
-    made = search(drawn(15), LOIHI, channels_last(events_for(0)), np.full(6, -1), widths=(4, 8))
+    made = search_widths(drawn(15), LOIHI, channels_last(events_for(0)), np.full(6, -1), widths=(4, 8))
     assert {(8, 8), (4, 4)} <= {point.bits for point in made.points}
     assert made.built
 

@@ -9,11 +9,12 @@ from hypothesis import strategies as st
 from made_files import TAXELS, events, own_file, recordings_folder, small_checkpoint, weights
 from random_networks import chain
 
-from spikeloom.compiler import Options, Recipe, compile_network, lift
+from spikeloom.compiler import Options, Recipe, compile_network
 from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.models.graphs import normalised_adjacency
 from spikeloom.runtime.equivalence.rounding import check_rounding
+from spikeloom.runtime.machines.integer import integer_machine_of
 
 
 def compiled(network, **options):
@@ -22,7 +23,7 @@ def compiled(network, **options):
 
 def checked(netlist, network, **provenance):
     netlist = dataclasses.replace(netlist, provenance=netlist.provenance | provenance)
-    return check_rounding(netlist, network, lift(netlist))
+    return check_rounding(integer_machine_of(netlist), network)
 
 
 @pytest.fixture(scope="module")

@@ -15,9 +15,9 @@ from spikeloom.compiler.interpret import run_integer
 from spikeloom.compiler.invariants import verify
 from spikeloom.compiler.ir import Form
 from spikeloom.compiler.passes.calibrate import calibrate
+from spikeloom.compiler.range_proof import prove_ranges
 from spikeloom.compiler.targets.loihi1.storage.compensate import compensated
 from spikeloom.compiler.targets.loihi1.storage.quantize import quantize
-from spikeloom.compiler.targets.loihi1.storage.range_proof import prove_ranges
 from spikeloom.compiler.targets.loihi1.storage.scales import (
     choose_levels,
     finest_thresholds,

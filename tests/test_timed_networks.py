@@ -15,19 +15,26 @@ from timed_networks import TIMING, events_of, written
 from spikeloom.compiler import Options, Recipe, compile_network, lift
 from spikeloom.compiler.dynamics import Clocks, Dynamics, with_clocks
 from spikeloom.compiler.errors import DataError, ModelError, NumericRangeError
-from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, MEMBRANE_MAX, ONE_STEP_SUM_MAX, read_only
+from spikeloom.compiler.fixedpoint import (
+    ACCUMULATOR_MAX,
+    CURRENT_MAX,
+    MEMBRANE_MAX,
+    ONE_STEP_SUM_MAX,
+    decay_registers,
+    read_only,
+)
 from spikeloom.compiler.formats.checkpoint import read_checkpoint
 from spikeloom.compiler.interpret import channels_last, run_float, run_integer
 from spikeloom.compiler.ir import Input
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.passes.prune import never_fires
+from spikeloom.compiler.range_proof import prove_ranges
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.netlist import one_step_bounds
 from spikeloom.compiler.targets.loihi1.netlist_file import netlist_bytes, read_netlist, write_netlist
 from spikeloom.compiler.targets.loihi1.netlist_text import netlist_text
 from spikeloom.compiler.targets.loihi1.storage.quantize import quantize
-from spikeloom.compiler.targets.loihi1.storage.range_proof import prove_ranges
-from spikeloom.compiler.targets.loihi1.storage.weight_storage import current_load, decay_registers
+from spikeloom.compiler.targets.loihi1.storage.weight_storage import current_load
 from spikeloom.models.networks.reference import float_spikes
 from spikeloom.models.recordings.grasps import synthetic_grasps
 from spikeloom.models.recordings.release import write_released
@@ -37,6 +44,7 @@ from spikeloom.runtime.equivalence.explanation.causes import explain, observe
 from spikeloom.runtime.equivalence.reference import require_match
 from spikeloom.runtime.equivalence.rounding import check_rounding
 from spikeloom.runtime.equivalence.verify import verify
+from spikeloom.runtime.machines.integer import integer_machine_of
 from spikeloom.runtime.machines.loihi1 import engine, spec
 from spikeloom.runtime.machines.loihi1.blocks import lay_out_blocks
 from spikeloom.runtime.machines.loihi1.stream import open_stream
@@ -391,7 +399,7 @@ def test_explain_finds_the_cause_of_every_root(timed, compiled):
             network,
             lift(compiled.netlist),
             channels_last(events, TIMING.clocks)[0],
-            observe(compiled.netlist, engine.prepare(compiled.netlist), events),
+            observe(integer_machine_of(compiled.netlist), events),
             absent=[np.zeros(p.size, np.bool_) for p in network.populations],
         )
         causes |= {root.cause for root in found.roots}
@@ -406,8 +414,8 @@ def test_a_wrong_current_register_is_named(timed, compiled):
     decay = compiled.netlist.decay_u.copy()
     decay[compiled.netlist.compartments_of(1)] = 100
     wrong = replace(compiled.netlist, decay_u=read_only(decay))
-    assert check_rounding(compiled.netlist, network, lift(compiled.netlist)).holds
-    assert check_rounding(wrong, network, lift(wrong)).layers["fc1"].faults == (
+    assert check_rounding(integer_machine_of(compiled.netlist), network).holds
+    assert check_rounding(integer_machine_of(wrong), network).layers["fc1"].faults == (
         "fc1 has decay registers 100 and 2867 instead of 204 and 2867",
     )
 

@@ -29,6 +29,7 @@ from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.models.recordings.events import load_data
 from spikeloom.models.recordings.evtouch import load_recordings
 from spikeloom.runtime.commands.exchange import watch
+from spikeloom.runtime.machines.integer import integer_machine_of
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.costs import cumulative
 from spikeloom.runtime.machines.votes import class_counts
@@ -433,7 +434,7 @@ def test_a_grasp_ends_as_soon_as_it_is_sure(lively, lively_file, lines, objects,
         found = objects(lively_file, lines(as_lines(events, seed)), "--bins", 40, "--until-sure", *given)
         votes = cumulative.votes_of(lively, events.reshape(1, 20, 40), np.array([40]))
         at = exits.standing(votes, np.array([40]))
-        sure = exits.proven(votes, at, exits.most_votes(lively, 40))
+        sure = exits.proven(votes, at, exits.most_votes(integer_machine_of(lively), 40))
         end = int(exits.exits(sure, at, np.inf if factor is None else factor)[0])
         early = end + 3 < 39  # the read-out lags three steps
         bins = end + 4 if early else 40

@@ -11,7 +11,7 @@ from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.loihi1.legalize import measure
 from spikeloom.compiler.targets.loihi1.storage import width_search
 from spikeloom.compiler.targets.loihi1.storage.quantize import shortlist
-from spikeloom.compiler.targets.loihi1.storage.width_search import Point, check_widths, front, search
+from spikeloom.compiler.targets.loihi1.storage.width_search import WidthPoint, check_widths, search_widths, widths_front
 
 WIDTHS = (2, 4, 8)
 
@@ -49,7 +49,7 @@ def test_figures_are_those_of_the_compiler(seed, groups):
     """Every point that is built counts what the compiled netlist does, and no other built point beats it."""
     checkpoint, network, events, labels = drawn(seed)
     samples, flat = 17, channels(events)
-    made = search(network, LOIHI, flat, labels, widths=WIDTHS, groups=groups, samples=samples)
+    made = search_widths(network, LOIHI, flat, labels, widths=WIDTHS, groups=groups, samples=samples)
     picked = np.linspace(0, len(events) - 1, samples).round().astype(int)
     wanted = vote(run_float(network, flat[picked]).spikes[-1].sum(axis=1))
     assert (made.samples, made.float_right) == (samples, np.count_nonzero(wanted == labels[picked]))
@@ -68,7 +68,9 @@ def test_figures_are_those_of_the_compiler(seed, groups):
 @pytest.mark.parametrize("seed", range(3))
 def test_the_descent_takes_the_best_neighbour(seed):
     _, network, events, labels = drawn(seed)
-    points = {point.bits: point for point in search(network, LOIHI, channels(events), labels, widths=WIDTHS).points}
+    points = {
+        point.bits: point for point in search_widths(network, LOIHI, channels(events), labels, widths=WIDTHS).points
+    }
     for figure in ("equal", "right"):
         at = (8, 8, 8, 8)
         while at != (2, 2, 2, 2):
@@ -79,8 +81,8 @@ def test_the_descent_takes_the_best_neighbour(seed):
 def test_no_point_on_the_front_is_left_unbuilt():
     for seed in range(3):
         _, network, events, labels = drawn(seed)
-        made = search(network, LOIHI, channels(events), labels, widths=WIDTHS)
-        best = {point.bits for by in ("equal", "right") for point in front(made.built, by)}
+        made = search_widths(network, LOIHI, channels(events), labels, widths=WIDTHS)
+        best = {point.bits for by in ("equal", "right") for point in widths_front(made.built, by)}
         assert best <= {point.bits for point in made.built}
         assert max(p.equal for p in made.built) >= max(
             p.equal for p in made.points if p.bits in {q.bits for q in made.built}
@@ -93,7 +95,7 @@ def test_recordings_count_up_to_their_own_length():
     for index, length in enumerate(lengths):
         events[index, ..., length:] = 0
     flat = channels(events)
-    made = search(network, LOIHI, flat, labels, widths=WIDTHS, lengths=lengths)
+    made = search_widths(network, LOIHI, flat, labels, widths=WIDTHS, lengths=lengths)
     wanted = vote(cut(run_float(network, flat).spikes[-1], lengths).sum(axis=1))
     assert made.float_right == np.count_nonzero(wanted == labels)
     for point in made.built:
@@ -104,7 +106,7 @@ def test_recordings_count_up_to_their_own_length():
 def test_without_labels_agreement_alone_counts():
     _, network, events, labels = drawn(7)
     labels[3] = -1
-    found = search(network, LOIHI, channels(events), labels, widths=WIDTHS)
+    found = search_widths(network, LOIHI, channels(events), labels, widths=WIDTHS)
     assert found.float_right is None
     assert {point.right for point in (*found.points, *found.built)} == {None}
     assert found.built
@@ -113,7 +115,7 @@ def test_without_labels_agreement_alone_counts():
 def test_memory_is_counted_list_by_list():
     network = chain(np.full((70, 3), 0.3), np.full((2, 70), 0.1))
     events = np.random.default_rng(0).random((8, 20, 3)) < 0.4
-    made = search(network, LOIHI, events, np.zeros(8, int), widths=(8,))
+    made = search_widths(network, LOIHI, events, np.zeros(8, int), widths=(8,))
     # three lists of 70 in blocks of 64 and 6, seventy of 2, each block with 10 bits more, in whole words
     assert [point.words for point in made.built] == [3 * (9 + 1) + 70]
     assert [point.words for point in made.points] == [-(-8 * (3 * 70 + 70 * 2) // 64)]
@@ -122,7 +124,9 @@ def test_memory_is_counted_list_by_list():
 def test_what_does_not_fit_the_chip_is_not_built():
     network = chain(np.random.default_rng(0).normal(0, 0.3, (40, 30)))
     events = np.random.default_rng(1).random((8, 20, 30)) < 0.3
-    found = search(network, small_target(core_synapse_words=60, chip_cores=2), events, np.zeros(8, int), widths=(2, 8))
+    found = search_widths(
+        network, small_target(core_synapse_words=60, chip_cores=2), events, np.zeros(8, int), widths=(2, 8)
+    )
     assert [point.bits for point in found.points] == [(8,), (2,)]
     assert [point.bits for point in found.built] == [(2,)]
 
@@ -137,19 +141,19 @@ def test_a_width_without_a_scale_is_left_out_for_its_layer(monkeypatch):
 
     unusable = None
     monkeypatch.setattr(width_search, "shortlist", no_two)
-    found = search(network, LOIHI, channels(events), labels, widths=(2, 8))
+    found = search_widths(network, LOIHI, channels(events), labels, widths=(2, 8))
     assert [point.bits for point in found.points] == [(8, 8, 8, 8)]
     unusable = 1
     with pytest.raises(ModelError, match=r"^layer 1: no scale at 8 bits$"):
-        search(network, LOIHI, channels(events), labels, widths=(2, 8))
+        search_widths(network, LOIHI, channels(events), labels, widths=(2, 8))
 
 
 def test_a_front_rises_with_memory():
     figures = [(2, 9, 5), (3, 9, 7), (4, 12, 7), (5, 4, 1), (6, 20, 8), (8, 20, 8)]
-    points = [Point(bits=(b,), words=w, equal=e, right=10 - e) for b, w, e in figures]
-    assert [p.bits[0] for p in front(points, "equal")] == [5, 3, 6]
-    assert [p.bits[0] for p in front(points, "right")] == [5]
-    assert front([], "equal") == ()
+    points = [WidthPoint(bits=(b,), words=w, equal=e, right=10 - e) for b, w, e in figures]
+    assert [p.bits[0] for p in widths_front(points, "equal")] == [5, 3, 6]
+    assert [p.bits[0] for p in widths_front(points, "right")] == [5]
+    assert widths_front([], "equal") == ()
 
 
 @pytest.mark.parametrize(

@@ -49,7 +49,7 @@ from spikeloom.compiler.archive import read_npy, stored_members
 from spikeloom.compiler.checkpoint import WEIGHTS, Float32Array
 from spikeloom.compiler.dynamics import MOST_STEPS, PLAIN, Dynamics, dynamics_from_json
 from spikeloom.compiler.errors import ModelError, OptionError
-from spikeloom.compiler.fixedpoint import THRESHOLD_MANTISSA_MAX
+from spikeloom.compiler.fixedpoint import THRESHOLD_MANTISSA_MAX, plane_distance
 from spikeloom.compiler.formats.released_file import DAMAGED, NOT_A_CHECKPOINT
 from spikeloom.compiler.formats.tensors import (
     Arrays,
@@ -71,7 +71,6 @@ from spikeloom.compiler.systems import (
     grid_from_json,
     shape_faults,
 )
-from spikeloom.compiler.targets.loihi1.storage.weight_storage import plane_distance
 
 FORMAT = "spikeloom-checkpoint"
 VERSION = 6

@@ -1,1 +1,1 @@
-"""One file per pass; the order lives in :mod:`loihi1.compilation`."""
+"""One file per pass; the order lives in each target's ``PASSES``."""

@@ -27,7 +27,7 @@ from spikeloom.compiler.fixedpoint import (
     encode_bias,
 )
 from spikeloom.compiler.ir import Form
-from spikeloom.compiler.targets.storage import decay_registers, reach, round_steps, step_units
+from spikeloom.compiler.fixedpoint import decay_registers, reach, round_steps, step_units
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.systems import in_order
 from spikeloom.compiler.formats.towers import members, side_by_side

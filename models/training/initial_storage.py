@@ -16,10 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.fixedpoint import BIAS_EXPONENT_MAX, BIAS_MANTISSA_MAX, MEMBRANE_SHIFT, THRESHOLD_MANTISSA_MAX
+from spikeloom.compiler.fixedpoint import (
+    BIAS_EXPONENT_MAX,
+    BIAS_MANTISSA_MAX,
+    MEMBRANE_SHIFT,
+    THRESHOLD_MANTISSA_MAX,
+    reach,
+    step_units,
+)
 from spikeloom.compiler.ir import Form, Network
 from spikeloom.compiler.passes.calibrate import Calibration
-from spikeloom.compiler.targets.storage import reach, step_units
 
 QUIET = 1e-4
 """Spike rate that an input without spikes is given, so that its weights still count."""

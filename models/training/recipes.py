@@ -13,7 +13,7 @@ from typing import Any
 
 from spikeloom.compiler.dynamics import MOST_CLOCKS, Dynamics, clocks_over
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.targets.storage import DECAY_ONE, decay_registers
+from spikeloom.compiler.fixedpoint import DECAY_ONE, decay_registers
 from spikeloom.models.networks.surrogate import FAST_SIGMOID, RECTANGLE, Surrogate
 from spikeloom.models.systems import HOPS
 from spikeloom.models.training.schedule import DECAY_EPOCHS

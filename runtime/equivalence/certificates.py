@@ -17,7 +17,7 @@ from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.interpret import BoolArray, cut
 from spikeloom.compiler.ir import IntegerNetwork, Network
-from spikeloom.compiler.targets.loihi1.storage.range_proof import prove_ranges
+from spikeloom.compiler.range_proof import prove_ranges
 from spikeloom.runtime.equivalence.certainty import float_certainty
 from spikeloom.runtime.machines.votes import readout_counts
 

@@ -8,11 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler import Netlist
 from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT
 from spikeloom.compiler.interpret import BoolArray
-from spikeloom.runtime.machines.loihi1 import engine
-from spikeloom.runtime.machines.loihi1.trace import aligned, comparable
+from spikeloom.runtime.machines.base import EventArray
+from spikeloom.runtime.machines.integer import IntegerMachine
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,12 +38,11 @@ class Divergence:
 
 
 def first_divergence(
-    netlist: Netlist,
-    prepared: engine.Engine,
+    machine: IntegerMachine,
     reference: list[BoolArray],
     chip: list[BoolArray],
     wide: list[BoolArray],
-    events: npt.NDArray[np.uint8],
+    events: EventArray,
     files: tuple[str, ...],
     membrane: Callable[[int, int], npt.NDArray[np.floating]],
 ) -> Divergence | None:
@@ -52,12 +50,11 @@ def first_divergence(
 
     Parameters
     ----------
-    netlist : Netlist
-    prepared : Engine
-        The same, ready to run.
+    machine : IntegerMachine
+        The chip.
     reference, chip, wide : list of (samples, steps, compared) bool
         Spikes of each layer of the float32 model, the chip and the float64 model, of neurons that can be compared.
-    events : (samples, channels, steps) uint8
+    events : (samples, taxels, polarities, steps) uint8
         Recordings.
     files : tuple of str
         Their names.
@@ -74,18 +71,16 @@ def first_divergence(
         for layer, d in enumerate(differs)
         for step, neuron in np.argwhere(d[sample])[:1]
     )
-    layer = netlist.layers[index]
+    layer, taxels = machine.integer.populations[index], machine.netlist.taxels
     ill_posed = bool(wide[index][sample, step, neuron] != reference[index][sample, step, neuron])
-    neuron = int(np.arange(layer.neurons)[comparable(netlist, index)][neuron])
-    trace = engine.simulate(prepared, events[sample : sample + 1], membranes=True)
-    assert trace.membranes is not None, "membranes were wanted"
-    register = int(aligned(netlist, trace.membranes, index)[0, step, neuron])
-    ids = netlist.compartments_of(index)
-    held = ids[netlist.neuron[ids] == neuron]  # empty where the chip leaves the neuron out, which then stays at zero
-    scale = float(netlist.scale[held[0]]) if len(held) else 1.0
-    chip_theta = int(netlist.threshold[held[0]]) / scale if len(held) else layer.theta
-    graph = layer.depth == 0 and layer.neurons % netlist.taxels == 0
-    features = layer.neurons // netlist.taxels
+    neuron = int(np.arange(layer.size)[machine.compared()[index]][neuron])
+    membranes = machine.run(events[sample : sample + 1], membranes=True).membranes
+    assert membranes is not None, "membranes were wanted"
+    register = int(membranes[layer.name][0, step, neuron])
+    held = not machine.absent[index][neuron]  # a neuron that the chip leaves out stays at zero
+    scale = float(layer.scale[neuron])
+    graph = machine.lags[index] == 0 and layer.size % taxels == 0
+    features = layer.size // taxels
     return Divergence(
         file=files[sample],
         step=step,
@@ -97,6 +92,6 @@ def first_divergence(
         chip_membrane=register / (scale * (1 << MEMBRANE_SHIFT)),
         chip_register=register,
         theta=layer.theta,
-        chip_theta=chip_theta,
+        chip_theta=int(layer.threshold[neuron]) / scale if held else layer.theta,
         ill_posed=ill_posed,
     )

@@ -21,13 +21,19 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
-from spikeloom.compiler import Netlist
-from spikeloom.compiler.fixedpoint import BIAS_EXPONENT_MAX, BIAS_MANTISSA_MAX, MEMBRANE_SHIFT, encode_bias
+from spikeloom.compiler.fixedpoint import (
+    BIAS_EXPONENT_MAX,
+    BIAS_MANTISSA_MAX,
+    MEMBRANE_SHIFT,
+    decay_registers,
+    encode_bias,
+    reach,
+    step_units,
+)
 from spikeloom.compiler.interpret import BoolArray
 from spikeloom.compiler.ir import INPUT, IntegerNetwork, Network, Sparse
 from spikeloom.compiler.passes.prune import never_fires
-from spikeloom.compiler.targets.base import load_target
-from spikeloom.compiler.targets.loihi1.storage.weight_storage import decay_registers, reach, step_units
+from spikeloom.runtime.machines.integer import IntegerMachine
 
 SLACK = 1 + 1e-9
 """Factor by which a value may miss a limit that it meets in real numbers."""
@@ -85,39 +91,28 @@ class Rounding:
         return f"{what}; by compensation not to the nearest: {', '.join(moved)}" if moved else f"{what} to the nearest"
 
 
-def absent_neurons(netlist: Netlist) -> tuple[BoolArray, ...]:
-    """Neurons of each layer, (neurons,) bool, that the chip does not hold."""
-    layers = enumerate(netlist.layers)
-    return tuple(
-        ~np.isin(np.arange(layer.neurons), netlist.neuron[netlist.compartments_of(index)]) for index, layer in layers
-    )
-
-
-def check_rounding(
-    netlist: Netlist, network: Network, integer: IntegerNetwork, *, fine_tuned: bool = False
-) -> Rounding:
+def check_rounding(machine: IntegerMachine, network: Network, *, fine_tuned: bool = False) -> Rounding:
     """Hold what a netlist stores against a float network of the same architecture.
 
     Parameters
     ----------
-    netlist : Netlist
+    machine : IntegerMachine
+        Of the netlist.
     network : Network
         What it should have been compiled from.
-    integer : IntegerNetwork
-        The netlist, lifted.
     fine_tuned : bool
         Whether the network was trained on the chip's integers, which compensates nothing. Otherwise the netlist
         remembers which layers were compensated, or at least whether there were recordings to do it on.
     """
+    integer, provenance = machine.integer, machine.netlist.provenance
     names = [population.name for population in network.populations]
-    calibrated = not fine_tuned and netlist.provenance.get("calibrated", True)
-    compensated = netlist.provenance.get("compensated", names if calibrated else [])
-    absent, pruned = absent_neurons(netlist), bool(netlist.provenance.get("prune_unused", False))
+    calibrated = not fine_tuned and provenance.get("calibrated", True)
+    compensated = provenance.get("compensated", names if calibrated else [])
+    absent, pruned = machine.absent, bool(provenance.get("prune_unused", False))
     zeroed = [_may_be_zero(integer, post, mask, pruned) for post, mask in enumerate(never_fires(network))]
     channels = np.zeros(network.input.size, np.bool_)
-    if "lean" in netlist.provenance:  # input channels that no neuron receives were pruned on evidence
-        channels[:] = True
-        channels[netlist.axon_source[netlist.axon_source < netlist.n_inputs]] = False
+    if "lean" in provenance:  # input channels that no neuron receives were pruned on evidence
+        channels = ~machine.received
     found = {}
     for post, population in enumerate(network.populations):
         found[population.name] = _check_layer(
@@ -127,7 +122,7 @@ def check_rounding(
             absent=absent,
             zeroed=zeroed,
             channels=channels,
-            coarsest=max(load_target(netlist.target).choices["synapse.exponent"]),
+            coarsest=max(machine.target.choices["synapse.exponent"]),
             compensates=population.name in compensated,
         )
     return Rounding(layers=found)

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler import Netlist, lift
+from spikeloom.compiler import Netlist
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import DataError
@@ -20,7 +20,6 @@ from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.interpret import BoolArray, channels_last, cut, vote
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.systems import GRAPH_SYSTEMS
-from spikeloom.runtime.equivalence import onnx_check
 from spikeloom.runtime.equivalence.breakdowns import breakdowns
 from spikeloom.runtime.equivalence.certificates import certify
 from spikeloom.runtime.equivalence.divergence import first_divergence
@@ -35,44 +34,9 @@ from spikeloom.runtime.equivalence.reference import (
 )
 from spikeloom.runtime.equivalence.rounding import check_rounding
 from spikeloom.runtime.equivalence.verdict import LayerSpikes, Rung, Verdict
-from spikeloom.runtime.machines.loihi1 import engine, spec
-from spikeloom.runtime.machines.loihi1.trace import ENGINES, Trace, aligned, check_channels, comparable
-from spikeloom.runtime.machines.votes import class_counts, readout_counts
-
-
-def _same_run(slow: Trace, prepared: engine.Engine, events: npt.NDArray[np.uint8]) -> bool:
-    """Whether specification and engine agree on one recording: every spike, membrane and count."""
-    fast = engine.simulate(prepared, events[None], spikes=True, membranes=True, updated=True)
-    pairs = [
-        (slow.spikes, fast.spikes),
-        (slow.membranes, fast.membranes),
-        (slow.updated, fast.updated),
-        (slow.counts.inputs, fast.counts.inputs),
-        (slow.counts.spikes, fast.counts.spikes),
-        (slow.counts.updates, fast.counts.updates),
-        (slow.counts.saturations, fast.counts.saturations),
-    ]
-    return all(a is not None and b is not None and np.array_equal(a, b[0]) for a, b in pairs)
-
-
-def _held_to_specification(
-    netlist: Netlist,
-    prepared: engine.Engine,
-    further: onnx_check.Check | None,
-    checked: int,
-    events: npt.NDArray[np.uint8],
-    lengths: IntArray | None,
-    spikes: BoolArray,
-) -> tuple[bool, int | None]:
-    """Whether specification and engines agree; spikes of a further engine that differ from ours, if there is one."""
-    ends = np.full(len(events), events.shape[2]) if lengths is None else lengths
-    samples = [events[i, :, : ends[i]] for i in range(checked)]
-    specified = [spec.simulate(netlist, sample) for sample in samples]
-    equal = all(_same_run(slow, prepared, sample) for slow, sample in zip(specified, samples, strict=True))
-    if further is None:
-        return equal, None
-    different = onnx_check.differing(further, events, lengths, spikes)
-    return equal and different == 0 and onnx_check.as_specified(further, samples, specified), different
+from spikeloom.runtime.machines.base import ENGINES
+from spikeloom.runtime.machines.integer import integer_machine_of
+from spikeloom.runtime.machines.votes import readout_counts
 
 
 def _compiled_from(netlist: Netlist, checkpoint: Checkpoint | Network, sha256: str | None) -> bool:
@@ -144,20 +108,14 @@ def verify(
     model = checkpoint if original is None else original
     require_match(netlist, checkpoint)
     require_match(netlist, model)
-    network, integer = float_network(model, adjacency), lift(netlist)
-    names = [layer.name for layer in netlist.layers]
-    flat = with_clocks(events, netlist.clocks)
-    check_channels(netlist, flat.shape[1])
-    further = onnx_check.prepare(netlist) if engine_name == "onnx" else None
+    machine = integer_machine_of(netlist)
+    network, integer, names = float_network(model, adjacency), machine.integer, machine.layers
+    machine.require_sensor(events)
+    machine.require_engine(engine_name)
     tuned = isinstance(checkpoint, Checkpoint) and checkpoint.forms is not None
-    weights = check_rounding(
-        netlist,
-        network if original is None else float_network(checkpoint, adjacency),
-        integer,
-        fine_tuned=tuned,
-    )
-
-    kept = [comparable(netlist, layer) for layer in range(len(names))]
+    origin = network if original is None else float_network(checkpoint, adjacency)
+    weights = check_rounding(machine, origin, fine_tuned=tuned)
+    kept = machine.compared()
 
     def compared(layers: Sequence[BoolArray]) -> list[BoolArray]:
         return [cut(spikes, lengths)[..., keep] for spikes, keep in zip(layers, kept, strict=True)]
@@ -168,10 +126,9 @@ def verify(
     wide = compared(spikes_of(model, adjacency, events, "float64"))
 
     begin("chip")
-    prepared = engine.prepare(netlist)
-    trace = engine.simulate(prepared, flat, lengths=lengths, spikes=True)
-    assert trace.spikes is not None, "spikes were wanted"
-    chip = [aligned(netlist, trace.spikes, layer)[..., keep] for layer, keep in enumerate(kept)]
+    ran = machine.run(events, lengths=lengths, spikes=True)
+    assert ran.spikes is not None, "spikes were wanted"
+    chip = [ran.spikes[name][..., keep] for name, keep in zip(names, kept, strict=True)]
 
     quantised_different = None
     if isinstance(checkpoint, Checkpoint) and tuned:
@@ -180,8 +137,9 @@ def verify(
         quantised_different = sum(int(np.count_nonzero(a != b)) for a, b in pairs)
 
     begin("specification")
-    checked = min(spec_samples, len(flat))
-    equal, different = _held_to_specification(netlist, prepared, further, checked, flat, lengths, trace.spikes)
+    checked = min(spec_samples, len(events))
+    equal = machine.check(events[:checked], lengths=lengths) == 0
+    beside = None if engine_name == ENGINES[0] else machine.beside(events, lengths=lengths, samples=checked)
 
     def rung(stage: str, spikes: list[BoolArray]) -> Rung:
         differ = {name: int(np.count_nonzero(a != b)) for name, a, b in zip(names, reference, spikes, strict=True)}
@@ -194,29 +152,28 @@ def verify(
 
     begin("first divergence")
     divergence = first_divergence(
-        netlist,
-        prepared,
+        machine,
         reference,
         chip,
         wide,
-        flat,
+        events,
         files,
         lambda sample, layer: membranes_of(model, adjacency, events[sample : sample + 1])[layer][0],
     )
     if divergence is not None and (isinstance(model, Network) or model.system not in GRAPH_SYSTEMS):
         divergence = replace(divergence, taxel=None, feature=None)  # its neurons lie otherwise
     float_counts = readout_counts(network.readout, network.classes, reference[network.readout.population])
-    chip_counts = class_counts(netlist, trace.counts.spikes)
-    neurons = [np.arange(layer.neurons)[keep] for layer, keep in zip(netlist.layers, kept, strict=True)]
+    neurons = [np.arange(each.size)[keep] for each, keep in zip(integer.populations, kept, strict=True)]
+    flat = with_clocks(events, netlist.clocks)
     begin("certificate")
-    certificate = certify(model, adjacency, integer, events, chip, vote(chip_counts), kept=kept, lengths=lengths)
+    certificate = certify(model, adjacency, integer, events, chip, ran.decisions, kept=kept, lengths=lengths)
     verdict = Verdict(
         files=files,
         labels=labels,
         float_predictions=vote(float_counts),
-        chip_predictions=vote(chip_counts),
+        chip_predictions=ran.decisions,
         float_counts=float_counts,
-        chip_counts=chip_counts,
+        chip_counts=ran.votes,
         spikes={
             name: LayerSpikes(
                 float=int(np.count_nonzero(reference[i])),
@@ -227,16 +184,16 @@ def verify(
             for i, name in enumerate(names)
         },
         spec_samples=checked,
-        spec_equals_engine=equal,
+        spec_equals_engine=equal and (beside is None or beside.equal),
         weights=weights,
         first_divergence=divergence,
         ladder=tuple(ladder),
         same_checkpoint=_compiled_from(netlist, checkpoint, sha256),
         quantised_different=quantised_different,
-        breakdowns=breakdowns(names, reference, chip, neurons, (float_counts, chip_counts), flat, files, lengths),
-        not_compared={layer.name: len(layer.unheard) for layer in netlist.layers if layer.unheard},
+        breakdowns=breakdowns(names, reference, chip, neurons, (float_counts, ran.votes), flat, files, lengths),
+        not_compared={name: int(out.sum()) for name, out in zip(names, machine.unused, strict=True) if out.any()},
         certificate=certificate,
         engine=engine_name,
-        engine_different=different,
+        engine_different=None if beside is None else beside.different,
     )
     return judged(verdict, {} if required is None else required)

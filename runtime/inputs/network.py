@@ -24,13 +24,13 @@ from spikeloom.compiler.formats.onnx.reader import OnnxNetwork, read_onnx
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.passes.expand import Factored, expand
 from spikeloom.compiler.systems import GRAPH_SYSTEMS, TACTILESGNET, TITLES
-from spikeloom.compiler.targets.loihi1.netlist import Netlist
-from spikeloom.compiler.targets.truenorth.native_file import is_trained
+from spikeloom.compiler.targets.netlist import Netlist
 from spikeloom.compiler.text import text
 from spikeloom.models.graphs import CHOICES, NEUTOUCH, Graph
 from spikeloom.models.sensors import read_layout, sensor_graph
 from spikeloom.models.systems import NO_GRAPH, grid_cells, propagation_of
 from spikeloom.runtime.inputs.files import shipped
+from spikeloom.runtime.machines.base import trained_for
 from spikeloom.runtime.report.console import progress
 
 FORMATS = {ONNX: "ONNX", NIR: "NIR"}
@@ -238,9 +238,9 @@ def load_checkpoint(path: str, arguments: argparse.Namespace) -> Checkpoint:
         If it is not there, or not as they say.
     """
     progress("reading the checkpoint")
-    if is_trained(shipped(path)):
+    if (chip := trained_for(shipped(path))) is not None:
         raise ModelError(
-            f"{path}: is a network for TrueNorth, which compile, verify, inspect and join take; this is for others"
+            f"{path}: is a network for {chip.TITLE}, which compile, verify, inspect and join take; this is for others"
         )
     places = sensor_places(getattr(arguments, "taxels", None))
     return read_checkpoint(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import import_module
@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler.archive import stated
-from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.targets.base import Target, load_target
@@ -35,13 +35,20 @@ EventArray = npt.NDArray[np.uint8 | np.bool_]
 DEFAULT = "loihi1"
 """Whose reader says what is wrong with a file that names no target."""
 
+ENGINES = ("spikeloom", "onnx")
+"""What can be held against a chip's specification: our simulator, or another program beside it."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Run:
-    """What a chip made of recordings: votes (samples, classes) int64, and spikes by layer where they were kept."""
+    """What a chip made of recordings: votes (samples, classes) int64, and by layer what was kept.
+
+    Spikes and membranes are (samples, steps, neurons), bool and int32.
+    """
 
     votes: IntArray
     spikes: Mapping[str, BoolArray] | None = None
+    membranes: Mapping[str, npt.NDArray[np.int32]] | None = None
 
     @property
     def decisions(self) -> IntArray:
@@ -69,6 +76,14 @@ class Price:
     time_s: Mapping[str, FloatArray]
     step_s: Mapping[str, float]
     outcome: Outcome
+
+
+@dataclass(frozen=True, slots=True)
+class Beside:
+    """Another program against our simulator: spikes that differ, and whether all that was compared is equal."""
+
+    different: int
+    equal: bool
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -101,6 +116,12 @@ class Step:
             return int(self.counts[0])
         second, first = np.partition(self.counts, -2)[-2:]
         return int(first - second)
+
+
+def one_by_one(channels: EventArray, lengths: IntArray | None) -> Iterator[EventArray]:
+    """Recordings (samples, channels, steps) in turn, each as long as it is."""
+    for index, each in enumerate(channels):
+        yield each if lengths is None else each[:, : lengths[index]]
 
 
 class Stream(Protocol):
@@ -169,7 +190,13 @@ class Machine(ABC):
 
     @abstractmethod
     def run(
-        self, events: EventArray, *, lengths: IntArray | None = None, spikes: bool = False, threads: int | None = None
+        self,
+        events: EventArray,
+        *,
+        lengths: IntArray | None = None,
+        spikes: bool = False,
+        membranes: bool = False,
+        threads: int | None = None,
     ) -> Run:
         """Run recordings, each from rest.
 
@@ -179,7 +206,7 @@ class Machine(ABC):
             Any value but zero is an event; the network's clocks tick by themselves.
         lengths : (samples,) int64, optional
             Data steps of each where some are shorter.
-        spikes : bool
+        spikes, membranes : bool
             Keep them.
         threads : int, optional
             Recordings at a time, by default one per processor.
@@ -222,6 +249,40 @@ class Machine(ABC):
         OptionError
             If there is no such table or detail.
         """
+
+    @abstractmethod
+    def check(self, events: EventArray, *, lengths: IntArray | None = None) -> int:
+        """Spikes, membranes and counts in which simulator and specification differ; events and lengths as for `run`."""
+
+    def require_engine(self, engine: str) -> None:
+        """Make ready whatever :meth:`beside` will run.
+
+        Raises
+        ------
+        OptionError, ModelError
+            If the other program cannot run this chip's netlists, is not installed, or cannot hold this one.
+        """
+        if engine != ENGINES[0]:
+            raise OptionError(f"--engine {engine}: is not for {self.target.title}; omit it")
+
+    def beside(self, events: EventArray, *, lengths: IntArray | None = None, samples: int) -> Beside:
+        """Run the other program that is ready; all it keeps is compared on the first `samples` recordings."""
+        raise NotImplementedError
+
+    def require_sensor(self, events: EventArray) -> None:
+        """Refuse recordings of another sensor.
+
+        Raises
+        ------
+        DataError
+            If they have another number of input channels.
+        """
+        found, due = events.shape[1] * events.shape[2], self.netlist.taxels * self.netlist.polarities
+        if found != due:
+            raise DataError(
+                f"recordings: {found} input channels found, the netlist has {due}; use recordings of the sensor that "
+                "the network was compiled for"
+            )
 
     @abstractmethod
     def batch(self, steps: int) -> int:
@@ -280,7 +341,7 @@ def chip_commands(name: str) -> Any | None:
     """What a chip does in its own way: its module ``commands``, if it has one.
 
     ``compile_network(arguments)`` and ``verify(arguments)`` for all networks; for checkpoints that were trained for the
-    chip, which ``takes(path)`` knows, ``inspect(arguments)`` and ``join(arguments)``.
+    chip, which ``takes(path)`` knows, ``TITLE``, ``inspect(arguments)`` and ``join(arguments)``.
     """
     return _own_module(name, "commands")
 

@@ -58,3 +58,8 @@ class Format:
     title: str
     write: Callable[[Request], Export]
     options: tuple[str, ...] = ()
+
+
+def port_lines(inputs: list[str], outputs: list[str]) -> tuple[str, ...]:
+    """Inputs and outputs of an ONNX graph, for people."""
+    return ("inputs:", *(f"  {port}" for port in inputs), "outputs:", *(f"  {p}" for p in outputs))

@@ -41,3 +41,10 @@ def readout_counts(readout: Readout, classes: int, spikes: BoolArray) -> IntArra
 def predictions(netlist: Voting, spikes: IntArray) -> IntArray:
     """Class of each recording from spike counts per compartment; ties go to the lowest class."""
     return vote(class_counts(netlist, spikes))
+
+
+def votes_by_step(readout: Readout, classes: int, spikes: BoolArray) -> IntArray:
+    """Votes so far after each step, from the spikes of the population that votes (samples, steps, neurons)."""
+    votes = np.zeros((*spikes.shape[:2], classes), np.int64)
+    np.add.at(np.moveaxis(votes, 2, 0), readout.label, np.moveaxis(spikes, 2, 0))
+    return np.cumsum(votes, axis=1)

@@ -20,9 +20,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.fixedpoint import FloatArray
+from spikeloom.compiler.fixedpoint import FloatArray, decay_registers
 from spikeloom.compiler.formats.nir.file import Node
-from spikeloom.compiler.targets.loihi1.storage.weight_storage import decay_registers
 
 CONVENTIONS = ("euler", "exponential")
 

@@ -12,6 +12,7 @@ from spikeloom.compiler.ir import IntegerNetwork, Network
 from spikeloom.compiler.passes.calibrate import Calibration
 from spikeloom.compiler.passes.expand import Factored
 from spikeloom.compiler.passes.prune import Masks, Removal
+from spikeloom.compiler.range_proof import RangeProof
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.layout.choose import Layout
 from spikeloom.compiler.targets.loihi1.layout.place import Placement
@@ -21,7 +22,6 @@ from spikeloom.compiler.targets.loihi1.netlist_file import inconsistencies
 from spikeloom.compiler.targets.loihi1.netlist_text import layout_text, netlist_text
 from spikeloom.compiler.targets.loihi1.options import Options
 from spikeloom.compiler.targets.loihi1.storage.quantize import Choice
-from spikeloom.compiler.targets.loihi1.storage.range_proof import RangeProof
 from spikeloom.compiler.targets.loihi1.storage.spike_exact import Exactness
 from spikeloom.compiler.text import text
 

@@ -12,6 +12,7 @@ from spikeloom.compiler.ir import IntegerNetwork, Network
 from spikeloom.compiler.passes import calibrate as calibration
 from spikeloom.compiler.passes import expand, prune
 from spikeloom.compiler.pipeline import Pass, run
+from spikeloom.compiler.range_proof import prove_ranges
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.compilation import LATER, Compilation
 from spikeloom.compiler.targets.loihi1.emit import Origin, emit
@@ -20,7 +21,6 @@ from spikeloom.compiler.targets.loihi1.legalize import require_legal
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.options import Options, Recipe, check_recipes, require_stored
 from spikeloom.compiler.targets.loihi1.storage.quantize import quantize, round_to_forms
-from spikeloom.compiler.targets.loihi1.storage.range_proof import prove_ranges
 from spikeloom.compiler.targets.loihi1.storage.spike_exact import make_exact
 
 __all__ = ["INTEGERS", "LAYOUT", "PASSES", "STORAGE", "Options", "lay_out_again", "start", "store", "without"]

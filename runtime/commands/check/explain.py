@@ -10,23 +10,20 @@ import argparse
 import sys
 from difflib import get_close_matches
 
-import numpy as np
-
-from spikeloom.compiler import Netlist, lift, read_netlist
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.interpret import channels_last
 from spikeloom.compiler.systems import GRAPH_SYSTEMS
+from spikeloom.compiler.targets.netlist import Netlist
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.commands.options import add_network, add_recordings
 from spikeloom.runtime.equivalence.explanation.causes import Explanation, explain, observe
 from spikeloom.runtime.equivalence.explanation.sections import sections
 from spikeloom.runtime.equivalence.explanation.summary import Explained, cause_roots, layer_roots, root_entry
 from spikeloom.runtime.equivalence.reference import require_match
-from spikeloom.runtime.equivalence.rounding import absent_neurons, check_rounding
+from spikeloom.runtime.equivalence.rounding import check_rounding
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import load_recordings
-from spikeloom.runtime.machines.loihi1 import engine
-from spikeloom.runtime.machines.loihi1.trace import check_channels
+from spikeloom.runtime.machines.integer import integer_machine_for
 from spikeloom.runtime.report.sections import Outcome
 
 NOTES = """\
@@ -60,19 +57,20 @@ def run(arguments: argparse.Namespace) -> Outcome:
     """
     if arguments.top < 1:
         raise OptionError(f"--top {arguments.top}: at least 1 root can be shown; give a positive number")
-    netlist = read_netlist(arguments.netlist)
+    machine = integer_machine_for(arguments.netlist)
+    netlist = machine.netlist
     loaded = load_network(arguments.checkpoint, arguments, netlist)
     require_match(netlist, loaded.model)
     _warn(netlist, loaded)
     if arguments.limit is None and arguments.sample is None:
         arguments.limit = LIMIT
     data = load_recordings(arguments, netlist)
-    check_channels(netlist, data.events.shape[1] * data.events.shape[2] + netlist.clocks.channels)
+    machine.require_sensor(data.events)
     chosen = range(len(data)) if arguments.sample is None else [_index(data, arguments.sample)]
 
-    checkpoint, integer, prepared = loaded.checkpoint, lift(netlist), engine.prepare(netlist)
+    checkpoint, integer = loaded.checkpoint, machine.integer
     tuned = checkpoint is not None and checkpoint.forms is not None
-    rounding = check_rounding(netlist, loaded.network, integer, fine_tuned=tuned)
+    rounding = check_rounding(machine, loaded.network, fine_tuned=tuned)
     explanation: Explanation | None = None
     index = 0
     for index in chosen:
@@ -81,10 +79,10 @@ def run(arguments: argparse.Namespace) -> Outcome:
             loaded.network,
             integer,
             channels_last(events, netlist.clocks)[0],
-            observe(netlist, prepared, events),
+            observe(machine, events),
             rounding=rounding,
-            absent=absent_neurons(netlist),
-            unused=[np.isin(np.arange(layer.neurons), layer.unheard) for layer in netlist.layers],
+            absent=machine.absent,
+            unused=machine.unused,
             pruned=bool(netlist.provenance.get("prune_unused", False)),
         )
         if any(explanation.different):

@@ -7,19 +7,16 @@ import json
 
 import numpy as np
 
-from spikeloom.compiler import Netlist, read_netlist
 from spikeloom.compiler.atomic import write_atomically
-from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.fixedpoint import FloatArray, IntArray
-from spikeloom.compiler.targets.base import load_target
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.commands.options import add_network, add_recordings
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.inputs.recordings import recordings
-from spikeloom.runtime.machines.loihi1.costs import cumulative
-from spikeloom.runtime.machines.loihi1.trace import check_channels
+from spikeloom.runtime.machines.integer import IntegerMachine, integer_machine_for
+from spikeloom.runtime.machines.votes import votes_by_step
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.encode import encode
 from spikeloom.runtime.report.sections import Outcome
@@ -76,15 +73,15 @@ def run(arguments: argparse.Namespace) -> Outcome:
         if place is not None:
             require_place(place, option, arguments)
     allowed = _allowed(arguments)
-    netlist = read_netlist(arguments.netlist)
-    data = _read(arguments.data, arguments.split, netlist, arguments, limit=arguments.limit)
+    machine = integer_machine_for(arguments.netlist)
+    data = _read(arguments.data, arguments.split, machine, arguments, limit=arguments.limit)
     lengths = _lengths(data)
-    floats = _float_votes(arguments, netlist, data)
-    points = _races(arguments, netlist)
+    floats = _float_votes(arguments, machine, data)
+    points = _races(arguments, machine)
     progress("running")
-    ran = cumulative.run(netlist, load_target(netlist.target), with_clocks(data.events, netlist.clocks), lengths)
+    ran = machine.cumulative(data.events, lengths)
     result = study(
-        netlist,
+        machine,
         data,
         ran,
         () if points is None else [exits.calibrate(points, share) for share in allowed],
@@ -118,19 +115,19 @@ def _allowed(arguments: argparse.Namespace) -> list[float]:
 
 
 def _read(
-    path: str, split: str, netlist: Netlist, arguments: argparse.Namespace, limit: int | None = None
+    path: str, split: str, machine: IntegerMachine, arguments: argparse.Namespace, limit: int | None = None
 ) -> Recordings:
     progress("reading the recordings")
     data = recordings(
         path,
         split,
         limit=limit,
-        classes=netlist.classes,
-        taxels=netlist.taxels,
+        classes=machine.netlist.classes,
+        taxels=machine.netlist.taxels,
         bin_s=arguments.bin,
-        bins=netlist.bins,
+        bins=machine.netlist.bins,
     )
-    check_channels(netlist, data.events.shape[1] * data.events.shape[2] + netlist.clocks.channels)
+    machine.require_sensor(data.events)
     return data
 
 
@@ -138,18 +135,17 @@ def _lengths(data: Recordings) -> IntArray:
     return np.full(len(data), data.steps) if data.lengths is None else data.lengths.astype(np.int64)
 
 
-def _races(arguments: argparse.Namespace, netlist: Netlist) -> FloatArray | None:
+def _races(arguments: argparse.Namespace, machine: IntegerMachine) -> FloatArray | None:
     """Turning points of the races on the training split, if there is something to calibrate on."""
     if arguments.calibrate is None:
         return None
-    training = _read(arguments.calibrate, "train", netlist, arguments)
+    training = _read(arguments.calibrate, "train", machine, arguments)
     progress("calibrating")
     lengths = _lengths(training)
-    votes = cumulative.votes_of(netlist, with_clocks(training.events, netlist.clocks), lengths)
-    return exits.turning_points(exits.races(votes, lengths))
+    return exits.turning_points(exits.races(machine.votes_by_step(training.events, lengths), lengths))
 
 
-def _float_votes(arguments: argparse.Namespace, netlist: Netlist, data: Recordings) -> IntArray | None:
+def _float_votes(arguments: argparse.Namespace, machine: IntegerMachine, data: Recordings) -> IntArray | None:
     """Votes of the float model so far after each step, (samples, steps, classes), if a checkpoint was given."""
     if arguments.checkpoint is None:
         given = [name for name in BESIDE if getattr(arguments, name) is not None]
@@ -159,13 +155,13 @@ def _float_votes(arguments: argparse.Namespace, netlist: Netlist, data: Recordin
     from spikeloom.compiler.interpret import cut
     from spikeloom.runtime.equivalence.reference import require_match, spikes_of
 
-    loaded = load_network(arguments.checkpoint, arguments, netlist)
-    require_match(netlist, loaded.model)
+    loaded = load_network(arguments.checkpoint, arguments, machine.netlist)
+    require_match(machine.netlist, loaded.model)
     readout, lengths = loaded.network.readout, _lengths(data)
     votes = []
     for first in range(0, len(data), PART):
         progress(f"float model: {first} of {len(data)}")
         part = slice(first, first + PART)
         spikes = spikes_of(loaded.model, loaded.adjacency, data.events[part], "float32")[readout.population]
-        votes.append(cumulative.float_votes(readout, netlist.classes, cut(spikes, lengths[part])))
+        votes.append(votes_by_step(readout, machine.netlist.classes, cut(spikes, lengths[part])))
     return np.concatenate(votes)

@@ -1,7 +1,7 @@
 """The command ``bits``: the storage width of each layer, from what the decisions have to keep.
 
-The search itself is :mod:`storage.width_search`. Its result is kept in the user's cache, so that another wanted share
-is answered at once.
+The search itself is :func:`compiler.search_widths`. Its result is kept in the user's cache, so that another wanted
+share is answered at once.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
-from spikeloom.compiler import DEFAULT_TARGET
+from spikeloom.compiler import DEFAULT_TARGET, WidthPoint, WidthSearch, check_widths, search_widths, widths_front
 from spikeloom.compiler.archive import is_netlist
 from spikeloom.compiler.atomic import write_atomically
 from spikeloom.compiler.checkpoint import Checkpoint
@@ -27,7 +27,6 @@ from spikeloom.compiler.formats.checkpoint_file import arrays_digest
 from spikeloom.compiler.interpret import channels_last
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.base import COMPARTMENTS, Target, load_target
-from spikeloom.compiler.targets.loihi1.storage.width_search import Point, WidthSearch, check_widths, front, search
 from spikeloom.compiler.version import __version__
 from spikeloom.models.recordings.events import BIN_S
 from spikeloom.models.recordings.evtouch import Recordings
@@ -116,7 +115,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--samples", type=int, default=SAMPLES, metavar="N", help=f"recordings to decide (default: {SAMPLES})"
     )
-    parser.add_argument("--target", default="loihi1", help="chip (default: loihi1)")
+    parser.add_argument("--target", default=DEFAULT_TARGET, help=f"chip (default: {DEFAULT_TARGET})")
     parser.add_argument("--top", type=int, default=10, metavar="N", help="points of the front to show (default: 10)")
     parser.add_argument("--no-cache", action="store_true", help="search anew, and keep nothing")
     parser.add_argument("-o", "--output", metavar="NET.loom", help="compile the recommended widths")
@@ -162,7 +161,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     )
     made, cached = _searched(arguments, checkpoint, adjacency, training, target, widths)
     progress("")
-    best = front(made.built, FIGURES[figure])
+    best = widths_front(made.built, FIGURES[figure])
     reaching = [point for point in best if getattr(point, FIGURES[figure]) >= wanted * made.samples - 1e-9]
     command = _command(arguments, reaching[0].bits) if reaching else None
     choice = WidthChoice(
@@ -201,7 +200,7 @@ def _share(count: int | None, samples: int) -> float | None:
     return None if count is None else count / samples
 
 
-def _built(point: Point, samples: int) -> BuiltPoint:
+def _built(point: WidthPoint, samples: int) -> BuiltPoint:
     return BuiltPoint(
         weight_bits=point.bits,
         words=point.words,
@@ -264,7 +263,7 @@ def _searched(
     kept = None if arguments.no_cache else read_search(path)
     if kept is not None:
         return kept, True
-    made = search(
+    made = search_widths(
         expand(checkpoint, adjacency),
         target,
         channels_last(training.events, checkpoint.dynamics.clocks),

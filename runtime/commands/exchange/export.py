@@ -19,9 +19,8 @@ from spikeloom.runtime.commands.options import DATA_HELP, MODEL, add_bin_option,
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import load_checkpoint, load_graph, propagation
 from spikeloom.runtime.inputs.recordings import recordings
-from spikeloom.runtime.machines.export_format import Export, Format, Request
+from spikeloom.runtime.machines.export_format import Export, Format, Request, port_lines
 from spikeloom.runtime.machines.exports import FORMATS
-from spikeloom.runtime.machines.loihi1.exports import port_lines
 from spikeloom.runtime.report.encode import INLINE
 from spikeloom.runtime.report.sections import Outcome, Section, Text
 

@@ -32,7 +32,7 @@ from spikeloom.runtime.report.sections import Outcome, Section, Text
 
 if TYPE_CHECKING:
     from spikeloom.compiler.fixedpoint import IntArray
-    from spikeloom.runtime.machines.base import Step, Stream
+from spikeloom.runtime.machines.base import Step, Stream
 
 NOTES = """\
 Lines come in the order of their times: an event whose bin is over, since a later one came, is counted as late and not
@@ -290,6 +290,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
         If an option, the netlist or a line cannot be used.
     """
     from spikeloom.runtime.machines.base import machine_for
+    from spikeloom.runtime.machines.integer import integer_machine
     from spikeloom.runtime.studies.anytime import exits
 
     bin_s = _duration(arguments.bin)  # of the recordings; a step of the network may join several
@@ -324,7 +325,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
             bins=arguments.bins,
             from_first=arguments.origin == "first",
             real=arguments.speed == "real",
-            may_end=None if factor is None else exits.live(netlist, arguments.bins, factor),
+            may_end=None if factor is None else exits.live(integer_machine(machine), arguments.bins, factor),
         )
         interrupted = session.run()
     if not session.events and not interrupted:

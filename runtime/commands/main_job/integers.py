@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 from spikeloom.compiler import Options, compile_network, write_netlist
 from spikeloom.compiler.errors import OptionError
@@ -14,7 +15,7 @@ from spikeloom.compiler.invariants import verify
 from spikeloom.compiler.version import __version__
 from spikeloom.runtime.commands.options import MODEL
 from spikeloom.runtime.inputs.compilation import ROUNDING, parse_cores
-from spikeloom.runtime.machines.loihi1 import description
+from spikeloom.runtime.machines.base import machine_of
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.encode import INLINE
 from spikeloom.runtime.report.sections import Outcome, Section, Text
@@ -27,7 +28,7 @@ FLOATS: Mapping[str, object] = {"dt": None, "convention": None, **ROUNDING, "cal
 class LaidOut:
     """A netlist of integers as they stood, and what was read from their file."""
 
-    netlist: description.NetlistFacts = field(metadata=INLINE)
+    netlist: Any = field(metadata=INLINE)
     path: str
     facts: Sequence[str]
 
@@ -60,18 +61,18 @@ def compile_integers(arguments: argparse.Namespace) -> Outcome:
     options = Options(keep_all=arguments.keep_all, cores_for=cores_for, chips=arguments.chips, provenance=provenance)
     done = compile_network(read.network, options, target=arguments.target)
     sha256 = write_netlist(done.netlist, arguments.output)
-    facts = description.describe(done.netlist, done.uses, sha256)
-    return Outcome(LaidOut(netlist=facts, path=arguments.output, facts=read.facts), _sections)
+    described = machine_of(done.netlist).describe(sha256)
+
+    def sections(made: LaidOut) -> Iterator[Section]:
+        yield Section("", [*map(Text, made.facts)])
+        *first, last = described.sections(made.netlist)
+        yield from first
+        yield Section("", [*last.blocks, Text(f"sha256 {sha256}")])
+
+    return Outcome(LaidOut(netlist=described.result, path=arguments.output, facts=read.facts), sections)
 
 
 def _refuse(arguments: argparse.Namespace, options: Mapping[str, object], why: str) -> None:
     for name, absent in options.items():
         if getattr(arguments, name) != absent:
             raise OptionError(f"--{name.replace('_', '-')}: {why}")
-
-
-def _sections(made: LaidOut) -> Iterator[Section]:
-    yield Section("", [*map(Text, made.facts)])
-    *first, last = description.sections(made.netlist)
-    yield from first
-    yield Section("", [*last.blocks, Text(f"sha256 {made.netlist.sha256}")])

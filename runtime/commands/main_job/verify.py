@@ -15,8 +15,7 @@ from spikeloom.runtime.equivalence.sections import sections
 from spikeloom.runtime.equivalence.verify import verify
 from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.inputs.recordings import netlist_recordings
-from spikeloom.runtime.machines.base import chip_commands, machine_for
-from spikeloom.runtime.machines.loihi1.trace import ENGINES
+from spikeloom.runtime.machines.base import ENGINES, chip_commands, machine_for
 from spikeloom.runtime.report.sections import Outcome
 
 

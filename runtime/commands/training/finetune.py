@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from spikeloom.compiler import DEFAULT_TARGET
+from spikeloom.compiler import DEFAULT_TARGET, round_to_forms
 from spikeloom.compiler.archive import is_netlist
 from spikeloom.compiler.atomic import remove_leftovers
 from spikeloom.compiler.checkpoint import Checkpoint
@@ -19,7 +19,6 @@ from spikeloom.compiler.formats.checkpoint import read_checkpoint
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.systems import GRAPH_SYSTEMS
 from spikeloom.compiler.targets.base import COMPARTMENTS, load_target
-from spikeloom.compiler.targets.storage import round_to_forms
 from spikeloom.models.graphs import Graph
 from spikeloom.models.recordings.events import joined_bins
 from spikeloom.models.recordings.grasps import SYNTHETIC

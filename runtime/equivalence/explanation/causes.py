@@ -15,10 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from spikeloom.compiler import Netlist
-from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT, FloatArray, IntArray
 from spikeloom.compiler.interpret import Activity, BoolArray, run_float, step_late
 from spikeloom.compiler.ir import INPUT, IntegerNetwork, Network
@@ -34,9 +31,8 @@ from spikeloom.runtime.equivalence.explanation.deviations import (
 from spikeloom.runtime.equivalence.explanation.replay import UNCLIPPED, run_variants, variants_of
 from spikeloom.runtime.equivalence.explanation.roots import Root, find_roots, sources_of
 from spikeloom.runtime.equivalence.rounding import Rounding
-from spikeloom.runtime.machines.loihi1 import engine
-from spikeloom.runtime.machines.loihi1.engine import Engine
-from spikeloom.runtime.machines.loihi1.trace import aligned
+from spikeloom.runtime.machines.base import EventArray
+from spikeloom.runtime.machines.integer import IntegerMachine
 
 UNDECIDED = 256 * float(np.finfo(np.float64).eps)
 """Distance to threshold, as a share of all that the neuron adds up, that the order of a sum decides."""
@@ -53,15 +49,14 @@ class Observed:
     membranes: tuple[IntArray, ...]
 
 
-def observe(netlist: Netlist, prepared: Engine, events: npt.NDArray[np.uint8]) -> Observed:
+def observe(machine: IntegerMachine, events: EventArray) -> Observed:
     """What the simulator shows of one recording, (1, taxels, polarities, steps)."""
-    trace = engine.simulate(prepared, with_clocks(events, netlist.clocks), spikes=True, membranes=True)
-    assert trace.spikes is not None, "spikes were wanted"
-    assert trace.membranes is not None, "membranes were wanted"
-    layers = range(len(netlist.layers))
+    ran = machine.run(events, spikes=True, membranes=True)
+    assert ran.spikes is not None, "spikes were wanted"
+    assert ran.membranes is not None, "membranes were wanted"
     return Observed(
-        spikes=tuple(aligned(netlist, trace.spikes, layer)[0] for layer in layers),
-        membranes=tuple(aligned(netlist, trace.membranes, layer)[0] for layer in layers),
+        spikes=tuple(spikes[0] for spikes in ran.spikes.values()),
+        membranes=tuple(membranes[0] for membranes in ran.membranes.values()),
     )
 
 

@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 
 from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX
 from spikeloom.compiler.passes.prune import Removal
+from spikeloom.compiler.range_proof import RangeProof
 from spikeloom.compiler.targets.loihi1.compilation import Compilation
 from spikeloom.compiler.targets.loihi1.layout import choose
 from spikeloom.compiler.targets.loihi1.layout.forecast import Expectation
 from spikeloom.compiler.targets.loihi1.layout.place import Placement
 from spikeloom.compiler.targets.loihi1.storage.quantize import Choice
-from spikeloom.compiler.targets.loihi1.storage.range_proof import RangeProof
 from spikeloom.compiler.targets.loihi1.storage.spike_exact import Exactness
 from spikeloom.runtime.machines.loihi1 import description
 from spikeloom.runtime.machines.loihi1.description import LayerFacts, NetlistFacts

@@ -16,7 +16,7 @@ from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.models.recordings.events import BIN_S
-from spikeloom.runtime.machines.export_format import Export, Format, Request
+from spikeloom.runtime.machines.export_format import Export, Format, Request, port_lines
 from spikeloom.runtime.report.encode import OPTIONAL
 
 
@@ -109,11 +109,6 @@ def _onnx(request: Request) -> Export:
     )
     lines = port_lines(inputs, outputs)
     return Export(content=[content], facts=facts, synapses=facts.synapses, form=form, lines=lines)
-
-
-def port_lines(inputs: list[str], outputs: list[str]) -> tuple[str, ...]:
-    """Inputs and outputs of an ONNX graph, for people."""
-    return ("inputs:", *(f"  {port}" for port in inputs), "outputs:", *(f"  {p}" for p in outputs))
 
 
 def _nir(request: Request) -> Export:

@@ -6,29 +6,40 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import islice
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
+import numpy.typing as npt
 
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.fixedpoint import IntArray
+from spikeloom.compiler.ir import IntegerNetwork
 from spikeloom.compiler.targets.base import with_tables
 from spikeloom.compiler.targets.loihi1.legalize import measure, require_legal
+from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
-from spikeloom.runtime.machines.base import BoolArray, EventArray, Machine, Price, Run
-from spikeloom.runtime.machines.loihi1 import description, engine
+from spikeloom.runtime.machines.base import Beside, BoolArray, EventArray, Price, Run, one_by_one
+from spikeloom.runtime.machines.integer import Cumulative, IntegerMachine
+from spikeloom.runtime.machines.loihi1 import description, engine, spec
 from spikeloom.runtime.machines.loihi1.blocks import obstacle
 from spikeloom.runtime.machines.loihi1.stream import Stream, open_stream
-from spikeloom.runtime.machines.loihi1.trace import aligned
+from spikeloom.runtime.machines.loihi1.trace import MembraneArray, aligned, differences
 from spikeloom.runtime.machines.votes import class_counts
 from spikeloom.runtime.report.sections import Outcome
+
+if TYPE_CHECKING:
+    from spikeloom.runtime.machines.loihi1.onnx_engine import OnnxEngine
+
+T = TypeVar("T", bound=np.generic)
 
 SUMS = 1 << 24
 """Sums of the time model that are held at a time: 128 MiB."""
 
 
 @dataclass(frozen=True)
-class Loihi(Machine):
+class Loihi(IntegerMachine):
     """A netlist and its simulator."""
 
     netlist: Netlist
@@ -59,12 +70,105 @@ class Loihi(Machine):
         require_legal(self.netlist, self.target)
 
     def run(
-        self, events: EventArray, *, lengths: IntArray | None = None, spikes: bool = False, threads: int | None = None
+        self,
+        events: EventArray,
+        *,
+        lengths: IntArray | None = None,
+        spikes: bool = False,
+        membranes: bool = False,
+        threads: int | None = None,
     ) -> Run:
         """Decisions, and spikes as the float model counts time."""
         channels = with_clocks(events, self.netlist.clocks)
-        trace = engine.simulate(self._engine, channels, lengths=lengths, spikes=spikes, threads=threads)
-        return self._run(trace.counts.spikes, trace.spikes)
+        trace = engine.simulate(
+            self._engine, channels, lengths=lengths, spikes=spikes, membranes=membranes, threads=threads
+        )
+        return self._run(trace.counts.spikes, trace.spikes, trace.membranes)
+
+    def check(self, events: EventArray, *, lengths: IntArray | None = None) -> int:
+        """Every spike, membrane, update and count, one recording after another."""
+        found = 0
+        for sample in one_by_one(with_clocks(events, self.netlist.clocks), lengths):
+            fast = engine.simulate(self._engine, sample[None], spikes=True, membranes=True, updated=True)
+            found += differences(spec.simulate(self.netlist, sample), fast)
+        return found
+
+    @cached_property
+    def _onnx(self) -> tuple[OnnxEngine, OnnxEngine]:
+        """The integer graph in both forms."""
+        from spikeloom.runtime.machines.loihi1 import onnx_engine
+
+        return onnx_engine.prepare(self.netlist, form="scan"), onnx_engine.prepare(self.netlist, form="step")
+
+    def require_engine(self, name: str) -> None:
+        """Load the integer graph for onnxruntime."""
+        if name == "onnx":
+            _ = self._onnx
+
+    def beside(self, events: EventArray, *, lengths: IntArray | None = None, samples: int) -> Beside:
+        """Spikes of all recordings in the form ``scan``; of the first all that ``step`` has."""
+        from spikeloom.runtime.machines.loihi1.onnx_engine import different_spikes, same_state
+
+        scan, step = self._onnx
+        channels = with_clocks(events, self.netlist.clocks)
+        different = different_spikes(scan, self._engine, channels, lengths)
+        few = islice(one_by_one(channels, lengths), samples)
+        return Beside(different, different == 0 and all(same_state(step, self._engine, each) for each in few))
+
+    @cached_property
+    def integer(self) -> IntegerNetwork:
+        """Compartments as populations, axons as projections."""
+        return lift(self.netlist)
+
+    @property
+    def lags(self) -> tuple[int, ...]:
+        """Depths of the layers."""
+        return tuple(layer.depth for layer in self.netlist.layers)
+
+    @property
+    def absent(self) -> tuple[BoolArray, ...]:
+        """Neurons without a compartment."""
+        return tuple(
+            ~np.isin(np.arange(layer.neurons), self.netlist.neuron[self.netlist.compartments_of(index)])
+            for index, layer in enumerate(self.netlist.layers)
+        )
+
+    @property
+    def unused(self) -> tuple[BoolArray, ...]:
+        """As the netlist lists them."""
+        return tuple(np.isin(np.arange(layer.neurons), layer.unheard) for layer in self.netlist.layers)
+
+    @property
+    def received(self) -> BoolArray:
+        """Channels with an axon."""
+        sources = self.netlist.axon_source
+        return np.isin(np.arange(self.netlist.n_inputs), sources[sources < self.netlist.n_inputs])
+
+    def cumulative(self, events: EventArray, lengths: IntArray) -> Cumulative:
+        """Sums that the engine adds up itself: no spike is kept."""
+        from spikeloom.runtime.machines.loihi1.costs import cumulative
+
+        return cumulative.run(self.netlist, self.target, with_clocks(events, self.netlist.clocks), lengths)
+
+    def votes_by_step(self, events: EventArray, lengths: IntArray) -> IntArray:
+        """The same of votes."""
+        from spikeloom.runtime.machines.loihi1.costs import cumulative
+
+        return cumulative.votes_of(self.netlist, with_clocks(events, self.netlist.clocks), lengths)
+
+    @property
+    def read_out_lag(self) -> int:
+        """Depth of the latest layer that votes."""
+        from spikeloom.runtime.machines.loihi1.costs import cumulative
+
+        return cumulative.read_out_depth(self.netlist)
+
+    @property
+    def least_intervals(self) -> IntArray:
+        """From the largest sums of each compartment that votes."""
+        from spikeloom.runtime.machines.loihi1.costs import cumulative
+
+        return cumulative.least_intervals(self.netlist)
 
     def price(
         self,
@@ -118,12 +222,14 @@ class Loihi(Machine):
         """One grasp, bin after bin."""
         return open_stream(self._stepwise)
 
-    def _run(self, counts: IntArray, spikes: BoolArray | None) -> Run:
-        layers = self.netlist.layers
-        held = (
-            None if spikes is None else {each.name: aligned(self.netlist, spikes, i) for i, each in enumerate(layers)}
-        )
-        return Run(votes=class_counts(self.netlist, counts), spikes=held)
+    def _run(self, counts: IntArray, spikes: BoolArray | None, membranes: MembraneArray | None = None) -> Run:
+        votes = class_counts(self.netlist, counts)
+        return Run(votes=votes, spikes=self._by_layer(spikes), membranes=self._by_layer(membranes))
+
+    def _by_layer(self, array: npt.NDArray[T] | None) -> dict[str, npt.NDArray[T]] | None:
+        if array is None:
+            return None
+        return {name: aligned(self.netlist, array, index) for index, name in enumerate(self.layers)}
 
 
 machine_of = Loihi

@@ -18,8 +18,13 @@ from spikeloom.compiler.formats.onnx import writer as onnx_writer
 from spikeloom.compiler.formats.onnx.builder import package
 from spikeloom.compiler.formats.onnx.writer_layers import Layer, plan
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
-from spikeloom.runtime.machines.loihi1.engine import EventArray
+from spikeloom.runtime.machines.loihi1 import engine
+from spikeloom.runtime.machines.loihi1.engine import Engine, EventArray
 from spikeloom.runtime.machines.loihi1.trace import BoolArray, MembraneArray, check_channels
+from spikeloom.runtime.machines.votes import class_counts
+
+PART = 64
+"""Recordings whose spikes are held at a time."""
 
 BATCH = {"step": 144, "scan": 16}
 """Recordings that run together: few enough for the caches."""
@@ -245,3 +250,27 @@ def _stop(overflown: IntArray, step: int | None) -> None:
             f"onnx: recording {overflown[0]}{where}: a register overflows, where the chip is not defined; "
             "compile with --ranges proven"
         )
+
+
+def different_spikes(onnx: OnnxEngine, ours: Engine, events: EventArray, lengths: IntArray | None) -> int:
+    """Entries (recording, chip step, compartment) in which onnxruntime's spikes are not our engine's."""
+    found = 0
+    for start in range(0, len(events), PART):
+        part, ends = events[start : start + PART], None if lengths is None else lengths[start : start + PART]
+        spikes = engine.simulate(ours, part, lengths=ends, spikes=True).spikes
+        found += int(np.count_nonzero(simulate(onnx, part, lengths=ends).spikes != spikes))
+    return found
+
+
+def same_state(onnx: OnnxEngine, ours: Engine, recording: EventArray) -> bool:
+    """Whether every spike, membrane after the reset and vote of one recording (channels, steps) is our engine's."""
+    expected = engine.simulate(ours, recording[None], spikes=True, membranes=True)
+    assert expected.spikes is not None, "spikes were wanted"
+    assert expected.membranes is not None, "membranes were wanted"
+    found = simulate(onnx, recording[None], membranes=True)
+    pairs = (
+        (found.spikes, expected.spikes),
+        (found.membranes, np.where(expected.spikes, 0, expected.membranes)),
+        (found.votes, class_counts(onnx.netlist, expected.counts.spikes)),
+    )
+    return all(one is not None and np.array_equal(one, other) for one, other in pairs)

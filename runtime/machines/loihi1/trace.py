@@ -22,9 +22,6 @@ MembraneArray = npt.NDArray[np.int32]
 REGISTER_LIMITS = {"synaptic sum": ACCUMULATOR_MAX, "current": CURRENT_MAX}
 """Registers that may not overflow, in the order in which a step fills them, and their largest magnitude."""
 
-ENGINES = ("spikeloom", "onnx")
-"""What can be held against the specification: our engine, or onnxruntime beside it."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Counts:
@@ -150,6 +147,13 @@ def comparable(netlist: Netlist, layer: int) -> slice | IntArray:
     """Neurons of a layer whose spikes can be compared: all but those left out because no neuron receives them."""
     unused = netlist.layers[layer].unheard
     return np.setdiff1d(np.arange(netlist.layers[layer].neurons), unused) if unused else slice(None)
+
+
+def differences(slow: Trace, fast: Trace) -> int:
+    """Spikes, membranes, updates and counts that differ; `fast` is a batch of the one recording."""
+    pairs = [(getattr(slow, name), getattr(fast, name)) for name in ("spikes", "membranes", "updated")]
+    pairs += [(getattr(slow.counts, name), getattr(fast.counts, name)) for name in Counts.__slots__]
+    return sum(int(np.count_nonzero(one != batch[0])) for one, batch in pairs)
 
 
 def check_channels(netlist: Netlist, channels: int) -> None:

@@ -6,7 +6,10 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NoReturn
+from typing import NoReturn, TypeVar
+
+import numpy as np
+import numpy.typing as npt
 
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import OptionError
@@ -15,12 +18,14 @@ from spikeloom.compiler.targets.base import with_tables
 from spikeloom.compiler.targets.truenorth.legalize import require_legal
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
 from spikeloom.compiler.targets.truenorth.netlist_file import read_crossbars
-from spikeloom.runtime.machines.base import EventArray, Machine, Price, Run
-from spikeloom.runtime.machines.truenorth import cost, engine
+from spikeloom.runtime.machines.base import EventArray, Machine, Price, Run, one_by_one
+from spikeloom.runtime.machines.truenorth import cost, engine, spec
 from spikeloom.runtime.machines.truenorth.describe import describe
-from spikeloom.runtime.machines.truenorth.trace import Trace
+from spikeloom.runtime.machines.truenorth.trace import Trace, differences
 from spikeloom.runtime.machines.votes import class_counts
 from spikeloom.runtime.report.sections import Outcome
+
+T = TypeVar("T", bound=np.generic)
 
 TICK = "tick"
 """Name of the one time table: every tick takes the same time, whatever happens in it."""
@@ -48,10 +53,24 @@ class TrueNorth(Machine):
         require_legal(self.netlist, self.target)
 
     def run(
-        self, events: EventArray, *, lengths: IntArray | None = None, spikes: bool = False, threads: int | None = None
+        self,
+        events: EventArray,
+        *,
+        lengths: IntArray | None = None,
+        spikes: bool = False,
+        membranes: bool = False,
+        threads: int | None = None,
     ) -> Run:
         """Decisions, and spikes by tick; one recording runs at a time, whatever `threads` says."""
-        return self._run(self._simulate(events, lengths, spikes=spikes))
+        return self._run(self._simulate(events, lengths, spikes=spikes, membranes=membranes))
+
+    def check(self, events: EventArray, *, lengths: IntArray | None = None) -> int:
+        """Every spike, membrane, vote and spike on an axon, one recording after another."""
+        found = 0
+        for sample in one_by_one(with_clocks(events, self.netlist.clocks), lengths):
+            fast = engine.simulate(self._engine, sample[None], spikes=True, membranes=True)
+            found += differences(spec.simulate(self.netlist, sample), fast)
+        return found
 
     def price(
         self,
@@ -91,17 +110,20 @@ class TrueNorth(Machine):
             f"{self.target.title}: runs whole recordings, not bin after bin; give a netlist for another chip"
         )
 
-    def _simulate(self, events: EventArray, lengths: IntArray | None, *, spikes: bool) -> Trace:
-        return engine.simulate(self._engine, with_clocks(events, self.netlist.clocks), lengths=lengths, spikes=spikes)
+    def _simulate(
+        self, events: EventArray, lengths: IntArray | None, *, spikes: bool, membranes: bool = False
+    ) -> Trace:
+        channels = with_clocks(events, self.netlist.clocks)
+        return engine.simulate(self._engine, channels, lengths=lengths, spikes=spikes, membranes=membranes)
 
     def _run(self, trace: Trace) -> Run:
-        layer, spikes = self.netlist.layer, trace.spikes
-        return Run(
-            votes=class_counts(self.netlist, trace.counts.votes),
-            spikes=None
-            if spikes is None
-            else {name: spikes[:, :, layer == index] for index, name in enumerate(self.netlist.layers)},
-        )
+        votes = class_counts(self.netlist, trace.counts.votes)
+        return Run(votes=votes, spikes=self._by_layer(trace.spikes), membranes=self._by_layer(trace.membranes))
+
+    def _by_layer(self, array: npt.NDArray[T] | None) -> dict[str, npt.NDArray[T]] | None:
+        if array is None:
+            return None
+        return {name: array[:, :, self.netlist.layer == index] for index, name in enumerate(self.layers)}
 
 
 machine_of = TrueNorth

@@ -90,6 +90,13 @@ class Trace:
     membranes: MembraneArray | None
 
 
+def differences(slow: Trace, fast: Trace) -> int:
+    """Spikes, membranes, votes and spikes on axons that differ; `fast` is a batch of the one recording."""
+    pairs = [(getattr(slow, name), getattr(fast, name)) for name in ("spikes", "membranes")]
+    pairs += [(getattr(slow.counts, name), getattr(fast.counts, name)) for name in ("axons", "votes")]
+    return sum(int(np.count_nonzero(one != batch[0])) for one, batch in pairs)
+
+
 def check_channels(netlist: CrossbarNetlist, channels: int) -> None:
     """Refuse recordings of another sensor.
 

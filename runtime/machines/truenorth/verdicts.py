@@ -13,8 +13,8 @@ from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.runtime.machines.truenorth import engine, spec
-from spikeloom.runtime.machines.truenorth.trace import Trace
+from spikeloom.runtime.machines.truenorth import engine
+from spikeloom.runtime.machines.truenorth.machine import machine_of
 from spikeloom.runtime.machines.votes import class_counts
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.encode import OPTIONAL, key
@@ -110,7 +110,7 @@ def compare(
     spec_steps : int, optional
         First steps of each to which that is confined.
     """
-    prepared = engine.prepare(netlist)
+    machine, prepared = machine_of(netlist), engine.prepare(netlist)
     layers = list(netlist.layers)
     spikes, differences = dict.fromkeys(first, 0), dict.fromkeys(first, 0)
     votes, overflows, wrong = np.zeros((len(data), netlist.classes), np.int64), 0, 0
@@ -118,8 +118,7 @@ def compare(
         progress(f"comparing: {index} of {len(data)}")
         events = data.events[index : index + 1, ..., : data.steps_of(index)]
         channels = with_clocks(events, netlist.clocks)
-        deep = index < spec_samples and spec_steps is None
-        trace = engine.simulate(prepared, channels, spikes=True, membranes=deep)
+        trace = engine.simulate(prepared, channels, spikes=True)
         assert trace.spikes is not None, "spikes are kept"
         expected = model(events[0])
         steps = events.shape[-1]
@@ -132,10 +131,8 @@ def compare(
             differences[name] += int(np.count_nonzero(on_chip != due))
         overflows += int(trace.counts.overflows.sum())
         votes[index] = class_counts(netlist, trace.counts.votes)[0]
-        if index < spec_samples and spec_steps is not None:
-            trace = engine.simulate(prepared, channels[..., :spec_steps], spikes=True, membranes=True)
         if index < spec_samples:
-            wrong += _against_spec(netlist, channels[0, :, :spec_steps], trace)
+            wrong += machine.check(events[..., :spec_steps])
     return Verdict(
         target=netlist.target,
         samples=len(data),
@@ -145,20 +142,6 @@ def compare(
         correct=int(np.count_nonzero(vote(votes) == data.labels)),
         spec_steps=spec_steps,
     )
-
-
-def _against_spec(netlist: CrossbarNetlist, channels: Any, trace: Trace) -> int:
-    """Spikes, membranes, and spikes on axons that differ between engine and specification."""
-    assert trace.spikes is not None, "spikes are kept"
-    assert trace.membranes is not None, "and membranes"
-    slow = spec.simulate(netlist, channels)
-    pairs = (
-        (slow.spikes, trace.spikes[0]),
-        (slow.membranes, trace.membranes[0]),
-        (slow.counts.axons, trace.counts.axons[0]),
-        (slow.counts.votes, trace.counts.votes[0]),
-    )
-    return sum(int(np.count_nonzero(one != other)) for one, other in pairs)
 
 
 def sections(found: Verdict) -> list[Section]:

@@ -27,18 +27,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spikeloom.compiler.fixedpoint import DECAY_BITS, MEMBRANE_SHIFT, FloatArray, IntArray
-from spikeloom.compiler.targets.loihi1.netlist import Netlist, one_step_bounds
+from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.runtime.equivalence.certificates import wins
-from spikeloom.runtime.machines.loihi1.costs.cumulative import read_out_depth
-from spikeloom.runtime.machines.loihi1.trace import BoolArray
+from spikeloom.runtime.machines.base import BoolArray
+from spikeloom.runtime.machines.integer import IntegerMachine
 
 CONFIDENCE = 0.95
 """Of the bound on the share of other races that end otherwise."""
-
-
-LONGEST = 4096
-"""Steps after which :func:`least_interval` looks no further: a spike may follow then."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -84,38 +79,9 @@ def standing(votes: IntArray, lengths: IntArray) -> Standing:
     return Standing(leader=np.argmax(votes, axis=2), lead=ahead, left=left)
 
 
-def least_interval(netlist: Netlist) -> IntArray:
-    """Least number of steps from one spike to the next of each output neuron, whatever its input; 0 if it never spikes.
-
-    Returns
-    -------
-    (output neurons,) int64
-        In the order of their compartments.
-    """
-    voters = np.flatnonzero(netlist.readout_class >= 0)
-    positive = one_step_bounds(netlist)[0][voters]
-    # a current that loses lost/4096 a step and gains x stays at or below x * 4096 / lost
-    current = (positive << MEMBRANE_SHIFT + DECAY_BITS) // (netlist.decay_u[voters] + 1)
-    gain = current + (netlist.bias_mantissa << netlist.bias_exponent)[voters]
-    threshold = netlist.threshold[voters] << MEMBRANE_SHIFT
-    keep = 2**DECAY_BITS - netlist.decay_v[voters]
-    membrane, interval = np.zeros_like(gain), np.zeros_like(gain)
-    open_ = np.ones(len(gain), np.bool_)
-    for step in range(1, LONGEST + 1):
-        raised = (membrane * keep >> DECAY_BITS) + gain
-        fires = open_ & (raised > threshold)
-        interval[fires] = step
-        open_ &= ~fires & (raised > membrane)  # what no longer rises never will
-        membrane = np.maximum(raised, 0)
-        if not open_.any():
-            break
-    interval[open_] = LONGEST
-    return interval
-
-
-def most_votes(netlist: Netlist, steps: int) -> IntArray:
+def most_votes(machine: IntegerMachine, steps: int) -> IntArray:
     """Most votes that each class can still get when 0 … `steps` steps are left; shape (classes, steps + 1)."""
-    interval = least_interval(netlist)
+    netlist, interval = machine.netlist, machine.least_intervals
     left = np.arange(steps + 1)
     each = np.where(interval[:, None] > 0, -(-left // np.maximum(interval, 1)[:, None]), 0)
     most = np.zeros((netlist.classes, steps + 1), np.int64)
@@ -157,12 +123,12 @@ def exits(sure: BoolArray, at: Standing, factor: float = np.inf) -> IntArray:
     return first
 
 
-def live(netlist: Netlist, bins: int, factor: float) -> Callable[[int, IntArray], bool]:
+def live(machine: IntegerMachine, bins: int, factor: float) -> Callable[[int, IntArray], bool]:
     """Make the rule of a grasp of so many bins that is stepped live.
 
     Parameters
     ----------
-    netlist : Netlist
+    machine : IntegerMachine
         What is stepped.
     bins : int
         Length of the grasp.
@@ -174,7 +140,7 @@ def live(netlist: Netlist, bins: int, factor: float) -> Callable[[int, IntArray]
     callable
         Given a chip step, from 0, and the votes (classes,) after it, says whether the grasp may end.
     """
-    most, depth = most_votes(netlist, bins), read_out_depth(netlist)
+    most, depth = most_votes(machine, bins), machine.read_out_lag
 
     def may_end(chip_step: int, counts: IntArray) -> bool:
         seen = chip_step + 1 - depth

@@ -7,12 +7,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from spikeloom.compiler import Netlist
 from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.interpret import BoolArray
 from spikeloom.models.recordings.eventfiles import UNLABELLED
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.runtime.machines.loihi1.costs.cumulative import Cumulative
+from spikeloom.runtime.machines.integer import Cumulative, IntegerMachine
 from spikeloom.runtime.report.encode import INLINE, OPTIONAL, key
 from spikeloom.runtime.report.intervals import wilson
 from spikeloom.runtime.studies.anytime import exits
@@ -135,7 +134,7 @@ class Anytime:
 
 
 def study(
-    netlist: Netlist,
+    machine: IntegerMachine,
     data: Recordings,
     ran: Cumulative,
     calibrated: Sequence[exits.Calibrated] = (),
@@ -148,7 +147,7 @@ def study(
 
     Parameters
     ----------
-    netlist : Netlist
+    machine : IntegerMachine
     data : Recordings
     ran : Cumulative
         Their run.
@@ -159,11 +158,12 @@ def study(
         To be remembered.
     """
     at = exits.standing(ran.votes, ran.lengths)
-    sure = exits.proven(ran.votes, at, exits.most_votes(netlist, data.steps))
+    sure = exits.proven(ran.votes, at, exits.most_votes(machine, data.steps))
     model = None
     if model_votes is not None:
         standing = exits.standing(model_votes, ran.lengths)
-        voters = np.bincount(netlist.readout_class[netlist.readout_class >= 0], minlength=netlist.classes)
+        label = machine.netlist.readout_class
+        voters = np.bincount(label[label >= 0], minlength=machine.netlist.classes)
         model = standing, exits.proven(model_votes, standing, voters[:, None] * np.arange(data.steps + 1))
     rules = tuple(_rule(rule, ran, at, sure, model, data.labels) for rule in (None, *calibrated))
     right = _correct(at.decision, data.labels)
@@ -174,7 +174,7 @@ def study(
         source=data.source,
         split=data.split,
         bins=data.steps,
-        least_interval=int(exits.least_interval(netlist).min(initial=1)),
+        least_interval=int(machine.least_intervals.min(initial=1)),
         full=Full(
             costs=_costs(ran, ran.chip_steps - 1),
             correct=right,

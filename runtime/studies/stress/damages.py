@@ -20,13 +20,13 @@ from spikeloom.compiler.fixedpoint import (
     THRESHOLD_MANTISSA_MAX,
     FloatArray,
     IntArray,
+    decay_registers,
     frozen,
     read_only,
     round_half_even,
     weight_step,
 )
 from spikeloom.compiler.ir import INPUT, Network, Population, Projection
-from spikeloom.compiler.targets.loihi1.storage.weight_storage import decay_registers
 from spikeloom.runtime.studies.stress.pair import Pair
 
 Mask = npt.NDArray[np.bool_]

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from spikeloom.compiler.errors import ModelError, OptionError
-from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX, FloatArray
+from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX, FloatArray, decay_registers, reach, step_units
 from spikeloom.compiler.interpret import run_integer
 from spikeloom.compiler.ir import Form, IntegerNetwork, Network, Population, Projection, row_parts
 from spikeloom.compiler.passes.calibrate import MANY, Calibration, fewer
@@ -22,7 +22,7 @@ from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.options import MARGIN, RANGES, Recipe, check_recipes
 from spikeloom.compiler.targets.loihi1.storage.compensate import compensated
 from spikeloom.compiler.targets.loihi1.storage.scales import Rounded, candidate, flips, grouped, observed_sums, rounded
-from spikeloom.compiler.targets.loihi1.storage.weight_storage import current_load, decay_registers, reach, step_units
+from spikeloom.compiler.targets.loihi1.storage.weight_storage import current_load
 
 CLIPPING = tuple(2 ** (k / 4) for k in range(21))
 """Factors by which a scale may exceed the one that just holds the largest weight; larger weights are clipped."""

@@ -21,18 +21,15 @@ from spikeloom.compiler.fixedpoint import (
     THRESHOLD_MANTISSA_MAX,
     FloatArray,
     IntArray,
+    plane_distance,
+    reach,
+    step_units,
     weight_step,
 )
 from spikeloom.compiler.interpret import BATCH, integer_recurrence, integer_sums, lasting_currents, product
 from spikeloom.compiler.ir import Form, IntegerPopulation, IntegerProjection, Population, Projection, Sparse
 from spikeloom.compiler.passes.calibrate import Calibration
-from spikeloom.compiler.targets.loihi1.storage.weight_storage import (
-    loads,
-    plane_distance,
-    reach,
-    round_population,
-    step_units,
-)
+from spikeloom.compiler.targets.loihi1.storage.weight_storage import loads, round_population
 
 WORTHWHILE = 0.95
 """The largest exponent that leaves this share of the finest weight scale is taken: each step up lets threshold and

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from spikeloom.compiler.fixedpoint import THRESHOLD_MANTISSA_MAX, IntArray
+from spikeloom.compiler.fixedpoint import THRESHOLD_MANTISSA_MAX, IntArray, decay_registers, reach, step_units
 from spikeloom.compiler.interpret import float_recurrence, product
 from spikeloom.compiler.ir import IntegerNetwork, Network
 from spikeloom.compiler.passes.calibrate import Calibration, fewer
@@ -27,7 +27,7 @@ from spikeloom.compiler.targets.loihi1.storage.quantize import (
     shortlist,
 )
 from spikeloom.compiler.targets.loihi1.storage.scales import finest_thresholds, flips, in_batches
-from spikeloom.compiler.targets.loihi1.storage.weight_storage import current_load, decay_registers, reach, step_units
+from spikeloom.compiler.targets.loihi1.storage.weight_storage import current_load
 
 SHARED = 0.8
 """A neuron whose threshold is below this share of its own finest is held back by those it shares the threshold with."""

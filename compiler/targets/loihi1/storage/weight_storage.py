@@ -17,15 +17,16 @@ import numpy as np
 
 from spikeloom.compiler.fixedpoint import (
     CURRENT_MAX,
-    DECAY_BITS,
+    DECAY_ONE,
     MEMBRANE_MAX,
     MEMBRANE_SHIFT,
     ONE_STEP_SUM_MAX,
     FloatArray,
     IntArray,
+    decay_registers,
     encode_bias,
-    round_half_even,
-    weight_step,
+    round_steps,
+    split_planes,
 )
 from spikeloom.compiler.ir import (
     MANTISSA,
@@ -39,95 +40,8 @@ from spikeloom.compiler.ir import (
     with_data,
 )
 
-DECAY_ONE = 1 << DECAY_BITS
-
 FORGETS = DECAY_ONE - 1
 """`decay_u` of a current that forgets everything in one step."""
-
-
-def decay_registers(beta: float, alpha: float = 0.0) -> tuple[int, int]:
-    """Registers ``decay_u`` and ``decay_v`` nearest to a current decay and a membrane decay.
-
-    The chip's current loses one part in 4096 more than its register says. So it can forget all, which a membrane
-    cannot, and cannot keep all.
-
-    Examples
-    --------
-    >>> decay_registers(0.2)
-    (4095, 3277)
-    >>> decay_registers(0.2, 0.95)
-    (204, 3277)
-    """
-    return min(4095, max(0, round(4096 * (1 - alpha)) - 1)), min(4095, max(0, round(4096 * (1 - beta))))
-
-
-def plane_distance(bits: int) -> int:
-    """Largest difference of exponents at which two planes leave no gap between their values.
-
-    Examples
-    --------
-    >>> [plane_distance(bits) for bits in (8, 4, 2)]
-    [7, 3, 1]
-    """
-    codes = (256 - weight_step(bits)) // weight_step(bits)
-    return (2 * codes + 1).bit_length() - 1
-
-
-def reach(bits: int, exponents: tuple[int, ...]) -> int:
-    """Largest magnitude that planes hold together, in steps of the finest one.
-
-    Examples
-    --------
-    >>> reach(8, (0,)), reach(8, (-1, 6)), reach(2, (0, 1))
-    (127, 16383, 3)
-    """
-    codes = (256 - weight_step(bits)) // weight_step(bits)
-    return codes * sum(1 << (exponent - exponents[0]) for exponent in exponents)
-
-
-def step_units(bits: int, exponents: tuple[int, ...]) -> float:
-    """Weight units of one step of the finest plane."""
-    return float(weight_step(bits) * 2.0 ** exponents[0])
-
-
-def round_steps(weight: FloatArray, scale: FloatArray | float, bits: int, exponents: tuple[int, ...]) -> IntArray:
-    """Round weights to whole steps of the finest plane and clip them to what the planes hold.
-
-    Parameters
-    ----------
-    weight : (...) float64
-        Real weights.
-    scale : (...) float64
-        Weight units per real unit; broadcasts against `weight`.
-
-    Examples
-    --------
-    >>> round_steps(np.array([1.0, -0.3, 100.0]), 254.0, 8, (0,)).tolist()
-    [127, -38, 127]
-    """
-    limit = reach(bits, exponents)
-    return np.clip(round_half_even(weight * (scale / step_units(bits, exponents))), -limit, limit)
-
-
-def split_planes(steps: IntArray, bits: int, exponents: tuple[int, ...]) -> list[IntArray]:
-    """Mantissas of each plane, finest first, which add up to given steps of the finest one.
-
-    A coarser plane is zero wherever the finer ones hold the value.
-
-    Examples
-    --------
-    >>> [plane.tolist() for plane in split_planes(np.array([5, 127, 128, -300]), 8, (-1, 6))]
-    [[10, 254, 0, -88], [0, 0, 2, -4]]
-    """
-    codes = (256 - weight_step(bits)) // weight_step(bits)
-    rest, mantissas = steps, []
-    for k in range(len(exponents) - 1, 0, -1):
-        ratio = 1 << (exponents[k] - exponents[0])
-        code = np.clip(round_half_even(rest / ratio), -codes, codes)
-        code = np.where(np.abs(rest) <= reach(bits, exponents[:k]), 0, code)
-        rest = rest - code * ratio
-        mantissas.append(code * weight_step(bits))
-    return [rest * weight_step(bits), *reversed(mantissas)]
 
 
 def scales(population: Population, form: Form) -> FloatArray:

@@ -33,7 +33,7 @@ Offers = list[dict[int, list[Candidate]]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Point:
+class WidthPoint:
     """One combination of widths.
 
     Parameters
@@ -68,16 +68,16 @@ class WidthSearch:
         Recordings that were decided.
     float_right : int or None
         Those of them that the float64 model decides right.
-    points : tuple of Point
+    points : tuple of WidthPoint
         Every combination that was tried, each layer at the scale that is best by itself.
-    built : tuple of Point
+    built : tuple of WidthPoint
         Those on a front (accuracy or agreement against memory) that fit the chip, as the compiler builds them.
     """
 
     samples: int
     float_right: int | None
-    points: tuple[Point, ...]
-    built: tuple[Point, ...]
+    points: tuple[WidthPoint, ...]
+    built: tuple[WidthPoint, ...]
 
 
 def check_widths(widths: Sequence[int], groups: int, layers: int, target: Target) -> Widths:
@@ -99,23 +99,23 @@ def check_widths(widths: Sequence[int], groups: int, layers: int, target: Target
     return tuple(sorted(set(widths)))
 
 
-def front(points: Iterable[Point], by: str) -> tuple[Point, ...]:
+def widths_front(points: Iterable[WidthPoint], by: str) -> tuple[WidthPoint, ...]:
     """Points that no other one beats in memory and in ``equal`` or ``right``, least memory first.
 
     Examples
     --------
-    >>> points = [Point(bits=(b,), words=w, equal=e, right=None) for b, w, e in ((2, 5, 1), (3, 6, 1), (4, 7, 3))]
-    >>> [point.bits for point in front(points, "equal")]
+    >>> points = [WidthPoint(bits=(b,), words=w, equal=e, right=None) for b, w, e in ((2, 5, 1), (3, 6, 1), (4, 7, 3))]
+    >>> [point.bits for point in widths_front(points, "equal")]
     [(2,), (4,)]
     """
-    best: list[Point] = []
+    best: list[WidthPoint] = []
     for point in sorted(points, key=lambda p: (p.words, -getattr(p, by), p.bits)):
         if not best or getattr(point, by) > getattr(best[-1], by):
             best.append(point)
     return tuple(best)
 
 
-def search(
+def search_widths(
     network: Network,
     target: Target,
     events: BoolArray,
@@ -175,14 +175,14 @@ def search(
     network = disconnect(network, never_fires(network))
     offers = _offers(network, target, widths, groups, calibration)
 
-    def point(bits: Widths, integer: IntegerNetwork, words: int, cores: int | None = None) -> Point:
+    def point(bits: Widths, integer: IntegerNetwork, words: int, cores: int | None = None) -> WidthPoint:
         decided = decide(run_integer(integer, shown).spikes[network.readout.population])
         equal, right = (int(np.count_nonzero(decided == aim)) for aim in (wanted, known))
-        return Point(bits=bits, words=words, equal=equal, right=right if "right" in figures else None, cores=cores)
+        return WidthPoint(bits=bits, words=words, equal=equal, right=right if "right" in figures else None, cores=cores)
 
-    tried: dict[Widths, Point] = {}
+    tried: dict[Widths, WidthPoint] = {}
 
-    def attempt(bits: Widths) -> Point:
+    def attempt(bits: Widths) -> WidthPoint:
         if bits not in tried:
             tell(f"trying combination {len(tried) + 1}")
             integer = assemble(network, [offers[post][width][0].layer for post, width in enumerate(bits)])
@@ -197,8 +197,8 @@ def search(
 
     # the front is drawn anew with the figures of what was built, until all that is on it was built
     rates = tuple(spikes.mean(axis=(0, 1)) for spikes in calibration.spikes)
-    current, built = dict(tried), dict[Widths, Point | None]()
-    while best := {p.bits for figure in figures for p in front(current.values(), figure)} - built.keys():
+    current, built = dict(tried), dict[Widths, WidthPoint | None]()
+    while best := {p.bits for figure in figures for p in widths_front(current.values(), figure)} - built.keys():
         tell(f"building the best of them: {len(built) + len(best)}")
         for bits in sorted(best):
             scales = settle(network, [offers[post][width] for post, width in enumerate(bits)], calibration)

@@ -6,43 +6,51 @@ window is run for itself. A chip that is stopped after so many steps has done, a
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-
 import numpy as np
 
-from spikeloom.compiler.fixedpoint import FloatArray, IntArray
+from spikeloom.compiler.fixedpoint import DECAY_BITS, MEMBRANE_SHIFT, FloatArray, IntArray
 from spikeloom.compiler.interpret import BoolArray
-from spikeloom.compiler.ir import Readout
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.layout.chips import chip_count
-from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.targets.loihi1.netlist import Netlist, one_step_bounds
+from spikeloom.runtime.machines.integer import LONGEST, Cumulative
 from spikeloom.runtime.machines.loihi1 import engine, timing
 from spikeloom.runtime.machines.loihi1.costs import cost, simple_times
 from spikeloom.runtime.machines.loihi1.trace import Charges
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Cumulative:
-    """Sums over chip steps up to and with each; after a recording's end they stay as they are.
-
-    Votes (samples, steps, classes) are those after each step of the read-out, which lags `depth` chip steps behind the
-    data; operations, joules by table and seconds by table and the simple model are (samples, chip steps). Tables that
-    cannot price the run are missing, and all times for several chips.
-    """
-
-    votes: IntArray
-    depth: int
-    lengths: IntArray
-    chip_steps: IntArray
-    operations: FloatArray
-    energy: Mapping[str, FloatArray]
-    time: Mapping[str, FloatArray]
-
-
 def read_out_depth(netlist: Netlist) -> int:
     """Chip steps by which the votes lag behind the data: the depth of the latest layer that votes."""
     return max(netlist.layers[int(layer)].depth for layer in np.unique(netlist.layer[netlist.readout_class >= 0]))
+
+
+def least_intervals(netlist: Netlist) -> IntArray:
+    """Least number of steps from one spike to the next of each output neuron, whatever its input; 0 if it never spikes.
+
+    Returns
+    -------
+    (output neurons,) int64
+        In the order of their compartments.
+    """
+    voters = np.flatnonzero(netlist.readout_class >= 0)
+    positive = one_step_bounds(netlist)[0][voters]
+    # a current that loses lost/4096 a step and gains x stays at or below x * 4096 / lost
+    current = (positive << MEMBRANE_SHIFT + DECAY_BITS) // (netlist.decay_u[voters] + 1)
+    gain = current + (netlist.bias_mantissa << netlist.bias_exponent)[voters]
+    threshold = netlist.threshold[voters] << MEMBRANE_SHIFT
+    keep = 2**DECAY_BITS - netlist.decay_v[voters]
+    membrane, interval = np.zeros_like(gain), np.zeros_like(gain)
+    open_ = np.ones(len(gain), np.bool_)
+    for step in range(1, LONGEST + 1):
+        raised = (membrane * keep >> DECAY_BITS) + gain
+        fires = open_ & (raised > threshold)
+        interval[fires] = step
+        open_ &= ~fires & (raised > membrane)  # what no longer rises never will
+        membrane = np.maximum(raised, 0)
+        if not open_.any():
+            break
+    interval[open_] = LONGEST
+    return interval
 
 
 def vote_charges(netlist: Netlist) -> Charges:
@@ -71,13 +79,6 @@ def votes_of(netlist: Netlist, events: engine.EventArray, lengths: IntArray) -> 
     trace = engine.simulate(prepared, events, lengths=lengths)
     assert trace.charged is not None, "votes were wanted"
     return _aligned(netlist, np.cumsum(trace.charged, axis=1), events.shape[2])
-
-
-def float_votes(readout: Readout, classes: int, spikes: BoolArray) -> IntArray:
-    """Votes so far after each step, from the spikes of the population that votes (samples, steps, neurons)."""
-    votes = np.zeros((*spikes.shape[:2], classes), np.int64)
-    np.add.at(np.moveaxis(votes, 2, 0), readout.label, np.moveaxis(spikes, 2, 0))
-    return np.cumsum(votes, axis=1)
 
 
 def run(netlist: Netlist, target: Target, events: engine.EventArray, lengths: IntArray) -> Cumulative:

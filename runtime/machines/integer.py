@@ -1,0 +1,131 @@
+"""Chips whose netlist reads back as the integer network that the float model became, neuron by neuron."""
+
+from __future__ import annotations
+
+import os
+from abc import abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.fixedpoint import FloatArray, IntArray
+from spikeloom.compiler.ir import IntegerNetwork
+from spikeloom.compiler.targets.netlist import Netlist
+from spikeloom.runtime.machines.base import BoolArray, EventArray, Machine, machine_for, machine_of
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Cumulative:
+    """Sums over chip steps up to and with each; after a recording's end they stay as they are.
+
+    Votes (samples, steps, classes) are those after each step of the read-out, which lags `depth` chip steps behind the
+    data; operations, joules by table and seconds by table and the simple model are (samples, chip steps). Tables that
+    cannot price the run are missing, and all times for several chips.
+    """
+
+    votes: IntArray
+    depth: int
+    lengths: IntArray
+    chip_steps: IntArray
+    operations: FloatArray
+    energy: Mapping[str, FloatArray]
+    time: Mapping[str, FloatArray]
+
+
+@dataclass(frozen=True)
+class IntegerMachine(Machine):
+    """A machine that can be compared with the float model: its layers are the model's, and so are their neurons.
+
+    Its runs count time as the float model does, and have membranes: registers before the comparison, so that ``register
+    / (scale * 2**MEMBRANE_SHIFT)`` is in the model's units. What the chip does not hold stays at zero.
+    """
+
+    @cached_property
+    @abstractmethod
+    def integer(self) -> IntegerNetwork:
+        """The netlist, cores forgotten; raises FormatError where it is no such network."""
+
+    @property
+    @abstractmethod
+    def lags(self) -> tuple[int, ...]:
+        """Chip steps by which each layer is behind the data."""
+
+    @property
+    @abstractmethod
+    def absent(self) -> tuple[BoolArray, ...]:
+        """Neurons of each layer, (neurons,) bool, that the chip does not hold."""
+
+    @property
+    @abstractmethod
+    def unused(self) -> tuple[BoolArray, ...]:
+        """Those of them that were left out because no neuron receives them: their spikes cannot be compared."""
+
+    @property
+    @abstractmethod
+    def received(self) -> BoolArray:
+        """Input channels, (channels,) bool, that some core takes in."""
+
+    @abstractmethod
+    def cumulative(self, events: EventArray, lengths: IntArray) -> Cumulative:
+        """Votes and costs step by step, from one run.
+
+        Parameters
+        ----------
+        events : (samples, taxels, polarities, steps) uint8 or bool
+        lengths : (samples,) int64
+            Data steps of each.
+        """
+
+    @abstractmethod
+    def votes_by_step(self, events: EventArray, lengths: IntArray) -> IntArray:
+        """Votes of :meth:`cumulative` alone."""
+
+    @property
+    @abstractmethod
+    def read_out_lag(self) -> int:
+        """Chip steps by which the votes are behind the data."""
+
+    @property
+    @abstractmethod
+    def least_intervals(self) -> IntArray:
+        """Least steps from one spike to the next of each neuron that votes, whatever its input; 0 if it never spikes.
+
+        In the order of ``readout_class``; after :data:`LONGEST` steps nothing is looked for any more.
+        """
+
+    def compared(self) -> list[slice | IntArray]:
+        """Neurons of each layer whose spikes can be compared."""
+        return [np.flatnonzero(~unused) if unused.any() else slice(None) for unused in self.unused]
+
+
+LONGEST = 4096
+"""Steps after which :attr:`IntegerMachine.least_intervals` looks no further: a spike may follow then."""
+
+
+def integer_machine(machine: Machine) -> IntegerMachine:
+    """The same machine, if a float model can be compared with it.
+
+    Raises
+    ------
+    OptionError
+        If not.
+    """
+    if not isinstance(machine, IntegerMachine):
+        raise OptionError(
+            f"{machine.target.title}: is not compared with a float model neuron by neuron; give a netlist for "
+            "another chip"
+        )
+    return machine
+
+
+def integer_machine_of(netlist: Netlist) -> IntegerMachine:
+    """As :func:`machine_of`; raises as :func:`integer_machine`."""
+    return integer_machine(machine_of(netlist))
+
+
+def integer_machine_for(path: str | os.PathLike[str]) -> IntegerMachine:
+    """As :func:`machine_for`; raises as :func:`integer_machine`."""
+    return integer_machine(machine_for(path))
