@@ -11,12 +11,13 @@ from random_netlists import lively
 
 from spikeloom.compiler import targets
 from spikeloom.compiler.dynamics import with_clocks
-from spikeloom.compiler.errors import FormatError, OptionError
+from spikeloom.compiler.errors import DataError, FormatError, OptionError
 from spikeloom.compiler.targets.base import load_target, shipped
 from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist
 from spikeloom.compiler.targets.truenorth.netlist_file import write_crossbars
 from spikeloom.runtime import machines
 from spikeloom.runtime.machines.base import machine_for, machine_of, trained_for
+from spikeloom.runtime.machines.integer import integer_machine
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.truenorth import engine as crossbar_engine
 from spikeloom.runtime.machines.votes import class_counts
@@ -73,6 +74,47 @@ def test_runs_and_prices_are_the_simulators(machine):
         assert "per inference" in terminal(price.outcome.sections(price.outcome.result))
     with pytest.raises(OptionError, match=f"--detail none: .* allowed: {', '.join(machine.details)}"):
         machine.price(events, bin_s=0.02, detail="none")
+
+
+def test_simulators_are_held_against_their_specifications(machine, monkeypatch):
+    events, lengths = grasps(machine, samples=3), np.array([12, 5, 9])
+    assert machine.check(events, lengths=lengths) == 0
+    done = machine.run(events, lengths=lengths, spikes=True, membranes=True)
+    assert {name: held.shape for name, held in done.membranes.items()} == {
+        name: held.shape for name, held in done.spikes.items()
+    }
+    assert any(held.any() for held in done.membranes.values())
+    simulator = engine if machine.netlist.target == "loihi1" else crossbar_engine
+    simulate = simulator.simulate
+
+    def wrong(*words, **options):
+        trace = simulate(*words, **options)
+        trace.membranes[0, -1, -1] ^= 1
+        return trace
+
+    monkeypatch.setattr(simulator, "simulate", wrong)
+    assert machine.check(events, lengths=lengths) == 3
+    with pytest.raises(DataError, match=r"9 input channels found, the netlist has \d+"):
+        machine.require_sensor(np.zeros((1, 3, 3, 12), np.uint8))
+
+
+def test_what_is_compared_with_a_float_model(machine):
+    if machine.netlist.target == "truenorth":
+        with pytest.raises(OptionError, match="TrueNorth: is not compared with a float model"):
+            integer_machine(machine)
+        with pytest.raises(OptionError, match="--engine onnx: is not for IBM TrueNorth"):
+            machine.require_engine("onnx")
+        return
+    found, events, lengths = integer_machine(machine), grasps(machine), np.array([12, 5, 12, 1, 9])
+    sizes = [layer.neurons for layer in found.netlist.layers]
+    assert [len(out) for out in found.absent] == [len(out) for out in found.unused] == sizes
+    assert len(found.lags) == len(sizes)
+    votes = found.votes_by_step(events, lengths)
+    ran = found.cumulative(events, lengths)
+    np.testing.assert_array_equal(ran.votes, votes)
+    np.testing.assert_array_equal(votes[:, -1], found.run(events, lengths=lengths).votes)
+    price = found.price(events, lengths=lengths, bin_s=0.02)[1]
+    np.testing.assert_array_equal(ran.operations[:, -1], price.synaptic_operations)
 
 
 def test_descriptions(machine):
@@ -132,6 +174,7 @@ def test_a_third_chip_is_a_folder(tmp_path, monkeypatch):
         assert (type(machine).__name__, machine.target.name) == ("Toy", "toy")
         events = grasps(machine)
         np.testing.assert_array_equal(machine.run(events).votes, machine_of(lively()).run(events).votes)
+        assert integer_machine(machine).check(events[:1]) == 0
         with pytest.raises(OptionError, match="toy has no such price model; allowed: counts"):
             machine.price(events, bin_s=0.02, detail="cycle")
     finally:
