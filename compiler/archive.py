@@ -24,10 +24,13 @@ from spikeloom.compiler.errors import FormatError
 
 Array = np.ndarray[Any, Any]
 
+TRAINED = "spikeloom-native"
+"""Trained in the whole numbers of a chip."""
+
 FORMATS = {
     "spikeloom-netlist": "cores of compartments (Loihi)",
     "spikeloom-crossbars": "crossbar cores (TrueNorth)",
-    "spikeloom-native": "a network trained for TrueNorth, not yet compiled",
+    TRAINED: "a network trained for TrueNorth, not yet compiled",
 }
 """What a manifest may say that an archive is."""
 

@@ -306,7 +306,7 @@ def grasps_network(seed):
         (("compile", "x.pt", "--target", "truenorth", "--planes", "2", "-o", "z.loom"), "--planes 2: is not for"),
         (("compile", "x.pt", "--target", "truenorth", "--in-time", "2", "-o", "z.loom"), "x.pt: --in-time 2: "),
         (("inspect", "x.pt", "--beta", "0.3"), "--beta 0.3: x.pt is a network for TrueNorth and says that itself"),
-        (("export", "x.pt", "--to", "onnx-float", "-o", "x.onnx"), "x.pt: is a network for TrueNorth"),
+        (("export", "x.pt", "--to", "onnx-float", "-o", "x.onnx"), "x.pt: is a network trained for TrueNorth"),
         ((*VERIFY, "x.pt", "--require", "E3=1"), "--require E3=1: a network for TrueNorth has one model"),
         ((*VERIFY, "x.pt", "--weights", "best"), "--weights best: x.loom was compiled from last; give the same"),
         ((*VERIFY, "y.pt"), "--checkpoint y.pt: x.loom was compiled from another file"),

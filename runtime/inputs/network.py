@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from spikeloom.compiler.archive import FORMATS, TRAINED, stated_format
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.fixedpoint import FloatArray, IntArray
@@ -30,10 +31,9 @@ from spikeloom.models.graphs import CHOICES, NEUTOUCH, Graph
 from spikeloom.models.sensors import read_layout, sensor_graph
 from spikeloom.models.systems import NO_GRAPH, grid_cells, propagation_of
 from spikeloom.runtime.inputs.files import shipped
-from spikeloom.runtime.machines.base import trained_for
 from spikeloom.runtime.report.console import progress
 
-FORMATS = {ONNX: "ONNX", NIR: "NIR"}
+NETWORKS = {ONNX: "ONNX", NIR: "NIR"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -150,7 +150,7 @@ def _require_fit(path: str, suffix: str | None, arguments: argparse.Namespace) -
         for name in ("system", "graph", "taxels", "edges", "directed", "weights", "beta", "theta", "run"):
             if getattr(arguments, name) not in (None, False, 0):
                 raise OptionError(
-                    f"--{name}: is for checkpoints, the {FORMATS[suffix]} file {path} holds all it needs; leave it away"
+                    f"--{name}: is for checkpoints, the {NETWORKS[suffix]} file {path} holds all it needs; omit it"
                 )
     if suffix != NIR:
         for name in ("dt", "convention"):
@@ -238,10 +238,8 @@ def load_checkpoint(path: str, arguments: argparse.Namespace) -> Checkpoint:
         If it is not there, or not as they say.
     """
     progress("reading the checkpoint")
-    if (chip := trained_for(shipped(path))) is not None:
-        raise ModelError(
-            f"{path}: is a network for {chip.TITLE}, which compile, verify, inspect and join take; this is for others"
-        )
+    if (kind := stated_format(Path(shipped(path)))) == TRAINED:
+        raise ModelError(f"{path}: is {FORMATS[kind]}; compile, verify, inspect and join take it, this is for others")
     places = sensor_places(getattr(arguments, "taxels", None))
     return read_checkpoint(
         shipped(path),

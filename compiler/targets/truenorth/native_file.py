@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from spikeloom.compiler.archive import (
+    TRAINED,
     Array,
     archive_bytes,
     read_manifest,
@@ -33,7 +34,7 @@ from spikeloom.compiler.errors import FormatError, ModelError
 from spikeloom.compiler.fixedpoint import IntArray, read_only
 from spikeloom.compiler.targets.truenorth.native import NativeNetwork, Stage, faults
 
-FORMAT = "spikeloom-native"
+FORMAT = TRAINED
 VERSIONS = (1,)
 PARTS = ("inputs", "level", "threshold", "floor", "leak")
 """Arrays of a stage, in file order."""
