@@ -220,6 +220,7 @@ def test_provenance_names_everything_that_decided(as_json, place):
         "ranges": "proven",
         "margin": 0.1,
         "calibrated": True,
+        "compensated": ["fc1"],
     }
 
 
@@ -542,7 +543,7 @@ def test_faults_of_a_table_are_told_at_once(spikeloom, tmp_path):
     code, out, err = spikeloom("run", "net.loom", "--data", "data", "--detail", "counts", "--table", path)
     assert (code, out) == (2, "")
     lines = err.splitlines()
-    assert len(lines) == 3
+    assert len(lines) == 2
     assert all(line.startswith(f"spikeloom: {path}: energy.mine.") for line in lines)
     assert spikeloom("estimate", "net.loom", "--data", "data", "--table", "mine") == (
         2,

@@ -6,6 +6,7 @@ name everything that decides a result; the same command goes on from there. jobl
 
 from __future__ import annotations
 
+import _thread
 import argparse
 import hashlib
 import json
@@ -15,10 +16,12 @@ import signal
 import sqlite3
 import sys
 import threading
+import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -229,7 +232,8 @@ def side_by_side(
     with place:
         work = Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch="all")
         try:
-            yield from work(delayed(_attempt)(run, index, payload) for index, payload in enumerate(payloads))
+            attempt = partial(_in_child, os.getpid()) if scheduler is None else _attempt
+            yield from work(delayed(attempt)(run, index, payload) for index, payload in enumerate(payloads))
         except TerminatedWorkerError:
             yield -1, ProcessDied("a process ended early, perhaps for lack of memory; go on with fewer --jobs")
 
@@ -256,6 +260,34 @@ def _attempt(run: Callable[[APayload], AResult], index: int, payload: APayload) 
         return index, error.with_traceback(None)
     except Exception:  # a defect; not every exception survives the way
         return index, RuntimeError(traceback.format_exc())
+
+
+def _in_child(
+    parent: int, run: Callable[[APayload], AResult], index: int, payload: APayload
+) -> tuple[int, AResult | Exception]:
+    """As :func:`_attempt`, in a process that does not outlive the one that started it, even where that is killed."""
+    _end_with(parent)
+    try:
+        return _attempt(run, index, payload)
+    except KeyboardInterrupt:
+        if os.getppid() != parent:  # tidy by now, and nobody waits for a result
+            os._exit(1)
+        raise
+
+
+@cache
+def _end_with(parent: int) -> None:
+    """Interrupt this process, as Ctrl-C does, when its parent is gone."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(0.5)
+        _thread.interrupt_main()
+        time.sleep(20)
+        os._exit(1)  # whatever it was that did not let itself be interrupted
+
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    threading.Thread(target=watch, daemon=True).start()
 
 
 @contextmanager

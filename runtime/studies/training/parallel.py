@@ -65,6 +65,8 @@ def _train(jobs: Sequence[Job], *, resume: bool) -> list[Result]:
         with ended_by_signal():
             _side_by_side(jobs, waiting, results)
     except KeyboardInterrupt as interrupt:
+        for job in jobs:
+            clear(job)
         done = [jobs[index] for index in waiting if index in results]
         raise KeyboardInterrupt(_kept(done, jobs)) from interrupt
     return [results[index] for index in range(len(jobs))]
@@ -113,7 +115,9 @@ def _kept(done: Sequence[Job], jobs: Sequence[Job]) -> str:
 
 def _side_by_side(jobs: Sequence[Job], waiting: Sequence[int], results: dict[int, Result]) -> None:
     """Run jobs in processes of their own; whatever ends this ends them all."""
-    there = [replace(jobs[index], output=jobs[index].output.absolute()) for index in waiting]
+    there = [jobs[index] for index in waiting]
+    if len(there) > 1:  # processes may be in another folder
+        there = [replace(job, output=job.output.absolute()) for job in there]
     for place, found in processes.side_by_side(there, run_job):
         if isinstance(found, ProcessDied):
             raise OptionError(f"{found}; go on with --resume, and with fewer --seeds")
