@@ -224,13 +224,6 @@ def test_every_lacking_price_is_named():
     }
 
 
-def test_no_table_at_all():
-    _, report = priced_by()
-    assert report.per_inference.energy_j == report.min.energy_j == {}
-    assert report.not_modelled == ()
-    assert "synaptic operations" in terminal(sections(report))
-
-
 def test_what_did_not_happen_needs_no_price():
     costs, _ = priced_by(table("idle", neuron_idle=50.0), silent=True)
     # 3 compartments in 6 steps
@@ -244,10 +237,13 @@ def test_one_price_for_both_forms_of_a_list():
     np.testing.assert_allclose(extra, [6e-12 * (1 + 3)] * 2)
 
 
-def test_what_no_table_covers_is_always_listed():
-    _, report = priced_by(table("full", **FULL))
+@pytest.mark.parametrize("tables", [(), (table("full", **FULL),)])
+def test_what_no_table_covers_is_always_listed(tables):
+    _, report = priced_by(*tables)
     assert report.not_priced == cost.NOT_PRICED
-    assert len(cost.NOT_PRICED) == 2
+    assert report.not_modelled == ()
+    assert set(report.per_inference.energy_j) == set(report.min.energy_j) == {each.name for each in tables}
+    assert "synaptic operations" in terminal(sections(report))
 
 
 # -- the report --------------------------------------------------------------------------------------------------------

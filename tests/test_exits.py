@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 from random_netlists import Axon, Neuron, build, large_netlist, netlists, recordings
 
-from spikeloom.compiler import compile_network, lift
+from spikeloom.compiler import compile_network
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import NumericRangeError
 from spikeloom.compiler.fixedpoint import read_only
@@ -140,11 +140,8 @@ def test_how_often_an_output_neuron_can_spike():
         Neuron(threshold=1, bias=-101, bias_exponent=6),
     )
     assert integer_machine_of(netlist).least_intervals.tolist() == [1, 2, 2, 4, 0, 3, 1, 0]
-    most = exits.most_votes(integer_machine_of(netlist), 5)
-    assert most[0].tolist() == [0, 1, 2, 3, 4, 5]
-    assert most[1].tolist() == [0, 1, 1, 2, 2, 3]
-    assert most[3].tolist() == [0, 1, 1, 1, 1, 2]
-    assert most[4].tolist() == [0] * 6
+    most = exits.most_votes(integer_machine_of(netlist), 5)[[0, 1, 3, 4]]
+    assert most.tolist() == [[0, 1, 2, 3, 4, 5], [0, 1, 1, 2, 2, 3], [0, 1, 1, 1, 1, 2], [0] * 6]
 
 
 def test_slow_neurons_are_looked_at_only_so_far():
@@ -182,17 +179,17 @@ def test_live_and_recorded_votes_end_alike():
     netlist = replace(netlist, classes=3, readout_class=read_only(np.arange(netlist.n_compartments) % 4 - 1))
     events = (np.random.default_rng(1).random((6, netlist.n_inputs, 40)) < 0.3).astype(np.uint8)
     lengths = np.full(6, 40)
-    votes = cumulative.votes_of(netlist, events, lengths)
+    machine = integer_machine_of(netlist)
+    votes, depth = cumulative.votes_of(netlist, events, lengths), machine.read_out_lag
     at = exits.standing(votes, lengths)
-    sure = exits.proven(votes, at, exits.most_votes(integer_machine_of(netlist), 40))
-    depth = integer_machine_of(netlist).read_out_lag
+    sure = exits.proven(votes, at, exits.most_votes(machine, 40))
     assert depth == 3
     for factor in (np.inf, 2.0, 0.0):
-        may_end = exits.live(integer_machine_of(netlist), 40, factor)
+        may_end = exits.live(machine, 40, factor)
         assert not may_end(depth - 1, votes[0, 0])
         for i, end in enumerate(exits.exits(sure, at, factor)):
-            told = [may_end(step + depth, votes[i, step]) for step in range(40)]
-            assert told.index(True) == end
+            ended = [may_end(step + depth, votes[i, step]) for step in range(40)]
+            assert ended.index(True) == end
 
 
 @pytest.mark.recordings
@@ -210,21 +207,6 @@ def test_no_recording_is_decided_otherwise_by_proof(which, split, shipped_netlis
     counts = engine.simulate(netlist, with_clocks(data.events, netlist.clocks)).counts.spikes
     assert_array_equal(at.decision, predictions(netlist, counts))
     assert ends.mean() < 0.95 * data.steps
-
-
-@pytest.mark.parametrize(("which", "classes"), [("objects", 36), ("containers", 20)])
-def test_the_last_layer_alone_allows_no_earlier_proof(which, classes, shipped_netlists):
-    network = lift(shipped_netlists[which])
-    weight = sum(p.effective().toarray() for p in network.projections if p.post == 3)
-    last = network.populations[3]
-    bias, overturned = last.bias / 64, 0
-    for leader in range(classes):
-        for rival in set(range(classes)) - {leader}:
-            spikes = (weight[rival] > 0) & (weight[leader] <= 0)
-            always = weight[rival, spikes].sum() + bias[rival] > last.threshold[rival]
-            never = weight[leader, spikes].sum() + bias[leader] <= 0
-            overturned += bool(always and never)
-    assert overturned == classes * (classes - 1)
 
 
 @pytest.fixture(scope="module")

@@ -104,7 +104,7 @@ def test_spikes_lie_where_the_chip_fires_them():
     assert_array_equal(found.packed, trace.packed)
 
 
-def test_neurons_that_the_chip_leaves_out_are_counted_where_they_are_heard():
+def test_neurons_that_the_chip_leaves_out_are_counted_elsewhere():
     network = lively(seed=2)
     netlist = compile_network(network).netlist
     first = netlist.compartments_of(0)
