@@ -1,6 +1,6 @@
 """The meaning of the intermediate representation: layer by layer over all time steps.
 
-One matrix product per projection, then the recurrence. A population that hears itself takes a further product in each
+One matrix product per projection, then the recurrence. A recurrent population takes a further product in each
 step: what it fired in the step before arrives together with what others send. The integer stage is exact: products run
 in floating point only where every partial sum is an integer that the type holds (below 2**24 in float32, 2**53 in
 float64).
@@ -116,8 +116,8 @@ def float_recurrence(
 ) -> tuple[BoolArray, Floating | None]:
     """LIF of the definition in :class:`ir.Population` on given synaptic sums, in their type.
 
-    `sums` is overwritten. `own` (neurons, neurons), of the same type, is from each neuron (row) of a population that
-    hears itself to each.
+    `sums` is overwritten. `own` (neurons, neurons), of the same type, is from each neuron (row) of a recurrent
+    population to each.
     """
     bias = population.bias.astype(sums.dtype)
     current = lasting_currents(sums, population.alpha) if population.alpha and own is None else sums

@@ -481,7 +481,7 @@ def test_released_style_files_on_the_command_line(data, capsys, system):
     [
         (
             "--system mlp --graph manual",
-            "--graph: is for taxel graphs, an MLP has none; leave it away",
+            "--graph: is for taxel graphs, an MLP has none; omit it",
         ),
         ("--system gcn", "train: no graph; name it with --graph: "),
         ("--system mlp --padding same", "--padding: is for grid-cnn, an MLP has no window; omit it"),

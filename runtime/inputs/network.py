@@ -145,7 +145,7 @@ def _require_fit(path: str, suffix: str | None, arguments: argparse.Namespace) -
         layout = {"--polarities": arguments.polarities, "--polarities-first or -last": arguments.polarities_first}
         for option, value in layout.items():
             if value is not None:
-                raise OptionError(f"{option}: is for ONNX and NIR files, {path} is none; leave it away")
+                raise OptionError(f"{option}: is for ONNX and NIR files, {path} is none; omit it")
     else:
         for name in ("system", "graph", "taxels", "edges", "directed", "weights", "beta", "theta", "run"):
             if getattr(arguments, name) not in (None, False, 0):
@@ -155,7 +155,7 @@ def _require_fit(path: str, suffix: str | None, arguments: argparse.Namespace) -
     if suffix != NIR:
         for name in ("dt", "convention"):
             if getattr(arguments, name) is not None:
-                raise OptionError(f"--{name}: is for NIR files, {path} is none; leave it away")
+                raise OptionError(f"--{name}: is for NIR files, {path} is none; omit it")
 
 
 def load_graph(arguments: argparse.Namespace, system: str = TACTILESGNET) -> Graph | None:
@@ -169,7 +169,7 @@ def load_graph(arguments: argparse.Namespace, system: str = TACTILESGNET) -> Gra
     if system not in GRAPH_SYSTEMS:
         for option in ("graph", "edges", "directed"):
             if getattr(arguments, option):
-                raise OptionError(f"--{option}: is for taxel graphs, {TITLES[system]} has none; leave it away")
+                raise OptionError(f"--{option}: is for taxel graphs, {TITLES[system]} has none; omit it")
         return None
     if not (arguments.graph or arguments.taxels or arguments.edges or arguments.directed):
         return None

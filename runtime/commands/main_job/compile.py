@@ -5,11 +5,11 @@ from __future__ import annotations
 import argparse
 import sys
 
-from spikeloom.compiler import Compilation, Options, compile_network, write_netlist
+from spikeloom.compiler import DEFAULT_TARGET, GOALS, MARGIN, Compilation, Options, compile_network, write_netlist
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.layout.choose import require_goal
-from spikeloom.compiler.targets.loihi1.options import GOALS, MARGIN, RANGES
+from spikeloom.compiler.targets.loihi1.options import RANGES
 from spikeloom.runtime.commands.main_job.integers import brings_integers, compile_integers
 from spikeloom.runtime.commands.options import add_bin_option, add_network
 from spikeloom.runtime.inputs.compilation import margin_of, parse_cores, parse_recipes, provenance
@@ -26,7 +26,9 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     """Add the options."""
     sub.add_argument("checkpoint", help="checkpoint, or a network as an ONNX, NIR or netx file")
     add_network(sub)
-    sub.add_argument("--target", default="loihi1", help="chip: loihi1 (default), or truenorth, to hear why not")
+    sub.add_argument(
+        "--target", default=DEFAULT_TARGET, help=f"chip: {DEFAULT_TARGET} (default), or truenorth, to hear why not"
+    )
     sub.add_argument(
         "--weight-bits",
         metavar="N[,N]",
@@ -39,7 +41,7 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
         action="store_true",
         help="add planes and scales until the training spikes are the float model's",
     )
-    sub.add_argument("--keep-all", action="store_true", help="keep neurons that provably never fire or are never heard")
+    sub.add_argument("--keep-all", action="store_true", help="keep neurons that never fire or that no neuron receives")
     sub.add_argument(
         "--prune-unused", action="store_true", help="leave out neurons that never fired on the training split, too"
     )
