@@ -26,9 +26,7 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     """Add the options."""
     sub.add_argument("checkpoint", help="checkpoint, or a network as an ONNX, NIR or netx file")
     add_network(sub)
-    sub.add_argument(
-        "--target", default=DEFAULT_TARGET, help=f"chip: {DEFAULT_TARGET} (default), or truenorth, to hear why not"
-    )
+    sub.add_argument("--target", default=DEFAULT_TARGET, help=f"chip: {DEFAULT_TARGET} (default), or truenorth")
     sub.add_argument(
         "--weight-bits",
         metavar="N[,N]",
