@@ -12,7 +12,15 @@ if TYPE_CHECKING:
     from spikeloom.compiler.targets.loihi1.lift import lift
     from spikeloom.compiler.targets.loihi1.netlist import Netlist
     from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist, write_netlist
-    from spikeloom.compiler.targets.loihi1.options import GOALS, MARGIN, MAX_PLANES, Options, Recipe, check_recipes
+    from spikeloom.compiler.targets.loihi1.options import (
+        GOALS,
+        MARGIN,
+        MAX_PLANES,
+        RANGES,
+        Options,
+        Recipe,
+        check_recipes,
+    )
     from spikeloom.compiler.targets.loihi1.passes import lay_out_again, store, without
     from spikeloom.compiler.targets.loihi1.storage.quantize import round_to_forms
     from spikeloom.compiler.targets.loihi1.storage.width_search import (
@@ -27,6 +35,7 @@ __all__ = [
     "GOALS",
     "MARGIN",
     "MAX_PLANES",
+    "RANGES",
     "Compilation",
     "Netlist",
     "Options",
@@ -53,6 +62,7 @@ _PLACES = {
     "GOALS": "options",
     "MARGIN": "options",
     "MAX_PLANES": "options",
+    "RANGES": "options",
     "Compilation": "compilation",
     "Netlist": "netlist",
     "Options": "options",

@@ -1,6 +1,7 @@
 """Slow and simple definitions that the product is held against."""
 
 import numpy as np
+import pytest
 
 
 def probed(stage, channels):
@@ -27,3 +28,13 @@ def weight_differences(first, second):
         name = first.populations[post].name
         found += [(name, int(i), int(j), int(one[i, j]), int(other[i, j])) for i, j in zip(row, column, strict=True)]
     return found
+
+
+def refused(error, words, call, *given, **options):
+    """Check that a call raises `error` and that its message holds each of the words, separated by ``|``."""
+    with pytest.raises(error) as caught:
+        call(*given, **options)
+    message = str(caught.value)
+    for word in words.split("|"):
+        assert word in message
+    return message

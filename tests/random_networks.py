@@ -13,6 +13,7 @@ from spikeloom.compiler.checkpoint import Checkpoint, Dense
 from spikeloom.compiler.dynamics import PLAIN
 from spikeloom.compiler.errors import CapacityError
 from spikeloom.compiler.fixedpoint import weight_step
+from spikeloom.compiler.interpret import run_integer
 from spikeloom.compiler.ir import (
     INPUT,
     Input,
@@ -27,6 +28,7 @@ from spikeloom.compiler.ir import (
 from spikeloom.compiler.targets.base import Quantity, Target, load_target
 from spikeloom.compiler.targets.loihi1.emit import emit
 from spikeloom.compiler.targets.loihi1.layout.partition import partition
+from spikeloom.models.graphs import normalised_adjacency
 
 LOIHI = load_target("loihi1")
 """The chip that most tests compile for."""
@@ -109,6 +111,13 @@ def integer_chain(*weights, bits=8, exponent=0, thresholds=None, polarities=1) -
         readout=Readout(population=len(weights) - 1, label=np.arange(len(weights[-1]))),
         classes=len(weights[-1]),
     )
+
+
+def ring(taxels):
+    """Normalised adjacency of taxels in a circle."""
+    source = np.arange(taxels)
+    edges = np.stack([source, (source + 1) % taxels], axis=1)
+    return normalised_adjacency(np.concatenate([edges, edges[:, ::-1]]), taxels)
 
 
 def random_checkpoint(*, taxels=5, features=3, hops=4, sizes=(6, 5, 4), seed=0, beta=0.2, theta=0.5) -> Checkpoint:
@@ -260,10 +269,14 @@ def dense_weights(network: IntegerNetwork, post: int) -> dict[int, np.ndarray]:
     return found
 
 
-def compiled(network, target=LOIHI):
+def compiled(network, target=LOIHI, provenance=None):
     """Netlist with core k on tile k."""
-    parts = partition(network, target)
-    return emit(network, parts, tuple(range(len(parts.cores))), target, {})
+    return seated(network, partition(network, target), target, provenance)
+
+
+def seated(network, parts, target=LOIHI, provenance=None):
+    """Netlist of a partition, with core k on tile k."""
+    return emit(network, parts, tuple(range(len(parts.cores))), target, provenance or {})
 
 
 def words_of_list(entries, weight_bits, index):
@@ -337,7 +350,21 @@ def roomy_targets(draw):
 
 
 def legal_partition(network, target):
+    """Partition of a network; gives up the example where it does not fit."""
     try:
         return partition(network, target)
     except CapacityError:
         assume(False)
+
+
+def moved(integer, calibration):
+    """Spikes of the calibration recordings that differ from float64."""
+    found = run_integer(integer, calibration.events).spikes
+    return sum(int(np.count_nonzero(a != b)) for a, b in zip(found, calibration.spikes, strict=True))
+
+
+def assert_same_layers(*runs):
+    """Spikes, layer by layer, are the same in every run."""
+    for layers in zip(*runs, strict=True):
+        for other in layers[1:]:
+            np.testing.assert_array_equal(other, layers[0])

@@ -17,26 +17,13 @@ from spikeloom.runtime.commands.choose import bits
 COMMAND = ("bits", "net.pt", "--calibrate", "data", "--widths", "2,4", "--samples", "9")
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture
 def place(tmp_path, monkeypatch):
     """A folder to work in, with recordings, a checkpoint and a cache of its own."""
-    monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("SPIKELOOM_DATA", str(tmp_path / "cache"))
     recordings_folder(tmp_path / "data", train=events(1, samples=12))
     own_file(tmp_path / "net.pt", last=weights(4))
     return tmp_path
-
-
-@pytest.fixture
-def spikeloom(capsys):
-    """Run a command; returns exit code, standard output and standard error."""
-
-    def command(*words):
-        capsys.readouterr()
-        code = cli.main([str(word) for word in words])
-        return code, *capsys.readouterr()
-
-    return command
 
 
 def refuse_search(*_, **__):
@@ -192,39 +179,6 @@ def test_the_printed_command_repeats_every_option():
     )
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (("--accuracy", "1.5"), "--accuracy 1.5: not a share; give a number from 0 to 1"),
-        (("--agreement", "nan"), "--agreement nan: not a share; give a number from 0 to 1"),
-        (("--agreement", "1", "--samples", "0"), "--samples 0: give 1 or more"),
-        (("--agreement", "1", "--top", "-1"), "--top -1: give 1 or more"),
-        (("--agreement", "1", "--widths", "two"), "--widths two: not a number; give widths as in 2,4,8"),
-        (
-            ("--agreement", "1", "--widths", "7"),
-            "--widths 7: Intel Loihi 1 does not store 7 bits; allowed: 2, 3, 4, 5, 6, 8",
-        ),
-        (("--agreement", "1", "-o", "nowhere/x.loom"), "-o nowhere/x.loom: the folder does not exist; make it first"),
-        (
-            ("--agreement", "1", "-o", "net.pt"),
-            "-o net.pt: is an input of this command (net.pt); give another name",
-        ),
-        ((), "one of the arguments --accuracy --agreement is required; see spikeloom bits --help"),
-    ],
-)
-def test_mistakes_take_one_line(spikeloom, words, message):
-    assert spikeloom(*COMMAND, *words) == (2, "", f"spikeloom: {message}\n")
-
-
-def test_a_netlist_has_no_widths_left(spikeloom):
-    assert spikeloom("compile", "net.pt", "-o", "net.loom")[0] == 0
-    assert spikeloom("bits", "net.loom", "--calibrate", "data", "--agreement", "1") == (
-        2,
-        "",
-        "spikeloom: net.loom: is a netlist, its widths are decided; give the checkpoint that it was made from\n",
-    )
-
-
 def test_accuracy_needs_labels_and_agreement_does_not(spikeloom, place):
     (place / "plain" / "train").mkdir(parents=True)
     rng = np.random.default_rng(3)
@@ -261,3 +215,29 @@ def test_released_recordings(spikeloom, objects_zip, released_checkpoint):
     assert report["recommended"]["weight_bits"] == [8, 8, 8, 8]
     assert report["recommended"]["agreement"] == 1.0
     assert (report["recordings"], report["of"]) == (12, 576)
+
+
+@pytest.mark.parametrize(
+    ("words", "telling"),
+    [
+        ("--accuracy 1.5", "--accuracy 1.5|from 0 to 1"),
+        ("--agreement nan", "--agreement nan|from 0 to 1"),
+        ("--agreement 1 --samples 0", "--samples 0|1 or more"),
+        ("--agreement 1 --top -1", "--top -1|1 or more"),
+        ("--agreement 1 --widths two", "--widths two|2,4,8"),
+        ("--agreement 1 --widths 7", "--widths 7|2, 3, 4, 5, 6, 8"),
+        ("--agreement 1 -o nowhere/x.loom", "-o nowhere/x.loom|folder"),
+        ("--agreement 1 -o net.pt", "-o net.pt|input"),
+        ("", "--accuracy --agreement is required"),
+    ],
+)
+def test_mistakes_take_one_line(spikeloom, words, telling):
+    code, out, err = spikeloom(*COMMAND, *words.split())
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert all(word in err for word in telling.split("|"))
+
+
+def test_a_netlist_has_no_widths_left(spikeloom):
+    assert spikeloom("compile", "net.pt", "-o", "net.loom")[0] == 0
+    code, _, err = spikeloom("bits", "net.loom", "--calibrate", "data", "--agreement", "1")
+    assert (code, "net.loom: is a netlist" in err) == (2, True)

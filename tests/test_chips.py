@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from oracles import refused
 from random_networks import LOIHI, integer_chain, small_target
 
 from spikeloom.compiler.errors import CapacityError, OptionError
 from spikeloom.compiler.formats import sanafe
-from spikeloom.compiler.passes.expand import expand_graph_convolution
 from spikeloom.compiler.targets.loihi1.emit import emit
 from spikeloom.compiler.targets.loihi1.layout.chips import chip_count, chip_of_core, place_on_chips, share
-from spikeloom.compiler.targets.loihi1.layout.choose import asked_cores, lay_out, require_goal
+from spikeloom.compiler.targets.loihi1.layout.choose import lay_out
 from spikeloom.compiler.targets.loihi1.layout.core_graph import core_map
 from spikeloom.compiler.targets.loihi1.layout.place import place
 from spikeloom.compiler.targets.loihi1.legalize import LimitUse, measure, require_legal
@@ -50,7 +50,7 @@ def recordings():
     return (np.random.default_rng(5).random((3, 6, 40)) < 0.5).astype(np.uint8)
 
 
-def test_a_network_takes_as_few_chips_as_hold_it(netlist):
+def test_a_network_takes_as_few_chips_as_hold_it(netlist, tmp_path):
     assert netlist.n_cores == 5
     chip = chip_of_core(netlist.core_tile, SMALL)
     assert np.bincount(chip).tolist() == [2, 2, 1]
@@ -58,27 +58,20 @@ def test_a_network_takes_as_few_chips_as_hold_it(netlist):
     assert len(set(netlist.core_tile.tolist())) == 5
     one, _ = lay_out(net(), LOIHI, chips=9)
     assert chip_count(np.array(one.placement.tiles), LOIHI) == 1
+    write_netlist(netlist, tmp_path / "net.loom")
+    assert read_netlist(tmp_path / "net.loom").core_tile.tolist() == netlist.core_tile.tolist()
 
 
 @pytest.mark.parametrize("chips", [1, 2])
 def test_too_few_chips(chips):
-    with pytest.raises(CapacityError) as caught:
-        lay_out(net(), SMALL, chips=chips)
-    assert str(caught.value) == (
-        f"{'chip' if chips == 1 else '2 chips'}: 5 used, {2 * chips} allowed (loihi1.chip.cores); "
-        "fewer neurons or weight bits, a sparser graph or more --chips"
-    )
+    words = f"{'chip' if chips == 1 else '2 chips'}: 5 used, {2 * chips} allowed (loihi1.chip.cores)|--chips"
+    refused(CapacityError, words, lay_out, net(), SMALL, chips=chips)
 
 
 def test_the_fullest_chip_is_measured(netlist):
-    full = LimitUse(name="chip.cores", used=2, allowed=2, core=None)
-    assert measure(netlist, SMALL)[-1] == full
+    assert measure(netlist, SMALL)[-1] == LimitUse(name="chip.cores", used=2, allowed=2, core=None)
     crowded = dataclasses.replace(netlist, core_tile=np.array([0, 1, 0, 2, 3]))
-    with pytest.raises(CapacityError) as caught:
-        require_legal(crowded, SMALL)
-    assert str(caught.value) == (
-        "chip: 3 used, 2 allowed (loihi1.chip.cores); fewer neurons or weight bits, a sparser graph or more --chips"
-    )
+    refused(CapacityError, "chip: 3 used, 2 allowed (loihi1.chip.cores)", require_legal, crowded, SMALL)
 
 
 def test_cores_that_talk_share_a_chip():
@@ -172,37 +165,13 @@ def test_the_report_says_what_is_not_modelled(netlist, recordings):
 
 
 def test_what_is_refused_of_several_chips(netlist, recordings):
-    end = (
-        "the netlist takes 3 chips, and links between chips are not modelled; use estimate --detail counts, or a "
-        "network that one chip holds"
-    )
-    with pytest.raises(OptionError) as caught:
-        estimate(netlist, SMALL, recordings, detail="cycle")
-    assert str(caught.value) == f"--detail cycle: {end}"
-    with pytest.raises(OptionError) as caught:
-        timing.prepare(netlist, SMALL, SMALL.time[0])
-    assert str(caught.value) == f"time: {end}"
-    for use in (lambda: sanafe.cores(netlist, SMALL), lambda: list(sanafe.export(netlist, SMALL))):
-        with pytest.raises(OptionError) as caught:
-            use()
-        assert str(caught.value) == f"--to sanafe: {end}"
-
-
-def test_options_that_make_no_sense():
-    for chips, goal, line in (
-        (0, "cores", "--chips 0: not a number of chips; give 1 or more"),
-        (2, "latency", "--optimize latency: links between chips are not modelled; leave --chips away"),
-        (2, "energy", "--optimize energy: links between chips are not modelled; leave --chips away"),
-    ):
-        with pytest.raises(OptionError) as caught:
-            require_goal(goal, None, LOIHI, calibrated=True, chips=chips)
-        assert str(caught.value) == line
-    with pytest.raises(OptionError) as caught:
-        asked_cores(net(), {"fc1": 7}, SMALL, 3)
-    assert str(caught.value) == (
-        "--cores-for fc1=7: 3 chips Intel Loihi 1 have 6 cores (loihi1.chip.cores); give 6 or fewer"
-    )
-    assert asked_cores(net(), {"fc1": 6}, SMALL, 3) == {0: 6}
+    for what, call in {
+        "--detail cycle": lambda: estimate(netlist, SMALL, recordings, detail="cycle"),
+        "time": lambda: timing.prepare(netlist, SMALL, SMALL.time[0]),
+        "--to sanafe": lambda: sanafe.cores(netlist, SMALL),
+        "--to sanafe: the netlist": lambda: list(sanafe.export(netlist, SMALL)),
+    }.items():
+        refused(OptionError, f"{what}|takes 3 chips|links between chips|--detail counts", call)
 
 
 def test_hops_between_chips_are_unknown_to_the_map(netlist):
@@ -211,23 +180,3 @@ def test_hops_between_chips_are_unknown_to_the_map(netlist):
     kinds = {chip[a] == chip[b]: edge["hops"] for a, b, edge in graph.edges(data=True) if a != "input"}
     assert kinds[False] is None
     assert kinds[True] == 1
-
-
-def test_a_netlist_on_several_chips_comes_back_whole(netlist, tmp_path):
-    write_netlist(netlist, tmp_path / "net.loom")
-    assert read_netlist(tmp_path / "net.loom").core_tile.tolist() == netlist.core_tile.tolist()
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_a_sparse_graph_expands_as_a_dense_one_does(seed):
-    from scipy import sparse
-
-    rng = np.random.default_rng(seed)
-    adjacency = np.where(rng.random((9, 9)) < 0.2, rng.normal(size=(9, 9)), 0.0)
-    hops = rng.normal(size=(4, 3, 2))
-    dense = expand_graph_convolution(adjacency, hops)
-    thin = expand_graph_convolution(sparse.csr_array(adjacency), hops)
-    assert thin.has_canonical_format
-    np.testing.assert_array_equal(thin.indptr, dense.indptr)
-    np.testing.assert_array_equal(thin.indices, dense.indices)
-    np.testing.assert_allclose(thin.data, dense.data, rtol=1e-12, atol=1e-14)

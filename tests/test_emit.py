@@ -10,6 +10,7 @@ from random_networks import (
     integer_networks,
     legal_partition,
     recordings_for,
+    seated,
     small_target,
     tight_targets,
 )
@@ -17,7 +18,6 @@ from random_networks import (
 from spikeloom.compiler import Recipe
 from spikeloom.compiler.interpret import run_integer
 from spikeloom.compiler.ir import INPUT, fan_in
-from spikeloom.compiler.targets.loihi1.emit import emit
 from spikeloom.compiler.targets.loihi1.legalize import require_legal
 from spikeloom.compiler.targets.loihi1.storage.quantize import quantize
 from spikeloom.runtime.machines.loihi1 import spec
@@ -28,7 +28,7 @@ from spikeloom.runtime.machines.loihi1.trace import aligned
 @given(integer_networks(), tight_targets())
 def test_the_netlist_holds_exactly_the_network(network, target):
     parts = legal_partition(network, target)
-    netlist = emit(network, parts, tuple(range(len(parts.cores))), target, {})
+    netlist = seated(network, parts, target)
     core_of_axon, core_of_compartment = [], []
     for core in range(netlist.n_cores):
         core_of_axon += [core] * int(np.diff(netlist.core_axons)[core])
@@ -81,7 +81,7 @@ def test_the_netlist_holds_exactly_the_network(network, target):
 @given(integer_networks(), tight_targets())
 def test_compartments_hold_the_registers_of_their_neurons(network, target):
     parts = legal_partition(network, target)
-    netlist = emit(network, parts, tuple(range(len(parts.cores))), target, {"seed": 1})
+    netlist = seated(network, parts, target, {"seed": 1})
     for index, population in enumerate(network.populations):
         ids = netlist.compartments_of(index)
         assert netlist.neuron[ids].tolist() == list(range(population.size))
@@ -111,7 +111,7 @@ def test_the_chip_spikes_like_the_network(data):
     network, _ = quantize(data.draw(float_networks()), LOIHI, recipes=(recipe,))
     target = data.draw(tight_targets())
     parts = legal_partition(network, target)
-    netlist = emit(network, parts, tuple(range(len(parts.cores))), target, {})
+    netlist = seated(network, parts, target)
     events = data.draw(recordings_for(network.input.size, samples=1))
     expected = run_integer(network, events, membranes=True)
     trace = spec.simulate(netlist, events[0].T)

@@ -2,14 +2,11 @@
 
 import numpy as np
 import pytest
-from random_networks import LOIHI, chain, random_checkpoint
+from random_networks import LOIHI, chain, moved
 
-from spikeloom.compiler import Options, Recipe, compile_network
-from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.interpret import run_integer
+from spikeloom.compiler import Recipe
 from spikeloom.compiler.invariants import verify
 from spikeloom.compiler.passes.calibrate import calibrate
-from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.loihi1.storage.quantize import quantize
 from spikeloom.compiler.targets.loihi1.storage.spike_exact import make_exact
 
@@ -20,13 +17,6 @@ def layer(seed, *, inputs=30, outputs=20, samples=40, outlier=0.0):
     weight[0, 0] = outlier
     network = chain(weight, rng.normal(0, 0.4, (5, outputs)))
     return network, calibrate(network, rng.random((samples, 30, inputs)) < 0.2)
-
-
-def moved(integer, calibration):
-    return sum(
-        int(np.count_nonzero(a != b))
-        for a, b in zip(run_integer(integer, calibration.events).spikes, calibration.spikes, strict=True)
-    )
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -66,27 +56,3 @@ def test_an_outlier_takes_another_plane():
     one, _ = quantize(network, LOIHI, calibration=calibration)
     assert moved(integer, calibration) < moved(one, calibration)
     assert found[0].tried[0][2] > found[0].flips
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({}, "--spike-exact: nothing to be exact on; give --calibrate"),
-        (
-            {"training_events": np.ones((2, 5, 2, 8), np.uint8), "ranges": "observed"},
-            "--spike-exact: needs proven ranges, --ranges says observed; omit --ranges",
-        ),
-        (
-            {"training_events": np.ones((2, 5, 2, 8), np.uint8), "recipes": (Recipe(planes=2),)},
-            "--spike-exact: finds planes and scales itself; give one width, no --planes or --scale-groups",
-        ),
-        (
-            {"training_events": np.ones((2, 5, 2, 8), np.uint8), "recipes": (Recipe(bits=7),)},
-            "--weight-bits 7: Intel Loihi 1 does not store that width; allowed: 2, 3, 4, 5, 6, 8",
-        ),
-    ],
-)
-def test_exactness_that_cannot_be_had(options, message):
-    with pytest.raises(OptionError) as caught:
-        compile_network(expand(random_checkpoint(), np.eye(5)), Options(spike_exact=True, **options))
-    assert str(caught.value) == message

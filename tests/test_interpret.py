@@ -65,27 +65,21 @@ def simulate_integer(network, events):
     return spikes, membranes
 
 
+@pytest.mark.parametrize(
+    ("networks", "run", "slowly"),
+    [
+        (float_networks(), run_float, simulate_float),
+        (integer_networks(exponents=(-1, 0, 1, 3, 7)), run_integer, simulate_integer),
+    ],
+)
 @settings(deadline=None)
-@given(st.data())
-def test_run_float_is_the_step_by_step_loop(data):
-    network = data.draw(float_networks())
+@given(data=st.data())
+def test_a_run_is_the_step_by_step_loop(networks, run, slowly, data):
+    network = data.draw(networks)
     events = data.draw(recordings_for(network.input.size))
-    activity = run_float(network, events, membranes=True)
+    activity = run(network, events, membranes=True)
     for sample in range(len(events)):
-        spikes, membranes = simulate_float(network, events[sample])
-        for post in range(len(network.populations)):
-            np.testing.assert_array_equal(activity.spikes[post][sample], spikes[post])
-            np.testing.assert_array_equal(activity.membranes[post][sample], membranes[post])
-
-
-@settings(deadline=None)
-@given(st.data())
-def test_run_integer_is_the_plain_integer_loop(data):
-    network = data.draw(integer_networks(exponents=(-1, 0, 1, 3, 7)))
-    events = data.draw(recordings_for(network.input.size))
-    activity = run_integer(network, events, membranes=True)
-    for sample in range(len(events)):
-        spikes, membranes = simulate_integer(network, events[sample])
+        spikes, membranes = slowly(network, events[sample])
         for post in range(len(network.populations)):
             np.testing.assert_array_equal(activity.spikes[post][sample], spikes[post])
             np.testing.assert_array_equal(activity.membranes[post][sample], membranes[post])

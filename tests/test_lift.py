@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from oracles import refused
 from random_netlists import Axon, Neuron, build
-from random_networks import dense_weights, integer_chain, integer_networks, recordings_for, small_target
+from random_networks import compiled, dense_weights, integer_chain, integer_networks, recordings_for, small_target
 
 from spikeloom.compiler import lift
 from spikeloom.compiler.errors import CapacityError, FormatError, NumericRangeError
@@ -15,8 +16,6 @@ from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.interpret import run_integer
 from spikeloom.compiler.invariants import verify
 from spikeloom.compiler.ir import INPUT, IntegerNetwork
-from spikeloom.compiler.targets.loihi1.emit import emit
-from spikeloom.compiler.targets.loihi1.layout.partition import partition
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.trace import aligned
@@ -26,9 +25,7 @@ MANY = settings(max_examples=120, deadline=None, derandomize=True)
 
 def lower(network: IntegerNetwork, **limits: int) -> Netlist:
     """Netlist of a network on cores of these limits."""
-    target = small_target(**limits)
-    parts = partition(network, target)
-    return emit(network, parts, tuple(range(len(parts.cores))), target, {})
+    return compiled(network, small_target(**limits))
 
 
 def assert_same_network(found: IntegerNetwork, expected: IntegerNetwork) -> None:
@@ -110,14 +107,10 @@ def netlist_of(*neurons: Neuron) -> Netlist:
 @pytest.mark.parametrize("field", ["decay_u", "decay_v"])
 def test_different_decays_in_a_layer_are_refused(field):
     netlist = netlist_of(Neuron(), Neuron(**{field: 7}), Neuron(layer=1))
-    with pytest.raises(FormatError) as failure:
-        lift(netlist)
-    assert str(failure.value) == f"layer layer0: has 2 values of {field}, one is allowed; compile it again"
+    refused(FormatError, f"layer0|2 values of {field}", lift, netlist)
 
 
 @pytest.mark.parametrize(("votes", "layers"), [([-1, -1], 0), ([0, 0], 2)])
 def test_one_layer_votes(votes, layers):
     netlist = dataclasses.replace(netlist_of(Neuron(), Neuron(layer=1)), readout_class=read_only(votes))
-    with pytest.raises(FormatError) as failure:
-        lift(netlist)
-    assert str(failure.value) == f"netlist: {layers} layers vote for classes, one is allowed; compile it again"
+    refused(FormatError, f"{layers} layers vote", lift, netlist)

@@ -1,10 +1,10 @@
 import dataclasses
-import time
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
+from oracles import refused
 from random_networks import (
     LOIHI,
     compiled,
@@ -14,6 +14,7 @@ from random_networks import (
     integer_population,
     legal_partition,
     roomy_targets,
+    seated,
     small_target,
     stored,
     tight_targets,
@@ -22,12 +23,9 @@ from random_networks import (
 
 from spikeloom.compiler.errors import CapacityError
 from spikeloom.compiler.ir import INPUT, Input, IntegerNetwork, IntegerProjection, Readout
-from spikeloom.compiler.targets.loihi1.emit import emit
 from spikeloom.compiler.targets.loihi1.layout.core_needs import Chunk, index_bits
 from spikeloom.compiler.targets.loihi1.layout.partition import Partition, partition
-from spikeloom.compiler.targets.loihi1.legalize import LimitUse, list_words, measure, require_legal
-
-MIXED = [8, 6, 4, 2]
+from spikeloom.compiler.targets.loihi1.legalize import REMEDIES, LimitUse, list_words, measure, require_legal
 
 
 def sizes(parts):
@@ -155,11 +153,8 @@ def test_projections_of_one_format_share_its_slot():
 def test_seven_formats_fit_a_core_and_eight_do_not():
     netlist = compiled(fan_in_of_formats(range(7)))
     assert (netlist.n_cores, len(netlist.format_exponent)) == (1, 7)
-    with pytest.raises(CapacityError) as caught:
-        partition(fan_in_of_formats(range(-1, 7)), LOIHI)
-    assert str(caught.value) == (
-        "fc1 neuron 0: 8 used, 7 allowed (loihi1.core.synapse_formats); fewer different weight formats on the core"
-    )
+    words = "fc1 neuron 0: 8 used, 7 allowed (loihi1.core.synapse_formats)"
+    refused(CapacityError, words, partition, fan_in_of_formats(range(-1, 7)), LOIHI)
 
 
 def test_index_widths_count_as_formats():
@@ -184,7 +179,7 @@ def test_index_widths_count_as_formats():
 @given(integer_networks(), tight_targets())
 def test_every_limit_is_kept(network, target):
     parts = legal_partition(network, target)
-    netlist = emit(network, parts, tuple(range(len(parts.cores))), target, {})
+    netlist = seated(network, parts, target)
     used = counted(netlist)
     for core, uses in enumerate(used):
         for rule, amount in uses.items():
@@ -197,18 +192,6 @@ def test_every_limit_is_kept(network, target):
     cores = LimitUse(name="chip.cores", used=netlist.n_cores, allowed=128, core=None)
     assert measure(netlist, target) == (*per_core, cores)
     assert require_legal(netlist, target) == measure(netlist, target)
-
-
-@settings(deadline=None, max_examples=60)
-@given(integer_networks(), tight_targets())
-def test_every_neuron_sits_on_one_core(network, target):
-    parts = legal_partition(network, target)
-    chunks = [chunk for core in parts.cores for chunk in core]
-    seated = [(chunk.population, neuron) for chunk in chunks for neuron in range(chunk.first, chunk.last)]
-    expected = [(i, n) for i, population in enumerate(network.populations) for n in range(population.size)]
-    assert sorted(seated) == expected
-    assert parts.bound <= len(parts.cores)
-    assert partition(network, target).cores == parts.cores
 
 
 def groupings(items):
@@ -235,7 +218,7 @@ def test_no_grouping_of_the_chunks_needs_fewer_cores(network, target):
         """Whether these chunks keep every limit on one core; each other chunk sits alone."""
         if frozenset(group) not in known:
             cores = (tuple(group), *((chunk,) for chunk in chunks if chunk not in group))
-            netlist = emit(network, Partition(cores=cores, bound=0), tuple(range(len(cores))), target, {})
+            netlist = seated(network, Partition(cores=cores, bound=0), target)
             used = counted(netlist)[0]
             known[frozenset(group)] = all(amount <= target.limit(rule) for rule, amount in used.items())
         return known[frozenset(group)]
@@ -256,36 +239,7 @@ def test_among_equal_packings_the_one_with_least_traffic_is_taken():
     assert sizes(partition(network, target, rates(0.1, 0.9))) == [[(0, 0, 3)], [(1, 0, 3), (2, 0, 3)]]
 
 
-def test_packing_of_ten_chunks_takes_no_time():
-    """Any two of ten layers fit a core, no three do: the worst case of the exhaustive search."""
-    network = integer_chain(*[np.full((3, 3), 2)] * 10)
-    start = time.perf_counter()
-    parts = partition(network, small_target(core_compartments=6))
-    assert len(parts.cores) == 5
-    assert time.perf_counter() - start < 5
-
-
-def test_many_chunks_are_packed_by_first_fit():
-    network = integer_chain(*[np.full((3, 3), 2)] * 12)
-    parts = partition(network, small_target(core_compartments=6))
-    assert len(parts.cores) == parts.bound == 6
-
-
-# --- networks that do not fit
-
-
-def refused(network, target=LOIHI):
-    with pytest.raises(CapacityError) as caught:
-        partition(network, target)
-    return str(caught.value)
-
-
-def test_4096_inputs_fit_and_4097_do_not():
-    assert len(partition(integer_chain(np.full((1, 4096), 2)), LOIHI).cores) == 1
-    assert refused(integer_chain(np.full((1, 4097), 2))) == (
-        "fc1 neuron 0: 4097 used, 4096 allowed (loihi1.core.axons_in); "
-        "fewer inputs to the layer: fewer features, taxels or a grouped layer"
-    )
+# --- what does not fit
 
 
 def test_inputs_of_weight_zero_need_no_axon():
@@ -296,112 +250,45 @@ def test_inputs_of_weight_zero_need_no_axon():
     assert len(partition(dataclasses.replace(network, projections=(kept,)), LOIHI).cores) == 1
 
 
-def test_every_violation_of_a_neuron_is_listed():
-    assert refused(integer_chain(np.full((1, 16385), 2))) == (
-        "fc1 neuron 0: 16385 used, 4096 allowed (loihi1.core.axons_in); "
-        "fewer inputs to the layer: fewer features, taxels or a grouped layer\n"
-        "fc1 neuron 0: 16385 used, 16384 allowed (loihi1.core.synapse_words); "
-        "fewer weight bits, fewer synapses or more cores"
-    )
-
-
 def test_the_neuron_that_breaks_a_rule_most_is_named():
     weights = np.full((4, 9), 2)
     weights[0, 5:] = weights[1, 2:] = weights[3, 7:] = 0
-    assert refused(integer_chain(weights), small_target(core_axons_in=4)) == (
-        "fc1 neuron 2: 9 used, 4 allowed (loihi1.core.axons_in); "
-        "fewer inputs to the layer: fewer features, taxels or a grouped layer"
-    )
-
-
-def test_every_layer_that_does_not_fit_is_listed():
-    network = integer_chain(np.full((3, 6), 2), np.full((5, 3), 2), np.full((1, 5), 2))
-    assert refused(network, small_target(core_axons_in=4)) == (
-        "fc1 neuron 0: 6 used, 4 allowed (loihi1.core.axons_in); "
-        "fewer inputs to the layer: fewer features, taxels or a grouped layer\n"
-        "fc3 neuron 0: 5 used, 4 allowed (loihi1.core.axons_in); "
-        "fewer inputs to the layer: fewer features, taxels or a grouped layer"
-    )
-
-
-def test_a_neuron_that_feeds_too_many_cores():
-    network = integer_chain([[2]], np.full((5, 1), 2))
-    assert len(partition(network, small_target(core_axons_out=5, core_compartments=1)).cores) == 6
-    assert refused(network, small_target(core_axons_out=4, core_compartments=1)) == (
-        "fc1 neuron 0: 5 used, 4 allowed (loihi1.core.axons_out); "
-        "split the layers that it feeds over fewer cores, or this one over more"
-    )
-
-
-def test_a_neuron_with_too_many_words():
-    network = integer_chain(np.full((1, 5), 2))
-    assert refused(network, small_target(core_synapse_words=4)) == (
-        "fc1 neuron 0: 5 used, 4 allowed (loihi1.core.synapse_words); fewer weight bits, fewer synapses or more cores"
-    )
-
-
-@pytest.mark.parametrize(
-    ("rule", "remedy"),
-    [
-        ("compartments", "split the layer over more cores"),
-        ("threshold_slots", "fewer different thresholds on the core"),
-        ("compartment_configs", "fewer different decays on the core"),
-    ],
-)
-def test_a_core_that_holds_nothing(rule, remedy):
-    message = f"fc1 neuron 0: 1 used, 0 allowed (loihi1.core.{rule}); {remedy}"
-    assert refused(integer_chain([[2]]), small_target(**{f"core_{rule}": 0})) == message
-
-
-def test_a_network_that_needs_too_many_cores():
-    network = integer_chain(np.full((129 * 1024, 1), 2))
-    assert refused(network) == (
-        "chip: 129 used, 128 allowed (loihi1.chip.cores); fewer neurons or weight bits, a sparser graph or more --chips"
-    )
-    assert len(partition(integer_chain(np.full((128 * 1024, 1), 2)), LOIHI).cores) == 128
+    words = "fc1 neuron 2: 9 used, 4 allowed (loihi1.core.axons_in)"
+    refused(CapacityError, words, partition, integer_chain(weights), small_target(core_axons_in=4))
 
 
 def test_an_illegal_netlist_is_refused_with_every_violation():
     network = integer_chain(np.full((4, 3), 2), np.full((2, 4), 2), thresholds=[[1, 2, 3, 4], 5])
-    netlist = compiled(network)
-    target = small_target(
-        core_compartments=5,
-        core_axons_in=6,
-        core_axons_out=3,
-        core_synapse_words=6,
-        core_threshold_slots=4,
-        core_synapse_formats=0,
-        core_compartment_configs=0,
-        chip_cores=0,
-    )
+    used = {
+        "core.compartments": 6,
+        "core.axons_in": 7,
+        "core.axons_out": 4,
+        "core.synapse_words": 7,
+        "core.threshold_slots": 5,
+        "core.synapse_formats": 1,
+        "core.compartment_configs": 1,
+        "chip.cores": 1,
+    }
+    target = small_target(**{rule.replace(".", "_", 1): amount - 1 for rule, amount in used.items()})
     with pytest.raises(CapacityError) as caught:
-        require_legal(netlist, target)
-    assert str(caught.value).splitlines() == [
-        "core 0 (fc1, fc2): 6 used, 5 allowed (loihi1.core.compartments); split the layer over more cores",
-        "core 0 (fc1, fc2): 7 used, 6 allowed (loihi1.core.axons_in); fewer inputs to the layer: fewer features, "
-        "taxels or a grouped layer",
-        "core 0 (fc1, fc2): 4 used, 3 allowed (loihi1.core.axons_out); split the layers that it feeds over fewer "
-        "cores, or this one over more",
-        "core 0 (fc1, fc2): 7 used, 6 allowed (loihi1.core.synapse_words); fewer weight bits, fewer synapses or more "
-        "cores",
-        "core 0 (fc1, fc2): 5 used, 4 allowed (loihi1.core.threshold_slots); fewer different thresholds on the core",
-        "core 0 (fc1, fc2): 1 used, 0 allowed (loihi1.core.synapse_formats); fewer different weight formats on the "
-        "core",
-        "core 0 (fc1, fc2): 1 used, 0 allowed (loihi1.core.compartment_configs); fewer different decays on the core",
-        "chip: 1 used, 0 allowed (loihi1.chip.cores); fewer neurons or weight bits, a sparser graph or more --chips",
-    ]
-    assert [violation.rule for violation in caught.value.violations][:2] == [
-        "loihi1.core.compartments",
-        "loihi1.core.axons_in",
-    ]
+        require_legal(compiled(network), target)
+    lines = str(caught.value).splitlines()
+    for line, (rule, amount) in zip(lines, used.items(), strict=True):
+        where = "chip" if rule == "chip.cores" else "core 0 (fc1, fc2)"
+        assert line == f"{where}: {amount} used, {amount - 1} allowed (loihi1.{rule}); {REMEDIES[rule]}"
+    assert [violation.rule for violation in caught.value.violations] == [f"loihi1.{rule}" for rule in used]
 
 
 def test_a_dense_list_that_starts_too_high_is_refused():
     network = integer_chain(np.full((300, 1), 2), np.full((40, 300), 2))
     cores = ((Chunk(population=0, first=0, last=300), Chunk(population=1, first=0, last=40)),)
-    netlist = emit(network, Partition(cores=cores, bound=1), (0,), small_target(core_dense_base=400), {})
-    with pytest.raises(CapacityError) as caught:
-        require_legal(netlist, LOIHI)
-    assert str(caught.value) == (
-        "core 0 (fc1, fc2): 300 used, 256 allowed (loihi1.core.dense_base); place the dense layer first on its core"
-    )
+    netlist = seated(network, Partition(cores=cores, bound=1), small_target(core_dense_base=400))
+    words = "core 0 (fc1, fc2): 300 used, 256 allowed (loihi1.core.dense_base)"
+    refused(CapacityError, words, require_legal, netlist, LOIHI)
+
+
+@pytest.mark.parametrize(("layers", "cores"), [(10, 5), (12, 6)])
+def test_any_two_of_many_layers_fit_a_core_and_no_three_do(layers, cores):
+    """The worst case of the exhaustive search; more chunks are packed by first fit."""
+    parts = partition(integer_chain(*[np.full((3, 3), 2)] * layers), small_target(core_compartments=6))
+    assert len(parts.cores) == parts.bound == cores

@@ -5,10 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from random_networks import random_checkpoint
+from oracles import refused
+from random_networks import assert_same_layers, random_checkpoint, ring
 
 from spikeloom.compiler import Options, Recipe, compile_network, lift, targets
-from spikeloom.compiler.errors import DataError, ModelError, OptionError, VerifyError
+from spikeloom.compiler.errors import OptionError, VerifyError
 from spikeloom.compiler.interpret import channels_last, run_float, run_integer, vote
 from spikeloom.compiler.ir import fan_in
 from spikeloom.compiler.passes.expand import Factored, expand
@@ -24,12 +25,6 @@ from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.models.recordings.evtouch import load_recordings
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.trace import aligned, comparable
-
-
-def ring(taxels):
-    source = np.arange(taxels)
-    edges = np.stack([source, (source + 1) % taxels], axis=1)
-    return normalised_adjacency(np.concatenate([edges, edges[:, ::-1]]), taxels)
 
 
 def grasps(samples=6, *, taxels=5, steps=40, seed=0):
@@ -152,18 +147,14 @@ def test_a_layout_changes_no_spike(options):
     assert tuple(done.netlist.core_tile) == done.layout.placement.tiles
     batch = events.reshape(len(events), -1, events.shape[-1])
     traces = [(c.netlist, engine.simulate(c.netlist, batch, spikes=True).spikes) for c in (usual, done)]
-    for layer in range(4):
-        np.testing.assert_array_equal(*(aligned(netlist, spikes, layer) for netlist, spikes in traces))
+    assert_same_layers(*([aligned(netlist, spikes, layer) for layer in range(4)] for netlist, spikes in traces))
 
 
 def test_what_is_left_out_is_not_counted_among_the_neurons_of_a_layer():
-    kept = compile_network(expand(random_checkpoint(seed=4), ring(5)), Options(cores_for={"conv1": 2}))
-    held = int(np.count_nonzero(kept.netlist.layer == 0))
-    with pytest.raises(OptionError) as caught:
-        compile_network(expand(random_checkpoint(seed=4), ring(5)), Options(cores_for={"conv1": held + 1}))
-    assert str(caught.value) == (
-        f"--cores-for conv1={held + 1}: conv1 has {held} neurons on the chip; give {held} or fewer"
-    )
+    network = expand(random_checkpoint(seed=4), ring(5))
+    held = np.count_nonzero(compile_network(network, Options(cores_for={"conv1": 2})).netlist.layer == 0)
+    words = f"--cores-for conv1={held + 1}|{held} neurons on the chip|{held} or fewer"
+    refused(OptionError, words, compile_network, network, Options(cores_for={"conv1": held + 1}))
 
 
 @pytest.mark.parametrize("bits", [2, 5, 8])
@@ -188,9 +179,7 @@ def test_the_file_means_the_integer_network(tmp_path):
     events = channels_last(grasps(seed=9))
     expected = run_integer(done.integer, events, membranes=True)
     found = run_integer(lift(read_netlist(tmp_path / "a.loom")), events, membranes=True)
-    for layer in range(4):
-        np.testing.assert_array_equal(found.spikes[layer], expected.spikes[layer])
-        np.testing.assert_array_equal(found.membranes[layer], expected.membranes[layer])
+    assert_same_layers(found.spikes + found.membranes, expected.spikes + expected.membranes)
 
 
 def test_the_proof_covers_the_netlist():
@@ -200,44 +189,6 @@ def test_the_proof_covers_the_netlist():
     for layer, proof in enumerate(done.proofs):
         ids = done.netlist.compartments_of(layer)
         assert proof.accumulator == 64 * max(positive[ids].max(), negative[ids].max())
-
-
-def test_observed_ranges_need_recordings():
-    with pytest.raises(OptionError) as caught:
-        compile_network(expand(random_checkpoint(), ring(5)), Options(ranges="observed"))
-    assert str(caught.value) == ("--ranges observed: nothing was observed; give --calibrate, or use --ranges proven")
-
-
-@pytest.mark.parametrize("margin", [-0.1, np.inf, np.nan])
-def test_a_margin_that_is_no_share(margin):
-    with pytest.raises(OptionError) as caught:
-        compile_network(
-            expand(random_checkpoint(), ring(5)), Options(training_events=grasps(), ranges="observed", margin=margin)
-        )
-    assert str(caught.value) == f"--margin {margin:g}: is no share to add to a range; give a number from 0"
-
-
-def test_an_unknown_target():
-    with pytest.raises(OptionError) as caught:
-        compile_network(expand(random_checkpoint(), ring(5)), target="loihi2")
-    assert (
-        str(caught.value) == "--target loihi2: not modelled; no public per-event energies; allowed: loihi1, truenorth"
-    )
-
-
-def test_an_empty_split():
-    with pytest.raises(DataError) as caught:
-        compile_network(expand(random_checkpoint(), ring(5)), Options(training_events=grasps(0)))
-    assert str(caught.value) == "calibration: the split is empty; give recordings with a train split"
-
-
-def test_another_graph():
-    with pytest.raises(ModelError) as caught:
-        compile_network(expand(random_checkpoint(taxels=5), ring(4)))
-    assert str(caught.value) == (
-        "graph and weights disagree: the graph has 4 taxels, fc1 was trained on 5; "
-        "give the graph that the checkpoint was trained on"
-    )
 
 
 # --- the released checkpoint

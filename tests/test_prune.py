@@ -1,17 +1,25 @@
 """What provably does nothing is left out, and nothing else."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_files import events, small_checkpoint
-from random_networks import chain, float_networks, integer_networks, random_checkpoint, recordings_for
+from random_networks import (
+    assert_same_layers,
+    chain,
+    float_networks,
+    integer_networks,
+    random_checkpoint,
+    recordings_for,
+)
 
 from spikeloom.compiler import Options, compile_network, lift
-from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.interpret import channels_last, run_float, run_integer
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.passes.prune import compact, disconnect, either, never_fires, none_of, removable
+from spikeloom.compiler.passes.prune import compact, disconnect, either, never_fires, removable
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist, write_netlist
 from spikeloom.runtime.equivalence.verify import verify
 from spikeloom.runtime.machines.loihi1 import engine, spec
@@ -27,9 +35,7 @@ def test_what_never_fires_never_fires(network, data):
         for mask, spikes in zip(silent, run_float(network, recordings, dtype=dtype).spikes, strict=True):
             assert not spikes[..., mask].any()
     assert not silent[network.readout.population].any()
-    left = run_float(disconnect(network, silent), recordings).spikes
-    for ours, theirs in zip(left, run_float(network, recordings).spikes, strict=True):
-        np.testing.assert_array_equal(ours, theirs)
+    assert_same_layers(*(run_float(each, recordings).spikes for each in (disconnect(network, silent), network)))
 
 
 @settings(deadline=None, max_examples=120)
@@ -90,8 +96,6 @@ def test_neurons_that_none_of_hears_are_not_compared(tmp_path):
     checkpoint, adjacency = small_checkpoint(tmp_path)
     weak = checkpoint.dense[0].weight.copy()
     weak[:, :3] *= 1e-6
-    from dataclasses import replace
-
     changed = replace(checkpoint, dense=(replace(checkpoint.dense[0], weight=weak), *checkpoint.dense[1:]))
     compilation = compile_network(expand(changed, adjacency))
     netlist, labels = compilation.netlist, np.zeros(6, np.int64)
@@ -111,14 +115,3 @@ def test_pruning_by_evidence_is_asked_for(tmp_path):
     assert sum(r.unused for r in plain.removals) == 0
     assert sum(r.unused for r in fewer.removals) > 0
     assert fewer.netlist.n_compartments < plain.netlist.n_compartments
-    for options in ({}, {"training_events": quiet, "keep_all": True}):
-        with pytest.raises(OptionError) as caught:
-            compile_network(expand(checkpoint, adjacency), Options(prune_unused=True, **options))
-        assert str(caught.value) == (
-            "--prune-unused: needs --calibrate, and neither --keep-all nor a fine-tuned checkpoint; change the options"
-        )
-
-
-def test_none_of_is_none_of():
-    network = chain([[1.0]])
-    assert [mask.tolist() for mask in none_of(network)] == [[False]]

@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 from random_networks import BITS, LOIHI, chain, dense_weights, float_networks, recordings_for
 
 from spikeloom.compiler import Recipe
-from spikeloom.compiler.errors import DataError, ModelError, OptionError
 from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX, decay_registers, weight_step
 from spikeloom.compiler.interpret import run_float, run_integer
 from spikeloom.compiler.invariants import verify
@@ -187,15 +186,6 @@ def test_weights_far_above_the_threshold_take_a_larger_exponent(weight, bits):
     assert largest == pytest.approx(weight, rel=0.3)
 
 
-def test_weights_too_large_for_any_scale():
-    with pytest.raises(ModelError) as caught:
-        quantize(chain([[1e6, 1.0]]), LOIHI, recipes=(Recipe(bits=6),))
-    assert str(caught.value) == (
-        "fc1: no scale at 6 bits keeps its threshold of at least one unit within the accumulator (32767 units a step); "
-        "use more bits or smaller weights"
-    )
-
-
 def test_tiny_weights_take_the_largest_threshold():
     integer, (choice,) = quantize(chain([[1e-9, -1e-12]]), LOIHI)
     assert integer.populations[0].threshold.tolist() == [131071]
@@ -300,47 +290,4 @@ def test_calibration_runs_the_float64_model():
 def test_recordings_are_evenly_spaced(samples, picked):
     events = np.arange(samples)[:, None, None]
     assert evenly_spaced(events, 4)[:, 0, 0].tolist() == picked
-
-
-def test_at_most_32_recordings_are_used():
     assert len(evenly_spaced(np.zeros((576, 1, 1), bool))) == 32
-
-
-# --- bad options
-
-
-@pytest.mark.parametrize("bits", [-1, 0, 1, 7, 9])
-def test_widths_that_the_chip_does_not_store(bits):
-    with pytest.raises(OptionError) as caught:
-        quantize(chain([[1.0]]), LOIHI, recipes=(Recipe(bits=bits),))
-    assert str(caught.value) == (
-        f"--weight-bits {bits}: Intel Loihi 1 does not store that width; allowed: 2, 3, 4, 5, 6, 8"
-    )
-
-
-def test_ranges_that_do_not_exist():
-    with pytest.raises(OptionError) as caught:
-        quantize(chain([[1.0]]), LOIHI, ranges="guessed")
-    assert str(caught.value) == "--ranges guessed: unknown; allowed: proven, observed"
-
-
-def test_observed_ranges_without_recordings():
-    with pytest.raises(OptionError) as caught:
-        quantize(chain([[1.0]]), LOIHI, ranges="observed")
-    message = "--ranges observed: nothing was observed; give --calibrate, or use --ranges proven"
-    assert str(caught.value) == message
-
-
-def test_calibration_on_an_empty_split():
-    with pytest.raises(DataError) as caught:
-        calibrate(chain([[1.0]]), np.zeros((0, 5, 1), bool))
-    assert str(caught.value) == "calibration: the split is empty; give recordings with a train split"
-
-
-def test_calibration_on_another_sensor():
-    with pytest.raises(DataError) as caught:
-        calibrate(chain([[1.0, 1.0]]), np.zeros((1, 5, 3), bool))
-    assert str(caught.value) == (
-        "calibration: the recordings have 3 channels, the network has 2; "
-        "give recordings of the sensor that it was trained on"
-    )

@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_networks import BITS, LOIHI, chain, float_networks, recordings_for
+from random_networks import BITS, LOIHI, chain, float_networks, moved, recordings_for
 
 from spikeloom.compiler import Recipe
-from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX
-from spikeloom.compiler.interpret import run_integer
 from spikeloom.compiler.invariants import verify
 from spikeloom.compiler.ir import Form
 from spikeloom.compiler.passes.calibrate import calibrate
@@ -37,13 +35,6 @@ def uneven_layer(seed=0, *, inputs=40, outputs=24):
     weight = rng.normal(0, 0.1, (outputs, inputs)) * np.geomspace(0.3, 30, outputs)[:, None]
     network = chain(weight, biases=[rng.normal(0, 0.05, outputs)])
     return network, calibrate(network, rng.random((8, 40, inputs)) < 0.2)
-
-
-def moved(integer, calibration):
-    return sum(
-        int(np.count_nonzero(a != b))
-        for a, b in zip(run_integer(integer, calibration.events).spikes, calibration.spikes, strict=True)
-    )
 
 
 # --- grouping
@@ -163,27 +154,3 @@ def test_a_neuron_that_would_overflow_is_rounded_to_nearest():
     finest = finest_thresholds(population, projections, 8, (-1, 6), 1.0, None)
     layer = compensated(population, projections, Form(bits=8, exponents=(-1, 6), threshold=finest), 0, calibration)
     assert ONE_STEP_SUM_MAX * 0.99 < layer.reached <= ONE_STEP_SUM_MAX
-
-
-# --- what cannot be asked for
-
-
-@pytest.mark.parametrize(
-    ("recipes", "message"),
-    [
-        ((Recipe(planes=0),), "--planes 0: allowed are 1 to 3; choose one of these"),
-        ((Recipe(planes=4),), "--planes 4: allowed are 1 to 3; choose one of these"),
-        (
-            (Recipe(groups=9),),
-            "--scale-groups 9: a core of Intel Loihi 1 holds 8 thresholds; give a number from 1 to 8",
-        ),
-        (
-            (Recipe(), Recipe()),
-            "--weight-bits: 2 layers are described, the network has 1; give one number, or one for each layer",
-        ),
-    ],
-)
-def test_recipes_that_do_not_exist(recipes, message):
-    with pytest.raises(OptionError) as caught:
-        quantize(chain([[1.0]]), LOIHI, recipes=recipes)
-    assert str(caught.value) == message

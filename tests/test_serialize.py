@@ -4,21 +4,17 @@ import hashlib
 import io
 import json
 import os
-import re
-import stat
 import zipfile
 from dataclasses import fields
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from random_networks import LOIHI, integer_chain, integer_networks
+from random_networks import compiled, integer_chain, integer_networks
 
 from spikeloom.compiler import archive
 from spikeloom.compiler.archive import is_netlist
 from spikeloom.compiler.errors import CapacityError, FormatError
-from spikeloom.compiler.targets.loihi1.emit import emit
-from spikeloom.compiler.targets.loihi1.layout.partition import partition
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import (
     ARRAYS,
@@ -30,11 +26,6 @@ from spikeloom.compiler.targets.loihi1.netlist_file import (
 )
 
 
-def placed(network, provenance=None):
-    parts = partition(network, LOIHI)
-    return emit(network, parts, tuple(range(len(parts.cores))), LOIHI, provenance or {})
-
-
 @pytest.fixture(scope="module")
 def netlist() -> Netlist:
     """Two layers on one core: 6 inputs of 3 taxels, 3 neurons, then 2."""
@@ -44,7 +35,7 @@ def netlist() -> Netlist:
         thresholds=[[1, 2, 131071], 7],
         polarities=2,
     )
-    return placed(network, {"graph": "manual", "options": {"weight_bits": 8}, "checkpoint": "0" * 64})
+    return compiled(network, provenance={"graph": "manual", "options": {"weight_bits": 8}, "checkpoint": "0" * 64})
 
 
 @pytest.fixture
@@ -63,6 +54,7 @@ def equal(left: Netlist, right: Netlist) -> bool:
 
 
 def refused(path) -> str:
+    """Message of the refusal without the path that starts it; one line."""
     with pytest.raises(FormatError) as caught:
         read_netlist(path)
     message = str(caught.value)
@@ -123,7 +115,7 @@ def test_a_netlist_comes_back_whole(path, netlist):
 @given(integer_networks())
 def test_every_netlist_comes_back_whole(tmp_path_factory, network):
     try:
-        original = placed(network)
+        original = compiled(network)
     except CapacityError:  # too many weight formats for a core
         return
     path = tmp_path_factory.mktemp("netlist") / "a.loom"
@@ -164,12 +156,6 @@ def test_numpy_alone_reads_the_file(path, netlist):
     assert manifest["provenance"] == netlist.provenance
 
 
-def test_the_documented_hash_is_the_one_in_the_file(path):
-    stated = str(members_of(path)["sha256"])
-    write_members(path, members_of(path))
-    assert str(members_of(path)["sha256"]) == stated
-
-
 def test_a_netlist_is_told_from_other_files(path, tmp_path):
     renamed = tmp_path / "a.bin"
     renamed.write_bytes(path.read_bytes())
@@ -186,26 +172,72 @@ def test_a_netlist_is_told_from_other_files(path, tmp_path):
 # --- files that are no netlist
 
 
-def test_a_missing_file(tmp_path):
-    assert refused(tmp_path / "a.loom") == "no such file; write one with spikeloom compile"
+def without(*names):
+    def change(path):
+        members = members_of(path)
+        write_members(path, {name: array for name, array in members.items() if name not in names}, sign=False)
+
+    return change
 
 
-def test_a_folder(tmp_path):
-    assert refused(tmp_path) == "is not a file; write one with spikeloom compile"
+def unsigned(name, changed):
+    def change(path):
+        members = members_of(path)
+        write_members(path, members | {name: changed(members[name])}, sign=False)
+
+    return change
 
 
-@pytest.mark.parametrize("content", [b"", b"hello", bytes(range(256)) * 50])
-def test_random_bytes(tmp_path, content):
-    path = tmp_path / "a.loom"
-    path.write_bytes(content)
-    assert refused(path) == "is truncated or not a netlist (File is not a zip file); compile it again"
+def stating(**entries):
+    return lambda path: rewrite_manifest(path, **entries)
+
+
+def manifest(text):
+    return lambda path: rewrite(path, manifest=np.array(text))
+
+
+def layer(**entries):
+    def change(path):
+        layers = json.loads(str(members_of(path)["manifest"]))["layers"]
+        layers[0] |= entries
+        rewrite_manifest(path, layers=layers)
+
+    return change
+
+
+DAMAGES = [
+    *((lambda path, content=content: path.write_bytes(content), "not a netlist") for content in (b"", bytes(9999))),
+    (unsigned("synapse_weight", lambda weights: weights + 2), "does not match its hash"),
+    (unsigned("manifest", lambda text: np.array(str(text).replace("manual", "knn:3 "))), "does not match its hash"),
+    (
+        lambda path: write_members(path, {"weights": np.zeros(3)}, sign=False),
+        "not a netlist (no manifest and no sha256)",
+    ),
+    (without("sha256"), "not a netlist (no sha256)"),
+    (lambda path: write_members(path, members_of(path), compression=zipfile.ZIP_DEFLATED), "compressed members"),
+    *((stating(version=version), f"format version {version}, this program reads 5") for version in (4, 6)),
+    *((manifest(text), "unreadable manifest") for text in ("{", "[" * 100_000)),
+    *((manifest(text), "not a netlist") for text in ("[]", "3", "{}", '{"format": "spikeloom-checkpoint"}')),
+    *(
+        (layer(**{name: value}), "no usable layers")
+        for name, value in {"neurons": "3", "scale": 0, "depth": 0.5, "name": 7, "beta": -1, "colour": "red"}.items()
+    ),
+    (stating(target="loihi3"), "is for 'loihi3', this program knows loihi1"),
+    (lambda path: rewrite(path, axon_sauce=np.zeros(1, "<i1")), "unknown members (axon_sauce)"),
+]
+
+
+@pytest.mark.parametrize(("change", "words"), DAMAGES)
+def test_a_damaged_file(path, change, words):
+    change(path)
+    assert words in refused(path)
 
 
 def test_a_file_cut_at_any_place(path):
     content = path.read_bytes()
     for end in range(0, len(content), 97):
         path.write_bytes(content[:end])
-        assert re.fullmatch(r"is truncated or not a netlist \(.+\); compile it again", refused(path)), end
+        assert refused(path).startswith("is truncated or not a netlist"), end
 
 
 def test_a_file_altered_at_any_place(path, netlist):
@@ -225,53 +257,17 @@ def test_a_file_altered_at_any_place(path, netlist):
     assert accepted < len(content) // 23
 
 
-def test_an_altered_weight_does_not_match_the_hash(path):
-    members = members_of(path)
-    weights = members["synapse_weight"].copy()
-    weights[0] += 2
-    write_members(path, members | {"synapse_weight": weights}, sign=False)
-    assert refused(path) == "its content does not match its hash, so it was altered; compile it again"
-
-
-def test_an_altered_manifest_does_not_match_the_hash(path):
-    members = members_of(path)
-    text = str(members["manifest"]).replace("manual", "knn:3 ")
-    write_members(path, members | {"manifest": np.array(text)}, sign=False)
-    assert refused(path) == "its content does not match its hash, so it was altered; compile it again"
-
-
-def test_another_archive_of_arrays(tmp_path):
-    np.savez(tmp_path / "a.npz", weights=np.zeros(3))
-    assert refused(tmp_path / "a.npz") == (
-        "is not a netlist (no manifest and no sha256); write one with spikeloom compile"
-    )
-
-
-def test_no_hash(path):
-    members = members_of(path)
-    del members["sha256"]
-    write_members(path, members, sign=False)
-    assert refused(path) == "is not a netlist (no sha256); write one with spikeloom compile"
-
-
-def test_compressed_members(path):
-    write_members(path, members_of(path), compression=zipfile.ZIP_DEFLATED)
-    assert "has compressed members" in refused(path)
-
-
-def test_more_bytes_declared_than_there_are(path, monkeypatch):
+def test_more_bytes_than_there_are_or_may_be(path, monkeypatch):
     """A stored member cannot be larger than its file."""
-    with zipfile.ZipFile(path) as archive:
-        infos = archive.infolist()
+    with zipfile.ZipFile(path) as opened:
+        infos = opened.infolist()
     infos[0].file_size = 10**9
-    monkeypatch.setattr(zipfile.ZipFile, "infolist", lambda _: infos)
-    assert "bytes claim to hold 1000" in refused(path)
-
-
-def test_a_file_too_large_to_read(path, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(zipfile.ZipFile, "infolist", lambda _: infos)
+        assert "bytes claim to hold 1000" in refused(path)
     size = path.stat().st_size
     monkeypatch.setattr(archive, "SIZE_LIMIT", size - 1)
-    assert refused(path) == f"{size} bytes, {size - 1} allowed; this is no netlist of one chip"
+    assert f"{size} bytes, {size - 1} allowed" in refused(path)
 
 
 def test_an_array_of_objects_is_never_unpickled(path):
@@ -287,38 +283,6 @@ def test_an_array_of_objects_is_never_unpickled(path):
     assert not (path.parent / "unpickled").exists()
 
 
-def test_an_array_that_announces_more_than_memory_holds(path):
-    content = io.BytesIO()
-    np.lib.format.write_array_header_1_0(content, {"descr": "<i8", "fortran_order": False, "shape": (2**60,)})
-    members = members_of(path)
-    del members["neuron"]
-    write_members(path, members)
-    with zipfile.ZipFile(path, "a") as archive:
-        archive.writestr("neuron.npy", content.getvalue())
-    assert re.fullmatch(r"is truncated or not a netlist \(.+\); compile it again", refused(path))
-
-
-# --- manifests
-
-
-@pytest.mark.parametrize("version", [4, 6])
-def test_another_version(path, version):
-    rewrite_manifest(path, version=version)
-    assert refused(path) == f"has format version {version}, this program reads 5; compile it again or update spikeloom"
-
-
-@pytest.mark.parametrize("text", ["{", "[" * 100_000])
-def test_a_manifest_that_is_no_json(path, text):
-    rewrite(path, manifest=np.array(text))
-    assert refused(path) == "has an unreadable manifest; compile it again"
-
-
-@pytest.mark.parametrize("text", ["[]", "3", "{}", '{"format": "spikeloom-checkpoint", "version": 1}'])
-def test_a_manifest_of_something_else(path, text):
-    rewrite(path, manifest=np.array(text))
-    assert refused(path) == "is not a netlist; write one with spikeloom compile"
-
-
 @pytest.mark.parametrize(
     ("key", "value"),
     [
@@ -330,38 +294,7 @@ def test_a_manifest_of_something_else(path, text):
 )
 def test_manifest_entries_of_another_kind(path, key, value):
     rewrite_manifest(path, **{key: value})
-    assert refused(path) == f"the manifest has no usable {key}; compile it again"
-
-
-@pytest.mark.parametrize(
-    ("field", "value"), [("neurons", "3"), ("scale", None), ("depth", -1), ("scale", 0), ("name", 7), ("depth", 0.5)]
-)
-def test_layers_of_another_kind(path, field, value):
-    layers = json.loads(str(members_of(path)["manifest"]))["layers"]
-    layers[0][field] = value
-    rewrite_manifest(path, layers=layers)
-    assert refused(path) == "the manifest has no usable layers; compile it again"
-
-
-def test_a_layer_with_a_field_too_many(path):
-    layers = json.loads(str(members_of(path)["manifest"]))["layers"]
-    layers[0]["colour"] = "red"
-    rewrite_manifest(path, layers=layers)
-    assert refused(path) == "the manifest has no usable layers; compile it again"
-
-
-def test_a_chip_that_this_program_does_not_know(path):
-    rewrite_manifest(path, target="loihi3")
-    assert refused(path) == "is for 'loihi3', this program knows loihi1; update spikeloom"
-
-
-def test_missing_and_unknown_members(path):
-    members = members_of(path)
-    del members["axon_source"]
-    write_members(path, members)
-    assert refused(path) == "has missing or unknown members (axon_source); compile it again"
-    write_members(path, members | {"axon_sauce": np.zeros(1, "<i1")})
-    assert refused(path) == "has missing or unknown members (axon_sauce, axon_source); compile it again"
+    assert f"no usable {key}" in refused(path)
 
 
 @pytest.mark.parametrize("name", ["neuron", "core_axons", "synapse_weight", "format_exponent"])
@@ -377,7 +310,7 @@ def test_members_of_another_type(path, name, form):
         "table": array[:, None],
     }[form]
     rewrite(path, **{name: np.asarray(changed)})
-    assert refused(path) == f"{name} is no list of integers; compile it again"
+    assert f"{name} is no list of integers" in refused(path)
 
 
 # --- files that match their hash and are nonsense all the same
@@ -430,14 +363,14 @@ def with_value(name, value, place=0):
 def test_indices_that_point_nowhere(path, netlist, change, message):
     changed = {name: array.astype("<i4") for name, array in change(netlist).items()}
     rewrite(path, **changed)
-    assert refused(path) == f"{message}; compile it again"
+    assert message in refused(path)
 
 
 @settings(deadline=None, max_examples=30)
 @given(integer_networks())
 def test_compiled_netlists_are_consistent(network):
     try:
-        assert inconsistencies(placed(network)) == []
+        assert inconsistencies(compiled(network)) == []
     except CapacityError:
         return
 
@@ -458,20 +391,3 @@ def test_a_write_that_fails_leaves_the_old_file(path, netlist, monkeypatch, erro
     assert [entry.name for entry in path.parent.iterdir()] == ["a.loom"]
     if isinstance(error, OSError):
         assert (caught.value.errno, caught.value.filename) == (errno.ENOSPC, str(path))
-
-
-def test_a_write_into_a_folder_that_does_not_exist(netlist, tmp_path):
-    with pytest.raises(FileNotFoundError) as caught:
-        write_netlist(netlist, tmp_path / "no" / "a.loom")
-    assert caught.value.filename == str(tmp_path / "no" / "a.loom")
-
-
-def test_a_written_file_has_the_usual_permissions(path, tmp_path):
-    (tmp_path / "plain").write_bytes(b"")
-    assert stat.S_IMODE(path.stat().st_mode) == stat.S_IMODE((tmp_path / "plain").stat().st_mode)
-
-
-def test_a_write_replaces_the_old_file(path, netlist):
-    newer = dataclasses.replace(netlist, provenance={})
-    write_netlist(newer, path)
-    assert equal(read_netlist(path), newer)

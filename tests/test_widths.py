@@ -5,13 +5,13 @@ import pytest
 from random_networks import LOIHI, chain, random_checkpoint, small_target
 
 from spikeloom.compiler import Options, Recipe, compile_network
-from spikeloom.compiler.errors import ModelError, OptionError
+from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.interpret import cut, run_float, run_integer, vote
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.loihi1.legalize import measure
 from spikeloom.compiler.targets.loihi1.storage import width_search
 from spikeloom.compiler.targets.loihi1.storage.quantize import shortlist
-from spikeloom.compiler.targets.loihi1.storage.width_search import WidthPoint, check_widths, search_widths, widths_front
+from spikeloom.compiler.targets.loihi1.storage.width_search import WidthPoint, search_widths, widths_front
 
 WIDTHS = (2, 4, 8)
 
@@ -154,26 +154,3 @@ def test_a_front_rises_with_memory():
     assert [p.bits[0] for p in widths_front(points, "equal")] == [5, 3, 6]
     assert [p.bits[0] for p in widths_front(points, "right")] == [5]
     assert widths_front([], "equal") == ()
-
-
-@pytest.mark.parametrize(
-    ("widths", "groups", "layers", "message"),
-    [
-        ([7], 1, 4, "--widths 7: Intel Loihi 1 does not store 7 bits; allowed: 2, 3, 4, 5, 6, 8"),
-        (
-            [4],
-            9,
-            4,
-            "--scale-groups 9: a core of Intel Loihi 1 holds 8 thresholds; give a number from 1 to 8",
-        ),
-    ],
-)
-def test_widths_that_cannot_be_searched(widths, groups, layers, message):
-    with pytest.raises(OptionError) as caught:
-        check_widths(widths, groups, layers, LOIHI)
-    assert str(caught.value) == message
-
-
-def test_widths_are_searched_once_each():
-    assert check_widths([8, 2, 8], 1, 4, LOIHI) == (2, 8)
-    assert check_widths([2, 3, 4, 5, 6, 8], 1, 4, LOIHI) == (2, 3, 4, 5, 6, 8)

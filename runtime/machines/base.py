@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import import_module
@@ -362,3 +362,20 @@ def trained_for(path: object) -> Any | None:
         return None
     chips = (chip_commands(each.name) for each in iter_modules(machines.__path__) if each.ispkg)
     return next((chip for chip in chips if chip is not None and chip.takes(path)), None)
+
+
+def compiled(compilation: Any, sha256: str, facts: Sequence[str]) -> Outcome:
+    """What a compilation chose, proved and removed, as its chip shows it: its module ``compiled``.
+
+    Parameters
+    ----------
+    compilation
+        What the target's ``compile`` gave.
+    sha256 : str
+        Of the file that its netlist was written to.
+    facts : sequence of str
+        What was read from a file of another format.
+    """
+    own: Any = _own_module(compilation.netlist.target, "compiled")
+    outcome: Outcome = own.outcome(compilation, sha256, facts)
+    return outcome

@@ -90,8 +90,8 @@ class Options:
     optimize: str = "cores"
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
-    def require_consistent(self) -> None:
-        """Refuse options that contradict each other.
+    def require_consistent(self, *, calibrated: bool) -> None:
+        """Refuse options that contradict each other; `calibrated` where there are, or will be, training events.
 
         Raises
         ------
@@ -100,7 +100,7 @@ class Options:
         """
         if not 0 <= self.margin < math.inf:
             raise OptionError(f"--margin {self.margin:g}: is no share to add to a range; give a number from 0")
-        calibrated, fine_tuned = self.training_events is not None, self.forms is not None
+        fine_tuned = self.forms is not None
         if self.prune_unused and (not calibrated or self.keep_all or fine_tuned):
             raise OptionError(
                 "--prune-unused: needs --calibrate, and neither --keep-all nor a fine-tuned checkpoint; "
@@ -120,6 +120,23 @@ class Options:
             raise OptionError(
                 "--spike-exact: finds planes and scales itself; give one width, no --planes or --scale-groups"
             )
+        self._require_goal(calibrated)
+
+    def _require_goal(self, calibrated: bool) -> None:
+        """Refuse a goal that is unknown or cannot be judged, and a number of chips that is none."""
+        if self.optimize not in GOALS:
+            raise OptionError(f"--optimize {self.optimize}: no such goal; give one of {', '.join(GOALS)}")
+        if self.chips < 1:
+            raise OptionError(f"--chips {self.chips}: not a number of chips; give 1 or more")
+        why = ""
+        if self.chips > 1:
+            why = "links between chips are not modelled; omit --chips"
+        elif self.cores_for:
+            why = "chooses the cores of every layer itself; omit --cores-for"
+        elif not calibrated:
+            why = "needs firing rates; give --calibrate"
+        if why and self.optimize != "cores":
+            raise OptionError(f"--optimize {self.optimize}: {why}")
 
 
 def check_recipes(recipes: Sequence[Recipe], layers: int, target: Target) -> tuple[Recipe, ...]:

@@ -16,7 +16,7 @@ from spikeloom.compiler.range_proof import prove_ranges
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.compilation import LATER, Compilation
 from spikeloom.compiler.targets.loihi1.emit import Origin, emit
-from spikeloom.compiler.targets.loihi1.layout.choose import lay_out, require_goal
+from spikeloom.compiler.targets.loihi1.layout.choose import lay_out
 from spikeloom.compiler.targets.loihi1.legalize import require_legal
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.options import Options, Recipe, check_recipes, require_stored
@@ -208,9 +208,7 @@ def start(
     OptionError
         If the options contradict each other.
     """
-    calibrated = options.training_events is not None
-    require_goal(options.optimize, options.cores_for, target, calibrated=calibrated, chips=options.chips)
-    options.require_consistent()
+    options.require_consistent(calibrated=options.training_events is not None)
     work = Compilation(source=source, options=options, target=target)
     if isinstance(source, IntegerNetwork):
         return replace(work, integer=source), (*INTEGERS, *LAYOUT)

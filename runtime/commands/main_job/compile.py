@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import argparse
 import sys
+from dataclasses import replace
 
-from spikeloom.compiler import DEFAULT_TARGET, GOALS, MARGIN, Compilation, Options, compile_network, write_netlist
+from spikeloom.compiler import DEFAULT_TARGET, GOALS, MARGIN, RANGES, Compilation, compile_network, write_netlist
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.targets.base import load_target
-from spikeloom.compiler.targets.loihi1.layout.choose import require_goal
-from spikeloom.compiler.targets.loihi1.options import RANGES
 from spikeloom.runtime.commands.main_job.integers import brings_integers, compile_integers
 from spikeloom.runtime.commands.options import add_bin_option, add_network
 from spikeloom.runtime.inputs.compilation import margin_of, parse_cores, parse_recipes, provenance
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.inputs.recordings import recordings
-from spikeloom.runtime.machines.base import chip_commands, trained_for
-from spikeloom.runtime.machines.loihi1 import compiled
+from spikeloom.runtime.machines.base import chip_commands, compiled, trained_for
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.sections import Outcome
 
@@ -91,9 +89,18 @@ def run(arguments: argparse.Namespace) -> Outcome:
         raise OptionError(
             f"--margin {arguments.margin:g}: only observed ranges have one; add --ranges observed or omit it"
         )
-    recipes = parse_recipes(arguments)
-    cores_for = parse_cores(arguments.cores_for)
-    require_goal(arguments.optimize, cores_for, chip, calibrated=arguments.calibrate is not None, chips=arguments.chips)
+    options = chip.options(
+        recipes=parse_recipes(arguments),
+        spike_exact=arguments.spike_exact,
+        keep_all=arguments.keep_all,
+        prune_unused=arguments.prune_unused,
+        ranges=arguments.ranges,
+        margin=margin_of(arguments),
+        cores_for=parse_cores(arguments.cores_for),
+        chips=arguments.chips,
+        optimize=arguments.optimize,
+    )
+    options.require_consistent(calibrated=arguments.calibrate is not None)
     asked = load_network(arguments.checkpoint, arguments)
     checkpoint, training = asked.checkpoint, None
     if arguments.calibrate is not None:
@@ -114,22 +121,14 @@ def run(arguments: argparse.Namespace) -> Outcome:
 
     compilation = compile_network(
         asked.source,
-        Options(
+        replace(
+            options,
             forms=None if checkpoint is None else checkpoint.forms,
-            recipes=recipes,
-            spike_exact=arguments.spike_exact,
-            keep_all=arguments.keep_all,
-            prune_unused=arguments.prune_unused,
             training_events=training,
-            ranges=arguments.ranges,
-            margin=margin_of(arguments),
-            cores_for=cores_for,
-            chips=arguments.chips,
-            optimize=arguments.optimize,
             provenance=provenance(arguments, asked, calibrated=training is not None),
         ),
         target=arguments.target,
         after=dump,
     )
     sha256 = write_netlist(compilation.netlist, arguments.output)
-    return Outcome(compiled.facts_of(compilation, sha256, asked.facts), compiled.sections)
+    return compiled(compilation, sha256, asked.facts)

@@ -18,7 +18,7 @@ from spikeloom.runtime.machines.loihi1 import description
 from spikeloom.runtime.machines.loihi1.description import LayerFacts, NetlistFacts
 from spikeloom.runtime.report.encode import INLINE, OPTIONAL
 from spikeloom.runtime.report.numbers import si
-from spikeloom.runtime.report.sections import Block, Section, Table, Text
+from spikeloom.runtime.report.sections import Block, Outcome, Section, Table, Text
 
 ZEROED = 0.25
 """Share of a layer's weights from which on it is said that they round to zero."""
@@ -72,6 +72,11 @@ def facts_of(done: Compilation, sha256: str, facts: Sequence[str] = ()) -> Compi
         layout=LayoutChoice(optimize=done.options.optimize, expected=_layout(done.layout), usual=_layout(done.usual)),
         facts=facts or None,
     )
+
+
+def outcome(done: Compilation, sha256: str, facts: Sequence[str] = ()) -> Outcome:
+    """Facts of a compilation with their layout."""
+    return Outcome(facts_of(done, sha256, facts), sections)
 
 
 def _layout(layout: choose.Layout) -> LayoutFacts:

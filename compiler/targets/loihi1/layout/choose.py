@@ -25,7 +25,6 @@ from spikeloom.compiler.targets.loihi1.layout.forecast import Expectation, Forec
 from spikeloom.compiler.targets.loihi1.layout.latency_search import estimate, fastest, tiles_for
 from spikeloom.compiler.targets.loihi1.layout.partition import Partition, arrange, chunks_of, cut, partition
 from spikeloom.compiler.targets.loihi1.layout.place import Placement, core_traffic, place_within
-from spikeloom.compiler.targets.loihi1.options import GOALS
 
 WORTH = 1e-3
 """Share of a step's energy that another layout has to save."""
@@ -61,53 +60,18 @@ def asked_cores(
         If there is no such layer, or the chip or the layer cannot be cut so often.
     """
     names = [population.name for population in network.populations]
-    found = {}
+    allowed = chips * target.limit("chip.cores")
+    owner = f"{target.title} has" if chips == 1 else f"{chips} chips {target.title} have"
     for name, least in cores_for.items():
+        asked = f"--cores-for {name}={least}"
         if name not in names:
-            raise OptionError(f"--cores-for {name}={least}: no such layer; layers are {', '.join(names)}")
-        population, allowed = names.index(name), chips * target.limit("chip.cores")
-        size = network.populations[population].size
+            raise OptionError(f"{asked}: no such layer; layers are {', '.join(names)}")
+        size = network.populations[names.index(name)].size
         if least > allowed:
-            raise OptionError(
-                f"--cores-for {name}={least}: {_named(target, chips)} {allowed} cores ({target.name}.chip.cores); "
-                f"give {allowed} or fewer"
-            )
+            raise OptionError(f"{asked}: {owner} {allowed} cores ({target.name}.chip.cores); give {allowed} or fewer")
         if least > size:
-            raise OptionError(
-                f"--cores-for {name}={least}: {name} has {size} neurons on the chip; give {size} or fewer"
-            )
-        found[population] = least
-    return found
-
-
-def _named(target: Target, chips: int) -> str:
-    return f"{target.title} has" if chips == 1 else f"{chips} chips {target.title} have"
-
-
-def require_goal(
-    goal: str, cores_for: Mapping[str, int] | None, target: Target, *, calibrated: bool, chips: int = 1
-) -> None:
-    """Refuse a goal that is unknown or cannot be judged, and a number of chips that is none.
-
-    Raises
-    ------
-    OptionError
-        Saying what it needs.
-    """
-    if goal not in GOALS:
-        raise OptionError(f"--optimize {goal}: no such goal; give one of {', '.join(GOALS)}")
-    if chips < 1:
-        raise OptionError(f"--chips {chips}: not a number of chips; give 1 or more")
-    if goal == "cores":
-        return
-    if chips > 1:
-        raise OptionError(f"--optimize {goal}: links between chips are not modelled; leave --chips away")
-    if cores_for:
-        raise OptionError(f"--optimize {goal}: chooses the cores of every layer itself; leave --cores-for away")
-    if not calibrated:
-        raise OptionError(f"--optimize {goal}: needs firing rates; give --calibrate")
-    if tables(target) is None:
-        raise OptionError(f"--optimize {goal}: {target.title} has no time or no energy table; give another target")
+            raise OptionError(f"{asked}: {name} has {size} neurons on the chip; give {size} or fewer")
+    return {names.index(name): least for name, least in cores_for.items()}
 
 
 def lay_out(
@@ -130,7 +94,7 @@ def lay_out(
     target : Target
         Limits, latencies and prices.
     goal : str
-        One of ``GOALS``: fewest cores, least expected energy of a step, shortest expected step.
+        One of ``options.GOALS``: fewest cores, least expected energy of a step, shortest expected step.
     cores_for : mapping of str to int, optional
         Least number of cores of a layer, by name. These hold no other layer.
     chips : int
@@ -152,9 +116,8 @@ def lay_out(
     CapacityError
         If a limit cannot be kept.
     OptionError
-        If the goal is unknown or cannot be judged, or the cores asked for do not exist.
+        If the goal cannot be judged, or the cores asked for do not exist.
     """
-    require_goal(goal, cores_for, target, calibrated=calibration is not None, chips=chips)
     least = asked_cores(network, cores_for or {}, target, chips)
     priced = tables(target)
     forecast = None
@@ -176,21 +139,19 @@ def lay_out(
     usual = placed(partition(network, target, rates, chips=chips))
     if least:
         return placed(partition(network, target, rates, cores_for=least, chips=chips)), usual
-    if forecast is None or goal == "cores":
+    if goal == "cores":
         return usual, usual
+    if forecast is None:
+        raise OptionError(f"--optimize {goal}: {target.title} has no time or no energy table; give another target")
     if goal == "energy":
-        best = usual
-        allowed = _expected(usual).step_j * (1 - WORTH)
-        for parts in _thrifty(forecast, rates):
-            if _least_energy(forecast, parts) < allowed:
-                thrifty = placed(parts)
-                if _expected(thrifty).step_j < allowed:
-                    best, allowed = thrifty, _expected(thrifty).step_j
-        return best, usual
-    found = fastest(forecast)
-    if found is None or estimate(forecast, found) >= _expected(usual).step_ns * PICOSECONDS:
+        found = map(placed, _thrifty(forecast, rates))
+        thrifty = min(found, key=lambda layout: _expected(layout).step_j, default=usual)
+        saves = _expected(thrifty).step_j < _expected(usual).step_j * (1 - WORTH)
+        return (thrifty if saves else usual), usual
+    cores = fastest(forecast)
+    if cores is None or estimate(forecast, cores) >= _expected(usual).step_ns * PICOSECONDS:
         return usual, usual
-    fast = placed(arrange(forecast.needs, found), tiles_for(forecast, len(found)))
+    fast = placed(arrange(forecast.needs, cores), tiles_for(forecast, len(cores)))
     return min([usual, fast], key=lambda layout: _expected(layout).step_ns), usual
 
 
@@ -224,12 +185,6 @@ def _thrifty(forecast: Forecast, rates: tuple[FloatArray, ...] | None) -> list[P
         with suppress(CapacityError, OptionError):  # the layers before may have to be cut more often for it
             found.append(partition(needs.network, needs.target, rates, cores_for=least, shared=True))
     return found
-
-
-def _least_energy(forecast: Forecast, parts: Partition) -> float:
-    """Joules of a step if no packet had to leave its tile."""
-    traffic = core_traffic(forecast.needs.network, parts, forecast.rates)
-    return forecast.expect(parts, (0,) * len(parts.cores), traffic).step_j
 
 
 def _cost(forecast: Forecast, chunk: Chunk) -> float:
