@@ -82,10 +82,12 @@ def events(
     return (np.random.default_rng(seed).random((samples, taxels, 2, steps)) < rate).astype(np.uint8)
 
 
-def recordings_folder(folder: Path, *, train: np.ndarray | None = None, test: np.ndarray | None = None) -> Path:
+def recordings_folder(
+    folder: Path, *, train: np.ndarray | None = None, test: np.ndarray | None = None, classes: int = CLASSES
+) -> Path:
     """Write recordings in the released layout, labels in turn."""
     for split, made in (("train", train if train is not None else events(1)), ("test", test)):
         (folder / split).mkdir(parents=True)
         for i, recording in enumerate(made if made is not None else events(2)):
-            np.save(folder / split / f"sample_{i}_label_{i % CLASSES}.npy", recording.astype(np.float32))
+            np.save(folder / split / f"sample_{i}_label_{i % classes}.npy", recording.astype(np.float32))
     return folder

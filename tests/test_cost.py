@@ -76,9 +76,8 @@ def brute_force(netlist, recording):
                     found["hop_north_south"][netlist.layer[sender]] += abs(here[0] - there[0])
     for layer in layers:
         found["neuron_active"][layer] = int(trace.counts.updates[layer])
-        found["neuron_idle"][layer] = sum(
-            netlist.layers[layer].neurons for _ in range(steps + netlist.max_depth)
-        ) - int(trace.counts.updates[layer])
+        held = int(np.count_nonzero(netlist.layer == layer))
+        found["neuron_idle"][layer] = held * (steps + netlist.max_depth) - int(trace.counts.updates[layer])
     return found
 
 

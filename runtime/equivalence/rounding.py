@@ -191,7 +191,9 @@ def _check_layer(
     unit = chip.scale * (1 << MEMBRANE_SHIFT)
     bias = np.clip(wanted.bias * unit, -BIAS_LIMIT, BIAS_LIMIT)
     coarse = 0.5 * (1 << np.maximum(encode_bias(bias)[1], chip.bias_exponent)) * SLACK
-    more, less = (lost * (1 << MEMBRANE_SHIFT) * SLACK) if moved else np.zeros((2, wanted.size))
+    # where no weight was moved, the bias takes up what the nearest ones lose
+    slack = compensates and wrong <= MOVED * weights
+    more, less = (lost * (1 << MEMBRANE_SHIFT) * SLACK) if slack else np.zeros((2, wanted.size))
     off = chip.bias - bias
     bad = held & ((off > more + coarse) | (-off > less + coarse)) & ~(zeroed[post] & (chip.bias == 0))
     if bad.any():

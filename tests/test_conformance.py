@@ -1,0 +1,322 @@
+"""What holds for every network: each invariant over the whole zoo, and the keys of ``--json`` that scripts rely on."""
+
+import hashlib
+import json
+from dataclasses import fields
+
+import numpy as np
+import pytest
+from json_keys import KEYS
+from numpy.testing import assert_array_equal
+from random_crossbars import assert_same
+from random_netlists import assert_equal, by_checked_engine, by_engine, by_steps
+from test_cost import check as check_costs
+from test_onnx_engine import assert_as_specified
+from zoo import CROSSBARS, FLOAT, LAYERED, MAKERS, over, specimen
+
+from spikeloom.compiler import lift
+from spikeloom.compiler.dynamics import with_clocks
+from spikeloom.compiler.interpret import channels_last, run_float, run_integer
+from spikeloom.compiler.targets.loihi1.netlist_file import netlist_bytes, read_netlist
+from spikeloom.compiler.targets.loihi1.netlist_text import netlist_text
+from spikeloom.compiler.targets.truenorth.netlist_file import crossbar_bytes
+from spikeloom.models.networks.reference import float_spikes
+from spikeloom.runtime.cli import build_parser, main
+from spikeloom.runtime.equivalence import float_engine
+from spikeloom.runtime.inputs.network import load_network
+from spikeloom.runtime.machines.loihi1 import engine, spec
+from spikeloom.runtime.machines.loihi1.blocks import obstacle
+from spikeloom.runtime.machines.loihi1.trace import aligned, unpack
+from spikeloom.runtime.machines.truenorth import engine as crossbar_engine
+from spikeloom.runtime.machines.truenorth import spec as crossbar_spec
+from spikeloom.runtime.machines.truenorth.trace import Counts, Trace
+from spikeloom.runtime.machines.votes import readout_counts
+
+CHECKPOINTS = tuple(name for name in FLOAT if name not in ("recurrent", "onnx"))
+STEP_BY_STEP = ("recurrent", "gcn", "onnx")
+"""Those that the kernel of layers does not take: a loop, or sums that may leave 16 bits."""
+
+
+def channels(made):
+    """Recordings (samples, channels, steps) with the clocks of the network."""
+    return with_clocks(made.events, made.machine.netlist.clocks)
+
+
+def float_side(made):
+    """The float network as the commands load it."""
+    words = ["verify", str(made.netlist), "--checkpoint", str(made.network), *made.reading, "--data", str(made.data)]
+    return load_network(str(made.network), build_parser("verify").parse_args(words), made.machine.netlist)
+
+
+def as_json(capsys, *words, codes=(0,)):
+    """The one object that a command prints."""
+    capsys.readouterr()
+    assert main([*map(str, words), "--json"]) in codes, capsys.readouterr().err
+    out = capsys.readouterr().out
+    assert out.count("\n") == 1
+    return json.loads(out)
+
+
+def require_keys(what, found):
+    """The keys that scripts rely on are there, and no others that the table does not list."""
+    always, sometimes = KEYS[what]
+    assert always <= set(found) <= always | sometimes
+
+
+# --- the chip -------------------------------------------------------------------------------------------------------
+
+
+@over(LAYERED)
+def test_every_kernel_is_the_specification(name):
+    made = specimen(name)
+    netlist = made.machine.netlist
+    assert (obstacle(netlist) is not None) == (name in STEP_BY_STEP)
+    total = np.zeros(len(netlist.layers), int)
+    for recording in channels(made):
+        expected = spec.simulate(netlist, recording)
+        for simulate in (by_engine, by_steps, by_checked_engine):
+            assert_equal(simulate(netlist, recording), expected)
+        total += [expected.counts.spikes[netlist.compartments_of(layer)].sum() for layer in range(len(total))]
+    assert total.all(), "a layer is silent, so nothing is tested here"
+
+
+@over(CROSSBARS)
+def test_the_engine_of_crossbars_is_the_specification(name):
+    made = specimen(name)
+    netlist = made.machine.netlist
+    batch = crossbar_engine.simulate(netlist, channels(made), spikes=True, membranes=True)
+    for sample, recording in enumerate(channels(made)):
+        counts = Counts(**{field.name: getattr(batch.counts, field.name)[sample] for field in fields(Counts)})
+        trace = Trace(counts=counts, spikes=batch.spikes[sample], membranes=batch.membranes[sample])
+        assert_same(trace, crossbar_spec.simulate(netlist, recording))
+    assert all(batch.spikes[..., netlist.layer == layer].any() for layer in range(len(netlist.layers)))
+
+
+@over(LAYERED)
+def test_onnxruntime_is_the_specification(name):
+    pytest.importorskip("onnxruntime")
+    made = specimen(name)
+    for recording in channels(made)[:2]:
+        assert_as_specified(made.machine.netlist, recording)
+
+
+@over(LAYERED)
+def test_the_integer_network_of_a_netlist_is_the_engine(name):
+    made = specimen(name)
+    netlist = made.machine.netlist
+    trace = engine.simulate(netlist, channels(made), spikes=True, membranes=True)
+    found = run_integer(lift(netlist), channels_last(made.events, netlist.clocks), membranes=True)
+    for layer in range(len(netlist.layers)):
+        held = netlist.neuron[netlist.compartments_of(layer)]
+        assert_array_equal(aligned(netlist, trace.spikes, layer), found.spikes[layer])
+        assert_array_equal(aligned(netlist, trace.membranes, layer)[..., held], found.membranes[layer][..., held])
+
+
+@over(MAKERS)
+def test_each_recording_is_decided_as_it_is_alone(name):
+    made = specimen(name)
+    steps = made.events.shape[-1]
+    lengths = np.array([steps, 1, steps - 2, steps])
+    together = made.machine.run(made.events, lengths=lengths, threads=2)
+    for index, length in enumerate(lengths):
+        alone = made.machine.run(made.events[index : index + 1, ..., :length])
+        assert_array_equal(together.votes[index], alone.votes[0])
+    assert together.votes.any()
+
+
+@over(LAYERED)
+def test_streams_give_the_votes_of_whole_recordings(name):
+    made = specimen(name)
+    votes = made.machine.run(made.events).votes
+    stream = made.machine.stream()
+    for recording, expected in zip(made.events[:2], votes, strict=False):
+        for column in np.moveaxis(recording, -1, 0):
+            last = stream.step(column)
+        last = (last, *stream.finish())[-1]
+        assert_array_equal(last.counts, expected)
+        assert last.decision == expected.argmax()
+        stream.reset()
+
+
+# --- files ----------------------------------------------------------------------------------------------------------
+
+
+@over(MAKERS)
+def test_a_file_holds_the_netlist_to_the_byte(name):
+    made = specimen(name)
+    made.machine.legal()
+    content = made.netlist.read_bytes()
+    assert (crossbar_bytes if name in CROSSBARS else netlist_bytes)(made.machine.netlist) == content
+    if name in LAYERED:
+        lines = netlist_text(made.machine.netlist).splitlines()
+        assert lines == netlist_text(read_netlist(made.netlist)).splitlines()
+
+
+@over(MAKERS)
+def test_compiled_again_the_bytes_are_the_same(name, tmp_path, capsys):
+    made = specimen(name)
+    found = as_json(capsys, *made.compilation, "-o", tmp_path / "again.loom")
+    require_keys("compile" + ", crossbars" * (name in CROSSBARS), found)
+    assert found["sha256"] == hashlib.sha256(made.netlist.read_bytes()).hexdigest()
+    assert (tmp_path / "again.loom").read_bytes() == made.netlist.read_bytes()
+
+
+# --- costs ----------------------------------------------------------------------------------------------------------
+
+
+@over(LAYERED)
+def test_costs_are_those_counted_spike_by_spike(name):
+    made = specimen(name)
+    assert check_costs(made.machine.netlist, channels(made)[:2]).synaptic_operations.sum() > 0
+
+
+@over(CROSSBARS)
+def test_costs_of_crossbars_are_those_counted_tick_by_tick(name):
+    made = specimen(name)
+    netlist = made.machine.netlist
+    _, price = made.machine.price(made.events, bin_s=0.02)
+    points = np.bincount(netlist.axon_of_synapse(), minlength=netlist.n_axons)
+    marginal = made.machine.target.energy[1]
+    for sample, recording in enumerate(channels(made)):
+        counts = crossbar_spec.simulate(netlist, recording).counts
+        events = sum(int(ticks) * int(lines) for ticks, lines in zip(counts.axons, points, strict=True))
+        assert price.synaptic_operations[sample] == events > 0
+        seconds = int(counts.ticks) * 1e-3
+        assert price.time_s["tick"][sample] == pytest.approx(seconds)
+        joules = events * marginal.joule("synaptic_event") + marginal.floor_w * seconds
+        assert price.energy_j[marginal.name][sample] == pytest.approx(joules)
+
+
+# --- the float side -------------------------------------------------------------------------------------------------
+
+
+@over(CHECKPOINTS)
+def test_the_expanded_network_is_the_float_model(name):
+    made = specimen(name)
+    loaded = float_side(made)
+    wanted = float_spikes(loaded.checkpoint, loaded.adjacency, made.events, dtype="float64")
+    found = run_float(loaded.network, channels_last(made.events, loaded.network.input.clocks)).spikes
+    for ours, (layer, theirs) in zip(found, wanted.items(), strict=True):
+        assert_array_equal(ours, theirs, err_msg=layer)
+        assert theirs.any(), layer
+
+
+@over(FLOAT)
+def test_the_float_engine_is_the_float_model(name):
+    made = specimen(name)
+    loaded, netlist = float_side(made), made.machine.netlist
+    inputs = channels_last(made.events, netlist.clocks)
+    if loaded.checkpoint is None:
+        wanted = run_float(loaded.network, inputs, dtype=np.float32).spikes
+    else:
+        wanted = tuple(float_spikes(loaded.checkpoint, loaded.adjacency, made.events).values())
+    found = float_engine.run(float_engine.prepare(loaded.network, netlist), channels(made))
+    flags = unpack(found.packed, netlist.n_compartments)
+    for layer, theirs in enumerate(wanted):
+        held = netlist.neuron[netlist.compartments_of(layer)]
+        assert_array_equal(aligned(netlist, flags, layer)[..., held], theirs[..., held])
+    assert_array_equal(found.votes, readout_counts(loaded.network.readout, loaded.network.classes, wanted[-1]))
+
+
+# --- commands -------------------------------------------------------------------------------------------------------
+
+
+@over((*FLOAT, *CROSSBARS))
+def test_verify_holds_every_network_to_its_file(name, capsys):
+    made = specimen(name)
+    words = ("verify", made.netlist, "--checkpoint", made.network, *made.reading, "--data", made.data)
+    found = as_json(capsys, *words, "--spec-samples", 1, *([] if name in CROSSBARS else ["--require", "E0"]))
+    if name in CROSSBARS:
+        require_keys("verify, crossbars", found)
+        assert found["E0"]["differences"] == 0
+        assert found["exact"]
+        return
+    require_keys("verify", found)
+    assert found["spec_equals_engine"] is found["same_checkpoint"] is True
+    assert all(layer["float"] > 0 for layer in found["spikes"].values())
+    assert found["ladder"][-1]["different"] == {name: each["different"] for name, each in found["spikes"].items()}
+    if "tuned" in name:
+        assert found["quantised_different"] == 0
+    first = next(iter(found["spikes"].values()))
+    assert first["different"] < 0.1 * first["float"] + 5
+
+
+@over(MAKERS)
+def test_run_estimate_and_inspect_agree(name, capsys):
+    made = specimen(name)
+    kind = ", crossbars" if name in CROSSBARS else ""
+    decided = as_json(capsys, "run", made.netlist, "--data", made.data)
+    require_keys("run", decided)
+    run = made.machine.run(made.events)
+    assert decided["counts"] == run.votes.tolist()
+    assert decided["predictions"] == run.decisions.tolist()
+    costs = as_json(capsys, "estimate", made.netlist, "--data", made.data)
+    require_keys("estimate" + kind, costs)
+    again = as_json(capsys, "run", made.netlist, "--data", made.data, "--detail", "counts")
+    assert again == decided | {"costs": costs}
+    shown = as_json(capsys, "inspect", made.netlist)
+    require_keys("inspect netlist" + kind, shown)
+    assert [layer["name"] for layer in shown["layers"]] == list(made.machine.layers)
+    if name in (*CHECKPOINTS, "native"):
+        require_keys("inspect checkpoint" + kind * (name == "native"), as_json(capsys, "inspect", made.network))
+
+
+@over(FLOAT)
+def test_explain_finds_causes(name, capsys):
+    made = specimen(name)
+    words = ("explain", made.netlist, "--checkpoint", made.network, *made.reading, "--data", made.data)
+    found = as_json(capsys, *words, "--sample", "sample_1_label_1.npy")
+    require_keys("explain", found)
+
+
+COMMANDS = {
+    "report": ("timed", "report {net} --checkpoint {file} --data {data} -o {out}/page.html"),
+    "anytime": ("gcn", "anytime {net} --checkpoint {file} --data {data}"),
+    "bits": ("joined", "bits {file} --calibrate {data} --agreement 0.1 --widths 4,8 --no-cache"),
+    "lean": ("recurrent", "lean {file} --dt 0.02 --data {data} -o {out}/lean.loom"),
+    "stress": ("recurrent", "stress {net} --checkpoint {file} --dt 0.02 --data {data} --seeds 1 --only taxels_dead"),
+    "chart": ("binned", "chart {file} --data {data} --grid bits=8 --jobs 1 -o {out}/chart"),
+    "yardsticks": ("joined", "yardsticks {file} --data {data}"),
+    "train": ("mlp", "train --data {data} --system mlp --features 2 --epochs 1 -o {out}/x.pt"),
+    "finetune": ("tactilesgnet", "finetune {file} --data {data} --weight-bits 4 --epochs 1 -o {out}/x.pt"),
+    "join": ("joined", "join {folder}/1.pt {folder}/2.pt -o {out}/x.pt"),
+    "data": ("mlp", "data describe {data}"),
+    **{
+        f"export {form}": (name, f"export {{{source}}} --to {form} -o {{out}}/x{suffix}")
+        for form, name, source, suffix in (
+            ("onnx", "timed", "net", ".onnx"),
+            ("onnx-float", "tactilesgnet", "file", ".onnx"),
+            ("nir", "recurrent", "net", ".nir"),
+            ("netx", "binned", "net", ".net"),
+            ("sanafe", "recurrent", "net", ".yaml"),
+        )
+    },
+}
+"""A command, the network that it is run on, and its words."""
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_other_commands_print_the_keys_of_the_table(command, tmp_path, capsys):
+    name, words = COMMANDS[command]
+    made = specimen(name)
+    places = {"net": made.netlist, "file": made.network, "data": made.data, "folder": made.folder, "out": tmp_path}
+    require_keys(command, as_json(capsys, *words.format(**places).split(), codes=(0, 1)))
+
+
+@over(("timed", "joined", "binned", "recurrent", "netx"))
+def test_watch_decides_as_run(name, tmp_path, capsys):
+    made = specimen(name)
+    lines = []
+    for recording in made.events:
+        step, taxel, polarity = np.nonzero(recording.transpose(2, 0, 1))
+        bin_s = 0.02 * made.machine.netlist.bins
+        lines += [f"{bin_s * (s + 0.5):.3f},{x},{p}" for s, x, p in zip(step, taxel, polarity, strict=True)] + [""]
+    (tmp_path / "lines.csv").write_text("\n".join(lines) + "\n")
+    capsys.readouterr()
+    words = ["watch", made.netlist, "--input", tmp_path / "lines.csv", "--bins", made.events.shape[-1], "--json"]
+    assert main([*map(str, words)]) == 0
+    shown = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    for entry in shown:
+        require_keys(f"watch {entry['kind']}", entry)
+    counts = [entry["counts"] for entry in shown if entry["kind"] == "grasp"]
+    assert counts == made.machine.run(made.events).votes.tolist()

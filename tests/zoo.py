@@ -1,0 +1,218 @@
+"""A dozen tiny networks of every kind, each made once a run: a file, recordings, and the netlist of the command."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
+from pathlib import Path
+
+import made_modules
+import made_netx
+import made_nir
+import nir
+import numpy as np
+import pytest
+from made_files import CLASSES, own_file, recordings_folder
+from made_modules import TAXELS
+from native_networks import random_network as native_network
+from timed_networks import GRAPH, TIMING, written
+
+from spikeloom.compiler.checkpoint import Checkpoint
+from spikeloom.compiler.dynamics import PLAIN
+from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.formats.towers import arrays_of, join
+from spikeloom.compiler.ir import Form
+from spikeloom.compiler.targets.truenorth.native_file import write_trained
+from spikeloom.models.networks.checkpoint import save_checkpoint
+from spikeloom.models.recordings.events import joined_bins
+from spikeloom.models.recordings.evtouch import Recordings, load_recordings
+from spikeloom.runtime.cli import main
+from spikeloom.runtime.machines.base import Machine, machine_for
+
+STEPS = 14
+STORAGE = ((8, (0,)), (4, (-1,)), (8, (0, 4)), (6, (1,)))
+"""Width and exponents of each layer of a fine-tuned network."""
+
+Made = tuple[str, int, str, str]
+"""File, taxels of its sensor, options that say how it is read, options of ``compile``."""
+
+
+@dataclass(frozen=True)
+class Specimen:
+    """A network, made and compiled."""
+
+    folder: Path
+    network: Path
+    reading: tuple[str, ...]
+    compiling: tuple[str, ...]
+
+    @property
+    def netlist(self) -> Path:
+        return self.folder / "net.loom"
+
+    @property
+    def data(self) -> Path:
+        """Recordings of both splits."""
+        return self.folder / "data"
+
+    @property
+    def compilation(self) -> list[str]:
+        """The command that made the netlist, without its output."""
+        return ["compile", str(self.network), *self.reading, *self.compiling]
+
+    @cached_property
+    def machine(self) -> Machine:
+        return machine_for(self.netlist)
+
+    @cached_property
+    def recordings(self) -> Recordings:
+        """The test split, of bins that the network takes."""
+
+        return joined_bins(load_recordings(self.data, "test"), self.machine.netlist.bins)
+
+    @property
+    def events(self) -> np.ndarray:
+        return self.recordings.events
+
+
+def stored(path: Path, checkpoint: Checkpoint, **changes: int) -> Checkpoint:
+    """Write a checkpoint as the commands do, and read it back."""
+    names = ("beta", "theta", "forms", "system", "grid", "dynamics", "towers", "bins")
+    facts = {name: getattr(checkpoint, name) for name in names} | {"training": {}} | changes
+    save_checkpoint(path, {"last": arrays_of(checkpoint)}, GRAPH, **facts | {"forms": checkpoint.forms or None})
+    return read_checkpoint(path)
+
+
+def tuned(checkpoint: Checkpoint, seed: int = 0) -> Checkpoint:
+    """A network with storage of its own, as fine-tuning leaves it: a threshold for each neuron."""
+    rng = np.random.default_rng(seed)
+    forms = tuple(
+        Form(bits=bits, exponents=exponents, threshold=rng.integers(20, 60, size=neurons))
+        for (bits, exponents), neurons in zip(STORAGE, checkpoint.neurons.values(), strict=True)
+    )
+    return replace(checkpoint, forms=forms)
+
+
+def of_system(system: str, dynamics=PLAIN, *compiling: str) -> Callable[[Path], Made]:
+    def make(folder: Path) -> Made:
+        written(folder / "net.pt", system, dynamics)
+        return "net.pt", 39, "", " ".join(compiling)
+
+    return make
+
+
+def joined(dynamics, make_member=lambda checkpoint, _seed: checkpoint) -> Callable[[Path], Made]:
+    def make(folder: Path) -> Made:
+        members = []
+        for seed in (1, 2, 3):
+            written(folder / f"{seed}.pt", dynamics=dynamics, seed=seed)
+            members.append(make_member(read_checkpoint(folder / f"{seed}.pt"), seed))
+        stored(folder / "net.pt", join(members, ["1.pt", "2.pt", "3.pt"]))
+        return "net.pt", 39, "", ""
+
+    return make
+
+
+def fine_tuned(folder: Path) -> Made:
+    written(folder / "float.pt", dynamics=PLAIN)
+    stored(folder / "net.pt", tuned(read_checkpoint(folder / "float.pt")))
+    return "net.pt", 39, "", ""
+
+
+def binned(folder: Path) -> Made:
+    written(folder / "one.pt", dynamics=PLAIN)
+    stored(folder / "net.pt", read_checkpoint(folder / "one.pt"), bins=3)
+    return "net.pt", 39, "", ""
+
+
+def recurrent(folder: Path) -> Made:
+    """A NIR file with a recurrent layer."""
+    rng = np.random.default_rng(0)
+    nodes = {
+        "a": made_nir.affine(rng, 12, 2 * TAXELS, 1.0),
+        "b": made_nir.lif(12, r=2.0),
+        "w": nir.Linear(rng.normal(size=(12, 12)) * 0.3),
+        "c": made_nir.affine(rng, CLASSES, 12, 1.5),
+        "d": made_nir.lif(CLASSES, r=2.0),
+    }
+    edges = [("a", "b"), ("b", "w"), ("w", "b"), ("b", "c"), ("c", "d")]
+    nir.write(folder / "net.nir", made_nir.graph_with(nodes, edges, (2 * TAXELS,), (CLASSES,)))
+    return "net.nir", TAXELS, "--dt 0.02", "--planes 2"
+
+
+def onnx_step(folder: Path) -> Made:
+    """One step of a torch module with a graph layer of its own."""
+    module = made_modules.gcn()
+    (folder / "net.onnx").write_bytes(made_modules.one_step(module, made_modules.example_of("gcn")))
+    return "net.onnx", TAXELS, "", ""
+
+
+def netx(folder: Path) -> Made:
+    rng = np.random.default_rng(0)
+    layers = ((12, 2 * TAXELS), (CLASSES, 12))
+    made_netx.write(folder / "net.net", *(made_netx.dense(made_netx.even(rng, *shape)) for shape in layers))
+    return "net.net", TAXELS, "", ""
+
+
+def native(folder: Path) -> Made:
+    network = native_network(0, taxels=TAXELS, classes=CLASSES, steps=STEPS)
+    write_trained(folder / "net.pt", {"last": network}, graph="ring", edges=np.array([[0, 1], [1, 0]]), training={})
+    return "net.pt", TAXELS, "", "--target truenorth"
+
+
+def in_time(folder: Path) -> Made:
+    own_file(folder / "net.pt", beta=0.0)
+    return "net.pt", TAXELS, "", "--target truenorth --in-time 3"
+
+
+MAKERS: dict[str, Callable[[Path], Made]] = {
+    "tactilesgnet": of_system("tactilesgnet", PLAIN, "--planes 2 --scale-groups 4"),
+    "mlp": of_system("mlp", PLAIN, "--weight-bits 4"),
+    "gcn": of_system("gcn", PLAIN, "--weight-bits 8,6,3,2 --ranges observed"),
+    "grid-cnn": of_system("grid-cnn", PLAIN, "--cores-for conv1=3,fc1=2"),
+    "timed": of_system("tactilesgnet", TIMING),
+    "binned": binned,
+    "joined": joined(PLAIN),
+    "joined-timed": joined(TIMING),
+    "joined-tuned": joined(PLAIN, tuned),
+    "fine-tuned": fine_tuned,
+    "recurrent": recurrent,
+    "onnx": onnx_step,
+    "netx": netx,
+    "native": native,
+    "in-time": in_time,
+}
+CROSSBARS = ("native", "in-time")
+INTEGERS = (*CROSSBARS, "netx")
+"""Those without a float network that compiles for the chip of the others."""
+LAYERED = tuple(name for name in MAKERS if name not in CROSSBARS)
+FLOAT = tuple(name for name in MAKERS if name not in INTEGERS)
+
+
+@cache
+def place() -> Path:
+    return Path(tempfile.mkdtemp(prefix="spikeloom-zoo-"))
+
+
+@cache
+def specimen(name: str) -> Specimen:
+    """Make a network, its recordings and its netlist."""
+    folder = place() / name
+    folder.mkdir()
+    file, taxels, reading, compiling = MAKERS[name](folder)
+    data = folder / "data"
+    rng = np.random.default_rng(7)
+    steps = 3 * STEPS - 1 if name == "binned" else STEPS
+    train, test = ((rng.random((samples, taxels, 2, steps)) < 0.2).astype(np.uint8) for samples in (8, 4))
+    recordings_folder(data, train=train, test=test, classes=3 if name == "onnx" else CLASSES)
+    calibrated = ["--calibrate", str(data)] if name in FLOAT and "tuned" not in name else []
+    made = Specimen(folder, folder / file, tuple(reading.split()), (*compiling.split(), *calibrated))
+    assert main([*made.compilation, "-o", str(made.netlist)]) == 0
+    return made
+
+
+def over(names) -> pytest.MarkDecorator:
+    """Run a test for each of these networks."""
+    return pytest.mark.parametrize("name", names)
