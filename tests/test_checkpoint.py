@@ -27,7 +27,7 @@ from spikeloom.models.training.record import training_record
 from spikeloom.models.training.train import Epoch, Trained
 
 TAXELS, FEATURES, HOPS, SIZES, CLASSES = 6, 4, 3, (5, 7), 3
-NOT_A_CHECKPOINT = "is not a checkpoint; give a file of spikeloom train or of the released layout"
+NOT_A_CHECKPOINT = "is not a checkpoint; give"
 DAMAGED = "is truncated or damaged"
 
 
@@ -200,160 +200,155 @@ def test_the_released_checkpoint(released_checkpoint):
 # --- refusals ------------------------------------------------------------------------------------------------------
 
 
-def test_missing_file_and_folder(tmp_path):
-    expected = "no such file"
-    assert expected in refusal(tmp_path / "x.t7")
-    assert expected in refusal(tmp_path)
-
-
-@pytest.mark.parametrize(
-    "content",
-    [b"", b"spikeloom", np.random.default_rng(0).bytes(3000), b"\x80" + bytes(50), b"\x80\x02}q\x00."],
-    ids=["empty", "text", "random", "half a pickle", "pickle of an empty dict"],
-)
-def test_other_files_are_no_checkpoints(tmp_path, content):
-    assert refusal(write(tmp_path / "x.t7", content)) == NOT_A_CHECKPOINT
-
-
-def test_other_zips_are_no_checkpoints(tmp_path):
-    path = tmp_path / "x.zip"
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("test/sample_0_label_0.npy", b"")
-    assert refusal(path) == NOT_A_CHECKPOINT
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("manifest.json", '{"format": "other", "files": []}')
-    assert refusal(path) == NOT_A_CHECKPOINT
-
-
-@pytest.mark.parametrize("share", [0.02, 0.5, 0.99])
-@pytest.mark.parametrize("kind", ["torch zip", "torch pre-1.6", "own"])
-def test_truncated_files(tmp_path, kind, share):
-    whole = {
-        "torch zip": torch_bytes(released(tensors())),
-        "torch pre-1.6": torch_bytes(released(tensors()), new=False),
-        "own": own(),
-    }[kind]
-    assert refusal(write(tmp_path / "x", whole[: int(share * len(whole))])).startswith(DAMAGED)
-
-
 class _Command:
     def __reduce__(self):
         return os.system, ("touch harm",)
 
 
-@pytest.mark.parametrize("form", ["zip", "pre-1.6", "plain pickle"])
+def changed(**tensors_too: object) -> bytes:
+    """A state dict with other tensors; None stands for one that is missing."""
+    state = tensors() | {key.replace("__", "."): value for key, value in tensors_too.items()}
+    return torch_bytes({key: value for key, value in state.items() if value is not None})
+
+
+def old_changed(**tensors_too: object) -> bytes:
+    state = old_keys(tensors()) | {key.replace("__", "."): value for key, value in tensors_too.items()}
+    return torch_bytes({key: value for key, value in state.items() if value is not None})
+
+
+def zipped(compression: int = zipfile.ZIP_STORED, **members: bytes | str) -> bytes:
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", compression) as archive:
+        for name, content in members.items():
+            archive.writestr(name.replace("__", "."), content)
+    return file.getvalue()
+
+
+def protocol(number: int) -> bytes:
+    file = io.BytesIO()
+    torch.save(tensors(), file, pickle_protocol=number)
+    return file.getvalue()
+
+
+NEITHER = "holds neither net_list nor weights of a TactileSGNet, but"
+REFUSED = {
+    "empty": (lambda: b"", NOT_A_CHECKPOINT),
+    "text": (lambda: b"spikeloom", NOT_A_CHECKPOINT),
+    "random": (lambda: np.random.default_rng(0).bytes(3000), NOT_A_CHECKPOINT),
+    "half a pickle": (lambda: b"\x80" + bytes(50), NOT_A_CHECKPOINT),
+    "pickle of an empty dict": (lambda: b"\x80\x02}q\x00.", NOT_A_CHECKPOINT),
+    "zip of recordings": (lambda: zipped(test__npy=b""), NOT_A_CHECKPOINT),
+    "other manifest": (lambda: zipped(manifest__json='{"format": "other", "files": []}'), NOT_A_CHECKPOINT),
+    "manifest that is no JSON": (lambda: zipped(manifest__json="{"), DAMAGED),
+    "pickled anew": (lambda: protocol(4), "is pickled with protocol 4 or newer, which torch does not read"),
+    "module": (lambda: torch_bytes(torch.nn.Linear(1, 1)), "a pickle that calls torch.nn.modules.linear.Linear"),
+    "nested": (lambda: torch_bytes({"epoch": 3, "model": tensors()}), f"{NEITHER} epoch, model"),
+    "tensor": (lambda: torch_bytes(torch.ones(3)), f"{NEITHER} Tensor"),
+    "nothing": (lambda: torch_bytes({}), f"{NEITHER} nothing"),
+    "odd name": (lambda: torch_bytes({"a\nb": 1}), f"{NEITHER} 'a\\nb'"),
+    "no run": (lambda: torch_bytes(released()), "net_list holds no run"),
+    "no list": (lambda: torch_bytes({"net_list": 5}), "net_list holds no run"),
+    "no convolution": (
+        lambda: torch_bytes({key: value for key, value in tensors().items() if key.startswith("fc")}),
+        "conv1.lins.0.weight is missing; conv1.bias is missing",
+    ),
+    "columns": (
+        lambda: old_changed(conv1__lin__weight=torch.ones(FEATURES, 7)),
+        "conv1.lin.weight has 7 columns, not a whole number of hops",
+    ),
+    "axes": (
+        lambda: old_changed(conv1__lin__weight=torch.ones(7), conv1__lin__bias=None),
+        "conv1.lin.weight is (7,), wanted (features, hops * 2)",
+    ),
+    "taxels": (
+        lambda: changed(fc1__weight=torch.ones(5, TAXELS * FEATURES + 1)),
+        "fc1.weight has 25 inputs, not a whole number of taxels with 4",
+    ),
+    "number": (lambda: changed(fc1__bias=5), "fc1.bias is a int, wanted a tensor"),
+    "integers": (lambda: changed(fc2__bias=torch.ones(7, dtype=torch.int64)), "fc2.bias is a tensor of int64"),
+    "sparse": (lambda: changed(fc3__bias=torch.ones(3).to_sparse()), "fc3.bias is a tensor of float32, wanted plain"),
+    "expanded": (
+        lambda: changed(fc3__weight=torch.ones(1).expand(10**6, 10**6)),
+        "fc3.weight claims 1000000000000 values, more than the file holds",
+    ),
+    "no classes": (
+        lambda: changed(fc3__weight=torch.ones(0, 7), fc3__bias=torch.ones(0)),
+        "fc3.weight is (0, 7), wanted (outputs, 7)",
+    ),
+    "bomb": (lambda: zipped(zipfile.ZIP_DEFLATED, data__pkl=bytes(10**7)), "bytes claim to hold 10000000"),
+    "packed": (
+        lambda: rebuilt(own(), lambda m, _: m.update(note="a" * 9000), compression=zipfile.ZIP_DEFLATED),
+        "bytes claim to hold",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_files_that_are_refused(tmp_path, name):
+    made, words = REFUSED[name]
+    assert words in refusal(write(tmp_path / "x.t7", made()))
+
+
+def test_missing_large_and_truncated_files(tmp_path):
+    assert "no such file" in refusal(tmp_path / "x.t7")
+    assert "no such file" in refusal(tmp_path)
+    with (tmp_path / "large").open("wb") as file:
+        file.truncate(SIZE_LIMIT + 1)
+    assert "more than 268435456 bytes, the limit of a checkpoint" in refusal(tmp_path / "large")
+    for whole in (torch_bytes(released(tensors())), torch_bytes(released(tensors()), new=False), own()):
+        for share in (0.02, 0.5, 0.99):
+            assert refusal(write(tmp_path / "x", whole[: int(share * len(whole))])).startswith(DAMAGED)
+
+
+@pytest.mark.parametrize("form", ["zip", "pre-1.6", "plain pickle", "protocol 4"])
 def test_code_in_a_pickle_is_refused_and_not_run(tmp_path, monkeypatch, form):
     monkeypatch.chdir(tmp_path)
-    content = released(tensors(), best_acc=_Command())
-    data = pickle.dumps(_Command(), protocol=2) if form == "plain pickle" else torch_bytes(content, new=form == "zip")
-    path = write(tmp_path / "x.t7", data)
-    assert f"is a pickle that calls {os.system.__module__}.system, allowed are tensors" in refusal(path)
+    pickled = {"plain pickle": 2, "protocol 4": 4}
+    if form in pickled:
+        data = pickle.dumps(_Command(), protocol=pickled[form])
+    else:
+        data = torch_bytes(released(tensors(), best_acc=_Command()), new=form == "zip")
+    told = "is pickled with protocol 4" if form == "protocol 4" else f"calls {os.system.__module__}.system, allowed"
+    assert told in refusal(write(tmp_path / "x.t7", data))
     assert not (tmp_path / "harm").exists()
 
 
-def test_newer_pickle_protocols_are_refused(tmp_path):
-    file = io.BytesIO()
-    torch.save(tensors(), file, pickle_protocol=4)
-    expected = "is pickled with protocol 4 or newer, which torch does not read"
-    assert expected in refusal(write(tmp_path / "x.t7", file.getvalue()))
-    assert expected in refusal(write(tmp_path / "x.t7", pickle.dumps(_Command(), protocol=4)))
-
-
-def test_a_whole_module_is_refused(tmp_path):
-    path = write(tmp_path / "x.t7", torch_bytes(torch.nn.Linear(1, 1)))
-    assert "is a pickle that calls torch.nn.modules.linear.Linear, allowed" in refusal(path)
-
-
-def test_other_tensors_are_no_network(tmp_path):
-    start = "holds neither net_list nor weights of a TactileSGNet, but"
-    path = write(tmp_path / "x.t7", torch_bytes({"epoch": 3, "model": tensors()}))
-    assert f"{start} epoch, model" in refusal(path)
-    assert f"{start} Tensor" in refusal(write(path, torch_bytes(torch.ones(3))))
-    assert f"{start} nothing" in refusal(write(path, torch_bytes({})))
-    assert f"{start} 'a\\nb'" in refusal(write(path, torch_bytes({"a\nb": 1})))
-    expected = "net_list holds no run"
-    assert expected in refusal(write(path, torch_bytes(released())))
-    assert expected in refusal(write(path, torch_bytes({"net_list": 5})))
-
-
 def test_every_fault_of_the_tensors_is_listed(tmp_path):
-    state = tensors()
-    del state["conv1.lins.1.weight"], state["fc2.bias"]
-    state["fc3.weight"] = torch.ones(CLASSES, 8)
-    state["fc1.bias"] = torch.ones(4)
-    state["fc4.weight"] = torch.ones(2, CLASSES)
-    state["fc1.weight"][2, :3] = torch.tensor([torch.nan, torch.inf, -torch.inf])
-    assert "conv1.lins.1.weight is missing" in refusal(write(tmp_path / "x.t7", torch_bytes(released(state))))
-
-
-def test_faults_of_old_keys(tmp_path):
-    state = old_keys(tensors())
-    state["conv1.lin.weight"] = torch.ones(FEATURES, 7)
-    path = write(tmp_path / "x.t7", torch_bytes(state))
-    assert "conv1.lin.weight has 7 columns, not a whole number of hops" in refusal(path)
-    del state["conv1.lin.bias"]
-    state["conv1.lin.weight"] = torch.ones(7)
-    assert "conv1.lin.weight is (7,), wanted (features, hops * 2)" in refusal(write(path, torch_bytes(state)))
-
-
-def test_without_a_convolution_both_its_tensors_are_missing(tmp_path):
-    dense = {key: value for key, value in tensors().items() if key.startswith("fc")}
-    assert "conv1.lins.0.weight is missing" in refusal(write(tmp_path / "x.t7", torch_bytes(dense)))
-
-
-def test_taxels_must_be_whole(tmp_path):
-    state = tensors() | {"fc1.weight": torch.ones(5, TAXELS * FEATURES + 1)}
-    assert "fc1.weight has 25 inputs, not a whole number of taxels with 4" in refusal(
-        write(tmp_path / "x.t7", torch_bytes(state))
+    weight = tensors()["fc1.weight"]
+    weight[2, :3] = torch.tensor([torch.nan, torch.inf, -torch.inf])
+    content = changed(
+        conv1__lins__1__weight=None,
+        fc2__bias=None,
+        fc3__weight=torch.ones(CLASSES, 8),
+        fc1__bias=torch.ones(4),
+        fc4__weight=torch.ones(2, CLASSES),
+        fc1__weight=weight,
     )
+    said = refusal(write(tmp_path / "x.t7", content))
+    assert said.rpartition("; ")[0].split("; ") == [
+        "conv1.lins.1.weight is missing",
+        "fc1.weight has 3 of 120 values NaN or infinite",
+        "fc1.bias is (4,), wanted (5,)",
+        "fc2.bias is missing",
+        "fc3.weight is (3, 8), wanted (3, 7)",
+        "fc4.weight is not part of a TactileSGNet",
+    ]
 
 
-def test_entries_that_are_no_plain_numbers(tmp_path):
-    state = tensors() | {
-        "fc1.bias": 5,
-        "fc2.bias": torch.ones(7, dtype=torch.int64),
-        "fc3.bias": torch.ones(3).to_sparse(),
-        "fc3.weight": torch.ones(1).expand(10**6, 10**6),
-    }
-    assert "fc1.bias is a int, wanted a tensor" in refusal(write(tmp_path / "x.t7", torch_bytes(state)))
-
-
-def test_empty_tensors(tmp_path):
-    state = tensors() | {"fc3.weight": torch.ones(0, 7), "fc3.bias": torch.ones(0)}
-    assert "fc3.weight is (0, 7), wanted (outputs, 7)" in refusal(write(tmp_path / "x.t7", torch_bytes(state)))
-
-
-def test_large_files_are_refused_unread(tmp_path):
-    path = tmp_path / "x.t7"
-    with path.open("wb") as file:
-        file.truncate(SIZE_LIMIT + 1)
-    assert "more than 268435456 bytes, the limit of a checkpoint" in refusal(path)
-
-
-def test_zip_bombs_are_refused(tmp_path):
-    file = io.BytesIO()
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("x/data.pkl", bytes(10**7))
-    path = write(tmp_path / "x.t7", file.getvalue())
-    assert f"{path.stat().st_size} bytes claim to hold 10000000" in refusal(path)
-    packed = rebuilt(own(), lambda manifest, _: manifest.update(note="a" * 9000), compression=zipfile.ZIP_DEFLATED)
-    assert f"{len(packed)} bytes claim to hold" in refusal(write(path, packed))
-
-
-def test_options_that_do_not_exist(tmp_path):
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"weights": "first"}, "--weights first: unknown"),
+        *[({"beta": beta}, f"beta {beta:g}: allowed are 0 <= beta < 1") for beta in (-0.1, 1.0, float("nan"))],
+        *[({"theta": theta}, f"theta {theta:g}: allowed are numbers above 0") for theta in (0.0, float("inf"))],
+        ({"run": 1}, "--run 1: the file holds only run 0"),
+        ({"weights": "best"}, "--weights best: the file holds the last epoch only"),
+    ],
+)
+def test_options_that_do_not_fit(tmp_path, options, words):
     path = write(tmp_path / "x.t7", torch_bytes(tensors()))
-    with_path = {"error": OptionError}
-    assert "--weights first: unknown" in refusal(path, weights="first", **with_path)
-    for beta in (-0.1, 1.0, float("nan")):
-        assert f"beta {beta:g}: allowed are 0 <= beta < 1" in refusal(path, beta=beta, **with_path)
-    for theta in (0.0, float("inf")):
-        assert f"theta {theta:g}: allowed are numbers above 0" in refusal(path, theta=theta, **with_path)
-
-
-def test_a_state_dict_has_one_run_and_one_epoch(tmp_path):
-    path = write(tmp_path / "x.t7", torch_bytes(tensors()))
-    assert "--run 1: the file holds only run 0" in refusal(path, run=1)
-    assert "--weights best: the file holds the last epoch only" in refusal(path, weights="best")
+    own_or_not = OptionError if not words.endswith(("run 0", "only")) else ModelError
+    assert words in refusal(path, own_or_not, **options)
 
 
 # --- our own format ------------------------------------------------------------------------------------------------
@@ -379,11 +374,7 @@ def test_own_format_round_trip(tmp_path):
     assert (read.taxels, read.classes) == (TAXELS, CLASSES)
     assert read.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
     assert read_checkpoint(path, beta=0.5).beta == 0.5
-
-
-def test_own_format_is_byte_deterministic():
-    assert own() == own()
-    assert own() != own(beta=0.3)
+    assert own() == own() != own(beta=0.3)
 
 
 def test_own_format_needs_neither_torch_nor_pickle(tmp_path):
@@ -414,29 +405,59 @@ def test_requests_that_an_own_file_cannot_meet(tmp_path):
     assert "--weights best: the file holds last" in refusal(path, weights="best")
 
 
-@pytest.mark.parametrize("version", [7, 0, None, "1\n"])
-def test_other_versions(tmp_path, version):
-    content = rebuilt(own(), lambda manifest, _: manifest.update(version=version))
-    assert f"has format version {version!r}, this program reads up to 6" in refusal(write(tmp_path / "x.pt", content))
+def member(content: bytes):
+    """A change that puts other bytes in the place of an array."""
+    return lambda _, members: members.update({"last/fc1.bias.npy": content})
 
 
-ALTERED = "its content does not match its hash, so it was altered; copy or train it again"
+ONES = npy(np.ones(5, np.float32))
+LARGE = ONES.replace(b"(5,), }" + b" " * 11, b"(100000000000,), }")
+ALTERED = "its content does not match its hash, so it was altered"
 
 
 @pytest.mark.parametrize(
-    "change",
+    ("change", "words"),
     [
-        lambda manifest, _: manifest.update(beta=0.3),
-        lambda manifest, _: manifest["graph"]["edges"].pop(),
-        lambda manifest, _: manifest.pop("sha256"),
-        lambda _, members: members.update({"last/fc1.bias.npy": npy(np.ones(5, np.float32))}),
-        lambda _, members: members.pop("best/fc1.bias.npy"),
-        lambda _, members: members.update({"last/more.npy": npy(np.ones(5, np.float32))}),
+        *[
+            (lambda m, _, version=version: m.update(version=version), f"has format version {version!r}, this program")
+            for version in (7, 0, None, "1\n")
+        ],
+        (lambda m, _: m.update(beta=0.3), ALTERED),
+        (lambda m, _: m["graph"]["edges"].pop(), ALTERED),
+        (lambda m, _: m.pop("sha256"), ALTERED),
+        (member(npy(np.zeros(5, np.float32))), ALTERED),
+        (lambda _, members: members.pop("best/fc1.bias.npy"), ALTERED),
+        (lambda _, members: members.update({"last/more.npy": ONES}), ALTERED),
+        (member(npy(np.ones(5))), DAMAGED),
+        (member(npy(np.asfortranarray(np.ones((2, 3), np.float32)))), DAMAGED),
+        (member(ONES[:-4]), DAMAGED),
+        (member(ONES.replace(b"(5,), }", b"(9**9,)")), DAMAGED),
+        (member(ONES.replace(b"(5,), } ", b"(1<<60,)")), DAMAGED),
+        (member(LARGE), DAMAGED),  # announces 400 GB
+        (member(b"no npy"), DAMAGED),
     ],
-    ids=["constant", "graph", "no hash", "array", "array missing", "array added"],
 )
-def test_altered_files(tmp_path, change):
-    assert refusal(write(tmp_path / "x.pt", rebuilt(own(), change, sign=False))) == ALTERED
+def test_altered_files(tmp_path, change, words):
+    assert len(LARGE) == len(ONES)
+    assert refusal(write(tmp_path / "x.pt", rebuilt(own(), change, sign=False))).startswith(words)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda m, _: m.pop("taxels"), "has an incomplete manifest (KeyError('taxels'))"),
+        (lambda m, _: m.update(beta=1.5), "beta 1.5: allowed are 0 <= beta < 1"),
+        (lambda m, _: m.update(graph={"name": "x", "edges": [[0, 6]]}), "the graph joins taxels outside 0..5"),
+        (lambda m, _: m.update(classes=4), "made for 6 taxels and 3 classes, the manifest says 6 taxels"),
+        (
+            lambda _, members: members.update({"last/fc2.bias.npy": npy(np.array([1, np.nan, 2], np.float32))}),
+            "fc2.bias has 1 of 3 values NaN or infinite",
+        ),
+        (lambda _, members: members.pop("last/conv1.hops.npy"), "conv1.hops is missing"),
+    ],
+)
+def test_signed_but_wrong(tmp_path, change, words):
+    assert words in refusal(write(tmp_path / "x.pt", rebuilt(own(), change)))
 
 
 def test_flipped_bits_are_found(tmp_path):
@@ -454,69 +475,6 @@ def test_flipped_bits_are_found(tmp_path):
             assert (read.beta, read.theta) == (0.25, 0.75)
         content[position] ^= 1
     assert found > 100
-
-
-@pytest.mark.parametrize(
-    ("change", "expected"),
-    [
-        (lambda m, _: m.pop("taxels"), "has an incomplete manifest (KeyError('taxels'))"),
-        (lambda m, _: m.update(beta=1.5), None),
-        (lambda m, _: m.update(graph={"name": "x", "edges": [[0, 6]]}), "the graph joins taxels outside 0..5"),
-        (
-            lambda m, _: m.update(classes=4),
-            "made for 6 taxels and 3 classes, the manifest says 6 taxels",
-        ),
-        (
-            lambda _, members: members.update({"last/fc2.bias.npy": npy(np.array([1, np.nan, 2], np.float32))}),
-            "fc2.bias has 1 of 3 values NaN or infinite",
-        ),
-        (lambda _, members: members.pop("last/conv1.hops.npy"), "conv1.hops is missing"),
-    ],
-)
-def test_signed_but_wrong(tmp_path, change, expected):
-    path = write(tmp_path / "x.pt", rebuilt(own(), change))
-    if expected is None:
-        assert "beta 1.5: allowed are 0 <= beta < 1" in refusal(path)
-    else:
-        assert expected in refusal(path)
-
-
-@pytest.mark.parametrize(
-    "member",
-    [
-        npy(np.ones(5)),
-        npy(np.asfortranarray(np.ones((2, 3), np.float32))),
-        npy(np.ones(5, np.float32))[:-4],
-        npy(np.ones(5, np.float32)).replace(b"(5,), }", b"(9**9,)"),
-        npy(np.ones(5, np.float32)).replace(b"(5,), } ", b"(1<<60,)"),
-        b"no npy",
-    ],
-    ids=["float64", "fortran", "cut", "expression", "another", "other"],
-)
-def test_arrays_that_are_not_as_described(tmp_path, member):
-    change = lambda _, members: members.update({"last/fc1.bias.npy": member})  # noqa: E731
-    assert refusal(write(tmp_path / "x.pt", rebuilt(own(), change, sign=False))).startswith(DAMAGED)
-
-
-def test_an_array_that_announces_more_than_it_has_takes_no_memory(tmp_path):
-    plain = npy(np.ones(5, np.float32))
-    member = plain.replace(b"(5,), }" + b" " * 11, b"(100000000000,), }")
-    assert len(member) == len(plain)
-    assert member != plain
-    change = lambda _, members: members.update({"last/fc1.bias.npy": member})  # noqa: E731
-    assert refusal(write(tmp_path / "x.pt", rebuilt(own(), change, sign=False))).startswith(DAMAGED)
-
-
-def test_manifest_must_be_json(tmp_path):
-    path = tmp_path / "x.pt"
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("manifest.json", "{")
-    assert refusal(path).startswith(DAMAGED)
-
-
-def test_weights_that_are_not_finite_are_not_written_into_a_manifest():
-    with pytest.raises(ValueError, match="Out of range float values are not JSON compliant"):
-        own(training={"loss": float("nan")})
 
 
 def test_an_interrupted_write_keeps_the_old_file(tmp_path):

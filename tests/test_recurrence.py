@@ -375,7 +375,10 @@ def test_widths_are_searched_with_loops_too():
 def test_what_cannot_have_it_says_so(files, capsys):
     words = ["compile", f"{files}/net.nir", "--dt", "0.02", "--target", "truenorth", "-o", f"{files}/x.loom"]
     assert main(words) == 2
-    assert f"{files}/net.nir" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert all(words in said for words in ("b, all 12 neurons", "truenorth.neuron.leak"))
+    assert said.count("\n") == 1
+    assert not (files / "x.loom").exists()
 
 
 def test_currents_biases_and_loops_together():
