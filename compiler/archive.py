@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from spikeloom.compiler.atomic import write_atomically
+from spikeloom.compiler.dynamics import MOST_CLOCKS, MOST_STEPS
 from spikeloom.compiler.errors import FormatError
 
 Array = np.ndarray[Any, Any]
@@ -223,6 +224,60 @@ def require_manifest(path: Path, manifest: Any, wanted: str, versions: tuple[int
             f"{', '.join(map(str, versions))}; compile it again or update spikeloom"
         )
     return dict(manifest)
+
+
+Kind = type | tuple[int, int] | dict[str, Any] | list[Any]
+"""What an entry of a manifest must be: of a type (``float``: from 0, finite), a whole number within bounds (both
+allowed), an object of exactly these entries, or a list of such things, ``[kind, ...]`` of at least one."""
+
+CLOCKS: Kind = {"channels": (0, MOST_CLOCKS), "steps": (1, MOST_STEPS)}
+
+
+def entry_faults(manifest: Mapping[str, Any], kinds: Mapping[str, Kind]) -> list[str]:
+    """Entries of a manifest that are missing or of another kind.
+
+    Examples
+    --------
+    >>> entry_faults({"taxels": 0, "layers": ["fc1"]}, {"taxels": (1, 9), "layers": [str], "target": str})
+    ['the manifest has no usable taxels', 'the manifest has no usable target']
+    """
+    return [f"the manifest has no usable {name}" for name, kind in kinds.items() if not _is(manifest.get(name), kind)]
+
+
+def _is(value: Any, kind: Kind) -> bool:
+    match kind:
+        case type() if kind is float:
+            return type(value) in (int, float) and 0 <= value < math.inf
+        case type():
+            return isinstance(value, kind)
+        case tuple():
+            return type(value) is int and kind[0] <= value <= kind[1]
+        case dict():
+            return isinstance(value, dict) and set(value) == set(kind) and all(_is(value[k], kind[k]) for k in kind)
+    return isinstance(value, list) and len(value) >= len(kind) - 1 and all(_is(one, kind[0]) for one in value)
+
+
+def bounds_faults(bounds: Mapping[str, tuple[Array, int, int]]) -> list[str]:
+    """Bounds (parts + 1,) that do not divide all entries; by name, with the numbers of parts and of entries."""
+    return [
+        f"{name} does not divide {total} entries in {parts} parts"
+        for name, (ends, parts, total) in bounds.items()
+        if len(ends) != parts + 1 or ends[0] != 0 or ends[-1] != total or np.any(np.diff(ends) < 0)
+    ]
+
+
+def is_outside(array: Array, low: int, high: int) -> bool:
+    """Whether an array has values below `low`, or `high` and above."""
+    return bool(array.size and (array.min() < low or array.max() >= high))
+
+
+def range_faults(ranges: Mapping[str, tuple[Array, int, int]]) -> list[str]:
+    """Arrays, by name with their ranges, that have values outside."""
+    return [
+        f"{name} has values outside {low} … {high - 1}"
+        for name, (a, low, high) in ranges.items()
+        if is_outside(a, low, high)
+    ]
 
 
 def read_archive(

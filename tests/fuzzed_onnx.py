@@ -34,63 +34,65 @@ def _graphs(graph):
                 yield from _graphs(attribute.g)
 
 
-def _change(graph, rng):  # noqa: PLR0912 one branch a kind of fault
-    """One fault in a graph."""
-    names = [name for node in graph.node for name in node.output] + [t.name for t in graph.initializer]
-    names += [value.name for value in graph.input]
+def _changed_attribute(node, rng):
+    attribute = rng.choice(node.attribute)
+    attribute.i = rng.choice(NUMBERS)
+    attribute.f = rng.choice((0.0, float("nan"), float("inf"), -1e30))
+    if attribute.ints:
+        attribute.ints[rng.randrange(len(attribute.ints))] = rng.choice(NUMBERS)
+
+
+def _new_attribute(node, rng):
+    attribute = node.attribute.add()
+    attribute.name = rng.choice(("axis", "axes", "perm", "to", "group", "pads", "kernel_shape", "reduction", "body"))
+    attribute.type = rng.randrange(15)
+    attribute.i = rng.choice(NUMBERS)
+    attribute.ints.extend(rng.choices(NUMBERS, k=rng.randrange(4)))
+
+
+def _elsewhere(tensor, rng):
+    tensor.data_location = 1
+    entry = tensor.external_data.add()
+    entry.key, entry.value = "location", rng.choice(("../x", "/etc/passwd", "net.onnx", "none", "", "a\0b", "."))
+
+
+def _change(graph, rng):
+    """One fault in a graph, if it has what the fault needs."""
     node = rng.choice(graph.node) if graph.node else None
     tensor = rng.choice(graph.initializer) if graph.initializer else None
-    kind = rng.randrange(15)
-    if kind == 0 and node:
-        node.op_type = rng.choice(OPERATORS)
-    elif kind == 1 and node and node.input:
-        node.input[rng.randrange(len(node.input))] = rng.choice([*names, "", "nothing"])
-    elif kind == 2 and node and node.output:
-        node.output[rng.randrange(len(node.output))] = rng.choice([*names, "new"])
-    elif kind == 3 and node:
-        graph.node.remove(node)
-    elif kind == 4 and node:
-        graph.node.add().CopyFrom(node)
-    elif kind == 5 and node and node.attribute:
-        attribute = rng.choice(node.attribute)
-        attribute.i = rng.choice(NUMBERS)
-        attribute.f = rng.choice((0.0, float("nan"), float("inf"), -1e30))
-        if attribute.ints:
-            attribute.ints[rng.randrange(len(attribute.ints))] = rng.choice(NUMBERS)
-    elif kind == 6 and node:
-        attribute = node.attribute.add()
-        attribute.name = rng.choice(
-            ("axis", "axes", "perm", "to", "group", "pads", "kernel_shape", "reduction", "body")
-        )
-        attribute.type = rng.randrange(15)
-        attribute.i = rng.choice(NUMBERS)
-        attribute.ints.extend(rng.choices(NUMBERS, k=rng.randrange(4)))
-    elif kind == 7 and node and node.attribute:
-        rng.choice(node.attribute).type = rng.randrange(15)
-    elif kind == 8 and tensor:
-        tensor.data_type = rng.randrange(24)
-    elif kind == 9 and tensor and tensor.dims:
-        tensor.dims[rng.randrange(len(tensor.dims))] = rng.choice(NUMBERS)
-    elif kind == 10 and tensor and tensor.raw_data:
-        tensor.raw_data = changed_bytes(tensor.raw_data, rng)
-    elif kind == 11 and tensor:
-        tensor.data_location = 1
-        entry = tensor.external_data.add()
-        entry.key, entry.value = "location", rng.choice(("../x", "/etc/passwd", "net.onnx", "none", "", "a\0b", "."))
-    elif kind == 12 and graph.input:
-        value = rng.choice(graph.input).type.tensor_type
-        if value.shape.dim:
-            value.shape.dim[rng.randrange(len(value.shape.dim))].dim_value = rng.choice(NUMBERS)
-    elif kind == 13 and graph.output:
-        rng.choice(graph.output).name = rng.choice([*names, "nothing"])
-    elif kind == 14 and tensor and node:
-        node.input.append(tensor.name)
+    value = rng.choice(graph.input).type.tensor_type if graph.input else None
+    names = [name for node in graph.node for name in node.output]
+    names += [one.name for one in (*graph.initializer, *graph.input)]
+
+    def replaced(items, *others):
+        items[rng.randrange(len(items))] = rng.choice(others)
+
+    faults = [
+        (node, lambda: setattr(node, "op_type", rng.choice(OPERATORS))),
+        (node and node.input, lambda: replaced(node.input, *names, "", "nothing")),
+        (node and node.output, lambda: replaced(node.output, *names, "new")),
+        (node, lambda: graph.node.remove(node)),
+        (node, lambda: graph.node.add().CopyFrom(node)),
+        (node and node.attribute, lambda: _changed_attribute(node, rng)),
+        (node, lambda: _new_attribute(node, rng)),
+        (node and node.attribute, lambda: setattr(rng.choice(node.attribute), "type", rng.randrange(15))),
+        (tensor, lambda: setattr(tensor, "data_type", rng.randrange(24))),
+        (tensor and tensor.dims, lambda: replaced(tensor.dims, *NUMBERS)),
+        (tensor and tensor.raw_data, lambda: setattr(tensor, "raw_data", changed_bytes(tensor.raw_data, rng))),
+        (tensor, lambda: _elsewhere(tensor, rng)),
+        (value and value.shape.dim, lambda: setattr(rng.choice(value.shape.dim), "dim_value", rng.choice(NUMBERS))),
+        (graph.output, lambda: setattr(rng.choice(graph.output), "name", rng.choice([*names, "nothing"]))),
+        (tensor and node, lambda: node.input.append(tensor.name)),
+    ]
+    possible, fault = rng.choice(faults)
+    if possible:
+        fault()
 
 
 def changed_structure(content, rng):
     """A few faults in a file that can still be parsed."""
     model = ModelProto.FromString(content)
-    for _ in range(rng.choice((1, 1, 2, 4))):
+    for _ in range(rng.choice((1, 1, 1, 2, 4))):
         _change(rng.choice(list(_graphs(model.graph))), rng)
     if rng.random() < 0.02 and model.opset_import:
         model.opset_import[0].version = rng.choice(NUMBERS)
@@ -101,5 +103,5 @@ def faulty(seed):
     """A file for a seed."""
     rng = random.Random(seed)
     content = rng.choice(sources())
-    content = changed_structure(content, rng) if rng.random() < 0.7 else content
-    return changed_bytes(content, rng) if rng.random() < 0.45 else content
+    content = changed_structure(content, rng) if rng.random() < 0.8 else content
+    return changed_bytes(content, rng) if rng.random() < 0.25 else content

@@ -71,32 +71,16 @@ def convolution(
     dilation: Sequence[int],
     groups: int = 1,
 ) -> tuple[Sparse, tuple[int, ...]]:
-    """Matrix of a convolution, and the shape of what it gives.
+    """Matrix of a convolution, csr_array (size of the result, size of the input), and the shape of what it gives.
 
-    Parameters
-    ----------
-    shape : (channels, *space)
-        Of the input.
-    weight : (filters, channels / groups, *kernel) float64
-        Kernels.
-    stride, dilation : one for each space axis
-    padding : zeros before and after, for each space axis
-    groups : int
-        Parts of the channels that do not mix.
+    shape: (channels, *space) of the input.
+    weight: (filters, channels / groups, *kernel) float64; weights of zero are not in the matrix.
+    stride, dilation: one for each space axis.
+    padding: zeros before and after, for each space axis.
+    groups: parts of the channels that do not mix.
 
-    Returns
-    -------
-    matrix : csr_array (size of the result, size of the input) float64
-        Without weights of zero.
-    shape : (filters, *places)
+    Raises ModelError if sizes do not fit each other, or the matrix would be too large.
 
-    Raises
-    ------
-    ModelError
-        If sizes do not fit each other, or the matrix would be too large.
-
-    Examples
-    --------
     >>> matrix, shape = convolution((1, 3), np.array([[[1.0, 2.0]]]), stride=[1], padding=[(0, 0)], dilation=[1])
     >>> shape, matrix.toarray().tolist()
     ((1, 2), [[1.0, 2.0, 0.0], [0.0, 1.0, 2.0]])
@@ -104,12 +88,13 @@ def convolution(
     channels, *space = shape
     filters, each, *kernel = weight.shape
     if groups < 1 or channels != each * groups or filters % groups:
+        turned = " (they would fit with filters and channels exchanged)" if channels == filters else ""
         raise ModelError(
             f"has kernels for {each} channels in {groups} groups and {filters} filters, its input has {channels} "
-            f"channels{_turned(channels, filters, each, groups)}; export it again"
+            f"channels{turned}; export it again"
         )
     out = places(space, kernel, stride, padding, dilation)
-    if weight.size * math.prod(out) > COEFFICIENT_LIMIT:
+    if max(weight.size, 1) * math.prod(out) > COEFFICIENT_LIMIT:
         raise ModelError(
             f"has {weight.size * math.prod(out):,} weights once written out, {COEFFICIENT_LIMIT:,} are allowed; this "
             "is no network of one chip"
@@ -142,9 +127,9 @@ def convolution(
     return matrix, (filters, *out)
 
 
-def _turned(channels: int, filters: int, each: int, groups: int) -> str:
-    """What would explain kernels that do not fit."""
-    return " (they would fit with filters and channels exchanged)" if channels == filters and each * groups > 0 else ""
+def block_diagonal(matrix: Sparse, copies: int) -> Sparse:
+    """The same matrix for each of so many parts of a value."""
+    return matrix if copies == 1 else sparse.csr_array(sparse.kron(sparse.identity(copies), matrix, format="csr"))
 
 
 def pooling(

@@ -11,6 +11,12 @@ def printable(name: str) -> str:
     return name if name.isprintable() and len(name) < 100 else repr(name[:100])
 
 
+def one_line(error: Exception) -> str:
+    """What another program said of a file, as a message can show it."""
+    said = " ".join(str(error).split())[:240] or type(error).__name__
+    return said if said.isprintable() else repr(said)
+
+
 def plain_names(names: Sequence[str], taken: Collection[str] = ()) -> tuple[str, ...]:
     """Names of letters, digits and underscores; one that is not unique, or taken, gets its place as a suffix.
 

@@ -31,16 +31,6 @@ from spikeloom.compiler.sensor_layout import sensor_layout
 
 NEURONS = ("CUBA", "LOIHI")
 
-NO_PLACE = {
-    "average": "averages spikes into numbers",
-    "concat": "joins layers that lie differently deep",
-    "convT": "is a transposed convolution, which netx itself does not load",
-    "dense_comp": "has complex weights",
-    "pool": "pools, which netx itself does not load",
-    "unpool": "unpools, which netx itself does not load",
-}
-"""Why layers that the format knows have no place here."""
-
 ALLOWED = "input, flatten, dense, dense_rec and conv"
 
 OWN = "spikeloom"
@@ -97,11 +87,8 @@ def integers_of(
     if own is None:
         sensor, positions, words = sensor_layout(shape, polarities=polarities, polarities_first=polarities_first)
     else:
-        sensor, positions, words = (
-            own[0],
-            np.arange(own[0].size),
-            f"{own[0].taxels} taxels, {own[0].polarities} polarities",
-        )
+        sensor, positions = own[0], np.arange(own[0].size)
+        words = f"{sensor.taxels} taxels, {sensor.polarities} polarities"
     facts = [f"netx, {len(blocks)} layers, read as they stand", f"input: {words}"]
     populations: list[IntegerPopulation] = []
     projections: list[IntegerProjection] = []
@@ -169,9 +156,7 @@ def _synapses(block: Block, shape: tuple[int, ...]) -> tuple[Sparse, tuple[int, 
         return sparse.csr_array(_matrix(block, "weight", neurons, math.prod(shape))), (neurons,)
     if block.type == "conv":
         return _conv(block, shape)
-    if block.type in NO_PLACE:
-        raise block.fail(f"{NO_PLACE[block.type]}; allowed are {ALLOWED}")
-    raise block.fail(f"is of a type that is not known, allowed are {ALLOWED}; export it again")
+    raise block.fail(f"is of a type that has no place here, allowed are {ALLOWED}; train without")
 
 
 def _matrix(block: Block, key: str, neurons: int, received: int) -> IntArray:
@@ -302,18 +287,18 @@ def _own(tree: Tree, inputs: int, voters: int) -> tuple[Input, IntArray] | None:
     if not isinstance(entries, dict):
         return None
     said = Block(number=-1, type=OWN, entries=entries)
-    taxels, polarities, channels, steps = (
-        said.number_of(key) for key in ("taxels", "polarities", "clocks", "clock_steps")
-    )
-    clocks = Clocks(channels=channels, steps=steps) if channels else NO_CLOCKS
-    bins = said.number_of("bins") if "bins" in entries else 1
-    if (
-        not 1 <= bins <= MOST_STEPS
-        or min(taxels, polarities) < 1
-        or not 0 <= channels <= MOST_CLOCKS
-        or not 1 <= steps <= MOST_STEPS
-    ):
+    limits = {
+        "taxels": 2**20,
+        "polarities": 2**20,
+        "clocks": MOST_CLOCKS,
+        "clock_steps": MOST_STEPS,
+        "bins": MOST_STEPS,
+    }
+    stated = {"bins": 1} | {key: said.number_of(key) for key in limits if key in entries or key != "bins"}
+    if any(not (key != "clocks") <= stated[key] <= most for key, most in limits.items()):
         raise ModelError(f"group {OWN} describes no sensor; {REMEDY}")
+    taxels, polarities, channels, steps, bins = (stated[key] for key in limits)
+    clocks = Clocks(channels=channels, steps=steps) if channels else NO_CLOCKS
     sensor = Input(taxels=taxels, polarities=polarities, clocks=clocks, bins=bins)
     label = said.integers("label").ravel()
     if sensor.size != inputs or label.size != voters or label.min() < 0 or label.max() >= voters:

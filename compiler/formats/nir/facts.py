@@ -95,21 +95,6 @@ def _drifts(graph: Graph, steps: Steps, spiking: Sequence[SpikingNode], sensor: 
             f"drift: r is tau / {written:g} in every neuron, as of a file written in steps of {written:g} s; in steps "
             f"of {steps.dt:g} s its decays and gains are others than there"
         )
-    rounded = [
-        f"{printable(name)}.{key} ({np.dtype(node.stored(key)).name})"
-        for name, node in graph.nodes.items()
-        for key in ("weight", "bias", "tau", "tau_mem", "tau_syn", "v_threshold")
-        if node.has(key) and (np.dtype(node.stored(key)).kind != "f" or np.dtype(node.stored(key)).itemsize < 4)
-    ]
-    if rounded:
-        facts.append(f"drift: rounded before the file was written: {', '.join(rounded[:6])}; read as they stand")
-    square = [
-        printable(name)
-        for name, node in graph.nodes.items()
-        if node.type in ("Affine", "Linear") and len(set(node.numbers("weight").shape)) == 1
-    ]
-    if square:
-        facts.append(f"square matrices are read as (to, from): {', '.join(square[:6])}")
     if sensor.clocks.channels:
         facts.append("biases that go through a synaptic current come from a channel that always has an event")
     return facts

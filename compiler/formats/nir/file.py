@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.fixedpoint import FloatArray
@@ -89,11 +88,6 @@ class Node:
         if length is not None and len(values) != length:
             raise self.fail(f"{key} has {len(values)} values, wanted {length}; {DAMAGED}")
         return values
-
-    def stored(self, key: str) -> npt.DTypeLike:
-        """Type in which a parameter is stored."""
-        array = self.values.get(key)
-        return array.dtype if isinstance(array, np.ndarray) else np.dtype(np.float64)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

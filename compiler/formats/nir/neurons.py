@@ -54,9 +54,11 @@ class Steps:
             return np.asarray(np.exp(-self.dt / tau))
         kept = 1 - self.dt / tau
         if np.any(kept < -TOLERANCE):
+            written = written_for(node)
+            hint = "" if written is None else f" (its r is tau / {written:g}, so it was written in steps of that)"
             raise node.fail(
                 f"{key} is {tau.min():g} s, shorter than the step of {self.dt:g} s, which the Euler convention cannot "
-                f"have{_why_short(node, tau)}; give another --dt, or --convention exponential"
+                f"have{hint}; give another --dt, or --convention exponential"
             )
         return np.maximum(kept, 0)
 
@@ -65,35 +67,22 @@ TOLERANCE = 1e-6
 """What float32 leaves of equal numbers."""
 
 
-def _why_short(node: Node, tau: FloatArray) -> str:
-    """What exporters are known to do to time constants."""
-    written = written_for(node)
-    if written is not None:
-        return f" (its r is tau / {written:g}, so it was written in steps of {written:g} s)"
-    if np.all(tau < 1e-3):
-        return " (Norse multiplies its dt into tau: such a file wants the square of that dt)"
-    return ""
-
-
 def written_for(node: Node) -> float | None:
     """Step that a file was written in, where the parameters of a neuron tell: `r` is tau over it, and not 1.
 
     Then a step adds its input as it is; snnTorch and SpikingJelly write so.
     """
-    key = "tau" if node.type in ("LIF", "LI") else "tau_mem"
-    if node.type == "IF" and node.has("r"):
-        r = node.numbers("r")
-        if r.size and np.all(r > 0) and np.ptp(r) <= TOLERANCE * r.flat[0] and r.flat[0] != 1:
-            return float(f"{1 / r.flat[0]:.6g}")
-    if not (node.has(key) and node.has("r")):
+    if not node.has("r"):
         return None
-    tau, r = node.numbers(key).ravel(), node.numbers("r").ravel()
-    if not tau.size or not r.size or (tau.size != r.size and 1 not in (tau.size, r.size)):
+    key = {"LIF": "tau", "LI": "tau", "CubaLIF": "tau_mem"}.get(node.type)
+    r = node.numbers("r").ravel()
+    tau = node.numbers(key).ravel() if key and node.has(key) else np.ones(1)
+    if 0 in (tau.size, r.size) or (tau.size != r.size and 1 not in (tau.size, r.size)) or np.all(r == 1):
         return None
-    if np.any(r <= 0) or np.any(tau <= 0) or np.all(np.abs(r - 1) < TOLERANCE):
-        return None
-    step = tau / r
-    return float(f"{step[0]:.6g}") if np.ptp(step) <= TOLERANCE * step[0] else None
+    with np.errstate(all="ignore"):
+        step = tau / r
+    same = step[0] > 0 and np.ptp(step) <= TOLERANCE * step[0]
+    return float(f"{step[0]:.6g}") if same else None
 
 
 def spread(node: Node, key: str, size: int, shape: tuple[int, ...]) -> FloatArray:

@@ -11,7 +11,7 @@ from scipy import sparse
 
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.fixedpoint import FloatArray
-from spikeloom.compiler.formats.kernels import Padding, convolution, pooling, same_padding
+from spikeloom.compiler.formats.kernels import Padding, block_diagonal, convolution, pooling, same_padding
 from spikeloom.compiler.formats.nir.file import Node
 from spikeloom.compiler.formats.nir.neurons import Steps, one, spread
 from spikeloom.compiler.formats.nir.values import Value, filtered, reshaped, scaled, shifted, through
@@ -39,10 +39,7 @@ def _linear(node: Node, value: Value, _steps: Steps) -> Value:
     copies = math.prod(value.shape[:-1])
     if copies * weight.size > DENSE_LIMIT:
         raise node.fail(f"has {copies * weight.size:,} weights, {DENSE_LIMIT:,} are allowed; this fits no chip")
-    matrix = sparse.csr_array(weight)
-    if copies != 1:
-        matrix = sparse.csr_array(sparse.kron(sparse.identity(copies), matrix, format="csr"))
-    result = through(value, matrix, (*value.shape[:-1], rows))
+    result = through(value, block_diagonal(sparse.csr_array(weight), copies), (*value.shape[:-1], rows))
     if node.type == "Linear":
         return result
     return shifted(result, np.tile(_each(node, "bias", rows), copies))

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.formats.names import one_line
 from spikeloom.compiler.formats.onnx.file import BOOL, Array, Node, decimal
 from spikeloom.compiler.formats.onnx.values import Table
 
@@ -102,8 +103,7 @@ def _gathered(data: Array, indices: Array, axis: int) -> Array:
 
 def misfit(error: Exception) -> ModelError:
     """What is said of an operator whose operands or attributes do not fit each other."""
-    reason = " ".join(f"{error}".split())[:120] or type(error).__name__
-    return ModelError(f"cannot be evaluated ({reason}); export it again")
+    return ModelError(f"cannot be evaluated ({one_line(error)}); export it again")
 
 
 @contextmanager

@@ -8,9 +8,7 @@ that float32 (0.2, not 0.200000003); the float32 model is the same, the float64 
 from __future__ import annotations
 
 import hashlib
-import math
-import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,13 +17,13 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.formats.names import printable
+from spikeloom.compiler.formats.names import one_line, printable
 
 Array = npt.NDArray[Any]
 """float64, int64 or bool."""
 
 SIZE_LIMIT = 2**28
-"""Bytes that a file and its external data may have together: 256 MiB, as of a checkpoint."""
+"""Bytes that a file may have, and its external data: 256 MiB, as of a checkpoint."""
 
 OPSETS = range(9, 27)
 """Versions of the operator set whose operators are known here."""
@@ -44,7 +42,6 @@ STRING = 8
 SAME = {"MatMulInteger": "MatMul"}
 """Operators that are another one once their numbers are widened."""
 
-_EXTERNAL = 1
 DAMAGED = "is truncated or damaged; export it again"
 
 
@@ -111,54 +108,6 @@ def _texts(values: Iterable[str | bytes]) -> tuple[str, ...]:
     return tuple(_text(value) for value in values)
 
 
-class _Content:
-    """Bytes of a file and of the files beside it that it names, counted together."""
-
-    def __init__(self, path: Path) -> None:
-        self.folder = path.absolute().parent
-        self.left = SIZE_LIMIT
-        self.digest = hashlib.sha256()
-        self.files: dict[str, bytes] = {}
-        self.main = self._bytes(path, "")
-
-    def external(self, name: str, entries: Iterable[Any]) -> bytes:
-        """The part of a file beside this one that holds a tensor."""
-        stated = {_text(entry.key): _text(entry.value) for entry in entries}
-        location = stated.get("location", "")
-        what = f"tensor {printable(name)}: its data lies in {printable(location)!r}"
-        place = Path(location)
-        # Links are followed before the folder is compared, so that none leads out of it.
-        inside = location and not place.is_absolute() and "\0" not in location and "\\" not in location
-        real = Path(os.path.realpath(self.folder / place)) if inside else place
-        if not inside or not real.is_relative_to(os.path.realpath(self.folder)):
-            raise ModelError(f"{what}, outside the folder of this file; allowed are files in it, do not trust this one")
-        if location not in self.files:
-            if not real.is_file():
-                raise ModelError(f"{what}, which is not there; copy it beside this file")
-            self.files[location] = self._bytes(real, f"{printable(location)}: ")
-        content = self.files[location]
-        try:
-            offset = int(stated.get("offset", "0"))
-            length = int(stated.get("length", str(len(content) - offset)))
-        except ValueError as error:
-            raise ModelError(f"{what} at an unreadable place; {DAMAGED}") from error
-        if offset < 0 or length < 0 or offset + length > len(content):
-            raise ModelError(f"{what} beyond its {len(content)} bytes; copy both files again")
-        return content[offset : offset + length]
-
-    def _bytes(self, path: Path, which: str) -> bytes:
-        try:
-            with path.open("rb") as file:
-                content = file.read(self.left + 1)
-        except OSError as error:
-            raise ModelError(f"{which}cannot be read ({error.strerror or error}); check its permissions") from error
-        self.left -= len(content)
-        if self.left < 0:
-            raise ModelError(f"{which}more than {SIZE_LIMIT} bytes, the limit of a network; export a smaller one")
-        self.digest.update(content)
-        return content
-
-
 def read_model(path: Path) -> Model:
     """Read a file.
 
@@ -170,10 +119,14 @@ def read_model(path: Path) -> Model:
 
     if not path.is_file():
         raise ModelError("no such file; give a file of torch.onnx.export")
-    content = _Content(path)
+    _require_size(path.stat().st_size)
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise ModelError(f"cannot be read ({error.strerror or error}); check its permissions") from error
     proto = ModelProto()
     try:
-        proto.ParseFromString(content.main)
+        proto.ParseFromString(content)
     except (DecodeError, ValueError) as error:
         raise ModelError(f"is not an ONNX file, or {DAMAGED}") from error
     if not proto.HasField("graph"):
@@ -185,27 +138,76 @@ def read_model(path: Path) -> Model:
             f"has operators of version {opset}, allowed are {OPSETS.start} to {OPSETS.stop - 1}; "
             "export it with opset_version=20"
         )
-    counted = [NODE_LIMIT]
-    graph = _graph(proto.graph, content, counted, NESTING)
+    digest = hashlib.sha256(content)
+    _bring_data(proto.graph, path.absolute().parent, digest)
+    _check(proto)
     return Model(
-        graph=graph, opset=opset, producer=printable(_text(proto.producer_name)), sha256=content.digest.hexdigest()
+        graph=_graph(proto.graph),
+        opset=opset,
+        producer=printable(_text(proto.producer_name)),
+        sha256=digest.hexdigest(),
     )
 
 
-def _graph(proto: Any, content: _Content, left: list[int], nesting: int) -> Graph:
-    left[0] -= len(proto.node)
+def _require_size(size: int) -> None:
+    if size > SIZE_LIMIT:
+        raise ModelError(f"more than {SIZE_LIMIT} bytes, the limit of a network; export a smaller one")
+
+
+def _bring_data(graph: Any, folder: Path, digest: Any) -> None:
+    """Put data that lie beside the file into its tensors; the onnx package refuses places outside the folder."""
+    from onnx.external_data_helper import load_external_data_for_tensor
+
+    total = 0
+    for tensor in _tensors(graph, [NODE_LIMIT], NESTING):
+        if tensor.data_location != tensor.EXTERNAL:
+            continue
+        location = next((entry.value for entry in tensor.external_data if entry.key == "location"), "")
+        try:
+            total += (folder / _text(location)).stat().st_size
+            _require_size(total)
+            load_external_data_for_tensor(tensor, str(folder))
+        except ModelError:
+            raise
+        except Exception as error:  # nearly anything, as of the checker
+            raise ModelError(
+                f"tensor {printable(_text(tensor.name))}: its data in {printable(_text(location))!r} beside the file "
+                f"cannot be had ({one_line(error)}); copy both files again"
+            ) from error
+        digest.update(tensor.raw_data)
+
+
+def _tensors(graph: Any, left: list[int], nesting: int) -> Iterator[Any]:
+    """Tensors of a graph and of those in it; there may be so many nodes left and so many graphs in graphs."""
+    left[0] -= len(graph.node)
     if nesting == 0 or left[0] < 0:
         what = f"more than {NODE_LIMIT} nodes" if left[0] < 0 else f"graphs nested deeper than {NESTING}"
         raise ModelError(f"has {what}; export one step of the network instead of all")
-    if len(proto.sparse_initializer) or len(proto.quantization_annotation):
-        raise ModelError("has sparse or quantised constants; export the float network")
-    constants: dict[str, Array] = {}
-    for tensor in proto.initializer:
-        if _text(tensor.name) in constants:
-            raise ModelError(f"tensor {printable(_text(tensor.name))} is there twice; {DAMAGED}")
-        constants[_text(tensor.name)] = _array(tensor, content)
+    yield from graph.initializer
+    for node in graph.node:
+        for attribute in node.attribute:
+            if attribute.HasField("t"):
+                yield attribute.t
+            if attribute.HasField("g"):
+                yield from _tensors(attribute.g, left, nesting - 1)
+
+
+def _check(proto: Any) -> None:
+    """Refuse what ONNX's own checker does: names that nothing makes, operators out of order, tensors cut short."""
+    from onnx import checker
+
+    for output in proto.graph.output:  # their shapes may be unknown
+        output.type.tensor_type.shape.SetInParent()
+    try:
+        checker.check_model(proto)
+    except Exception as error:
+        raise ModelError(f"is no graph as ONNX defines it ({one_line(error)}); export it again") from error
+
+
+def _graph(proto: Any) -> Graph:
+    constants = {_text(tensor.name): _array(tensor) for tensor in proto.initializer}
     return Graph(
-        nodes=tuple(_node(node, content, left, nesting) for node in proto.node),
+        nodes=tuple(map(_node, proto.node)),
         inputs=tuple(_declared(value) for value in proto.input if _text(value.name) not in constants),
         outputs=tuple(_text(value.name) for value in proto.output),
         constants=constants,
@@ -226,7 +228,7 @@ def _declared(proto: Any) -> Declared:
     return Declared(name=_text(proto.name), kind=kind.elem_type, shape=tuple(shape))
 
 
-def _node(proto: Any, content: _Content, left: list[int], nesting: int) -> Node:
+def _node(proto: Any) -> Node:
     named = _text(proto.name or (proto.output[0] if proto.output else "?"))
     node = Node(
         name=named,
@@ -250,9 +252,9 @@ def _node(proto: Any, content: _Content, left: list[int], nesting: int) -> Node:
             case entry.STRING:
                 value = entry.s.decode("utf-8", "replace")
             case entry.TENSOR:
-                value = _array(entry.t, content)
+                value = _array(entry.t)
             case entry.GRAPH:
-                value = _graph(entry.g, content, left, nesting - 1)
+                value = _graph(entry.g)
             case entry.FLOATS:
                 value = [decimal(number) for number in entry.floats]
             case entry.INTS:
@@ -267,27 +269,20 @@ def _node(proto: Any, content: _Content, left: list[int], nesting: int) -> Node:
     return replace(node, attributes=attributes)
 
 
-def _array(proto: Any, content: _Content) -> Array:
-    """A tensor, widened to float64, int64 or bool; its declared size is held against what the file has."""
-    from onnx import helper, numpy_helper
+def _array(proto: Any) -> Array:
+    """A tensor, widened to float64, int64 or bool."""
+    from onnx import numpy_helper
 
     what = f"tensor {printable(_text(proto.name)) or '(no name)'}"
-    if proto.data_type not in NUMBERS or proto.data_type == STRING:
-        raise ModelError(f"{what}: has element type {proto.data_type}, allowed are numbers and truth values; {DAMAGED}")
-    kind, shape = helper.tensor_dtype_to_np_dtype(proto.data_type), tuple(int(size) for size in proto.dims)
-    if len(shape) > DIMENSIONS or any(size < 0 for size in shape):
-        raise ModelError(f"{what}: has an impossible shape {shape[:DIMENSIONS]}; {DAMAGED}")
-    if proto.data_location == _EXTERNAL:
-        proto.raw_data = content.external(_text(proto.name), proto.external_data)
-        proto.data_location = 0
-    listed = getattr(proto, helper.tensor_dtype_to_field(proto.data_type))
-    held = len(proto.raw_data) / kind.itemsize if proto.HasField("raw_data") else len(listed)
-    if math.prod(shape) != held:
-        raise ModelError(f"{what}: claims {math.prod(shape)} values, the file holds {held:g}; {DAMAGED}")
+    if proto.data_type not in NUMBERS or proto.data_type == STRING or len(proto.dims) > DIMENSIONS:
+        raise ModelError(
+            f"{what}: has element type {proto.data_type} and {len(proto.dims)} dimensions, allowed are numbers and "
+            f"truth values in up to {DIMENSIONS}; {DAMAGED}"
+        )
     try:
         return widened(numpy_helper.to_array(proto), what)
     except (OverflowError, TypeError, ValueError) as error:
-        raise ModelError(f"{what}: holds numbers that its type cannot; {DAMAGED}") from error
+        raise ModelError(f"{what}: cannot be read ({one_line(error)}); {DAMAGED}") from error
 
 
 def widened(array: Array, what: str) -> Array:

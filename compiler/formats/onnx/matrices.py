@@ -5,6 +5,7 @@ Tensors are flat, in C order. Biases (of Conv, Gemm) are added by who asks for t
 
 from __future__ import annotations
 
+import math
 import string
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -12,6 +13,7 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
+from spikeloom.compiler.formats.kernels import Padding, block_diagonal, convolution
 from spikeloom.compiler.formats.onnx.file import Array, Node
 from spikeloom.compiler.formats.onnx.values import COEFFICIENT_LIMIT, Table, size_of
 from spikeloom.compiler.ir import Sparse
@@ -112,66 +114,42 @@ def _reduce_matrix(node: Node, table: Table, operands: Operands, _which: int) ->
     return _contract(table, f"{letters},->{out}", _positions(operands[0]), np.array(share), operands[0].size)
 
 
-def _windows(node: Node, table: Table, data: Array, kernel: Sequence[int], filling: float) -> Array:
-    """Patches of (batch, channels, *space): (batch, channels, *places, *kernel)."""
-    space = data.ndim - 2
-    strides = [int(n) for n in node.attributes.get("strides", [1] * space)]
-    dilations = [int(n) for n in node.attributes.get("dilations", [1] * space)]
-    pads = [int(n) for n in node.attributes.get("pads", [0] * 2 * space)]
+def _window_words(node: Node, axes: int) -> tuple[list[int], Padding, list[int]]:
+    """Strides, padding and dilations of windows over so many axes."""
     if node.attributes.get("auto_pad", "NOTSET") not in ("NOTSET", "VALID") or node.attributes.get("ceil_mode", 0):
         raise ValueError("auto_pad and ceil_mode are not known")
-    if min(*pads, 0) < 0 or min(*strides, *dilations, *kernel) < 1 or space < 1:
-        raise ValueError("impossible windows")
-    sides = [(0, 0), (0, 0), *zip(pads[:space], pads[space:], strict=True)]
-    table.room([size + sum(side) for size, side in zip(data.shape, sides, strict=True)])
-    padded = np.pad(data, sides, constant_values=filling)
-    reach = [(k - 1) * d + 1 for k, d in zip(kernel, dilations, strict=True)]
-    view = np.lib.stride_tricks.sliding_window_view(padded, reach, axis=tuple(range(2, data.ndim)))
-    step = [
-        slice(None),
-        slice(None),
-        *(slice(None, None, s) for s in strides),
-        *(slice(None, None, d) for d in dilations),
-    ]
-    view = view[tuple(step)]
-    table.room(view.shape, COEFFICIENT_LIMIT)
-    return view
+    ones, zeros = [1] * axes, [0] * 2 * axes
+    strides, pads, dilations = (
+        [int(n) for n in node.attributes.get(key, default)]
+        for key, default in (("strides", ones), ("pads", zeros), ("dilations", ones))
+    )
+    return strides, list(zip(pads[:axes], pads[axes:], strict=True)), dilations
 
 
-def _grouped(node: Node, table: Table, operands: Operands, data: Array, filling: float) -> tuple[Array, Array, str]:
-    """Windows and weights of a convolution with their groups as an axis, and how to contract them."""
-    weight, groups = operands[1], int(node.attributes.get("group", 1))
-    if weight.ndim != data.ndim or data.ndim < 3 or groups < 1 or weight.shape[1] * groups != data.shape[1]:
-        raise ValueError("sizes that do not fit each other")
-    windows = _windows(node, table, data, weight.shape[2:], filling)
-    windows = windows.reshape(data.shape[0], groups, weight.shape[1], *windows.shape[2:])
-    space = data.ndim - 2
-    places, kernel = string.ascii_lowercase[:space], string.ascii_lowercase[space : 2 * space]
-    filters = weight.reshape(groups, len(weight) // groups, *weight.shape[1:])
-    return windows, filters, f"xyz{places}{kernel},ywz{kernel}->xyw{places}"
+def _convolved(node: Node, table: Table, data: Array, weight: Array, groups: int) -> Sparse:
+    """Matrix of a convolution of each recording of a batch; its size is checked before."""
+    strides, padding, dilations = _window_words(node, data.ndim - 2)
+    matrix, out = convolution(
+        data.shape[1:], weight, stride=strides, padding=padding, dilation=dilations, groups=groups
+    )
+    table.room([len(data), math.prod(out) * math.prod(weight.shape[1:])], COEFFICIENT_LIMIT)
+    return block_diagonal(matrix, len(data))
 
 
 def _conv_matrix(node: Node, table: Table, operands: Operands, _which: int) -> Sparse:
-    windows, filters, spelled = _grouped(node, table, operands, _positions(operands[0]), -1)
-    return _contract(table, spelled, windows, filters, operands[0].size)
-
-
-def _pooled(node: Node, table: Table, data: Array) -> tuple[Array, int]:
-    """Windows of positions to average over, and how many axes of the data have windows."""
-    space = data.ndim - 2
-    if node.op == "GlobalAveragePool":
-        return _positions(data).reshape(*data.shape[:2], *[1] * space, *data.shape[2:]), space
-    kernel = [int(n) for n in node.attributes["kernel_shape"]]
-    return _windows(node, table, _positions(data), kernel, -1), space
+    return _convolved(node, table, operands[0], operands[1], int(node.attributes.get("group", 1)))
 
 
 def _pool_matrix(node: Node, table: Table, operands: Operands, _which: int) -> Sparse:
-    windows, space = _pooled(node, table, operands[0])
-    kernel = size_of(windows.shape[-space:])
-    places = windows.reshape(-1, kernel)
-    counted = node.op == "GlobalAveragePool" or node.attributes.get("count_include_pad", 0)
-    share = 1 / (np.full(len(places), kernel) if counted else (places >= 0).sum(axis=1))
-    return _matrix(np.arange(len(places))[:, None], places, share[:, None], (len(places), operands[0].size))
+    data = operands[0]
+    everywhere = node.op == "GlobalAveragePool"
+    kernel = data.shape[2:] if everywhere else [int(n) for n in node.attributes["kernel_shape"]]
+    ones = np.ones(table.room([data.shape[1], 1, *kernel]))
+    matrix = _convolved(node, table, data, ones, data.shape[1])
+    inside = np.diff(matrix.indptr)
+    held = np.full(len(inside), math.prod(kernel)) if node.attributes.get("count_include_pad", 0) else inside
+    matrix.data = matrix.data / np.repeat(held, inside)
+    return matrix
 
 
 LINEAR: Mapping[str, tuple[Matrix, tuple[int, ...]]] = {

@@ -52,8 +52,6 @@ from spikeloom.compiler.formats.onnx.values import (
 from spikeloom.compiler.ir import Sparse
 
 NO_LIF = "keeps a state that is no leaky integrate-and-fire neuron; only such neurons can be lowered"
-UNKNOWN = "is an operator that is not known here; write the layer with other operators"
-
 STATEFUL = ("GRU", "LSTM", "RNN")
 
 CONSTANT = "is computed from constants by an operator that is not known here; fold constants before the export"
@@ -204,8 +202,6 @@ def _linear(node: Node, table: Table, values: Sequence[Value | None], varying: l
 
 
 def _elementwise(node: Node, table: Table, values: Sequence[Value | None], varying: list[int]) -> Value:
-    from onnx import defs  # slow to load, so only where it is used
-
     op = node.op
     if op == "Cast" and varying == [0]:
         return _cast(node, table, values[0])
@@ -217,7 +213,7 @@ def _elementwise(node: Node, table: Table, values: Sequence[Value | None], varyi
         return _added(op, parts) if op in ("Add", "Mean", "Neg", "Sub", "Sum") else _scaled(op, table, parts, varying)
     if op in STATEFUL:
         raise ModelError(NO_LIF)
-    raise ModelError(NOT_AFFINE if defs.has(op) else UNKNOWN)
+    raise ModelError(NOT_AFFINE)
 
 
 def _cast(node: Node, table: Table, value: Value | None) -> Value:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -45,7 +45,7 @@ def run(graph: Graph, outer: Mapping[str, Value], given: Mapping[str, Value], ta
     Raises ModelError naming the operator that cannot be evaluated, or is not affine, and why.
     """
     values: dict[str, Value] = {**outer, **graph.constants, **given}
-    order = ordered(graph, values)
+    order = needed(graph)
     held = membranes(
         order, graph.outputs, {name for name, value in values.items() if not isinstance(value, np.ndarray)}
     )
@@ -65,7 +65,7 @@ def run(graph: Graph, outer: Mapping[str, Value], given: Mapping[str, Value], ta
                 values.pop(name, None)
     for name in graph.outputs:
         if name not in values:
-            raise ModelError(f"output {printable(name)}: its operator does not give so many results; export it again")
+            raise ModelError(f"output {printable(name)}: nothing makes it; export it again")
     return [values[name] for name in graph.outputs]
 
 
@@ -206,49 +206,14 @@ def reads(node: Node) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _makers(graph: Graph) -> dict[str, Node]:
-    makers: dict[str, Node] = {}
-    for node in graph.nodes:
-        for name in node.outputs:
-            if name and (name in makers or name in graph.constants):
-                raise ModelError(f"{node}: makes {printable(name)} again, each value is made once; export it again")
-            makers[name] = node
-    return makers
-
-
-def ordered(graph: Graph, known: Container[str]) -> list[Node]:
-    """Operators that the outputs need, each after those that it needs itself; `known` are values from outside.
-
-    Raises ModelError if a value is made twice, not at all, or from itself.
-    """
-    makers = _makers(graph)
-    order: list[Node] = []
-    state: dict[int, bool] = {}  # by operator: False while those that it needs are being placed, True once it is
-    for output in graph.outputs:
-        if output not in makers and output not in known:
-            raise ModelError(f"output {printable(output)}: nothing makes it; export it again")
-        pending = [(makers[output], iter(reads(makers[output])))] if output in makers else []
-        while pending:
-            node, left = pending[-1]
-            if state.get(id(node)):
-                pending.pop()
-                continue
-            state[id(node)] = False
-            for name in left:
-                maker = makers.get(name)
-                if maker is None:
-                    if name not in known:
-                        raise ModelError(f"{node}: reads {printable(name)}, which nothing makes; export it again")
-                elif state.get(id(maker)) is False:
-                    raise ModelError(f"{node}: needs its own result, a cycle; state must go in and out of the graph")
-                elif not state.get(id(maker)):
-                    pending.append((maker, iter(reads(maker))))
-                    break
-            else:
-                state[id(node)] = True
-                order.append(node)
-                pending.pop()
-    return order
+def needed(graph: Graph) -> list[Node]:
+    """Operators that the outputs need; a file has each after those that it needs itself."""
+    wanted, found = set(graph.outputs), []
+    for node in reversed(graph.nodes):
+        if wanted & set(node.outputs):
+            wanted |= set(reads(node))
+            found.append(node)
+    return found[::-1]
 
 
 def membranes(order: list[Node], outputs: tuple[str, ...], varying: set[str]) -> set[str]:

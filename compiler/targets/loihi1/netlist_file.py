@@ -17,17 +17,27 @@ Equal netlists give equal bytes: members are stored, not compressed, in a fixed 
 
 from __future__ import annotations
 
-import math
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from spikeloom.compiler.archive import Array, archive_bytes, read_archive, write_archive
-from spikeloom.compiler.dynamics import MOST_CLOCKS, MOST_STEPS, Clocks
+from spikeloom.compiler.archive import (
+    CLOCKS,
+    Array,
+    Kind,
+    archive_bytes,
+    bounds_faults,
+    entry_faults,
+    is_outside,
+    range_faults,
+    read_archive,
+    write_archive,
+)
+from spikeloom.compiler.dynamics import MOST_STEPS, Clocks
 from spikeloom.compiler.errors import FormatError
 from spikeloom.compiler.fixedpoint import frozen, read_only, read_only_float
 from spikeloom.compiler.targets.base import COMPARTMENTS, known_targets
@@ -40,6 +50,14 @@ LARGE = frozenset({"synapse_target", "synapse_weight"})
 
 FLOATS = frozenset({"scale"})
 """Array members of real numbers."""
+
+LAYER: Kind = {
+    "name": str,
+    "unheard": [(0, 2**31)],
+    **dict.fromkeys(("neurons", "depth", "weight_bits", "synapses", "max_fan_in"), (0, 2**62)),
+    **dict.fromkeys(("beta", "theta", "alpha"), float),
+}
+"""Entries of :class:`netlist.Layer`."""
 
 _SCALARS = ("target", "taxels", "polarities", "classes", "layers", "provenance", "clocks", "bins")
 ARRAYS = tuple(field.name for field in fields(Netlist) if field.name not in _SCALARS)
@@ -109,19 +127,18 @@ def read_netlist(path: str | os.PathLike[str]) -> Netlist:
 
 def _type_faults(manifest: Mapping[str, Any], members: Mapping[str, Array]) -> list[str]:
     """Entries of the manifest or arrays that are missing or of another kind than :class:`Netlist` has."""
-    layers, clocks = manifest.get("layers"), manifest.get("clocks")
-    entries = {
-        "target": isinstance(manifest.get("target"), str),
-        "provenance": isinstance(manifest.get("provenance"), dict),
-        "layers": isinstance(layers, list) and bool(layers) and all(map(_is_layer, layers)),
-        "clocks": isinstance(clocks, dict)
-        and set(clocks) == {"channels", "steps"}
-        and _is_whole(clocks["channels"], 0, MOST_CLOCKS)
-        and _is_whole(clocks["steps"], 1, MOST_STEPS),
-        "bins": _is_whole(manifest.get("bins"), 1, MOST_STEPS),
-    }
-    entries |= {name: _is_whole(manifest.get(name), 1) for name in ("taxels", "polarities", "classes")}
-    faults = [f"the manifest has no usable {name}" for name, good in entries.items() if not good]
+    counts = dict.fromkeys(("taxels", "polarities", "classes"), (1, 2**31))
+    faults = entry_faults(
+        manifest,
+        {
+            "target": str,
+            "provenance": dict,
+            "layers": [LAYER, ...],
+            "clocks": CLOCKS,
+            "bins": (1, MOST_STEPS),
+            **counts,
+        },
+    )
     return faults + [
         f"{name} is no list of {'numbers' if name in FLOATS else 'integers'}"
         for name in ARRAYS
@@ -129,40 +146,16 @@ def _type_faults(manifest: Mapping[str, Any], members: Mapping[str, Array]) -> l
     ]
 
 
-def _is_whole(value: Any, least: int, most: float = math.inf) -> bool:
-    return type(value) is int and least <= value <= most
-
-
-def _is_layer(entry: Any) -> bool:
-    kinds = {field.name: str(field.type) for field in fields(Layer)}
-    if not isinstance(entry, dict) or set(entry) != set(kinds):
-        return False
-    good: dict[str, Callable[[Any], bool]] = {
-        "str": lambda value: isinstance(value, str),
-        "int": lambda value: _is_whole(value, 0),
-        "float": lambda value: type(value) in (int, float) and 0 <= value < math.inf,
-    }
-    listed = entry["unheard"]
-    return (
-        isinstance(listed, list)
-        and all(_is_whole(neuron, 0) for neuron in listed)
-        and all(good[kind](entry[name]) for name, kind in kinds.items() if name != "unheard")
-    )
-
-
-def _bounds_fault(name: str, bounds: Array, parts: int, total: int) -> str | None:
-    good = len(bounds) == parts + 1 and bounds[0] == 0 and bounds[-1] == total and np.all(np.diff(bounds) >= 0)
-    return None if good else f"{name} does not divide {total} entries in {parts} parts"
-
-
 def inconsistencies(netlist: Netlist) -> list[str]:
     """Say what in a netlist points nowhere: a file can match its hash and still be nonsense."""
     compartments, axons, synapses = netlist.n_compartments, netlist.n_axons, netlist.n_synapses
-    found: list[str | None] = [
-        _bounds_fault("core_compartments", netlist.core_compartments, netlist.n_cores, compartments),
-        _bounds_fault("core_axons", netlist.core_axons, netlist.n_cores, axons),
-        _bounds_fault("axon_synapses", netlist.axon_synapses, axons, synapses),
-    ]
+    found = bounds_faults(
+        {
+            "core_compartments": (netlist.core_compartments, netlist.n_cores, compartments),
+            "core_axons": (netlist.core_axons, netlist.n_cores, axons),
+            "axon_synapses": (netlist.axon_synapses, axons, synapses),
+        }
+    )
     per_compartment = ("neuron", "decay_u", "decay_v", "threshold", "bias_mantissa", "bias_exponent", "scale")
     for name in (*per_compartment, "readout_class"):
         if len(getattr(netlist, name)) != compartments:
@@ -171,12 +164,8 @@ def inconsistencies(netlist: Netlist) -> list[str]:
         found.append("axon_format or synapse_target has the wrong length")
     if not len(netlist.format_exponent) == len(netlist.format_weight_bits) == len(netlist.format_index_bits):
         found.append("the format arrays have different lengths")
-    if any(found):
-        return [fault for fault in found if fault]
-
-    def outside(array: Array, low: int, high: int) -> bool:
-        return bool(array.size and (array.min() < low or array.max() >= high))
-
+    if found:
+        return found
     ranges = {
         "layer": (netlist.layer, 0, len(netlist.layers)),
         "axon_source": (netlist.axon_source, 0, netlist.n_inputs + compartments),
@@ -193,22 +182,18 @@ def inconsistencies(netlist: Netlist) -> list[str]:
         "format_index_bits": (netlist.format_index_bits, 0, 13),
         "core_tile": (netlist.core_tile, 0, 2**31),
     }
-    found += [
-        f"{name} has values outside {low} … {high - 1}"
-        for name, (a, low, high) in ranges.items()
-        if outside(a, low, high)
-    ]
+    found += range_faults(ranges)
     if not np.all(np.isfinite(netlist.scale) & (netlist.scale > 0)):
         found.append("scale has values that are not positive numbers")
     on_core = np.diff(netlist.core_compartments)[netlist.core_of_axon()][netlist.axon_of_synapse()]
-    if outside(netlist.synapse_target, 0, 2**31) or np.any(netlist.synapse_target >= on_core):
+    if is_outside(netlist.synapse_target, 0, 2**31) or np.any(netlist.synapse_target >= on_core):
         found.append("synapse_target points beyond its core")
     for index, layer in enumerate(netlist.layers):
         neurons = np.sort(netlist.neuron[netlist.layer == index])
         if np.intersect1d(neurons, layer.unheard).size or max(layer.unheard, default=0) >= layer.neurons:
             found.append(f"layer {layer.name} holds neurons that it leaves out, or leaves out some that are not there")
-        if outside(neurons, 0, layer.neurons) or len(np.unique(neurons)) != len(neurons) or not len(neurons):
+        if is_outside(neurons, 0, layer.neurons) or len(np.unique(neurons)) != len(neurons) or not len(neurons):
             found.append(
                 f"layer {layer.name} holds none of its {layer.neurons} neurons, one twice or one that is not there"
             )
-    return [fault for fault in found if fault]
+    return found

@@ -19,9 +19,11 @@ from typing import Any
 import numpy as np
 
 from spikeloom.compiler.archive import (
+    CLOCKS,
     TRAINED,
     Array,
     archive_bytes,
+    entry_faults,
     read_manifest,
     read_members,
     require_whole,
@@ -29,7 +31,7 @@ from spikeloom.compiler.archive import (
 )
 from spikeloom.compiler.atomic import write_atomically
 from spikeloom.compiler.checkpoint import WEIGHTS
-from spikeloom.compiler.dynamics import MOST_CLOCKS, MOST_STEPS, Clocks
+from spikeloom.compiler.dynamics import Clocks
 from spikeloom.compiler.errors import FormatError, ModelError
 from spikeloom.compiler.fixedpoint import IntArray, read_only
 from spikeloom.compiler.targets.truenorth.native import NativeNetwork, Stage, faults
@@ -193,30 +195,26 @@ def _core(path: Path, error: FormatError) -> str:
 
 def _kind_faults(manifest: Mapping[str, Any]) -> list[str]:
     """What in the manifest is missing or of another kind."""
-    layers, clocks, sets, graph = (manifest.get(name) for name in ("layers", "clocks", "weights", "graph"))
-    good = {
-        "layers": isinstance(layers, list)
-        and 0 < len(layers) <= MOST_LAYERS
-        and len(set(map(str, layers))) == len(layers)
-        and all(isinstance(name, str) and name and "/" not in name for name in layers),
-        "clocks": isinstance(clocks, dict)
-        and set(clocks) == {"channels", "steps"}
-        and _is_count(clocks["channels"], 0, MOST_CLOCKS)
-        and _is_count(clocks["steps"], 1, MOST_STEPS),
-        "weights": isinstance(sets, list) and bool(sets) and all(name in WEIGHTS for name in sets),
-        "graph": isinstance(graph, dict)
-        and isinstance(graph.get("name"), str)
-        and isinstance(graph.get("edges"), list)
-        and all(isinstance(edge, list) and len(edge) == 2 and {*map(type, edge)} == {int} for edge in graph["edges"]),
-        "towers": _is_count(manifest.get("towers"), 1, MOST_TOWERS),
-        "training": isinstance(manifest.get("training"), dict),
+    counts = dict.fromkeys(("taxels", "polarities", "classes", "copies"), (1, 2**20))
+    edge = [(-(2**31), 2**31)]
+    kinds = {
+        "layers": [str, ...],
+        "clocks": CLOCKS,
+        "weights": [str, ...],
+        "graph": {"name": str, "edges": [edge]},
+        "towers": (1, MOST_TOWERS),
+        "training": dict,
+        **counts,
     }
-    good |= {name: _is_count(manifest.get(name), 1, 2**20) for name in ("taxels", "polarities", "classes", "copies")}
-    return [f"the manifest has no usable {name}" for name, fine in good.items() if not fine]
-
-
-def _is_count(value: Any, least: int, most: int) -> bool:
-    return type(value) is int and least <= value <= most
+    if found := entry_faults(manifest, kinds):
+        return found
+    layers, edges = manifest["layers"], manifest["graph"]["edges"]
+    fine = {
+        "layers": len(set(layers)) == len(layers) <= MOST_LAYERS and all(name and "/" not in name for name in layers),
+        "weights": set(manifest["weights"]) <= set(WEIGHTS),
+        "graph": all(len(edge) == 2 for edge in edges),
+    }
+    return [f"the manifest has no usable {name}" for name, good in fine.items() if not good]
 
 
 def _names(manifest: Mapping[str, Any]) -> list[str]:

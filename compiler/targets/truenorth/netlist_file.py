@@ -15,8 +15,17 @@ from typing import Any
 
 import numpy as np
 
-from spikeloom.compiler.archive import Array, archive_bytes, read_archive, write_archive
-from spikeloom.compiler.dynamics import MOST_CLOCKS, MOST_STEPS, Clocks
+from spikeloom.compiler.archive import (
+    CLOCKS,
+    Array,
+    archive_bytes,
+    bounds_faults,
+    entry_faults,
+    range_faults,
+    read_archive,
+    write_archive,
+)
+from spikeloom.compiler.dynamics import Clocks
 from spikeloom.compiler.errors import FormatError
 from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.targets.base import CROSSBARS, known_targets
@@ -96,27 +105,20 @@ def read_crossbars(path: str | os.PathLike[str]) -> CrossbarNetlist:
 
 def _kind_faults(manifest: dict[str, Any], members: dict[str, Array]) -> list[str]:
     """What in the manifest or among the arrays is missing or of another kind."""
-    layers, clocks = manifest.get("layers"), manifest.get("clocks")
-    good = {
-        "target": isinstance(manifest.get("target"), str),
-        "provenance": isinstance(manifest.get("provenance"), dict),
-        "layers": isinstance(layers, list) and all(isinstance(name, str) for name in layers),
-        "clocks": isinstance(clocks, dict)
-        and set(clocks) == {"channels", "steps"}
-        and _is_count(clocks["channels"], 0, MOST_CLOCKS)
-        and _is_count(clocks["steps"], 1, MOST_STEPS),
-        "bin_ticks": _is_count(manifest.get("bin_ticks"), 1, MOST_TICKS),
+    counts = dict.fromkeys(("taxels", "polarities", "classes"), (1, 2**31))
+    kinds = {
+        "target": str,
+        "provenance": dict,
+        "layers": [str],
+        "clocks": CLOCKS,
+        "bin_ticks": (1, MOST_TICKS),
+        **counts,
     }
-    good |= {name: _is_count(manifest.get(name), 1, 2**31) for name in ("taxels", "polarities", "classes")}
-    return [f"the manifest has no usable {name}" for name, fine in good.items() if not fine] + [
+    return entry_faults(manifest, kinds) + [
         f"{name} is no {'table' if name == 'weight' else 'list'} of integers"
         for name in ARRAYS
         if members[name].ndim != 1 + (name == "weight") or members[name].dtype.kind != "i"
     ]
-
-
-def _is_count(value: Any, least: int, most: int) -> bool:
-    return type(value) is int and least <= value <= most
 
 
 def inconsistencies(netlist: CrossbarNetlist) -> list[str]:
@@ -127,11 +129,7 @@ def inconsistencies(netlist: CrossbarNetlist) -> list[str]:
         "core_axons": (netlist.core_axons, cores, axons),
         "axon_synapses": (netlist.axon_synapses, axons, netlist.n_synapses),
     }
-    found = [
-        f"{name} does not divide {total} entries in {parts} parts"
-        for name, (ends, parts, total) in bounds.items()
-        if len(ends) != parts + 1 or ends[0] != 0 or ends[-1] != total or np.any(np.diff(ends) < 0)
-    ]
+    found = bounds_faults(bounds)
     lengths = {"core_y": cores, "axon_type": axons, **dict.fromkeys(PER_NEURON, neurons)}
     lengths |= {name: len(getattr(netlist, columns[0])) for columns in TABLES.values() for name in columns}
     for name, length in lengths.items():
@@ -152,10 +150,7 @@ def inconsistencies(netlist: CrossbarNetlist) -> list[str]:
     }
     registers = [name for name in ARRAYS if name not in ranges and name not in bounds]
     ranges |= dict.fromkeys(registers, (-(2**31), 2**31))
-    for name, (low, high) in ranges.items():
-        array = getattr(netlist, name)
-        if array.size and (array.min() < low or array.max() >= high):
-            found.append(f"{name} has values outside {low} … {high - 1}")
+    found += range_faults({name: (getattr(netlist, name), *ends) for name, ends in ranges.items()})
     on_core = np.diff(netlist.core_neurons)[netlist.core_of_axon()][netlist.axon_of_synapse()]
     if netlist.n_synapses and (netlist.synapse_neuron.min() < 0 or np.any(netlist.synapse_neuron >= on_core)):
         found.append("synapse_neuron points beyond its core")
