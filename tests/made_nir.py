@@ -84,7 +84,7 @@ def simulate(graph, events, dt, convention="euler", late=()):
                 values[name] = now.reshape(node.input_type["input"]).astype(float)
                 continue
             x = sum((before if (source, name) in late else values)[source] for source in heard[name])
-            values[name] = _step(node, x, state.setdefault(name, {}), dt, convention)
+            values[name] = stepped(node, x, state.setdefault(name, {}), dt, convention)
             if isinstance(node, nir.LIF | nir.IF | nir.CubaLIF | nir.Threshold):
                 spikes.setdefault(name, []).append(values[name].ravel() > 0)
         before = values
@@ -95,7 +95,8 @@ def _kept(tau, dt, convention):
     return 1 - dt / tau if convention == "euler" else np.exp(-dt / tau)
 
 
-def _step(node, x, state, dt, convention):  # noqa: PLR0911 one return a node
+def stepped(node, x, state, dt, convention):  # noqa: PLR0911 one return a node
+    """What a node gives in a step, by NIR's equations."""
     match node:
         case nir.Affine():
             return x @ node.weight.T + node.bias

@@ -20,13 +20,10 @@ PART = 48
 SETS = {"objects_zip": ("objects", (576, 144)), "containers_zip": ("containers", (240, 60))}
 
 
-def netlist_of(name, archive, bits, folder: Path):
-    """Netlist of a shipped network, scales chosen on the training split, as a user compiles it."""
-    path = folder / f"{name}{bits}.loom"
-    words = ["compile", f"pretrained:{name}", "--calibrate", archive, "--weight-bits", bits, "-o", path]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cli, "show", lambda _text: None)
-        assert cli.main(list(map(str, words))) == 0
+def compiled(folder: Path, *words):
+    """Netlist of a network, as a user compiles it."""
+    path = folder / "net.loom"
+    assert cli.main(["compile", *map(str, words), "-o", str(path)]) == 0
     return read_netlist(path)
 
 
@@ -50,7 +47,7 @@ def differing(netlist, events, forms=("step", "scan")):
 def test_all_recordings(fixture, bits, request, tmp_path, capsys):
     name, sizes = SETS[fixture]
     archive = request.getfixturevalue(fixture)
-    netlist = netlist_of(name, archive, bits, tmp_path)
+    netlist = compiled(tmp_path, f"pretrained:{name}", "--calibrate", archive, "--weight-bits", bits)
     for split, size in zip(("train", "test"), sizes, strict=True):
         events = load_recordings(archive, split).events
         assert len(events) == size
@@ -65,12 +62,8 @@ def test_all_recordings(fixture, bits, request, tmp_path, capsys):
 
 @pytest.mark.recordings
 def test_some_recordings_of_the_released_checkpoint(objects_zip, released_checkpoint, tmp_path):
-    path = tmp_path / "objects.loom"
-    words = ["compile", released_checkpoint, "--graph", "manual", "-o", path]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cli, "show", lambda _text: None)
-        assert cli.main(list(map(str, words))) == 0
-    ours, found = differing(read_netlist(path), load_recordings(objects_zip, "test", limit=4).events)
+    netlist = compiled(tmp_path, released_checkpoint, "--graph", "manual")
+    ours, found = differing(netlist, load_recordings(objects_zip, "test", limit=4).events)
     assert ours > 50_000
     assert found == {"step": 0, "scan": 0}
 
