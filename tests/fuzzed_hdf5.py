@@ -1,22 +1,15 @@
-"""NIR and netx files with faults: bytes and content of good ones changed at random, the same for the same seed.
-
-As a program, ``fuzzed_hdf5.py FIRST COUNT`` takes files with changed bytes apart in one process, as the reader does in
-one of its own, and reads what comes out; it names each seed before, so that whoever started it knows where it died.
-"""
+"""NIR and netx files with faults: bytes and content of good ones changed at random, the same for the same seed."""
 
 import copy
 import random
-import resource
-import signal
-import sys
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 from fuzzed_bytes import changed_bytes
 
-from spikeloom.compiler.errors import ModelError, SpikeloomError
-from spikeloom.compiler.formats.hdf5 import MEMORY, SECONDS, tree_of
+from spikeloom.compiler.errors import SpikeloomError
+from spikeloom.compiler.formats.hdf5 import tree_of
 from spikeloom.compiler.formats.netx.layout import blocks_of
 from spikeloom.compiler.formats.netx.reader import integers_of
 from spikeloom.compiler.formats.nir.file import graph_of
@@ -30,7 +23,6 @@ TYPES = ("Affine", "AvgPool2d", "Conv1d", "Conv2d", "CubaLIF", "Delay", "Flatten
 TYPES += ("LIF", "Linear", "NIRGraph", "Output", "Scale", "SumPool2d", "Threshold")
 TYPES += ("conv", "dense", "dense_rec", "flatten", "input")
 NUMBERS = (-(2**63), -(2**31), -100, -1, 0, 1, 2, 3, 7, 100, 2**20, 2**31, 2**62, 1e-300, 1e300, np.nan, np.inf, 0.5)
-ALARM = 4
 
 
 @cache
@@ -161,31 +153,7 @@ def content_outcome(seed):
     return outcome(tree)
 
 
-def bytes_outcome(seed):
-    """How bytes for a seed are read."""
+def bytes_for(seed):
+    """Bytes of a file for a seed."""
     rng = random.Random(seed)
-    content = changed_bytes(rng.choice(sources()), rng)
-    try:
-        tree = tree_of(content)
-    except ModelError as error:
-        return "damaged" if "is truncated or damaged" in str(error) else "refused"
-    return outcome(tree)
-
-
-def main():
-    """See the module."""
-    first, count = int(sys.argv[1]), int(sys.argv[2])
-    resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
-    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
-    for seed in range(first, first + count):
-        sys.stdout.write(f"{seed}\n")
-        sys.stdout.flush()
-        signal.alarm(ALARM)
-        ending = bytes_outcome(seed)
-        signal.alarm(0)
-        sys.stdout.write(f"{ending}\n")
-    sys.stdout.write("done\n")
-
-
-if __name__ == "__main__":
-    main()
+    return changed_bytes(rng.choice(sources()), rng)

@@ -490,17 +490,10 @@ def test_what_disagrees_is_listed_in_one_line(tmp_path, capsys):
     written(tmp_path / "b.pt", "gcn", other, classes=5, features=2, hidden=(8, 7))
     written(tmp_path / "c.pt", theta=0.75)
     place = str(tmp_path)
-    assert refusal(capsys, f"join {place}/a.pt {place}/b.pt {place}/c.pt -o {place}/x.pt") == (
-        f"spikeloom: join: the networks differ in system ({place}/a.pt: tactilesgnet; {place}/b.pt: gcn), "
-        f"classes ({place}/a.pt: 4; {place}/b.pt: 5), "
-        f"layers ({place}/a.pt: 3 filters of 3 features, fc1 8, fc2 6, fc3 4; "
-        f"{place}/b.pt: 1 filters of 2 features, fc1 8, fc2 7, fc3 5), "
-        f"membrane decays ({place}/a.pt: 0.2, 0.3, 0.0, 0.4; {place}/b.pt: 0.2, 0.3, 0.1, 0.4), "
-        f"current decays ({place}/a.pt: 0.0, 0.95, 0.5, 0.0; {place}/b.pt: 0.0, 0.9, 0.5, 0.0), "
-        f"threshold ({place}/a.pt: 0.5; {place}/c.pt: 0.75), "
-        f"clocks ({place}/a.pt: 3 of 4 steps; {place}/b.pt: 2 of 5 steps); "
-        "give networks of one system, sensor and timing\n"
-    )
+    said = refusal(capsys, f"join {place}/a.pt {place}/b.pt {place}/c.pt -o {place}/x.pt")
+    b = f"({place}/b.pt)"
+    assert f"differ from {place}/a.pt in system {b}, classes {b}, layers {b}, membrane decays {b}, current" in said
+    assert f"threshold ({place}/c.pt), clocks {b}; give networks of one system" in said
     assert not (tmp_path / "x.pt").exists()
 
 
@@ -510,14 +503,9 @@ def test_graphs_and_storage_must_agree(tmp_path):
     turned = replace(one, edges=one.edges[::-1], graph="the same, listed the other way round")
     assert join([one, turned], ["a", "b"]).towers == 2
     another = replace(one, edges=build_graph("knn:1").edges, graph="knn:1")
-    with pytest.raises(ModelError, match=r"differ in graph \(a: \d+ edges #[0-9a-f]{8}; b: \d+ edges #[0-9a-f]{8}\);"):
-        join([one, another], ["a", "b"])
-    with pytest.raises(ModelError) as error:
-        join([one, tuned(one, 1)], ["a", "b"])
-    assert str(error.value) == (
-        "join: the networks differ in storage (a: none; b: 8 bits with exponents [0], 4 bits with exponents [-1], "
-        "8 bits with exponents [0, 4], 6 bits with exponents [1]); give networks of one system, sensor and timing"
-    )
+    for other, what in ((another, "graph"), (tuned(one, 1), "storage")):
+        with pytest.raises(ModelError, match=rf"differ from a in {what} \(b\);"):
+            join([one, other], ["a", "b"])
 
 
 def test_what_cannot_be_joined_says_so(data, tmp_path, capsys):

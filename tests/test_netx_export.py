@@ -111,10 +111,8 @@ def test_the_command_counts_what_it_moves(tmp_path, capsys):
     net, out = tmp_path / "g.loom", tmp_path / "g.net"
     assert run(capsys, "compile", "pretrained:grasps", "-o", net)[0] == 0
     code, text, _ = run(capsys, "export", net, "--to", "netx", "-o", out, "--data", "synthetic", "--limit", 8, "--json")
-    assert code == 0
     report = json.loads(text)
-    assert not report["exact"]
-    assert report["recordings"] == 8
+    assert (code, report["exact"], report["recordings"]) == (0, False, 8)
     network = lift(read_netlist(net))
     blocks = netx_export.blocks_for(network)
     assert sum(layer["biases_rounded"] for layer in report["layers"]) == sum(block.rounded for block in blocks) > 0
@@ -122,14 +120,10 @@ def test_the_command_counts_what_it_moves(tmp_path, capsys):
     back = read_netx(out).network
     assert back.input == network.input
     assert_array_equal(back.readout.label, network.readout.label)
-    code, text, _ = run(capsys, "export", net, "--to", "netx", "-o", out)
-    assert code == 0
-    assert text.endswith("--data counts the spikes that this moves\n")
     before = out.read_bytes()
     code, _, said = run(capsys, "export", net, "--to", "netx", "-o", out, "--strict")
     assert code == 2
     assert said.startswith(f"spikeloom: --strict: netx cannot hold {net} as it is (conv1: ")
-    assert said.count("\n") == 1
     assert out.read_bytes() == before
 
 
@@ -155,18 +149,15 @@ def test_currents_and_clocks_come_back(tmp_path, capsys):
     assert [population.decay_u for population in back.populations] == [p.decay_u for p in ours.populations]
 
 
-def test_netlists_that_the_format_cannot_hold():
-    def said(network, **options):
-        netlist = compile_network(network, Options(**options)).netlist
-        with pytest.raises(ModelError) as caught:
-            netx_export.blocks_for(lift(netlist))
-        return str(caught.value)
-
-    rng = np.random.default_rng(7)
-    weight = rng.normal(size=(20, 6)) * np.geomspace(0.01, 1, 20)[:, None]
-    assert said(chain(weight), recipes=[Recipe(groups=4)]) == (
-        "fc1: has 4 thresholds, netx has one for a layer; compile with --scale-groups 1"
-    )
-    words = said(chain(weight), recipes=[Recipe(planes=2)])
-    assert words.startswith("fc1: has weights from ")
-    assert words.endswith("netx holds 8 bits without an exponent; compile with --planes 1 --weight-bits 8")
+@pytest.mark.parametrize(
+    ("recipe", "words"),
+    [
+        (Recipe(groups=4), "fc1: has 4 thresholds, netx has one for a layer; compile with --scale-groups 1"),
+        (Recipe(planes=2), "netx holds 8 bits without an exponent; compile with --planes 1 --weight-bits 8"),
+    ],
+)
+def test_netlists_that_the_format_cannot_hold(recipe, words):
+    weight = np.random.default_rng(7).normal(size=(20, 6)) * np.geomspace(0.01, 1, 20)[:, None]
+    netlist = compile_network(chain(weight), Options(recipes=[recipe])).netlist
+    with pytest.raises(ModelError, match=words):
+        netx_export.blocks_for(lift(netlist))

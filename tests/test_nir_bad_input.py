@@ -106,7 +106,7 @@ GRAPHS = [
         "node x (LIF): receives nothing but its own",
         lambda: graph_with(ALONE, [("a", "b"), ("b", "d"), ("x", "x"), ("x", "d")], (4,), (5,), last="d"),
     ),
-    ("weight is for 3 values, it gets [5]; the matrix looks transposed", lambda: chain(W, lif(5), affine(RNG, 5, 3))),
+    ("weight is for 3 values, it gets [5]", lambda: chain(W, lif(5), affine(RNG, 5, 3))),
     ("weight is for 7 values, it gets [5]; the shapes disagree", lambda: chain(W, lif(5), affine(RNG, 3, 7), lif(3))),
     ("r has the shape [6], it gets [5]", lambda: chain(W, lif(6), affine(RNG, 3, 6), lif(3))),
     (
@@ -119,9 +119,9 @@ GRAPHS = [
             {"a": lif(4), "b": affine(RNG, 3, 4), "c": lif(3)}, [("a", "b"), ("b", "c"), ("a", "c")], (4,), (3,)
         ),
     ),
-    ("for inputs of [6, 5], it gets [5, 6]; its axes look exchanged", lambda: conv(input_shape=(6, 5))),
+    ("for inputs of [6, 5], it gets [5, 6]", lambda: conv(input_shape=(6, 5))),
     ("for inputs of [7, 5], it gets [5, 6]", lambda: conv(input_shape=(7, 5))),
-    ("filters and channels exchanged", lambda: conv(weight=np.ones((2, 4, 3, 2)), bias=np.zeros(2))),
+    ("2 filters, its input has 2 channels", lambda: conv(weight=np.ones((2, 4, 3, 2)), bias=np.zeros(2))),
     ("stride or dilation below 1", lambda: conv(stride=0)),
     ("has a kernel of 3 for 5 places", lambda: conv(dilation=9)),
     ("padding has 3 values, wanted 2", lambda: conv(padding=np.array([1, 2, 3]))),

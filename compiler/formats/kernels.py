@@ -88,10 +88,9 @@ def convolution(
     channels, *space = shape
     filters, each, *kernel = weight.shape
     if groups < 1 or channels != each * groups or filters % groups:
-        turned = " (they would fit with filters and channels exchanged)" if channels == filters else ""
         raise ModelError(
             f"has kernels for {each} channels in {groups} groups and {filters} filters, its input has {channels} "
-            f"channels{turned}; export it again"
+            f"channels; export it again"
         )
     out = places(space, kernel, stride, padding, dilation)
     if max(weight.size, 1) * math.prod(out) > COEFFICIENT_LIMIT:

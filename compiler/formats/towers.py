@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from hashlib import sha256
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,6 @@ import numpy.typing as npt
 
 from spikeloom.compiler.checkpoint import SHARED, Checkpoint, towers_of
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.formats.tensors import Arrays, apart, together
 from spikeloom.compiler.ir import Form
 
@@ -90,13 +88,14 @@ def join(checkpoints: Sequence[Checkpoint], names: Sequence[str]) -> Checkpoint:
         If they disagree in any of these; all of them are listed.
     """
     facts = [_facts(checkpoint) for checkpoint in checkpoints]
-    differing = []
-    for what, first in facts[0].items():
-        others = [f"{name}: {found[what]}" for name, found in zip(names, facts, strict=True) if found[what] != first]
-        differing += [f"{what} ({names[0]}: {first}; {'; '.join(others)})"] if others else []
-    if differing:
+    others = {
+        what: [name for name, found in zip(names, facts, strict=True) if found[what] != first]
+        for what, first in facts[0].items()
+    }
+    if differing := [f"{what} ({', '.join(which)})" for what, which in others.items() if which]:
         raise ModelError(
-            f"join: the networks differ in {', '.join(differing)}; give networks of one system, sensor and timing"
+            f"join: networks differ from {names[0]} in {', '.join(differing)}; give networks of one system, sensor and "
+            "timing"
         )
     every = [member for checkpoint in checkpoints for member in members(checkpoint)]
     arrays = together([arrays_of(member) for member in every])
@@ -124,34 +123,23 @@ def _joined_forms(joined: Checkpoint, every: Sequence[Checkpoint]) -> tuple[Form
     return tuple(replace(form, threshold=thresholds[name]) for name, form in zip(joined.neurons, forms[0], strict=True))
 
 
-def _digest(values: IntArray) -> str:
-    return sha256(np.ascontiguousarray(values, "<i8").tobytes()).hexdigest()[:8]
-
-
-def _facts(checkpoint: Checkpoint) -> dict[str, str]:
-    """What the networks of a joined one have in common, as text that tells them apart."""
-    grid, dynamics, forms = checkpoint.grid, checkpoint.dynamics, checkpoint.forms
-    sensor = f"{checkpoint.taxels} taxels x {checkpoint.hops.shape[2]}"
-    if grid is not None:
-        sensor += f" on a grid of {grid.rows} x {grid.columns}, stride {grid.stride}, padding {grid.padding}, "
-        sensor += f"cells #{_digest(grid.cells)}"
+def _facts(checkpoint: Checkpoint) -> dict[str, object]:
+    """What the networks of a joined one have in common."""
+    grid, dynamics = checkpoint.grid, checkpoint.dynamics
     edges = np.zeros((0, 2), np.int64) if checkpoint.edges is None else checkpoint.edges
-    ordered = edges[np.lexsort(edges.T[::-1])]
-    features = checkpoint.hops.shape[1] // checkpoint.towers
-    sizes = [f"{stage.name} {len(stage.bias) // checkpoint.towers}" for stage in checkpoint.dense]
+    sizes = [len(stage.bias) // checkpoint.towers for stage in checkpoint.dense]
     layers = range(1 + len(sizes))
-    clocks = dynamics.clocks
-    storage = [f"{form.bits} bits with exponents {list(form.exponents)}" for form in forms or ()]
     return {
         "system": checkpoint.system,
-        "sensor": sensor,
-        "graph": f"{len(ordered)} edges #{_digest(ordered)}",
-        "classes": str(checkpoint.classes),
-        "layers": ", ".join([f"{len(checkpoint.hops)} filters of {features} features", *sizes]),
-        "membrane decays": ", ".join(repr(dynamics.beta(layer, checkpoint.beta)) for layer in layers),
-        "current decays": ", ".join(repr(dynamics.alpha(layer)) for layer in layers),
-        "threshold": repr(checkpoint.theta),
-        "clocks": f"{clocks.channels} of {clocks.steps} steps" if clocks.channels else "none",
-        "bins of a step": str(checkpoint.bins),
-        "storage": ", ".join(storage) or "none",
+        "sensor": (checkpoint.taxels, checkpoint.hops.shape[2]),
+        "grid": grid and (grid.rows, grid.columns, grid.stride, grid.padding, grid.cells.tolist()),
+        "graph": sorted(edges.tolist()),
+        "classes": checkpoint.classes,
+        "layers": (len(checkpoint.hops), checkpoint.hops.shape[1] // checkpoint.towers, *sizes),
+        "membrane decays": [dynamics.beta(layer, checkpoint.beta) for layer in layers],
+        "current decays": [dynamics.alpha(layer) for layer in layers],
+        "threshold": checkpoint.theta,
+        "clocks": dynamics.clocks,
+        "bins of a step": checkpoint.bins,
+        "storage": [(form.bits, form.exponents) for form in checkpoint.forms or ()],
     }

@@ -163,10 +163,8 @@ def _matrix(block: Block, key: str, neurons: int, received: int) -> IntArray:
     weight = block.integers(key)
     weight = weight.reshape(neurons, -1) if weight.ndim == 1 and weight.size == neurons * received else weight
     if weight.shape != (neurons, received):
-        turned = " (it looks transposed)" if weight.shape == (received, neurons) else ""
         raise block.fail(
-            f"{key} has the shape {list(weight.shape)}, wanted {[neurons, received]}{turned}; the shapes disagree, "
-            f"{REMEDY}"
+            f"{key} has the shape {list(weight.shape)}, wanted {[neurons, received]}; the shapes disagree, {REMEDY}"
         )
     return weight
 
@@ -195,8 +193,7 @@ def _conv(block: Block, shape: tuple[int, ...]) -> tuple[Sparse, tuple[int, ...]
         raise block.fail(str(error)) from error
     declared = block.sizes()
     if declared != out:
-        turned = "; its axes look exchanged" if declared == (out[0], out[2], out[1]) else ""
-        raise block.fail(f"gives {list(out)}, the file says {list(declared)}{turned}; {REMEDY}")
+        raise block.fail(f"gives {list(out)}, the file says {list(declared)}; {REMEDY}")
     return matrix.astype(np.int64), out
 
 

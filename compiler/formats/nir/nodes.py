@@ -35,7 +35,8 @@ def _linear(node: Node, value: Value, _steps: Steps) -> Value:
         raise node.fail(f"weight has the shape {list(weight.shape)}, allowed are (to, from); export it again")
     rows, columns = weight.shape
     if value.shape[-1:] != (columns,):
-        raise node.fail(_misfit(weight.shape, value))
+        missing = "a Flatten is missing before it" if value.size == columns else "the shapes disagree, export it again"
+        raise node.fail(f"weight is for {columns} values, it gets {list(value.shape)}; {missing}")
     copies = math.prod(value.shape[:-1])
     if copies * weight.size > DENSE_LIMIT:
         raise node.fail(f"has {copies * weight.size:,} weights, {DENSE_LIMIT:,} are allowed; this fits no chip")
@@ -43,17 +44,6 @@ def _linear(node: Node, value: Value, _steps: Steps) -> Value:
     if node.type == "Linear":
         return result
     return shifted(result, np.tile(_each(node, "bias", rows), copies))
-
-
-def _misfit(shape: tuple[int, ...], value: Value) -> str:
-    """Why a matrix does not fit what it gets."""
-    rows, columns = shape
-    said = f"weight is for {columns} values, it gets {list(value.shape)}"
-    if value.shape[-1:] == (rows,):
-        return f"{said}; the matrix looks transposed, NIR wants (to, from)"
-    if value.size == columns:
-        return f"{said}; a Flatten is missing before it"
-    return f"{said}; the shapes disagree, export it again"
 
 
 def _each(node: Node, key: str, size: int) -> FloatArray:
@@ -102,8 +92,7 @@ def _conv(node: Node, value: Value, _steps: Steps) -> Value:
     if node.has("input_shape"):
         declared = node.whole("input_shape")
         if declared != shape[1:]:
-            turned = "; its axes look exchanged" if declared == shape[:0:-1] else ""
-            raise node.fail(f"is for inputs of {list(declared)}, it gets {list(shape[1:])}{turned}; export it again")
+            raise node.fail(f"is for inputs of {list(declared)}, it gets {list(shape[1:])}; export it again")
     stride, dilation = node.whole("stride", axes), node.whole("dilation", axes)
     padding, groups = _padding(node, kernel, dilation, stride), node.whole("groups", 1)[0]
     matrix, out = _named(

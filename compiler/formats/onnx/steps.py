@@ -12,7 +12,7 @@ from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.formats.assemble import class_of_each
 from spikeloom.compiler.formats.names import printable
 from spikeloom.compiler.formats.onnx.lif import EQUAL, RESET, Neurons
-from spikeloom.compiler.formats.onnx.values import INPUT_ATOM, MEMBRANE, SPIKE, Affine, Table
+from spikeloom.compiler.formats.onnx.values import INPUT_ATOM, MEMBRANE, Affine, Table
 from spikeloom.compiler.ir import INPUT, Sparse
 
 
@@ -246,19 +246,12 @@ def readout(table: Table, found: Unrolled, outputs: Mapping[str, Affine]) -> tup
     summed = [vote for vote in votes if not np.array_equal(vote[1], np.arange(len(vote[1])))]
     chosen = summed or plain
     if not chosen:
-        raise ModelError(_no_vote(table, outputs))
+        shown = ", ".join(printable(name) for name in outputs)
+        raise ModelError(
+            f"outputs {shown}: none counts the spikes of the last layer; give its spikes, or their sum over time, one "
+            "neuron or one group of neurons a class"
+        )
     if any(vote[0] != chosen[0][0] or not np.array_equal(vote[1], chosen[0][1]) for vote in chosen):
         shown = ", ".join(printable(vote[2]) for vote in chosen)
         raise ModelError(f"outputs {shown} count spikes differently; leave one of them, the classes")
     return chosen[0]
-
-
-def _no_vote(table: Table, outputs: Mapping[str, Affine]) -> str:
-    shown = ", ".join(printable(name) for name in outputs)
-    membranes = any(table.atoms[atom].kind not in (SPIKE, INPUT_ATOM) for o in outputs.values() for atom in o.terms)
-    spikes = any(table.atoms[atom].kind == SPIKE for output in outputs.values() for atom in output.terms)
-    seen = "membranes" if membranes and not spikes else "other values"
-    return (
-        f"outputs {shown}: none counts the spikes of the last layer, they hold {seen}; give its spikes, or their sum "
-        "over time, one neuron or one group of neurons a class"
-    )
