@@ -1,5 +1,7 @@
 """Small ONNX graphs written by hand: two spiking layers, with the neuron spelled in every way."""
 
+import re
+
 import numpy as np
 from onnx import TensorProto, helper, numpy_helper
 
@@ -36,85 +38,52 @@ def model(nodes, inputs, outputs, constants=None, *, opset=20, domains=()):
     return helper.make_model(graph, opset_imports=imports, ir_version=9, producer_name="hand").SerializeToString()
 
 
+def written(text, **names):
+    """Nodes of lines such as ``d = Mul(u, beta)``; casts are to float, names are replaced."""
+    found = []
+    for output, op, inputs in re.findall(r"(\w+) = (\w+)\(([^)]*)\)", text):
+        given = " ".join(names.get(name, name) for name in inputs.split(", "))
+        found.append(node(op, given, names.get(output, output), **({"to": FLOAT} if op == "Cast" else {})))
+    return found
+
+
+RESETS = {
+    "product": "d = Mul(u, beta); q = Sub(one, s); k = Mul(d, q)",
+    "difference": "q = Mul(u, s); d = Sub(u, q); k = Mul(beta, d)",
+    "where": "q = Greater(u, theta); d = Mul(u, beta); k = Where(q, zero, d)",
+    "less": "q = LessOrEqual(u, theta); r = Cast(q); d = Mul(u, beta); k = Mul(d, r)",
+    "truth": "q = Not(s); r = Cast(q); d = Mul(u, beta); k = Mul(d, r)",
+    "subtract": "d = Mul(u, beta); q = Mul(s, theta); k = Sub(d, q)",
+    "after": "k = Mul(u, beta)",
+}
+"""What is kept of a membrane ``u`` after its spikes ``s``: several spellings, and one that is another neuron."""
+
+
 def neuron(k, source, spelling="product"):
-    """Nodes of a layer whose current is `source`: u0 -> u0_new and so on; several spellings of the same neuron."""
-    u, s, new, fired = f"u{k}", f"s{k}", f"u{k}_new", f"s{k}_new"
-    fire = [node("Greater", f"{new} theta", f"{fired}_b"), node("Cast", f"{fired}_b", fired, to=FLOAT)]
-    match spelling:
-        case "product":
-            reset = [
-                node("Mul", f"{u} beta", f"d{k}"),
-                node("Sub", f"one {s}", f"q{k}"),
-                node("Mul", f"d{k} q{k}", f"k{k}"),
-            ]
-        case "difference":
-            reset = [
-                node("Mul", f"{u} {s}", f"q{k}"),
-                node("Sub", f"{u} q{k}", f"d{k}"),
-                node("Mul", f"beta d{k}", f"k{k}"),
-            ]
-        case "where":
-            reset = [
-                node("Greater", f"{u} theta", f"q{k}"),
-                node("Mul", f"{u} beta", f"d{k}"),
-                node("Where", f"q{k} zero d{k}", f"k{k}"),
-            ]
-        case "less":
-            reset = [
-                node("LessOrEqual", f"{u} theta", f"q{k}"),
-                node("Cast", f"q{k}", f"r{k}", to=FLOAT),
-                node("Mul", f"{u} beta", f"d{k}"),
-                node("Mul", f"d{k} r{k}", f"k{k}"),
-            ]
-        case "truth":
-            reset = [
-                node("Not", s, f"q{k}"),
-                node("Cast", f"q{k}", f"r{k}", to=FLOAT),
-                node("Mul", f"{u} beta", f"d{k}"),
-                node("Mul", f"d{k} r{k}", f"k{k}"),
-            ]
-            fire = [node("Greater", f"{new} theta", fired)]
-        case "subtract":
-            reset = [
-                node("Mul", f"{u} beta", f"d{k}"),
-                node("Mul", f"{s} theta", f"q{k}"),
-                node("Sub", f"d{k} q{k}", f"k{k}"),
-            ]
-        case _:
-            reset = [node("Mul", f"{u} beta", f"k{k}")]
-    add = [node("Add", f"k{k} {source}", new)]
-    if spelling == "after":
-        after = [node("Where", f"{fired}_b zero {new}", f"u{k}_kept")]
-        return reset + add + fire + after
-    return reset + add + fire
+    """Nodes of a layer whose current is `source`: u0 -> u0_new and so on."""
+    names = {name: f"{name}{k}" for name in "usdqrk"} | {"new": f"u{k}_new", "source": source}
+    names |= {"fired": f"s{k}_new", "bool": f"s{k}_new_b", "kept": f"u{k}_kept"}
+    fire = "fired = Greater(new, theta)" if spelling == "truth" else "bool = Greater(new, theta); fired = Cast(bool)"
+    after = "; kept = Where(bool, zero, new)" if spelling == "after" else ""
+    return written(f"{RESETS[spelling]}; new = Add(k, source); {fire}{after}", **names)
 
 
 FIRES = {
-    "greater": [("Greater", "{u} theta", "hot"), ("Cast", "hot", "{s}", {"to": FLOAT})],
-    "less": [("Less", "theta {u}", "hot"), ("Cast", "hot", "{s}", {"to": FLOAT})],
-    "where": [("Greater", "{u} theta", "hot"), ("Where", "hot one zero", "{s}")],
-    "not": [("LessOrEqual", "{u} theta", "c"), ("Not", "c", "hot"), ("Cast", "hot", "{s}", {"to": FLOAT})],
-    "shift": [("Sub", "{u} theta", "d"), ("Greater", "d zero", "hot"), ("Cast", "hot", "{s}", {"to": FLOAT})],
-    "share": [("Div", "{u} theta", "d"), ("Greater", "d one", "hot"), ("Cast", "hot", "{s}", {"to": FLOAT})],
-    "sign": [("Sub", "{u} theta", "d"), ("Sign", "d", "e"), ("Relu", "e", "{s}")],
-    "heaviside": [
-        ("Sub", "{u} theta", "d"),
-        ("Equal", "d zero", "eq"),
-        ("Less", "d zero", "lt"),
-        ("Where", "lt zero one", "step"),
-        ("Where", "eq zero step", "{s}"),
-    ],
+    "greater": "hot = Greater(u, theta); s = Cast(hot)",
+    "less": "hot = Less(theta, u); s = Cast(hot)",
+    "where": "hot = Greater(u, theta); s = Where(hot, one, zero)",
+    "not": "c = LessOrEqual(u, theta); hot = Not(c); s = Cast(hot)",
+    "shift": "d = Sub(u, theta); hot = Greater(d, zero); s = Cast(hot)",
+    "share": "d = Div(u, theta); hot = Greater(d, one); s = Cast(hot)",
+    "sign": "d = Sub(u, theta); e = Sign(d); s = Relu(e)",
+    "heaviside": "d = Sub(u, theta); eq = Equal(d, zero); lt = Less(d, zero); step = Where(lt, zero, one); "
+    "s = Where(eq, zero, step)",
 }
 
 
 def fire(kind, u, s):
     """Nodes from a membrane to its spikes."""
-    lines = []
-    for line in FIRES[kind]:
-        names = [word.format(u=u, s=s) for word in line[1:3]]
-        attributes = line[3] if len(line) > 3 else {}
-        lines.append(node(line[0], names[0], names[1], **attributes))
-    return lines
+    return written(FIRES[kind], u=u, s=s)
 
 
 STAGE = [node("Gemm", "x w b", "current")]

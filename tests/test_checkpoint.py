@@ -8,12 +8,13 @@ import pickle
 import subprocess
 import sys
 import zipfile
-from itertools import pairwise
 from pathlib import Path
 
+import made_files as made
 import numpy as np
 import pytest
 import torch
+from made_files import state_dict
 
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.formats.checkpoint import SIZE_LIMIT, read_checkpoint
@@ -33,14 +34,7 @@ DAMAGED = "is truncated or damaged"
 
 def tensors(seed: int = 0) -> dict[str, torch.Tensor]:
     """State dict under the keys of current torch_geometric."""
-    generator = torch.Generator().manual_seed(seed)
-    state = {"conv1.bias": torch.rand(FEATURES, generator=generator)}
-    state |= {f"conv1.lins.{k}.weight": torch.rand(FEATURES, 2, generator=generator) for k in range(HOPS + 1)}
-    sizes = (TAXELS * FEATURES, *SIZES, CLASSES)
-    for i, (inputs, outputs) in enumerate(pairwise(sizes), start=1):
-        state[f"fc{i}.weight"] = torch.rand(outputs, inputs, generator=generator)
-        state[f"fc{i}.bias"] = torch.rand(outputs, generator=generator)
-    return state
+    return state_dict(made.weights(seed, features=FEATURES, sizes=(*SIZES, CLASSES)))
 
 
 def old_keys(state: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
@@ -74,17 +68,8 @@ def refusal(path: Path, error: type[Exception] = ModelError, **options: object) 
     return message.removeprefix(f"{path}: ")
 
 
-def weights(scale: float = 1.0) -> dict[str, np.ndarray]:
-    rng = np.random.default_rng(1)
-    shapes = {
-        "conv1.hops": (HOPS + 1, FEATURES, 2),
-        "conv1.bias": (FEATURES,),
-        "fc1.weight": (5, TAXELS * FEATURES),
-        "fc1.bias": (5,),
-        "fc2.weight": (CLASSES, 5),
-        "fc2.bias": (CLASSES,),
-    }
-    return {name: np.float32(scale) * rng.random(shape, np.float32) for name, shape in shapes.items()}
+def weights(seed: int = 1) -> dict[str, np.ndarray]:
+    return made.weights(seed, features=FEATURES, sizes=(5, CLASSES))
 
 
 def ring() -> Graph:
@@ -94,7 +79,7 @@ def ring() -> Graph:
 
 def own(**changes: object) -> bytes:
     options = {"beta": 0.25, "theta": 0.75, "training": {"seed": 4}} | changes
-    sets = options.pop("weights", {"last": weights(), "best": weights(2.0)})
+    sets = options.pop("weights", {"last": weights(), "best": weights(2)})
     return checkpoint_bytes(sets, options.pop("graph", ring()), **options)
 
 
@@ -356,12 +341,10 @@ def test_options_that_do_not_fit(tmp_path, options, words):
 
 def test_own_format_round_trip(tmp_path):
     path = tmp_path / "x.pt"
-    save_checkpoint(
-        path, {"last": weights(), "best": weights(2.0)}, ring(), beta=0.25, theta=0.75, training={"seed": 4}
-    )
-    for which, scale in (("last", 1.0), ("best", 2.0)):
+    save_checkpoint(path, {"last": weights(), "best": weights(2)}, ring(), beta=0.25, theta=0.75, training={"seed": 4})
+    for which, seed in (("last", 1), ("best", 2)):
         read = read_checkpoint(path, weights=which)
-        expected = weights(scale)
+        expected = weights(seed)
         np.testing.assert_array_equal(read.hops, expected["conv1.hops"])
         np.testing.assert_array_equal(read.conv_bias, expected["conv1.bias"])
         assert [dense.name for dense in read.dense] == ["fc1", "fc2"]
@@ -388,7 +371,7 @@ def test_own_format_needs_neither_torch_nor_pickle(tmp_path):
         manifest = json.loads(archive.read("manifest.json"))
         array = np.lib.format.read_array(io.BytesIO(archive.read("best/fc2.bias.npy")), allow_pickle=False)
     assert manifest["weights"] == ["last", "best"]
-    np.testing.assert_array_equal(array, weights(2.0)["fc2.bias"])
+    np.testing.assert_array_equal(array, weights(2)["fc2.bias"])
 
 
 def test_more_than_nine_dense_stages(tmp_path):
