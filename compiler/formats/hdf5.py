@@ -11,7 +11,6 @@ import io
 import os
 import subprocess
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -57,30 +56,13 @@ except ModelError:
 """
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class File:
-    """Content of a file, and its hash."""
+def read_hdf5(path: Path, what: str, remedy: str) -> tuple[Tree, str]:
+    """Content of a whole file, and its sha256.
 
-    tree: Tree
-    sha256: str
+    For messages: `what` it should be (``NIR file``), and the `remedy` for a damaged one.
 
-
-def read_hdf5(path: Path, what: str, remedy: str) -> File:
-    """Read a whole file.
-
-    Parameters
-    ----------
-    path : Path
-        File.
-    what, remedy : str
-        For messages: what it should be (``NIR file``), and what to do about a damaged one.
-
-    Raises
-    ------
-    ModelError
-        If it is missing, too large, no HDF5 file, damaged, or holds what may not be read; without the path.
-    OSError
-        If it cannot be read.
+    Raises ModelError if it is missing, too large, no HDF5 file, damaged, or holds what may not be read, without the
+    path; OSError if it cannot be read.
     """
     if not path.is_file():
         found = "is not a file" if path.exists() else "no such file"
@@ -93,7 +75,7 @@ def read_hdf5(path: Path, what: str, remedy: str) -> File:
         raise ModelError(f"is no HDF5 file, as a {what} is; {remedy}")
     try:
         try_reading(content)
-        return File(tree=tree_of(content), sha256=hashlib.sha256(content).hexdigest())
+        return tree_of(content), hashlib.sha256(content).hexdigest()
     except ModelError as error:
         raise ModelError(f"{error}; {remedy}") from error
 

@@ -100,8 +100,8 @@ def read_blocks(path: Path) -> tuple[list[Block], Tree, str]:
 
     Raises ModelError if it is none; without the path.
     """
-    file = read_hdf5(path, "netx file", REMEDY)
-    return blocks_of(file.tree), file.tree, file.sha256
+    tree, sha256 = read_hdf5(path, "netx file", REMEDY)
+    return blocks_of(tree), tree, sha256
 
 
 def blocks_of(tree: Tree) -> list[Block]:

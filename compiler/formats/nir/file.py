@@ -124,8 +124,7 @@ def read_graph(path: Path) -> Graph:
 
     Raises ModelError if it is none, or inconsistent; without the path.
     """
-    file = read_hdf5(path, "NIR file", DAMAGED)
-    return graph_of(file.tree, file.sha256)
+    return graph_of(*read_hdf5(path, "NIR file", DAMAGED))
 
 
 def graph_of(tree: Tree, sha256: str) -> Graph:
