@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -28,8 +27,6 @@ from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.truenorth.legalize import require_legal
 from spikeloom.compiler.targets.truenorth.netlist import RESET_NONE, RESET_TO, CrossbarNetlist
 from spikeloom.compiler.targets.truenorth.netlist_file import read_crossbars
-
-Json = dict[str, Any]
 
 EventArray = npt.NDArray[np.uint8] | npt.NDArray[np.bool_]
 
@@ -47,20 +44,14 @@ def unsupported(netlist: CrossbarNetlist) -> list[str]:
     A neuron that saturates at zero, is reset to zero and has no other use of its negative threshold is expressed as a
     reset; all others that saturate are not.
     """
-    saturates = (netlist.negative_saturates > 0) & ~_resets_as_it_saturates(netlist)
+    resets = (netlist.reset_mode == RESET_TO) & (netlist.reset == netlist.negative_threshold)
     found = {
         "a leak with reversal": (netlist.leak_reversal > 0) & (netlist.leak != 0),
         "a random threshold": netlist.mask_bits > 0,
         "a reset that does nothing": netlist.reset_mode == RESET_NONE,
-        "a negative threshold that saturates": saturates,
+        "a negative threshold that saturates": (netlist.negative_saturates > 0) & ~resets,
     }
     return [f"{name} ({np.count_nonzero(which)} neurons)" for name, which in found.items() if which.any()]
-
-
-def _resets_as_it_saturates(netlist: CrossbarNetlist) -> npt.NDArray[np.bool_]:
-    """Neurons whose saturation at the negative threshold is what a reset to its reset value does."""
-    same: npt.NDArray[np.bool_] = (netlist.reset_mode == RESET_TO) & (netlist.reset == netlist.negative_threshold)
-    return same
 
 
 def export(netlist: CrossbarNetlist, events: EventArray | None = None) -> Iterator[str]:
@@ -114,14 +105,16 @@ def export(netlist: CrossbarNetlist, events: EventArray | None = None) -> Iterat
     yield "]}"
 
 
-def _packets(netlist: CrossbarNetlist, events: EventArray | None, x: IntArray, y: IntArray) -> list[list[Json]]:
+def _packets(
+    netlist: CrossbarNetlist, events: EventArray | None, x: IntArray, y: IntArray
+) -> list[list[dict[str, object]]]:
     """Packets of each tick; an axon that is reached twice gets one."""
     if events is None:
         return [[]]
     ticks = netlist.ticks(events.shape[1])
     due: list[set[tuple[int, int]]] = [set() for _ in range(ticks)]
-    feeds = zip(*(column.tolist() for column in _feeds(netlist)), strict=True)
-    for channel, core, line, offset in feeds:
+    feeds = (netlist.feed_channel, netlist.feed_core, netlist.feed_line, netlist.feed_tick)
+    for channel, core, line, offset in zip(*(column.tolist() for column in feeds), strict=True):
         for step in np.flatnonzero(events[channel]).tolist():
             if step * netlist.bin_ticks + offset < ticks:
                 due[step * netlist.bin_ticks + offset].add((core, line))
@@ -136,10 +129,6 @@ def _packets(netlist: CrossbarNetlist, events: EventArray | None, x: IntArray, y
         ]
         for axons in due
     ]
-
-
-def _feeds(netlist: CrossbarNetlist) -> tuple[IntArray, ...]:
-    return netlist.feed_channel, netlist.feed_core, netlist.feed_line, netlist.feed_tick
 
 
 def _aims(
@@ -162,7 +151,9 @@ def _aims(
     return [(dx, dy, axon, tick) for dx, dy, axon, tick in aim.astype(np.int64).tolist()]
 
 
-def _core(netlist: CrossbarNetlist, core: int, x: int, y: int, aims: list[tuple[int, int, int, int]]) -> Json:
+def _core(
+    netlist: CrossbarNetlist, core: int, x: int, y: int, aims: list[tuple[int, int, int, int]]
+) -> dict[str, object]:
     first, last = netlist.core_neurons[core : core + 2].tolist()
     axons = slice(*netlist.core_axons[core : core + 2].tolist())
     lines = netlist.axon_line[axons]
@@ -192,22 +183,3 @@ def _core(netlist: CrossbarNetlist, core: int, x: int, y: int, aims: list[tuple[
             for n in range(first, last)
         ],
     }
-
-
-def read_outputs(text: str, voters: int) -> npt.NDArray[np.bool_]:
-    r"""Spikes of the voters, (ticks, voters), from the output file of a run of one tick more.
-
-    Raises
-    ------
-    ValueError
-        If it is no such file.
-
-    Examples
-    --------
-    >>> read_outputs("0 0 0 \n1 0 0 \n0 1 1 \n", 2).tolist()
-    [[True, False], [False, True]]
-    """
-    rows = [[word == "1" for word in line.split()] for line in text.splitlines() if line.strip()]
-    if any(len(row) != voters + 1 for row in rows):
-        raise ValueError(f"rows of other than {voters} voters and what is left")
-    return np.array(rows[1:], np.bool_).reshape(-1, voters + 1)[:, :voters]

@@ -169,8 +169,7 @@ def _loop(node: Node, values: Mapping[str, Value], operands: list[Value | None],
 def _scan(node: Node, values: Mapping[str, Value], operands: list[Value | None], table: Table) -> list[Value]:
     body, inputs = node.attributes["body"], int(node.attributes["num_scan_inputs"])
     carried = len(operands) - inputs
-    if any(node.attributes.get(f"scan_{side}_directions", ()) for side in ("input", "output") if any(
-        node.attributes.get(f"scan_{side}_directions", ()))):  # fmt: skip
+    if any(any(node.attributes.get(f"scan_{side}_directions", ())) for side in ("input", "output")):
         raise ModelError("runs backwards in time; only forward can be lowered")
     everything = [value for value in operands if value is not None]
     if not 1 <= inputs <= len(operands) or len(everything) != len(operands) or len(body.inputs) != len(operands):
