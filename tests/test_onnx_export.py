@@ -169,7 +169,6 @@ def test_every_name_is_documented(proved):
 
 
 def test_the_reference_of_the_format_computes_the_same():
-    pytest.importorskip("onnx", "1.18", "before, the evaluator did not see constants from inside a loop")
     netlist = three_neurons()
     given = np.random.default_rng(2).integers(0, 2, (2, 2, 12), np.uint8)
     expected = engine.simulate(netlist, given, spikes=True).spikes
