@@ -27,7 +27,7 @@ from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.targets.base import Target, load_target
 from spikeloom.compiler.targets.netlist import Netlist
 from spikeloom.runtime import machines
-from spikeloom.runtime.report.sections import Outcome, Section, Text
+from spikeloom.runtime.report.sections import Outcome
 
 BoolArray = npt.NDArray[np.bool_]
 EventArray = npt.NDArray[np.uint8 | np.bool_]
@@ -330,11 +330,6 @@ def machine_for(path: str | os.PathLike[str]) -> Machine:
     known = name is not None and name.isidentifier() and has_machine(name)
     machine: Machine = _module(name if known and name else DEFAULT).load(path)
     return machine
-
-
-def as_text(text: Callable[[Any], str], result: Any) -> list[Section]:
-    """Layout of a result that is printed as it stands."""
-    return [Section("", [Text(text(result))])]
 
 
 def chip_commands(name: str) -> Any | None:

@@ -26,8 +26,6 @@ from spikeloom.runtime.machines.loihi1.costs.cost import Costs
 from spikeloom.runtime.machines.loihi1.timing import DetailedTimes, SimpleTimes
 from spikeloom.runtime.machines.loihi1.trace import BoolArray, Counts
 
-DETAILS = ("spikes", "counts", "cycle")
-
 PART = 16
 """Recordings whose spikes are kept at a time in detail ``cycle``."""
 
