@@ -31,13 +31,7 @@ REFUSED = {
 
 
 def recipe_for(name: str, given: Mapping[str, Any]) -> Recipe:  # noqa: ARG001 -- there is one
-    """The only recipe.
-
-    Raises
-    ------
-    OptionError
-        If an option is given that such networks do not take.
-    """
+    """The only recipe; OptionError if an option is given that such networks do not take."""
     for option, reason in REFUSED.items():
         if option in given:
             raise OptionError(f"{option} {given[option]}: a network of system {SYSTEM} {reason}; omit it")

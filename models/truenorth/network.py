@@ -138,16 +138,8 @@ def sized(
 class NativeNet(TrainedModule):
     """See the module docstring; neurons of the convolution lie taxel by taxel, of the others group by group.
 
-    Parameters
-    ----------
-    architecture : NativeArchitecture
-        Sizes.
-    propagation : (taxels, taxels) float64
-        Normalised adjacency.
-    seed : int
-        Of the initial weights. The global random state is neither used nor moved.
-    surrogate : Surrogate
-        Derivative of a spike, its width in thresholds.
+    `propagation` (taxels, taxels) is the normalised adjacency; the `seed` is that of the initial weights: the global
+    random state is neither used nor moved. The width of the surrogate, the derivative of a spike, is in thresholds.
     """
 
     def __init__(
@@ -209,10 +201,7 @@ class NativeNet(TrainedModule):
     def forward(self, events: Tensor, lengths: Tensor | None = None) -> Tensor:
         """Votes per step and output neuron for each class, (samples, classes), for (steps, samples, taxels, channels).
 
-        Parameters
-        ----------
-        lengths : (samples,) int64, optional
-            Steps of each recording, where some were filled up with silence.
+        `lengths` (samples,) are the steps of each recording, where some were filled up with silence.
         """
         architecture = self.architecture
         *_, spikes = run_layers(self.rounded(), self.inputs, architecture.clocks, events, self.surrogate)
@@ -253,12 +242,8 @@ def run_layers(
 ) -> list[Tensor]:
     """Spikes of every layer of a tower, each (steps, samples, neurons), for (steps, samples, taxels, channels).
 
-    Parameters
-    ----------
-    layers : sequence of Rounded
-        The first receives the sensor in one block.
-    inputs : sequence of (blocks, width) int64
-        What each block of the others receives from the layer before.
+    The first of the layers receives the sensor in one block; `inputs` (blocks, width) are what each block of the others
+    receives from the layer before.
     """
     steps, samples = events.shape[:2]
     ticks = torch.from_numpy(clocks.events(steps).T.astype(np.float32))
@@ -313,17 +298,9 @@ def predict(network: NativeNetwork, recordings: Recordings) -> NDArray[np.int64]
 
 
 def run_network(network: NativeNetwork, events: NDArray[np.uint8]) -> dict[str, NDArray[np.bool_]]:
-    """Spikes of every layer, towers side by side, as the model computes them in training.
+    """Spikes of every layer (samples, steps, neurons), towers side by side, as the model computes them in training.
 
-    Parameters
-    ----------
-    network : NativeNetwork
-        As read from a file.
-    events : (samples, taxels, polarities, steps) uint8
-
-    Returns
-    -------
-    mapping of layer to (samples, steps, neurons) bool
+    `events` are (samples, taxels, polarities, steps) uint8.
     """
     given = torch.from_numpy(events.transpose(3, 0, 1, 2).astype(np.float32, order="C"))
     parts: dict[str, list[NDArray[np.bool_]]] = {}

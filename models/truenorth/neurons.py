@@ -111,15 +111,8 @@ def _differentiate(above: Any, membrane: Any, threshold: Any, floor: Any, width:
 def block_sums(spikes: Tensor, weight: Tensor) -> Tensor:
     """Sums of the weights of the inputs that spiked, block by block: a matrix product of matrices on a diagonal.
 
-    Parameters
-    ----------
-    spikes : (steps, samples, blocks * width) float32
-        Zeros and ones, the inputs of a block side by side.
-    weight : (blocks, width, size) float32
-
-    Returns
-    -------
-    (steps, samples, blocks * size)
+    `spikes` (steps, samples, blocks * width) are zeros and ones, the inputs of a block side by side; with `weight`
+    (blocks, width, size) they give (steps, samples, blocks * size).
     """
     found: Tensor = _BlockSums.apply(spikes, weight)  # type: ignore[no-untyped-call]
     return found

@@ -167,26 +167,14 @@ class Machine(ABC):
         """How the simulator goes through a recording, in a few words."""
 
     def require_detail(self, detail: str) -> None:
-        """Refuse a depth that the chip's price model has not.
-
-        Raises
-        ------
-        OptionError
-            Naming those that it has.
-        """
+        """Refuse a depth that the chip's price model has not; the OptionError names those that it has."""
         if detail not in self.details:
             allowed = ", ".join(self.details)
             raise OptionError(f"--detail {detail}: {self.netlist.target} has no such price model; allowed: {allowed}")
 
     @abstractmethod
     def legal(self) -> None:
-        """Hold the netlist against every limit of the chip.
-
-        Raises
-        ------
-        SpikeloomError
-            Naming each limit that it breaks.
-        """
+        """Hold the netlist against every limit of the chip; the SpikeloomError names each that it breaks."""
 
     @abstractmethod
     def run(
@@ -294,13 +282,7 @@ class Machine(ABC):
 
     @abstractmethod
     def stream(self) -> Stream:
-        """State of one grasp that runs bin after bin.
-
-        Raises
-        ------
-        OptionError
-            If this chip's simulator runs whole recordings only.
-        """
+        """State of one grasp that runs bin after bin; OptionError if the simulator runs whole recordings only."""
 
 
 def _module(name: str) -> Any:
@@ -319,13 +301,7 @@ def machine_of(netlist: Netlist) -> Machine:
 
 
 def machine_for(path: str | os.PathLike[str]) -> Machine:
-    """Read a netlist file, whatever chip it is for.
-
-    Raises
-    ------
-    FormatError, SpikeloomError
-        If it is no netlist, or breaks a limit of its chip.
-    """
+    """Read a netlist file, whatever chip it is for; SpikeloomError if it is none, or breaks a limit of its chip."""
     name = stated(Path(path), "target")
     known = name is not None and name.isidentifier() and has_machine(name)
     machine: Machine = _module(name if known and name else DEFAULT).load(path)

@@ -25,13 +25,7 @@ from spikeloom.compiler.targets.loihi1.netlist import Netlist
 
 
 class ChipNeurons(nn.Module):
-    """The neurons of one layer: a step's synaptic sums in, its spikes out; the state is kept between steps.
-
-    Parameters
-    ----------
-    population : IntegerPopulation
-        Registers.
-    """
+    """The neurons of one layer: a step's synaptic sums in, its spikes out; the state is kept between steps."""
 
     def __init__(self, population: IntegerPopulation) -> None:
         super().__init__()
@@ -58,11 +52,6 @@ class ChipNeurons(nn.Module):
 
 class ChipModule(nn.Module):
     """A netlist that runs as a torch module.
-
-    Parameters
-    ----------
-    netlist : Netlist
-        Compiled network.
 
     Notes
     -----
@@ -128,11 +117,6 @@ def vote(votes: Tensor) -> Tensor:
 
 def neurobench_model(netlist: Netlist) -> Any:
     """The netlist as a ``neurobench.models.TorchModel``, to be given to ``neurobench.benchmarks.Benchmark``.
-
-    Parameters
-    ----------
-    netlist : Netlist
-        Compiled network.
 
     Raises
     ------

@@ -69,16 +69,9 @@ def crossing_points(levels: IntArray, weights: Sequence[int]) -> IntArray:
 
 @dataclass(slots=True, kw_only=True)
 class Core:
-    """A core in the making.
+    """A core in the making at a place: axons as (line, type), neurons as (Neuron, layer, number).
 
-    Parameters
-    ----------
-    x, y : int
-        Place.
-    axons : list of (line, type)
-    neurons : list of (Neuron, layer, number)
-    synapses : list of list of int
-        For each axon the neurons of the core at its crossing points.
+    `synapses` has for each axon the neurons of the core at its crossing points.
     """
 
     x: int

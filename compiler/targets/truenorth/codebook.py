@@ -120,15 +120,9 @@ def group_width(copies: int, chip: Target) -> int:
 
 
 def in_levels(network: Network, copies: int, chip: Target) -> LevelNetwork:
-    """Round a history-free network to levels.
+    """Round a history-free chain of layers to levels.
 
-    Parameters
-    ----------
-    network : Network
-        A chain of layers.
-    copies : int
-        Axons of an input, 2 to 4; layers that receive a clock take three at the most.
-    chip : Target
+    An input has `copies` axons, 2 to 4; layers that receive a clock take three at the most.
 
     Raises
     ------
@@ -178,12 +172,7 @@ def _layer(population: Population, weight: FloatArray, copies: int, chip: Target
 def gate_axons(groups: int, least: int = 0) -> tuple[int, int]:
     """Axons of the clocks that lift a gated neuron to its threshold, and that pull it down.
 
-    Parameters
-    ----------
-    groups : int
-        Whose partial sums it adds up.
-    least : int
-        Lowest threshold on its core.
+    It adds up the partial sums of so many groups; `least` is the lowest threshold on its core.
 
     Examples
     --------

@@ -20,12 +20,12 @@ those of the others by copies of the neurons.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from spikeloom.compiler.errors import CapacityError, Violation
+from spikeloom.compiler.errors import CapacityError
 from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.truenorth.builder import RELAY, Draft, Neuron, crossing_points
@@ -41,7 +41,7 @@ from spikeloom.compiler.targets.truenorth.codebook import (
     gate_axons,
 )
 from spikeloom.compiler.targets.truenorth.legalize import signed_range
-from spikeloom.compiler.targets.truenorth.lower import place_cores
+from spikeloom.compiler.targets.truenorth.lower import exceeded, place_cores
 from spikeloom.compiler.targets.truenorth.netlist import AXON_TYPES, RESET_LINEAR, RESET_TO, CrossbarNetlist
 
 CLOCK = AXON_TYPES - 1
@@ -104,13 +104,7 @@ def first_spikes(network: LevelNetwork) -> dict[str, int]:
 
 @dataclass(slots=True, kw_only=True)
 class _Placing:
-    """Cores as they are made, last layer first.
-
-    Parameters
-    ----------
-    starts : list of int
-        Of the layers.
-    """
+    """Cores as they are made, last layer first; `starts` are those of the layers."""
 
     network: LevelNetwork
     chip: Target
@@ -122,13 +116,13 @@ class _Placing:
     def layer(self, depth: int, ends: list[list[Place]] | None) -> list[list[Place]]:
         """Add a layer whose neurons reach axons `ends`; return the axons that each of its inputs must reach."""
         layer = self.network.layers[depth]
-        if layer.is_split:
-            return self._split(depth, layer, ends)
-        return self._whole(depth, layer, ends)
-
-    def _whole(self, depth: int, layer: Layer, ends: list[list[Place]] | None) -> list[list[Place]]:
-        """A layer whose inputs fit a core: a neuron for each axon that it reaches, all in one tick."""
         inputs: list[list[Place]] = [[] for _ in range(layer.level.shape[1])]
+        add = self._split if layer.is_split else self._whole
+        add(depth, layer, ends, inputs)
+        return inputs
+
+    def _whole(self, depth: int, layer: Layer, ends: list[list[Place]] | None, inputs: list[list[Place]]) -> None:
+        """A layer whose inputs fit a core: a neuron for each axon that it reaches, all in one tick."""
         aims = [(n, end) for n in range(len(layer.level)) for end in ([None] if ends is None else ends[n])]
         types, start = _types(layer.copies), self.starts[depth]
         for part in self._packed(layer, aims):
@@ -139,17 +133,15 @@ class _Placing:
                 lift, leak = (types[CLOCK], -threshold) if threshold > 0 else (1 - threshold, -1)
                 self._require_leak(layer, n, max(-leak, lift))
                 made = Neuron(weights=(*types[:CLOCK], lift), leak=leak, threshold=0)
-                self._add(core, made, layer, n, end, depth)
+                self._add(core, made, layer, n, None if end is None else [end], depth, 1)
             chosen = np.array([n for n, _ in part])
             self._inputs(core, layer, layer.level[chosen].T, range(layer.level.shape[1]), inputs)
             waiting = np.flatnonzero(layer.threshold[chosen] <= 0).tolist()
             if waiting:
                 self._clock(core, CLOCK, waiting, start)
-        return inputs
 
-    def _split(self, depth: int, layer: Layer, ends: list[list[Place]] | None) -> list[list[Place]]:
+    def _split(self, depth: int, layer: Layer, ends: list[list[Place]] | None, inputs: list[list[Place]]) -> None:
         """A layer whose partial sums travel in time."""
-        inputs: list[list[Place]] = [[] for _ in range(layer.level.shape[1])]
         groups, start = layer.groups, self.starts[depth]
         sums = self._gated(depth, layer, len(groups), ends)
         most, types = self.chip.limit("core.neurons"), _types(layer.copies)
@@ -170,7 +162,6 @@ class _Placing:
                 self._inputs(core, layer, layer.level[chosen][:, group].T, range(group.start, group.stop), inputs)
                 for _ in range(EMPTYING):
                     self._clock(core, CLOCK, range(len(part)), start + MOST)
-        return inputs
 
     def _gated(self, depth: int, layer: Layer, groups: int, ends: list[list[Place]] | None) -> list[list[Place]]:
         """Neurons that add up partial sums; returns for each the lines of its groups, above zero and below in turn."""
@@ -178,17 +169,9 @@ class _Placing:
         lifts, pulls = gate_axons(groups, int(layer.threshold.min()))
         a_core = min((self.chip.limit("core.axons") - lifts - pulls) // (2 * groups), self.chip.limit("core.neurons"))
         if a_core < 1:
-            raise CapacityError(
-                (
-                    Violation(
-                        owner=f"{layer.name}, a neuron",
-                        rule=f"{self.chip.name}.core.axons",
-                        used=2 * groups + lifts + pulls,
-                        allowed=self.chip.limit("core.axons"),
-                        remedy=f"partial sums of {groups} groups and the clocks beside; use fewer inputs or copies",
-                    ),
-                )
-            )
+            remedy = f"partial sums of {groups} groups and the clocks beside; use fewer inputs or copies"
+            used = 2 * groups + lifts + pulls
+            raise CapacityError((exceeded(self.chip, f"{layer.name}, a neuron", "core.axons", used, remedy),))
         start, found = self.starts[depth], list[list[Place]]()
         for first in range(0, len(layer.level), a_core):
             core, numbers = self.draft.core(0, 0), range(first, min(first + a_core, len(layer.level)))
@@ -199,7 +182,7 @@ class _Placing:
                     reset_mode=RESET_TO,
                     negative_threshold=reach,
                 )
-                self._lead(core, made, layer, n, ends, depth)
+                self._add(core, made, layer, n, None if ends is None else ends[n], depth, RELAYED)
                 lines = [self.draft.axon(core, sign) for _ in range(groups) for sign in (0, 1)]
                 for line in lines:
                     self.draft.connect(core, line, [n - first])
@@ -210,15 +193,17 @@ class _Placing:
                 self._clock(core, 3, range(len(numbers)), start + BIN_TICKS)
         return found
 
-    def _lead(self, core: int, made: Neuron, layer: Layer, n: int, ends: list[list[Place]] | None, depth: int) -> None:
-        """Add a gated neuron, and what leads its spikes on: a wire where it has one target, relays otherwise."""
+    def _add(
+        self, core: int, made: Neuron, layer: Layer, n: int, ends: Sequence[Place] | None, depth: int, delay: int
+    ) -> None:
+        """Add a neuron and what leads its spikes on: a vote, a wire to its only target, or relays to several."""
         number = self.draft.neuron(core, made, layer=layer.name, number=n)
         if ends is None:
             self.draft.vote((core, number), int(self.network.label[n]), first=self.starts[depth])
-        elif len(ends[n]) == 1:
-            self.wires.append(((core, number), (*ends[n][0], RELAYED)))
-        elif ends[n]:
-            self.wires.append(((core, number), (*self._relays(ends[n]), 1)))
+        elif len(ends) == 1:
+            self.wires.append(((core, number), (*ends[0], delay)))
+        elif ends:
+            self.wires.append(((core, number), (*self._relays(ends), 1)))
 
     def _relays(self, aims: Sequence[Place]) -> Place:
         """An axon, and a relay for each target on its core; the last core of relays is used as long as it has room."""
@@ -232,14 +217,6 @@ class _Placing:
         self.draft.connect(core, line, relays)
         self.wires += [((core, relay), (*aim, 1)) for relay, aim in zip(relays, aims, strict=True)]
         return core, line
-
-    def _add(self, core: int, made: Neuron, layer: Layer, n: int, end: Place | None, depth: int) -> None:
-        """Add a neuron with one target, or a vote."""
-        number = self.draft.neuron(core, made, layer=layer.name, number=n)
-        if end is None:
-            self.draft.vote((core, number), int(self.network.label[n]), first=self.starts[depth])
-        else:
-            self.wires.append(((core, number), (*end, 1)))
 
     def _packed(self, layer: Layer, aims: list[tuple[int, Place | None]]) -> Iterator[list[tuple[int, Place | None]]]:
         """Neurons in their order, as many to a core as their inputs leave room for, with an axon for a clock."""
@@ -270,14 +247,9 @@ class _Placing:
         """A threshold is a leak, and a lift of a clock where it is not above zero."""
         most = -signed_range(self.chip.limit("neuron.leak_bits"))[0] - 1
         if needed > most:
-            broken = Violation(
-                owner=f"{layer.name}, neuron {n}",
-                rule=f"{self.chip.name}.neuron.leak_bits",
-                used=needed,
-                allowed=most,
-                remedy="its threshold in steps of its weights; use fewer axons an input",
-            )
-            raise CapacityError((broken,))
+            remedy = "its threshold in steps of its weights; use fewer axons an input"
+            broken = exceeded(self.chip, f"{layer.name}, neuron {n}", "neuron.leak_bits", needed, remedy)
+            raise CapacityError((replace(broken, allowed=most),))
 
     def _clock(self, core: int, kind: int, neurons: Sequence[int], phase: int) -> None:
         line = self.draft.axon(core, kind)

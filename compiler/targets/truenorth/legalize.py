@@ -18,23 +18,26 @@ from spikeloom.compiler.targets.truenorth.netlist import RESET_NONE, RESET_TO, C
 Offender = tuple[int, str, str]
 """Core (-1 for the chip), who on it, and what was found."""
 
+Broken = tuple[Iterable[Offender], str, str, str]
+"""Who breaks a rule, none where it holds; what is allowed, the rule, and what to do."""
+
 RELAYS = "copy the neuron, or split its spikes by relays"
 
 
 def faults(netlist: CrossbarNetlist, chip: Target) -> tuple[Violation, ...]:
     """Every rule that a network breaks, in the order of cores, axons, neurons, wires, feeds and clocks."""
-    parts = (_cores, _axons, _parameters, _targets, _wires, _feeds, _clocks)
-    return tuple(fault for part in parts for fault in part(netlist, chip))
+    found = []
+    for part in (_cores, _axons, _parameters, _targets, _wires, _feeds, _clocks):
+        for broken, allowed, rule, remedy in part(netlist, chip):
+            for core, group in groupby(broken, key=lambda offender: offender[0]):
+                first, *others = group
+                owner, name = _owner(core, first[1], len(others)), f"{chip.name}.{rule}"
+                found.append(Violation(owner=owner, used=first[2], allowed=allowed, rule=name, remedy=remedy))
+    return tuple(found)
 
 
 def require_legal(netlist: CrossbarNetlist, chip: Target) -> None:
-    """Refuse a network that breaks a rule.
-
-    Raises
-    ------
-    CapacityError
-        Listing every fault.
-    """
+    """Refuse a network that breaks a rule; the CapacityError lists every fault."""
     found = faults(netlist, chip)
     if found:
         raise CapacityError(found)
@@ -51,47 +54,44 @@ def signed_range(bits: int) -> tuple[int, int]:
     return -(1 << (bits - 1)), (1 << (bits - 1)) - 1
 
 
-def _told(offenders: Iterable[Offender], allowed: str, rule: str, remedy: str, chip: Target) -> Iterator[Violation]:
-    """A fault for each core with offenders."""
-    for core, group in groupby(offenders, key=lambda offender: offender[0]):
-        (_, who, found), *others = group
-        place = f"core {core}{', ' * bool(who)}" if core >= 0 else ""
-        more = f" (and {len(others)} more on this core)" if others else ""
-        yield Violation(
-            owner=f"{place}{who}{more}", used=found, allowed=allowed, rule=f"{chip.name}.{rule}", remedy=remedy
-        )
+def _owner(core: int, who: str, others: int) -> str:
+    """The first offender on a core, and how many more there are."""
+    place = f"core {core}{', ' * bool(who)}" if core >= 0 else ""
+    return f"{place}{who}" + (f" (and {others} more on this core)" if others else "")
 
 
-def _cores(netlist: CrossbarNetlist, chip: Target) -> Iterator[Violation]:
-    width, height = chip.limit("mesh.width"), chip.limit("mesh.height")
+def _cores(netlist: CrossbarNetlist, chip: Target) -> Iterator[Broken]:
     places = list(zip(netlist.core_x.tolist(), netlist.core_y.tolist(), strict=True))
-    on_mesh = f"x 0 … {width - 1} and y 0 … {height - 1}"
     off = [(core, "", f"at ({x}, {y})") for core, (x, y) in enumerate(places) if not _inside(x, y, chip)]
-    yield from _told(off, on_mesh, "mesh", "place it on the mesh", chip)
+    yield off, _mesh(chip), "mesh", "place it on the mesh"
     double = [
         (core, "", f"at ({x}, {y}) as core {places.index((x, y))}")
         for core, (x, y) in enumerate(places)
         if places.index((x, y)) != core
     ]
-    yield from _told(double, "one core to a place", "mesh", "place it elsewhere", chip)
+    yield double, "one core to a place", "mesh", "place it elsewhere"
     most = chip.limit("chip.cores")
     if netlist.n_cores > most:
         found = [(-1, "chip", f"{netlist.n_cores} cores")]
-        yield from _told(found, str(most), "chip.cores", "fewer neurons, inputs or copies", chip)
+        yield found, str(most), "chip.cores", "fewer neurons, inputs or copies"
     for what, bounds, remedy in (
         ("neurons", netlist.core_neurons, "use more cores"),
         ("axons", netlist.core_axons, "fewer inputs or copies of inputs, or more cores"),
     ):
         limit, held = chip.limit(f"core.{what}"), np.diff(bounds).tolist()
         full = [(core, "", f"{count} {what}") for core, count in enumerate(held) if count > limit]
-        yield from _told(full, str(limit), f"core.{what}", remedy, chip)
+        yield full, str(limit), f"core.{what}", remedy
 
 
 def _inside(x: int, y: int, chip: Target) -> bool:
     return 0 <= x < chip.limit("mesh.width") and 0 <= y < chip.limit("mesh.height")
 
 
-def _axons(netlist: CrossbarNetlist, chip: Target) -> Iterator[Violation]:
+def _mesh(chip: Target) -> str:
+    return f"x 0 … {chip.limit('mesh.width') - 1} and y 0 … {chip.limit('mesh.height') - 1}"
+
+
+def _axons(netlist: CrossbarNetlist, chip: Target) -> Iterator[Broken]:
     lines, kinds = chip.limit("core.axons"), chip.limit("core.axon_types")
     off, odd, twice, other = [], [], [], []
     seen: dict[tuple[int, int], int] = {}
@@ -108,14 +108,14 @@ def _axons(netlist: CrossbarNetlist, chip: Target) -> Iterator[Violation]:
             twice.append((core, who, "there twice"))
         else:
             other.append((core, who, f"types {seen[core, line]} and {kind}"))
-    yield from _told(off, f"0 … {lines - 1}", "core.axons", "use a line of the core", chip)
-    yield from _told(odd, f"0 … {kinds - 1}", "core.axon_types", "use one of the types", chip)
+    yield off, f"0 … {lines - 1}", "core.axons", "use a line of the core"
+    yield odd, f"0 … {kinds - 1}", "core.axon_types", "use one of the types"
     remedy = "a type belongs to an axon, for all neurons of its core: copy the input onto a second axon"
-    yield from _told(other, "one type to an axon", "core.axon_types", remedy, chip)
-    yield from _told(twice, "one axon to a line", "core.axons", "connect its neurons to one of them", chip)
+    yield other, "one type to an axon", "core.axon_types", remedy
+    yield twice, "one axon to a line", "core.axons", "connect its neurons to one of them"
 
 
-def _parameters(netlist: CrossbarNetlist, chip: Target) -> Iterator[Violation]:
+def _parameters(netlist: CrossbarNetlist, chip: Target) -> Iterator[Broken]:
     """Numbers that do not fit their registers."""
     unsigned = (0, (1 << chip.limit("neuron.threshold_bits")) - 1)
     signed = {what: signed_range(chip.limit(f"neuron.{what}_bits")) for what in ("weight", "leak", "reset", "membrane")}
@@ -138,7 +138,7 @@ def _parameters(netlist: CrossbarNetlist, chip: Target) -> Iterator[Violation]:
     for name, values, (low, high), rule, mend in (*weights, *columns):
         bad = np.flatnonzero((values < low) | (values > high))
         offenders = _on_cores(netlist, bad, [f"{name} {values[neuron]}" for neuron in bad])
-        yield from _told(offenders, f"{low} … {high}", rule, mend, chip)
+        yield offenders, f"{low} … {high}", rule, mend
 
 
 def _on_cores(netlist: CrossbarNetlist, neurons: IntArray, found: list[str]) -> list[Offender]:
@@ -148,7 +148,7 @@ def _on_cores(netlist: CrossbarNetlist, neurons: IntArray, found: list[str]) -> 
     return [(int(c), f"neuron {n}", what) for c, n, what in zip(cores, own, found, strict=True)]
 
 
-def _targets(netlist: CrossbarNetlist, chip: Target) -> Iterator[Violation]:
+def _targets(netlist: CrossbarNetlist, chip: Target) -> Iterator[Broken]:
     """Neurons with more than one target: an axon, or the way out of the chip."""
     limit = chip.limit("neuron.targets")
     places = sorted({*zip(netlist.wire_x.tolist(), netlist.wire_y.tolist(), strict=True)})
@@ -164,24 +164,20 @@ def _targets(netlist: CrossbarNetlist, chip: Target) -> Iterator[Violation]:
         (within, [f"{wires[n]} targets on one core" for n in within], f"let one axon reach all neurons, {RELAYS}"),
         (out, ["votes and has a target on the chip" for _ in out], RELAYS),
     ):
-        yield from _told(_on_cores(netlist, neurons, found), str(limit), "neuron.targets", remedy, chip)
+        yield _on_cores(netlist, neurons, found), str(limit), "neuron.targets", remedy
 
 
-def _wires(netlist: CrossbarNetlist, chip: Target) -> Iterator[Violation]:
+def _wires(netlist: CrossbarNetlist, chip: Target) -> Iterator[Broken]:
     longest, reach = chip.limit("neuron.delay"), chip.limit("mesh.reach")
     source = netlist.core_of_neuron()[netlist.wire_neuron]
     order = np.argsort(source, kind="stable")
     aim = netlist.cores_at(netlist.wire_x, netlist.wire_y)
     axon = netlist.axons_at(aim, netlist.wire_line)
     far = np.maximum(np.abs(netlist.core_x[source] - netlist.wire_x), np.abs(netlist.core_y[source] - netlist.wire_y))
-    late: list[Offender] = []
-    off: list[Offender] = []
-    nowhere: list[Offender] = []
-    beyond: list[Offender] = []
+    late, off, nowhere, beyond = (list[Offender]() for _ in range(4))
+    columns = netlist.wire_x, netlist.wire_y, netlist.wire_line, netlist.wire_delay, source
     for row in order.tolist():
-        x, y, line = (int(column[row]) for column in (netlist.wire_x, netlist.wire_y, netlist.wire_line))
-        delay = int(netlist.wire_delay[row])
-        core = int(source[row])
+        x, y, line, delay, core = (int(column[row]) for column in columns)
         who = f"neuron {netlist.wire_neuron[row] - netlist.core_neurons[core]}"
         if not 1 <= delay <= longest:
             late.append((core, who, f"delay {delay}"))
@@ -193,41 +189,34 @@ def _wires(netlist: CrossbarNetlist, chip: Target) -> Iterator[Violation]:
             nowhere.append((core, who, f"target line {line} of core {aim[row]}, which has no axon there"))
         elif far[row] > reach:
             beyond.append((core, who, f"{far[row]} cores away"))
-    yield from _told(late, f"1 … {longest} ticks", "neuron.delay", "add relays for longer ways", chip)
-    on_mesh = f"x 0 … {chip.limit('mesh.width') - 1} and y 0 … {chip.limit('mesh.height') - 1}"
-    yield from _told(off, on_mesh, "mesh", "aim at a core of the mesh", chip)
-    yield from _told(nowhere, "an axon of a core", "target", "add the axon, or leave the wire away", chip)
-    yield from _told(beyond, str(reach), "mesh.reach", "place the cores nearer to each other", chip)
+    yield late, f"1 … {longest} ticks", "neuron.delay", "add relays for longer ways"
+    yield off, _mesh(chip), "mesh", "aim at a core of the mesh"
+    yield nowhere, "an axon of a core", "target", "add the axon, or omit the wire"
+    yield beyond, str(reach), "mesh.reach", "place the cores nearer to each other"
 
 
-def _feeds(netlist: CrossbarNetlist, chip: Target) -> Iterator[Violation]:
-    axon = netlist.axons_at(netlist.feed_core, netlist.feed_line)
-    bad = np.flatnonzero(axon < 0).tolist()
-    lost = [
-        (
-            -1,
-            f"input channel {netlist.feed_channel[row]}",
-            f"line {netlist.feed_line[row]} of core {netlist.feed_core[row]}",
-        )
-        for row in bad
-    ]
-    yield from _told(lost, "an axon of a core", "target", "add the axon, or leave the feed away", chip)
-    early = [
-        (-1, f"input channel {netlist.feed_channel[row]}", f"tick {netlist.feed_tick[row]} of a data step")
-        for row in np.flatnonzero(netlist.feed_tick < 0)
-    ]
-    yield from _told(early, "0 or later", "feed", "feed it when it is there", chip)
+def _feeds(netlist: CrossbarNetlist, _chip: Target) -> Iterator[Broken]:
+    rows = zip(netlist.feed_channel, netlist.feed_core, netlist.feed_line, netlist.feed_tick, strict=True)
+    axons = netlist.axons_at(netlist.feed_core, netlist.feed_line).tolist()
+    lost, early = list[Offender](), list[Offender]()
+    for axon, (channel, core, line, tick) in zip(axons, rows, strict=True):
+        if axon < 0:
+            lost.append((-1, f"input channel {channel}", f"line {line} of core {core}"))
+        if tick < 0:
+            early.append((-1, f"input channel {channel}", f"tick {tick} of a data step"))
+    yield lost, "an axon of a core", "target", "add the axon, or omit the feed"
+    yield early, "0 or later", "feed", "feed it when it is there"
 
 
-def _clocks(netlist: CrossbarNetlist, chip: Target) -> Iterator[Violation]:
+def _clocks(netlist: CrossbarNetlist, _chip: Target) -> Iterator[Broken]:
     axon = netlist.axons_at(netlist.clock_core, netlist.clock_line)
     for row in range(len(axon)):
         who, period, phase = f"clock {row}", int(netlist.clock_period[row]), int(netlist.clock_phase[row])
         if period < 1:
             found = [(-1, who, f"a period of {period} ticks")]
-            yield from _told(found, "1 or more", "clock", "say every how many ticks it spikes", chip)
+            yield found, "1 or more", "clock", "say every how many ticks it spikes"
         if phase < 0:
-            yield from _told([(-1, who, f"phase {phase}")], "0 or later", "clock", "start it with the recording", chip)
+            yield [(-1, who, f"phase {phase}")], "0 or later", "clock", "start it with the recording"
         if axon[row] < 0:
             found = [(-1, who, f"line {netlist.clock_line[row]} of core {netlist.clock_core[row]}")]
-            yield from _told(found, "an axon of a core", "target", "add the axon, or leave the clock away", chip)
+            yield found, "an axon of a core", "target", "add the axon, or omit the clock"

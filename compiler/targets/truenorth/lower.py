@@ -21,14 +21,7 @@ from spikeloom.compiler.errors import CapacityError, Violation
 from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.truenorth.builder import Draft, Neuron, crossing_points
-from spikeloom.compiler.targets.truenorth.native import (
-    BASES,
-    UNIT,
-    NativeNetwork,
-    Stage,
-    Tower,
-    faults,
-)
+from spikeloom.compiler.targets.truenorth.native import BASES, UNIT, NativeNetwork, Stage, Tower, faults
 from spikeloom.compiler.targets.truenorth.netlist import RESET_TO, CrossbarNetlist
 
 Place = tuple[int, int]
@@ -36,16 +29,7 @@ Place = tuple[int, int]
 
 
 def lower(network: NativeNetwork, chip: Target, *, provenance: Mapping[str, Any] | None = None) -> CrossbarNetlist:
-    """Place a network.
-
-    Parameters
-    ----------
-    network : NativeNetwork
-        Without faults.
-    chip : Target
-        Crossbar cores.
-    provenance : mapping, optional
-        JSON values to store.
+    """Place a network without faults; `provenance` are JSON values to store.
 
     Raises
     ------
@@ -69,21 +53,21 @@ def lower(network: NativeNetwork, chip: Target, *, provenance: Mapping[str, Any]
     )
 
 
+def exceeded(chip: Target, owner: str, rule: str, used: int, remedy: str) -> Violation:
+    """A limit of the chip that is exceeded, by its rule."""
+    return Violation(owner=owner, rule=f"{chip.name}.{rule}", used=used, allowed=chip.limit(rule), remedy=remedy)
+
+
 def _require_axons(network: NativeNetwork, chip: Target) -> None:
-    limit = chip.limit("core.axons")
-    broken = [
-        Violation(
-            owner=f"tower {number}, {stage.name}",
-            rule=f"{chip.name}.core.axons",
-            used=stage.level.shape[1] * network.copies,
-            allowed=limit,
-            remedy=f"{stage.level.shape[1]} inputs and clocks with {network.copies} copies each; train it with more "
-            "groups, or fewer clocks or copies",
-        )
-        for number, tower in enumerate(network.towers)
-        for stage in tower
-        if stage.level.shape[1] * network.copies > limit
-    ]
+    """Refuse blocks with more inputs than a core has axons."""
+    copies, broken = network.copies, []
+    for number, tower in enumerate(network.towers):
+        for stage in tower:
+            inputs = stage.level.shape[1]
+            if inputs * copies > chip.limit("core.axons"):
+                words = f"{inputs} inputs and clocks with {copies} copies each; "
+                words += "train it with more groups, or fewer clocks or copies"
+                broken.append(exceeded(chip, f"tower {number}, {stage.name}", "core.axons", inputs * copies, words))
     if broken:
         raise CapacityError(tuple(broken))
 
@@ -92,12 +76,7 @@ def _require_axons(network: NativeNetwork, chip: Target) -> None:
 class _Placing:
     """Cores as they are made.
 
-    Parameters
-    ----------
-    numbers : dict
-        Neurons of each layer so far.
-    wires : list
-        From a neuron to an axon; drawn when all cores have their places.
+    `numbers` are the neurons of each layer so far; `wires` from neurons to axons are drawn when all cores have places.
     """
 
     network: NativeNetwork
@@ -171,15 +150,11 @@ class _Placing:
 def place_cores(draft: Draft, wires: Sequence[tuple[Place, tuple[int, ...]]], chip: Target, remedy: str) -> None:
     """Give cores their places, line by line in a square as they were made, and draw wires to (core, line, delay).
 
-    Raises
-    ------
-    CapacityError
-        If there are more cores than on the chip; `remedy` says what to do about it.
+    CapacityError with the `remedy` if there are more cores than on the chip.
     """
-    count, limit = len(draft.cores), chip.limit("chip.cores")
-    if count > limit:
-        broken = Violation(owner="chip", rule=f"{chip.name}.chip.cores", used=count, allowed=limit, remedy=remedy)
-        raise CapacityError((broken,))
+    count = len(draft.cores)
+    if count > chip.limit("chip.cores"):
+        raise CapacityError((exceeded(chip, "chip", "chip.cores", count, remedy),))
     side = max(int(np.ceil(np.sqrt(count))), -(-count // chip.limit("mesh.height")))
     for number, core in enumerate(draft.cores):
         core.y, core.x = divmod(number, side)

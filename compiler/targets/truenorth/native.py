@@ -68,15 +68,9 @@ def steepest_leak(threshold: IntArray, depth: int) -> IntArray:
 class Stage:
     """Neurons of one layer of a tower; neuron ``block * size + n``.
 
-    Parameters
-    ----------
-    name : str
-        Of the layer.
-    inputs : (blocks, width) int64
-        Neurons of the stage before that each block receives; channels of the sensor in the first stage.
-    level : (blocks, width + clocks, size) int64
-        For each input of a block and for each clock, as far as the stage receives them; for each neuron.
-    threshold, floor, leak : (blocks * size,) int64
+    `inputs` (blocks, width) are the neurons of the stage before that each block receives, channels of the sensor in the
+    first stage; `level` (blocks, width + clocks, size) is for each of these, for each clock as far as the stage
+    receives them, and for each neuron; `threshold`, `floor` and `leak` are (blocks * size,); all int64.
     """
 
     name: str
@@ -112,17 +106,9 @@ Tower = tuple[Stage, ...]
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class NativeNetwork:
-    """Towers over one sensor.
+    """Towers over one sensor: neuron n of a last stage votes for class ``n % classes``.
 
-    Parameters
-    ----------
-    taxels, polarities, classes : int
-        Neuron n of a last stage votes for class ``n % classes``.
-    copies : int
-        Axons that an input is led to, 2 to 4.
-    clocks : Clocks
-        Channels after those of the sensor.
-    towers : tuple of tuple of Stage
+    An input is led to `copies` axons, 2 to 4; the `clocks` are channels after those of the sensor.
     """
 
     taxels: int
@@ -179,13 +165,7 @@ def _stage_faults(network: NativeNetwork, stage: Stage, depth: int, fan_in: int)
 
 
 def joined(networks: Sequence[NativeNetwork]) -> NativeNetwork:
-    """One network with the towers of all; their votes add up.
-
-    Raises
-    ------
-    ValueError
-        Naming in what they differ.
-    """
+    """One network with the towers of all, whose votes add up; the ValueError names in what they differ."""
     one = networks[0]
     for what in ("taxels", "polarities", "classes", "copies", "clocks"):
         found = {str(getattr(network, what)) for network in networks}

@@ -49,24 +49,10 @@ _AGAIN = "copy or train it again"
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Trained:
-    """What a file holds.
+    """What a file holds: the network of the chosen set `weights`, and all `sets`.
 
-    Parameters
-    ----------
-    network : NativeNetwork
-        Of the set that was chosen.
-    weights : str
-        Name of that set.
-    sets : tuple of str
-        All sets of the file.
-    graph : str
-        Name of the taxel graph.
-    edges : (edges, 2) int64
-        Of it, source and target.
-    training : mapping
-        JSON values: how the network was made and what it reached.
-    sha256 : str
-        Of the file.
+    `graph` and `edges` (edges, 2), source and target, are those of the taxel graph; `training` are JSON values: how the
+    network was made and what it reached; the hash is the file's.
     """
 
     network: NativeNetwork

@@ -147,10 +147,7 @@ def start(
 ) -> tuple[Compilation, tuple[Pass[Compilation], ...]]:
     """What the passes begin with, and which of them are due: whole numbers need no rounding.
 
-    Raises
-    ------
-    OptionError
-        If there is no such number of axons, or it is asked of whole numbers.
+    OptionError if there is no such number of axons, or it is asked of whole numbers.
     """
     native = isinstance(source, NativeNetwork)
     if native and options.in_time is not None:

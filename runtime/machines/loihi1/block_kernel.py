@@ -421,17 +421,6 @@ def _block_step(*, listed: bool, rests: bool, lasts: bool) -> Function:
     return step
 
 
-def _steps(*, lasts: bool) -> tuple[Function, ...]:
-    """By words, at rest or not, then listed, at rest or not."""
-    return tuple(
-        _block_step(listed=listed, rests=rests, lasts=lasts) for listed in (False, True) for rests in (True, False)
-    )
-
-
-_restful_step, _busy_step, _restful_listed_step, _busy_listed_step = _steps(lasts=False)
-_restful_lasting_step, _busy_lasting_step, _restful_listed_lasting_step, _busy_listed_lasting_step = _steps(lasts=True)
-
-
 def _charging(*, narrow: bool) -> Function:
     """Make the sum of charges; `narrow` where it fits the 32 bits of a charge."""
     each, wide = ir.VectorType(_STATE, CHARGES), ir.VectorType(_WORD, CHARGES)
@@ -561,73 +550,47 @@ def _list(words: AnyArray, start: int, width: int, steps: int, bounds: AnyArray,
     return listed
 
 
-@compiled
-def _run_block(
-    blocks: Blocks,
-    s: int,
-    block: int,
-    steps: int,
-    words: AnyArray,
-    start: int,
-    width: int,
-    listed: AnyArray,
-    bounds: IntArray,
-    scratch: Scratch,
-) -> None:
-    """Run a block of a stage through a recording, on its sources as words and listed."""
-    begin, end = blocks.stage[s], blocks.stage[s + 1]
-    rests = blocks.restful[block] != 0
-    for t in range(steps):
-        place = steps * begin + t * (end - begin) + block - begin
-        kept = place * LANES if scratch.membranes.size else -1
-        if not blocks.dense[s]:
-            at = start + t * width
-            if rests:
-                fired = _restful_step(blocks, words, at, 0, block, scratch, None, place, kept)
+def _block_runner(*, lasts: bool) -> Function:
+    """Make what runs a block of a stage through a recording, on its sources as words or listed."""
+    restful, busy, restful_listed, busy_listed = (
+        _block_step(listed=listed, rests=rests, lasts=lasts) for listed in (False, True) for rests in (True, False)
+    )
+
+    @compiled
+    def run(
+        blocks: Blocks,
+        s: int,
+        block: int,
+        steps: int,
+        words: AnyArray,
+        start: int,
+        width: int,
+        listed: AnyArray,
+        bounds: IntArray,
+        scratch: Scratch,
+        lasting: Lasting | None,
+    ) -> None:
+        begin, end = blocks.stage[s], blocks.stage[s + 1]
+        rests = blocks.restful[block] != 0
+        for t in range(steps):
+            place = steps * begin + t * (end - begin) + block - begin
+            kept = place * LANES if scratch.membranes.size else -1
+            at, last = start + t * width, bounds[t + 1]
+            if not blocks.dense[s]:
+                if rests:
+                    fired = restful(blocks, words, at, 0, block, scratch, lasting, place, kept)
+                else:
+                    fired = busy(blocks, words, at, 0, block, scratch, lasting, place, kept)
+            elif rests:
+                fired = restful_listed(blocks, listed, bounds[t], last, block, scratch, lasting, place, kept)
             else:
-                fired = _busy_step(blocks, words, at, 0, block, scratch, None, place, kept)
-        elif rests:
-            fired = _restful_listed_step(blocks, listed, bounds[t], bounds[t + 1], block, scratch, None, place, kept)
-        else:
-            fired = _busy_listed_step(blocks, listed, bounds[t], bounds[t + 1], block, scratch, None, place, kept)
-        scratch.raster[place] = fired
+                fired = busy_listed(blocks, listed, bounds[t], last, block, scratch, lasting, place, kept)
+            scratch.raster[place] = fired
+
+    return run
 
 
-@compiled
-def _run_lasting_block(
-    blocks: Blocks,
-    s: int,
-    block: int,
-    steps: int,
-    words: AnyArray,
-    start: int,
-    width: int,
-    listed: AnyArray,
-    bounds: IntArray,
-    scratch: Scratch,
-    lasting: Lasting,
-) -> None:
-    """The same where currents outlast a step."""
-    begin, end = blocks.stage[s], blocks.stage[s + 1]
-    rests = blocks.restful[block] != 0
-    for t in range(steps):
-        place = steps * begin + t * (end - begin) + block - begin
-        kept = place * LANES if scratch.membranes.size else -1
-        if not blocks.dense[s]:
-            at = start + t * width
-            if rests:
-                fired = _restful_lasting_step(blocks, words, at, 0, block, scratch, lasting, place, kept)
-            else:
-                fired = _busy_lasting_step(blocks, words, at, 0, block, scratch, lasting, place, kept)
-        elif rests:
-            fired = _restful_listed_lasting_step(
-                blocks, listed, bounds[t], bounds[t + 1], block, scratch, lasting, place, kept
-            )
-        else:
-            fired = _busy_listed_lasting_step(
-                blocks, listed, bounds[t], bounds[t + 1], block, scratch, lasting, place, kept
-            )
-        scratch.raster[place] = fired
+_run_block, _run_lasting_block = (_block_runner(lasts=lasts) for lasts in (False, True))
 
 
 @compiled
@@ -648,7 +611,7 @@ def _run_stage(
         if lasting is not None and lasting.keep_u[block] != 0:
             _run_lasting_block(blocks, s, block, steps, words, start, width, listed, bounds, scratch, lasting)
         else:
-            _run_block(blocks, s, block, steps, words, start, width, listed, bounds, scratch)
+            _run_block(blocks, s, block, steps, words, start, width, listed, bounds, scratch, None)
 
 
 @compiled

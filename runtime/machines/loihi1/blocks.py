@@ -65,11 +65,8 @@ def _is_pipeline(netlist: Netlist) -> bool:
 def lay_out_blocks(netlist: Netlist) -> Blocks | None:
     """Make blocks of a netlist.
 
-    Returns
-    -------
-    Blocks or None
-        None where a register could overflow or saturate, a layer is recurrent or receives from others than the one
-        before it, or synapses are so scattered that rows of 64 would waste memory.
+    None where a register could overflow or saturate, a layer is recurrent or receives from others than the one before
+    it, or synapses are so scattered that rows of 64 would waste memory.
     """
     if not _is_pipeline(netlist) or not _in_range(netlist):
         return None

@@ -236,11 +236,5 @@ machine_of = Loihi
 
 
 def load(path: str | os.PathLike[str]) -> Loihi:
-    """Read a netlist file.
-
-    Raises
-    ------
-    FormatError
-        As :func:`netlist_file.read_netlist` does.
-    """
+    """Read a netlist file; raises as :func:`netlist_file.read_netlist` does."""
     return Loihi(read_netlist(path))

@@ -70,13 +70,7 @@ class OnnxTrace:
 
 
 def open_session(model: bytes, *, threads: int = 1) -> Any:
-    """Load a model into onnxruntime's CPU provider.
-
-    Raises
-    ------
-    OptionError
-        If ``onnxruntime`` is not installed.
-    """
+    """Load a model into onnxruntime's CPU provider; OptionError if ``onnxruntime`` is not installed."""
     onnxruntime = package("onnxruntime")
     settings = onnxruntime.SessionOptions()
     settings.intra_op_num_threads = threads
@@ -86,16 +80,7 @@ def open_session(model: bytes, *, threads: int = 1) -> Any:
 
 
 def prepare(netlist: Netlist, *, form: str = "scan", threads: int = 1) -> OnnxEngine:
-    """Export a netlist and load the file's content.
-
-    Parameters
-    ----------
-    netlist : Netlist
-        Network.
-    form : {"step", "scan"}
-        See :mod:`formats.onnx.writer`.
-    threads : int
-        Threads of one operator.
+    """Export a netlist in a form, ``step`` or ``scan``, and load the file's content.
 
     Raises
     ------
@@ -120,14 +105,10 @@ def simulate(
     batch: int | None = None,
     progress: Callable[[int], object] | None = None,
 ) -> OnnxTrace:
-    """Run recordings, each from rest.
+    """Run recordings (recordings, n_inputs, T), each from rest.
 
     Parameters
     ----------
-    engine : OnnxEngine
-        Network.
-    events : (recordings, n_inputs, T) uint8 or bool
-        Input events; any value but zero is an event.
     lengths : (recordings,) int64, optional
         Steps of each recording where some are shorter than T; those of one length run together.
     membranes : bool
@@ -139,10 +120,8 @@ def simulate(
 
     Raises
     ------
-    DataError
-        If the recordings have another number of input channels than the network.
-    NumericRangeError
-        If a register overflows: the chip is not defined there.
+    DataError, NumericRangeError
+        If the recordings have other channels than the network, or a register overflows: the chip is not defined there.
     """
     netlist = engine.netlist
     check_channels(netlist, events.shape[1])

@@ -38,17 +38,7 @@ def _registers_hold(netlist: Netlist) -> bool:
 
 
 def _segments(source: IntArray, target: IntArray, n_sources: int) -> tuple[dict[str, IntArray], IntArray, int]:
-    """Cut each source's targets into segments.
-
-    Returns
-    -------
-    geometry : dict
-        ``shape``, ``base``, ``first``, ``start``, ``stop`` and ``offset`` of :class:`kernel.Tables`.
-    entry : (synapses,) int64
-        Index of each synapse in the array of weights.
-    size : int
-        Length of that array.
-    """
+    """Cut each source's targets into segments; geometry of the tables, entry of each synapse, entries in all."""
     blocks = int(target.max(initial=0)) // BLOCK + 1
     used = np.unique(source * blocks + target // BLOCK)
     of_source, block = np.divmod(used, blocks)

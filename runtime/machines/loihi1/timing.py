@@ -141,8 +141,6 @@ def prepare(
 
     Parameters
     ----------
-    netlist, target, table
-        The placed network, its chip, and one of that chip's time tables.
     input_tiles : tuple of int
         Tiles of cores that hold the input channels, as many on each as it has room for; empty if no core holds them.
     dense : (synapses,) bool, optional
@@ -244,15 +242,8 @@ def _slots(
 def simple_times(clock: Clock, sums: IntArray, sweep: IntArray, steps: IntArray) -> SimpleTimes:
     """Times of the simple model from what each core does in each step.
 
-    Parameters
-    ----------
-    clock : Clock
-    sums : (samples, chip steps, 2 * cores) int64
-        Picoseconds of each core's sweep and sending, then of its receiving.
-    sweep : (cores,) int64
-        Picoseconds that each sweep takes beyond that.
-    steps : (samples,) int64
-        Chip steps of each recording.
+    `sums` (samples, chip steps, 2 * cores) are picoseconds of each core's sweep and sending, then of its receiving;
+    `sweep` (cores,) those that each sweep takes beyond that; `steps` (samples,) the chip steps of each recording.
     """
     samples, length = sums.shape[:2]
     cores = len(sweep)
@@ -273,20 +264,9 @@ def detailed(
 ) -> DetailedTimes:
     """Time a batch of recordings by the detailed model.
 
-    Parameters
-    ----------
-    clock : Clock
-    spikes, updated : (samples, chip steps, compartments) bool
-        What a simulator found, see :class:`trace.Trace`.
-    events : (samples, n_inputs, T) uint8 or bool
-        What it was given.
-    steps : (samples,) int64, optional
-        Chip steps of each recording, by default all.
-
-    Raises
-    ------
-    DataError
-        If the trace is of another netlist.
+    `spikes` and `updated` (samples, chip steps, compartments) are a simulator's, see :class:`trace.Trace`, for `events`
+    (samples, n_inputs, T); `steps` (samples,) are the chip steps of each recording, by default all. Raises DataError if
+    the trace is of another netlist.
     """
     fired, worked, events = _slots(clock, spikes, updated, events)
     samples, length = spikes.shape[:2]

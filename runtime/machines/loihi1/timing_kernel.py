@@ -110,22 +110,12 @@ def conclude(
     critical: IntArray,
     receiving: AnyArray,
 ) -> None:
-    """Find the slowest core of each step, the sum of all steps, and how long each step takes.
+    """Find the slowest core of each step, the sum of all steps, and how long each step takes; all in picoseconds.
 
-    Parameters
-    ----------
-    sums : (samples, chip steps, 2 * cores) int64
-        Picoseconds that events cost each core's sweep and sending, then its receiving.
-    sweep : (cores,) int64
-        Picoseconds that a sweep takes in any case.
-    steps : (samples,) int64
-        Chip steps of each recording; nothing happens after them.
-    barrier : int
-        Picoseconds that end a step.
-    duration, critical, receiving : (samples, chip steps) float64, int64, bool
-        Filled for the steps of each recording; picoseconds.
-    each : (samples, 2 * cores) int64
-        Zeros; filled with the sum of all steps.
+    `sums` (samples, chip steps, 2 * cores) is what events cost each core's sweep and sending, then its receiving;
+    `sweep` (cores,) what a sweep takes in any case; `steps` (samples,) where each recording ends; `barrier` what ends a
+    step. Filled are `duration`, `critical` and `receiving` (samples, chip steps) and, from zeros, `each` (samples, 2 *
+    cores), the sum of all steps.
     """
     cores = sweep.size
     for r in range(sums.shape[0]):

@@ -118,19 +118,8 @@ def unpack(packed: npt.NDArray[np.uint64], compartments: int) -> BoolArray:
 def aligned(netlist: Netlist, array: npt.NDArray[Any], layer: int) -> npt.NDArray[Any]:
     """Cut one layer out of a trace and shift it back by its depth, as the float model counts time.
 
-    Parameters
-    ----------
-    netlist : Netlist
-        The network that was simulated.
-    array : (…, chip steps, compartments)
-        Spikes or membranes of a :class:`Trace`.
-    layer : int
-        Index into ``netlist.layers``.
-
-    Returns
-    -------
-    (…, T, neurons)
-        Ordered by neuron; zero for neurons that the chip does not hold.
+    `array` (…, chip steps, compartments) becomes (…, T, neurons), ordered by neuron; zero for those that the chip does
+    not hold.
     """
     depth = netlist.layers[layer].depth
     length = array.shape[-2] - netlist.max_depth

@@ -72,13 +72,7 @@ def decisions(path: str, weights: str | None, data: Recordings, windows: Sequenc
 
 
 def build(path: str, weights: str | None, file: Path) -> tuple[CrossbarNetlist, int, str]:
-    """Place a network and write it; the netlist, its neurons, and the hash of its file.
-
-    Raises
-    ------
-    CapacityError
-        If it does not fit.
-    """
+    """Place a network and write it; the netlist, its neurons, the hash of its file; or CapacityError."""
     found, chip = trained(path, weights), load_target(NAME)
     netlist: CrossbarNetlist = chip.compile(found.network, Options(provenance=provenance(found))).netlist
     file.parent.mkdir(parents=True, exist_ok=True)

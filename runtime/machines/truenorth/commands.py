@@ -70,13 +70,7 @@ def takes(path: str) -> bool:
 
 
 def read(path: str, arguments: argparse.Namespace) -> Trained:
-    """Read a trained network as the options say.
-
-    Raises
-    ------
-    OptionError, ModelError
-        If it is not as they say, or an option is for others.
-    """
+    """Read a trained network as the options say; OptionError or ModelError if it is not as they say."""
     _refuse_options(arguments, OTHERS, f"{path} is a network for {TITLE} and says that itself")
     return read_trained(shipped(path), weights=arguments.weights)
 
@@ -87,13 +81,7 @@ def inspect(arguments: argparse.Namespace) -> Outcome:
 
 
 def compile_network(arguments: argparse.Namespace) -> Outcome:
-    """Place a network on cores and write it.
-
-    Raises
-    ------
-    OptionError, ModelError, CapacityError
-        If the options or the network cannot be used, or it does not fit.
-    """
+    """Place a network on cores and write it; OptionError, ModelError or CapacityError if that cannot be."""
     path, trained = arguments.checkpoint, takes(arguments.checkpoint)
     chip = load_target("truenorth")
     if arguments.target != chip.name:

@@ -59,11 +59,7 @@ class Engine:
 def prepare(netlist: CrossbarNetlist, *, careful: bool = False) -> Engine:
     """Arrange a network that breaks no rule of its chip for the kernel.
 
-    Parameters
-    ----------
-    netlist : CrossbarNetlist
-    careful : bool
-        Whether neurons that nothing keeps within their register are never run together with others.
+    Where it is `careful`, neurons that nothing keeps within their register never run together with others.
     """
     bits = load_target(netlist.target).limit("neuron.membrane_bits")
     low, high = signed_range(bits)
@@ -125,20 +121,12 @@ def _synapses(twins: Twins) -> tuple[IntArray, IntArray, IntArray]:
 def _steady_first(
     netlist: CrossbarNetlist, twins: Twins, low: int, high: int, *, careful: bool
 ) -> tuple[Twins, int, int, IntArray]:
-    """The same kinds with steady neurons first.
+    """The same kinds with steady neurons first; how many are plain, and steady in all; and the cap of each kind.
 
     Steady are neurons without random numbers and reversal whose registers, and all that can reach them in a tick, leave
     the membrane within its range: *plain* ones, which are reset to a value and held at their negative threshold, those
     that are reset to values on both sides, and those that are held and reset by their threshold, as far as they begin a
-    tick at their cap or below.
-
-    Returns
-    -------
-    twins : Twins
-    plain, steady : int
-        How many are plain, and steady in all.
-    cap : (kinds,) int64
-        Highest membrane from which a tick cannot leave the register.
+    tick at their cap or below: the highest membrane from which a tick cannot leave the register.
     """
     first = twins.first_neuron
     positive, negative = (

@@ -22,13 +22,7 @@ KEPT = ("command", "seed", "epochs", "recipe", "data", "data_sha256", "test_samp
 
 
 def join(arguments: argparse.Namespace) -> Joined:
-    """Put the towers of several networks into one file.
-
-    Raises
-    ------
-    ModelError, OptionError
-        If a network cannot be used, or they do not fit together.
-    """
+    """Put the towers of several networks into one file; ModelError or OptionError if they do not fit together."""
     for name in arguments.checkpoints:
         require_place(arguments.output, "-o", argparse.Namespace(checkpoint=name))
     found = [read_trained(shipped(name), weights=arguments.weights) for name in arguments.checkpoints]

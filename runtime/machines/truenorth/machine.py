@@ -130,13 +130,7 @@ machine_of = TrueNorth
 
 
 def load(path: str | os.PathLike[str]) -> TrueNorth:
-    """Read a netlist file and hold it against every rule of its chip.
-
-    Raises
-    ------
-    FormatError, CapacityError
-        If it is no such file, or breaks a rule.
-    """
+    """Read a netlist file and hold it against every rule of its chip; FormatError or CapacityError."""
     machine = TrueNorth(read_crossbars(path))
     machine.legal()
     return machine

@@ -98,13 +98,7 @@ def differences(slow: Trace, fast: Trace) -> int:
 
 
 def check_channels(netlist: CrossbarNetlist, channels: int) -> None:
-    """Refuse recordings of another sensor.
-
-    Raises
-    ------
-    DataError
-        If their number of channels is not the network's.
-    """
+    """Raise DataError unless recordings of so many input channels fit the network."""
     if channels != netlist.n_inputs:
         raise DataError(
             f"recordings have {channels} input channels, the network has {netlist.n_inputs}; "

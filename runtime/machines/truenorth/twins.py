@@ -48,12 +48,9 @@ class Twins:
 
 
 def find_twins(netlist: CrossbarNetlist, half: int) -> Twins:
-    """Kinds of a network that breaks no rule; a neuron that draws random numbers, which are its own, is alone.
+    """Kinds of a network that breaks no rule; positive sums are shifted by `half` bits.
 
-    Parameters
-    ----------
-    half : int
-        Bits that the positive sum is shifted by.
+    A neuron that draws random numbers, which are its own, is alone.
     """
     neuron, axon = netlist.neuron_of_synapse(), netlist.axon_of_synapse()
     weight = netlist.weight[neuron, netlist.axon_type[axon]]

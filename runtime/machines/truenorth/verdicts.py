@@ -97,18 +97,12 @@ def compare(
 
     Parameters
     ----------
-    netlist : CrossbarNetlist
-        Compiled from the model.
     model : callable
         Spikes (steps, neurons) of each layer for events (taxels, polarities, steps).
     first : mapping of str to int
         Tick in which a layer spikes for the first data step; for others as many data steps later.
-    data : Recordings
-        What to run.
-    spec_samples : int
-        Recordings, from the first, on which the specification runs, too.
-    spec_steps : int, optional
-        First steps of each to which that is confined.
+    spec_samples, spec_steps : int
+        Recordings, from the first, on which the specification runs, too; first steps of each to which that is confined.
     """
     machine, prepared = machine_of(netlist), engine.prepare(netlist)
     layers = list(netlist.layers)

@@ -126,15 +126,7 @@ class Meter:
 
 
 def prepare(netlist: Netlist, target: Target) -> Meter:
-    """Look up what spikes cause.
-
-    Parameters
-    ----------
-    netlist : Netlist
-        What runs.
-    target : Target
-        Its chip, with energy tables.
-    """
+    """Look up what spikes cause on a target with energy tables."""
     dense, sparse, zeros = _visits(netlist)
     of_layer = np.eye(len(netlist.layers))[netlist.layer]
     silent = np.zeros((netlist.n_inputs, len(netlist.layers)))
@@ -163,19 +155,8 @@ def prepare(netlist: Netlist, target: Target) -> Meter:
 def count(meter: Meter, counts: Counts, steps: int | IntArray) -> dict[str, FloatArray]:
     """Amount per recording and layer of everything that a meter knows and of neuron updates.
 
-    Parameters
-    ----------
-    meter : Meter
-        The prepared netlist.
-    counts : Counts
-        Of a batch: arrays have one leading axis of recordings.
-    steps : int or (samples,) int64
-        Data steps T of all recordings, or of each.
-
-    Raises
-    ------
-    DataError
-        If the counts are of another netlist.
+    `counts` are those of a batch, with one leading axis of recordings; `steps` the data steps T of all of them, or of
+    each (samples,). Raises DataError if the counts are of another netlist.
     """
     netlist = meter.netlist
     wanted = netlist.n_inputs, netlist.n_compartments, len(netlist.layers)
@@ -214,17 +195,7 @@ def price(table: EnergyTable, events: Mapping[str, FloatArray]) -> FloatArray | 
 
 
 def estimate(meter: Meter, counts: Counts, steps: int | IntArray) -> Costs:
-    """Price a run with every table of its chip.
-
-    Parameters
-    ----------
-    meter : Meter
-        The prepared netlist.
-    counts : Counts
-        Of a batch of recordings, neuron updates included.
-    steps : int or (samples,) int64
-        Data steps T of all recordings, or of each.
-    """
+    """Price a run with every table of its chip; `counts` and `steps` as for :func:`count`."""
     amounts = count(meter, counts, steps)
     events = {event: amounts[event] for event in EVENTS}
     priced = {table.name: price(table, events) for table in meter.target.energy}

@@ -64,17 +64,7 @@ def vote_charges(netlist: Netlist) -> Charges:
 
 
 def votes_of(netlist: Netlist, events: engine.EventArray, lengths: IntArray) -> IntArray:
-    """Votes so far after each step of the read-out: ``Cumulative.votes`` alone.
-
-    Parameters
-    ----------
-    netlist : Netlist
-        What runs.
-    events : (samples, n_inputs, T) uint8 or bool
-        Recordings.
-    lengths : (samples,) int64
-        Data steps of each.
-    """
+    """Votes so far after each step of the read-out, ``Cumulative.votes`` alone; arguments as for :func:`run`."""
     prepared = engine.prepare(netlist, charges=vote_charges(netlist))
     trace = engine.simulate(prepared, events, lengths=lengths)
     assert trace.charged is not None, "votes were wanted"
@@ -82,18 +72,7 @@ def votes_of(netlist: Netlist, events: engine.EventArray, lengths: IntArray) -> 
 
 
 def run(netlist: Netlist, target: Target, events: engine.EventArray, lengths: IntArray) -> Cumulative:
-    """Run recordings once.
-
-    Parameters
-    ----------
-    netlist : Netlist
-        What runs.
-    target : Target
-        Its chip.
-    events : (samples, n_inputs, T) uint8 or bool
-        Recordings.
-    lengths : (samples,) int64
-        Data steps of each.
+    """Run recordings (samples, n_inputs, T), each for its own length in data steps (samples,), once.
 
     Raises
     ------

@@ -28,13 +28,8 @@ PARTS = {
 def by_part(table: EnergyTable, events: Mapping[str, FloatArray]) -> dict[str, FloatArray] | tuple[str, ...]:
     """Energy of each part in joules, or the events that happened and that the table has no price for.
 
-    Parameters
-    ----------
-    table : EnergyTable
-        Prices.
-    events : mapping of str to array
-        Amount of each event, by layer as :func:`cost.count` gives it, or by core as :func:`count_by_core`
-        does. The parts add up to :func:`cost.price` of the same amounts.
+    `events` are amounts by layer, as :func:`cost.count` gives them, or by core, as :func:`count_by_core` does; the
+    parts add up to :func:`cost.price` of the same amounts.
     """
     whole = price(table, events)
     if isinstance(whole, tuple):
@@ -57,31 +52,20 @@ def count_by_core(
     input_tiles: tuple[int, ...] = (),
     dense: BoolArray | None = None,
 ) -> dict[str, FloatArray]:
-    """Amount of every event of ``events.EVENTS`` per recording and core.
+    """Amount of every event of ``cost.EVENTS`` per recording and core, (samples, cores) float64 each.
 
     Synaptic operations belong to the core that receives them, packets and hops to the core that sends them.
 
     Parameters
     ----------
-    netlist : Netlist
-        What ran.
-    target : Target
-        Its chip.
     counts : Counts
         Of a batch: arrays have one leading axis of recordings.
     updates : (samples, cores) int64
         Neuron updates on each core, for example :func:`updates_by_core` of a trace.
     chip_steps : int or (samples,) int64
         Chip steps of all recordings, or of each.
-    input_tiles : tuple of int
-        Tiles of cores that hold the input channels, see :func:`timing.prepare`. They come after the others,
-        and all that they cost is their packets and hops.
-    dense : (synapses,) bool, optional
-        Which synapses have the price of a dense list; by default those that are stored in one.
-
-    Returns
-    -------
-    mapping of str to (samples, cores) float64
+    input_tiles, dense
+        As for :func:`timing.prepare`; cores of inputs come after the others and cost only their packets and hops.
     """
     cores = netlist.n_cores + len(input_tiles)
     tile = np.append(netlist.core_tile, np.array(input_tiles, np.int64))

@@ -60,16 +60,10 @@ def estimate(
 
     Parameters
     ----------
-    netlist : Netlist
-        What runs.
-    target : Target
-        Its chip, with energy and time tables.
     events : (samples, n_inputs, T) uint8 or bool
-        Recordings.
     lengths : (samples,) int64, optional
         Data steps of each where some are shorter than T.
     detail : {"counts", "cycle"}
-        How deep.
     spikes : (samples, chip steps, compartments) bool, optional
         Array to fill, see :class:`trace.Trace`.
     progress : callable, optional
@@ -80,11 +74,8 @@ def estimate(
     DataError, NumericRangeError
         As the engine says.
     OptionError
-        If several chips shall be simulated by the cycle.
-
-    Notes
-    -----
-    Of several chips events are counted and priced but not timed: links between chips have no public latency.
+        If several chips shall be simulated by the cycle. Their events are counted and priced but not timed: links
+        between chips have no public latency.
     """
     if detail == "cycle":
         require_one_chip(netlist.core_tile, target, "--detail cycle")

@@ -16,17 +16,9 @@ from spikeloom.runtime.machines.loihi1.trace import Charges
 
 
 def charges(clock: Clock) -> Charges:
-    """What events add to each core's picoseconds of sweep and sending, then to those of receiving.
+    """What events add to each core's picoseconds of sweep and sending, then to those of receiving: ``2 * cores`` sums.
 
-    Parameters
-    ----------
-    clock : Clock
-        Of a netlist whose input channels are on no core.
-
-    Returns
-    -------
-    Charges
-        Of ``2 * cores`` sums.
+    The input channels of the clock's netlist are on no core.
     """
     tables, netlist = clock.tables, clock.netlist
     cores = netlist.n_cores
@@ -53,21 +45,9 @@ def side_by_side(parts: Sequence[Charges]) -> Charges:
 
 
 def simple_from(clock: Clock, charged: IntArray, steps: IntArray) -> SimpleTimes:
-    """Times of the simple model.
+    """Times of the simple model from what :func:`charges` added up to, (samples, chip steps, 2 * cores) int64.
 
-    Parameters
-    ----------
-    clock : Clock
-        As for :func:`charges`.
-    charged : (samples, chip steps, 2 * cores) int64
-        What they added up to, see :class:`trace.Trace`.
-    steps : (samples,) int64
-        Chip steps of each recording.
-
-    Raises
-    ------
-    DataError
-        If the sums are of another netlist.
+    `steps` (samples,) are the chip steps of each recording. Raises DataError if the sums are of another netlist.
     """
     if charged.ndim != 3 or charged.shape[::2] != (len(steps), 2 * clock.netlist.n_cores):
         raise DataError(
