@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from spikeloom.compiler.archive import FORMATS, TRAINED, stated
+from spikeloom.compiler.archive import FORMATS, TRAINED, stated_format
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.fixedpoint import FloatArray, IntArray
@@ -238,7 +238,7 @@ def load_checkpoint(path: str, arguments: argparse.Namespace) -> Checkpoint:
         If it is not there, or not as they say.
     """
     progress("reading the checkpoint")
-    if (kind := stated(Path(shipped(path)), "format")) == TRAINED:
+    if (kind := stated_format(Path(shipped(path)))) == TRAINED:
         raise ModelError(f"{path}: is {FORMATS[kind]}; compile, verify, inspect and join take it, this is for others")
     places = sensor_places(getattr(arguments, "taxels", None))
     return read_checkpoint(

@@ -13,6 +13,7 @@ import hashlib
 import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +29,8 @@ from spikeloom.compiler.archive import (
     read_members,
     require_whole,
     stated_format,
+    write_archive,
 )
-from spikeloom.compiler.atomic import write_atomically
 from spikeloom.compiler.checkpoint import WEIGHTS
 from spikeloom.compiler.dynamics import Clocks
 from spikeloom.compiler.errors import FormatError, ModelError
@@ -64,10 +65,15 @@ class Trained:
     sha256: str
 
 
-def trained_bytes(
-    networks: Mapping[str, NativeNetwork], *, graph: str, edges: IntArray, training: Mapping[str, Any]
-) -> bytes:
-    """File content; equal input gives equal bytes.
+def write_trained(
+    path: str | os.PathLike[str],
+    networks: Mapping[str, NativeNetwork],
+    *,
+    graph: str,
+    edges: IntArray,
+    training: Mapping[str, Any],
+) -> str:
+    """Write a file, whole or not at all; return its sha256. Equal input gives equal bytes.
 
     Parameters
     ----------
@@ -75,6 +81,11 @@ def trained_bytes(
         At least one; all of one shape.
     graph, edges, training
         As :class:`Trained`.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written; an older file is left as it was.
     """
     one = next(iter(networks.values()))
     manifest = {
@@ -95,28 +106,7 @@ def trained_bytes(
         for stage in tower
         for part in PARTS
     }
-    return archive_bytes(manifest, arrays)
-
-
-def write_trained(
-    path: str | os.PathLike[str],
-    networks: Mapping[str, NativeNetwork],
-    *,
-    graph: str,
-    edges: IntArray,
-    training: Mapping[str, Any],
-) -> str:
-    """Write a file, whole or not at all; return its sha256. Parameters as :func:`trained_bytes`.
-
-    Raises
-    ------
-    OSError
-        If it cannot be written; an older file is left as it was.
-    """
-    content = trained_bytes(networks, graph=graph, edges=edges, training=training)
-    with write_atomically(path) as file:
-        file.write(content)
-    return hashlib.sha256(content).hexdigest()
+    return write_archive(archive_bytes(manifest, arrays), path)
 
 
 def is_trained(path: str | os.PathLike[str]) -> bool:
@@ -149,7 +139,7 @@ def read_trained(path: str | os.PathLike[str], *, weights: str | None = None) ->
         wrong = _kind_faults(manifest)
         if wrong:
             raise ModelError(f"{path}: {'; '.join(wrong)}; {_AGAIN}")
-        require_whole(path, members, tuple(_names(manifest)))
+        require_whole(path, members, _names(manifest))
     except FormatError as error:
         raise ModelError(f"{path}: damaged, altered or of another version ({_core(path, error)}); {_AGAIN}") from error
     sets = tuple(name for name in WEIGHTS if name in manifest["weights"])
@@ -203,15 +193,10 @@ def _kind_faults(manifest: Mapping[str, Any]) -> list[str]:
     return [f"the manifest has no usable {name}" for name, good in fine.items() if not good]
 
 
-def _names(manifest: Mapping[str, Any]) -> list[str]:
+def _names(manifest: Mapping[str, Any]) -> tuple[str, ...]:
     """Array members, in file order."""
-    return [
-        f"{which}/{number}/{layer}/{part}"
-        for which in manifest["weights"]
-        for number in range(manifest["towers"])
-        for layer in manifest["layers"]
-        for part in PARTS
-    ]
+    sets, towers, layers = manifest["weights"], range(manifest["towers"]), manifest["layers"]
+    return tuple(f"{which}/{n}/{layer}/{part}" for which, n, layer, part in product(sets, towers, layers, PARTS))
 
 
 def _network(manifest: Mapping[str, Any], members: Mapping[str, Array], which: str) -> NativeNetwork:
