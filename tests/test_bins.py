@@ -28,7 +28,7 @@ BINS = 3
 
 NO_MEMORY = "conv1=0,fc1=0,fc2=0,fc3=0"
 
-TRAINED = ("--graph", "manual", "--epochs", "3")
+TRAINED = ("--graph", "manual", "--epochs", "1")
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +91,7 @@ def test_it_is_the_network_of_recordings_in_longer_bins(place):
     assert (own.bins, plain.bins) == (BINS, 1)
     for ours, theirs in zip((own.hops, own.dense[-1].weight), (plain.hops, plain.dense[-1].weight), strict=True):
         assert_array_equal(ours, theirs)
-    assert own.training["command"] == f"spikeloom train --data fine --join {BINS} --graph manual --epochs 3 --seed 0"
+    assert own.training["command"] == f"spikeloom train --data fine --join {BINS} --graph manual --epochs 1 --seed 0"
     assert own.training["history"] == plain.training["history"]
     fine = own.training["data_sha256"]
     assert fine != plain.training["data_sha256"], "the hash is over what the data set holds"

@@ -1,6 +1,5 @@
 """Layers and networks against step-by-step code, and the float reference against the released outputs."""
 
-import json
 import math
 
 import numpy as np
@@ -11,13 +10,11 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 from spikeloom.compiler.checkpoint import Checkpoint, Dense
-from spikeloom.compiler.formats.checkpoint import read_checkpoint
 from spikeloom.compiler.passes.expand import expand_graph_convolution
 from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.models.networks.layers import SURROGATE_HALF_WIDTH, LifSteps, lif, spike_linear, tag_convolution
 from spikeloom.models.networks.networks import Architecture, SpikingNet
 from spikeloom.models.networks.reference import float_membranes, float_spikes
-from spikeloom.models.recordings.evtouch import load_recordings
 
 BETA, THETA = 0.2, 0.5
 
@@ -329,18 +326,6 @@ def test_reference_gives_the_spikes_of_the_network(dtype):
         assert membranes[name].dtype == np.dtype(dtype)
         assert_array_equal(membranes[name] > np.dtype(dtype).type(SMALL.theta), found)
         assert_allclose(membranes[name], expected[name][1].transpose(0, 1), rtol=1e-4, atol=1e-5)
-
-
-@pytest.mark.recordings
-def test_reference_gives_the_released_outputs(objects_zip, released_checkpoint, shared_dir):
-    expected = json.loads((shared_dir / "checkpoints/objects_manual.expected.json").read_text())
-    test = load_recordings(objects_zip)
-    assert list(test.files) == expected["files"]
-    spikes = float_spikes(read_checkpoint(released_checkpoint), adjacency_of(), test.events)
-    counts = spikes["fc3"].sum(axis=1)
-    assert_array_equal(counts, expected["spike_counts"])
-    assert_array_equal(counts.argmax(axis=1), expected["predictions"])
-    assert int((counts.argmax(axis=1) == test.labels).sum()) == expected["right"] == 127
 
 
 def test_the_recurrence_in_torch_operations_equals_the_kernels_bit_for_bit():

@@ -1,6 +1,5 @@
 """The systems beside TactileSGNet: their first layer in training, in files, on the chip and on the command line."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -373,22 +372,6 @@ def test_expansion_equals_probing_the_layer(tmp_path, system):
 
 
 @pytest.mark.parametrize("system", NEW)
-def test_the_chip_follows_the_float_model(tmp_path, system):
-    checkpoint = saved(tmp_path, network_of(system))
-    seen = seen_by(system)
-    compiled = compile_network(expand(checkpoint, seen))
-    assert [layer.name for layer in compiled.netlist.layers] == ["conv1", "fc1", "fc2", "fc3"]
-    events = events_of(8, samples=6, steps=40)
-    verdict = verify(compiled.netlist, checkpoint, seen, events, np.arange(6) % 4, tuple("abcdef"))
-    assert verdict.spec_equals_engine
-    assert np.count_nonzero(verdict.float_predictions != verdict.chip_predictions) <= 1
-    assert all(layer.different < 0.1 * layer.float + 5 for layer in verdict.spikes.values())
-    assert verdict.certificate.decisions >= 4
-    if verdict.first_divergence is not None and system == MLP:
-        assert verdict.first_divergence.taxel is None
-
-
-@pytest.mark.parametrize("system", NEW)
 def test_fine_tuned_on_the_chips_integers_they_are_the_chip(tmp_path, system):
     checkpoint, seen = saved(tmp_path, network_of(system)), seen_by(system)
     training, test = (
@@ -449,33 +432,6 @@ def told(capsys, *words, code=0):
     return captured.err if code == 2 else captured.out
 
 
-@pytest.mark.parametrize("system", NEW)
-def test_train_compile_verify_explain(data, capsys, system):
-    graph = ("--graph", "manual") if system == GCN else ()
-    out = told(capsys, "train", "--data", "data", "--system", system, *graph, "--epochs", 2, "-o", "x.pt")
-    assert out.startswith(" ".join(["spikeloom train --data data --system", system, *graph, "--epochs 2 --seed 0"]))
-    first = (data / "x.pt").read_bytes()
-    told(capsys, "train", "--data", "data", "--system", system, *graph, "--epochs", 2, "-o", "y.pt")
-    assert (data / "y.pt").read_bytes() == first
-    told(capsys, "compile", "x.pt", "--system", system, "--calibrate", "data", "-o", "x.loom")
-    code = main(["verify", "x.loom", "--checkpoint", "x.pt", "--data", "data", "--require", "E0", "--json"])
-    report = json.loads(capsys.readouterr().out)
-    assert code == 0
-    assert next(iter(report["spikes"])) == "conv1"
-    told(capsys, "explain", "x.loom", "--checkpoint", "x.pt", "--system", system, "--data", "data")
-    shown = told(capsys, "inspect", "x.pt", "--system", system)
-    assert f"39 taxels, {system}, conv1 " in shown
-    told(capsys, "yardsticks", "x.pt", "--data", "data")
-
-
-@pytest.mark.parametrize("system", NEW)
-def test_released_style_files_on_the_command_line(data, capsys, system):
-    torch_file(data / "x.t7", state_of(network_of(system, classes=20)))
-    graph = ("--graph", "manual") if system == GCN else ()
-    told(capsys, "compile", "x.t7", "--system", system, *graph, "-o", "x.loom")
-    told(capsys, "verify", "x.loom", "--checkpoint", "x.t7", *graph, "--data", "data", "--require", "E0")
-
-
 @pytest.mark.parametrize(
     ("words", "line"),
     [
@@ -502,28 +458,6 @@ def test_a_sensor_that_no_window_fits():
     assert str(refused.value) == (
         "grid-cnn: the grid has 2 * 6 cells, a window of 3 * 3 does not fit into it; give --padding same"
     )
-
-
-@pytest.mark.parametrize("system", NEW)
-def test_an_interrupted_training_of_each_system_resumes_to_the_same_weights(tmp_path, system):
-    training, test = (
-        replace(synthetic_grasps(per_class=2, steps=10, seed=seed), split=split)
-        for seed, split in ((1, "train"), (2, "test"))
-    )
-    sizes = Architecture(taxels=39, classes=20, features=4, hidden=(8, 6), system=system)
-    whole = train(training, test, seen_by(system), sizes, epochs=3)
-
-    class StopError(Exception):
-        pass
-
-    def stop(epoch):
-        if epoch.epoch == 2:
-            raise StopError
-
-    with pytest.raises(StopError):
-        train(training, test, seen_by(system), sizes, epochs=3, state=tmp_path / "s", after_epoch=stop)
-    again = train(training, test, seen_by(system), sizes, epochs=3, state=tmp_path / "s", resume=True)
-    assert all(np.array_equal(whole.last[name], again.last[name]) for name in whole.last)
 
 
 @pytest.mark.recordings

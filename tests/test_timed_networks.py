@@ -11,6 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from random_netlists import Axon, Neuron, build
 from random_networks import chain, integer_population
 from timed_networks import TIMING, events_of, written
+from zoo import specimen
 
 from spikeloom.compiler import Options, Recipe, compile_network, lift
 from spikeloom.compiler.dynamics import Clocks, Dynamics, with_clocks
@@ -24,7 +25,7 @@ from spikeloom.compiler.fixedpoint import (
     read_only,
 )
 from spikeloom.compiler.formats.checkpoint import read_checkpoint
-from spikeloom.compiler.interpret import channels_last, run_float, run_integer
+from spikeloom.compiler.interpret import channels_last, run_float
 from spikeloom.compiler.ir import Input
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.passes.prune import never_fires
@@ -36,8 +37,6 @@ from spikeloom.compiler.targets.loihi1.netlist_text import netlist_text
 from spikeloom.compiler.targets.loihi1.storage.quantize import quantize
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import current_load
 from spikeloom.models.networks.reference import float_spikes
-from spikeloom.models.recordings.grasps import synthetic_grasps
-from spikeloom.models.recordings.release import write_released
 from spikeloom.runtime.cli import main
 from spikeloom.runtime.equivalence.certainty import float_certainty
 from spikeloom.runtime.equivalence.explanation.causes import explain, observe
@@ -46,7 +45,6 @@ from spikeloom.runtime.equivalence.rounding import check_rounding
 from spikeloom.runtime.equivalence.verify import verify
 from spikeloom.runtime.machines.integer import integer_machine_of
 from spikeloom.runtime.machines.loihi1 import engine, spec
-from spikeloom.runtime.machines.loihi1.blocks import lay_out_blocks
 from spikeloom.runtime.machines.loihi1.stream import open_stream
 from spikeloom.runtime.machines.loihi1.trace import aligned
 from spikeloom.runtime.machines.votes import class_counts
@@ -185,30 +183,6 @@ def test_the_chip_follows_the_float_network(timed, compiled):
         heard = ~np.isin(np.arange(wanted.shape[2]), compiled.netlist.layers[layer].unheard)
         assert np.mean(found[..., heard] != wanted[..., heard]) < 0.02, name
         assert wanted.any(), name
-
-
-def test_netlist_and_integer_network_are_the_same(compiled):
-    events = events_of(11)
-    back = lift(compiled.netlist)
-    assert [p.alpha for p in back.populations] == list(TIMING.alphas)
-    assert back.input.clocks == TIMING.clocks
-    found = run_integer(back, channels_last(events, TIMING.clocks)).spikes
-    trace = engine.simulate(compiled.netlist, with_clocks(events, TIMING.clocks), spikes=True)
-    for layer, spikes in enumerate(found):
-        assert_array_equal(aligned(compiled.netlist, trace.spikes, layer), spikes)
-
-
-def test_both_kernels_are_the_specification(compiled):
-    events = with_clocks(events_of(12, samples=3), TIMING.clocks)
-    assert lay_out_blocks(compiled.netlist) is not None, "the fast kernel holds such networks"
-    kept = {"spikes": True, "membranes": True, "updated": True}
-    for stepwise in (False, True):
-        fast = engine.simulate(engine.prepare(compiled.netlist, stepwise=stepwise), events, **kept)
-        for index, recording in enumerate(events):
-            slow = spec.simulate(compiled.netlist, recording)
-            for name in kept:
-                assert_array_equal(getattr(fast, name)[index], getattr(slow, name), err_msg=name)
-            assert_array_equal(fast.counts.updates[index], slow.counts.updates)
 
 
 def test_recordings_without_their_clocks_are_refused(compiled):
@@ -358,22 +332,6 @@ def test_a_radius_covers_the_gathered_rounding():
     assert doubt[0, -1].all()
 
 
-def test_verify_holds_the_chip_to_the_checkpoint(timed, compiled):
-    checkpoint, seen, _ = timed
-    events = events_of(17, samples=6, steps=25)
-    labels, files = np.arange(6) % 4, tuple(f"r{i}" for i in range(6))
-    verdict = verify(compiled.netlist, checkpoint, seen, events, labels, files, spec_samples=6)
-    assert verdict.spec_equals_engine
-    assert verdict.certificate.unproven == ()
-    ladder = rungs(verdict)
-    assert ladder["float64"] == dict.fromkeys(LAYERS, 0)
-    assert ladder["beta"]["conv1"] <= ladder["weights"]["conv1"]
-    assert ladder["rounding"] == ladder["saturation"]
-    for name in LAYERS:
-        assert verdict.spikes[name].different <= 0.02 * 6 * 25 * 120
-        assert verdict.spikes[name].float > 0
-
-
 def test_the_decay_alone_is_a_rung_of_the_ladder(tmp_path):
     """A decay that the register holds exactly moves nothing; one between two of its values does."""
     moved = []
@@ -444,99 +402,36 @@ def test_a_stream_lets_the_clocks_tick_by_itself(compiled):
 # --- commands ------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    """Recordings, and a network trained on them for one epoch, compiled."""
-    place = tmp_path_factory.mktemp("timed-data")
-    splits = [replace(synthetic_grasps(per_class=3, steps=14, seed=s), split=n) for n, s in (("train", 1), ("test", 2))]
-    write_released(place / "data", splits)
-    words = (
-        f"train --data {place}/data --graph manual --recipe timed --clocks 4 --features 8 --epochs 2 -o {place}/x.pt"
-    )
-    assert main(words.split()) == 0
-    assert main(f"compile {place}/x.pt --calibrate {place}/data -o {place}/x.loom".split()) == 0
-    return place
+@pytest.fixture
+def made():
+    return specimen("timed")
 
 
-def as_json(capsys, words):
-    assert main([*words.split(), "--json"]) == 0
-    return json.loads(capsys.readouterr().out)
+def test_what_does_not_know_such_networks_says_so(made, tmp_path, capsys):
+    for words, reason in (
+        (f"finetune {made.network} --data {made.data} --weight-bits 4 -o {tmp_path}/y.pt", "fine-tuning does not know"),
+        (f"export {made.network} --to onnx-float -o {tmp_path}/y.onnx", "export the netlist with --to onnx"),
+    ):
+        assert main(words.split()) == 2
+        err = capsys.readouterr().err
+        assert "has clocks, or decays of single layers" in err
+        assert reason in err
 
 
-def test_every_command_takes_a_timed_network(data, capsys):
-    capsys.readouterr()
-    shared = f"--data {data}/data"
-    inspected = as_json(capsys, f"inspect {data}/x.pt")
-    assert inspected["dynamics"]["clocks"] == {"channels": 4, "steps": 4}
-    assert inspected["layers"][0] == {"name": "conv1", "neurons": 39 * 8 + 4}
-    netlist = as_json(capsys, f"inspect {data}/x.loom")
-    assert netlist["clocks"] == {"channels": 4, "steps": 4}
-    held = 3891 / 4096
-    assert [layer.get("alpha") for layer in netlist["layers"]] == [None, held, held, held]
-    assert netlist["layers"][1]["alpha_realised"] == held
-    verdict = as_json(capsys, f"verify {data}/x.loom --checkpoint {data}/x.pt {shared} --min-agreement 0.8")
-    assert verdict["spec_equals_engine"] is True
-    rungs = {rung["stage"]: rung for rung in verdict["ladder"]}
-    assert rungs["beta"] == rungs["float64"] | {"stage": "beta"}, "trained with the decays of the chip"
-    decided = as_json(capsys, f"run {data}/x.loom {shared}")
-    assert len(decided["predictions"]) == decided["samples"]
-    assert as_json(capsys, f"estimate {data}/x.loom {shared}")
-    assert as_json(capsys, f"explain {data}/x.loom --checkpoint {data}/x.pt {shared}")["sample"]
-    assert as_json(capsys, f"export {data}/x.loom --to onnx -o {data}/x.onnx")["form"] == "scan"
-    found = as_json(capsys, f"bits {data}/x.pt --calibrate {data}/data --agreement 0.5 --widths 4,8 --no-cache")
-    assert found["recommended"]["agreement"] >= 0.5
-
-
-def test_onnxruntime_runs_the_chip_with_its_clocks(data, capsys):
-    pytest.importorskip("onnxruntime")
-    capsys.readouterr()
-    words = f"verify {data}/x.loom --checkpoint {data}/x.pt --data {data}/data --engine onnx --min-agreement 0"
-    verdict = as_json(capsys, words)
-    assert (verdict["spec_equals_engine"], verdict["engine_different"]) == (True, 0)
-
-
-def test_watch_decides_as_run(data, capsys):
-    from spikeloom.models.recordings.evtouch import load_recordings
-
-    capsys.readouterr()
-    decided = as_json(capsys, f"run {data}/x.loom --data {data}/data")
-    recordings = load_recordings(data / "data", "test")
-    lines = []
-    for events in recordings.events:
-        step, taxel, polarity = np.nonzero(events.transpose(2, 0, 1))
-        lines += [f"{0.02 * s + 0.001:.3f},{x},{p}" for s, x, p in zip(step, taxel, polarity, strict=True)] + [""]
-    (data / "lines.csv").write_text("\n".join(lines) + "\n")
-    assert main(f"watch {data}/x.loom --input {data}/lines.csv --bins 14 --json".split()) == 0
-    shown = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    counts = [entry["counts"] for entry in shown if entry["kind"] == "grasp"]
-    assert counts == decided["counts"]
-
-
-def refusal(capsys, words):
-    capsys.readouterr()
-    assert main(words.split()) == 2
-    return capsys.readouterr().err
-
-
-def test_what_does_not_know_such_networks_says_so(data, capsys):
-    assert refusal(capsys, f"finetune {data}/x.pt --data {data}/data --weight-bits 4 -o {data}/y.pt") == (
-        f"spikeloom: {data}/x.pt: has clocks, or decays of single layers, which fine-tuning does not know; "
-        "compile it as it is\n"
-    )
-    assert refusal(capsys, f"export {data}/x.pt --to onnx-float -o {data}/y.onnx") == (
-        "spikeloom: --to onnx-float: the network has clocks, or decays of single layers, which this form does not say; "
-        "compile it and export the netlist with --to onnx\n"
-    )
-
-
-def test_text_shows_clocks_and_current_decay(data, capsys):
-    capsys.readouterr()
-    assert main(["inspect", f"{data}/x.pt"]) == 0
-    shown = capsys.readouterr().out
-    assert "\n  current decay by layer: conv1 0, fc1 0.949951, fc2 0.949951, fc3 0.949951\n" in shown
-    assert "\n  4 clocks of 4 steps each, 16 in all, beside the sensor\n" in shown
-    assert main(["inspect", f"{data}/x.loom"]) == 0
-    shown = capsys.readouterr().out
-    assert "\n  4 clocks of 4 steps each, 16 in all, beside the sensor\n" in shown
-    head = next(line for line in shown.splitlines() if line.lstrip().startswith("layer"))
-    assert head.split()[-3:] == ["β", "α", "cores"]
+def test_inspect_shows_clocks_and_decays(made, capsys):
+    for path in (made.network, made.netlist):
+        capsys.readouterr()
+        assert main(["inspect", str(path), "--json"]) == 0
+        found = json.loads(capsys.readouterr().out)
+        assert found.get("dynamics", found)["clocks"] == {"channels": 3, "steps": 4}
+        assert main(["inspect", str(path)]) == 0
+        shown = capsys.readouterr().out
+        assert "\n  3 clocks of 4 steps each, 12 in all, beside the sensor\n" in shown
+        if path == made.network:
+            assert "\n  current decay by layer: conv1 0, fc1 0.95, fc2 0.5, fc3 0\n" in shown
+            assert found["layers"][0] == {"name": "conv1", "neurons": 39 * 3 + 3}
+        else:
+            assert found["layers"][1]["alpha"] == 0.95
+            assert found["layers"][1]["alpha_realised"] == 3891 / 4096
+            head = next(line for line in shown.splitlines() if line.lstrip().startswith("layer"))
+            assert head.split()[-3:] == ["β", "α", "cores"]
