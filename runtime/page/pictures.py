@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from spikeloom.runtime.page.results import Core, Cores, Taxels, Trace, Way
+from spikeloom.runtime.machines.page_parts import Core, Cores, Way
+from spikeloom.runtime.page.results import Taxels, Trace
 from spikeloom.runtime.report.drawing import CHIP, COLOURS, DASHES, FLOAT, GREY, Drawing, sheet, styled
 
 if TYPE_CHECKING:

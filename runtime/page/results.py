@@ -11,9 +11,9 @@ import numpy.typing as npt
 
 from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.runtime.equivalence.verdict import Verdict
-from spikeloom.runtime.machines.loihi1.costs.result import CostReport
-from spikeloom.runtime.machines.loihi1.description import NetlistFacts
-from spikeloom.runtime.report.encode import OPTIONAL, key
+from spikeloom.runtime.machines.page_parts import BatchParts, Cores, Sizes
+from spikeloom.runtime.report.encode import HIDDEN, OPTIONAL, key
+from spikeloom.runtime.report.sections import Outcome
 from spikeloom.runtime.studies.chart.results import Chart
 from spikeloom.runtime.studies.stress.results import Stress
 
@@ -48,64 +48,6 @@ class Decisions:
             if label != decided
         ]
         return sorted(pairs, key=lambda pair: (-pair[2] - pair[3], pair[0], pair[1]))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Fill:
-    """Use of a limit."""
-
-    used: int
-    allowed: int
-    share: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Core:
-    """A core: its place, what it holds, and its use of each limit, of which one is the fullest."""
-
-    core: int
-    chip: int
-    tile: int
-    x: int
-    y: int
-    layers: tuple[str, ...]
-    compartments: int
-    fullest: str
-    fill: Mapping[str, Fill]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Way:
-    """Packets of a mean recording from a core, or None for the input, to another."""
-
-    source: int | None = field(metadata=key("from"))
-    to: int
-    packets: float
-    axons: int
-    hops: int | None
-
-    @property
-    def sender(self) -> str:
-        """Where they come from."""
-        return "input" if self.source is None else str(self.source)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Mesh:
-    """Tiles of a chip, and cores of a tile."""
-
-    width: int
-    height: int
-    tile_cores: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Cores:
-    """Where the cores lie, how full each is, and who sends how much to whom."""
-
-    mesh: Mesh
-    cores: tuple[Core, ...]
-    traffic: tuple[Way, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -204,8 +146,9 @@ class Recording:
     input: IntArray
     layers: tuple[LayerSpikes, ...]
     membranes: tuple[Trace, ...]
-    costs: CostReport
+    costs: object
     by_step: BySteps
+    core_energy_j: Mapping[str, Mapping[str, float]] = field(metadata=HIDDEN)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -277,13 +220,15 @@ class Report:
 
     verify: Verdict
     decisions: Decisions
-    netlist: NetlistFacts
+    netlist: Sizes
     cores: Cores
     taxels: Taxels
     recording: Recording
-    costs: CostReport
+    costs: object
     provenance: Provenance
     stress: Stress | None = field(default=None, metadata=OPTIONAL)
     chart: Chart | None = field(default=None, metadata=OPTIONAL)
     explained_cost: Any = field(default=None, metadata=OPTIONAL)
     output: str
+    described: Outcome = field(metadata=HIDDEN)
+    chip: BatchParts = field(metadata=HIDDEN)

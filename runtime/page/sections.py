@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from typing import Any
 
@@ -11,15 +11,13 @@ import numpy as np
 
 from spikeloom.runtime.equivalence.sections import ladder_table
 from spikeloom.runtime.equivalence.sections import sections as verdict_sections
-from spikeloom.runtime.machines.loihi1 import description
-from spikeloom.runtime.machines.loihi1.costs.result import CostReport
-from spikeloom.runtime.machines.loihi1.costs.sections import sections as cost_sections
 from spikeloom.runtime.page import pictures
 from spikeloom.runtime.page.results import LayerSpikes, Provenance, Recording, Report, Trace
 from spikeloom.runtime.report import drawing
 from spikeloom.runtime.report.drawing import Drawing
+from spikeloom.runtime.report.figures import bar_figure
 from spikeloom.runtime.report.numbers import percent, si
-from spikeloom.runtime.report.sections import Block, Code, Details, Facts, Figure, Section, Table, Text
+from spikeloom.runtime.report.sections import Block, Code, Details, Facts, Figure, Outcome, Section, Table, Text
 from spikeloom.runtime.studies.chart.sections import figures, saved, taken
 from spikeloom.runtime.studies.stress.sections import stability
 
@@ -48,15 +46,20 @@ def sections(report: Report) -> list[Section]:
     chapters = [
         Section("Verdict", _verdict(report)),
         Section("Decisions", _decisions(report)),
-        Section("Cores", [*description.sections(report.netlist), *_cores(report)]),
+        Section("Cores", [*_of_chip(report.described), *_cores(report)]),
         Section("Taxels", _taxels(report)),
         Section("One recording", _recording(report.recording)),
-        Section("Energy and time", [*cost_sections(report.costs), *_costs(report.costs), *_by_step(report.recording)]),
+        Section("Energy and time", [*_of_chip(report.chip.costs), *_by_step(report.recording)]),
         Section("Stability", [] if report.stress is None else stability(report.stress)),
         Section("Configurations", _configurations(report)),
         Section("Provenance", _provenance(report.provenance)),
     ]
     return [Section(each.title, each.blocks, chapter=True) for each in chapters if each.blocks]
+
+
+def _of_chip(outcome: Outcome) -> Iterable[Block]:
+    """What the chip says of itself, in its layout."""
+    return outcome.sections(outcome.result)
 
 
 def about(report: Report) -> str:
@@ -89,7 +92,7 @@ def _verdict(report: Report) -> list[Block]:
 
 
 def _cards(report: Report) -> dict[str, tuple[str, str]]:
-    verdict, costs = report.verify, report.costs
+    verdict, costs = report.verify, report.chip
     cards = {}
     for side, share in verdict.accuracy.items():
         value, _, note = percent(round(share * verdict.samples), verdict.samples).partition(" (")
@@ -98,17 +101,15 @@ def _cards(report: Report) -> dict[str, tuple[str, str]]:
     cards["decisions equal"] = f"{equal} of {verdict.samples}", "chip and float model"
     exact = f"every spike, membrane and count of {verdict.spec_samples} recordings"
     cards["specification = engine"] = "yes" if verdict.spec_equals_engine else "NO", exact
-    energy = costs.per_inference.energy_j
+    energy = costs.energy_j
     if energy:
         shown = dict.fromkeys(si(value, "J") for value in sorted(energy.values()))
         cards["energy an inference"] = (
             " … ".join(dict.fromkeys([next(iter(shown)), list(shown)[-1]])),
             ", ".join(energy),
         )
-    times = [entry for entry in costs.time if entry.model == "simple"]
-    if times:
-        mean = si(times[0].inference_s["mean"], "s")
-        cards["time an inference"] = mean, f"at full speed, {times[0].table}, simple model"
+    for table, seconds in list(costs.time_s.items())[:1]:
+        cards["time an inference"] = si(seconds, "s"), f"at full speed, {table}, simple model"
     net = report.netlist
     return cards | {"cores": (f"{net.cores}", f"{net.compartments:,} neurons on the chip")}
 
@@ -315,39 +316,9 @@ def _raster(layer: LayerSpikes, steps: int) -> Figure:
 # -- energy and time ---------------------------------------------------------------------------------------------------
 
 
-def _costs(found: CostReport) -> list[Block]:
-    """Energy by layer and part, time by core."""
-    tables = list(found.per_inference.energy_j)
-    blocks: list[Block] = []
-    if tables:
-        layers = {layer.name: list(layer.amounts.energy_j.values()) for layer in found.layers}
-        title, caption = "Energy of a mean inference by layer", "Synapses belong to the layer that receives."
-        blocks.append(_bars("energy-layers", title, layers, tables, "J", caption))
-        parts = next(iter(found.energy_by_part_j.values()))
-        shares = {part: [found.energy_by_part_j[name][part] for name in tables] for part in parts}
-        title = "Energy of a mean inference by part of the chip"
-        caption = "Synapse: visited entries; soma: neuron updates and spikes; network: packets and hops."
-        blocks.append(_bars("energy-parts", title, shares, tables, "J", caption))
-    if found.time:
-        first = found.time[0].table
-        cores = {f"core {core.core}": [core.sweep_s[first], core.receive_s[first]] for core in found.cores}
-        title = "Time of a mean inference by core"
-        caption = "Both go on at once; a step lasts as long as the slowest core."
-        blocks.append(_bars("time-cores", title, cores, ["sweep and send", "receive"], "s", caption))
-    return blocks
-
-
-def _bars(
-    name: str, title: str, rows: Mapping[str, Sequence[float]], series: Sequence[str], unit: str, caption: str
-) -> Figure:
-    cells = [[label, *(si(value, unit) for value in values)] for label, values in rows.items()]
-    numbers = [Table(["", *series], cells, title, most=0)]
-    return Figure(name, partial(drawing.bars, title, rows, series, unit), f"{title}. {caption}", numbers)
-
-
 def _by_step(recording: Recording) -> list[Block]:
     """Energy by core, energy and time by step of the recording that is drawn."""
-    found, cores = recording.by_step, recording.costs.cores
+    found, cores = recording.by_step, recording.core_energy_j
     times = {**found.time_s, **{f"mean of all, {name}": each for name, each in found.mean_time_s.items()}}
     rows = [
         [f"{what}, {name}", si(float(each.mean()), unit), si(float(each.max()), unit), str(int(each.argmax()))]
@@ -355,11 +326,10 @@ def _by_step(recording: Recording) -> list[Block]:
         for name, each in series.items()
     ]
     blocks: list[Block] = [Table(["by chip step", "mean", "most", "at step"], rows, f"Chip steps of {recording.file}")]
-    tables = list(cores[0].energy_j)
-    if tables:
-        energy = {f"core {core.core}": list(core.energy_j.values()) for core in cores}
+    if tables := list(next(iter(cores.values()))):
+        energy = {core: list(joules.values()) for core, joules in cores.items()}
         caption = "It is the one that is drawn above, simulated message by message."
-        blocks.append(_bars("energy-cores", "Energy of this recording by core", energy, tables, "J", caption))
+        blocks.append(bar_figure("energy-cores", "Energy of this recording by core", energy, tables, "J", caption))
     for name, title, series, unit in (
         ("energy-steps", "Energy of each chip step of this recording", found.energy_j, "J"),
         ("time-steps", "Time of each chip step of this recording", times, "s"),

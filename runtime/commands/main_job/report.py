@@ -9,22 +9,16 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from spikeloom.compiler import Netlist
 from spikeloom.compiler.atomic import write_atomically
-from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import DataError, ModelError, OptionError
-from spikeloom.compiler.targets.base import load_target
-from spikeloom.compiler.targets.loihi1.legalize import measure
-from spikeloom.compiler.targets.loihi1.netlist import Netlist
-from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.commands.options import add_explain_cost, add_network, add_recordings
 from spikeloom.runtime.costs.simulated import Account
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import load_recordings
-from spikeloom.runtime.machines.base import machine_of
-from spikeloom.runtime.machines.loihi1.description import describe
-from spikeloom.runtime.machines.loihi1.trace import check_channels
+from spikeloom.runtime.machines.integer import IntegerMachine, integer_machine_for
 from spikeloom.runtime.report import html
 from spikeloom.runtime.report.sections import Outcome, Section, Text
 from spikeloom.runtime.studies.chart.files import read_chart
@@ -70,7 +64,8 @@ def run(arguments: argparse.Namespace) -> Outcome:
     from spikeloom.runtime.studies.stress.results import read_stress
 
     require_place(arguments.output, "-o", arguments)
-    netlist = read_netlist(arguments.netlist)
+    machine = integer_machine_for(arguments.netlist)
+    netlist = machine.netlist
     battery = None
     if arguments.stress is not None:
         sha256 = hashlib.sha256(Path(arguments.netlist).read_bytes()).hexdigest()
@@ -79,9 +74,9 @@ def run(arguments: argparse.Namespace) -> Outcome:
     _require_origin(arguments, netlist, loaded)
     chart = None if arguments.chart is None else read_chart(arguments.chart, loaded.sha256, arguments.checkpoint)
     data = load_recordings(arguments, netlist, labels_for="report")
-    check_channels(netlist, data.events.shape[1] * data.events.shape[2] + netlist.clocks.channels)
+    machine.require_sensor(data.events)
     chosen = None if arguments.recording is None else find_recording(data, arguments.recording)
-    report = replace(_report(arguments, netlist, loaded, data, chosen), stress=battery, chart=chart)
+    report = replace(_report(arguments, machine, loaded, data, chosen), stress=battery, chart=chart)
     made = report.provenance
     title = f"{made.netlist.file} on {made.data.name}"
     with write_atomically(arguments.output) as file:
@@ -142,19 +137,17 @@ def find_recording(data: Recordings, asked: str) -> int:
 
 
 def _report(
-    arguments: argparse.Namespace, netlist: Netlist, loaded: LoadedNetwork, data: Recordings, chosen: int | None
+    arguments: argparse.Namespace, machine: IntegerMachine, loaded: LoadedNetwork, data: Recordings, chosen: int | None
 ) -> Report:
     """All that the page shows, but for what other commands found."""
     from spikeloom.runtime.equivalence.verify import verify
-    from spikeloom.runtime.machines.loihi1.costs.estimate import estimate
-    from spikeloom.runtime.machines.loihi1.costs.result import cost_report
     from spikeloom.runtime.page import facts
     from spikeloom.runtime.page.provenance import provenance
     from spikeloom.runtime.page.recording import recording
     from spikeloom.runtime.page.results import Report
 
-    account = Account(machine_of(netlist), data, checked=arguments.spec_samples)
-    target, bin_s = load_target(netlist.target), arguments.bin * netlist.bins
+    netlist = machine.netlist
+    account = Account(machine, data, checked=arguments.spec_samples)
     verdict = verify(
         netlist,
         loaded.model,
@@ -171,18 +164,21 @@ def _report(
     if chosen is None:
         chosen = 0 if verdict.first_divergence is None else data.files.index(verdict.first_divergence.file)
     account.begin("costs")
-    counts, costs = estimate(netlist, target, with_clocks(data.events, netlist.clocks), lengths=data.lengths)
+    chip = machine.page_parts(data.events, lengths=data.lengths, bin_s=arguments.bin)
     account.begin("the recording")
-    origin = provenance(arguments, netlist, target, loaded, data, data.files[chosen])
+    origin = provenance(arguments, netlist, machine.target, loaded, data, data.files[chosen])
+    described = machine.describe(origin.netlist.sha256)
     report = Report(
         verify=verdict,
         decisions=facts.decisions(verdict, netlist.classes),
-        netlist=describe(netlist, measure(netlist, target), origin.netlist.sha256),
-        cores=facts.cores(netlist, target, counts),
-        taxels=facts.taxels(netlist, loaded, data, counts, arguments.taxels),
-        recording=recording(netlist, target, loaded, data, chosen, costs, bin_s=bin_s),
-        costs=cost_report(netlist, target, costs, bin_s=bin_s),
+        netlist=described.result,
+        cores=chip.cores,
+        taxels=facts.taxels(netlist, loaded, data, chip.spikes, arguments.taxels),
+        recording=recording(machine, loaded, data, chosen, chip.step_s, bin_s=arguments.bin),
+        costs=chip.costs.result,
         provenance=origin,
         output=arguments.output,
+        described=described,
+        chip=chip,
     )
     return replace(report, explained_cost=account.explained(True)) if arguments.explain_cost else report

@@ -1,0 +1,171 @@
+"""What the page of a network shows of this chip: costs with figures, cores on the mesh, energy and time by step."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from spikeloom.compiler.fixedpoint import FloatArray, IntArray
+from spikeloom.compiler.targets.base import Target
+from spikeloom.compiler.targets.loihi1.layout.chips import chip_count, chip_of_core, chip_tiles
+from spikeloom.compiler.targets.loihi1.layout.core_graph import core_map
+from spikeloom.compiler.targets.loihi1.legalize import measure
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.runtime.machines.base import EventArray
+from spikeloom.runtime.machines.loihi1 import engine
+from spikeloom.runtime.machines.loihi1.costs import cost
+from spikeloom.runtime.machines.loihi1.costs.estimate import estimate
+from spikeloom.runtime.machines.loihi1.costs.result import CostReport, cost_report
+from spikeloom.runtime.machines.loihi1.costs.sections import sections
+from spikeloom.runtime.machines.loihi1.timing import DetailedTimes, SimpleTimes
+from spikeloom.runtime.machines.loihi1.trace import Counts, Trace
+from spikeloom.runtime.machines.page_parts import BatchParts, Core, Cores, Fill, Mesh, RecordingParts, Way
+from spikeloom.runtime.report.figures import bar_figure
+from spikeloom.runtime.report.sections import Block, Outcome, Section
+
+FILLS = ("core.compartments", "core.synapse_words", "core.axons_in", "core.axons_out")
+"""Limits of which the fullest says how full a core is: those that a larger network uses up."""
+
+
+def batch_parts(
+    netlist: Netlist, target: Target, events: EventArray, *, lengths: IntArray | None, bin_s: float
+) -> BatchParts:
+    """Run recordings (samples, channels, steps), clocks among their channels; `bin_s` is the seconds of a data step."""
+    counts, found = estimate(netlist, target, events, lengths=lengths)
+    report = cost_report(netlist, target, found, bin_s=bin_s)
+    running = {name: times.critical_core >= 0 for name, times in found.simple.items()}
+    fired, spikes = counts.spikes.mean(axis=0), dict[str, FloatArray]()
+    for index, layer in enumerate(netlist.layers):
+        ids = netlist.compartments_of(index)
+        spikes[layer.name] = np.zeros(layer.neurons)
+        spikes[layer.name][netlist.neuron[ids]] = fired[ids]
+    return BatchParts(
+        costs=Outcome(report, lambda costs: [*sections(costs), Section("", _figures(costs))]),
+        energy_j=report.per_inference.energy_j,
+        time_s={each.table: each.inference_s["mean"] for each in report.time if each.model == "simple"},
+        cores=_cores(netlist, target, counts),
+        spikes=spikes,
+        step_s={
+            f"{name}, simple model": np.where(running[name], times.duration_ns, 0).sum(axis=0)
+            / np.maximum(running[name].sum(axis=0), 1)
+            * 1e-9
+            for name, times in found.simple.items()
+        },
+    )
+
+
+def recording_parts(netlist: Netlist, target: Target, events: EventArray, *, bin_s: float) -> RecordingParts:
+    """Run one recording (1, channels, steps), message by message where it is on one chip."""
+    detail = "cycle" if chip_count(netlist.core_tile, target) == 1 else "counts"
+    _, found = estimate(netlist, target, events, detail=detail)
+    trace = engine.simulate(netlist, events, spikes=True, updated=True)
+    report = cost_report(netlist, target, found, bin_s=bin_s)
+    models: dict[str, Mapping[str, SimpleTimes | DetailedTimes]] = {"simple": found.simple, "detailed": found.detailed}
+    return RecordingParts(
+        costs=report,
+        core_energy_j={f"core {each.core}": each.energy_j for each in report.cores},
+        energy_j=_energy_by_step(netlist, target, events[0], trace),
+        time_s={
+            f"{name}, {model} model": times.duration_ns[0] * 1e-9
+            for model, each in models.items()
+            for name, times in each.items()
+        },
+    )
+
+
+def _energy_by_step(netlist: Netlist, target: Target, events: EventArray, trace: Trace) -> dict[str, FloatArray]:
+    """Joules of each chip step of one recording by table; they add up to what :func:`cost.estimate` says.
+
+    Parameters
+    ----------
+    netlist, target : Netlist, Target
+        What ran, on which chip.
+    events : (channels, steps) uint8
+        The recording, with the network's clocks.
+    trace : Trace
+        Of a batch of this one recording, with spikes and updates.
+    """
+    assert trace.spikes is not None, "spikes were asked for"
+    assert trace.updated is not None, "updates were asked for"
+    spikes: IntArray = trace.spikes[0].astype(np.int64)
+    inputs = np.zeros((len(spikes), netlist.n_inputs), np.int64)
+    inputs[: events.shape[1]] = events.T
+    of_layer = np.eye(len(netlist.layers), dtype=np.int64)[netlist.layer]
+    updates = trace.updated[0].astype(np.int64) @ of_layer
+    counts = Counts(inputs=inputs, spikes=spikes, updates=updates, saturations=np.zeros_like(updates))
+    # each chip step is priced as a run of its own: one that ends after `max_depth + (1 - max_depth)` steps
+    costs = cost.estimate(cost.prepare(netlist, target), counts, 1 - netlist.max_depth)
+    return {name: each.sum(axis=1) for name, each in costs.energy.items()}
+
+
+def _cores(netlist: Netlist, target: Target, counts: Counts) -> Cores:
+    """Where the cores lie, how full each is of everything, and packets of the mean of the recordings in `counts`."""
+    width, chip = target.limit("mesh.width"), chip_of_core(netlist.core_tile, target)
+    fill: dict[int, dict[str, Fill]] = {core: {} for core in range(netlist.n_cores)}
+    for use in measure(netlist, target):
+        if use.core is not None and use.allowed:
+            fill[use.core][use.name] = Fill(used=use.used, allowed=use.allowed, share=use.used / use.allowed)
+    graph, placed = core_map(netlist, target), []
+    for core, tile in enumerate(netlist.core_tile.tolist()):
+        y, x = divmod(tile % chip_tiles(target), width)
+        placed.append(
+            Core(
+                core=core,
+                chip=int(chip[core]),
+                tile=tile,
+                x=x,
+                y=y,
+                layers=tuple(graph.nodes[core]["layers"]),
+                compartments=graph.nodes[core]["compartments"],
+                fullest=max(FILLS, key=lambda name: fill[core][name].share),
+                fill=fill[core],
+            )
+        )
+    packets = _packets(netlist, counts)
+    traffic = [
+        Way(
+            source=None if pre == "input" else pre,
+            to=post,
+            packets=float(packets[-1 if pre == "input" else pre, post]),
+            axons=edge["axons"],
+            hops=edge["hops"],
+        )
+        for pre, post, edge in graph.edges(data=True)
+    ]
+    return Cores(
+        mesh=Mesh(width=width, height=target.limit("mesh.height"), tile_cores=target.limit("mesh.tile_cores")),
+        cores=tuple(placed),
+        traffic=tuple(sorted(traffic, key=lambda way: (-1 if way.source is None else way.source, way.to))),
+    )
+
+
+def _packets(netlist: Netlist, counts: Counts) -> FloatArray:
+    """Packets of a mean recording from each core, and in the last row from the input, to each core."""
+    fired = np.concatenate([counts.inputs, counts.spikes], axis=1).mean(axis=0)
+    home = np.append(np.full(netlist.n_inputs, netlist.n_cores), netlist.core_of_compartment())
+    packets = np.zeros((netlist.n_cores + 1, netlist.n_cores))
+    np.add.at(packets, (home[netlist.axon_source], netlist.core_of_axon()), fired[netlist.axon_source])
+    return packets
+
+
+def _figures(found: CostReport) -> list[Block]:
+    """Energy by layer and part, time by core."""
+    tables = list(found.per_inference.energy_j)
+    blocks: list[Block] = []
+    if tables:
+        layers = {layer.name: list(layer.amounts.energy_j.values()) for layer in found.layers}
+        title, caption = "Energy of a mean inference by layer", "Synapses belong to the layer that receives."
+        blocks.append(bar_figure("energy-layers", title, layers, tables, "J", caption))
+        parts = next(iter(found.energy_by_part_j.values()))
+        shares = {part: [found.energy_by_part_j[name][part] for name in tables] for part in parts}
+        title = "Energy of a mean inference by part of the chip"
+        caption = "Synapse: visited entries; soma: neuron updates and spikes; network: packets and hops."
+        blocks.append(bar_figure("energy-parts", title, shares, tables, "J", caption))
+    if found.time:
+        first = found.time[0].table
+        cores = {f"core {core.core}": [core.sweep_s[first], core.receive_s[first]] for core in found.cores}
+        title = "Time of a mean inference by core"
+        caption = "Both go on at once; a step lasts as long as the slowest core."
+        blocks.append(bar_figure("time-cores", title, cores, ["sweep and send", "receive"], "s", caption))
+    return blocks

@@ -1,0 +1,119 @@
+"""What the page of a netlist shows that each chip has in its own way: where its cores lie, and what runs cost."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from spikeloom.compiler.fixedpoint import FloatArray
+from spikeloom.runtime.report.encode import key
+from spikeloom.runtime.report.sections import Outcome
+
+
+class Sizes(Protocol):
+    """What the page says of a netlist itself; the rest of its facts has the chip's layout."""
+
+    @property
+    def target(self) -> str:
+        """Name of the chip."""
+
+    @property
+    def neurons(self) -> int:
+        """Of the network."""
+
+    @property
+    def compartments(self) -> int:
+        """Neurons that the chip holds."""
+
+    @property
+    def synapses(self) -> int:
+        """Of the network."""
+
+    @property
+    def cores(self) -> int:
+        """How many."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Fill:
+    """Use of a limit."""
+
+    used: int
+    allowed: int
+    share: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Core:
+    """A core: its place, what it holds, and its use of each limit, of which one is the fullest."""
+
+    core: int
+    chip: int
+    tile: int
+    x: int
+    y: int
+    layers: tuple[str, ...]
+    compartments: int
+    fullest: str
+    fill: Mapping[str, Fill]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Way:
+    """Packets of a mean recording from a core, or None for the input, to another."""
+
+    source: int | None = field(metadata=key("from"))
+    to: int
+    packets: float
+    axons: int
+    hops: int | None
+
+    @property
+    def sender(self) -> str:
+        """Where they come from."""
+        return "input" if self.source is None else str(self.source)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Mesh:
+    """Tiles of a chip, and cores of a tile."""
+
+    width: int
+    height: int
+    tile_cores: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Cores:
+    """Where the cores lie, how full each is, and who sends how much to whom."""
+
+    mesh: Mesh
+    cores: tuple[Core, ...]
+    traffic: tuple[Way, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class BatchParts:
+    """Of all recordings.
+
+    Costs with the chip's layout; mean joules and seconds of an inference by table; mean spikes of each neuron, by
+    layer; and seconds of each chip step by table, the mean of the recordings that still run.
+    """
+
+    costs: Outcome
+    energy_j: Mapping[str, float]
+    time_s: Mapping[str, float]
+    cores: Cores
+    spikes: Mapping[str, FloatArray]
+    step_s: Mapping[str, FloatArray]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RecordingParts:
+    """Of one recording: its costs, joules of each core by table, and joules and seconds of each chip step by table."""
+
+    costs: object
+    core_energy_j: Mapping[str, Mapping[str, float]]
+    energy_j: Mapping[str, FloatArray]
+    time_s: Mapping[str, FloatArray]
