@@ -181,9 +181,7 @@ REFUSED = {
     "allowed); only affine stages between LIF layers can become synapses": lambda: nn.Sequential(
         nn.Linear(4, 3), LIF(), nn.Sequential(nn.Linear(3, 2), nn.ReLU()), LIF()
     ),
-    "module: has no LIF layer, so nothing spikes; put spikeloom.models.networks.lif.LIF between its stages": lambda: (
-        nn.Linear(4, 2)
-    ),
+    "module: has no LIF layer, so nothing spikes; put spikeloom.LIF between its stages": lambda: nn.Linear(4, 2),
     "module 1: is called 2 times in a step, each LIF layer holds the neurons of one place; use one for each": twice,
     "module: returns a tuple, wanted one tensor, the spikes of its classes": Pair,
     "module: its output is no count of the spikes of its last LIF layer; return these spikes, or their sum over a "

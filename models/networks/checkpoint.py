@@ -14,8 +14,8 @@ import numpy.typing as npt
 
 from spikeloom.compiler.atomic import write_atomically
 from spikeloom.compiler.dynamics import PLAIN, Dynamics
-from spikeloom.compiler.ir import Form
 from spikeloom.compiler.formats.checkpoint_file import FORMAT, VERSION, content_digest
+from spikeloom.compiler.ir import Form
 from spikeloom.compiler.systems import TACTILESGNET, Grid
 from spikeloom.models.graphs import Graph
 

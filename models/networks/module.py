@@ -9,21 +9,19 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from scipy import sparse
 from torch import Tensor, nn
 
+from spikeloom.compiler import DEFAULT_TARGET, Compilation, Options, compile_network
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.fixedpoint import FloatArray
 from spikeloom.compiler.formats.assemble import Layer, assemble, class_of_each
 from spikeloom.compiler.formats.names import unique_names
-from spikeloom.compiler.sensor_layout import sensor_layout
 from spikeloom.compiler.ir import INPUT, Network, Sparse
-from spikeloom.compiler import DEFAULT_TARGET, Compilation, Options, compile_network
+from spikeloom.compiler.sensor_layout import sensor_layout
 from spikeloom.models.networks.lif import LIF, reset
 
 AFFINE_TOLERANCE = 1e-9
@@ -62,7 +60,7 @@ class _Probe:
                     "holds the neurons of one place; use one for each"
                 )
         if not first:
-            raise ModelError("module: has no LIF layer, so nothing spikes; put spikeloom.models.networks.lif.LIF between its stages")
+            raise ModelError("module: has no LIF layer, so nothing spikes; put spikeloom.LIF between its stages")
         self.shapes = [tuple(current.shape) for current in first]
         self.batched = self._is_batched()
 

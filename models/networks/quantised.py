@@ -1,7 +1,7 @@
 """The network on the chip's own integers, as a torch model with gradients: what it computes is what the chip computes.
 
-Weights, biases and thresholds are rounded by :mod:`storage.weight_storage`, the compiler's own rounding. Synaptic sums are
-sums of integers in float32, exact below 2**24, which the 21-bit accumulator guarantees; the recurrence runs in
+Weights, biases and thresholds are rounded by :func:`fixedpoint.round_steps`, the compiler's own rounding. Synaptic
+sums are sums of integers in float32, exact below 2**24, which the 21-bit accumulator guarantees; the recurrence runs in
 integers. Gradients pass the rounding straight through, and a spike by the same surrogate as in training.
 """
 
@@ -17,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.fixedpoint import (
     BIAS_EXPONENT_MAX,
     BIAS_MANTISSA_MAX,
@@ -24,14 +25,16 @@ from spikeloom.compiler.fixedpoint import (
     MEMBRANE_MAX,
     MEMBRANE_SHIFT,
     ONE_STEP_SUM_MAX,
+    decay_registers,
     encode_bias,
+    reach,
+    round_steps,
+    step_units,
 )
-from spikeloom.compiler.ir import Form
-from spikeloom.compiler.fixedpoint import decay_registers, reach, round_steps, step_units
-from spikeloom.compiler.checkpoint import Checkpoint
-from spikeloom.compiler.systems import in_order
 from spikeloom.compiler.formats.towers import members, side_by_side
+from spikeloom.compiler.ir import Form
 from spikeloom.compiler.passes.expand import effective_weight, stack_of
+from spikeloom.compiler.systems import in_order
 from spikeloom.models.networks.layers import differentiate, events_of, gather, scatter
 from spikeloom.models.networks.surrogate import RECTANGLE
 

@@ -2,8 +2,8 @@
 
 >>> import spikeloom
 >>> net = spikeloom.compile("pretrained:grasps")
->>> net
-loihi1: 2,886 neurons (2,517 on the chip), 451,712 synapses (363,967 stored, 345,889 non-zero), 5 cores …
+>>> net  # doctest: +ELLIPSIS
+loihi1: 2,886 neurons (2,517 on the chip), 451,712 synapses (371,854 stored, 355,500 non-zero), 5 cores on tiles ...
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ from spikeloom.compiler.atomic import write_atomically
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.runtime.commands.options import add_network, add_recordings
+from spikeloom.runtime.commands.options import MODEL, add_network, add_recordings
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.inputs.recordings import recordings
@@ -36,7 +36,7 @@ ALLOWED = (0.0, 0.005, 0.01, 0.02, 0.05)
 DIFFER = 0.0
 """By default no calibration race may end otherwise; of real votes a little more do than of races."""
 
-BESIDE = ("graph", "taxels", "edges", "system", "weights", "dt", "convention")
+BESIDE = ("graph", "taxels", "edges", "directed", "system", "run", "weights", "beta", "theta", "dt", "convention")
 """Options that say how a checkpoint is read, and are nothing without one."""
 
 PART = 16
@@ -148,7 +148,7 @@ def _races(arguments: argparse.Namespace, machine: IntegerMachine) -> FloatArray
 def _float_votes(arguments: argparse.Namespace, machine: IntegerMachine, data: Recordings) -> IntArray | None:
     """Votes of the float model so far after each step, (samples, steps, classes), if a checkpoint was given."""
     if arguments.checkpoint is None:
-        given = [name for name in BESIDE if getattr(arguments, name) is not None]
+        given = [name for name in BESIDE if getattr(arguments, name) != MODEL.get(name)]
         if given:
             raise OptionError(f"--{given[0]}: is for --checkpoint, which is not given; add it or omit this")
         return None

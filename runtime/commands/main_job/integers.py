@@ -12,6 +12,7 @@ from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.formats.netx.layout import SUFFIX
 from spikeloom.compiler.formats.netx.reader import read_netx
 from spikeloom.compiler.invariants import verify
+from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.version import __version__
 from spikeloom.runtime.commands.options import MODEL
 from spikeloom.runtime.inputs.compilation import ROUNDING, parse_cores
@@ -41,6 +42,10 @@ def brings_integers(source: object) -> bool:
 def compile_integers(arguments: argparse.Namespace) -> Outcome:
     """Run the command for such a file."""
     path = arguments.checkpoint
+    if load_target(arguments.target).options is not Options:
+        raise OptionError(f"--target {arguments.target}: {path} holds integers of another chip; omit it")
+    if arguments.in_time is not None:
+        raise OptionError(f"--in-time {arguments.in_time}: is for float networks, {path} holds integers; omit it")
     _refuse(arguments, FLOATS, f"is for float networks, {path} holds integers; omit it")
     _refuse(arguments, MODEL, f"is for checkpoints, the netx file {path} holds all it needs; omit it")
     why = f"weighs layouts by what a float network does on recordings, {path} holds integers; omit it"
