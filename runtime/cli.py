@@ -20,7 +20,7 @@ from spikeloom.compiler.version import __version__
 
 GROUPS: dict[str, dict[str, str]] = {
     "main job": {
-        "demo": "the main job on a shipped checkpoint and synthetic grasps; needs no file and no network",
+        "demo": "the main job on a shipped checkpoint and synthetic grasps; needs no files and no internet",
         "compile": "lower a checkpoint to a netlist that obeys every limit of the chip",
         "inspect": "show a netlist (layers, scales, cores, fill of every limit) or a checkpoint",
         "run": "run a netlist exactly as the chip would",

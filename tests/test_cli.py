@@ -185,7 +185,7 @@ def test_no_step_is_expected_without_recordings(as_json, spikeloom, tmp_path):
         (["--optimize", "latency"], "--optimize latency: needs firing rates; give --calibrate"),
         (
             ["--optimize", "latency", "--calibrate", "data", "--cores-for", "fc1=2"],
-            "--optimize latency: chooses the cores of every layer itself; leave --cores-for away",
+            "--optimize latency: chooses the cores of every layer itself; omit --cores-for",
         ),
     ],
 )

@@ -1,4 +1,4 @@
-"""Leave out what provably does nothing: neurons that can never fire, neurons that no neuron receives.
+"""Leave out what provably does nothing: neurons that can never fire, neurons whose spikes reach no neuron.
 
 The bounds hold for any input, so every spike that is left is as before. A neuron that cannot fire in the float model
 is taken out before rounding: its weights then no longer take room in the accumulators of its listeners, whose scales
@@ -141,7 +141,7 @@ def disconnect(network: Network, gone: Masks) -> Network:
 
 
 def removable(network: IntegerNetwork) -> tuple[Masks, Masks]:
-    """Neurons that the chip need not hold: those that no input can make fire, and others that no neuron receives.
+    """Neurons that the chip need not hold: those that no input can make fire, and others whose spikes reach no neuron.
 
     Neurons that vote are never among them, and every population keeps one neuron.
 

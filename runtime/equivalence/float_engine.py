@@ -60,7 +60,7 @@ class Layer:
     `pres` are its other presynaptic populations, ``INPUT`` for the input, whose neurons are numbered one after the
     other in `runs`; `own` are its recurrent weights. It lags `depth` chip steps behind the data, `late` of them beyond
     the one that follows the layer before, which cost it as many steps of its input. `seat` is each neuron's compartment
-    or ``NOWHERE``; those that no neuron receives are not `compared` with the chip's.
+    or ``NOWHERE``; those whose spikes reach no neuron are not `compared` with the chip's.
     """
 
     pres: tuple[int, ...]

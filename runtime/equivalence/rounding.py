@@ -111,7 +111,7 @@ def check_rounding(machine: IntegerMachine, network: Network, *, fine_tuned: boo
     absent, pruned = machine.absent, bool(provenance.get("prune_unused", False))
     zeroed = [_may_be_zero(integer, post, mask, pruned) for post, mask in enumerate(never_fires(network))]
     channels = np.zeros(network.input.size, np.bool_)
-    if "lean" in provenance:  # input channels that no neuron receives were pruned on evidence
+    if "lean" in provenance:  # input channels that reach no neuron were pruned on evidence
         channels = ~machine.received
     found = {}
     for post, population in enumerate(network.populations):

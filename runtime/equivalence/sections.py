@@ -36,7 +36,7 @@ def _lines(verdict: Verdict) -> list[str]:
         )
     if verdict.not_compared:
         absent = ", ".join(f"{name} {count:,}" for name, count in verdict.not_compared.items())
-        lines.append(f"not compared, left out because no neuron receives them: {absent}")
+        lines.append(f"not compared, left out because their spikes reach no neuron: {absent}")
     return lines
 
 

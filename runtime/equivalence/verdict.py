@@ -56,7 +56,7 @@ class Verdict:
     with onnxruntime beside, whether its spikes, membranes after the reset and votes were so too, and its spikes our
     engine's on all recordings: `engine_different` counts those that are not. `quantised_different` counts spikes in
     which a fine-tuned checkpoint's torch model, on chip integers, and the chip differ. `not_compared` are neurons of
-    each layer that the chip omits because no neuron receives them. `missed` is what was required and is not reached.
+    each layer that the chip omits because their spikes reach no neuron. `missed` is what was required.
     """
 
     files: tuple[str, ...] = field(metadata=HIDDEN)

@@ -224,7 +224,7 @@ def propagation(checkpoint: Checkpoint, asked: Graph | None, where: str) -> tupl
     if checkpoint.edges is not None and not np.array_equal(seen(checkpoint.edges, checkpoint.taxels), found):
         raise ModelError(
             f"{where}: graph and weights disagree: it was trained on {checkpoint.graph}, --graph says "
-            f"{asked.name}; leave --graph away"
+            f"{asked.name}; omit --graph"
         )
     return asked.name, found
 

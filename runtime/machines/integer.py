@@ -62,7 +62,7 @@ class IntegerMachine(Machine):
     @property
     @abstractmethod
     def unused(self) -> tuple[BoolArray, ...]:
-        """Those of them that were left out because no neuron receives them: their spikes cannot be compared."""
+        """Those of them that were left out because their spikes reach no neuron: their spikes cannot be compared."""
 
     @property
     @abstractmethod

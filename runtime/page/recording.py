@@ -31,8 +31,8 @@ AROUND = 25
 class BothSides:
     """What float32 model and chip do on one recording, layer by layer and aligned with the data.
 
-    Spikes (steps, neurons) are silent where neurons are left out because no neuron receives them; membranes, in the
-    float model's units, are those before the comparison, zero where the chip holds no neuron.
+    Spikes (steps, neurons) are silent where neurons are left out because their spikes reach no neuron; membranes, in
+    the float model's units, are those before the comparison, zero where the chip holds no neuron.
     """
 
     float_spikes: tuple[BoolArray, ...]

@@ -64,7 +64,7 @@ class Compilation:
     identity : tuple of (neurons left,) int64
         Which neurons these are, by population.
     silent, unreceived : tuple of (neurons,) bool
-        Neurons that it does not hold: they cannot fire, or no neuron receives them.
+        Neurons that it does not hold: they cannot fire, or their spikes reach no neuron.
     removals : tuple of Removal
         The same in numbers, and why.
     layout, usual : Layout

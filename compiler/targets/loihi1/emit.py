@@ -61,7 +61,7 @@ class Origin:
     identity : tuple of (neurons left,) int64
         For each population, which of its neurons the chip holds.
     unreceived : tuple of (neurons,) bool
-        Neurons removed although they fire, because no neuron receives them.
+        Neurons removed although they fire, because their spikes reach no neuron.
     """
 
     network: IntegerNetwork

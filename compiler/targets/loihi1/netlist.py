@@ -45,7 +45,7 @@ class Layer:
     neurons : int
         Neurons of the float model's layer; the chip may hold fewer compartments.
     unheard : tuple of int
-        Neurons left out although they fire, because no neuron receives them; any other that is missing cannot fire.
+        Neurons left out although they fire, as their spikes reach no neuron; any other that is missing cannot fire.
     depth : int
         Steps that the layer lags behind the data.
     beta, theta : float

@@ -162,7 +162,7 @@ INTEGERS = (
     ),
     Pass(
         name="remove",
-        does="takes out the neurons that no input can make fire and those that no neuron receives",
+        does="takes out the neurons that no input can make fire and those whose spikes reach no neuron",
         keeps="every spike of the neurons that are left, on any input",
         apply=_remove,
     ),

@@ -10,7 +10,7 @@ from spikeloom.compiler import DEFAULT_TARGET, GOALS, MARGIN, RANGES, Compilatio
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.runtime.commands.main_job.integers import brings_integers, compile_integers
-from spikeloom.runtime.commands.options import add_bin_option, add_network
+from spikeloom.runtime.commands.options import add_bin_option, add_network, group
 from spikeloom.runtime.inputs.compilation import margin_of, parse_cores, parse_recipes, provenance
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import load_network
@@ -24,51 +24,52 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     """Add the options."""
     sub.add_argument("checkpoint", help="checkpoint, or a network as an ONNX, NIR or netx file")
     add_network(sub)
+    storage, layout, output = (group(sub, title) for title in ("storage", "layout", "output"))
     sub.add_argument("--target", default=DEFAULT_TARGET, help=f"chip: {DEFAULT_TARGET} (default), or truenorth")
-    sub.add_argument(
+    storage.add_argument(
         "--weight-bits",
         metavar="N[,N]",
         help="storage width, one or one a layer: 2 to 6 or 8 (default: 8)",
     )
-    sub.add_argument("--planes", metavar="N[,N]", help="times a synapse is stored, 1 to 3 (default: 1)")
-    sub.add_argument("--scale-groups", metavar="N[,N]", help="scales in a layer, 1 to 8 (default: 1)")
-    sub.add_argument(
+    storage.add_argument("--planes", metavar="N[,N]", help="times a synapse is stored, 1 to 3 (default: 1)")
+    storage.add_argument("--scale-groups", metavar="N[,N]", help="scales in a layer, 1 to 8 (default: 1)")
+    storage.add_argument(
         "--spike-exact",
         action="store_true",
         help="add planes and scales until the training spikes are the float model's",
     )
-    sub.add_argument("--keep-all", action="store_true", help="keep neurons that never fire or that no neuron receives")
-    sub.add_argument(
+    storage.add_argument("--keep-all", action="store_true", help="keep neurons that never fire or reach no neuron")
+    storage.add_argument(
         "--prune-unused", action="store_true", help="leave out neurons that never fired on the training split, too"
     )
-    sub.add_argument("--calibrate", metavar="PATH", help="recordings whose train split chooses the scales")
+    storage.add_argument("--calibrate", metavar="PATH", help="recordings whose train split chooses the scales")
     add_bin_option(sub)
-    sub.add_argument(
+    storage.add_argument(
         "--in-time",
         type=int,
         metavar="N",
         help="truenorth: lower a history-free network, N axons an input (2 to 4), whose sums travel in 20 ticks a step",
     )
-    sub.add_argument(
+    storage.add_argument(
         "--ranges", default="proven", help=f"how overflow is excluded: {' or '.join(RANGES)} (default: proven)"
     )
-    sub.add_argument("--margin", type=float, help=f"share added to observed ranges (default: {MARGIN:g})")
-    sub.add_argument(
+    storage.add_argument("--margin", type=float, help=f"share added to observed ranges (default: {MARGIN:g})")
+    layout.add_argument(
         "--cores-for",
         metavar="LAYER=N[,…]",
         help="at least N cores for a layer, which it shares with none, as in conv1=4,fc1=6",
     )
-    sub.add_argument("--chips", type=int, default=1, metavar="N", help="use up to N chips (default: 1)")
-    sub.add_argument(
+    layout.add_argument("--chips", type=int, default=1, metavar="N", help="use up to N chips (default: 1)")
+    layout.add_argument(
         "--optimize",
         default="cores",
         metavar="GOAL",
         help=f"choose the cores for {', '.join(GOALS)}; the last two need --calibrate (default: cores)",
     )
-    sub.add_argument(
+    output.add_argument(
         "--dump-after", action="append", default=[], metavar="PASS", help="print the network after a pass, on stderr"
     )
-    sub.add_argument("-o", "--output", required=True, metavar="NET.loom")
+    output.add_argument("-o", "--output", required=True, metavar="NET.loom", help="netlist to write")
 
 
 def run(arguments: argparse.Namespace) -> Outcome:

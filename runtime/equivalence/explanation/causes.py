@@ -131,8 +131,8 @@ def explain(
     rounding : Rounding, optional
         What is known of the stored weights; by default each is the nearest.
     absent, unused : sequence of (neurons,) bool, optional
-        Neurons of each population that the chip does not hold, and those of them that no neuron receives, which are
-        not compared.
+        Neurons of each population that the chip does not hold, and those of them whose spikes reach no neuron,
+        which are not compared.
     pruned : bool
         Whether neurons were left out on evidence; otherwise only those that their rounded weights cannot fire.
     """

@@ -142,7 +142,7 @@ def _removed(facts: CompilationFacts) -> Iterator[str]:
     """What the chip does not hold, and why."""
     reasons = {
         "that no input can make fire": [layer.silent for layer in facts.removals],
-        "that no neuron receives": [layer.unreceived for layer in facts.removals],
+        "whose spikes reach no neuron": [layer.unreceived for layer in facts.removals],
         "that did not fire in training (by evidence, not by proof)": [layer.unused for layer in facts.removals],
     }
     for why, neurons in reasons.items():

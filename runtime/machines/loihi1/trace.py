@@ -133,7 +133,7 @@ def aligned(netlist: Netlist, array: npt.NDArray[Any], layer: int) -> npt.NDArra
 
 
 def comparable(netlist: Netlist, layer: int) -> slice | IntArray:
-    """Neurons of a layer whose spikes can be compared: all but those left out because no neuron receives them."""
+    """Neurons of a layer whose spikes can be compared: all but those left out because their spikes reach no neuron."""
     unused = netlist.layers[layer].unheard
     return np.setdiff1d(np.arange(netlist.layers[layer].neurons), unused) if unused else slice(None)
 
