@@ -84,6 +84,7 @@ def test_modules_come_in_as_they_are(data):
 def test_what_does_not_suit_is_refused(data, net):
     with pytest.raises(OptionError, match=r"wieght_bits: unknown option; allowed: .*weight_bits"):
         api.compile("pretrained:grasps", wieght_bits="4")
+    assert len(net.run(data.test, limit=2).value.files) == 2
     with pytest.raises(DataError, match="has 39 taxels, the network has 6"):
         net.run(api.recordings("synthetic").test)
 
