@@ -13,7 +13,7 @@ import math
 import os
 import struct
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -88,18 +88,6 @@ def write_archive(content: bytes, path: str | os.PathLike[str]) -> str:
     with write_atomically(path) as file:
         file.write(content)
     return hashlib.sha256(content).hexdigest()
-
-
-def require_file(path: Path) -> None:
-    """Refuse a path that is no file.
-
-    Raises
-    ------
-    FormatError
-    """
-    if not path.is_file():
-        found = "is not a file" if path.exists() else "no such file"
-        raise FormatError(f"{path}: {found}; write one with spikeloom compile")
 
 
 def stored_members(content: bytes) -> dict[str, bytes]:
@@ -187,45 +175,6 @@ def is_netlist(path: str | os.PathLike[str]) -> bool:
         return False
 
 
-def read_manifest(path: Path, members: Mapping[str, Array], wanted: str, versions: tuple[int, ...]) -> dict[str, Any]:
-    """Manifest of an archive, as :func:`require_manifest` wants it.
-
-    Raises
-    ------
-    FormatError
-        If there is none, or it is of another format or version.
-    """
-    missing = sorted({"manifest", "sha256"} - set(members))
-    if missing:
-        raise FormatError(f"{path}: is not a netlist (no {' and no '.join(missing)}); write one with spikeloom compile")
-    try:
-        manifest = json.loads(str(members["manifest"]))
-    except (ValueError, RecursionError) as error:
-        raise FormatError(f"{path}: has an unreadable manifest; compile it again") from error
-    return require_manifest(path, manifest, wanted, versions)
-
-
-def require_manifest(path: Path, manifest: Any, wanted: str, versions: tuple[int, ...]) -> dict[str, Any]:
-    """Refuse a JSON value that is no manifest of a format, one of ``FORMATS``, in a version that is read.
-
-    Raises
-    ------
-    FormatError
-        What is wrong first.
-    """
-    stated = manifest.get("format") if isinstance(manifest, dict) else None
-    if isinstance(stated, str) and stated in FORMATS and stated != wanted:
-        raise FormatError(f"{path}: holds {FORMATS[stated]}, this is for {FORMATS[wanted]}; give such a file")
-    if stated != wanted:
-        raise FormatError(f"{path}: is not a netlist; write one with spikeloom compile")
-    if manifest.get("version") not in versions:
-        raise FormatError(
-            f"{path}: has format version {manifest.get('version')}, this program reads "
-            f"{', '.join(map(str, versions))}; compile it again or update spikeloom"
-        )
-    return dict(manifest)
-
-
 Kind = type | tuple[int, int] | dict[str, Any] | list[Any]
 """What an entry of a manifest must be: of a type (``float``: from 0, finite), a whole number within bounds (both
 allowed), an object of exactly these entries, or a list of such things, ``[kind, ...]`` of at least one."""
@@ -281,9 +230,14 @@ def range_faults(ranges: Mapping[str, tuple[Array, int, int]]) -> list[str]:
 
 
 def read_archive(
-    path: Path, wanted: str, versions: tuple[int, ...], arrays: tuple[str, ...]
+    path: Path, wanted: str, versions: tuple[int, ...], names: Callable[[Mapping[str, Any]], Iterable[str]]
 ) -> tuple[dict[str, Any], dict[str, Array]]:
-    """Manifest and members of a file of a format, one of ``FORMATS``, that matches its hash.
+    """Manifest and arrays of a file of a format, one of ``FORMATS``, that matches its hash.
+
+    Parameters
+    ----------
+    names : callable
+        Gives from the manifest the names of all arrays, in their order.
 
     Raises
     ------
@@ -292,27 +246,30 @@ def read_archive(
     OSError
         If it cannot be read.
     """
-    require_file(path)
+    if not path.is_file():
+        found = "is not a file" if path.exists() else "no such file"
+        raise FormatError(f"{path}: {found}; write one with spikeloom compile")
     members = read_members(path)
-    manifest = read_manifest(path, members, wanted, versions)
-    require_whole(path, members, arrays)
-    return manifest, members
-
-
-def require_whole(path: Path, members: dict[str, Array], arrays: tuple[str, ...]) -> None:
-    """Refuse an archive with other members, or that does not match its hash.
-
-    The hash is taken out of the members.
-
-    Raises
-    ------
-    FormatError
-        What is wrong first.
-    """
-    stated = str(members.pop("sha256"))
-    names = {"manifest", *arrays}
-    if set(members) != names:
-        odd = ", ".join(sorted(names ^ set(members)))
-        raise FormatError(f"{path}: has missing or unknown members ({odd}); compile it again")
-    if digest({"manifest": members["manifest"], **{name: members[name] for name in arrays}}) != stated:
+    if missing := sorted({"manifest", "sha256"} - set(members)):
+        raise FormatError(f"{path}: is not a netlist (no {' and no '.join(missing)}); write one with spikeloom compile")
+    text, written = members.pop("manifest"), str(members.pop("sha256"))
+    try:
+        manifest = json.loads(str(text))
+    except (ValueError, RecursionError) as error:
+        raise FormatError(f"{path}: has an unreadable manifest; compile it again") from error
+    kind = manifest.get("format") if isinstance(manifest, dict) else None
+    if isinstance(kind, str) and kind in FORMATS and kind != wanted:
+        raise FormatError(f"{path}: holds {FORMATS[kind]}, this is for {FORMATS[wanted]}; give such a file")
+    if kind != wanted:
+        raise FormatError(f"{path}: is not a netlist; write one with spikeloom compile")
+    if manifest.get("version") not in versions:
+        raise FormatError(
+            f"{path}: has format version {manifest.get('version')}, this program reads "
+            f"{', '.join(map(str, versions))}; compile it again or update spikeloom"
+        )
+    expected = tuple(names(manifest))
+    if odd := sorted(set(expected) ^ set(members)):
+        raise FormatError(f"{path}: has missing or unknown members ({', '.join(odd)}); compile it again")
+    if digest({"manifest": text, **{name: members[name] for name in expected}}) != written:
         raise FormatError(f"{path}: its content does not match its hash, so it was altered; compile it again")
+    return manifest, members

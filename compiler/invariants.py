@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
-import networkx as nx
 import numpy as np
 
 from spikeloom.compiler.errors import VerifyError
@@ -22,7 +21,6 @@ from spikeloom.compiler.ir import (
     Population,
     Projection,
     depths,
-    to_networkx,
 )
 
 Faults = Iterator[str]
@@ -34,12 +32,9 @@ def _names_are_unique(network: Network | IntegerNetwork) -> Faults:
         yield f"two populations are called {name!r}"
 
 
-def _sizes(populations: tuple[Population | IntegerPopulation, ...]) -> dict[int, int]:
-    return {i: population.size for i, population in enumerate(populations)}
-
-
 def _projections_fit(network: Network | IntegerNetwork) -> Faults:
-    sizes = {INPUT: network.input.size} | _sizes(network.populations)
+    populations: tuple[Population | IntegerPopulation, ...] = network.populations
+    sizes = {INPUT: network.input.size} | {i: population.size for i, population in enumerate(populations)}
     projections: tuple[Projection | IntegerProjection, ...] = network.projections
     for i, projection in enumerate(projections):
         expected = (sizes.get(projection.post), sizes.get(projection.pre))
@@ -78,10 +73,11 @@ def _no_layer_is_skipped(network: Network | IntegerNetwork) -> Faults:
 def _everything_is_reached(network: Network | IntegerNetwork) -> Faults:
     if not _populations_exist(network):
         return
-    reached = nx.descendants(to_networkx(network), "input")
-    for population in network.populations:
-        if population.name not in reached:
-            yield f"population {population.name!r} is not reached from the input"
+    reached = {INPUT}
+    for post, pre in sorted((p.post, p.pre) for p in network.projections):  # a recurrent one after the others
+        reached |= {post} if pre in reached else set()
+    for post in sorted(set(range(len(network.populations))) - reached):
+        yield f"population {network.populations[post].name!r} is not reached from the input"
 
 
 def _readout_fits(network: Network | IntegerNetwork) -> Faults:

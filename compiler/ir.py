@@ -8,11 +8,10 @@ object can know is checked on construction, everything else in :mod:`compiler.in
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
-import networkx as nx
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
@@ -264,18 +263,6 @@ def recurrent(network: Network | IntegerNetwork) -> tuple[str, ...]:
     return tuple(network.populations[post].name for post in sorted(hears))
 
 
-def to_networkx(network: Network | IntegerNetwork) -> nx.MultiDiGraph:
-    """Populations as nodes (``input`` among them), projections as edges with their synapse count."""
-    graph = nx.MultiDiGraph()
-    graph.add_node("input", neurons=network.input.size)
-    for population in network.populations:
-        graph.add_node(population.name, neurons=population.size)
-    for projection in network.projections:
-        pre = "input" if projection.pre == INPUT else network.populations[projection.pre].name
-        graph.add_edge(pre, network.populations[projection.post].name, synapses=int(projection.weight.nnz))
-    return graph
-
-
 def fan_in(network: Network | IntegerNetwork, post: int) -> IntArray:
     """Structural synapses into each neuron of a population, planes of one synapse counted once; shape (neurons,)."""
     planes: dict[int, list[Sparse]] = {}
@@ -301,18 +288,21 @@ def with_data(weight: Sparse, data: npt.NDArray[Any]) -> Sparse:
     return sparse.csr_array((data, weight.indices, weight.indptr), shape=weight.shape)
 
 
-def one_sided(projection: IntegerProjection) -> tuple[IntArray, IntArray]:
-    """Sums of the positive weights of each neuron and of the magnitudes of its negative ones, weight units.
+def one_sided(projections: Iterable[IntegerProjection], neurons: int) -> tuple[IntArray, IntArray]:
+    """Largest positive and negative synaptic sum that any input can bring to each neuron, as magnitudes, weight units.
+
+    Planes count one by one, which covers every order of their arrival.
 
     Returns
     -------
-    positive, negative : (neurons of post,) int64
+    positive, negative : (neurons,) int64
     """
-    positive, negative = np.zeros((2, projection.weight.shape[0]), np.int64)
-    for rows in row_parts(projection.weight):
-        part = replace(projection, weight=projection.weight[rows]).effective()
-        positive[rows] = part.maximum(0).sum(axis=1)
-        negative[rows] = -part.minimum(0).sum(axis=1)
+    positive, negative = np.zeros((2, neurons), np.int64)
+    for projection in projections:
+        for rows in row_parts(projection.weight):
+            part = replace(projection, weight=projection.weight[rows]).effective()
+            positive[rows] += part.maximum(0).sum(axis=1)
+            negative[rows] -= part.minimum(0).sum(axis=1)
     return positive, negative
 
 

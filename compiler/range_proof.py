@@ -7,7 +7,14 @@ from typing import ClassVar
 
 import numpy as np
 
-from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, MEMBRANE_MAX, MEMBRANE_SHIFT, FloatArray
+from spikeloom.compiler.fixedpoint import (
+    ACCUMULATOR_MAX,
+    CURRENT_MAX,
+    MEMBRANE_MAX,
+    MEMBRANE_SHIFT,
+    FloatArray,
+    IntArray,
+)
 from spikeloom.compiler.ir import IntegerNetwork, one_sided
 
 
@@ -36,12 +43,10 @@ class RangeProof:
         return self.accumulator <= ACCUMULATOR_MAX and self.current <= CURRENT_MAX and self.membrane <= MEMBRANE_MAX
 
 
-def _settled(inflow: FloatArray, kept: float) -> FloatArray:
+def _settled(inflow: FloatArray | IntArray, kept: float) -> FloatArray:
     """Limit of ``x <- kept * x + inflow``: what a leaking register can add up to."""
-    if kept < 1:
-        limit: FloatArray = inflow / (1 - kept)
-        return limit
-    return np.where(inflow > 0, np.inf, 0.0)
+    limit: FloatArray = inflow / (1 - kept) if kept < 1 else np.where(inflow > 0, np.inf, 0.0)
+    return limit
 
 
 def prove_ranges(network: IntegerNetwork) -> tuple[RangeProof, ...]:
@@ -58,13 +63,8 @@ def prove_ranges(network: IntegerNetwork) -> tuple[RangeProof, ...]:
     """
     proofs = []
     for post, population in enumerate(network.populations):
-        positive = np.zeros(population.size)
-        negative = np.zeros(population.size)
-        for projection in network.projections:
-            if projection.post == post:
-                gained, lost = one_sided(projection)
-                positive += gained
-                negative += lost
+        into = (projection for projection in network.projections if projection.post == post)
+        positive, negative = one_sided(into, population.size)
         unit = 1 << MEMBRANE_SHIFT
         kept_u = (4096 - (population.decay_u + 1)) / 4096
         up, down = _settled(positive * unit, kept_u), _settled(negative * unit, kept_u)

@@ -8,8 +8,8 @@ from random_networks import BITS, chain, float_networks
 
 from spikeloom.compiler.fixedpoint import plane_distance, reach, split_planes, weight_step
 from spikeloom.compiler.invariants import verify
-from spikeloom.compiler.ir import Form, IntegerNetwork
-from spikeloom.compiler.targets.loihi1.storage.weight_storage import one_sided_sums, round_population, scales
+from spikeloom.compiler.ir import Form, IntegerNetwork, one_sided
+from spikeloom.compiler.targets.loihi1.storage.weight_storage import round_population, scales
 
 
 @st.composite
@@ -69,7 +69,7 @@ def test_a_rounded_population_is_the_nearest_of_its_grid(network, storage, data)
             wanted = projection.weight.toarray() * scales(population, form)[:, None] / step
             error = stored / step - np.clip(wanted, -limit, limit)
             assert np.abs(error).max(initial=0) <= 0.5 * (1 + 1e-9)
-        sums = one_sided_sums(planes, population.size)
+        sums = np.maximum(*one_sided(planes, population.size))
         by_hand = np.zeros((2, population.size))
         for plane in planes:
             dense = plane.effective().toarray()

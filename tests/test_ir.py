@@ -18,7 +18,7 @@ from scipy import sparse
 
 from spikeloom.compiler.errors import VerifyError
 from spikeloom.compiler.invariants import verify
-from spikeloom.compiler.ir import INPUT, Network, Projection, Readout, depths, fan_in, recurrent, to_networkx
+from spikeloom.compiler.ir import INPUT, Network, Projection, Readout, depths, fan_in, recurrent
 from spikeloom.compiler.targets.loihi1.netlist_text import netlist_text
 from spikeloom.compiler.text import text
 
@@ -175,23 +175,6 @@ def test_fan_in_counts_a_synapse_once_whatever_its_planes():
     assert fan_in(twice, 0).tolist() == fan_in(network, 0).tolist() == [3, 3]
 
 
-@pytest.mark.parametrize("make", [chain, integer_chain])
-def test_the_networkx_graph_holds_populations_and_projections(make):
-    graph = to_networkx(make(np.full((2, 3), 2), np.full((4, 2), 2)))
-    assert dict(graph.nodes(data="neurons")) == {"input": 3, "fc1": 2, "fc2": 4}
-    assert list(graph.edges(data="synapses")) == [("input", "fc1", 6), ("fc1", "fc2", 8)]
-    assert nx.dag_longest_path_length(nx.DiGraph(graph)) == 2
-
-
-@given(integer_networks())
-def test_the_networkx_graph_counts_every_synapse(network):
-    graph = to_networkx(network)
-    assert sum(n for *_, n in graph.edges(data="synapses")) == sum(p.weight.nnz for p in network.projections)
-    graph.remove_edges_from(list(nx.selfloop_edges(graph, keys=True)))
-    longest = nx.dag_longest_path_length(nx.DiGraph(graph), weight=None)
-    assert max(depths(network)) == longest - 1
-
-
 # --- printed form
 
 
@@ -250,3 +233,9 @@ def test_every_array_of_a_netlist_shows_in_its_text(field):
     changed = getattr(netlist, field).copy()
     changed[len(changed) // 2] += 1
     assert netlist_text(replace(netlist, **{field: changed})) != netlist_text(netlist)
+
+
+@given(integer_networks())
+def test_depths_are_the_longest_paths(network):
+    graph = nx.DiGraph((p.pre, p.post) for p in network.projections if p.pre != p.post)
+    assert max(depths(network)) == nx.dag_longest_path_length(graph) - 1

@@ -11,7 +11,7 @@ from random_networks import BITS, LOIHI, chain, float_networks, moved, recording
 from spikeloom.compiler import Recipe
 from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX
 from spikeloom.compiler.invariants import verify
-from spikeloom.compiler.ir import Form
+from spikeloom.compiler.ir import Form, one_sided
 from spikeloom.compiler.passes.calibrate import calibrate
 from spikeloom.compiler.range_proof import prove_ranges
 from spikeloom.compiler.targets.loihi1.storage.compensate import compensated
@@ -21,10 +21,11 @@ from spikeloom.compiler.targets.loihi1.storage.scales import (
     finest_thresholds,
     flips,
     group_by_fineness,
+    layer_of,
     planes_from,
     rounded,
 )
-from spikeloom.compiler.targets.loihi1.storage.weight_storage import one_sided_sums, round_population
+from spikeloom.compiler.targets.loihi1.storage.weight_storage import round_population
 
 LOIHI_EXPONENTS = LOIHI.choices["synapse.exponent"]
 
@@ -75,10 +76,10 @@ def test_the_finest_thresholds_are_legal_and_hardly_more_is(network, bits, plane
     exponents = planes_from(0, bits, planes, LOIHI_EXPONENTS)
     for post, population in enumerate(network.populations):
         projections = tuple(p for p in network.projections if p.post == post)
-        finest = finest_thresholds(population, projections, bits, exponents, 1.0, None)
+        finest = finest_thresholds(layer_of(network, post), bits, exponents)
         form = Form(bits=bits, exponents=exponents, threshold=np.maximum(finest, 1))
         _, integer = round_population(population, projections, form)
-        assert np.all((one_sided_sums(integer, population.size) <= ONE_STEP_SUM_MAX)[finest > 0])
+        assert np.all((np.maximum(*one_sided(integer, population.size)) <= ONE_STEP_SUM_MAX)[finest > 0])
 
 
 @settings(deadline=None, max_examples=30)
@@ -125,7 +126,8 @@ def test_errors_cancel_on_the_recordings(seed):
     calibration = calibrate(network, np.repeat(cause, 4, axis=2) & (rng.random((6, 60, 48)) < 0.9))
     population, projections = network.populations[0], network.projections
     form = Form(bits=4, exponents=(0,), threshold=np.full(16, 200))
-    nearest, other = rounded(population, projections, form), compensated(population, projections, form, 0, calibration)
+    layer = layer_of(network, 0)
+    nearest, other = rounded(layer, form), compensated(layer, form, calibration)
 
     def error(layer):
         weight = sum(p.effective().toarray() for p in layer.projections) - projections[0].weight.toarray() * 400
@@ -141,7 +143,7 @@ def test_compensation_is_kept_only_where_it_keeps_spikes():
     integer, (choice,) = quantize(network, LOIHI, recipes=(Recipe(bits=3),), calibration=calibration)
     assert choice.flips == moved(integer, calibration)
     form = Form(bits=3, exponents=(choice.exponent,), threshold=integer.populations[0].threshold)
-    nearest = int(flips(rounded(network.populations[0], network.projections, form), 0, calibration).sum())
+    nearest = int(flips(rounded(layer_of(network, 0), form), 0, calibration).sum())
     assert choice.flips < nearest if choice.compensated else choice.flips == nearest
 
 
@@ -150,7 +152,7 @@ def test_a_neuron_that_would_overflow_is_rounded_to_nearest():
     rng = np.random.default_rng(0)
     network = chain(np.abs(rng.normal(0, 0.1, (4, 300))))
     calibration = calibrate(network, rng.random((4, 50, 300)) < 0.3)
-    population, projections = network.populations[0], network.projections
-    finest = finest_thresholds(population, projections, 8, (-1, 6), 1.0, None)
-    layer = compensated(population, projections, Form(bits=8, exponents=(-1, 6), threshold=finest), 0, calibration)
-    assert ONE_STEP_SUM_MAX * 0.99 < layer.reached <= ONE_STEP_SUM_MAX
+    layer = layer_of(network, 0)
+    finest = finest_thresholds(layer, 8, (-1, 6))
+    stored = compensated(layer, Form(bits=8, exponents=(-1, 6), threshold=finest), calibration)
+    assert ONE_STEP_SUM_MAX * 0.99 < stored.reached <= ONE_STEP_SUM_MAX

@@ -134,10 +134,10 @@ def test_what_does_not_fit_the_chip_is_not_built():
 def test_a_width_without_a_scale_is_left_out_for_its_layer(monkeypatch):
     _, network, events, labels = drawn(8)
 
-    def no_two(network, post, recipe, *rest):
-        if recipe.bits == 2 or post == unusable:
-            raise ModelError(f"layer {post}: no scale at {recipe.bits} bits")
-        return shortlist(network, post, recipe, *rest)
+    def no_two(layer, recipe, *rest):
+        if recipe.bits == 2 or layer.post == unusable:
+            raise ModelError(f"layer {layer.post}: no scale at {recipe.bits} bits")
+        return shortlist(layer, recipe, *rest)
 
     unusable = None
     monkeypatch.setattr(width_search, "shortlist", no_two)

@@ -7,8 +7,9 @@ become finer. Left out on request only: neurons that did not fire on the trainin
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +23,11 @@ Mask = npt.NDArray[np.bool_]
 
 Masks = tuple[Mask, ...]
 """Some neurons of each population."""
+
+Known = dict[int, Mask]
+"""Neurons that are known to do nothing, by population; the channels of the input under ``INPUT``."""
+
+Net = TypeVar("Net", Network, IntegerNetwork)
 
 FLOAT32_ROUNDING = 2.0**-23
 """Relative error of one float32 operation, doubled: the float model is silent in that precision and order too."""
@@ -60,29 +66,25 @@ def never_fires(network: Network) -> Masks:
     A neuron that has not fired holds at most ``sum(positive weights) + bias``, added up by the leak, where a current
     that outlasts its step has added up the weights already.
     """
-    silent: dict[int, Mask] = {INPUT: np.zeros(network.input.size, np.bool_)}
+    silent: Known = {INPUT: np.zeros(network.input.size, np.bool_)}
     for post in range(len(network.populations)):
-
-        def judge(own: Mask, post: int = post) -> Mask:
-            return _never_fires(network, post, silent | {post: own})
-
-        silent[post] = _grown(network, post, judge)
+        _grow(network, post, silent, _never_fires)
     return _without_voters(network, tuple(silent[post] for post in range(len(network.populations))))
 
 
-def _grown(network: Network | IntegerNetwork, post: int, judge: Callable[[Mask], Mask]) -> Mask:
-    """Neurons of a population that `judge` finds to do nothing, given those of them that are known to do nothing.
+def _grow(network: Net, post: int, known: Known, judge: Callable[[Net, int, Known], Mask]) -> None:
+    """Let `judge` say which neurons of a population do nothing, given what is known to do nothing.
 
-    What it finds is known from then on, until nothing more is found; at once where the population is not recurrent.
+    What it finds is known from then on; of a recurrent population it may lead to more.
     """
-    found = judge(np.zeros(network.populations[post].size, np.bool_))
+    known[post] = np.zeros(network.populations[post].size, np.bool_)
+    known[post] = judge(network, post, known)
     if any(p.pre == p.post == post for p in network.projections):
-        while not np.array_equal(found, more := judge(found)):
-            found = more
-    return found
+        while not np.array_equal(known[post], more := judge(network, post, known)):
+            known[post] = more
 
 
-def _never_fires(network: Network, post: int, silent: Mapping[int, Mask]) -> Mask:
+def _never_fires(network: Network, post: int, silent: Known) -> Mask:
     """Neurons of one population that cannot fire as long as those that are known to be silent do not."""
     population = network.populations[post]
     up, total = np.zeros(population.size), np.abs(population.bias)
@@ -150,29 +152,21 @@ def removable(network: IntegerNetwork) -> tuple[Masks, Masks]:
     silent, unreceived : tuple of (neurons,) bool
         One mask per population; no neuron is in both.
     """
-    silent: dict[int, Mask] = {INPUT: np.zeros(network.input.size, np.bool_)}
+    silent: Known = {INPUT: np.zeros(network.input.size, np.bool_)}
     for post in range(len(network.populations)):
-
-        def judge(own: Mask, post: int = post) -> Mask:
-            return _silent(network, post, silent | {post: own})
-
-        silent[post] = _grown(network, post, judge)
-    unreceived: dict[int, Mask] = {}
+        _grow(network, post, silent, _silent)
+    unreceived: Known = {}
     for pre in reversed(range(len(network.populations))):
         if pre == network.readout.population:
             silent[pre] = np.zeros(network.populations[pre].size, np.bool_)
-
-        def deaf(own: Mask, pre: int = pre) -> Mask:
-            return _unreceived(network, pre, silent, unreceived | {pre: own})
-
-        unreceived[pre] = _grown(network, pre, deaf)
+        _grow(network, pre, unreceived, lambda net, at, known: _unreceived(net, at, known, silent))
         if np.all(silent[pre] | unreceived[pre]):
             silent[pre][0] = unreceived[pre][0] = False
     indices = range(len(network.populations))
     return tuple(silent[i] for i in indices), tuple(unreceived[i] for i in indices)
 
 
-def _silent(network: IntegerNetwork, post: int, silent: Mapping[int, Mask]) -> Mask:
+def _silent(network: IntegerNetwork, post: int, silent: Known) -> Mask:
     """Neurons of one population that cannot fire as long as those that are known to be silent do not."""
     population = network.populations[post]
     up = np.zeros(population.size)
@@ -184,7 +178,7 @@ def _silent(network: IntegerNetwork, post: int, silent: Mapping[int, Mask]) -> M
     return _cannot_reach(population, up * (1 << MEMBRANE_SHIFT))
 
 
-def _unreceived(network: IntegerNetwork, pre: int, silent: Mapping[int, Mask], unreceived: Mapping[int, Mask]) -> Mask:
+def _unreceived(network: IntegerNetwork, pre: int, unreceived: Known, silent: Known) -> Mask:
     """Neurons of one population, not silent, without a vote or a synapse to one that is neither."""
     received = np.full(network.populations[pre].size, pre == network.readout.population)
     for p in network.projections:

@@ -39,20 +39,8 @@ _NOT_MODELLED = {"loihi2": "not modelled; no public per-event energies"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Target:
-    """A chip: integer limits, permitted values, named energy and time tables, static power by source (of a chip).
-
-    `cores` is ``COMPARTMENTS`` or ``CROSSBARS``; only the first have choices and time tables.
-    """
-
-    name: str
-    title: str
-    limits: Mapping[str, Quantity]
-    choices: Mapping[str, tuple[int, ...]]
-    energy: tuple[EnergyTable, ...]
-    time: tuple[TimeTable, ...]
-    static: Mapping[str, Quantity]
-    cores: str = COMPARTMENTS
+class Target(Numbers):
+    """A chip: its numbers, and how a network is compiled for it."""
 
     def limit(self, rule: str) -> int:
         """Largest amount that `rule`, for example ``core.axons_in``, allows."""

@@ -56,16 +56,19 @@ Faults = list[str]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Numbers:
-    """What a file says about a chip, see :class:`base.Target`."""
+    """What a file says about a chip: integer limits, permitted values, named energy and time tables, static power.
+
+    `cores` is ``COMPARTMENTS`` or ``CROSSBARS``; only the first have choices and time tables.
+    """
 
     name: str
     title: str
-    cores: str
     limits: Mapping[str, Quantity]
     choices: Mapping[str, tuple[int, ...]]
     energy: tuple[EnergyTable, ...]
     time: tuple[TimeTable, ...]
     static: Mapping[str, Quantity]
+    cores: str = COMPARTMENTS
 
 
 def read_numbers(path: str | os.PathLike[str]) -> Numbers:

@@ -19,9 +19,9 @@ from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.layout.core_needs import (
     Chunk,
     Lists,
+    Needs,
     choose_dense,
     index_bits,
-    lean_fits,
     lists_into,
 )
 from spikeloom.compiler.targets.loihi1.layout.partition import Partition
@@ -138,7 +138,7 @@ def emit(
     formats: dict[tuple[int, int, int], int] = {}
     axons_per_core = np.zeros(len(partition.cores), np.int64)
     parts: dict[str, list[npt.NDArray[Any]]] = {key: [] for key in ("source", "format", "length", "target", "weight")}
-    lean = [lean_fits(network, target, chunks) for chunks in partition.cores]
+    lean = [Needs(network, target).lean(chunks) for chunks in partition.cores]
     for chunk, core, base in placed:
         for lists in lists_into(network, chunk):
             projection = network.projections[lists.projection]

@@ -103,7 +103,7 @@ def read_netlist(path: str | os.PathLike[str]) -> Netlist:
         If it cannot be read.
     """
     path = Path(path)
-    manifest, members = read_archive(path, FORMAT, (VERSION,), ARRAYS)
+    manifest, members = read_archive(path, FORMAT, (VERSION,), lambda _: ARRAYS)
     if faults := _type_faults(manifest, members):
         raise FormatError(f"{path}: {'; '.join(faults)}; compile it again")
     if manifest["target"] not in known_targets(COMPARTMENTS):

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from itertools import product
 from pathlib import Path
@@ -25,9 +25,7 @@ from spikeloom.compiler.archive import (
     Array,
     archive_bytes,
     entry_faults,
-    read_manifest,
-    read_members,
-    require_whole,
+    read_archive,
     stated_format,
     write_archive,
 )
@@ -133,13 +131,14 @@ def read_trained(path: str | os.PathLike[str], *, weights: str | None = None) ->
     if not path.is_file():
         found = "is not a file" if path.exists() else "no such file"
         raise ModelError(f"{path}: {found}; make one with spikeloom train")
-    try:
-        members = read_members(path)
-        manifest = read_manifest(path, members, FORMAT, VERSIONS)
-        wrong = _kind_faults(manifest)
-        if wrong:
+
+    def names(manifest: Mapping[str, Any]) -> Iterable[str]:
+        if wrong := _kind_faults(manifest):
             raise ModelError(f"{path}: {'; '.join(wrong)}; {_AGAIN}")
-        require_whole(path, members, _names(manifest))
+        return _names(manifest)
+
+    try:
+        manifest, members = read_archive(path, FORMAT, VERSIONS, names)
     except FormatError as error:
         raise ModelError(f"{path}: damaged, altered or of another version ({_core(path, error)}); {_AGAIN}") from error
     sets = tuple(name for name in WEIGHTS if name in manifest["weights"])

@@ -84,7 +84,7 @@ def read_crossbars(path: str | os.PathLike[str]) -> CrossbarNetlist:
         If it cannot be read.
     """
     path = Path(path)
-    manifest, members = read_archive(path, FORMAT, VERSIONS, ARRAYS)
+    manifest, members = read_archive(path, FORMAT, VERSIONS, lambda _: ARRAYS)
     wrong = _kind_faults(manifest, members)
     if not wrong and manifest["target"] not in known_targets(CROSSBARS):
         wrong = [f"it is for {manifest['target']!r}, known are {', '.join(known_targets(CROSSBARS))}"]

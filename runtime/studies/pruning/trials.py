@@ -21,8 +21,7 @@ from spikeloom.compiler.ir import Form, IntegerNetwork
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.passes.prune import deaf_to
 from spikeloom.compiler.targets.base import load_target
-from spikeloom.compiler.targets.loihi1.storage.quantize import incoming
-from spikeloom.compiler.targets.loihi1.storage.scales import rounded
+from spikeloom.compiler.targets.loihi1.storage.scales import layer_of, rounded
 from spikeloom.models.recordings.events import join_bins
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.machines.loihi1 import engine
@@ -205,7 +204,7 @@ def without_hops(
         exponents=tuple(sorted({p.exponent for p in planes})),
         threshold=np.maximum(integer.populations[0].threshold, 1),
     )
-    layer = rounded(network.populations[0], incoming(network, 0), form)
+    layer = rounded(layer_of(network, 0), form)
     if layer is None or layer.reached > ONE_STEP_SUM_MAX:
         return None
     return replace(integer, projections=(*layer.projections, *(p for p in integer.projections if p.post != 0)))

@@ -212,8 +212,3 @@ class Needs:
         """Charge the sources of chunks with these."""
         for pre, axons in self.source_axons(chunks).items():
             self.out_axons[pre] += axons
-
-
-def lean_fits(network: IntegerNetwork, target: Target, chunks: tuple[Chunk, ...]) -> bool:
-    """Whether a core still holds its chunks when lists prefer few visited synapses to few words."""
-    return Needs(network, target).lean(chunks)

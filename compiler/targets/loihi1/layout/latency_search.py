@@ -16,7 +16,7 @@ from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.targets.loihi1.layout.core_needs import Chunk
 from spikeloom.compiler.targets.loihi1.layout.forecast import Core, Forecast
-from spikeloom.compiler.targets.loihi1.layout.partition import chunks_of, cut, order_on_core, spread
+from spikeloom.compiler.targets.loihi1.layout.partition import chunks_of, cut, cut_layer, order_on_core
 
 SHORTER = 0.9
 """Each time that the search cuts for is this share of the one before."""
@@ -122,7 +122,7 @@ class _Search:
         key = population, least, sha256(needs.out_axons[population].tobytes()).digest()
         if key not in self._cuts:
             try:
-                chunks, _ = spread(needs, population, least)
+                chunks, _ = cut_layer(needs, population, least)
             except OptionError:
                 chunks = []
             self._cuts[key] = None

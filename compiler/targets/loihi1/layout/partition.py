@@ -59,21 +59,28 @@ Cut = tuple[list[Chunk], list[Violation]]
 """Chunks of a population, or why one of its neurons fits no core."""
 
 
-def fill(needs: Needs, population: int) -> Cut:
-    """Cut one population greedily into chunks that fit an empty core; or say why one neuron does not."""
-    return _charged(needs, population, lambda: _fill(needs, population))
+def cut_layer(needs: Needs, population: int, least: int | None = None) -> Cut:
+    """Cut one population into full chunks, or as evenly as possible into at least `least`; or say why it cannot be.
 
+    A recurrent one is cut until its neurons have output axons for its own chunks, too; finer chunks need more.
 
-def _charged(needs: Needs, population: int, again: Callable[[], Cut]) -> Cut:
-    """Cut a population until its neurons have output axons for its own chunks, too; finer chunks need more."""
+    Raises
+    ------
+    OptionError
+        If it needs more than `least` chunks.
+    """
+
+    def once() -> Cut:
+        return _fill(needs, population) if least is None else _spread(needs, population, least)
+
     if not any(projection.pre == projection.post == population for projection in needs.network.projections):
-        return again()
+        return once()
     others = needs.out_axons[population]
     charged = np.zeros_like(others)
     try:
         while True:
             needs.out_axons[population] = others + charged
-            chunks, why = again()
+            chunks, why = once()
             own = needs.source_axons(chunks).get(population, charged)
             if why or np.all(own <= charged):
                 return chunks, why
@@ -181,11 +188,6 @@ def _pack(needs: Needs, chunks: list[Chunk], traffic: Callable[[Chunk, Chunk], f
     return best
 
 
-def spread(needs: Needs, population: int, least: int) -> Cut:
-    """Cut one population as evenly as possible into at least so many chunks that fit an empty core; or say why not."""
-    return _charged(needs, population, lambda: _spread(needs, population, least))
-
-
 def _spread(needs: Needs, population: int, least: int) -> Cut:
     name, size = needs.network.populations[population].name, needs.network.populations[population].size
     for parts in range(least, size + 1):
@@ -218,7 +220,7 @@ def cut(needs: Needs, least: Mapping[int, int]) -> list[Chunk]:
     violations: list[Violation] = []
     needs.forget()
     for population in reversed(range(len(needs.network.populations))):
-        found, why = spread(needs, population, least[population]) if population in least else fill(needs, population)
+        found, why = cut_layer(needs, population, least.get(population))
         violations = why + violations
         chunks += found
         needs.listen(found)

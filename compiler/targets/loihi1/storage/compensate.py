@@ -18,10 +18,10 @@ from scipy import sparse
 from scipy.linalg import solve_triangular
 
 from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX, FloatArray, IntArray, reach, step_units
-from spikeloom.compiler.ir import Form, Population, Projection
+from spikeloom.compiler.ir import Form
 from spikeloom.compiler.passes.calibrate import Calibration
-from spikeloom.compiler.targets.loihi1.storage.scales import Rounded, flips
-from spikeloom.compiler.targets.loihi1.storage.weight_storage import loads, scales, store
+from spikeloom.compiler.targets.loihi1.storage.scales import FloatLayer, Rounded, flips
+from spikeloom.compiler.targets.loihi1.storage.weight_storage import scales, store
 
 DAMPING = 1e-3
 """Share of the mean activity that is added to each input's own: inputs that never spiked are rounded to nearest."""
@@ -30,20 +30,14 @@ BLOCK = 64
 """Columns whose errors are passed on to all later ones at once: the same sums, as one matrix product."""
 
 
-def compensated(
-    population: Population,
-    projections: tuple[Projection, ...],
-    form: Form,
-    post: int,
-    calibration: Calibration,
-    observed: FloatArray | None = None,
-) -> Rounded | None:
+def compensated(layer: FloatLayer, form: Form, calibration: Calibration) -> Rounded | None:
     """Round one population with compensation; None where a bias has no register value.
 
     Weights that the range cuts off stay at its end: their errors are not passed on. A neuron whose sums would leave
     the accumulator, or that keeps fewer of its spikes (one that fires from its bias alone, say), is rounded to
-    nearest instead. `observed` as for :func:`scales.rounded`.
+    nearest instead.
     """
+    population, projections, post = layer.population, layer.projections, layer.post
     scale, step = scales(population, form), step_units(form.bits, form.exponents)
     offset, width = 0, sum(p.weight.shape[1] for p in projections)
     wanted, stored = np.zeros((2, population.size, width))
@@ -72,19 +66,19 @@ def compensated(
             integer, planes = store(population, projections, form, [steps[place] for place in places], bias)
         except ValueError:
             return None
-        sums = loads(integer, planes) if observed is None else observed * scale
-        return Rounded(form=form, population=integer, projections=planes, reached=float(np.max(sums, initial=0)))
+        reached = float(np.max(layer.sums(integer, planes), initial=0))
+        return Rounded(form=form, population=integer, projections=planes, reached=reached)
 
     nearest = np.rint(held).astype(np.int64)
     plain = stored_as(nearest, np.zeros(population.size))
     errors = (held - steps) @ rate * step / scale
     errors[population.size - population.relays :] = 0  # a relay has no bias
-    layer = stored_as(steps, errors)
-    if layer is None or plain is None:
+    found = stored_as(steps, errors)
+    if found is None or plain is None:
         return None
-    back = flips(layer, post, calibration) > flips(plain, post, calibration)
-    if observed is None:
-        back |= loads(layer.population, layer.projections) > ONE_STEP_SUM_MAX
+    back = flips(found, post, calibration) > flips(plain, post, calibration)
+    if layer.observed is None:
+        back |= layer.sums(found.population, found.projections) > ONE_STEP_SUM_MAX
     steps[back], errors[back] = nearest[back], 0
     return stored_as(steps, errors)
 

@@ -14,14 +14,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from spikeloom.compiler.errors import ModelError, OptionError
-from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX, FloatArray, decay_registers, reach, step_units
+from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX, decay_registers, reach, step_units
 from spikeloom.compiler.interpret import run_integer
-from spikeloom.compiler.ir import Form, IntegerNetwork, Network, Population, Projection, row_parts
+from spikeloom.compiler.ir import Form, IntegerNetwork, Network, Population, row_parts
 from spikeloom.compiler.passes.calibrate import MANY, Calibration, fewer
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.options import MARGIN, RANGES, Recipe, check_recipes
 from spikeloom.compiler.targets.loihi1.storage.compensate import compensated
-from spikeloom.compiler.targets.loihi1.storage.scales import Rounded, candidate, flips, grouped, observed_sums, rounded
+from spikeloom.compiler.targets.loihi1.storage.scales import (
+    FloatLayer,
+    Rounded,
+    candidate,
+    flips,
+    grouped,
+    layer_of,
+    observed_sums,
+    rounded,
+)
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import current_load
 
 CLIPPING = tuple(2 ** (k / 4) for k in range(21))
@@ -86,33 +95,17 @@ class Candidate:
     compensated: bool = False
 
 
-def incoming(network: Network, post: int) -> tuple[Projection, ...]:
-    """Projections into a population."""
-    return tuple(p for p in network.projections if p.post == post)
-
-
 def _register(population: Population) -> str:
     """Register that the sums of a population fill first."""
-    full = current_load(decay_registers(population.beta, population.alpha)[0]) > 1
-    return "current" if full else "accumulator"
+    return "current" if current_load(decay_registers(population.beta, population.alpha)[0]) > 1 else "accumulator"
 
 
-def _current_words(population: Population) -> str:
-    if _register(population) == "accumulator":
-        return ""
-    return f" and its current, of which a step keeps {population.alpha:g}, within its register"
+def _moved(stored: Rounded, layer: FloatLayer) -> int | None:
+    """Calibration spikes that differ from float64; None without calibration."""
+    return None if layer.calibration is None else int(flips(stored, layer.post, layer.calibration).sum())
 
 
-def shortlist(
-    network: Network,
-    post: int,
-    recipe: Recipe,
-    exponents: tuple[int, ...],
-    calibration: Calibration | None,
-    observed: FloatArray | None,
-    *,
-    clip: bool = True,
-) -> list[Candidate]:
+def shortlist(layer: FloatLayer, recipe: Recipe, exponents: tuple[int, ...], *, clip: bool = True) -> list[Candidate]:
     """Scales of one population worth a closer look, best first; a single one without calibration.
 
     Without `clip` every weight must fit its planes.
@@ -122,51 +115,48 @@ def shortlist(
     ModelError
         If there is none.
     """
-    population, projections = network.populations[post], incoming(network, post)
-    factors = CLIPPING if clip and calibration is not None and recipe.planes == 1 else (1.0,)
-    fitted = [candidate(population, projections, recipe.bits, recipe.planes, f, exponents, observed) for f in factors]
+    population = layer.population
+    factors = CLIPPING if clip and layer.calibration is not None and recipe.planes == 1 else (1.0,)
+    fitted = [candidate(layer, recipe, factor, exponents) for factor in factors]
     # one scale at two exponents is two candidates: mantissas and clipping differ
     found = list({(c.form.exponents, int(c.form.threshold[0])): c for c in fitted if c is not None}.values())
     if not found:
+        register = _register(population)
+        lasting = f" and its current, of which a step keeps {population.alpha:g}, within its register"
         raise ModelError(
             f"{population.name}: no scale at {recipe.bits} bits keeps its threshold of at least one unit within the "
-            f"accumulator ({ONE_STEP_SUM_MAX} units a step){_current_words(population)}; use more bits or smaller "
-            "weights"
+            f"accumulator ({ONE_STEP_SUM_MAX} units a step){lasting if register == 'current' else ''}; use more bits "
+            "or smaller weights"
         )
-    if calibration is None:
-        counted = [Candidate(layer=found[0], flips=None, tried=1)]
-    else:
-        counted = [Candidate(layer=c, flips=int(flips(c, post, calibration).sum()), tried=len(found)) for c in found]
-        counted.sort(key=lambda c: c.flips or 0)
+    counted = [Candidate(layer=stored, flips=_moved(stored, layer), tried=len(found)) for stored in found]
+    counted.sort(key=_fewest)
     if recipe.groups > 1:
-        best = grouped(population, projections, post, counted[0].layer, recipe.groups, factors, calibration, observed)
-        if best is not None:
-            moved = None if calibration is None else int(flips(best, post, calibration).sum())
-            counted.insert(0, Candidate(layer=best, flips=moved, tried=counted[0].tried))
-            counted.sort(key=lambda c: c.flips or 0)
-            counted = counted[:1]
-    if calibration is not None:
-        form, tried = counted[0].layer.form, counted[0].tried
-        other = compensated(population, projections, form, post, calibration, observed)
-        moved = None if other is None else int(flips(other, post, calibration).sum())
-        if other is not None and moved is not None and moved < (counted[0].flips or 0):
-            counted.insert(0, Candidate(layer=other, flips=moved, tried=tried, compensated=True))
-    worst = SHORTLIST_RATIO * (counted[0].flips or 0)
-    return [c for c in counted[:SHORTLIST] if (c.flips or 0) <= worst]
+        several = grouped(layer, counted[0].layer, recipe.groups, factors[-1])
+        if several is not None:
+            several_scales = replace(counted[0], layer=several, flips=_moved(several, layer))
+            counted = [min(several_scales, counted[0], key=_fewest)]
+    if layer.calibration is not None:
+        other = compensated(layer, counted[0].layer.form, layer.calibration)
+        if other is not None and (moved := _moved(other, layer) or 0) < _fewest(counted[0]):
+            counted.insert(0, replace(counted[0], layer=other, flips=moved, compensated=True))
+    return [c for c in counted[:SHORTLIST] if _fewest(c) <= SHORTLIST_RATIO * _fewest(counted[0])]
 
 
-def round_with_more(
-    network: Network, post: int, candidate: Candidate, calibration: Calibration, observed: FloatArray | None = None
-) -> Candidate:
+def _fewest(candidate: Candidate) -> int:
+    return candidate.flips or 0
+
+
+def round_with_more(layer: FloatLayer, candidate: Candidate, calibration: Calibration) -> Candidate:
     """Let the errors of a layer cancel on ``MANY`` recordings at the storage that was chosen on ``FEW``.
 
     What keeps fewer spikes there is dropped.
     """
     many = fewer(calibration, MANY)
-    layer = compensated(network.populations[post], incoming(network, post), candidate.layer.form, post, many, observed)
-    if layer is None or flips(layer, post, many).sum() > flips(candidate.layer, post, many).sum():
+    stored = compensated(layer, candidate.layer.form, many)
+    if stored is None or flips(stored, layer.post, many).sum() > flips(candidate.layer, layer.post, many).sum():
         return candidate
-    return replace(candidate, layer=layer, flips=int(flips(layer, post, fewer(many)).sum()), compensated=True)
+    moved = int(flips(stored, layer.post, fewer(many)).sum())
+    return replace(candidate, layer=stored, flips=moved, compensated=True)
 
 
 def settle(network: Network, shortlists: list[list[Candidate]], calibration: Calibration) -> list[Candidate]:
@@ -195,12 +185,12 @@ def assemble(network: Network, layers: Sequence[Rounded]) -> IntegerNetwork:
     )
 
 
-def explain_choice(network: Network, post: int, chosen: Candidate, calibration: Calibration | None) -> Choice:
+def explain_choice(layer: FloatLayer, chosen: Candidate) -> Choice:
     """Say what was chosen for a population."""
     form, scale = chosen.layer.form, chosen.layer.population.scale
+    held = reach(form.bits, form.exponents) * step_units(form.bits, form.exponents)
     clipped = zeroed = weights = 0
-    for p in incoming(network, post):
-        held = reach(form.bits, form.exponents) * step_units(form.bits, form.exponents)
+    for p in layer.projections:
         planes = [plane for plane in chosen.layer.projections if plane.pre == p.pre]
         for rows in row_parts(p.weight):
             weight = p.weight[rows]
@@ -211,7 +201,7 @@ def explain_choice(network: Network, post: int, chosen: Candidate, calibration: 
             units = np.abs(weight.data) * np.repeat(scale[rows], np.diff(weight.indptr))
             clipped += int(np.count_nonzero(units > held * (1 + 1e-12)))
     return Choice(
-        layer=network.populations[post].name,
+        layer=layer.population.name,
         bits=form.bits,
         planes=len({p.exponent for p in chosen.layer.projections}),
         groups=len(np.unique(form.threshold)),
@@ -224,7 +214,7 @@ def explain_choice(network: Network, post: int, chosen: Candidate, calibration: 
         compensated=chosen.compensated,
         candidates=chosen.tried,
         flips=chosen.flips,
-        spikes=None if calibration is None else int(np.count_nonzero(calibration.spikes[post])),
+        spikes=None if layer.calibration is None else int(np.count_nonzero(layer.calibration.spikes[layer.post])),
         headroom=1 - chosen.layer.reached / ONE_STEP_SUM_MAX,
     )
 
@@ -278,16 +268,13 @@ def quantize(
         raise OptionError("--ranges observed: nothing was observed; give --calibrate, or use --ranges proven")
     exponents = target.choices["synapse.exponent"]
     few = None if calibration is None else fewer(calibration)
-    limits: list[FloatArray | None] = [None] * len(recipes)
+    layers = [layer_of(network, post, few) for post in range(len(recipes))]
     if ranges == "observed" and few is not None:
-        limits = [
-            observed_sums(population, incoming(network, post), post, few) * (1 + margin)
-            for post, population in enumerate(network.populations)
-        ]
+        layers = [replace(layer, observed=observed_sums(layer, few) * (1 + margin)) for layer in layers]
     shortlists, faults = [], []
-    for post, (recipe, observed) in enumerate(zip(recipes, limits, strict=True)):
+    for layer, recipe in zip(layers, recipes, strict=True):
         try:
-            shortlists.append(shortlist(network, post, recipe, exponents, few, observed))
+            shortlists.append(shortlist(layer, recipe, exponents))
         except ModelError as error:
             faults.append(str(error))
     if faults:
@@ -295,12 +282,9 @@ def quantize(
     if calibration is None or few is None:
         chosen = [candidates[0] for candidates in shortlists]
     else:
-        chosen = settle(network, shortlists, few)
-        chosen = [
-            candidate if recipe.planes == 1 else round_with_more(network, post, candidate, calibration, observed)
-            for post, (candidate, recipe, observed) in enumerate(zip(chosen, recipes, limits, strict=True))
-        ]
-    choices = tuple(explain_choice(network, post, c, few) for post, c in enumerate(chosen))
+        settled = zip(layers, settle(network, shortlists, few), recipes, strict=True)
+        chosen = [c if recipe.planes == 1 else round_with_more(layer, c, calibration) for layer, c, recipe in settled]
+    choices = tuple(map(explain_choice, layers, chosen))
     return assemble(network, [c.layer for c in chosen]), choices
 
 
@@ -314,13 +298,13 @@ def round_to_forms(
     ModelError
         If a bias has no register value, or the accumulator may overflow.
     """
+    layers = [layer_of(network, post, calibration) for post in range(len(network.populations))]
     chosen = []
-    for post, (population, form) in enumerate(zip(network.populations, forms, strict=True)):
-        layer = rounded(population, incoming(network, post), form)
-        if layer is None or layer.reached > ONE_STEP_SUM_MAX:
-            what = "a bias has no register value" if layer is None else f"the {_register(population)} may overflow"
-            raise ModelError(f"{population.name}: at the scale that it was fine-tuned for, {what}; fine-tune it again")
-        moved = None if calibration is None else int(flips(layer, post, calibration).sum())
-        chosen.append(Candidate(layer=layer, flips=moved, tried=1))
-    choices = tuple(explain_choice(network, post, c, calibration) for post, c in enumerate(chosen))
-    return assemble(network, [c.layer for c in chosen]), choices
+    for layer, form in zip(layers, forms, strict=True):
+        stored, name = rounded(layer, form), layer.population.name
+        if stored is None or stored.reached > ONE_STEP_SUM_MAX:
+            overflow = f"the {_register(layer.population)} may overflow"
+            what = "a bias has no register value" if stored is None else overflow
+            raise ModelError(f"{name}: at the scale that it was fine-tuned for, {what}; fine-tune it again")
+        chosen.append(Candidate(layer=stored, flips=_moved(stored, layer), tried=1))
+    return assemble(network, [c.layer for c in chosen]), tuple(map(explain_choice, layers, chosen))

@@ -27,8 +27,9 @@ from spikeloom.compiler.fixedpoint import (
     weight_step,
 )
 from spikeloom.compiler.interpret import BATCH, integer_recurrence, integer_sums, lasting_currents, product
-from spikeloom.compiler.ir import Form, IntegerPopulation, IntegerProjection, Population, Projection, Sparse
+from spikeloom.compiler.ir import Form, IntegerPopulation, IntegerProjection, Network, Population, Projection, Sparse
 from spikeloom.compiler.passes.calibrate import Calibration
+from spikeloom.compiler.targets.loihi1.options import Recipe
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import loads, round_population
 
 WORTHWHILE = 0.95
@@ -40,6 +41,45 @@ SCALE_STEPS = 1024
 
 LEVELS = 24
 """Thresholds that are tried on the calibration recordings where neurons are grouped by the spikes that they keep."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FloatLayer:
+    """One population with the synapses into it, and what is known of its activity.
+
+    Parameters
+    ----------
+    post : int
+        Its index in the network.
+    calibration : Calibration, optional
+        Spikes of the float model.
+    observed : (neurons,) float64, optional
+        Largest sums that were observed, membrane units, see :func:`observed_sums`; without it the proven ones count.
+    """
+
+    population: Population
+    projections: tuple[Projection, ...]
+    post: int
+    calibration: Calibration | None = None
+    observed: FloatArray | None = None
+
+    def sums(self, integer: IntegerPopulation, planes: tuple[IntegerProjection, ...]) -> FloatArray:
+        """Largest one-sided sum of one step of each neuron, weight units, observed or proven; shape (neurons,)."""
+        return loads(integer, planes) if self.observed is None else self.observed * integer.scale
+
+    def peaks(self) -> FloatArray:
+        """Magnitude of the largest weight of each neuron; shape (neurons,)."""
+        peak = np.zeros(self.population.size)
+        for projection in self.projections:
+            row = np.repeat(np.arange(self.population.size), np.diff(projection.weight.indptr))
+            np.maximum.at(peak, row, np.abs(projection.weight.data))
+        return peak
+
+
+def layer_of(network: Network, post: int, calibration: Calibration | None = None) -> FloatLayer:
+    """One layer of a network."""
+    into = tuple(p for p in network.projections if p.post == post)
+    return FloatLayer(population=network.populations[post], projections=into, post=post, calibration=calibration)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -63,24 +103,16 @@ class Rounded:
     reached: float
 
 
-def rounded(
-    population: Population, projections: tuple[Projection, ...], form: Form, observed: FloatArray | None = None
-) -> Rounded | None:
-    """Round one population, or None where a bias has no register value or a relay would miss its clock.
-
-    Parameters
-    ----------
-    observed : (neurons,) float64, optional
-        Largest sums that were observed, membrane units, see :func:`observed_sums`; without it the proven ones count.
-    """
+def rounded(layer: FloatLayer, form: Form) -> Rounded | None:
+    """Round one population, or None where a bias has no register value or a relay would miss its clock."""
     try:
-        integer, planes = round_population(population, projections, form)
+        integer, planes = round_population(layer.population, layer.projections, form)
     except ValueError:
         return None
-    if population.relays and not _relays_follow(population, integer, planes):
+    if layer.population.relays and not _relays_follow(layer.population, integer, planes):
         return None
-    sums = loads(integer, planes) if observed is None else observed * integer.scale
-    return Rounded(form=form, population=integer, projections=planes, reached=float(np.max(sums, initial=0)))
+    reached = float(np.max(layer.sums(integer, planes), initial=0))
+    return Rounded(form=form, population=integer, projections=planes, reached=reached)
 
 
 def _relays_follow(population: Population, integer: IntegerPopulation, planes: tuple[IntegerProjection, ...]) -> bool:
@@ -97,21 +129,20 @@ def in_batches(calibration: Calibration, measure: Callable[[slice], IntArray | F
         return [np.asarray(part, np.float64) for part in pool.map(measure, parts)]
 
 
-def observed_sums(
-    population: Population, projections: tuple[Projection, ...], post: int, calibration: Calibration
-) -> FloatArray:
+def observed_sums(layer: FloatLayer, calibration: Calibration) -> FloatArray:
     """Largest one-sided sum of each neuron of the float model on the calibration recordings, membrane units.
 
     A current that outlasts its step counts, too, by the share of its register that it fills.
     """
     narrower = ONE_STEP_SUM_MAX * (1 << MEMBRANE_SHIFT) / CURRENT_MAX
+    sources = [(p.weight, calibration.source(p.pre, layer.post)) for p in layer.projections]
 
     def largest(part: slice) -> FloatArray:
-        up = sum(product(p.weight.maximum(0), calibration.source(p.pre, post)[part], np.float64) for p in projections)
-        down = sum(product(p.weight.minimum(0), calibration.source(p.pre, post)[part], np.float64) for p in projections)
+        up = sum(product(weight.maximum(0), spikes[part], np.float64) for weight, spikes in sources)
+        down = sum(product(weight.minimum(0), spikes[part], np.float64) for weight, spikes in sources)
         both: FloatArray = np.maximum(np.max(up, axis=(0, 1)), -np.min(down, axis=(0, 1)))
-        if population.alpha:
-            lasting = lasting_currents(np.asarray(up + down), population.alpha)
+        if layer.population.alpha:
+            lasting = lasting_currents(np.asarray(up + down), layer.population.alpha)
             both = np.maximum(both, np.abs(lasting).max(axis=(0, 1)) * narrower)
         return both
 
@@ -149,12 +180,10 @@ def planes_from(exponent: int, bits: int, planes: int, exponents: tuple[int, ...
     return tuple(found)
 
 
-def full_scale(
-    population: Population, projections: tuple[Projection, ...], bits: int, planes: tuple[int, ...]
-) -> float:
+def full_scale(layer: FloatLayer, bits: int, planes: tuple[int, ...]) -> float:
     """Mantissa units per membrane unit at which the planes just hold the largest weight."""
-    peak = max(float(np.abs(p.weight.data).max(initial=0)) for p in projections)
-    return reach(bits, planes) * weight_step(bits) / peak if peak else 1.0 / population.theta
+    peak = float(layer.peaks().max(initial=0))
+    return reach(bits, planes) * weight_step(bits) / peak if peak else 1.0 / layer.population.theta
 
 
 def _largest_threshold(population: Population) -> float:
@@ -164,44 +193,37 @@ def _largest_threshold(population: Population) -> float:
     return min(THRESHOLD_MANTISSA_MAX, bias_limit * population.theta / bias_peak if bias_peak else np.inf)
 
 
-def fit(
-    population: Population,
-    projections: tuple[Projection, ...],
-    bits: int,
-    mantissa_scale: float,
-    exponents: tuple[int, ...],
-    observed: FloatArray | None,
-) -> Rounded | None:
+def fit(layer: FloatLayer, bits: int, exponents: tuple[int, ...], mantissa_scale: float) -> Rounded | None:
     """Population with the finest scale up to `mantissa_scale` that stays within the accumulator.
 
     A threshold is a whole number of weight units. Only scales at which it is one exactly are tried, so it carries
     no rounding at all; that costs at most one unit of scale in ``theta * scale``. Rounded weights, and so their sum,
     never shrink when the scale grows: the finest scale (to one part in ``SCALE_STEPS``) is closed in from both sides.
     """
+    population = layer.population
 
     def tried(units: int) -> tuple[Rounded | None, float]:
-        form = Form(bits=bits, exponents=exponents, threshold=np.full(population.size, units, np.int64))
-        layer = rounded(population, projections, form, observed)
+        threshold = np.full(population.size, units, np.int64)
+        found = rounded(layer, Form(bits=bits, exponents=exponents, threshold=threshold))
         # None: a bias that rounds just out of its register, or a relay whose clipped weight no longer reaches
-        return layer, np.inf if layer is None else layer.reached
+        return found, np.inf if found is None else found.reached
 
     high = int(min(population.theta * mantissa_scale * 2.0 ** exponents[0], _largest_threshold(population)))
     if high < 1:
         return None
-    layer, reached = tried(high)
-    if reached <= ONE_STEP_SUM_MAX and layer is not None:
-        return layer
-    low, best, over = 0, None, reached
+    found, over = tried(high)
+    if over <= ONE_STEP_SUM_MAX:
+        return found
+    low, under, best = 0, 0.0, None
     narrowed = True
     while high - low > max(1, low // SCALE_STEPS):
         # in proportion as long as that narrows well, else in the middle: sums of few coarse weights grow in leaps
-        under = best.reached if best is not None else 0.0
         share = (ONE_STEP_SUM_MAX - under) / (over - under) if narrowed and np.isfinite(over) else 0.5
         units = min(max(low + int(share * (high - low)), low + 1), high - 1)
         before = high - low
-        layer, reached = tried(units)
-        if layer is not None and reached <= ONE_STEP_SUM_MAX:
-            low, best = units, layer
+        found, reached = tried(units)
+        if reached <= ONE_STEP_SUM_MAX:
+            low, under, best = units, reached, found
         else:
             high, over = units, reached
         narrowed = not narrowed or 2 * (high - low) <= before
@@ -213,15 +235,7 @@ def mantissa_scale(layer: Rounded) -> float:
     return float(layer.population.scale.min()) / 2.0 ** layer.form.exponents[0]
 
 
-def candidate(
-    population: Population,
-    projections: tuple[Projection, ...],
-    bits: int,
-    planes: int,
-    factor: float,
-    exponents: tuple[int, ...],
-    observed: FloatArray | None,
-) -> Rounded | None:
+def candidate(layer: FloatLayer, recipe: Recipe, factor: float, exponents: tuple[int, ...]) -> Rounded | None:
     """Best compromise between a fine weight scale and a fine threshold, see ``WORTHWHILE``.
 
     `factor` says how far the scale may exceed the one that just holds the largest weight; the rest is clipped.
@@ -229,9 +243,8 @@ def candidate(
     chosen: Rounded | None = None
     finest = 0.0
     for exponent in sorted(exponents):
-        stored = planes_from(exponent, bits, planes, exponents)
-        scale = full_scale(population, projections, bits, stored) * factor
-        fitted = fit(population, projections, bits, scale, stored, observed)
+        stored = planes_from(exponent, recipe.bits, recipe.planes, exponents)
+        fitted = fit(layer, recipe.bits, stored, full_scale(layer, recipe.bits, stored) * factor)
         if fitted is None and chosen is None:
             continue  # the threshold is less than a unit, a larger exponent makes it more
         if fitted is None or mantissa_scale(fitted) < WORTHWHILE * finest:
@@ -244,14 +257,7 @@ def candidate(
 # -- a scale for each group of neurons ---------------------------------------------------------------------------------
 
 
-def finest_thresholds(
-    population: Population,
-    projections: tuple[Projection, ...],
-    bits: int,
-    exponents: tuple[int, ...],
-    factor: float,
-    observed: FloatArray | None,
-) -> IntArray:
+def finest_thresholds(layer: FloatLayer, bits: int, exponents: tuple[int, ...], factor: float = 1.0) -> IntArray:
     """Largest threshold of each neuron that accumulator and registers allow, and `factor` beyond its largest weight.
 
     Returns
@@ -259,21 +265,16 @@ def finest_thresholds(
     (neurons,) int64
         0 where there is none.
     """
-    peak = np.zeros(population.size)
-    for projection in projections:
-        row = np.repeat(np.arange(population.size), np.diff(projection.weight.indptr))
-        np.maximum.at(peak, row, np.abs(projection.weight.data))
+    population = layer.population
     with np.errstate(divide="ignore"):
-        held = population.theta * reach(bits, exponents) * step_units(bits, exponents) * factor / peak
+        held = population.theta * reach(bits, exponents) * step_units(bits, exponents) * factor / layer.peaks()
     high = np.minimum(held, _largest_threshold(population)).astype(np.int64) + 1  # one more than allowed
     low = np.zeros(population.size, np.int64)
     while np.any(high - low > np.maximum(1, low // SCALE_STEPS)):
         middle = (low + high + 1) // 2
         middle = np.where(high - low > 1, middle, np.maximum(low, 1))
         form = Form(bits=bits, exponents=exponents, threshold=np.maximum(middle, 1))
-        integer, planes = round_population(population, projections, form)
-        sums = loads(integer, planes) if observed is None else observed * integer.scale
-        good = sums <= ONE_STEP_SUM_MAX
+        good = layer.sums(*round_population(population, layer.projections, form)) <= ONE_STEP_SUM_MAX
         low, high = np.where(good & (high - low > 1), middle, low), np.where(good | (high - low <= 1), high, middle)
     return low
 
@@ -348,49 +349,30 @@ def choose_levels(cost: FloatArray, groups: int) -> IntArray:
     return np.array(sorted(set(picked)))
 
 
-def grouped(
-    population: Population,
-    projections: tuple[Projection, ...],
-    post: int,
-    uniform: Rounded,
-    groups: int,
-    clipping: tuple[float, ...],
-    calibration: Calibration | None,
-    observed: FloatArray | None,
-) -> Rounded | None:
+def grouped(layer: FloatLayer, uniform: Rounded, groups: int, factor: float) -> Rounded | None:
     """Population with up to `groups` thresholds, stored with the width and planes of a `uniform` one.
 
     With several planes, or without calibration, neurons are grouped by the finest threshold that each allows; else
-    by the calibration spikes that each keeps under ``LEVELS`` thresholds. None where some neurons relay clocks: these
-    bind the threshold of all.
+    by the calibration spikes that each keeps under ``LEVELS`` thresholds, clipped up to `factor`. None where some
+    neurons relay clocks: these bind the threshold of all.
     """
-    if population.relays:
+    if layer.population.relays:
         return None
-    form = uniform.form
-    finest = finest_thresholds(population, projections, form.bits, form.exponents, clipping[-1], observed)
-    floor = int(uniform.form.threshold[0])
-    finest = np.maximum(finest, floor)
-    if calibration is None or len(form.exponents) > 1:
-        exact = finest_thresholds(population, projections, form.bits, form.exponents, 1.0, observed)
-        threshold = group_by_fineness(np.maximum(exact, floor), groups)
+    bits, exponents, floor = uniform.form.bits, uniform.form.exponents, int(uniform.form.threshold[0])
+    unclipped = finest_thresholds(layer, bits, exponents)
+    if layer.calibration is None or len(exponents) > 1:
+        threshold = group_by_fineness(np.maximum(unclipped, floor), groups)
     else:
-        unclipped = finest_thresholds(population, projections, form.bits, form.exponents, 1.0, observed)
+        finest = np.maximum(finest_thresholds(layer, bits, exponents, factor), floor)
         bottom = min(floor, int(unclipped.min()))
         ladder = np.unique(np.geomspace(max(bottom, 1), finest.max(), LEVELS).astype(np.int64))
-        cost = np.empty((population.size, len(ladder)))
+        cost = np.empty((layer.population.size, len(ladder)))
         for column, level in enumerate(ladder):
-            layer = rounded(
-                population,
-                projections,
-                Form(bits=form.bits, exponents=form.exponents, threshold=np.minimum(level, finest)),
-                observed,
-            )
-            assert layer is not None, "finest thresholds hold every bias"
-            cost[:, column] = np.where(level <= finest, flips(layer, post, calibration), np.inf)
+            stored = rounded(layer, Form(bits=bits, exponents=exponents, threshold=np.minimum(level, finest)))
+            assert stored is not None, "finest thresholds hold every bias"
+            cost[:, column] = np.where(level <= finest, flips(stored, layer.post, layer.calibration), np.inf)
         picked = choose_levels(cost, groups)
         # among equals the finest, which is the last
         best = len(picked) - 1 - np.argmin(cost[:, picked][:, ::-1], axis=1)
         threshold = ladder[picked][best]
-    return rounded(
-        population, projections, Form(bits=form.bits, exponents=form.exponents, threshold=threshold), observed
-    )
+    return rounded(layer, Form(bits=bits, exponents=exponents, threshold=threshold))

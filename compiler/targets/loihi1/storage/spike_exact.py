@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from spikeloom.compiler.fixedpoint import THRESHOLD_MANTISSA_MAX, IntArray, decay_registers, reach, step_units
 from spikeloom.compiler.interpret import float_recurrence, product
@@ -22,11 +23,10 @@ from spikeloom.compiler.targets.loihi1.storage.quantize import (
     Choice,
     assemble,
     explain_choice,
-    incoming,
     round_with_more,
     shortlist,
 )
-from spikeloom.compiler.targets.loihi1.storage.scales import finest_thresholds, flips, in_batches
+from spikeloom.compiler.targets.loihi1.storage.scales import FloatLayer, finest_thresholds, flips, in_batches, layer_of
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import current_load
 
 SHARED = 0.8
@@ -103,73 +103,70 @@ def make_exact(
     exponents = target.choices["synapse.exponent"]
     few = fewer(calibration)
     chosen, found = [], []
-    for post, population in enumerate(network.populations):
-        tell(population.name)
+    layers = [layer_of(network, post, few) for post in range(len(network.populations))]
+    for layer in layers:
+        tell(layer.population.name)
         best: Candidate | None = None
         tried: list[tuple[int, int, int]] = []
         for recipe in ladder:
-            if recipe.planes > 2 and best is not None and not len(_full_range(network, post, best)):
+            if recipe.planes > 2 and best is not None and not _full_range(layer, best).any():
                 break  # the planes hold every weight already
-            candidate = shortlist(network, post, recipe, exponents, few, None, clip=False)[0]
+            candidate = shortlist(layer, recipe, exponents, clip=False)[0]
             moved = candidate.flips or 0
             tried.append((recipe.planes, recipe.groups, moved))
             if best is None or moved <= (best.flips or 0):
                 best = candidate
-            if not moved and not flips(candidate.layer, post, calibration).any():
+            if not moved and not flips(candidate.layer, layer.post, calibration).any():
                 break
         assert best is not None, "the ladder has steps"
         if best.flips:
-            best = round_with_more(network, post, best, calibration)
-        moved_by = flips(best.layer, post, calibration)
+            best = round_with_more(layer, best, calibration)
+        moved_by = flips(best.layer, layer.post, calibration)
         chosen.append(replace(best, flips=int(moved_by.sum())))
         found.append(
             Exactness(
-                layer=population.name,
+                layer=layer.population.name,
                 tried=tuple(tried),
-                spikes=int(np.count_nonzero(calibration.spikes[post])),
+                spikes=int(np.count_nonzero(calibration.spikes[layer.post])),
                 flips=int(moved_by.sum()),
-                limits=_limits(network, post, best, moved_by, slots) if moved_by.any() else (),
-                decay=_decay_flips(network, post, calibration) if moved_by.any() else 0,
+                limits=_limits(layer, best, moved_by, slots) if moved_by.any() else (),
+                decay=_decay_flips(layer, calibration) if moved_by.any() else 0,
             )
         )
-    choices = tuple(explain_choice(network, post, c, calibration) for post, c in enumerate(chosen))
+    on_all = [replace(layer, calibration=calibration) for layer in layers]
+    choices = tuple(map(explain_choice, on_all, chosen))
     return assemble(network, [c.layer for c in chosen]), choices, tuple(found)
 
 
-def _full_range(network: Network, post: int, candidate: Candidate) -> IntArray:
-    """Neurons whose largest weight fills the planes."""
+def _full_range(layer: FloatLayer, candidate: Candidate) -> npt.NDArray[np.bool_]:
+    """Whether the largest weight of each neuron fills the planes; shape (neurons,)."""
     form, scale = candidate.layer.form, candidate.layer.population.scale
-    peak = np.zeros(len(scale))
-    for p in incoming(network, post):
-        row = np.repeat(np.arange(len(scale)), np.diff(p.weight.indptr))
-        np.maximum.at(peak, row, np.abs(p.weight.data) * scale[row])
-    steps = peak / step_units(form.bits, form.exponents)
-    return np.flatnonzero(steps >= AT_LIMIT * reach(form.bits, form.exponents))
+    steps = layer.peaks() * scale / step_units(form.bits, form.exponents)
+    full: npt.NDArray[np.bool_] = steps >= AT_LIMIT * reach(form.bits, form.exponents)
+    return full
 
 
-def _limits(
-    network: Network, post: int, candidate: Candidate, moved: IntArray, slots: int
-) -> tuple[tuple[str, int], ...]:
+def _limits(layer: FloatLayer, candidate: Candidate, moved: IntArray, slots: int) -> tuple[tuple[str, int], ...]:
     form = candidate.layer.form
-    population, projections = network.populations[post], incoming(network, post)
-    finest = finest_thresholds(population, projections, form.bits, form.exponents, 1.0, None)
+    finest = finest_thresholds(layer, form.bits, form.exponents)
     fullest = "24-bit current" if current_load(candidate.layer.population.decay_u) > 1 else "21-bit accumulator"
-    cause = np.full(population.size, fullest, dtype=object)
-    cause[_full_range(network, post, candidate)] = "range of the planes"
+    cause = np.full(layer.population.size, fullest, dtype=object)
+    cause[_full_range(layer, candidate)] = "range of the planes"
     cause[form.threshold >= AT_LIMIT * THRESHOLD_MANTISSA_MAX] = "17-bit threshold"
     cause[form.threshold < SHARED * finest] = f"{slots} thresholds a core"
     counted = {str(name): int(moved[cause == name].sum()) for name in sorted(set(cause))}
     return tuple((name, count) for name, count in sorted(counted.items(), key=lambda pair: -pair[1]) if count)
 
 
-def _decay_flips(network: Network, post: int, calibration: Calibration) -> int:
-    population, projections = network.populations[post], incoming(network, post)
-    lost_u, lost_v = decay_registers(population.beta, population.alpha)
-    realised = replace(population, alpha=(4095 - lost_u) / 4096, beta=(4096 - lost_v) / 4096)
+def _decay_flips(layer: FloatLayer, calibration: Calibration) -> int:
+    """Spikes that move if nothing but the decays is rounded."""
+    lost_u, lost_v = decay_registers(layer.population.beta, layer.population.alpha)
+    realised = replace(layer.population, alpha=(4095 - lost_u) / 4096, beta=(4096 - lost_v) / 4096)
+    sources = [(p.weight, calibration.source(p.pre, layer.post)) for p in layer.projections]
 
     def moved(part: slice) -> IntArray:
-        sums = sum(product(p.weight, calibration.source(p.pre, post)[part], np.float64) for p in projections)
+        sums = sum(product(weight, spikes[part], np.float64) for weight, spikes in sources)
         spikes, _ = float_recurrence(realised, np.asarray(sums))
-        return np.asarray(np.count_nonzero(spikes != calibration.spikes[post][part]))
+        return np.asarray(np.count_nonzero(spikes != calibration.spikes[layer.post][part]))
 
     return int(np.sum(in_batches(calibration, moved)))

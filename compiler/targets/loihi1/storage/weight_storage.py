@@ -150,32 +150,13 @@ def current_load(decay_u: int) -> float:
     return max(1.0, ONE_STEP_SUM_MAX * (4096 / (decay_u + 1)) * (1 << MEMBRANE_SHIFT) / CURRENT_MAX)
 
 
-def one_sided_sums(projections: tuple[IntegerProjection, ...], neurons: int) -> IntArray:
-    """Largest one-sided synaptic sum that any input can bring to each neuron, weight units; shape (neurons,).
-
-    Planes count one by one, which covers every order of their arrival.
-    """
-    up, down = two_sums(projections, neurons)
-    return np.maximum(up, down)
-
-
-def two_sums(projections: tuple[IntegerProjection, ...], neurons: int) -> tuple[IntArray, IntArray]:
-    """Largest positive and negative synaptic sum of each neuron, as magnitudes; see :func:`one_sided_sums`."""
-    up, down = np.zeros(neurons, np.int64), np.zeros(neurons, np.int64)
-    for projection in projections:
-        positive, negative = one_sided(projection)
-        up += positive
-        down += negative
-    return up, down
-
-
 def loads(population: IntegerPopulation, projections: tuple[IntegerProjection, ...]) -> FloatArray:
     """One-sided sums, or more where a current that outlasts its step fills a register sooner; shape (neurons,).
 
     What is within ``ONE_STEP_SUM_MAX`` overflows neither accumulator nor current, whatever the input. Nor does it
     saturate a membrane, unless that keeps more than half of itself: the scale would then be too coarse.
     """
-    up, down = two_sums(projections, population.size)
+    up, down = one_sided(projections, population.size)
     worst = np.maximum(up, down).astype(np.float64)
     if population.decay_u == FORGETS:
         return worst

@@ -24,6 +24,7 @@ from spikeloom.compiler.targets.loihi1.layout.core_needs import Needs
 from spikeloom.compiler.targets.loihi1.layout.partition import partition
 from spikeloom.compiler.targets.loihi1.options import Recipe, check_recipes
 from spikeloom.compiler.targets.loihi1.storage.quantize import Candidate, assemble, settle, shortlist
+from spikeloom.compiler.targets.loihi1.storage.scales import layer_of
 
 Widths = tuple[int, ...]
 """Storage width of each layer."""
@@ -228,7 +229,7 @@ def _offers(network: Network, target: Target, widths: Widths, groups: int, calib
         for bits in reversed(widths):
             try:
                 recipe = Recipe(bits=bits, groups=groups)
-                offer[bits] = shortlist(network, post, recipe, exponents, calibration, None)
+                offer[bits] = shortlist(layer_of(network, post, calibration), recipe, exponents)
             except ModelError as error:
                 faults.append(error)
         if not offer:
