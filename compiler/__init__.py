@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from spikeloom.compiler.ir import IntegerNetwork, Network
     from spikeloom.compiler.passes.expand import Factored
+    from spikeloom.compiler.targets.loihi1.alike import store_alike
     from spikeloom.compiler.targets.loihi1.compilation import Compilation
     from spikeloom.compiler.targets.loihi1.lift import lift
     from spikeloom.compiler.targets.loihi1.netlist import Netlist
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     )
     from spikeloom.compiler.targets.loihi1.passes import lay_out_again, store, without
     from spikeloom.compiler.targets.loihi1.storage.quantize import round_to_forms
+    from spikeloom.compiler.targets.loihi1.storage.scales import layer_of, rounded
     from spikeloom.compiler.targets.loihi1.storage.width_search import (
         WidthPoint,
         WidthSearch,
@@ -46,11 +48,14 @@ __all__ = [
     "check_widths",
     "compile_network",
     "lay_out_again",
+    "layer_of",
     "lift",
     "read_netlist",
     "round_to_forms",
+    "rounded",
     "search_widths",
     "store",
+    "store_alike",
     "widths_front",
     "without",
     "write_netlist",
@@ -72,11 +77,14 @@ _PLACES = {
     "check_recipes": "options",
     "check_widths": "storage.width_search",
     "lay_out_again": "passes",
+    "layer_of": "storage.scales",
     "lift": "lift",
     "read_netlist": "netlist_file",
     "round_to_forms": "storage.quantize",
+    "rounded": "storage.scales",
     "search_widths": "storage.width_search",
     "store": "passes",
+    "store_alike": "alike",
     "widths_front": "storage.width_search",
     "without": "passes",
     "write_netlist": "netlist_file",

@@ -14,6 +14,7 @@ from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.fixedpoint import decay_registers
 from spikeloom.compiler.formats.checkpoint import read_checkpoint
 from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.targets.loihi1.alike import unplaced
 from spikeloom.models.graphs import normalised_adjacency
 from spikeloom.runtime.equivalence import float_engine
 from spikeloom.runtime.machines.loihi1 import engine, spec
@@ -230,13 +231,13 @@ def test_windows_that_open_late_are_those_of_the_specification():
 @pytest.mark.parametrize("recipe", [None, (Recipe(planes=2),), (Recipe(bits=4),)])
 def test_an_unplaced_netlist_spikes_as_the_placed_one(recipe):
     pair = made(recipe=recipe)
-    flat = other_networks.unplaced(lift(pair.netlist), pair.netlist)
+    flat = unplaced(lift(pair.netlist), pair.netlist)
     events = inputs(pair)
-    placed, unplaced = (engine.simulate(netlist, events) for netlist in (pair.netlist, flat))
+    placed, other = (engine.simulate(netlist, events) for netlist in (pair.netlist, flat))
     for post in range(len(flat.layers)):
         ids, others = pair.netlist.compartments_of(post), flat.compartments_of(post)
         ours = placed.counts.spikes[:, ids]
-        assert_array_equal(ours, unplaced.counts.spikes[:, others][:, pair.netlist.neuron[ids]])
+        assert_array_equal(ours, other.counts.spikes[:, others][:, pair.netlist.neuron[ids]])
         assert ours.any()
     assert_array_equal(engine.simulate(flat, events[:1], spikes=True).spikes[0], spec.simulate(flat, events[0]).spikes)
 

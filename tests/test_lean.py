@@ -47,8 +47,7 @@ def compiled(tmp_path_factory):
     """A small network, what it was compiled to, and training recordings."""
     checkpoint, adjacency = small_checkpoint(tmp_path_factory.mktemp("small"), last=weights(3, gain=2.5))
     compilation = compile_network(expand(checkpoint, adjacency), Options(training_events=_recordings(1, 24)))
-    flat = _recordings(1, 24).reshape(24, -1, STEPS)
-    seen = trials.Scene(flat=flat, labels=np.arange(24) % CLASSES, lengths=None)
+    seen = trials.Scene(events=_recordings(1, 24), labels=np.arange(24) % CLASSES, lengths=None)
     return checkpoint, adjacency, compilation, seen
 
 
@@ -63,7 +62,7 @@ def trial(compilation, seen, allowed):
 
 
 def counts(netlist, seen):
-    return engine.simulate(netlist, seen.flat).counts.spikes
+    return engine.simulate(netlist, seen.events.reshape(len(seen.events), -1, STEPS)).counts.spikes
 
 
 def test_text(spikeloom, golden):
@@ -124,9 +123,9 @@ def test_silenced_is_as_if_it_were_gone(compiled):
     netlist, whole = compilation.netlist, trial(compilation, seen, 0)
     taxels = np.array([1, 4])
     silent = trials.silenced(netlist, trials.sources_of(netlist, taxels))
-    quiet = seen.flat.copy()
-    quiet[:, [2, 3, 8, 9]] = 0
-    assert_array_equal(counts(silent, seen), engine.simulate(netlist, quiet).counts.spikes)
+    quiet = seen.events.copy()
+    quiet[:, taxels] = 0
+    assert_array_equal(counts(silent, seen), counts(netlist, replace(seen, events=quiet)))
     deaf = replace(whole, integer=trials.without_taxels(compilation.integer, netlist, taxels)).built()
     assert_array_equal(trials.decisions(deaf, seen), trials.decisions(silent, seen))
     for layer in range(4):
@@ -227,12 +226,12 @@ def test_bisection_finds_the_longest_beginning():
 def test_joined_bins():
     netlist = chain()
     seen = trials.Scene(
-        flat=np.array([[[1, 0, 0, 0, 1], [0, 1, 1, 0, 0]]], np.uint8), labels=np.array([0]), lengths=np.array([5])
+        events=np.array([[[[1, 0, 0, 0, 1], [0, 1, 1, 0, 0]]]], np.uint8), labels=np.array([0]), lengths=np.array([5])
     )
-    joined = trials.coarser(seen, netlist, 2)
-    assert joined.flat.tolist() == [[[1, 0, 1], [1, 1, 0]]]
+    joined = trials.coarser(seen, 2)
+    assert joined.events.tolist() == [[[[1, 0, 1], [1, 1, 0]]]]
     assert joined.lengths.tolist() == [3]
-    assert trials.coarser(seen, netlist, 4).flat.tolist() == [[[1, 1], [1, 0]]]
+    assert trials.coarser(seen, 4).events.tolist() == [[[[1, 1], [1, 0]]]]
     slow = trials.coarse_netlist(netlist, 2, adapted=True)
     assert slow.decay_v.tolist() == [round(4096 * (1 - (819 / 4096) ** 2))] * 3
     assert slow.decay_u.tolist() == [4095] * 3

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import numpy.typing as npt
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.fixedpoint import FloatArray, IntArray
@@ -95,6 +96,22 @@ class IntegerMachine(Machine):
         """Least steps from one spike to the next of each neuron that votes, whatever its input; 0 if it never spikes.
 
         In the order of ``readout_class``; after :data:`LONGEST` steps nothing is looked for any more.
+        """
+
+    @abstractmethod
+    def spike_counts(self, events: EventArray, lengths: IntArray | None) -> IntArray:
+        """Spikes of each neuron that the chip holds, in the order of the netlist; (samples, neurons)."""
+
+    @abstractmethod
+    def packed(self, channels: EventArray, lengths: IntArray) -> tuple[npt.NDArray[np.uint64], IntArray]:
+        """Spikes at a bit each, (samples, chip steps, words), and membranes that were clipped, (samples,), on a thread.
+
+        Bits are in the order of the netlist's neurons; channels (samples, channels, steps) include the clocks.
+
+        Raises
+        ------
+        NumericRangeError
+            If a register overflows in any recording.
         """
 
     @abstractmethod

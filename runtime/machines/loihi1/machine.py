@@ -171,6 +171,17 @@ class Loihi(IntegerMachine):
 
         return cumulative.least_intervals(self.netlist)
 
+    def spike_counts(self, events: EventArray, lengths: IntArray | None) -> IntArray:
+        """Those of compartments."""
+        channels = with_clocks(events, self.netlist.clocks)
+        return engine.simulate(self._engine, channels, lengths=lengths).counts.spikes
+
+    def packed(self, channels: EventArray, lengths: IntArray) -> tuple[npt.NDArray[np.uint64], IntArray]:
+        """Bits by compartment, as the engine packs them."""
+        trace = engine.simulate(self._engine, channels, lengths=lengths, packed=True, threads=1)
+        assert trace.packed is not None, "packed spikes were wanted"
+        return trace.packed, trace.counts.saturations.sum(axis=1)
+
     def page_parts(self, events: EventArray, *, lengths: IntArray | None, bin_s: float) -> BatchParts:
         """Costs with figures, and cores on the mesh."""
         from spikeloom.runtime.machines.loihi1.costs import page

@@ -94,8 +94,8 @@ def _candidate(
     forms = None if loaded.checkpoint is None else loaded.checkpoint.forms
     compilation = compile_network(loaded.network, Options(forms=forms, training_events=training.events))
     netlist = compilation.netlist
-    decided, cost = priced(netlist, scene(training, netlist))
-    decided_test, cost_test = priced(netlist, scene(test, netlist))
+    decided, cost = priced(netlist, scene(training))
+    decided_test, cost_test = priced(netlist, scene(test))
     return Candidate(
         costs=cost_test,
         name=path,
@@ -129,8 +129,8 @@ class _Whole:
         self, loaded: LoadedNetwork, compilation: Compilation, training: Recordings, test: Recordings, allowed: int
     ) -> None:
         self.loaded, self.compilation, self.netlist = loaded, compilation, compilation.netlist
-        self.training, self.test = scene(training, self.netlist), scene(test, self.netlist)
-        self.spikes = spikes_of(self.netlist, self.training).sum(axis=0)
+        self.training, self.test = scene(training), scene(test)
+        self.spikes = spikes_of(self.netlist, self.training)
         self.wanted, self.wanted_test = decisions(self.netlist, self.training), decisions(self.netlist, self.test)
         self.strict = Trial(
             compilation=compilation,
@@ -226,7 +226,7 @@ class _Whole:
         """Join bins, with the decays as they are and with those of as many steps."""
         for bins in BINS:
             progress(f"{bins} bins joined")
-            scenes = coarser(self.training, self.netlist, bins), coarser(self.test, self.netlist, bins)
+            scenes = coarser(self.training, bins), coarser(self.test, bins)
             for adapted, how in ((False, "decays as they are"), (True, "decays of as many steps")):
                 netlist = coarse_netlist(self.netlist, bins, adapted=adapted)
                 yield self._left(f"{bins} bins joined, {how}", Removed(bins=bins), netlist, scenes)
@@ -242,7 +242,7 @@ class _Whole:
         taxels = trial.spare_taxels(built, self.changed)
         trial = replace(trial, integer=without_taxels(trial.integer, built, taxels))
         built = trial.built()
-        spared = trial.spare_neurons(built, spikes_of(built, self.training).sum(axis=0))
+        spared = trial.spare_neurons(built, spikes_of(built, self.training))
         removed = Removed(hops=hops or None, taxels=_numbers(taxels), neurons=_by_layer(built, spared))
         return self._left(f"together, {_allowed(trial)}", removed, trial.built(spared, built), offered=True)
 
@@ -261,9 +261,7 @@ class _Whole:
 
     def taxels(self) -> tuple[TaxelUse, ...]:
         """Events of each taxel and what its absence changes."""
-        netlist = self.netlist
-        sensor = self.training.flat[:, : netlist.taxels * netlist.polarities]
-        events = sensor.reshape(len(sensor), netlist.taxels, -1).sum(axis=(0, 2), dtype=np.int64)
+        events = self.training.events.sum(axis=(0, 2, 3), dtype=np.int64)
         return tuple(
             TaxelUse(events=count, training_differ=here, test_differ=there)
             for count, here, there in zip(

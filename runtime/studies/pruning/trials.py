@@ -12,55 +12,52 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from spikeloom.compiler import Compilation, Netlist, without
+from spikeloom.compiler import Compilation, Netlist, layer_of, rounded, without
 from spikeloom.compiler.checkpoint import Checkpoint
-from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.fixedpoint import DECAY_BITS, ONE_STEP_SUM_MAX, FloatArray, IntArray, read_only
 from spikeloom.compiler.interpret import BoolArray
 from spikeloom.compiler.ir import Form, IntegerNetwork
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.passes.prune import deaf_to
-from spikeloom.compiler.targets.base import load_target
-from spikeloom.compiler.targets.loihi1.storage.scales import layer_of, rounded
 from spikeloom.models.recordings.events import join_bins
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.runtime.machines.loihi1 import engine
-from spikeloom.runtime.machines.loihi1.costs.estimate import estimate
-from spikeloom.runtime.machines.votes import predictions
+from spikeloom.runtime.machines.base import EventArray, machine_of
+from spikeloom.runtime.machines.integer import integer_machine_of
 from spikeloom.runtime.studies.pruning.results import Costs
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Scene:
-    """Recordings of a split as channels of a network (samples, n_inputs, T), clocks among them."""
+    """Recordings of a split, (samples, taxels, polarities, T), and the data steps of each where some are shorter."""
 
-    flat: engine.EventArray
+    events: EventArray
     labels: IntArray
     lengths: IntArray | None
 
 
-def scene(data: Recordings, netlist: Netlist) -> Scene:
-    """Recordings as the input of a netlist."""
-    return Scene(flat=with_clocks(data.events, netlist.clocks), labels=data.labels, lengths=data.lengths)
+def scene(data: Recordings) -> Scene:
+    """Recordings as they are."""
+    return Scene(events=data.events, labels=data.labels, lengths=data.lengths)
 
 
 def spikes_of(netlist: Netlist, of: Scene) -> IntArray:
-    """Spikes of each compartment in each recording; (samples, compartments)."""
-    return engine.simulate(netlist, of.flat, lengths=of.lengths).counts.spikes
+    """Spikes of each compartment in all recordings; (compartments,)."""
+    spikes: IntArray = integer_machine_of(netlist).spike_counts(of.events, of.lengths).sum(axis=0)
+    return spikes
 
 
 def decisions(netlist: Netlist, of: Scene) -> IntArray:
     """Class of each recording."""
-    return predictions(netlist, spikes_of(netlist, of))
+    return machine_of(netlist).run(of.events, lengths=of.lengths).decisions
 
 
 def priced(netlist: Netlist, of: Scene) -> tuple[IntArray, Costs]:
     """Class of each recording, and what an inference costs."""
-    counts, found = estimate(netlist, load_target(netlist.target), of.flat, lengths=of.lengths)
-    return predictions(netlist, counts.spikes), Costs(
-        operations=float(found.costs.synaptic_operations.sum(axis=1).mean()),
-        energy_j={name: float(each.sum(axis=1).mean()) for name, each in found.costs.energy.items()},
-        time_s={name: float(each.duration_ns.sum(axis=1).mean() * 1e-9) for name, each in found.simple.items()},
+    run, price = machine_of(netlist).price(of.events, bin_s=1.0, lengths=of.lengths)  # at full speed, whatever the pace
+    return run.decisions, Costs(
+        operations=float(price.synaptic_operations.mean()),
+        energy_j={name: float(each.mean()) for name, each in price.energy_j.items()},
+        time_s={name: float(each.mean()) for name, each in price.time_s.items()},
         cores=netlist.n_cores,
         neurons=netlist.n_compartments,
         synapses=netlist.n_synapses,
@@ -152,8 +149,7 @@ class Trial:
 
     def spare_taxels(self, netlist: Netlist, alone: IntArray) -> IntArray:
         """Taxels that may go together; those first without which, `alone`, fewest decisions change."""
-        touched = self.training.flat[:, : netlist.taxels * netlist.polarities].sum(axis=(0, 2), dtype=np.int64)
-        events = touched.reshape(netlist.taxels, netlist.polarities).sum(axis=1)
+        events = self.training.events.sum(axis=(0, 2, 3), dtype=np.int64)
         order = np.lexsort((events, alone))
         return most_spared(
             order,
@@ -177,14 +173,12 @@ def without_taxels(integer: IntegerNetwork, netlist: Netlist, taxels: IntArray) 
 
 def changed_alone(netlist: Netlist, of: Scene, wanted: IntArray) -> IntArray:
     """Decisions that change without each taxel; shape (taxels,)."""
-    prepared, changed = engine.prepare(netlist), np.zeros(netlist.taxels, np.int64)
+    machine, changed = machine_of(netlist), np.zeros(netlist.taxels, np.int64)
     for taxel in range(netlist.taxels):
-        channels = slice(taxel * netlist.polarities, (taxel + 1) * netlist.polarities)
-        if of.flat[:, channels].any():
-            without_it = of.flat.copy()
-            without_it[:, channels] = 0
-            counts = engine.simulate(prepared, without_it, lengths=of.lengths).counts
-            changed[taxel] = np.count_nonzero(predictions(netlist, counts.spikes) != wanted)
+        if of.events[:, taxel].any():
+            without_it = of.events.copy()
+            without_it[:, taxel] = 0
+            changed[taxel] = np.count_nonzero(machine.run(without_it, lengths=of.lengths).decisions != wanted)
     return changed
 
 
@@ -210,17 +204,10 @@ def without_hops(
     return replace(integer, projections=(*layer.projections, *(p for p in integer.projections if p.post != 0)))
 
 
-def coarser(of: Scene, netlist: Netlist, bins: int) -> Scene:
+def coarser(of: Scene, bins: int) -> Scene:
     """Bins joined to longer ones: an event wherever there was one in any of them."""
-    n_sensor = netlist.taxels * netlist.polarities
-    joined = join_bins(of.flat[:, :n_sensor], bins)
     lengths = None if of.lengths is None else -(-of.lengths // bins)
-    clocks = coarse_netlist(netlist, bins, adapted=False).clocks
-    return Scene(
-        flat=with_clocks(joined.reshape(len(joined), netlist.taxels, netlist.polarities, -1), clocks),
-        labels=of.labels,
-        lengths=lengths,
-    )
+    return Scene(events=join_bins(of.events, bins), labels=of.labels, lengths=lengths)
 
 
 def coarse_netlist(netlist: Netlist, bins: int, *, adapted: bool) -> Netlist:

@@ -10,91 +10,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from spikeloom.compiler import Netlist
-from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX, IntArray, round_half_even
-from spikeloom.compiler.ir import (
-    Form,
-    IntegerNetwork,
-    IntegerPopulation,
-    IntegerProjection,
-    Network,
-    Population,
-    Projection,
-)
-from spikeloom.compiler.targets.base import load_target
-from spikeloom.compiler.targets.loihi1.emit import emit
-from spikeloom.compiler.targets.loihi1.layout.core_needs import Chunk
-from spikeloom.compiler.targets.loihi1.layout.partition import Partition
-from spikeloom.compiler.targets.loihi1.storage.weight_storage import loads, round_population
+from spikeloom.compiler import store_alike
+from spikeloom.compiler.fixedpoint import IntArray
+from spikeloom.compiler.ir import Network, Projection
 from spikeloom.runtime.studies.stress.pair import Pair
 
 
 def stored_alike(pair: Pair, network: Network, *, coarser: int = 1) -> Pair:
-    """Another float network of the same sizes, stored as the netlist stores its own.
-
-    Widths, exponents and thresholds are the netlist's, weights are rounded to the nearest; a neuron that the netlist
-    does not hold gets its layer's median threshold. With `coarser` scales, and thresholds with them, are so many times
-    smaller; so they are where a register could overflow otherwise.
-
-    Raises
-    ------
-    OptionError
-        If a bias has no register value at this scale.
-    """
-    netlist = pair.netlist
-    filled = np.flatnonzero(np.diff(netlist.axon_synapses))
-    listener = netlist.layer[netlist.synapse_compartment()[netlist.axon_synapses[filled]]]
-    exponents = netlist.format_exponent[netlist.axon_format[filled]]
-    populations, projections = list[IntegerPopulation](), list[IntegerProjection]()
-    for post, (population, layer) in enumerate(zip(network.populations, netlist.layers, strict=True)):
-        ids = netlist.compartments_of(post)
-        threshold = np.full(layer.neurons, round(float(np.median(netlist.threshold[ids]))))
-        threshold[netlist.neuron[ids]] = netlist.threshold[ids]
-        threshold = np.maximum(round_half_even(threshold / coarser), 1)
-        used = tuple(sorted(set(exponents[listener == post].tolist()))) or (0,)
-        form = Form(bits=layer.weight_bits, exponents=used, threshold=threshold)
-        into = tuple(projection for projection in network.projections if projection.post == post)
-        try:
-            integer, planes = _fitted(population, into, form)
-        except ValueError as error:
-            raise OptionError(f"{population.name}: {error}; omit this perturbation") from error
-        populations.append(integer)
-        projections += planes
-    whole = IntegerNetwork(
-        input=network.input,
-        populations=tuple(populations),
-        projections=tuple(projections),
-        readout=network.readout,
-        classes=network.classes,
-    )
-    return Pair(netlist=unplaced(whole, netlist), network=network)
-
-
-def _fitted(
-    population: Population, into: tuple[Projection, ...], form: Form
-) -> tuple[IntegerPopulation, tuple[IntegerProjection, ...]]:
-    """Round to a form, with thresholds so much smaller that no register can overflow where one could."""
-    while True:
-        integer, planes = round_population(population, into, form)
-        fullest = float(loads(integer, planes).max(initial=0))
-        smaller = np.maximum(np.floor(form.threshold * (ONE_STEP_SUM_MAX / max(fullest, 1.0))), 1).astype(np.int64)
-        if fullest <= ONE_STEP_SUM_MAX or np.array_equal(smaller, form.threshold):
-            return integer, planes
-        form = replace(form, threshold=smaller)
-
-
-def unplaced(network: IntegerNetwork, like: Netlist) -> Netlist:
-    """A netlist to simulate, not to load: cores hold as many compartments as they can, whatever these need."""
-    target = load_target(like.target)
-    most = target.limit("core.compartments")
-    cores = tuple(
-        (Chunk(population=post, first=first, last=min(first + most, population.size)),)
-        for post, population in enumerate(network.populations)
-        for first in range(0, population.size, most)
-    )
-    partition = Partition(cores=cores, bound=len(cores))
-    return emit(network, partition, tuple(range(len(cores))), target, like.provenance)
+    """Another float network of the same sizes beside a netlist that stores it as :func:`store_alike` says."""
+    return Pair(netlist=store_alike(pair.netlist, network, coarser=coarser), network=network)
 
 
 def add_outliers(pair: Pair, factor: int, rng: np.random.Generator) -> Pair:

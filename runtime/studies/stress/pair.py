@@ -18,7 +18,7 @@ from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.ir import Network
 from spikeloom.runtime.equivalence import float_engine
-from spikeloom.runtime.machines.loihi1 import engine
+from spikeloom.runtime.machines.integer import IntegerMachine, integer_machine_of
 
 Words = npt.NDArray[np.uint64]
 
@@ -40,7 +40,7 @@ class Pair:
 class Ready:
     """A pair, prepared to run; `masks` (layers, words) uint64 has the bits of a layer's compartments."""
 
-    chip: engine.Engine
+    chip: IntegerMachine
     model: float_engine.FloatEngine
     masks: Words
 
@@ -75,7 +75,7 @@ def ready(pair: Pair) -> Ready:
     masks = np.zeros((len(netlist.layers), -(-netlist.n_compartments // 64)), np.uint64)
     ids = np.arange(netlist.n_compartments)
     np.bitwise_or.at(masks, (netlist.layer, ids // 64), np.left_shift(np.uint64(1), (ids % 64).astype(np.uint64)))
-    return Ready(chip=engine.prepare(netlist), model=float_engine.prepare(pair.network, netlist), masks=masks)
+    return Ready(chip=integer_machine_of(netlist), model=float_engine.prepare(pair.network, netlist), masks=masks)
 
 
 def evaluate(prepared: Ready, inputs: Inputs) -> Outcome:
@@ -94,24 +94,20 @@ def evaluate(prepared: Ready, inputs: Inputs) -> Outcome:
     return Outcome(votes={"float": model.votes, "chip": votes}, spikes=spikes, stopped=stopped, saturated=saturated)
 
 
-def _chip(prepared: engine.Engine, inputs: Inputs) -> tuple[Words, npt.NDArray[np.bool_], IntArray]:
+def _chip(machine: IntegerMachine, inputs: Inputs) -> tuple[Words, npt.NDArray[np.bool_], IntArray]:
     """Packed spikes, which recordings stopped the simulator, and clipped membranes."""
-
-    def simulate(part: slice) -> tuple[Words, IntArray]:
-        trace = engine.simulate(prepared, inputs.events[part], lengths=inputs.lengths[part], packed=True, threads=1)
-        assert trace.packed is not None, "packed spikes"
-        return trace.packed, trace.counts.saturations.sum(axis=1)
-
     stopped = np.zeros(len(inputs.events), np.bool_)
     try:
-        packed, saturated = simulate(slice(None))
+        packed, saturated = machine.packed(inputs.events, inputs.lengths)
     except NumericRangeError:  # by one recording at least: run them one by one
-        steps = inputs.events.shape[2] + prepared.drain
-        packed = np.zeros((len(inputs.events), steps, -(-prepared.netlist.n_compartments // 64)), np.uint64)
+        netlist = machine.netlist
+        steps = inputs.events.shape[2] + netlist.max_depth
+        packed = np.zeros((len(inputs.events), steps, -(-netlist.n_compartments // 64)), np.uint64)
         saturated = np.zeros(len(inputs.events), np.int64)
         for index in range(len(inputs.events)):
+            one = slice(index, index + 1)
             try:
-                packed[index : index + 1], saturated[index : index + 1] = simulate(slice(index, index + 1))
+                packed[one], saturated[one] = machine.packed(inputs.events[one], inputs.lengths[one])
             except NumericRangeError:
                 stopped[index] = True
     return packed, stopped, saturated
