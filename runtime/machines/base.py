@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from importlib import import_module
 from importlib.util import find_spec
@@ -65,6 +65,8 @@ class Price:
     synaptic_operations : (samples,)
     energy_j, time_s : mapping of table to (samples,) float64
         Joules and seconds of each recording.
+    time_ns : mapping of table to (samples,) float64
+        The same in nanoseconds, not rounded to seconds, where the time model counts them.
     step_s : mapping of time table to float
         Seconds of the longest data step.
     outcome : Outcome
@@ -76,6 +78,7 @@ class Price:
     time_s: Mapping[str, FloatArray]
     step_s: Mapping[str, float]
     outcome: Outcome
+    time_ns: Mapping[str, FloatArray] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
