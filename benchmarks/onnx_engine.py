@@ -22,10 +22,10 @@ import numpy as np
 import onnx
 import onnxruntime
 
+from spikeloom.compiler import __version__
 from spikeloom.compiler.atomic import write_atomically
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
-from spikeloom.compiler.version import __version__
 from spikeloom.models.recordings.evtouch import load_recordings
 from spikeloom.runtime.machines.loihi1 import engine, onnx_engine
 

@@ -11,10 +11,11 @@ from worker import Job, Task, UnfitError, serve
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
+from spikeloom.compiler.types import BoolArray
 from spikeloom.runtime.machines.loihi1 import timing
 from spikeloom.runtime.machines.loihi1.costs import cost, simple_times
 from spikeloom.runtime.machines.loihi1.engine import prepare, simulate
-from spikeloom.runtime.machines.loihi1.trace import BoolArray, Trace, unpack
+from spikeloom.runtime.machines.loihi1.trace import Trace, unpack
 
 Run = Callable[[Any], Trace]
 """Runs events (recordings, channels, steps); what it computes beyond the trace is computed and thrown away."""

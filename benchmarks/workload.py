@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX, FloatArray, IntArray, decay, decay_registers, encode_bias
+from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX, decay, decay_registers, encode_bias
 from spikeloom.compiler.ir import INPUT, Input, IntegerNetwork, IntegerPopulation, IntegerProjection, Readout
 from spikeloom.compiler.passes.expand import expand_graph_convolution
 from spikeloom.compiler.targets.base import load_target
@@ -24,6 +24,7 @@ from spikeloom.compiler.targets.loihi1.layout.partition import partition
 from spikeloom.compiler.targets.loihi1.layout.place import core_traffic, place
 from spikeloom.compiler.targets.loihi1.legalize import require_legal
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.models.graphs import build_graph, normalised_adjacency
 
 SpikeArray = npt.NDArray[np.bool_]

@@ -33,6 +33,8 @@ if TYPE_CHECKING:
         widths_front,
     )
 
+__version__ = "0.1.0"
+
 __all__ = [
     "GOALS",
     "MARGIN",
@@ -44,6 +46,7 @@ __all__ = [
     "Recipe",
     "WidthPoint",
     "WidthSearch",
+    "__version__",
     "check_recipes",
     "check_widths",
     "compile_network",

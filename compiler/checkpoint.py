@@ -13,9 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler.dynamics import PLAIN, Dynamics
-from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.ir import Form, Readout
 from spikeloom.compiler.systems import MLP, TACTILESGNET, Grid, in_order
+from spikeloom.compiler.types import IntArray
 
 Float32Array = npt.NDArray[np.float32]
 
@@ -25,87 +25,40 @@ WEIGHTS = ("last", "best", "clean")
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Dense:
-    """A fully connected stage.
+    """A fully connected stage."""
 
-    Parameters
-    ----------
-    name : str
-        ``fc1`` …
-    weight : (outputs, inputs) float32
-        Of a joined network with the inputs of one tower: no row has weights from another one.
-    bias : (outputs,) float32
-    """
-
-    name: str
+    name: str  # ``fc1`` …
+    # (outputs, inputs) float32; of a joined network with the inputs of one tower: no row has weights from another one
     weight: Float32Array
-    bias: Float32Array
+    bias: Float32Array  # (outputs,) float32
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Checkpoint:
-    """Trained weights, and what is known about them.
+    """Trained weights, and what is known about them."""
 
-    Parameters
-    ----------
-    system : str
-        One of ``SYSTEMS``.
-    hops : (filters, features, channels) float32
-        Filters of the first layer: of a TactileSGNet K + 1, one for each hop.
-    conv_bias : (features,) float32
-    dense : tuple of Dense
-        Fully connected stages in order.
-    beta, theta : float
-        Membrane decay and threshold.
-    assumed : tuple of str
-        Which of ``beta`` and ``theta`` neither the file nor the user gave.
-    graph : str or None
-        Name of the graph that it was trained on.
-    edges : (edges, 2) int64 or None
-        Its edge list, (source, target).
-    layout : {"spikeloom", "released", "state_dict"}
-        Kind of file.
-    weights : {"last", "best", "clean"}
-        Epoch that the weights are from.
-    sets : tuple of str
-        All epochs that the file holds.
-    runs : int
-        Trainings that the file holds; this is one of them.
-    training : mapping or None
-        JSON values: how it was made and what it reached.
-    forms : tuple of Form, or None
-        How the chip stores each layer, where the network was fine-tuned for it.
-    sha256 : str
-        Of the file.
-    grid : Grid or None
-        Of a grid-based CNN.
-    dynamics : Dynamics
-        Decays of single layers, and clocks.
-    towers : int
-        Networks that lie side by side and vote together, see :mod:`formats.towers`.
-    bins : int
-        Bins of the recordings that a step joins.
-    """
-
+    # (filters, features, channels) float32; filters of the first layer: of a TactileSGNet K + 1, one for each hop
     hops: Float32Array
-    conv_bias: Float32Array
-    dense: tuple[Dense, ...]
+    conv_bias: Float32Array  # (features,) float32
+    dense: tuple[Dense, ...]  # Fully connected stages in order
+    # beta, theta: Membrane decay and threshold
     beta: float
     theta: float
-    assumed: tuple[str, ...]
-    graph: str | None
-    edges: IntArray | None
-    layout: str
-    weights: str
-    sets: tuple[str, ...]
-    runs: int
-    training: Mapping[str, Any] | None
-    forms: tuple[Form, ...] | None
-    sha256: str
-    system: str = TACTILESGNET
-    grid: Grid | None = None
-    dynamics: Dynamics = PLAIN
-    towers: int = 1
-    bins: int = 1
+    assumed: tuple[str, ...]  # Which of ``beta`` and ``theta`` neither the file nor the user gave
+    graph: str | None  # Name of the graph that it was trained on
+    edges: IntArray | None  # (edges, 2) int64 or None; its edge list, (source, target)
+    layout: str  # {"spikeloom", "released", "state_dict"}; kind of file
+    weights: str  # {"last", "best", "clean"}; epoch that the weights are from
+    sets: tuple[str, ...]  # All epochs that the file holds
+    runs: int  # Trainings that the file holds; this is one of them
+    training: Mapping[str, Any] | None  # JSON values: how it was made and what it reached
+    forms: tuple[Form, ...] | None  # How the chip stores each layer, where the network was fine-tuned for it
+    sha256: str  # Of the file
+    system: str = TACTILESGNET  # One of ``SYSTEMS``
+    grid: Grid | None = None  # Of a grid-based CNN
+    dynamics: Dynamics = PLAIN  # Decays of single layers, and clocks
+    towers: int = 1  # Networks that lie side by side and vote together, see :mod:`formats.towers`
+    bins: int = 1  # Bins of the recordings that a step joins
 
     @property
     def places(self) -> int:

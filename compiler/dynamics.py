@@ -19,6 +19,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from spikeloom.compiler.types import JsonObject
+
 RELAY_WEIGHT = 2.0
 """Weight of a clock channel to its relay, in thresholds."""
 
@@ -31,18 +33,10 @@ MOST_STEPS = 2**20
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Clocks:
-    """Input channels that tell the time.
+    """Input channels that tell the time."""
 
-    Parameters
-    ----------
-    channels : int
-        How many; none by default.
-    steps : int
-        How long each of them has events.
-    """
-
-    channels: int = 0
-    steps: int = 1
+    channels: int = 0  # How many; none by default
+    steps: int = 1  # How long each of them has events
 
     def events(self, steps: int, *, first: int = 0) -> npt.NDArray[np.uint8]:
         """Events of the steps ``first … first + steps - 1``, (channels, steps).
@@ -93,16 +87,10 @@ def with_clocks(events: npt.NDArray[Any], clocks: Clocks) -> npt.NDArray[Any]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Dynamics:
-    """Decays of each layer, and clocks.
+    """Decays of each layer, and clocks."""
 
-    Parameters
-    ----------
-    betas, alphas : tuple of float
-        Shares of the membrane and of the synaptic current that a step keeps, by layer; empty where all layers have
-        the common membrane decay, or no current outlasts its step.
-    clocks : Clocks
-    """
-
+    # betas, alphas: Shares of the membrane and of the synaptic current that a step keeps, by layer; empty where all
+    # layers have the common membrane decay, or no current outlasts its step
     betas: tuple[float, ...] = ()
     alphas: tuple[float, ...] = ()
     clocks: Clocks = NO_CLOCKS
@@ -120,7 +108,7 @@ class Dynamics:
         """Current decay of a layer."""
         return self.alphas[layer] if self.alphas else 0.0
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> JsonObject:
         """JSON values."""
         clocks = {"channels": self.clocks.channels, "steps": self.clocks.steps}
         return {"betas": list(self.betas), "alphas": list(self.alphas), "clocks": clocks}

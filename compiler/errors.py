@@ -60,25 +60,14 @@ class VerifyError(Exception):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Violation:
-    """One limit that a network breaks.
+    """One limit that a network breaks."""
 
-    Parameters
-    ----------
-    owner : str
-        Who breaks it, for example ``core 3 (fc1)``.
-    rule : str
-        Name of the limit in the target file, the chip's before it: ``CHIP.core.axons_in``.
-    used, allowed : int or str
-        What was found and what is allowed: amounts, or words where the rule is no amount.
-    remedy : str
-        What would make it fit.
-    """
-
-    owner: str
-    rule: str
+    owner: str  # Who breaks it, for example ``core 3 (fc1)``
+    rule: str  # Name of the limit in the target file, the chip's before it: ``CHIP.core.axons_in``
+    # used, allowed: What was found and what is allowed: amounts, or words where the rule is no amount
     used: int | str
     allowed: int | str
-    remedy: str
+    remedy: str  # What would make it fit
 
     def __str__(self) -> str:
         used = f"{self.used} used" if isinstance(self.used, int) else self.used

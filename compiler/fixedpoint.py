@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-IntArray = npt.NDArray[np.int64]
-FloatArray = npt.NDArray[np.float64]
+from spikeloom.compiler.types import FloatArray, IntArray
 
 DECAY_BITS = 12
 """Decay registers count in 1/4096."""

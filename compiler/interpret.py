@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler.dynamics import NO_CLOCKS, Clocks, with_clocks
-from spikeloom.compiler.fixedpoint import MEMBRANE_MAX, MEMBRANE_SHIFT, IntArray
+from spikeloom.compiler.fixedpoint import MEMBRANE_MAX, MEMBRANE_SHIFT
 from spikeloom.compiler.ir import (
     INPUT,
     IntegerNetwork,
@@ -28,8 +28,8 @@ from spikeloom.compiler.ir import (
     Population,
     Sparse,
 )
+from spikeloom.compiler.types import BoolArray, IntArray
 
-BoolArray = npt.NDArray[np.bool_]
 Floating = npt.NDArray[np.floating[Any]]
 
 BATCH = 8
@@ -41,17 +41,10 @@ DENORMAL = 1e-30
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Activity:
-    """Spikes of each population, and the values that were compared with the threshold.
+    """Spikes of each population, and the values that were compared with the threshold."""
 
-    Parameters
-    ----------
-    spikes : tuple of (samples, steps, neurons) bool
-        One array per population, all aligned with the data.
-    membranes : tuple of (samples, steps, neurons), or None
-        Membrane before the reset; float64 in model units, or int64 register values.
-    """
-
-    spikes: tuple[BoolArray, ...]
+    spikes: tuple[BoolArray, ...]  # One array per population, all aligned with the data
+    # Membrane before the reset; float64 in model units, or int64 register values
     membranes: tuple[npt.NDArray[Any], ...] | None
 
 

@@ -17,7 +17,8 @@ import numpy.typing as npt
 from scipy import sparse
 
 from spikeloom.compiler.dynamics import NO_CLOCKS, Clocks
-from spikeloom.compiler.fixedpoint import DECAY_BITS, FloatArray, IntArray
+from spikeloom.compiler.fixedpoint import DECAY_BITS
+from spikeloom.compiler.types import FloatArray, IntArray
 
 INPUT = -1
 """Source id of a projection that starts at the input."""
@@ -52,17 +53,11 @@ class Input:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Readout:
-    """Spike-count vote over one population.
+    """Spike-count vote over one population."""
 
-    Parameters
-    ----------
-    population : int
-        Index of the population that votes.
-    label : (neurons,) int64
-        Class that each of its neurons votes for. The class with most spikes wins, the lowest index on a tie.
-    """
-
-    population: int
+    population: int  # Index of the population that votes
+    # (neurons,) int64; class that each of its neurons votes for. The class with most spikes wins, the lowest index on a
+    # tie.
     label: IntArray
 
 
@@ -71,26 +66,15 @@ class Population:
     """LIF neurons of the float model.
 
     ``i <- alpha * i + W s``, ``u <- beta * u * (1 - s) + i + bias``, ``s = u > theta``.
-
-    Parameters
-    ----------
-    name : str
-        Unique in the network.
-    beta, theta : float
-        Decay (0 to 1) and threshold, in the model's membrane units.
-    bias : (neurons,) float64
-        Added in every step.
-    alpha : float
-        Share of the synaptic current that a step keeps, 0 to below 1.
-    relays : int
-        How many of the last neurons relay a clock each: whatever is rounded, they must spike when it ticks.
     """
 
-    name: str
+    name: str  # Unique in the network
+    # beta, theta: Decay (0 to 1) and threshold, in the model's membrane units
     beta: float
     theta: float
-    bias: FloatArray
-    alpha: float = 0.0
+    bias: FloatArray  # (neurons,) float64; added in every step
+    alpha: float = 0.0  # Share of the synaptic current that a step keeps, 0 to below 1
+    # How many of the last neurons relay a clock each: whatever is rounded, they must spike when it ticks
     relays: int = 0
 
     @property
@@ -101,19 +85,12 @@ class Population:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Projection:
-    """Synapses from one population to another, or to itself.
+    """Synapses from one population to another, or to itself."""
 
-    Parameters
-    ----------
-    pre, post : int
-        Population indices; `pre` may be ``INPUT``. If they are equal, spikes of a step arrive in the next one.
-    weight : csr_array (neurons of post, neurons of pre) float64
-        ``weight[i, j]`` is from neuron j of `pre` to neuron i of `post`.
-    """
-
+    # pre, post: Population indices; `pre` may be ``INPUT``. If they are equal, spikes of a step arrive in the next one.
     pre: int
     post: int
-    weight: Sparse
+    weight: Sparse  # ``weight[i, j]`` is from neuron j of `pre` to neuron i of `post`
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -129,50 +106,27 @@ class Network:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Form:
-    """How one population is stored.
+    """How one population is stored."""
 
-    Parameters
-    ----------
-    bits : int
-        Storage width of a mantissa.
-    exponents : tuple of int
-        Exponent of each plane, finest first.
-    threshold : (neurons,) int64
-        Threshold mantissas, at least 1.
-    """
-
-    bits: int
-    exponents: tuple[int, ...]
-    threshold: IntArray
+    bits: int  # Storage width of a mantissa
+    exponents: tuple[int, ...]  # Exponent of each plane, finest first
+    threshold: IntArray  # (neurons,) int64; threshold mantissas, at least 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class IntegerPopulation:
-    """The same neurons in the chip's registers; units as in :class:`netlist.Netlist`.
+    """The same neurons in the chip's registers; units as in :class:`netlist.Netlist`."""
 
-    Parameters
-    ----------
-    name : str
-        Unique in the network.
-    beta, theta, alpha : float
-        What the float model asked for.
-    scale : (neurons,) float64
-        Weight units per membrane unit of the float model.
-    decay_u, decay_v : int
-        Decay registers.
-    threshold : (neurons,) int64
-        Threshold mantissas.
-    bias_mantissa, bias_exponent : (neurons,) int64
-        Encoded biases.
-    """
-
-    name: str
+    name: str  # Unique in the network
+    # beta, theta, alpha: What the float model asked for
     beta: float
     theta: float
-    scale: FloatArray
+    scale: FloatArray  # (neurons,) float64; weight units per membrane unit of the float model
+    # decay_u, decay_v: Decay registers
     decay_u: int
     decay_v: int
-    threshold: IntArray
+    threshold: IntArray  # (neurons,) int64; threshold mantissas
+    # bias_mantissa, bias_exponent: (neurons,) int64; encoded biases
     bias_mantissa: IntArray
     bias_exponent: IntArray
     alpha: float = 0.0
@@ -206,25 +160,14 @@ class IntegerPopulation:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class IntegerProjection:
-    """Synapses as stored: mantissas of `bits` bits with a common exponent.
+    """Synapses as stored: mantissas of `bits` bits with a common exponent."""
 
-    Parameters
-    ----------
-    pre, post : int
-        Population indices; `pre` may be ``INPUT``.
-    weight : csr_array (neurons of post, neurons of pre) of an integer type
-        Signed mantissas, usually ``MANTISSA``.
-    exponent : int
-        A synapse adds ``mantissa * 2**exponent`` weight units.
-    bits : int
-        Storage width of a mantissa.
-    """
-
+    # pre, post: Population indices; `pre` may be ``INPUT``
     pre: int
     post: int
-    weight: Sparse
-    exponent: int
-    bits: int
+    weight: Sparse  # Signed mantissas, usually ``MANTISSA``
+    exponent: int  # A synapse adds ``mantissa * 2**exponent`` weight units
+    bits: int  # Storage width of a mantissa
 
     def effective(self) -> Sparse:
         """Weights in weight units, csr_array of int32; exact, since mantissas are even."""

@@ -22,24 +22,12 @@ W = TypeVar("W", bound=Work)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Pass(Generic[W]):
-    """One step of a compilation.
+    """One step of a compilation."""
 
-    Parameters
-    ----------
-    name : str
-        For ``--dump-after`` and the table in docs/compile.md.
-    does : str
-        Its contract in one sentence.
-    keeps : str
-        What is the same before and after it.
-    apply : callable
-        Makes new work of what it is given, which stays as it is.
-    """
-
-    name: str
-    does: str
-    keeps: str
-    apply: Callable[[W], W]
+    name: str  # For ``--dump-after`` and the table in docs/compile.md
+    does: str  # Its contract in one sentence
+    keeps: str  # What is the same before and after it
+    apply: Callable[[W], W]  # Makes new work of what it is given, which stays as it is
 
 
 def run(passes: Iterable[Pass[W]], work: W, after: Callable[[str, W], object] | None = None) -> W:

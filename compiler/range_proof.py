@@ -7,32 +7,20 @@ from typing import ClassVar
 
 import numpy as np
 
-from spikeloom.compiler.fixedpoint import (
-    ACCUMULATOR_MAX,
-    CURRENT_MAX,
-    MEMBRANE_MAX,
-    MEMBRANE_SHIFT,
-    FloatArray,
-    IntArray,
-)
+from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, MEMBRANE_MAX, MEMBRANE_SHIFT
 from spikeloom.compiler.ir import IntegerNetwork, one_sided
+from spikeloom.compiler.types import FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RangeProof:
-    """Worst cases of one population over all inputs, register units.
-
-    Parameters
-    ----------
-    layer : str
-        Population.
-    accumulator, current, membrane : float
-        Largest magnitude that any input can bring to any neuron; infinite where nothing bounds it.
-    """
+    """Worst cases of one population over all inputs, register units."""
 
     json_properties: ClassVar = ("holds",)
 
-    layer: str
+    layer: str  # Population
+    # accumulator, current, membrane: Largest magnitude that any input can bring to any neuron; infinite where nothing
+    # bounds it
     accumulator: float
     current: float
     membrane: float

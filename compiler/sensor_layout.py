@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from spikeloom.compiler.errors import ModelError, OptionError
-from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.ir import Input
+from spikeloom.compiler.types import IntArray
 
 POLARITIES = 2
 """Of a sensor's events: up and down."""

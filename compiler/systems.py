@@ -29,7 +29,7 @@ from typing import Any
 
 import numpy as np
 
-from spikeloom.compiler.fixedpoint import FloatArray, IntArray
+from spikeloom.compiler.types import FloatArray, IntArray, JsonObject
 
 TACTILESGNET, GRID_CNN, MLP, GCN = SYSTEMS = ("tactilesgnet", "grid-cnn", "mlp", "gcn")
 
@@ -45,23 +45,15 @@ SMALL_GRID = 4096
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Grid:
-    """A grid of cells over a sensor, and how a window moves over it.
+    """A grid of cells over a sensor, and how a window moves over it."""
 
-    Parameters
-    ----------
-    rows, columns : int
-        Cells.
-    stride, padding : int
-        Of the window; the padding is empty.
-    cells : (taxels, 2) int64
-        Row and column of each taxel; two in one cell add up.
-    """
-
+    # rows, columns: Cells
     rows: int
     columns: int
+    # stride, padding: Of the window; the padding is empty
     stride: int
     padding: int
-    cells: IntArray
+    cells: IntArray  # (taxels, 2) int64; row and column of each taxel; two in one cell add up
 
     def places(self, kernel: int) -> tuple[int, int]:
         """Positions of a square window, down and across; zero where it is larger than the grid."""
@@ -82,7 +74,7 @@ class Grid:
                     stack[tap, i * across + j, taxel] = 1.0
         return stack
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> JsonObject:
         """JSON values."""
         whole = {name: getattr(self, name) for name in ("rows", "columns", "stride", "padding")}
         return whole | {"cells": self.cells.tolist()}

@@ -8,7 +8,6 @@ from collections.abc import Iterator
 import numpy as np
 
 from spikeloom.compiler.dynamics import Clocks
-from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.ir import (
     INPUT,
     IntegerNetwork,
@@ -18,6 +17,7 @@ from spikeloom.compiler.ir import (
     Population,
     Sparse,
 )
+from spikeloom.compiler.types import FloatArray, IntArray
 
 
 def span(values: IntArray | FloatArray) -> str:

@@ -15,8 +15,8 @@ from collections.abc import Iterable, Sequence
 from importlib import import_module
 from typing import Any, NoReturn
 
+from spikeloom.compiler import __version__
 from spikeloom.compiler.errors import OptionError, SpikeloomError, UnfinishedError
-from spikeloom.compiler.version import __version__
 
 GROUPS: dict[str, dict[str, str]] = {
     "main job": {

@@ -16,7 +16,7 @@ from random_netlists import Axon, Neuron, build, large_netlist
 from test_export import run
 from test_onnx_engine import three_neurons
 
-from spikeloom.compiler import Options, Recipe, compile_network
+from spikeloom.compiler import Options, Recipe, __version__, compile_network
 from spikeloom.compiler.errors import FormatError, ModelError, OptionError
 from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.formats.onnx import writer as onnx_writer
@@ -25,7 +25,6 @@ from spikeloom.compiler.formats.onnx.builder import port_words
 from spikeloom.compiler.formats.onnx.writer_layers import digits, is_pipeline, plan
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.loihi1.netlist_file import netlist_bytes, write_netlist
-from spikeloom.compiler.version import __version__
 from spikeloom.models.networks.reference import float_spikes
 from spikeloom.runtime.machines.loihi1 import engine, onnx_engine
 

@@ -99,7 +99,7 @@ def test_neurons_that_none_of_hears_are_not_compared(tmp_path):
     changed = replace(checkpoint, dense=(replace(checkpoint.dense[0], weight=weak), *checkpoint.dense[1:]))
     compilation = compile_network(expand(changed, adjacency))
     netlist, labels = compilation.netlist, np.zeros(6, np.int64)
-    assert netlist.layers[0].unheard == (0, 1, 2)
+    assert netlist.layers[0].unreceived == (0, 1, 2)
     assert isinstance(comparable(netlist, 0), np.ndarray)
     verdict = verify(netlist, changed, adjacency, events(2), labels, tuple("abcdef"))
     reference = run_float(compilation.network, channels_last(events(2))).spikes[0]

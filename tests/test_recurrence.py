@@ -189,10 +189,10 @@ def test_neurons_that_only_each_other_hear_are_left_out():
     network = hearing_itself(network, 0, own)
     made = compile_network(network)
     assert [removal.unreceived for removal in made.removals] == [2, 0]
-    assert made.netlist.layers[0].unheard == (2, 3)
+    assert made.netlist.layers[0].unreceived == (2, 3)
     own[2, 2] = 1  # what hears itself counts as heard
     made = compile_network(hearing_itself(replace(network, projections=network.projections[:2]), 0, own))
-    assert made.netlist.layers[0].unheard == (3,)
+    assert made.netlist.layers[0].unreceived == (3,)
 
 
 # -- cores -------------------------------------------------------------------------------------------------------------

@@ -180,7 +180,7 @@ def test_the_chip_follows_the_float_network(timed, compiled):
     trace = engine.simulate(compiled.netlist, with_clocks(events, TIMING.clocks), spikes=True)
     for layer, (name, wanted) in enumerate(zip(LAYERS, truth, strict=True)):
         found = aligned(compiled.netlist, trace.spikes, layer)
-        heard = ~np.isin(np.arange(wanted.shape[2]), compiled.netlist.layers[layer].unheard)
+        heard = ~np.isin(np.arange(wanted.shape[2]), compiled.netlist.layers[layer].unreceived)
         assert np.mean(found[..., heard] != wanted[..., heard]) < 0.02, name
         assert wanted.any(), name
 

@@ -12,9 +12,9 @@ import numpy as np
 
 from spikeloom.compiler.targets.base import Target, TimeTable
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.types import BoolArray
 from spikeloom.runtime.machines.loihi1.engine import EventArray
 from spikeloom.runtime.machines.loihi1.timing import Clock, SimpleTimes, simple_times
-from spikeloom.runtime.machines.loihi1.trace import BoolArray
 
 Link = tuple[int, int, str]
 

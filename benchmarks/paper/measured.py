@@ -11,13 +11,13 @@ import numpy as np
 from spikeloom.compiler import Compilation, Options, compile_network, without
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.errors import CapacityError
-from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.formats.checkpoint import read_checkpoint
 from spikeloom.compiler.interpret import cut, vote
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.base import Target, load_target
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs.network import propagation
 from spikeloom.runtime.machines.loihi1 import engine
@@ -109,8 +109,8 @@ def _figures(
         **costs,
         "first_layer": {
             "neurons": first.neurons,
-            "cannot_fire": first.neurons - len(held) - len(first.unheard),
-            "unheard": len(first.unheard),
+            "cannot_fire": first.neurons - len(held) - len(first.unreceived),
+            "unheard": len(first.unreceived),
             "quiet_in_training": int(quiet.sum()),
             "quiet_in_both": int(np.sum(quiet & (spikes[:, held].sum(axis=0) == 0))),
         },

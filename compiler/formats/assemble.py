@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.formats.names import printable
 from spikeloom.compiler.ir import INPUT, Input, Network, Population, Projection, Readout, Sparse, depths
+from spikeloom.compiler.types import FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

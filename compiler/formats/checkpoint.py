@@ -16,7 +16,6 @@ import numpy.typing as npt
 
 from spikeloom.compiler.checkpoint import WEIGHTS, Checkpoint, Dense, Float32Array
 from spikeloom.compiler.errors import ModelError, OptionError
-from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.formats.checkpoint_file import own_contents, own_members, require_constants
 from spikeloom.compiler.formats.released_file import GIVE, read_released
 from spikeloom.compiler.formats.tensors import Arrays, Contents
@@ -27,6 +26,7 @@ from spikeloom.compiler.systems import (
     kernel_of,
     window_forms,
 )
+from spikeloom.compiler.types import IntArray
 
 BETA, THETA = 0.2, 0.5
 """Decay and threshold of the released code; files in its layout do not hold them."""

@@ -71,6 +71,7 @@ from spikeloom.compiler.systems import (
     grid_from_json,
     shape_faults,
 )
+from spikeloom.compiler.types import JsonObject
 
 FORMAT = "spikeloom-checkpoint"
 VERSION = 6
@@ -117,7 +118,7 @@ def own_members(where: str, content: bytes) -> dict[str, bytes] | None:
     return members if "manifest.json" in members else None
 
 
-def _manifest(where: str, content: bytes) -> dict[str, Any]:
+def _manifest(where: str, content: bytes) -> JsonObject:
     try:
         manifest = json.loads(content)
     except (ValueError, RecursionError) as error:

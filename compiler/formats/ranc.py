@@ -22,11 +22,11 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.truenorth.legalize import require_legal
 from spikeloom.compiler.targets.truenorth.netlist import RESET_NONE, RESET_TO, CrossbarNetlist
 from spikeloom.compiler.targets.truenorth.netlist_file import read_crossbars
+from spikeloom.compiler.types import IntArray
 
 EventArray = npt.NDArray[np.uint8] | npt.NDArray[np.bool_]
 

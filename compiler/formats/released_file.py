@@ -30,6 +30,7 @@ from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.names import printable
 from spikeloom.compiler.formats.tensors import Arrays, Contents, Shape, faults_of, size, taxel_faults, wanted_dense
 from spikeloom.compiler.systems import GCN, GRID_CNN, MLP, TACTILESGNET, TITLES
+from spikeloom.compiler.types import JsonObject
 
 CHANNELS = 2
 """Polarities of a recording; old keys do not say how many channels a hop has."""
@@ -243,7 +244,7 @@ def _refuse(where: str, faults: list[str], system: str) -> NoReturn:
     raise ModelError(f"{where}: {'; '.join(faults)}; give the weights of {TITLES[system]}")
 
 
-def _training(loaded: Mapping[str, Any], run: int, runs: int) -> dict[str, Any]:
+def _training(loaded: Mapping[str, Any], run: int, runs: int) -> JsonObject:
     """What the released script stored beside the weights, as JSON values; unknown where it is not as it wrote it."""
     epochs = loaded.get("num_epochs")
     training: dict[str, Any] = {"runs": runs, "weights": "last epoch"}

@@ -28,16 +28,14 @@ from collections.abc import Iterator
 from itertools import pairwise
 
 import numpy as np
-import numpy.typing as npt
 
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.fixedpoint import DECAY_BITS, MEMBRANE_SHIFT, IntArray
+from spikeloom.compiler.fixedpoint import DECAY_BITS, MEMBRANE_SHIFT
 from spikeloom.compiler.formats.names import plain_names
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.layout.chips import require_one_chip
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
-
-BoolArray = npt.NDArray[np.bool_]
+from spikeloom.compiler.types import BoolArray, IntArray
 
 INPUT = "input"
 VERSION = "2.2.9"

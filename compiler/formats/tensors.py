@@ -10,10 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler.dynamics import PLAIN, Dynamics
-from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.formats.names import printable
 from spikeloom.compiler.ir import Form
 from spikeloom.compiler.systems import TACTILESGNET, Grid
+from spikeloom.compiler.types import IntArray
 
 Arrays = dict[str, npt.NDArray[Any]]
 

@@ -10,8 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from spikeloom.compiler.errors import DataError
-from spikeloom.compiler.interpret import BoolArray, run_float, step_late
+from spikeloom.compiler.interpret import run_float, step_late
 from spikeloom.compiler.ir import INPUT, Network
+from spikeloom.compiler.types import BoolArray
 
 FEW = 32
 """Recordings on which storage is chosen, evenly spaced over the split: eight thousand steps a neuron."""
@@ -22,18 +23,10 @@ MANY = 256
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Calibration:
-    """Spikes of the float64 model on the calibration recordings.
+    """Spikes of the float64 model on the calibration recordings."""
 
-    Parameters
-    ----------
-    events : (samples, steps, channels) bool
-        Input events.
-    spikes : tuple of (samples, steps, neurons) bool
-        Spikes of each population.
-    """
-
-    events: BoolArray
-    spikes: tuple[BoolArray, ...]
+    events: BoolArray  # (samples, steps, channels) bool; input events
+    spikes: tuple[BoolArray, ...]  # Spikes of each population
 
     def source(self, pre: int, post: int) -> BoolArray:
         """What a projection brings in each step: spikes of its source population, its own a step late, or events."""

@@ -27,24 +27,18 @@ from scipy import sparse
 from spikeloom.compiler.checkpoint import Checkpoint, inputs_of
 from spikeloom.compiler.dynamics import RELAY_WEIGHT
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.fixedpoint import FloatArray
 from spikeloom.compiler.ir import INPUT, Input, Network, Population, Projection, Sparse
 from spikeloom.compiler.systems import TACTILESGNET, TITLES, in_order
+from spikeloom.compiler.types import FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Factored:
-    """Trained weights and what their first layer sees, not yet written out as synapses.
+    """Trained weights and what their first layer sees, not yet written out as synapses."""
 
-    Parameters
-    ----------
-    checkpoint : Checkpoint
-        Trained weights.
-    propagation : (taxels, taxels) or (filters, places, taxels) float64
-        Of a TactileSGNet the normalised adjacency A, whose powers make the stack; of the others the stack itself.
-    """
-
-    checkpoint: Checkpoint
+    checkpoint: Checkpoint  # Trained weights
+    # (taxels, taxels) or (filters, places, taxels) float64; of a TactileSGNet the normalised adjacency A, whose powers
+    # make the stack; of the others the stack itself
     propagation: FloatArray
 
 

@@ -14,9 +14,10 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT, IntArray
+from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT
 from spikeloom.compiler.ir import INPUT, IntegerNetwork, IntegerPopulation, Network, Sparse, row_parts, with_data
 from spikeloom.compiler.passes.calibrate import Calibration
+from spikeloom.compiler.types import IntArray
 
 Mask = npt.NDArray[np.bool_]
 """Some neurons of a population, (neurons,) bool."""
@@ -35,27 +36,14 @@ FLOAT32_ROUNDING = 2.0**-23
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Removal:
-    """What was left out of one layer.
+    """What was left out of one layer."""
 
-    Parameters
-    ----------
-    layer : str
-        Population.
-    silent : int
-        Neurons that no input can make fire, in the float model or on the chip.
-    unreceived : int
-        Neurons that fire, but without a synapse that is not zero to any that is left, and without a vote.
-    unused : int
-        Neurons that did not fire on the training recordings; on request only.
-    synapses : int
-        Synapses from and to all of these that would not have been zero.
-    """
-
-    layer: str
-    silent: int
+    layer: str  # Population
+    silent: int  # Neurons that no input can make fire, in the float model or on the chip
+    # Neurons that fire, but without a synapse that is not zero to any that is left, and without a vote
     unreceived: int = field(metadata={"key": "unheard"})  # its name in JSON
-    unused: int
-    synapses: int
+    unused: int  # Neurons that did not fire on the training recordings; on request only
+    synapses: int  # Synapses from and to all of these that would not have been zero
 
 
 def never_fires(network: Network) -> Masks:

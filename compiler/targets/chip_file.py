@@ -26,6 +26,7 @@ from spikeloom.compiler.targets.price_tables import (
     Quantity,
     TimeTable,
 )
+from spikeloom.compiler.types import JsonObject
 
 COMPARTMENTS, CROSSBARS = "compartments", "crossbars"
 """What cores are made of: lists of weighted synapses onto compartments (Loihi), or a binary crossbar (TrueNorth)."""
@@ -128,7 +129,7 @@ def read_cost_tables(path: str, cores: str) -> tuple[tuple[EnergyTable, ...], tu
     return tables
 
 
-def _toml(path: str | os.PathLike[str], what: str) -> dict[str, Any]:
+def _toml(path: str | os.PathLike[str], what: str) -> JsonObject:
     try:
         return tomllib.loads(Path(path).read_text("utf-8"))
     except OSError as error:

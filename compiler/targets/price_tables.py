@@ -64,25 +64,15 @@ class EnergyTable:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TimeTable:
-    """Latencies per event; all are whole picoseconds, so that sums of them are exact.
+    """Latencies per event; all are whole picoseconds, so that sums of them are exact."""
 
-    Parameters
-    ----------
-    name, title : str
-        For humans.
-    latencies : mapping
-        Of each of ``LATENCIES``.
-    barriers : mapping of int to Quantity
-        Length of the barrier that ends a step, by the least number of used tiles that it holds for.
-    link_buffer : Quantity
-        Messages that a link of the mesh holds.
-    """
-
+    # name, title: For humans
     name: str
     title: str
-    latencies: Mapping[str, Quantity]
+    latencies: Mapping[str, Quantity]  # Of each of ``LATENCIES``
+    # Length of the barrier that ends a step, by the least number of used tiles that it holds for
     barriers: Mapping[int, Quantity]
-    link_buffer: Quantity
+    link_buffer: Quantity  # Messages that a link of the mesh holds
 
     def picoseconds(self, event: str) -> int:
         """Latency of one `event`."""

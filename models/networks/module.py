@@ -17,11 +17,11 @@ from torch import Tensor, nn
 
 from spikeloom.compiler import DEFAULT_TARGET, Compilation, Options, compile_network
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.fixedpoint import FloatArray
 from spikeloom.compiler.formats.assemble import Layer, assemble, class_of_each
 from spikeloom.compiler.formats.names import unique_names
 from spikeloom.compiler.ir import INPUT, Network, Sparse
 from spikeloom.compiler.sensor_layout import sensor_layout
+from spikeloom.compiler.types import FloatArray
 from spikeloom.models.networks.lif import LIF, reset
 
 AFFINE_TOLERANCE = 1e-9

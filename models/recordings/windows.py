@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.fixedpoint import IntArray
+from spikeloom.compiler.types import IntArray
 from spikeloom.models.recordings.evtouch import Recordings
 
 WHOLE = 100

@@ -14,8 +14,8 @@ from pkgutil import iter_modules
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
 from spikeloom import models
-from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.systems import SYSTEMS, TACTILESGNET, Grid
+from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.models.graphs import Graph
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.systems import HOPS, filters_of, propagation_of

@@ -9,11 +9,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
-from typing import Any
 
 from spikeloom.compiler.dynamics import MOST_CLOCKS, Dynamics, clocks_over
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.fixedpoint import DECAY_ONE, decay_registers
+from spikeloom.compiler.types import JsonObject
 from spikeloom.models.networks.surrogate import FAST_SIGMOID, RECTANGLE, Surrogate
 from spikeloom.models.systems import HOPS
 from spikeloom.models.training.schedule import DECAY_EPOCHS
@@ -59,7 +59,7 @@ class Recipe:
     # neurons that do so, mean over steps and recordings
     penalty: float = 0.0
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> JsonObject:
         """JSON values; without the usual number of epochs, which a training states by itself, and a penalty of zero."""
         values = asdict(self) | {"betas": dict(self.betas), "alphas": dict(self.alphas)}
         del values["epochs"]

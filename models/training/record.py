@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from spikeloom.compiler.types import JsonObject
+
 if TYPE_CHECKING:
     from spikeloom.models.recordings.evtouch import Recordings
     from spikeloom.models.training.protocols import Reported
@@ -59,7 +61,7 @@ class TrainingRecord:
     device: str
     recipe: Mapping[str, Any] | None = field(default=None, metadata={"optional": True})
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> JsonObject:
         """JSON values."""
         return {key: value for key, value in asdict(self).items() if value is not None}
 

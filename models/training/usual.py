@@ -10,9 +10,9 @@ from typing import Any
 from spikeloom.compiler import systems
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.formats.checkpoint import read_checkpoint
 from spikeloom.compiler.formats.towers import arrays_of
+from spikeloom.compiler.types import IntArray
 from spikeloom.models.networks.checkpoint import save_checkpoint
 from spikeloom.models.networks.networks import Architecture, SpikingNet
 from spikeloom.models.recordings.events import joined_bins

@@ -8,9 +8,9 @@ from typing import Any
 
 from spikeloom.compiler.dynamics import clocks_over
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.targets.truenorth.native import BASES, SYSTEM, USUAL_COPIES
 from spikeloom.compiler.targets.truenorth.native_file import Trained, read_trained, write_trained
+from spikeloom.compiler.types import IntArray
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.training.kinds import Plan, same_graph
 from spikeloom.models.training.recipes import Recipe

@@ -25,11 +25,11 @@ import numpy.typing as npt
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import DataError
-from spikeloom.compiler.fixedpoint import FloatArray
 from spikeloom.compiler.ir import INPUT, Network
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.systems import GCN, TACTILESGNET
 from spikeloom.compiler.targets.base import Quantity
+from spikeloom.compiler.types import FloatArray
 from spikeloom.runtime.report.encode import key
 from spikeloom.runtime.report.numbers import si
 from spikeloom.runtime.report.sections import Section, Table, Text

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.fixedpoint import IntArray
-from spikeloom.compiler.interpret import BoolArray, vote
+from spikeloom.compiler.interpret import vote
+from spikeloom.compiler.types import BoolArray, IntArray
 
 OFTEN = 10
 """Spikes from which on a neuron that falls silent, or that wakes up, is worth a line."""

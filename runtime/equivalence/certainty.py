@@ -21,11 +21,11 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler.checkpoint import Checkpoint
-from spikeloom.compiler.fixedpoint import FloatArray
-from spikeloom.compiler.interpret import BATCH, DENORMAL, BoolArray, channels_last
+from spikeloom.compiler.interpret import BATCH, DENORMAL, channels_last
 from spikeloom.compiler.ir import INPUT, Network
 from spikeloom.compiler.passes.expand import effective_weight, expand, stack_of
 from spikeloom.compiler.systems import TACTILESGNET, in_order
+from spikeloom.compiler.types import BoolArray, FloatArray
 
 UNIT = 2.0**-24
 """Unit roundoff of float32."""

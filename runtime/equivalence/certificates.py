@@ -14,10 +14,10 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler.checkpoint import Checkpoint
-from spikeloom.compiler.fixedpoint import FloatArray, IntArray
-from spikeloom.compiler.interpret import BoolArray, cut
+from spikeloom.compiler.interpret import cut
 from spikeloom.compiler.ir import IntegerNetwork, Network
 from spikeloom.compiler.range_proof import prove_ranges
+from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.runtime.equivalence.certainty import float_certainty
 from spikeloom.runtime.machines.votes import readout_counts
 

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT
-from spikeloom.compiler.interpret import BoolArray
+from spikeloom.compiler.types import BoolArray
 from spikeloom.runtime.machines.base import EventArray
 from spikeloom.runtime.machines.integer import IntegerMachine
 

@@ -23,9 +23,9 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler import Netlist
-from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.interpret import DENORMAL
 from spikeloom.compiler.ir import INPUT, Network, Projection
+from spikeloom.compiler.types import IntArray
 
 Floats = npt.NDArray[np.float32]
 Words = npt.NDArray[np.uint64]
@@ -115,7 +115,7 @@ def prepare(network: Network, netlist: Netlist) -> FloatEngine:
         seat, compared = np.full(population.size, NOWHERE), np.ones(population.size, np.bool_)
         ids = netlist.compartments_of(post)
         seat[netlist.neuron[ids]] = ids
-        compared[list(netlist.layers[post].unheard)] = False
+        compared[list(netlist.layers[post].unreceived)] = False
         before = max((-1 if pre == INPUT else depth[pre] for pre in pres), default=-1)
         layers.append(
             Layer(

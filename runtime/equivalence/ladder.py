@@ -17,10 +17,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT, FloatArray
-from spikeloom.compiler.interpret import BoolArray, run_float, run_integer
+from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT
+from spikeloom.compiler.interpret import run_float, run_integer
 from spikeloom.compiler.ir import IntegerNetwork, Network, Projection, Sparse
 from spikeloom.compiler.range_proof import prove_ranges
+from spikeloom.compiler.types import BoolArray, FloatArray
 
 LADDER = ("float64", "beta", "weights", "bias_threshold", "rounding", "saturation")
 """Deviations in the order in which they are added; the last one is the chip."""

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.fixedpoint import IntArray
+from spikeloom.compiler.types import IntArray
 from spikeloom.runtime.equivalence.verdict import LayerSpikes, Level, Verdict
 
 LEVELS = ("E0", "E1", "E2", "E3")

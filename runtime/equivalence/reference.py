@@ -9,10 +9,10 @@ from spikeloom.compiler import Netlist
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.dynamics import Clocks
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.fixedpoint import FloatArray
-from spikeloom.compiler.interpret import BoolArray, channels_last, run_float
+from spikeloom.compiler.interpret import channels_last, run_float
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.types import BoolArray, FloatArray
 
 
 def require_match(netlist: Netlist, model: Checkpoint | Network) -> None:

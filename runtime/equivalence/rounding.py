@@ -30,9 +30,9 @@ from spikeloom.compiler.fixedpoint import (
     reach,
     step_units,
 )
-from spikeloom.compiler.interpret import BoolArray
 from spikeloom.compiler.ir import INPUT, IntegerNetwork, Network, Sparse
 from spikeloom.compiler.passes.prune import never_fires
+from spikeloom.compiler.types import BoolArray
 from spikeloom.runtime.machines.integer import IntegerMachine
 
 SLACK = 1 + 1e-9

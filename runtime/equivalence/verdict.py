@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from spikeloom.compiler.fixedpoint import IntArray
+from spikeloom.compiler.types import IntArray
 from spikeloom.runtime.costs.simulated import Part
 from spikeloom.runtime.equivalence.breakdowns import Breakdown
 from spikeloom.runtime.equivalence.certificates import Certificate

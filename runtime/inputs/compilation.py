@@ -6,10 +6,9 @@ import argparse
 from collections.abc import Mapping
 from typing import Any
 
-from spikeloom.compiler import MARGIN, Recipe
+from spikeloom.compiler import MARGIN, Recipe, __version__
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.version import __version__
 from spikeloom.runtime.inputs.network import LoadedNetwork
 
 ROUNDING: dict[str, object] = {

@@ -15,7 +15,6 @@ import numpy as np
 from spikeloom.compiler.archive import FORMATS, TRAINED, stated_format
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.errors import ModelError, OptionError
-from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.formats.checkpoint import read_checkpoint
 from spikeloom.compiler.formats.netx.layout import SUFFIX as NETX
 from spikeloom.compiler.formats.nir.reader import SUFFIX as NIR
@@ -27,6 +26,7 @@ from spikeloom.compiler.passes.expand import Factored, expand
 from spikeloom.compiler.systems import GRAPH_SYSTEMS, TACTILESGNET, TITLES
 from spikeloom.compiler.targets.netlist import Netlist
 from spikeloom.compiler.text import text
+from spikeloom.compiler.types import FloatArray, IntArray, JsonObject
 from spikeloom.models.graphs import CHOICES, NEUTOUCH, Graph
 from spikeloom.models.sensors import read_layout, sensor_graph
 from spikeloom.models.systems import NO_GRAPH, grid_cells, propagation_of
@@ -52,7 +52,7 @@ class LoadedNetwork:
     # How it was read, beyond what it says: the time step of a NIR file
     read_as: Mapping[str, Any] = field(default_factory=dict)
 
-    def origin(self, run: int) -> dict[str, Any]:
+    def origin(self, run: int) -> JsonObject:
         """What a netlist remembers of the file; `run` is which of a released file's runs was asked for."""
         if self.checkpoint is None:
             return {"format": self.format, **self.read_as}

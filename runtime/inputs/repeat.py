@@ -8,6 +8,7 @@ import shlex
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from spikeloom.compiler.types import JsonObject
 from spikeloom.models.recordings.events import BIN_S
 
 NETWORK = ("graph", "taxels", "edges", "directed", "system", "run", "weights", "beta", "theta")
@@ -33,7 +34,7 @@ def words(options: Mapping[str, Any]) -> list[str]:
     return typed
 
 
-def given(arguments: argparse.Namespace, names: Sequence[str]) -> dict[str, Any]:
+def given(arguments: argparse.Namespace, names: Sequence[str]) -> JsonObject:
     """Some options of a command, by name."""
     return {name: getattr(arguments, name) for name in names}
 

@@ -22,14 +22,13 @@ import numpy.typing as npt
 
 from spikeloom.compiler.archive import stated
 from spikeloom.compiler.errors import DataError, OptionError
-from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.targets.base import Target, load_target
 from spikeloom.compiler.targets.netlist import Netlist
+from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.runtime import machines
 from spikeloom.runtime.report.sections import Outcome
 
-BoolArray = npt.NDArray[np.bool_]
 EventArray = npt.NDArray[np.uint8 | np.bool_]
 
 DEFAULT = "loihi1"
@@ -58,26 +57,15 @@ class Run:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Price:
-    """What recordings cost, in the terms that all chips share.
+    """What recordings cost, in the terms that all chips share."""
 
-    Parameters
-    ----------
-    synaptic_operations : (samples,)
-    energy_j, time_s : mapping of table to (samples,) float64
-        Joules and seconds of each recording.
-    time_ns : mapping of table to (samples,) float64
-        The same in nanoseconds, not rounded to seconds, where the time model counts them.
-    step_s : mapping of time table to float
-        Seconds of the longest data step.
-    outcome : Outcome
-        All that the chip's own price model knows, with its layout.
-    """
-
-    synaptic_operations: IntArray | FloatArray
+    synaptic_operations: IntArray | FloatArray  # (samples,)
+    # energy_j, time_s: Joules and seconds of each recording
     energy_j: Mapping[str, FloatArray]
     time_s: Mapping[str, FloatArray]
-    step_s: Mapping[str, float]
-    outcome: Outcome
+    step_s: Mapping[str, float]  # Seconds of the longest data step
+    outcome: Outcome  # All that the chip's own price model knows, with its layout
+    # The same in nanoseconds, not rounded to seconds, where the time model counts them
     time_ns: Mapping[str, FloatArray] = field(default_factory=dict)
 
 
@@ -91,21 +79,12 @@ class Beside:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Step:
-    """What one chip step brought.
+    """What one chip step brought."""
 
-    Parameters
-    ----------
-    index : int
-        Chip step, from 0; while events come in, also the index of the bin.
-    spikes : tuple of (neurons,) bool
-        Who spiked in this chip step: one array for each layer, ordered by neuron; read-only.
-    counts : (classes,) int64
-        Votes for each class since the grasp began; read-only.
-    """
-
-    index: int
+    index: int  # Chip step, from 0; while events come in, also the index of the bin
+    # Who spiked in this chip step: one array for each layer, ordered by neuron; read-only
     spikes: tuple[BoolArray, ...]
-    counts: IntArray
+    counts: IntArray  # (classes,) int64; votes for each class since the grasp began; read-only
 
     @property
     def decision(self) -> int:

@@ -12,10 +12,10 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.ir import IntegerNetwork
 from spikeloom.compiler.targets.netlist import Netlist
-from spikeloom.runtime.machines.base import BoolArray, EventArray, Machine, machine_for, machine_of
+from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
+from spikeloom.runtime.machines.base import EventArray, Machine, machine_for, machine_of
 from spikeloom.runtime.machines.page_parts import BatchParts, RecordingParts
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from spikeloom.compiler.fixedpoint import FloatArray
+from spikeloom.compiler.types import FloatArray
 from spikeloom.runtime.report.encode import key
 from spikeloom.runtime.report.sections import Outcome
 

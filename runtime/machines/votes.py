@@ -6,9 +6,9 @@ from typing import Protocol
 
 import numpy as np
 
-from spikeloom.compiler.fixedpoint import IntArray
-from spikeloom.compiler.interpret import BoolArray, vote
+from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.ir import Readout
+from spikeloom.compiler.types import BoolArray, IntArray
 
 
 class Voting(Protocol):

@@ -15,6 +15,7 @@ import numpy as np
 from spikeloom import __version__
 from spikeloom.compiler import Netlist
 from spikeloom.compiler.targets.base import Target
+from spikeloom.compiler.types import JsonObject
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.network import LoadedNetwork
@@ -111,7 +112,7 @@ def _commands(arguments: argparse.Namespace, netlist: Netlist, recording: str) -
     return tuple(Command(what=what, command=repeat.command(*words)) for what, words in lines.items())
 
 
-def _compile_options(made: Mapping[str, Any], data: str) -> dict[str, Any]:
+def _compile_options(made: Mapping[str, Any], data: str) -> JsonObject:
     """Options of the compilation as far as the netlist remembers them."""
     options: dict[str, Any] = {}
     for key, usual in (("weight_bits", 8), ("planes", 1), ("scale_groups", 1)):

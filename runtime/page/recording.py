@@ -10,11 +10,11 @@ import numpy.typing as npt
 
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.dynamics import with_clocks
-from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT, FloatArray, IntArray
-from spikeloom.compiler.interpret import BoolArray
+from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.systems import GRAPH_SYSTEMS
 from spikeloom.compiler.targets.netlist import Netlist
+from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.equivalence.reference import membranes_of, spikes_of
 from spikeloom.runtime.inputs.network import LoadedNetwork

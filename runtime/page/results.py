@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.fixedpoint import FloatArray, IntArray
+from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.runtime.equivalence.verdict import Verdict
 from spikeloom.runtime.machines.page_parts import BatchParts, Cores, Sizes
 from spikeloom.runtime.report.encode import HIDDEN, OPTIONAL, key

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal, ParamSpec
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.fixedpoint import FloatArray
+from spikeloom.compiler.types import FloatArray, JsonObject
 from spikeloom.runtime.report.numbers import counted, si
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ class Drawing:
             text = text.replace(colour, f"var(--c{index})")
         return re.sub(r'(id="|href="#|url\(#)', rf"\1{name}-", text)
 
-    def values(self) -> dict[str, Any]:
+    def values(self) -> JsonObject:
         """What a page's script reads: places in the units of the SVG."""
         height = self.figure.get_figheight() * 72
 

@@ -22,7 +22,7 @@ def page(title: str, about: str, sections: Iterable[Section]) -> str:
     sections : iterable of Section
         Its chapters, which the page links to; each has a title.
     """
-    from spikeloom.compiler.version import __version__
+    from spikeloom.compiler import __version__
 
     files = resources.files("spikeloom.runtime.report")
     return (

@@ -25,8 +25,9 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any, TypeVar
 
+from spikeloom.compiler import __version__
 from spikeloom.compiler.errors import DataError, OptionError, SpikeloomError, UnfinishedError
-from spikeloom.compiler.version import __version__
+from spikeloom.compiler.types import JsonObject
 
 APayload = TypeVar("APayload")
 AResult = TypeVar("AResult")
@@ -83,7 +84,7 @@ def sweep(
     scheduler: str | None = None,
     fresh: bool = False,
     label: str,
-) -> dict[str, Any]:
+) -> JsonObject:
     """Measure points, as far as the store does not know them.
 
     Parameters

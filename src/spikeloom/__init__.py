@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from spikeloom.models.networks.lif import LIF
     from spikeloom.runtime.api import Compiled, compile, load, recordings
 
-from spikeloom.compiler.version import __version__
+from spikeloom.compiler import __version__
 
 __all__ = ["LIF", "Compiled", "SpikeloomError", "__version__", "compile", "load", "recordings"]
 

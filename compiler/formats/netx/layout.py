@@ -19,9 +19,9 @@ from pathlib import Path
 import numpy as np
 
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.formats.hdf5 import Tree, read_hdf5
 from spikeloom.compiler.formats.names import printable
+from spikeloom.compiler.types import IntArray
 
 SUFFIX = ".net"
 

@@ -13,7 +13,7 @@ from scipy import sparse
 
 from spikeloom.compiler.dynamics import MOST_CLOCKS, MOST_STEPS, NO_CLOCKS, Clocks
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.fixedpoint import BIAS_MANTISSA_MAX, THRESHOLD_MANTISSA_MAX, IntArray
+from spikeloom.compiler.fixedpoint import BIAS_MANTISSA_MAX, THRESHOLD_MANTISSA_MAX
 from spikeloom.compiler.formats.hdf5 import Tree
 from spikeloom.compiler.formats.kernels import convolution
 from spikeloom.compiler.formats.netx.layout import BIAS_EXPONENT, DEFAULT_INPUT_WEIGHT, REMEDY, Block, read_blocks
@@ -28,6 +28,7 @@ from spikeloom.compiler.ir import (
     Sparse,
 )
 from spikeloom.compiler.sensor_layout import sensor_layout
+from spikeloom.compiler.types import IntArray
 
 NEURONS = ("CUBA", "LOIHI")
 

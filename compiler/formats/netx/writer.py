@@ -18,18 +18,13 @@ from typing import Any
 import numpy as np
 
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.fixedpoint import (
-    BIAS_MANTISSA_MAX,
-    MEMBRANE_SHIFT,
-    THRESHOLD_MANTISSA_MAX,
-    IntArray,
-    round_half_even,
-)
+from spikeloom.compiler.fixedpoint import BIAS_MANTISSA_MAX, MEMBRANE_SHIFT, THRESHOLD_MANTISSA_MAX, round_half_even
 from spikeloom.compiler.formats.hdf5 import Tree
 from spikeloom.compiler.formats.netx.layout import blocks_of
 from spikeloom.compiler.formats.netx.reader import OWN, integers_of
-from spikeloom.compiler.interpret import BoolArray, run_integer
+from spikeloom.compiler.interpret import run_integer
 from spikeloom.compiler.ir import INPUT, IntegerNetwork, IntegerPopulation
+from spikeloom.compiler.types import BoolArray, IntArray
 
 MOST_SHIFT = 8
 

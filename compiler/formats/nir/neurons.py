@@ -20,8 +20,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.fixedpoint import FloatArray, decay_registers
+from spikeloom.compiler.fixedpoint import decay_registers
 from spikeloom.compiler.formats.nir.file import Node
+from spikeloom.compiler.types import FloatArray
 
 CONVENTIONS = ("euler", "exponential")
 

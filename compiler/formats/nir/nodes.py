@@ -10,11 +10,11 @@ import numpy as np
 from scipy import sparse
 
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.fixedpoint import FloatArray
 from spikeloom.compiler.formats.kernels import Padding, block_diagonal, convolution, pooling, same_padding
 from spikeloom.compiler.formats.nir.file import Node
 from spikeloom.compiler.formats.nir.neurons import Steps, one, spread
 from spikeloom.compiler.formats.nir.values import Value, filtered, reshaped, scaled, shifted, through
+from spikeloom.compiler.types import FloatArray
 
 Made = TypeVar("Made")
 

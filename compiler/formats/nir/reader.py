@@ -13,7 +13,6 @@ from scipy import sparse
 
 from spikeloom.compiler.dynamics import MOST_STEPS, RELAY_WEIGHT, Clocks
 from spikeloom.compiler.errors import ModelError, OptionError
-from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.formats.assemble import Layer, assemble, class_of_each, in_order
 from spikeloom.compiler.formats.names import printable, unique_names
 from spikeloom.compiler.formats.nir.facts import SpikingNode, facts_of, hint, stated_step
@@ -25,6 +24,7 @@ from spikeloom.compiler.formats.nir.order import loops
 from spikeloom.compiler.formats.nir.values import Value, added, filtered, scaled, spikes_of
 from spikeloom.compiler.ir import INPUT, Input, Network, Sparse
 from spikeloom.compiler.sensor_layout import sensor_layout
+from spikeloom.compiler.types import FloatArray, IntArray
 
 SUFFIX = ".nir"
 

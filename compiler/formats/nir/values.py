@@ -10,8 +10,8 @@ import numpy as np
 from scipy import sparse
 
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.fixedpoint import FloatArray
 from spikeloom.compiler.ir import Sparse
+from spikeloom.compiler.types import FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from spikeloom.compiler import __version__
 from spikeloom.compiler.errors import ModelError, OptionError
-from spikeloom.compiler.version import __version__
 
 OPSET = 17
 IR_VERSION = 8

@@ -8,7 +8,6 @@ import numpy as np
 from scipy import sparse
 
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.fixedpoint import FloatArray
 from spikeloom.compiler.formats.onnx.evaluate import COMPARISONS
 from spikeloom.compiler.formats.onnx.file import Node
 from spikeloom.compiler.formats.onnx.values import (
@@ -27,6 +26,7 @@ from spikeloom.compiler.formats.onnx.values import (
     scaled,
     size_of,
 )
+from spikeloom.compiler.types import FloatArray
 
 NOT_AFFINE = "is not affine in its input; only affine operators between two spiking layers can become synapses"
 

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.fixedpoint import FloatArray
 from spikeloom.compiler.formats.names import printable
 from spikeloom.compiler.formats.onnx.values import (
     INPUT_ATOM,
@@ -26,6 +25,7 @@ from spikeloom.compiler.formats.onnx.values import (
     one_each,
 )
 from spikeloom.compiler.ir import Sparse
+from spikeloom.compiler.types import FloatArray
 
 EQUAL = 1e-12
 """Relative difference that reordered arithmetic on two constants explains."""

@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.formats.assemble import Layer, assemble
 from spikeloom.compiler.formats.names import printable, unique_names
 from spikeloom.compiler.formats.onnx.file import BOOL, DOUBLE, Declared, Graph, Model, read_model
@@ -28,6 +27,7 @@ from spikeloom.compiler.formats.onnx.steps import Unrolled, group, readout
 from spikeloom.compiler.formats.onnx.values import INPUT_ATOM, Affine, Table
 from spikeloom.compiler.ir import INPUT, Network, Sparse
 from spikeloom.compiler.sensor_layout import sensor_layout
+from spikeloom.compiler.types import IntArray
 
 SUFFIX = ".onnx"
 

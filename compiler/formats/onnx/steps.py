@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.formats.assemble import class_of_each
 from spikeloom.compiler.formats.names import printable
 from spikeloom.compiler.formats.onnx.lif import EQUAL, RESET, Neurons
 from spikeloom.compiler.formats.onnx.values import INPUT_ATOM, MEMBRANE, Affine, Table
 from spikeloom.compiler.ir import INPUT, Sparse
+from spikeloom.compiler.types import FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -16,10 +16,10 @@ import numpy as np
 from scipy import sparse
 
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.formats.names import printable
 from spikeloom.compiler.formats.onnx.file import Array, Node
 from spikeloom.compiler.ir import Sparse
+from spikeloom.compiler.types import FloatArray, IntArray
 
 VALUE_LIMIT, COEFFICIENT_LIMIT = 2**22, 2**24
 """Elements of a value, and coefficients of an operator: more than the synapses of a chip."""

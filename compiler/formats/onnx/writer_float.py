@@ -28,7 +28,6 @@ import numpy as np
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.dynamics import NO_CLOCKS
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.fixedpoint import FloatArray
 from spikeloom.compiler.formats.onnx.builder import (
     Nodes,
     Port,
@@ -41,6 +40,7 @@ from spikeloom.compiler.formats.onnx.builder import (
 )
 from spikeloom.compiler.formats.onnx.writer import timing_words
 from spikeloom.compiler.passes.expand import expand_dense
+from spikeloom.compiler.types import FloatArray
 
 
 def export_float(checkpoint: Checkpoint, adjacency: FloatArray, form: str, *, graph_name: str) -> bytes:

@@ -13,18 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.fixedpoint import (
-    ACCUMULATOR_MAX,
-    CURRENT_MAX,
-    DECAY_BITS,
-    MEMBRANE_MAX,
-    MEMBRANE_SHIFT,
-    IntArray,
-)
+from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT
 from spikeloom.compiler.formats.names import plain_names
 from spikeloom.compiler.formats.onnx.builder import require_room
 from spikeloom.compiler.ir import INPUT
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, one_step_bounds
+from spikeloom.compiler.types import IntArray
 
 ONE = 2**DECAY_BITS
 NARROW = 2**31 - 1

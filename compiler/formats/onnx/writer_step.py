@@ -7,17 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spikeloom.compiler.fixedpoint import (
-    ACCUMULATOR_MAX,
-    CURRENT_MAX,
-    DECAY_BITS,
-    MEMBRANE_MAX,
-    MEMBRANE_SHIFT,
-    IntArray,
-)
+from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT
 from spikeloom.compiler.formats.onnx.builder import Nodes, Port
 from spikeloom.compiler.formats.onnx.writer_layers import Layer, digits
 from spikeloom.compiler.ir import INPUT
+from spikeloom.compiler.types import IntArray
 
 Products = tuple[tuple[str, str], ...]
 """Pairs of an int32 product of spikes with digits, and the constant of what a one in it adds, in membrane units."""

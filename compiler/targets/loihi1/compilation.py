@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from spikeloom.compiler.errors import VerifyError
-from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.invariants import verify
 from spikeloom.compiler.ir import IntegerNetwork, Network
 from spikeloom.compiler.passes.calibrate import Calibration
@@ -24,6 +23,7 @@ from spikeloom.compiler.targets.loihi1.options import Options
 from spikeloom.compiler.targets.loihi1.storage.quantize import Choice
 from spikeloom.compiler.targets.loihi1.storage.spike_exact import Exactness
 from spikeloom.compiler.text import text
+from spikeloom.compiler.types import FloatArray, IntArray
 
 LATER: Any = None
 """Of a field that a pass fills in."""
@@ -31,71 +31,32 @@ LATER: Any = None
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Compilation:
-    """Everything that one compilation was given and has made so far; each field is filled in by one pass.
+    """Everything that one compilation was given and has made so far; each field is filled in by one pass."""
 
-    Parameters
-    ----------
-    source : Factored, Network or IntegerNetwork
-        What is compiled.
-    options : Options
-        What was asked for.
-    target : Target
-        Chip.
-    network : Network
-        Float network, a synapse for each pair of neurons (`expand`).
-    calibration : Calibration or None
-        What it did on training recordings, where there are any (`calibrate`).
-    rates : tuple of (neurons,) float64, or None
-        Spikes per step by population, likewise; the placement weighs traffic by them.
-    connected : Network
-        The same network without the weights of neurons that do nothing (`disconnect`).
-    unused : tuple of (neurons,) bool
-        Neurons that never fired in training and are to go for it.
-    integer : IntegerNetwork
-        In the integers of the chip (`quantize`).
-    choices : tuple of Choice
-        Scale of each layer and why.
-    exactness : tuple of Exactness
-        What is in the way of equal spikes, where these were asked for; else empty.
-    proofs : tuple of RangeProof
-        Worst-case register values of each layer (`prove`).
-    held : IntegerNetwork
-        What the chip holds of it (`remove`).
-    identity : tuple of (neurons left,) int64
-        Which neurons these are, by population.
-    silent, unreceived : tuple of (neurons,) bool
-        Neurons that it does not hold: they cannot fire, or their spikes reach no neuron.
-    removals : tuple of Removal
-        The same in numbers, and why.
-    layout, usual : Layout
-        Cores and tiles, and those of the layout of fewest cores; often they are one (`place`).
-    netlist : Netlist
-        The result (`emit`).
-    uses : tuple of LimitUse
-        Use of every limit by every core (`legalize`).
-    """
-
-    source: Factored | Network | IntegerNetwork
-    options: Options
-    target: Target
-    network: Network = LATER
-    calibration: Calibration | None = None
+    source: Factored | Network | IntegerNetwork  # What is compiled
+    options: Options  # What was asked for
+    target: Target  # Chip
+    network: Network = LATER  # Float network, a synapse for each pair of neurons (`expand`)
+    calibration: Calibration | None = None  # What it did on training recordings, where there are any (`calibrate`)
+    # Spikes per step by population, likewise; the placement weighs traffic by them
     rates: tuple[FloatArray, ...] | None = None
-    connected: Network = LATER
-    unused: Masks = ()
-    integer: IntegerNetwork = LATER
-    choices: tuple[Choice, ...] = ()
-    exactness: tuple[Exactness, ...] = ()
-    proofs: tuple[RangeProof, ...] = ()
-    held: IntegerNetwork = LATER
-    identity: tuple[IntArray, ...] = ()
+    connected: Network = LATER  # The same network without the weights of neurons that do nothing (`disconnect`)
+    unused: Masks = ()  # Neurons that never fired in training and are to go for it
+    integer: IntegerNetwork = LATER  # In the integers of the chip (`quantize`)
+    choices: tuple[Choice, ...] = ()  # Scale of each layer and why
+    exactness: tuple[Exactness, ...] = ()  # What is in the way of equal spikes, where these were asked for; else empty
+    proofs: tuple[RangeProof, ...] = ()  # Worst-case register values of each layer (`prove`)
+    held: IntegerNetwork = LATER  # What the chip holds of it (`remove`)
+    identity: tuple[IntArray, ...] = ()  # Which neurons these are, by population
+    # silent, unreceived: Neurons that it does not hold: they cannot fire, or their spikes reach no neuron
     silent: Masks = ()
     unreceived: Masks = ()
-    removals: tuple[Removal, ...] = ()
+    removals: tuple[Removal, ...] = ()  # The same in numbers, and why
+    # layout, usual: Cores and tiles, and those of the layout of fewest cores; often they are one (`place`)
     layout: Layout = LATER
     usual: Layout = LATER
-    netlist: Netlist = LATER
-    uses: tuple[LimitUse, ...] = ()
+    netlist: Netlist = LATER  # The result (`emit`)
+    uses: tuple[LimitUse, ...] = ()  # Use of every limit by every core (`legalize`)
 
     @property
     def placement(self) -> Placement:

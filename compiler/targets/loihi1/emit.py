@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.fixedpoint import IntArray, frozen, read_only, read_only_float
+from spikeloom.compiler.fixedpoint import frozen, read_only, read_only_float
 from spikeloom.compiler.ir import INPUT, MANTISSA, IntegerNetwork, depths, fan_in
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.layout.core_needs import (
@@ -26,6 +26,7 @@ from spikeloom.compiler.targets.loihi1.layout.core_needs import (
 )
 from spikeloom.compiler.targets.loihi1.layout.partition import Partition
 from spikeloom.compiler.targets.loihi1.netlist import Layer, Netlist
+from spikeloom.compiler.types import IntArray
 
 
 def _entries(
@@ -52,20 +53,11 @@ def _entries(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Origin:
-    """What a network was before neurons were left out.
+    """What a network was before neurons were left out."""
 
-    Parameters
-    ----------
-    network : IntegerNetwork
-        With all neurons.
-    identity : tuple of (neurons left,) int64
-        For each population, which of its neurons the chip holds.
-    unreceived : tuple of (neurons,) bool
-        Neurons removed although they fire, because their spikes reach no neuron.
-    """
-
-    network: IntegerNetwork
-    identity: tuple[IntArray, ...]
+    network: IntegerNetwork  # With all neurons
+    identity: tuple[IntArray, ...]  # For each population, which of its neurons the chip holds
+    # Neurons removed although they fire, because their spikes reach no neuron
     unreceived: tuple[npt.NDArray[np.bool_], ...]
 
 
@@ -84,7 +76,7 @@ def _layers(origin: Origin) -> tuple[Layer, ...]:
         Layer(
             name=population.name,
             neurons=population.size,
-            unheard=tuple(np.flatnonzero(origin.unreceived[post]).tolist()),
+            unreceived=tuple(np.flatnonzero(origin.unreceived[post]).tolist()),
             depth=depth,
             beta=population.beta,
             theta=population.theta,

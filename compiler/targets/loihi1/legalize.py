@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from spikeloom.compiler.errors import CapacityError, Violation
-from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.types import IntArray
 
 REMEDIES = {
     "core.compartments": "split the layer over more cores",

@@ -14,9 +14,10 @@ import numpy.typing as npt
 from scipy import sparse
 
 from spikeloom.compiler.errors import FormatError
-from spikeloom.compiler.fixedpoint import THRESHOLD_MANTISSA_MAX, IntArray
+from spikeloom.compiler.fixedpoint import THRESHOLD_MANTISSA_MAX
 from spikeloom.compiler.ir import INPUT, Input, IntegerNetwork, IntegerPopulation, IntegerProjection, Readout
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.types import IntArray
 
 
 def _one(netlist: Netlist, layer: int, field: str) -> int:

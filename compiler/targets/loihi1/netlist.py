@@ -31,120 +31,76 @@ from typing import Any
 import numpy as np
 
 from spikeloom.compiler.dynamics import NO_CLOCKS, Clocks
-from spikeloom.compiler.fixedpoint import FloatArray, IntArray
+from spikeloom.compiler.types import FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Layer:
-    """One population of the network, as the netlist remembers it.
+    """One population of the network, as the netlist remembers it."""
 
-    Parameters
-    ----------
-    name : str
-        ``conv1``, ``fc1`` …
-    neurons : int
-        Neurons of the float model's layer; the chip may hold fewer compartments.
-    unheard : tuple of int
-        Neurons left out although they fire, as their spikes reach no neuron; any other that is missing cannot fire.
-    depth : int
-        Steps that the layer lags behind the data.
-    beta, theta : float
-        Decay and threshold of the float model.
-    weight_bits : int
-        Storage width of the mantissas.
-    synapses : int
-        Structural synapses into the layer, before zeros were dropped.
-    max_fan_in : int
-        Largest structural fan-in of a neuron.
-    alpha : float
-        Current decay of the float model.
-    """
-
-    name: str
-    neurons: int
-    unheard: tuple[int, ...]
-    depth: int
+    name: str  # ``conv1``, ``fc1`` …
+    neurons: int  # Neurons of the float model's layer; the chip may hold fewer compartments
+    # Neurons left out although they fire, as their spikes reach no neuron; any other that is missing cannot fire
+    unreceived: tuple[int, ...]
+    depth: int  # Steps that the layer lags behind the data
+    # beta, theta: Decay and threshold of the float model
     beta: float
     theta: float
-    weight_bits: int
-    synapses: int
-    max_fan_in: int
-    alpha: float = 0.0
+    weight_bits: int  # Storage width of the mantissas
+    synapses: int  # Structural synapses into the layer, before zeros were dropped
+    max_fan_in: int  # Largest structural fan-in of a neuron
+    alpha: float = 0.0  # Current decay of the float model
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Netlist:
-    """A placed integer network; see the module docstring for ids and time.
+    """A placed integer network; see the module docstring for ids and time."""
 
-    Parameters
-    ----------
-    target : str
-        Name of the chip.
-    taxels, polarities, classes : int
-        Sensor size and number of classes; ``n_inputs = taxels * polarities``, and the clocks.
-    layers : tuple of Layer
-        In order of depth; ``readout_class`` says which of them votes.
-    core_tile : (cores,) int64
-        Tile of each core, row-major on the mesh (``x = tile % width``, ``y = tile // width``).
-    core_compartments, core_axons : (cores + 1,) int64
-        Range bounds, see above.
-    layer, neuron : (compartments,) int64
-        Which neuron of which layer a compartment is.
-    decay_u, decay_v : (compartments,) int64
-        Registers: the current loses ``(decay_u + 1)/4096``, the membrane ``decay_v/4096`` a step.
-    threshold : (compartments,) int64
-        Mantissa; a spike needs ``v > 64 * threshold``.
-    bias_mantissa, bias_exponent : (compartments,) int64
-        ``mantissa * 2**exponent`` is added to the membrane, unshifted.
-    scale : (compartments,) float64
-        Weight units (mantissa times 2**exponent) per unit of the float model's membrane; a membrane register
-        holds 64ths of a weight unit, so float membrane = register / (64 * scale). No register of the chip.
-    readout_class : (compartments,) int64
-        Class that a spike votes for, -1 for none.
-    axon_source, axon_format : (axons,) int64
-        Source id and synapse format of each axon.
-    axon_synapses : (axons + 1,) int64
-        Range bounds into the synapses.
-    synapse_target, synapse_weight : (synapses,) of an integer type
-        Compartment within the core, and mantissa; in as few bytes as hold them.
-    format_weight_bits, format_exponent, format_index_bits : (formats,) int64
-        Synapse formats of the whole netlist; a core uses some of them.
-    provenance : mapping
-        JSON values only: checkpoint hash, graph, options, version.
-    clocks : Clocks
-        Input channels beyond those of the sensor, whose events :func:`dynamics.with_clocks` makes.
-    bins : int
-        Bins of the recordings that a step joins.
-    """
-
-    target: str
+    target: str  # Name of the chip
+    # taxels, polarities, classes: Sensor size and number of classes; ``n_inputs = taxels * polarities``, and the clocks
     taxels: int
     polarities: int
     classes: int
-    layers: tuple[Layer, ...]
+    layers: tuple[Layer, ...]  # In order of depth; ``readout_class`` says which of them votes
+    # (cores,) int64; tile of each core, row-major on the mesh (``x = tile % width``, ``y = tile // width``)
     core_tile: IntArray
+    # core_compartments, core_axons: (cores + 1,) int64; range bounds, see above
     core_compartments: IntArray
     core_axons: IntArray
+    # layer, neuron: (compartments,) int64; which neuron of which layer a compartment is
     layer: IntArray
     neuron: IntArray
+    # decay_u, decay_v: (compartments,) int64; registers: the current loses ``(decay_u + 1)/4096``, the membrane
+    # ``decay_v/4096`` a step
     decay_u: IntArray
     decay_v: IntArray
-    threshold: IntArray
+    threshold: IntArray  # (compartments,) int64; mantissa; a spike needs ``v > 64 * threshold``
+    # bias_mantissa, bias_exponent: (compartments,) int64; ``mantissa * 2**exponent`` is added to the membrane,
+    # unshifted
     bias_mantissa: IntArray
     bias_exponent: IntArray
+    # (compartments,) float64; weight units (mantissa times 2**exponent) per unit of the float model's membrane; a
+    # membrane register holds 64ths of a weight unit, so float membrane = register / (64 * scale). No register of the
+    # chip.
     scale: FloatArray
-    readout_class: IntArray
+    readout_class: IntArray  # (compartments,) int64; class that a spike votes for, -1 for none
+    # axon_source, axon_format: (axons,) int64; source id and synapse format of each axon
     axon_source: IntArray
     axon_format: IntArray
-    axon_synapses: IntArray
+    axon_synapses: IntArray  # (axons + 1,) int64; range bounds into the synapses
+    # synapse_target, synapse_weight: (synapses,) of an integer type; compartment within the core, and mantissa; in as
+    # few bytes as hold them
     synapse_target: IntArray
     synapse_weight: IntArray
+    # format_weight_bits, format_exponent, format_index_bits: (formats,) int64; synapse formats of the whole netlist; a
+    # core uses some of them
     format_weight_bits: IntArray
     format_exponent: IntArray
     format_index_bits: IntArray
-    provenance: Mapping[str, Any]
+    provenance: Mapping[str, Any]  # JSON values only: checkpoint hash, graph, options, version
+    # Input channels beyond those of the sensor, whose events :func:`dynamics.with_clocks` makes
     clocks: Clocks = NO_CLOCKS
-    bins: int = 1
+    bins: int = 1  # Bins of the recordings that a step joins
 
     @property
     def n_inputs(self) -> int:

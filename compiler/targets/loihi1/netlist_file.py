@@ -42,6 +42,7 @@ from spikeloom.compiler.errors import FormatError
 from spikeloom.compiler.fixedpoint import frozen, read_only, read_only_float
 from spikeloom.compiler.targets.base import COMPARTMENTS, known_targets
 from spikeloom.compiler.targets.loihi1.netlist import Layer, Netlist
+from spikeloom.compiler.types import JsonObject
 
 FORMAT, VERSION = "spikeloom-netlist", 5
 
@@ -53,7 +54,7 @@ FLOATS = frozenset({"scale"})
 
 LAYER: Kind = {
     "name": str,
-    "unheard": [(0, 2**31)],
+    "unreceived": [(0, 2**31)],
     **dict.fromkeys(("neurons", "depth", "weight_bits", "synapses", "max_fan_in"), (0, 2**62)),
     **dict.fromkeys(("beta", "theta", "alpha"), float),
 }
@@ -64,7 +65,7 @@ ARRAYS = tuple(field.name for field in fields(Netlist) if field.name not in _SCA
 """Array members in file order."""
 
 
-def manifest_of(netlist: Netlist) -> dict[str, Any]:
+def manifest_of(netlist: Netlist) -> JsonObject:
     """What a netlist says beside its arrays, as JSON values."""
     values = {name: getattr(netlist, name) for name in ("target", "taxels", "polarities", "classes", "bins")}
     return values | {
@@ -115,7 +116,7 @@ def read_netlist(path: str | os.PathLike[str]) -> Netlist:
     }
     netlist = Netlist(
         **stated,
-        layers=tuple(Layer(**(layer | {"unheard": tuple(layer["unheard"])})) for layer in manifest["layers"]),
+        layers=tuple(Layer(**(layer | {"unreceived": tuple(layer["unreceived"])})) for layer in manifest["layers"]),
         clocks=Clocks(**manifest["clocks"]),
         scale=read_only_float(members["scale"]),
         **arrays,
@@ -190,7 +191,7 @@ def inconsistencies(netlist: Netlist) -> list[str]:
         found.append("synapse_target points beyond its core")
     for index, layer in enumerate(netlist.layers):
         neurons = np.sort(netlist.neuron[netlist.layer == index])
-        if np.intersect1d(neurons, layer.unheard).size or max(layer.unheard, default=0) >= layer.neurons:
+        if np.intersect1d(neurons, layer.unreceived).size or max(layer.unreceived, default=0) >= layer.neurons:
             found.append(f"layer {layer.name} holds neurons that it leaves out, or leaves out some that are not there")
         if is_outside(neurons, 0, layer.neurons) or len(np.unique(neurons)) != len(neurons) or not len(neurons):
             found.append(

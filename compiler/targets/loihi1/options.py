@@ -27,68 +27,36 @@ MARGIN = 0.1
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Recipe:
-    """Storage of one population.
+    """Storage of one population."""
 
-    Parameters
-    ----------
-    bits : int
-        Storage width of a mantissa.
-    planes : int
-        Times that a synapse may be stored, with different exponents.
-    groups : int
-        Different thresholds, and so scales, at most.
-    """
-
-    bits: int = 8
-    planes: int = 1
-    groups: int = 1
+    bits: int = 8  # Storage width of a mantissa
+    planes: int = 1  # Times that a synapse may be stored, with different exponents
+    groups: int = 1  # Different thresholds, and so scales, at most
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Options:
-    """Options of a compilation.
+    """Options of a compilation."""
 
-    Parameters
-    ----------
-    forms : sequence of Form, optional
-        Storage that the network was fine-tuned for, by population.
-    recipes : sequence of Recipe, optional
-        Storage of each layer, or one for all; 8 bits by default. A fine-tuned network brings its own and takes none.
-    spike_exact : bool
-        Add planes and scales until every spike on the training recordings, all of them, is the float64 model's, see
-        :mod:`storage.spike_exact`; takes the width from `recipes` and nothing else.
-    keep_all : bool
-        Keep neurons that provably do nothing, too.
-    prune_unused : bool
-        Remove neurons that did not fire on any training recording, too.
-    training_events : (samples, taxels, polarities, steps), optional
-        Training recordings for calibration, of which 32, evenly spaced, are used; with several planes 256.
-    ranges : str
-        One of ``RANGES``.
-    margin : float
-        Share added to observed ranges.
-    cores_for : mapping of str to int
-        Least number of cores of a layer, by name; they hold no other. Its neurons are cut as evenly as possible.
-    chips : int
-        Number of chips at most; as few are used as hold the cores.
-    optimize : str
-        One of ``GOALS``: what the layout is chosen for, see :mod:`layout.choose`; all but cores need training events.
-    provenance : mapping
-        JSON values to store with the netlist.
-    """
-
-    forms: Sequence[Form] | None = None
+    forms: Sequence[Form] | None = None  # Storage that the network was fine-tuned for, by population
+    # Storage of each layer, or one for all; 8 bits by default. A fine-tuned network brings its own and takes none.
     recipes: Sequence[Recipe] | None = None
+    # Add planes and scales until every spike on the training recordings, all of them, is the float64 model's, see
+    # :mod:`storage.spike_exact`; takes the width from `recipes` and nothing else
     spike_exact: bool = False
-    keep_all: bool = False
-    prune_unused: bool = False
+    keep_all: bool = False  # Keep neurons that provably do nothing, too
+    prune_unused: bool = False  # Remove neurons that did not fire on any training recording, too
+    # (samples, taxels, polarities, steps), optional; training recordings for calibration, of which 32, evenly spaced,
+    # are used; with several planes 256
     training_events: npt.NDArray[Any] | None = None
-    ranges: str = "proven"
-    margin: float = MARGIN
+    ranges: str = "proven"  # One of ``RANGES``
+    margin: float = MARGIN  # Share added to observed ranges
+    # Least number of cores of a layer, by name; they hold no other. Its neurons are cut as evenly as possible.
     cores_for: Mapping[str, int] = field(default_factory=dict)
-    chips: int = 1
+    chips: int = 1  # Number of chips at most; as few are used as hold the cores
+    # One of ``GOALS``: what the layout is chosen for, see :mod:`layout.choose`; all but cores need training events
     optimize: str = "cores"
-    provenance: Mapping[str, Any] = field(default_factory=dict)
+    provenance: Mapping[str, Any] = field(default_factory=dict)  # JSON values to store with the netlist
 
     def require_consistent(self, *, calibrated: bool) -> None:
         """Refuse options that contradict each other; `calibrated` where there are, or will be, training events.

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from spikeloom.compiler.fixedpoint import FloatArray
 from spikeloom.compiler.interpret import channels_last
 from spikeloom.compiler.ir import IntegerNetwork, Network
 from spikeloom.compiler.passes import calibrate as calibration
@@ -22,6 +21,7 @@ from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.options import Options, Recipe, check_recipes, require_stored
 from spikeloom.compiler.targets.loihi1.storage.quantize import quantize, round_to_forms
 from spikeloom.compiler.targets.loihi1.storage.spike_exact import make_exact
+from spikeloom.compiler.types import FloatArray
 
 __all__ = ["INTEGERS", "LAYOUT", "PASSES", "STORAGE", "Options", "lay_out_again", "start", "store", "without"]
 

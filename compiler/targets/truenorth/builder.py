@@ -13,8 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler.dynamics import NO_CLOCKS, Clocks
-from spikeloom.compiler.fixedpoint import IntArray, read_only
+from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.targets.truenorth.netlist import AXON_TYPES, RESET_TO, CrossbarNetlist
+from spikeloom.compiler.types import IntArray
 
 Rows = list[tuple[int, ...]]
 

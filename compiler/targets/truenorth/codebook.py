@@ -14,11 +14,10 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.fixedpoint import FloatArray, IntArray, read_only
+from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.ir import INPUT, Network, Population
 from spikeloom.compiler.targets.base import Target
-
-BoolArray = npt.NDArray[np.bool_]
+from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 
 BIN_TICKS = 20
 """Ticks of a data step whose sums travel in time: a millisecond each of the sensor's 20."""

@@ -26,7 +26,6 @@ from typing import Any
 import numpy as np
 
 from spikeloom.compiler.errors import CapacityError
-from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.truenorth.builder import RELAY, Draft, Neuron, crossing_points
 from spikeloom.compiler.targets.truenorth.codebook import (
@@ -43,6 +42,7 @@ from spikeloom.compiler.targets.truenorth.codebook import (
 from spikeloom.compiler.targets.truenorth.legalize import signed_range
 from spikeloom.compiler.targets.truenorth.lower import exceeded, place_cores
 from spikeloom.compiler.targets.truenorth.netlist import AXON_TYPES, RESET_LINEAR, RESET_TO, CrossbarNetlist
+from spikeloom.compiler.types import IntArray
 
 CLOCK = AXON_TYPES - 1
 """Type of axons that clocks reach on cores that add up inputs."""

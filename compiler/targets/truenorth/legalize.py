@@ -11,9 +11,9 @@ from itertools import groupby
 import numpy as np
 
 from spikeloom.compiler.errors import CapacityError, Violation
-from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.truenorth.netlist import RESET_NONE, RESET_TO, CrossbarNetlist
+from spikeloom.compiler.types import IntArray
 
 Offender = tuple[int, str, str]
 """Core (-1 for the chip), who on it, and what was found."""

@@ -18,11 +18,11 @@ from typing import Any
 import numpy as np
 
 from spikeloom.compiler.errors import CapacityError, Violation
-from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.truenorth.builder import Draft, Neuron, crossing_points
 from spikeloom.compiler.targets.truenorth.native import BASES, UNIT, NativeNetwork, Stage, Tower, faults
 from spikeloom.compiler.targets.truenorth.netlist import RESET_TO, CrossbarNetlist
+from spikeloom.compiler.types import IntArray
 
 Place = tuple[int, int]
 """Core, and neuron or line on it."""

@@ -32,8 +32,9 @@ from spikeloom.compiler.archive import (
 from spikeloom.compiler.checkpoint import WEIGHTS
 from spikeloom.compiler.dynamics import Clocks
 from spikeloom.compiler.errors import FormatError, ModelError
-from spikeloom.compiler.fixedpoint import IntArray, read_only
+from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.targets.truenorth.native import NativeNetwork, Stage, faults
+from spikeloom.compiler.types import IntArray
 
 FORMAT = TRAINED
 VERSIONS = (1,)

@@ -10,9 +10,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from spikeloom.compiler.errors import Violation
-from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.ir import Network, fan_in
 from spikeloom.compiler.targets.base import Target
+from spikeloom.compiler.types import IntArray
 
 MOST_COPIES = 4
 """Axons of an input beyond which types repeat: there are four."""

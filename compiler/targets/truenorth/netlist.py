@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 
 from spikeloom.compiler.dynamics import NO_CLOCKS, Clocks
-from spikeloom.compiler.fixedpoint import IntArray
+from spikeloom.compiler.types import IntArray
 
 RESET_TO, RESET_LINEAR, RESET_NONE = 0, 1, 2
 """What a spike leaves: the reset value, the membrane less the threshold, the membrane."""
@@ -46,106 +46,67 @@ PER_NEURON = (
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class CrossbarNetlist:
-    """A placed network of crossbar cores; see the module docstring for ids and time.
+    """A placed network of crossbar cores; see the module docstring for ids and time."""
 
-    Parameters
-    ----------
-    target : str
-        Name of the chip.
-    taxels, polarities, classes : int
-        Sensor size and number of classes.
-    bin_ticks : int
-        Ticks of a data step.
-    layers : tuple of str
-        Names; relays that copy spikes have one of their own.
-    core_x, core_y : (cores,) int64
-        Places on the mesh.
-    core_neurons, core_axons : (cores + 1,) int64
-        Range bounds, see above.
-    axon_line, axon_type : (axons,) int64
-        Line on the core, and type.
-    axon_synapses : (axons + 1,) int64
-        Range bounds into the crossing points.
-    synapse_neuron : (synapses,) int64
-        Neuron on the core.
-    weight : (neurons, 4) int64
-        By axon type.
-    leak : (neurons,) int64
-        Added in every tick.
-    leak_reversal : (neurons,) int64
-        1 where the leak takes the sign of the membrane; a membrane that it would carry past zero is then zero.
-    threshold : (neurons,) int64
-        A spike needs a membrane of at least this, and the masked random number.
-    mask_bits : (neurons,) int64
-        Random bits that are added to both thresholds in every tick; 0 for none.
-    reset_mode, reset : (neurons,) int64
-        ``RESET_TO``, ``RESET_LINEAR`` or ``RESET_NONE``, and the value of the first.
-    negative_threshold : (neurons,) int64
-        Magnitude. A membrane below ``-negative_threshold`` (and the random number) is reset, too.
-    negative_saturates : (neurons,) int64
-        1 where it stays at ``-negative_threshold`` instead of being reset.
-    initial : (neurons,) int64
-        Membrane before the first tick.
-    layer, neuron : (neurons,) int64
-        Which neuron of which layer it is; copies of one share the numbers.
-    readout_class, readout_first : (neurons,) int64
-        Class that a spike votes for, -1 for none, and the tick from which on it does.
-    wire_neuron, wire_x, wire_y, wire_line, wire_delay : (wires,) int64
-        From a neuron to a line of the core at a place, ticks on the way.
-    feed_channel, feed_core, feed_line, feed_tick : (feeds,) int64
-        From an input channel (channel ``taxel * polarities + polarity``, then the clocks of `clocks`) to a line of a
-        core.
-    clock_core, clock_line, clock_period, clock_phase : (clocks,) int64
-        Periodic spikes from outside.
-    provenance : mapping
-        JSON values only.
-    clocks : Clocks
-        Input channels that tell the time, see :mod:`compiler.dynamics`.
-    """
-
-    target: str
+    target: str  # Name of the chip
+    # taxels, polarities, classes: Sensor size and number of classes
     taxels: int
     polarities: int
     classes: int
-    bin_ticks: int
-    layers: tuple[str, ...]
+    bin_ticks: int  # Ticks of a data step
+    layers: tuple[str, ...]  # Names; relays that copy spikes have one of their own
+    # core_x, core_y: (cores,) int64; places on the mesh
     core_x: IntArray
     core_y: IntArray
+    # core_neurons, core_axons: (cores + 1,) int64; range bounds, see above
     core_neurons: IntArray
     core_axons: IntArray
+    # axon_line, axon_type: (axons,) int64; line on the core, and type
     axon_line: IntArray
     axon_type: IntArray
-    axon_synapses: IntArray
-    synapse_neuron: IntArray
-    weight: IntArray
-    leak: IntArray
+    axon_synapses: IntArray  # (axons + 1,) int64; range bounds into the crossing points
+    synapse_neuron: IntArray  # (synapses,) int64; neuron on the core
+    weight: IntArray  # (neurons, 4) int64; by axon type
+    leak: IntArray  # (neurons,) int64; added in every tick
+    # (neurons,) int64; 1 where the leak takes the sign of the membrane; a membrane that it would carry past zero is
+    # then zero
     leak_reversal: IntArray
-    threshold: IntArray
-    mask_bits: IntArray
+    threshold: IntArray  # (neurons,) int64; A spike needs a membrane of at least this, and the masked random number
+    mask_bits: IntArray  # (neurons,) int64; random bits that are added to both thresholds in every tick; 0 for none
+    # reset_mode, reset: (neurons,) int64; ``RESET_TO``, ``RESET_LINEAR`` or ``RESET_NONE``, and the value of the first
     reset_mode: IntArray
     reset: IntArray
+    # (neurons,) int64; magnitude. A membrane below ``-negative_threshold`` (and the random number) is reset, too.
     negative_threshold: IntArray
-    negative_saturates: IntArray
-    initial: IntArray
+    negative_saturates: IntArray  # (neurons,) int64; 1 where it stays at ``-negative_threshold`` instead of being reset
+    initial: IntArray  # (neurons,) int64; membrane before the first tick
+    # layer, neuron: (neurons,) int64; which neuron of which layer it is; copies of one share the numbers
     layer: IntArray
     neuron: IntArray
+    # readout_class, readout_first: (neurons,) int64; class that a spike votes for, -1 for none, and the tick from which
+    # on it does
     readout_class: IntArray
     readout_first: IntArray
+    # wire_neuron, wire_x, wire_y, wire_line, wire_delay: (wires,) int64; from a neuron to a line of the core at a
+    # place, ticks on the way
     wire_neuron: IntArray
     wire_x: IntArray
     wire_y: IntArray
     wire_line: IntArray
     wire_delay: IntArray
+    # feed_channel, feed_core, feed_line, feed_tick: (feeds,) int64; from an input channel (channel ``taxel * polarities
+    # + polarity``, then the clocks of `clocks`) to a line of a core
     feed_channel: IntArray
     feed_core: IntArray
     feed_line: IntArray
     feed_tick: IntArray
+    # clock_core, clock_line, clock_period, clock_phase: (clocks,) int64; periodic spikes from outside
     clock_core: IntArray
     clock_line: IntArray
     clock_period: IntArray
     clock_phase: IntArray
-    provenance: Mapping[str, Any]
-    clocks: Clocks = NO_CLOCKS
+    provenance: Mapping[str, Any]  # JSON values only
+    clocks: Clocks = NO_CLOCKS  # Input channels that tell the time, see :mod:`compiler.dynamics`
 
     @property
     def bins(self) -> int:

@@ -9,7 +9,7 @@ import numpy as np
 
 from spikeloom.compiler.atomic import write_atomically
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.fixedpoint import FloatArray, IntArray
+from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.commands.options import MODEL, add_network, add_recordings
 from spikeloom.runtime.inputs.files import require_place

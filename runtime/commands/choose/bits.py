@@ -17,17 +17,24 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
-from spikeloom.compiler import DEFAULT_TARGET, WidthPoint, WidthSearch, check_widths, search_widths, widths_front
+from spikeloom.compiler import (
+    DEFAULT_TARGET,
+    WidthPoint,
+    WidthSearch,
+    __version__,
+    check_widths,
+    search_widths,
+    widths_front,
+)
 from spikeloom.compiler.archive import is_netlist
 from spikeloom.compiler.atomic import write_atomically
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.errors import ModelError, OptionError
-from spikeloom.compiler.fixedpoint import FloatArray
 from spikeloom.compiler.formats.checkpoint_file import arrays_digest
 from spikeloom.compiler.interpret import channels_last
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.base import COMPARTMENTS, Target, load_target
-from spikeloom.compiler.version import __version__
+from spikeloom.compiler.types import FloatArray
 from spikeloom.models.recordings.events import BIN_S
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.recordings.fetch import data_folder

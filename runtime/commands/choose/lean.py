@@ -7,10 +7,9 @@ import json
 from collections.abc import Mapping
 from dataclasses import replace
 
-from spikeloom.compiler import write_netlist
+from spikeloom.compiler import __version__, write_netlist
 from spikeloom.compiler.atomic import write_atomically
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.version import __version__
 from spikeloom.models.recordings.counts import number
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.commands.options import add_network, add_recordings

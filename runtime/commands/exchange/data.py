@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.fixedpoint import FloatArray
+from spikeloom.compiler.types import FloatArray
 from spikeloom.models.graphs import NEUTOUCH
 from spikeloom.models.recordings.counts import EventCounts, Oddities, number, oddities, show_notes
 from spikeloom.models.recordings.describe import describe

@@ -31,7 +31,7 @@ from spikeloom.runtime.report.encode import OPTIONAL
 from spikeloom.runtime.report.sections import Outcome, Section, Text
 
 if TYPE_CHECKING:
-    from spikeloom.compiler.fixedpoint import IntArray
+    from spikeloom.compiler.types import IntArray
 from spikeloom.runtime.machines.base import Step, Stream
 
 NOTES = """\

@@ -7,13 +7,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from spikeloom.compiler import Options, compile_network, write_netlist
+from spikeloom.compiler import Options, __version__, compile_network, write_netlist
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.formats.netx.layout import SUFFIX
 from spikeloom.compiler.formats.netx.reader import read_netx
 from spikeloom.compiler.invariants import verify
 from spikeloom.compiler.targets.base import load_target
-from spikeloom.compiler.version import __version__
 from spikeloom.runtime.commands.options import MODEL
 from spikeloom.runtime.inputs.compilation import ROUNDING, parse_cores
 from spikeloom.runtime.machines.base import machine_of

@@ -16,9 +16,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT, FloatArray, IntArray
-from spikeloom.compiler.interpret import Activity, BoolArray, run_float, step_late
+from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT
+from spikeloom.compiler.interpret import Activity, run_float, step_late
 from spikeloom.compiler.ir import INPUT, IntegerNetwork, Network
+from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.runtime.equivalence.explanation.deviations import (
     LEFT_OUT,
     TIE,

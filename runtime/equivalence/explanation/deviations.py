@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spikeloom.compiler.fixedpoint import DECAY_BITS, MEMBRANE_SHIFT, FloatArray, reach, step_units
-from spikeloom.compiler.interpret import BoolArray
+from spikeloom.compiler.fixedpoint import DECAY_BITS, MEMBRANE_SHIFT, reach, step_units
 from spikeloom.compiler.ir import INPUT, IntegerNetwork, IntegerProjection, Network, Projection
+from spikeloom.compiler.types import BoolArray, FloatArray
 from spikeloom.runtime.equivalence.rounding import SLACK
 
 WEIGHTS, BIAS, THRESHOLD = "weight rounding", "bias rounding", "threshold rounding"

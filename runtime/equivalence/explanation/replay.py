@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from spikeloom.compiler.fixedpoint import MEMBRANE_MAX, FloatArray, IntArray
-from spikeloom.compiler.interpret import BoolArray
+from spikeloom.compiler.fixedpoint import MEMBRANE_MAX
+from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.runtime.equivalence.explanation.deviations import (
     BETA,
     BIAS,

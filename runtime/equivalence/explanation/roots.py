@@ -18,8 +18,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spikeloom.compiler.interpret import BoolArray
 from spikeloom.compiler.ir import INPUT, IntegerNetwork, Network
+from spikeloom.compiler.types import BoolArray
 
 Sources = tuple[tuple[tuple[int, BoolArray], ...], ...]
 """For each population its presynaptic populations, and which pairs (neurons of pre, neurons of post) are connected."""

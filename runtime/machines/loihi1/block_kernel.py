@@ -35,7 +35,8 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from spikeloom.compiler.fixedpoint import DECAY_BITS, IntArray
+from spikeloom.compiler.fixedpoint import DECAY_BITS
+from spikeloom.compiler.types import IntArray
 from spikeloom.runtime.machines.loihi1.kernel import compiled, compiled_and_cached
 
 AnyArray = npt.NDArray[Any]
@@ -58,137 +59,75 @@ _SUMS, _STATES = ir.VectorType(_SUM, LANES), ir.VectorType(_STATE, LANES)
 
 
 class Blocks(NamedTuple):
-    """A netlist as the kernel reads it; nothing in here changes.
+    """A netlist as the kernel reads it; nothing in here changes."""
 
-    Parameters
-    ----------
-    stage : (stages + 1,) int64
-        Bounds of each stage, the layers of one depth, in the blocks.
-    dense : (stages,) bool
-        Whether every block of a stage has a row for every source; then its sources are listed.
-    first : (blocks + 1,) int64
-        Bounds of each block in the links.
-    word, linked, row : (links,) int64, uint64, int64
-        A word of sources that reach a block, which of them do, and the row of the first of these.
-    weight : (rows * 64,) int8 or int16
-        Net weight of a source for each position of a block, shifted right by what all weights of the block have in
-        common.
-    shift : (blocks,) uint32
-        From a sum of these to membrane units.
-    reached : (rows,) uint64
-        Positions that a source has a synapse to, whatever its weight.
-    restful : (blocks,) uint64
-        Positions without a bias.
-    held : (blocks,) uint64
-        Positions that hold a compartment.
-    bias, threshold : (blocks * 64,) int32
-        In membrane units; a position without a compartment has a threshold that nothing reaches.
-    keep, keep_u : (blocks,) uint32
-        What a membrane and a current keep in a step, in 1/4096.
-    depth, layer : (blocks,) int64
-        Depth and layer of each block.
-    compartment : (blocks * 64,) int64
-        Compartment of each position, -1 for none.
-    whole : (blocks,) int64
-        Compartment of the first position where the block holds 64 consecutive ones, else -1.
-    """
-
-    stage: IntArray
+    stage: IntArray  # (stages + 1,) int64; bounds of each stage, the layers of one depth, in the blocks
+    # (stages,) bool; whether every block of a stage has a row for every source; then its sources are listed
     dense: AnyArray
-    first: IntArray
+    first: IntArray  # (blocks + 1,) int64; bounds of each block in the links
+    # word, linked, row: (links,) int64, uint64, int64; A word of sources that reach a block, which of them do, and the
+    # row of the first of these
     word: IntArray
     linked: AnyArray
     row: IntArray
+    # (rows * 64,) int8 or int16; net weight of a source for each position of a block, shifted right by what all weights
+    # of the block have in common
     weight: AnyArray
-    shift: AnyArray
-    reached: AnyArray
-    restful: AnyArray
-    held: AnyArray
+    shift: AnyArray  # (blocks,) uint32; from a sum of these to membrane units
+    reached: AnyArray  # (rows,) uint64; positions that a source has a synapse to, whatever its weight
+    restful: AnyArray  # (blocks,) uint64; positions without a bias
+    held: AnyArray  # (blocks,) uint64; positions that hold a compartment
+    # bias, threshold: (blocks * 64,) int32; in membrane units; a position without a compartment has a threshold that
+    # nothing reaches
     bias: AnyArray
     threshold: AnyArray
+    # keep, keep_u: (blocks,) uint32; what a membrane and a current keep in a step, in 1/4096
     keep: AnyArray
     keep_u: AnyArray
+    # depth, layer: (blocks,) int64; depth and layer of each block
     depth: IntArray
     layer: IntArray
-    compartment: IntArray
+    compartment: IntArray  # (blocks * 64,) int64; compartment of each position, -1 for none
+    # (blocks,) int64; compartment of the first position where the block holds 64 consecutive ones, else -1
     whole: IntArray
 
 
 class ChargeRows(NamedTuple):
-    """What events add to sums of each chip step; see :class:`trace.Charges`.
+    """What events add to sums of each chip step; see :class:`trace.Charges`."""
 
-    Parameters
-    ----------
-    width : int
-        Sums, padded to a multiple of `CHARGES`; 0 if there are none.
-    narrow : bool
-        Whether all events that a stage can receive in a step add up to less than 2**31 in each sum.
-    source : ((words of the inputs + blocks) * 64 * width,) int32
-        What an event of each channel, then a spike of each position adds.
-    everyone : (stages * width,) int64
-        What an update of all compartments of each stage adds.
-    update : (kinds * width,) int64
-        What an update adds; few compartments differ in that.
-    first : (blocks + 1,) int64
-        Bounds of each block in the groups.
-    group, member : (groups,) int64, uint64
-        Kind of each group, and which positions of the block are of it.
-    """
-
-    width: int
-    narrow: bool
+    width: int  # Sums, padded to a multiple of `CHARGES`; 0 if there are none
+    narrow: bool  # Whether all events that a stage can receive in a step add up to less than 2**31 in each sum
+    # ((words of the inputs + blocks) * 64 * width,) int32; what an event of each channel, then a spike of each position
+    # adds
     source: AnyArray
-    everyone: IntArray
-    update: IntArray
-    first: IntArray
+    everyone: IntArray  # (stages * width,) int64; what an update of all compartments of each stage adds
+    update: IntArray  # (kinds * width,) int64; what an update adds; few compartments differ in that
+    first: IntArray  # (blocks + 1,) int64; bounds of each block in the groups
+    # group, member: (groups,) int64, uint64; kind of each group, and which positions of the block are of it
     group: IntArray
     member: AnyArray
 
 
 class Scratch(NamedTuple):
-    """What a recording leaves behind; made anew for each.
+    """What a recording leaves behind; made anew for each."""
 
-    Parameters
-    ----------
-    words : (steps * words of the inputs,) uint64
-        Channels with an event in each step.
-    raster, idle : (steps * blocks,) uint64
-        Who spiked and who was idle, stage after stage; within a stage step after step.
-    inputs : (words of the inputs * 64,) int64
-        Events of each channel.
-    spikes : (blocks * 64,) int64
-        Spikes of each position.
-    membrane : (blocks * 64,) int32
-        Last membranes.
-    before : (blocks * 64,) int16
-        Synaptic sums of the last step: what the current register still holds.
-    membranes : (steps * blocks * 64,) int32, or empty
-        Membranes before a reset, in the order of `raster`.
-    """
-
-    words: AnyArray
+    words: AnyArray  # (steps * words of the inputs,) uint64; channels with an event in each step
+    # raster, idle: (steps * blocks,) uint64; who spiked and who was idle, stage after stage; within a stage step after
+    # step
     raster: AnyArray
     idle: AnyArray
-    inputs: AnyArray
-    spikes: AnyArray
-    membrane: AnyArray
-    before: AnyArray
-    membranes: AnyArray
+    inputs: AnyArray  # (words of the inputs * 64,) int64; events of each channel
+    spikes: AnyArray  # (blocks * 64,) int64; spikes of each position
+    membrane: AnyArray  # (blocks * 64,) int32; last membranes
+    before: AnyArray  # (blocks * 64,) int16; synaptic sums of the last step: what the current register still holds
+    membranes: AnyArray  # (steps * blocks * 64,) int32, or empty; membranes before a reset, in the order of `raster`
 
 
 class Lasting(NamedTuple):
-    """Currents that outlast their step, in a recording.
+    """Currents that outlast their step, in a recording."""
 
-    Parameters
-    ----------
-    keep_u : (blocks,) uint32
-        As in :class:`Blocks`; 0 where there is no such current.
-    current : (blocks * 64,) int32
-        Last currents.
-    """
-
-    keep_u: AnyArray
-    current: AnyArray
+    keep_u: AnyArray  # (blocks,) uint32; as in :class:`Blocks`; 0 where there is no such current
+    current: AnyArray  # (blocks * 64,) int32; last currents
 
 
 # -- vectors -----------------------------------------------------------------------------------------------------------

@@ -7,10 +7,11 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.fixedpoint import CURRENT_MAX, DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT, IntArray
+from spikeloom.compiler.fixedpoint import CURRENT_MAX, DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, one_step_bounds
+from spikeloom.compiler.types import BoolArray, IntArray
 from spikeloom.runtime.machines.loihi1.block_kernel import CHARGES, LANES, Blocks, ChargeRows
-from spikeloom.runtime.machines.loihi1.trace import BoolArray, Charges
+from spikeloom.runtime.machines.loihi1.trace import Charges
 
 SUM_MAX = 2**15 - 1
 """Largest sum that the kernel holds."""
@@ -184,26 +185,15 @@ def _sums_between(rows: IntArray, bounds: IntArray) -> IntArray:
 
 
 class _Seats(NamedTuple):
-    """Where compartments sit.
+    """Where compartments sit."""
 
-    Parameters
-    ----------
-    position : (compartments,) int64
-        Block and lane of each.
-    layer, keep, keep_u : (blocks,) int64
-        Layer of each block, and what its membranes and currents keep, in 1/4096.
-    stage : (stages + 1,) int64
-        Bounds of the stages in the blocks.
-    depth : (layers,) int64
-        Depth of each layer, the number of its stage.
-    """
-
-    position: IntArray
+    position: IntArray  # (compartments,) int64; block and lane of each
+    # layer, keep, keep_u: (blocks,) int64; layer of each block, and what its membranes and currents keep, in 1/4096
     layer: IntArray
     keep: IntArray
     keep_u: IntArray
-    stage: IntArray
-    depth: IntArray
+    stage: IntArray  # (stages + 1,) int64; bounds of the stages in the blocks
+    depth: IntArray  # (layers,) int64; depth of each layer, the number of its stage
 
 
 def _seats(netlist: Netlist) -> _Seats:

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from spikeloom.compiler.dynamics import Clocks
-from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.layout.chips import chip_count
 from spikeloom.compiler.targets.loihi1.legalize import LimitUse
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.runtime.report.encode import OPTIONAL
 from spikeloom.runtime.report.sections import Section, Table, Text
 

@@ -20,15 +20,14 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler.errors import NumericRangeError
-from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.types import BoolArray, IntArray
 from spikeloom.runtime.machines.loihi1.block_kernel import Blocks, ChargeRows, run_recordings
 from spikeloom.runtime.machines.loihi1.blocks import charge_rows, lay_out_blocks
 from spikeloom.runtime.machines.loihi1.kernel import State, Tables, chip_steps
 from spikeloom.runtime.machines.loihi1.segments import lay_out_segments, padded
 from spikeloom.runtime.machines.loihi1.trace import (
     REGISTER_LIMITS,
-    BoolArray,
     Charges,
     Counts,
     MembraneArray,

@@ -26,14 +26,8 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from spikeloom.compiler.fixedpoint import (
-    ACCUMULATOR_MAX,
-    CURRENT_MAX,
-    DECAY_BITS,
-    MEMBRANE_MAX,
-    MEMBRANE_SHIFT,
-    IntArray,
-)
+from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT
+from spikeloom.compiler.types import IntArray
 
 AnyArray = npt.NDArray[Any]
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -43,77 +37,49 @@ FOLDED_SHIFT = 1
 
 
 class Tables(NamedTuple):
-    """A netlist as the kernel reads it; nothing in here changes.
+    """A netlist as the kernel reads it; nothing in here changes."""
 
-    Parameters
-    ----------
-    shape, base : (sources,) int64
-        Shape of each source's row, and where its entries begin in `weight`.
-    first : (shapes + 1,) int64
-        Bounds of each shape in the segment arrays.
-    start, stop, offset : (segments,) int64
-        Positions of a segment, and where its entries begin within a row.
-    weight : (entries,) int32 or int64
-        Packed net weights; where registers are checked, packed positive weights.
-    shift : int32
-        Bits that count arrivals.
-    run_start : (runs + 1,) int64
-        Bounds of the runs in positions.
-    run_layer, run_depth : (runs,) int64
-        Layer of a run and its depth.
-    keep_u, keep_v : (runs,) int32
-        What current and membrane keep in a step, in 1/4096.
-    threshold, bias : (padded positions,) int32
-        In membrane units.
-    compartment : (positions,) int64
-        Compartment id of each position.
-    """
-
+    # shape, base: (sources,) int64; shape of each source's row, and where its entries begin in `weight`
     shape: IntArray
     base: IntArray
-    first: IntArray
+    first: IntArray  # (shapes + 1,) int64; bounds of each shape in the segment arrays
+    # start, stop, offset: (segments,) int64; positions of a segment, and where its entries begin within a row
     start: IntArray
     stop: IntArray
     offset: IntArray
+    # (entries,) int32 or int64; packed net weights; where registers are checked, packed positive weights
     weight: AnyArray
-    shift: np.int32
-    run_start: IntArray
+    shift: np.int32  # Bits that count arrivals
+    run_start: IntArray  # (runs + 1,) int64; bounds of the runs in positions
+    # run_layer, run_depth: (runs,) int64; layer of a run and its depth
     run_layer: IntArray
     run_depth: IntArray
+    # keep_u, keep_v: (runs,) int32; what current and membrane keep in a step, in 1/4096
     keep_u: AnyArray
     keep_v: AnyArray
+    # threshold, bias: (padded positions,) int32; in membrane units
     threshold: AnyArray
     bias: AnyArray
-    compartment: IntArray
+    compartment: IntArray  # (positions,) int64; compartment id of each position
 
 
 class State(NamedTuple):
-    """Registers of a chip between two steps, and what was counted so far; changed in place by :func:`advance`.
+    """Registers of a chip between two steps, and what was counted so far; changed in place by :func:`advance`."""
 
-    Parameters
-    ----------
-    clock : (2,) int64
-        Next chip step; number of compartments that spiked in the last one.
-    fired : int64
-        Sources that spiked in the last step, ``clock[1]`` of them.
-    current, membrane : (padded positions,) int32
-        The two registers of each position, after any reset.
-    total, positive, negative, flags, worked, active
-        Scratch of one step; `flags` and `worked` tell who spiked and who had work to do.
-    inputs, spikes, updates, saturations
-        See :class:`trace.Counts`.
-    """
-
-    clock: IntArray
-    fired: IntArray
+    clock: IntArray  # (2,) int64; next chip step; number of compartments that spiked in the last one
+    fired: IntArray  # Sources that spiked in the last step, ``clock[1]`` of them
+    # current, membrane: (padded positions,) int32; the two registers of each position, after any reset
     current: AnyArray
     membrane: AnyArray
+    # total, positive, negative, flags, worked, active: Scratch of one step; `flags` and `worked` tell who spiked and
+    # who had work to do
     total: AnyArray
     positive: AnyArray
     negative: AnyArray
     flags: AnyArray
     worked: AnyArray
     active: IntArray
+    # inputs, spikes, updates, saturations: See :class:`trace.Counts`
     inputs: IntArray
     spikes: IntArray
     updates: IntArray

@@ -13,14 +13,14 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler.dynamics import with_clocks
-from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.ir import IntegerNetwork
 from spikeloom.compiler.targets.base import with_tables
 from spikeloom.compiler.targets.loihi1.legalize import measure, require_legal
 from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
-from spikeloom.runtime.machines.base import Beside, BoolArray, EventArray, Price, Run, one_by_one
+from spikeloom.compiler.types import BoolArray, IntArray
+from spikeloom.runtime.machines.base import Beside, EventArray, Price, Run, one_by_one
 from spikeloom.runtime.machines.integer import Cumulative, IntegerMachine
 from spikeloom.runtime.machines.loihi1 import description, engine, spec
 from spikeloom.runtime.machines.loihi1.blocks import obstacle
@@ -137,7 +137,7 @@ class Loihi(IntegerMachine):
     @property
     def unused(self) -> tuple[BoolArray, ...]:
         """As the netlist lists them."""
-        return tuple(np.isin(np.arange(layer.neurons), layer.unheard) for layer in self.netlist.layers)
+        return tuple(np.isin(np.arange(layer.neurons), layer.unreceived) for layer in self.netlist.layers)
 
     @property
     def received(self) -> BoolArray:

@@ -13,14 +13,14 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler.errors import NumericRangeError
-from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.formats.onnx import writer as onnx_writer
 from spikeloom.compiler.formats.onnx.builder import package
 from spikeloom.compiler.formats.onnx.writer_layers import Layer, plan
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.types import BoolArray, IntArray
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.engine import Engine, EventArray
-from spikeloom.runtime.machines.loihi1.trace import BoolArray, MembraneArray, check_channels
+from spikeloom.runtime.machines.loihi1.trace import MembraneArray, check_channels
 from spikeloom.runtime.machines.votes import class_counts
 
 PART = 64

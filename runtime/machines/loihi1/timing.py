@@ -29,13 +29,12 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler.errors import DataError
-from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.targets.base import PICOSECONDS, Target, TimeTable
 from spikeloom.compiler.targets.loihi1.layout.chips import require_one_chip
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.runtime.machines.loihi1.engine import EventArray
 from spikeloom.runtime.machines.loihi1.timing_kernel import Steps, Tables, conclude, schedule
-from spikeloom.runtime.machines.loihi1.trace import BoolArray
 
 EAST, WEST, NORTH, SOUTH, PORTS = range(5)
 """Links of a tile: one that messages enter by for each direction in which they travel, then its cores' own ports."""
@@ -57,53 +56,32 @@ class Clock:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SimpleTimes:
-    """What the simple model says of a batch of recordings; nothing happens after a recording's own steps.
+    """What the simple model says of a batch of recordings; nothing happens after a recording's own steps."""
 
-    Parameters
-    ----------
-    duration_ns : (samples, steps) float64
-        Of each chip step, barrier included.
-    generation_ns, processing_ns : (samples, cores) float64
-        Time that each core spends on its sweep and on sending, and on receiving, over all steps.
-    critical_core : (samples, steps) int64
-        Core that took longest; the lowest of several, -1 after the end.
-    receiving : (samples, steps) bool
-        Whether it took longest to receive.
-    """
-
-    duration_ns: FloatArray
+    duration_ns: FloatArray  # (samples, steps) float64; of each chip step, barrier included
+    # generation_ns, processing_ns: (samples, cores) float64; time that each core spends on its sweep and on sending,
+    # and on receiving, over all steps
     generation_ns: FloatArray
     processing_ns: FloatArray
-    critical_core: IntArray
-    receiving: BoolArray
+    critical_core: IntArray  # (samples, steps) int64; core that took longest; the lowest of several, -1 after the end
+    receiving: BoolArray  # (samples, steps) bool; whether it took longest to receive
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DetailedTimes:
-    """What the detailed model says of a batch of recordings; nothing happens after a recording's own steps.
+    """What the detailed model says of a batch of recordings; nothing happens after a recording's own steps."""
 
-    Parameters
-    ----------
-    duration_ns : (samples, steps) float64
-        Of each chip step, barrier included.
-    sent_ns, processed_ns : (samples, steps) float64
-        When the last core ended its sweep and sending, and when the last message was processed.
-    blocked_ns : (samples, steps) float64
-        Time for which cores could not send because the links were full, summed over the cores.
-    critical_core : (samples, steps) int64
-        Core that was last; the lowest of several, -1 after the end.
-    receiving : (samples, steps) bool
-        Whether it was last in receiving.
-    peak_load : (samples, steps) float64
-        Most messages on any link at any time; one on its way counts as one spread evenly over its links and its end.
-    """
-
-    duration_ns: FloatArray
+    duration_ns: FloatArray  # (samples, steps) float64; of each chip step, barrier included
+    # sent_ns, processed_ns: (samples, steps) float64; when the last core ended its sweep and sending, and when the last
+    # message was processed
     sent_ns: FloatArray
     processed_ns: FloatArray
+    # (samples, steps) float64; time for which cores could not send because the links were full, summed over the cores
     blocked_ns: FloatArray
-    critical_core: IntArray
-    receiving: BoolArray
+    critical_core: IntArray  # (samples, steps) int64; core that was last; the lowest of several, -1 after the end
+    receiving: BoolArray  # (samples, steps) bool; whether it was last in receiving
+    # (samples, steps) float64; most messages on any link at any time; one on its way counts as one spread evenly over
+    # its links and its end
     peak_load: FloatArray
 
 

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.fixedpoint import FloatArray, IntArray
+from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.runtime.machines.loihi1.kernel import compiled, compiled_and_cached
 
 AnyArray = npt.NDArray[Any]
@@ -27,55 +27,36 @@ class Tables(NamedTuple):
 
     *Slots* are what a core sweeps: compartments in the order of their ids, then, where they are on a core, the input
     channels.
-
-    Parameters
-    ----------
-    start : (cores + 1,) int64
-        Bounds of each core in the slots.
-    access, update, spike : (cores,) int64
-        Picoseconds of a slot on each core.
-    axon_out : int
-        Picoseconds of a message at its sender.
-    sender, sending : (slots,) int64
-        Core of each slot, and picoseconds of a spike there, messages included.
-    first : (slots + 1,) int64
-        Bounds of each slot in the deliveries.
-    destination, processing, route : (deliveries,) int64
-        Core that receives it, picoseconds that it takes there, and way that it goes.
-    channel_first, channel_destination, channel_processing
-        The same for input channels that are on no core; they go no way.
-    route_first, route_link : int64
-        Bounds of each way in the links, and the links, the sender's own port first.
-    route_hops : (ways,) float64
-        Picoseconds of the hops.
-    route_share : (ways,) int64
-        What one message adds to each link of its way, ``unit / (links + 1)``, a whole number.
-    unit : int
-        What a load of one message is counted as.
-    capacity : int
-        Messages that a link holds.
     """
 
-    start: IntArray
+    start: IntArray  # (cores + 1,) int64; bounds of each core in the slots
+    # access, update, spike: (cores,) int64; picoseconds of a slot on each core
     access: IntArray
     update: IntArray
     spike: IntArray
-    axon_out: int
+    axon_out: int  # Picoseconds of a message at its sender
+    # sender, sending: (slots,) int64; core of each slot, and picoseconds of a spike there, messages included
     sender: IntArray
     sending: IntArray
-    first: IntArray
+    first: IntArray  # (slots + 1,) int64; bounds of each slot in the deliveries
+    # destination, processing, route: (deliveries,) int64; core that receives it, picoseconds that it takes there, and
+    # way that it goes
     destination: IntArray
     processing: IntArray
     route: IntArray
+    # channel_first, channel_destination, channel_processing: The same for input channels that are on no core; they go
+    # no way
     channel_first: IntArray
     channel_destination: IntArray
     channel_processing: IntArray
+    # route_first, route_link: Bounds of each way in the links, and the links, the sender's own port first
     route_first: IntArray
     route_link: IntArray
-    route_hops: FloatArray
+    route_hops: FloatArray  # (ways,) float64; picoseconds of the hops
+    # (ways,) int64; what one message adds to each link of its way, ``unit / (links + 1)``, a whole number
     route_share: IntArray
-    unit: int
-    capacity: int
+    unit: int  # What a load of one message is counted as
+    capacity: int  # Messages that a link holds
 
 
 class Steps(NamedTuple):

@@ -13,10 +13,10 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler.errors import DataError, NumericRangeError
-from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, IntArray
+from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.types import BoolArray, IntArray
 
-BoolArray = npt.NDArray[np.bool_]
 MembraneArray = npt.NDArray[np.int32]
 
 REGISTER_LIMITS = {"synaptic sum": ACCUMULATOR_MAX, "current": CURRENT_MAX}
@@ -25,74 +25,45 @@ REGISTER_LIMITS = {"synaptic sum": ACCUMULATOR_MAX, "current": CURRENT_MAX}
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Counts:
-    """Events of a whole run; every array is int64.
+    """Events of a whole run; every array is int64."""
 
-    Parameters
-    ----------
-    inputs : (…, n_inputs) int64
-        Input events per channel.
-    spikes : (…, compartments) int64
-        Spikes per compartment.
-    updates : (…, layers) int64
-        Neuron updates: compartment-steps inside the layer's window in which the compartment had work to do, that is
-        its membrane or its current was not zero before the step, or an active axon held a synapse to it (whatever
-        the weight), or its bias is not zero.
-    saturations : (…, layers) int64
-        Compartment-steps whose membrane was clipped to its register.
-    """
-
-    inputs: IntArray
-    spikes: IntArray
+    inputs: IntArray  # (…, n_inputs) int64; input events per channel
+    spikes: IntArray  # (…, compartments) int64; spikes per compartment
+    # (…, layers) int64; neuron updates: compartment-steps inside the layer's window in which the compartment had work
+    # to do, that is its membrane or its current was not zero before the step, or an active axon held a synapse to it
+    # (whatever the weight), or its bias is not zero
     updates: IntArray
-    saturations: IntArray
+    saturations: IntArray  # (…, layers) int64; compartment-steps whose membrane was clipped to its register
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Charges:
-    """What events add to some sums of each chip step: times, energies, anything that is linear in them.
+    """What events add to some sums of each chip step: times, energies, anything that is linear in them."""
 
-    Parameters
-    ----------
-    channels : (n_inputs, sums) int64
-        By an input event of each channel.
-    spikes : (compartments, sums) int64
-        By a spike of each compartment.
-    updates : (compartments, sums) int64
-        By an update of each compartment. All three are below 2**31 in magnitude.
-    """
-
-    channels: IntArray
-    spikes: IntArray
+    channels: IntArray  # (n_inputs, sums) int64; by an input event of each channel
+    spikes: IntArray  # (compartments, sums) int64; by a spike of each compartment
+    # (compartments, sums) int64; by an update of each compartment. All three are below 2**31 in magnitude.
     updates: IntArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Trace:
-    """Result of a simulation.
+    """Result of a simulation."""
 
-    Parameters
-    ----------
-    counts : Counts
-        What happened, summed over chip steps.
-    spikes : (…, chip steps, compartments) bool, or None
-        Whether a compartment spiked in a chip step; None unless wanted.
-    membranes : (…, chip steps, compartments) int32, or None
-        The saturated membrane that was compared with the threshold, before a spike resets it, in 1/64 of a weight
-        unit; zero outside the layer's window. None unless wanted.
-    updated : (…, chip steps, compartments) bool, or None
-        Whether a compartment had work to do in a chip step, as ``Counts.updates`` counts it; None unless wanted.
-    charged : (…, chip steps, sums) int64, or None
-        What the events of each chip step add up to under the charges that the engine was prepared with.
-    packed : (…, chip steps, ceil(compartments / 64)) uint64, or None
-        The spikes at a bit each: that of compartment c is bit ``c % 64`` of word ``c // 64``; see :func:`unpack`. None
-        unless wanted.
-    """
-
-    counts: Counts
+    counts: Counts  # What happened, summed over chip steps
+    # (…, chip steps, compartments) bool, or None; whether a compartment spiked in a chip step; None unless wanted
     spikes: BoolArray | None
+    # (…, chip steps, compartments) int32, or None; the saturated membrane that was compared with the threshold, before
+    # a spike resets it, in 1/64 of a weight unit; zero outside the layer's window. None unless wanted.
     membranes: MembraneArray | None
+    # (…, chip steps, compartments) bool, or None; whether a compartment had work to do in a chip step, as
+    # ``Counts.updates`` counts it; None unless wanted
     updated: BoolArray | None = None
+    # (…, chip steps, sums) int64, or None; what the events of each chip step add up to under the charges that the
+    # engine was prepared with
     charged: IntArray | None = None
+    # (…, chip steps, ceil(compartments / 64)) uint64, or None; the spikes at a bit each: that of compartment c is bit
+    # ``c % 64`` of word ``c // 64``; see :func:`unpack`. None unless wanted.
     packed: npt.NDArray[np.uint64] | None = None
 
 
@@ -134,7 +105,7 @@ def aligned(netlist: Netlist, array: npt.NDArray[Any], layer: int) -> npt.NDArra
 
 def comparable(netlist: Netlist, layer: int) -> slice | IntArray:
     """Neurons of a layer whose spikes can be compared: all but those left out because their spikes reach no neuron."""
-    unused = netlist.layers[layer].unheard
+    unused = netlist.layers[layer].unreceived
     return np.setdiff1d(np.arange(netlist.layers[layer].neurons), unused) if unused else slice(None)
 
 

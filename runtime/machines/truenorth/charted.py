@@ -5,11 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.targets.base import Target, load_target
 from spikeloom.compiler.targets.truenorth.native import SYSTEM, highest_level
@@ -17,6 +15,7 @@ from spikeloom.compiler.targets.truenorth.native_file import Trained, read_train
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
 from spikeloom.compiler.targets.truenorth.netlist_file import write_crossbars
 from spikeloom.compiler.targets.truenorth.passes import Options
+from spikeloom.compiler.types import IntArray, JsonObject
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.recordings.windows import steps_of
 from spikeloom.runtime.inputs.files import shipped
@@ -37,7 +36,7 @@ def trained(path: str, weights: str | None) -> Trained:
     return read_trained(shipped(path), weights=weights)
 
 
-def facts(path: str, weights: str | None) -> dict[str, Any]:
+def facts(path: str, weights: str | None) -> JsonObject:
     """What a chart says of a network: it knows everything but its weights itself."""
     found = trained(path, weights)
     network = found.network

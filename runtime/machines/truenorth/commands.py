@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from spikeloom.compiler import __version__
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.passes.expand import Factored
@@ -22,14 +23,14 @@ from spikeloom.compiler.targets.truenorth.native_file import Trained, is_trained
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
 from spikeloom.compiler.targets.truenorth.netlist_file import write_crossbars
 from spikeloom.compiler.targets.truenorth.passes import Compilation, Options
-from spikeloom.compiler.version import __version__
+from spikeloom.compiler.types import BoolArray, JsonObject
 from spikeloom.runtime.inputs.files import shipped
 from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.inputs.recordings import netlist_recordings
 from spikeloom.runtime.machines.truenorth import joining, verdicts
 from spikeloom.runtime.machines.truenorth.describe import describe, describe_trained
 from spikeloom.runtime.machines.truenorth.machine import load
-from spikeloom.runtime.machines.truenorth.verdicts import BoolArray, PartialSums, Verdict, compare
+from spikeloom.runtime.machines.truenorth.verdicts import PartialSums, Verdict, compare
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.sections import Outcome
 
@@ -108,7 +109,7 @@ def compile_network(arguments: argparse.Namespace) -> Outcome:
     return describe(netlist, chip, write_crossbars(netlist, arguments.output))
 
 
-def provenance(trained: Trained) -> dict[str, Any]:
+def provenance(trained: Trained) -> JsonObject:
     """What a netlist remembers of the trained network that it is from."""
     return {
         "spikeloom": __version__,

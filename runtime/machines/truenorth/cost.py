@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.targets.base import EnergyTable, Target
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
+from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.runtime.machines.truenorth.trace import Counts
 from spikeloom.runtime.report.numbers import si
 from spikeloom.runtime.report.sections import Outcome, Section, Table, Text
@@ -44,24 +44,14 @@ class Energy:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Costs:
-    """Costs of recordings.
+    """Costs of recordings."""
 
-    Parameters
-    ----------
-    ticks : (samples,) int64
-    time_s : (samples,) float64
-        At the length of a tick in real time.
-    synaptic_events, spikes : (samples, layers) int64
-        By the layer that receives and that sends.
-    packets, hops : (samples,) int64
-        Spikes with a target on the chip, and the cores that they pass.
-    energy : mapping of table to Energy
-    """
-
-    ticks: IntArray
-    time_s: FloatArray
+    ticks: IntArray  # (samples,) int64
+    time_s: FloatArray  # (samples,) float64; at the length of a tick in real time
+    # synaptic_events, spikes: (samples, layers) int64; by the layer that receives and that sends
     synaptic_events: IntArray
     spikes: IntArray
+    # packets, hops: (samples,) int64; spikes with a target on the chip, and the cores that they pass
     packets: IntArray
     hops: IntArray
     energy: Mapping[str, Energy]

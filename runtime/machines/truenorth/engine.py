@@ -10,10 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler.errors import NumericRangeError
-from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.truenorth.legalize import signed_range
 from spikeloom.compiler.targets.truenorth.netlist import RESET_LINEAR, RESET_TO, CrossbarNetlist
+from spikeloom.compiler.types import IntArray
 from spikeloom.runtime.machines.truenorth import kernel
 from spikeloom.runtime.machines.truenorth.spec import Neuron, neuron_tick
 from spikeloom.runtime.machines.truenorth.trace import Counts, EventArray, Trace, check_channels
@@ -34,25 +34,14 @@ MOST_TICKS = 2**31
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Engine:
-    """A network as the kernel takes it.
-
-    Parameters
-    ----------
-    netlist : CrossbarNetlist
-    twins : Twins
-        Neurons and axons that are alike; the kernel runs one of each kind.
-    low, high : int
-        Range of the membrane register.
-    slots : int
-        Power of two above every delay.
-    wiring : Wiring
-    """
+    """A network as the kernel takes it."""
 
     netlist: CrossbarNetlist
-    twins: Twins
+    twins: Twins  # Neurons and axons that are alike; the kernel runs one of each kind
+    # low, high: Range of the membrane register
     low: int
     high: int
-    slots: int
+    slots: int  # Power of two above every delay
     wiring: kernel.Wiring
 
 

@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.targets.truenorth.netlist import RESET_LINEAR, RESET_TO
+from spikeloom.compiler.types import IntArray
 from spikeloom.runtime.machines.loihi1.kernel import compiled, compiled_and_cached
 from spikeloom.runtime.machines.truenorth.trace import MIX_1, MIX_2, STEP_NEURON, STEP_TICK
 
@@ -55,61 +55,32 @@ _30, _27, _31, _64, _ONE = np.uint64(30), np.uint64(27), np.uint64(31), np.uint6
 
 
 class Wiring(NamedTuple):
-    """What does not change while a recording runs.
+    """What does not change while a recording runs."""
 
-    Parameters
-    ----------
-    offsets : (offsets,) int64
-        Ticks of a data step in which channels are fed.
-    feed_bounds : (offsets, channels + 1) int64
-        Rows of `feed_axon` that a channel feeds at an offset.
-    feed_axon : (feeds,) int32
-    clocks : (clocks, 3) int64
-        Axon, period, phase.
-    segment_bounds : (axons + 1,) int64
-        Segments of each axon.
-    segments : (segments, 3) int64
-        First steady neuron, the one after the last, and where in `row` the weights for them begin.
-    row : (…) int32
-        Weights of segments, zero where nothing is joined.
-    plain : int
-        Number of plain steady neurons, the first ones.
-    steady : (7, steady) int32
-        Leak, threshold, reset, the negative threshold below zero, what a membrane below that becomes, 1 for a reset by
-        the threshold, and the cap.
-    axon_synapses : (axons + 1,) int64
-        Crossing points with all other neurons.
-    synapse_neuron : (synapses,) int32
-    synapse_weight : (synapses,) int64
-        In halves.
-    number : (neurons,) int64
-        Which neuron of the network it is, whose random numbers it draws.
-    parameters : (neurons, 12) int32
-    direct : (neurons,) bool
-        Whether a spike reaches steady neurons alone, in the next tick, on an axon that nothing else leads to.
-    instant : (neurons,) int32
-        The leak, below zero, of neurons that start each tick at zero and spike where they do not end it below zero;
-        0 for all others.
-    initial : (neurons,) int32
-    """
-
-    offsets: IntArray
-    feed_bounds: IntArray
-    feed_axon: Int32
-    clocks: IntArray
-    segment_bounds: IntArray
+    offsets: IntArray  # (offsets,) int64; ticks of a data step in which channels are fed
+    feed_bounds: IntArray  # (offsets, channels + 1) int64; rows of `feed_axon` that a channel feeds at an offset
+    feed_axon: Int32  # (feeds,) int32
+    clocks: IntArray  # (clocks, 3) int64; axon, period, phase
+    segment_bounds: IntArray  # (axons + 1,) int64; segments of each axon
+    # (segments, 3) int64; first steady neuron, the one after the last, and where in `row` the weights for them begin
     segments: IntArray
-    row: Int32
-    plain: int
+    row: Int32  # (…) int32; weights of segments, zero where nothing is joined
+    plain: int  # Number of plain steady neurons, the first ones
+    # (7, steady) int32; leak, threshold, reset, the negative threshold below zero, what a membrane below that becomes,
+    # 1 for a reset by the threshold, and the cap
     steady: Int32
-    axon_synapses: IntArray
-    synapse_neuron: Int32
-    synapse_weight: IntArray
-    number: IntArray
-    parameters: Int32
+    axon_synapses: IntArray  # (axons + 1,) int64; crossing points with all other neurons
+    synapse_neuron: Int32  # (synapses,) int32
+    synapse_weight: IntArray  # (synapses,) int64; in halves
+    number: IntArray  # (neurons,) int64; which neuron of the network it is, whose random numbers it draws
+    parameters: Int32  # (neurons, 12) int32
+    # (neurons,) bool; whether a spike reaches steady neurons alone, in the next tick, on an axon that nothing else
+    # leads to
     direct: npt.NDArray[np.bool_]
+    # (neurons,) int32; the leak, below zero, of neurons that start each tick at zero and spike where they do not end it
+    # below zero; 0 for all others
     instant: Int32
-    initial: Int32
+    initial: Int32  # (neurons,) int32
 
 
 class State(NamedTuple):

@@ -8,10 +8,9 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler.errors import DataError
-from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
+from spikeloom.compiler.types import BoolArray, IntArray
 
-BoolArray = npt.NDArray[np.bool_]
 MembraneArray = npt.NDArray[np.int32]
 EventArray = npt.NDArray[np.uint8 | np.bool_]
 
@@ -42,51 +41,28 @@ def random_bits(seed: int, neuron: int, tick: int, bits: int) -> int:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Counts:
-    """Events of whole runs; every array is int64, a batch adds one leading axis.
+    """Events of whole runs; every array is int64, a batch adds one leading axis."""
 
-    Parameters
-    ----------
-    ticks : (…) int64
-        Ticks that were run.
-    inputs : (…, n_inputs) int64
-        Input events per channel.
-    spikes : (…, neurons) int64
-        Spikes per neuron in all ticks.
-    votes : (…, neurons) int64
-        Spikes per neuron in the ticks in which it votes; zero for neurons that do not.
-    axons : (…, axons) int64
-        Ticks in which an axon had a spike.
-    merged : (…) int64
-        Spikes that reached an axon in a tick in which it had one already, and were lost.
-    overflows : (…, neurons) int64
-        Ticks in which the membrane left its register, or would have in some order of arrivals; it saturates.
-    """
-
-    ticks: IntArray
-    inputs: IntArray
-    spikes: IntArray
+    ticks: IntArray  # (…) int64; ticks that were run
+    inputs: IntArray  # (…, n_inputs) int64; input events per channel
+    spikes: IntArray  # (…, neurons) int64; spikes per neuron in all ticks
+    # (…, neurons) int64; spikes per neuron in the ticks in which it votes; zero for neurons that do not
     votes: IntArray
-    axons: IntArray
-    merged: IntArray
+    axons: IntArray  # (…, axons) int64; ticks in which an axon had a spike
+    merged: IntArray  # (…) int64; spikes that reached an axon in a tick in which it had one already, and were lost
+    # (…, neurons) int64; ticks in which the membrane left its register, or would have in some order of arrivals; it
+    # saturates
     overflows: IntArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Trace:
-    """Result of a simulation.
-
-    Parameters
-    ----------
-    counts : Counts
-    spikes : (…, ticks, neurons) bool, or None
-        Whether a neuron spiked in a tick; None unless wanted.
-    membranes : (…, ticks, neurons) int32, or None
-        Membranes at the end of each tick, after resets; None unless wanted. In a batch a shorter
-        recording is filled up with zeros after its last tick.
-    """
+    """Result of a simulation."""
 
     counts: Counts
-    spikes: BoolArray | None
+    spikes: BoolArray | None  # (…, ticks, neurons) bool, or None; whether a neuron spiked in a tick; None unless wanted
+    # (…, ticks, neurons) int32, or None; membranes at the end of each tick, after resets; None unless wanted. In a
+    # batch a shorter recording is filled up with zeros after its last tick.
     membranes: MembraneArray | None
 
 

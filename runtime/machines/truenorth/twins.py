@@ -13,9 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
-from spikeloom.runtime.machines.truenorth.trace import BoolArray
+from spikeloom.compiler.types import BoolArray, IntArray
 
 _FEED, _CLOCK, _WIRE, _ITSELF = range(4)
 _REGISTERS = (
@@ -26,22 +25,16 @@ _REGISTERS = (
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Twins:
-    """Which neurons and axons are of a kind.
+    """Which neurons and axons are of a kind."""
 
-    Parameters
-    ----------
-    neuron, axon : (neurons,), (axons,) int64
-        Kind of each.
-    first_neuron, first_axon : (kinds,) int64
-        The first of each kind.
-    synapse_axon, synapse_neuron, synapse_halves : (pairs,) int64
-        Kinds that are joined, by axon and neuron, and the weight in halves of the kernel.
-    """
-
+    # neuron, axon: (neurons,), (axons,) int64; kind of each
     neuron: IntArray
     axon: IntArray
+    # first_neuron, first_axon: (kinds,) int64; the first of each kind
     first_neuron: IntArray
     first_axon: IntArray
+    # synapse_axon, synapse_neuron, synapse_halves: (pairs,) int64; kinds that are joined, by axon and neuron, and the
+    # weight in halves of the kernel
     synapse_axon: IntArray
     synapse_neuron: IntArray
     synapse_halves: IntArray

@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
+from spikeloom.compiler.types import BoolArray
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.machines.truenorth import engine
 from spikeloom.runtime.machines.truenorth.machine import machine_of
@@ -20,8 +20,6 @@ from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.encode import OPTIONAL, key
 from spikeloom.runtime.report.intervals import wilson
 from spikeloom.runtime.report.sections import Section, Table, Text
-
-BoolArray = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,9 +27,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spikeloom.compiler.fixedpoint import FloatArray, IntArray
+from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.runtime.equivalence.certificates import wins
-from spikeloom.runtime.machines.base import BoolArray
 from spikeloom.runtime.machines.integer import IntegerMachine
 
 CONFIDENCE = 0.95

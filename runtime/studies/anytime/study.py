@@ -7,8 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from spikeloom.compiler.fixedpoint import FloatArray, IntArray
-from spikeloom.compiler.interpret import BoolArray
+from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.models.recordings.eventfiles import UNLABELLED
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.machines.integer import Cumulative, IntegerMachine

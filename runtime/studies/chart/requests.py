@@ -11,8 +11,9 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
+from spikeloom.compiler import __version__
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.version import __version__
+from spikeloom.compiler.types import JsonObject
 from spikeloom.models.recordings.windows import WHOLE
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.report.encode import encode
@@ -43,7 +44,7 @@ class Source:
     theta: float | None = None
     target: str | None = None
 
-    def options(self) -> dict[str, Any]:
+    def options(self) -> JsonObject:
         """All but the file."""
         return {field.name: getattr(self, field.name) for field in fields(self) if field.name != "path"}
 
@@ -72,7 +73,7 @@ class Storage:
     own: bool = False
     levels: int | None = None
 
-    def options(self) -> dict[str, Any]:
+    def options(self) -> JsonObject:
         """Options of ``compile`` that ask for it, where it is not the usual one."""
         if self.own:
             return {}
@@ -93,7 +94,7 @@ class Storage:
         return " ".join([*parts, *(["pruned"] if self.prune else [])])
 
 
-def layout_options(layout: str) -> dict[str, Any]:
+def layout_options(layout: str) -> JsonObject:
     """Options of ``compile`` that ask for a layout, where it is not the usual one.
 
     Examples

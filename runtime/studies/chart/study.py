@@ -8,9 +8,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from spikeloom.compiler import __version__
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.fixedpoint import IntArray
-from spikeloom.compiler.version import __version__
+from spikeloom.compiler.types import IntArray, JsonObject
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.systems import NO_GRAPH
 from spikeloom.runtime.machines.base import chip_chart
@@ -58,7 +58,7 @@ class Stored:
     build: Build
     job: Job
 
-    def named(self, layout: str) -> dict[str, Any]:
+    def named(self, layout: str) -> JsonObject:
         """Fields of a :class:`results.Configuration`."""
         network, storage = self.network, self.storage
         return {
@@ -187,7 +187,7 @@ def _times(facts: Facts, target: str) -> dict[str, str]:
 # -- work --------------------------------------------------------------------------------------------------------------
 
 
-def _identity(network: Given) -> dict[str, Any]:
+def _identity(network: Given) -> JsonObject:
     """What tells a network from others, wherever its file is."""
     about = {"checkpoint": network.sha256, "weights": network.weights, "sees": network.sees}
     return about | {"options": encode(network.source.options())}

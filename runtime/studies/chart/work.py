@@ -19,9 +19,9 @@ import numpy as np
 
 from spikeloom.compiler import Options, lay_out_again, store, write_netlist
 from spikeloom.compiler.errors import CapacityError, DataError, FormatError, ModelError
-from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.interpret import cut, vote
 from spikeloom.compiler.targets.base import load_target
+from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.models.recordings.events import joined_bins
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.recordings.windows import first_part, steps_of

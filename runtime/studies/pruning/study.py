@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from spikeloom.compiler import Compilation, Netlist, Options, compile_network
-from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.systems import TACTILESGNET
+from spikeloom.compiler.types import IntArray
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs.network import LoadedNetwork
 from spikeloom.runtime.report.console import progress

@@ -14,11 +14,11 @@ import numpy as np
 
 from spikeloom.compiler import Compilation, Netlist, layer_of, rounded, without
 from spikeloom.compiler.checkpoint import Checkpoint
-from spikeloom.compiler.fixedpoint import DECAY_BITS, ONE_STEP_SUM_MAX, FloatArray, IntArray, read_only
-from spikeloom.compiler.interpret import BoolArray
+from spikeloom.compiler.fixedpoint import DECAY_BITS, ONE_STEP_SUM_MAX, read_only
 from spikeloom.compiler.ir import Form, IntegerNetwork
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.passes.prune import deaf_to
+from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.models.recordings.events import join_bins
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.machines.base import EventArray, machine_of

@@ -10,9 +10,9 @@ from typing import Any, TypeVar
 import numpy as np
 
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.systems import GRAPH_SYSTEMS, TITLES
+from spikeloom.compiler.types import IntArray
 from spikeloom.models.graphs import build_graph
 from spikeloom.models.systems import propagation_of
 from spikeloom.runtime.studies.stress import damages, disturbances, other_networks

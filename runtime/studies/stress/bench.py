@@ -12,8 +12,8 @@ import numpy as np
 from spikeloom.compiler import Netlist, read_netlist
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.dynamics import with_clocks
-from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.systems import GRAPH_SYSTEMS
+from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.models.graphs import NEUTOUCH
 from spikeloom.models.recordings.events import join_bins
 from spikeloom.models.sensors import read_layout, sensor_graph

@@ -18,8 +18,6 @@ from spikeloom.compiler import Netlist
 from spikeloom.compiler.fixedpoint import (
     DECAY_BITS,
     THRESHOLD_MANTISSA_MAX,
-    FloatArray,
-    IntArray,
     decay_registers,
     frozen,
     read_only,
@@ -27,6 +25,7 @@ from spikeloom.compiler.fixedpoint import (
     weight_step,
 )
 from spikeloom.compiler.ir import INPUT, Network, Population, Projection
+from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.runtime.studies.stress.pair import Pair
 
 Mask = npt.NDArray[np.bool_]

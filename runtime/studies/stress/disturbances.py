@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.fixedpoint import FloatArray, IntArray
+from spikeloom.compiler.types import FloatArray, IntArray
 
 Events = npt.NDArray[np.uint8]
 

@@ -11,8 +11,8 @@ from dataclasses import replace
 import numpy as np
 
 from spikeloom.compiler import store_alike
-from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.ir import Network, Projection
+from spikeloom.compiler.types import IntArray
 from spikeloom.runtime.studies.stress.pair import Pair
 
 

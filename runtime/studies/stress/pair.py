@@ -14,9 +14,9 @@ import numpy.typing as npt
 
 from spikeloom.compiler import Netlist
 from spikeloom.compiler.errors import NumericRangeError
-from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.ir import Network
+from spikeloom.compiler.types import IntArray
 from spikeloom.runtime.equivalence import float_engine
 from spikeloom.runtime.machines.integer import IntegerMachine, integer_machine_of
 

@@ -14,8 +14,9 @@ from io import StringIO
 from pathlib import Path
 from typing import Any
 
+from spikeloom.compiler import __version__
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.version import __version__
+from spikeloom.compiler.types import JsonObject
 from spikeloom.runtime.inputs.network import LoadedNetwork
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.encode import decode, encode
@@ -75,7 +76,7 @@ class Request:
         named = {name: options[name] for name in FILES if options[name] and Path(options[name]).exists()}
         return Request(**options | {name: str(Path(path).resolve()) for name, path in named.items()})
 
-    def readings(self) -> dict[str, Any]:
+    def readings(self) -> JsonObject:
         """All but the files, which are known by their hashes."""
         return {name: value for name, value in asdict(self).items() if name not in FILES}
 
@@ -221,7 +222,7 @@ def _keyed(task: Task, facts: Mapping[str, Any]) -> Point:
     return Point(key=content_key({**facts, **about}), label=f"{task.name} {shown(task.level)}", payload=task)
 
 
-def measure_task(task: Task) -> dict[str, Any]:
+def measure_task(task: Task) -> JsonObject:
     """JSON values of a task's runs, in a process of its own."""
     bench, reference = _loaded(task.request)
     return {"runs": encode(measure(bench, task.name, task.level, task.seeds, reference))}

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from spikeloom.compiler.atomic import remove_leftovers
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.fixedpoint import IntArray
+from spikeloom.compiler.types import IntArray
 from spikeloom.runtime.studies import jobs as processes
 from spikeloom.runtime.studies.jobs import ProcessDied, ended_by_signal, only_one
 from spikeloom.runtime.studies.training.report import Finished

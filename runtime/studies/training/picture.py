@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from spikeloom.compiler.fixedpoint import IntArray
+from spikeloom.compiler.types import IntArray
 from spikeloom.models.training.recipes import MSE
 from spikeloom.models.training.record import TrainingRecord
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from spikeloom.compiler import __version__
 from spikeloom.compiler.checkpoint import WEIGHTS
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.fixedpoint import IntArray
-from spikeloom.compiler.version import __version__
+from spikeloom.compiler.types import IntArray
 from spikeloom.models.recordings.events import joined_bins
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.training.kinds import Plan, kind_of, seen_by

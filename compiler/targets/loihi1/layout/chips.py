@@ -9,9 +9,9 @@ from __future__ import annotations
 import numpy as np
 
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.layout.place import Placement, place
+from spikeloom.compiler.types import FloatArray, IntArray
 
 
 def chip_tiles(target: Target) -> int:

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from spikeloom.compiler.errors import CapacityError, OptionError
-from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.ir import IntegerNetwork
 from spikeloom.compiler.passes.calibrate import Calibration
 from spikeloom.compiler.targets.base import PICOSECONDS, Target
@@ -25,6 +24,7 @@ from spikeloom.compiler.targets.loihi1.layout.forecast import Expectation, Forec
 from spikeloom.compiler.targets.loihi1.layout.latency_search import estimate, fastest, tiles_for
 from spikeloom.compiler.targets.loihi1.layout.partition import Partition, arrange, chunks_of, cut, partition
 from spikeloom.compiler.targets.loihi1.layout.place import Placement, core_traffic, place_within
+from spikeloom.compiler.types import FloatArray, IntArray
 
 WORTH = 1e-3
 """Share of a step's energy that another layout has to save."""
@@ -32,21 +32,11 @@ WORTH = 1e-3
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Layout:
-    """A placed partition.
+    """A placed partition."""
 
-    Parameters
-    ----------
-    parts : Partition
-        Chunks of each core.
-    placement : Placement
-        Tiles.
-    expected : Expectation, optional
-        Time and energy of a step, where these can be told.
-    """
-
-    parts: Partition
-    placement: Placement
-    expected: Expectation | None
+    parts: Partition  # Chunks of each core
+    placement: Placement  # Tiles
+    expected: Expectation | None  # Time and energy of a step, where these can be told
 
 
 def asked_cores(

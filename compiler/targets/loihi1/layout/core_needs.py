@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spikeloom.compiler.fixedpoint import IntArray
 from spikeloom.compiler.ir import INPUT, IntegerNetwork, IntegerProjection
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.legalize import LimitUse, list_words
+from spikeloom.compiler.types import IntArray
 
 SPARSE_SHARE = 0.75
 """A list goes sparse when it stores at most this share of what the dense form would store and visit."""
@@ -38,23 +38,12 @@ class Chunk:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Lists:
-    """Synapse lists from one projection into one chunk, one per source neuron with a non-zero weight.
+    """Synapse lists from one projection into one chunk, one per source neuron with a non-zero weight."""
 
-    Parameters
-    ----------
-    projection : int
-        Index in the network.
-    source : (lists,) int64
-        Neuron of the source population.
-    nonzero : (lists,) int64
-        Non-zero synapses of each list.
-    first, last : (lists,) int64
-        First and last neuron of the chunk (counted within it) with a non-zero weight.
-    """
-
-    projection: int
-    source: IntArray
-    nonzero: IntArray
+    projection: int  # Index in the network
+    source: IntArray  # (lists,) int64; neuron of the source population
+    nonzero: IntArray  # (lists,) int64; non-zero synapses of each list
+    # first, last: (lists,) int64; first and last neuron of the chunk (counted within it) with a non-zero weight
     first: IntArray
     last: IntArray
 

@@ -17,14 +17,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
-from spikeloom.compiler.fixedpoint import FloatArray, IntArray
-from spikeloom.compiler.interpret import BoolArray
 from spikeloom.compiler.ir import INPUT, IntegerNetwork, depths
 from spikeloom.compiler.passes.calibrate import Calibration, fewer
 from spikeloom.compiler.targets.base import PICOSECONDS, EnergyTable, Target, TimeTable
 from spikeloom.compiler.targets.loihi1.layout.core_needs import Chunk, Needs, choose_dense
 from spikeloom.compiler.targets.loihi1.layout.partition import Partition
 from spikeloom.compiler.targets.loihi1.layout.place import hops
+from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 
 SAMPLES = 1000
 """Chip steps that are looked at, evenly spaced over the calibration recordings."""
@@ -34,18 +33,10 @@ Core = tuple[Chunk, ...]
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Activity:
-    """Events and spikes in some chip steps, each as 0 or 1.
+    """Events and spikes in some chip steps, each as 0 or 1."""
 
-    Parameters
-    ----------
-    inputs : csc_array (steps, channels) float64
-        Input events.
-    spikes : tuple of csc_array (steps, neurons) float64
-        Spikes of each population.
-    """
-
-    inputs: sparse.csc_array
-    spikes: tuple[sparse.csc_array, ...]
+    inputs: sparse.csc_array  # Input events
+    spikes: tuple[sparse.csc_array, ...]  # Spikes of each population
 
     @property
     def steps(self) -> int:
@@ -59,36 +50,18 @@ class Activity:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Expectation:
-    """What a layout is expected to take on the calibration recordings, on average over their chip steps.
+    """What a layout is expected to take on the calibration recordings, on average over their chip steps."""
 
-    Parameters
-    ----------
-    step_ns : float
-        Length of a step, barrier included.
-    critical_core : int
-        Core that takes longest in most steps.
-    critical_share : float
-        In what share of them.
-    receiving : bool
-        Whether receiving takes it longer than sweeping and sending, on average.
-    packets, hops : float
-        Packets of a step, and the links between tiles that they cross.
-    step_j : float
-        Energy of a step in joules: neurons, synapses, packets and hops.
-    route_j : float
-        Of this, packets and hops.
-    time_table, energy_table : str
-        Names of the tables.
-    """
-
-    step_ns: float
-    critical_core: int
-    critical_share: float
-    receiving: bool
+    step_ns: float  # Length of a step, barrier included
+    critical_core: int  # Core that takes longest in most steps
+    critical_share: float  # In what share of them
+    receiving: bool  # Whether receiving takes it longer than sweeping and sending, on average
+    # packets, hops: Packets of a step, and the links between tiles that they cross
     packets: float
     hops: float
-    step_j: float
-    route_j: float
+    step_j: float  # Energy of a step in joules: neurons, synapses, packets and hops
+    route_j: float  # Of this, packets and hops
+    # time_table, energy_table: Names of the tables
     time_table: str
     energy_table: str
 

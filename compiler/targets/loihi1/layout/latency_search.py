@@ -13,10 +13,10 @@ from hashlib import sha256
 import numpy as np
 
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.targets.loihi1.layout.core_needs import Chunk
 from spikeloom.compiler.targets.loihi1.layout.forecast import Core, Forecast
 from spikeloom.compiler.targets.loihi1.layout.partition import chunks_of, cut, cut_layer, order_on_core
+from spikeloom.compiler.types import FloatArray, IntArray
 
 SHORTER = 0.9
 """Each time that the search cuts for is this share of the one before."""
@@ -61,30 +61,14 @@ def estimate(forecast: Forecast, cores: list[Core]) -> float:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Trial:
-    """Layers cut evenly, each chunk on a core of its own.
+    """Layers cut evenly, each chunk on a core of its own."""
 
-    Parameters
-    ----------
-    counts : dict of int to int
-        Chunks of each population.
-    chunks : list of Chunk
-        All of them.
-    score : float
-        What is made small.
-    blamed : int
-        Population that takes longest in most steps.
-    longest : float
-        Mean picoseconds of the slowest core of the slowest layer.
-    barrier : int
-        Picoseconds.
-    """
-
-    counts: dict[int, int]
-    chunks: list[Chunk]
-    score: float
-    blamed: int
-    longest: float
-    barrier: int
+    counts: dict[int, int]  # Chunks of each population
+    chunks: list[Chunk]  # All of them
+    score: float  # What is made small
+    blamed: int  # Population that takes longest in most steps
+    longest: float  # Mean picoseconds of the slowest core of the slowest layer
+    barrier: int  # Picoseconds
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

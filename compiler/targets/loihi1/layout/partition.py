@@ -17,11 +17,11 @@ from itertools import pairwise
 import numpy as np
 
 from spikeloom.compiler.errors import CapacityError, OptionError, Violation
-from spikeloom.compiler.fixedpoint import FloatArray
 from spikeloom.compiler.ir import IntegerNetwork
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.layout.core_needs import Chunk, Needs
 from spikeloom.compiler.targets.loihi1.legalize import LimitUse, violation
+from spikeloom.compiler.types import FloatArray
 
 EXACT_CHUNKS = 10
 """Up to this many chunks the packing is searched exhaustively; above it, first fit."""
@@ -29,18 +29,10 @@ EXACT_CHUNKS = 10
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Partition:
-    """Chunks of each core, in their order on it.
+    """Chunks of each core, in their order on it."""
 
-    Parameters
-    ----------
-    cores : tuple of tuple of Chunk
-        First core first.
-    bound : int
-        No legal partition can use fewer cores than this.
-    """
-
-    cores: tuple[tuple[Chunk, ...], ...]
-    bound: int
+    cores: tuple[tuple[Chunk, ...], ...]  # First core first
+    bound: int  # No legal partition can use fewer cores than this
 
 
 def _largest(low: int, high: int, fits: Callable[[int], bool]) -> int:

@@ -15,11 +15,11 @@ from typing import TypeVar
 
 import numpy as np
 
-from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.ir import INPUT, IntegerNetwork
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.layout.core_needs import lists_into
 from spikeloom.compiler.targets.loihi1.layout.partition import Partition
+from spikeloom.compiler.types import FloatArray, IntArray
 
 EXACT_STEPS = 30_000
 """Search steps (some 40 microseconds each) after which the best placement found so far is taken, and said not to be
@@ -38,24 +38,12 @@ Tiles = TypeVar("Tiles", int, IntArray)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Placement:
-    """Tiles of the cores.
+    """Tiles of the cores."""
 
-    Parameters
-    ----------
-    tiles : tuple of int
-        Tile of each core, row-major on the mesh.
-    spike_hops : float
-        Spikes per step times hops that this placement costs.
-    bound : float
-        No placement costs less (by more than a billionth); equal to `spike_hops` if that is proven optimal.
-    between_chips : float
-        Packets per step that leave their chip.
-    """
-
-    tiles: tuple[int, ...]
-    spike_hops: float
-    bound: float
-    between_chips: float = 0.0
+    tiles: tuple[int, ...]  # Tile of each core, row-major on the mesh
+    spike_hops: float  # Spikes per step times hops that this placement costs
+    bound: float  # No placement costs less (by more than a billionth); equal to `spike_hops` if that is proven optimal
+    between_chips: float = 0.0  # Packets per step that leave their chip
 
 
 def core_traffic(network: IntegerNetwork, partition: Partition, rates: tuple[FloatArray, ...] | None) -> FloatArray:

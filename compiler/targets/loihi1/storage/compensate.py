@@ -17,11 +17,12 @@ import numpy as np
 from scipy import sparse
 from scipy.linalg import solve_triangular
 
-from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX, FloatArray, IntArray, reach, step_units
+from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX, reach, step_units
 from spikeloom.compiler.ir import Form
 from spikeloom.compiler.passes.calibrate import Calibration
 from spikeloom.compiler.targets.loihi1.storage.scales import FloatLayer, Rounded, flips
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import scales, store
+from spikeloom.compiler.types import FloatArray, IntArray
 
 DAMPING = 1e-3
 """Share of the mean activity that is added to each input's own: inputs that never spiked are rounded to nearest."""

@@ -42,46 +42,30 @@ SHORTLIST, SHORTLIST_RATIO = 3, 1.25
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Choice:
-    """The storage that was chosen for one population, and why.
+    """The storage that was chosen for one population, and why."""
 
-    Parameters
-    ----------
-    layer : str
-        Population.
-    bits, planes, groups : int
-        Width of a mantissa, times that a synapse is stored at most, different scales.
-    exponent : int
-        Exponent of the finest plane.
-    scale, finest_scale : float
-        Weight units (mantissa times 2**exponent) per membrane unit of the model, of the coarsest and of the finest
-        group.
-    clipped, zeroed, weights : int
-        Weights that the range cuts off, those that round to zero, and all that are not zero.
-    compensated : bool
-        Whether weights were rounded so that their errors cancel, rather than each to the nearest.
-    candidates : int
-        Scales that were compared.
-    flips, spikes : int or None
-        Calibration spikes that differ from float64, and how many the float64 model has; None without calibration.
-    headroom : float
-        Share of the accumulator that the worst case (proven) or the largest observed step leaves free; of the
-        current's register where a current that outlasts its step fills that sooner.
-    """
-
-    layer: str
+    layer: str  # Population
+    # bits, planes, groups: Width of a mantissa, times that a synapse is stored at most, different scales
     bits: int
     planes: int
     groups: int
-    exponent: int
+    exponent: int  # Exponent of the finest plane
+    # scale, finest_scale: Weight units (mantissa times 2**exponent) per membrane unit of the model, of the coarsest and
+    # of the finest group
     scale: float
     finest_scale: float
+    # clipped, zeroed, weights: Weights that the range cuts off, those that round to zero, and all that are not zero
     clipped: int
     zeroed: int
     weights: int
-    compensated: bool
-    candidates: int
+    compensated: bool  # Whether weights were rounded so that their errors cancel, rather than each to the nearest
+    candidates: int  # Scales that were compared
+    # flips, spikes: Calibration spikes that differ from float64, and how many the float64 model has; None without
+    # calibration
     flips: int | None
     spikes: int | None
+    # Share of the accumulator that the worst case (proven) or the largest observed step leaves free; of the current's
+    # register where a current that outlasts its step fills that sooner
     headroom: float
 
 

@@ -19,8 +19,6 @@ from spikeloom.compiler.fixedpoint import (
     MEMBRANE_SHIFT,
     ONE_STEP_SUM_MAX,
     THRESHOLD_MANTISSA_MAX,
-    FloatArray,
-    IntArray,
     plane_distance,
     reach,
     step_units,
@@ -31,6 +29,7 @@ from spikeloom.compiler.ir import Form, IntegerPopulation, IntegerProjection, Ne
 from spikeloom.compiler.passes.calibrate import Calibration
 from spikeloom.compiler.targets.loihi1.options import Recipe
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import loads, round_population
+from spikeloom.compiler.types import FloatArray, IntArray
 
 WORTHWHILE = 0.95
 """The largest exponent that leaves this share of the finest weight scale is taken: each step up lets threshold and
@@ -45,22 +44,14 @@ LEVELS = 24
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FloatLayer:
-    """One population with the synapses into it, and what is known of its activity.
-
-    Parameters
-    ----------
-    post : int
-        Its index in the network.
-    calibration : Calibration, optional
-        Spikes of the float model.
-    observed : (neurons,) float64, optional
-        Largest sums that were observed, membrane units, see :func:`observed_sums`; without it the proven ones count.
-    """
+    """One population with the synapses into it, and what is known of its activity."""
 
     population: Population
     projections: tuple[Projection, ...]
-    post: int
-    calibration: Calibration | None = None
+    post: int  # Its index in the network
+    calibration: Calibration | None = None  # Spikes of the float model
+    # (neurons,) float64, optional; largest sums that were observed, membrane units, see :func:`observed_sums`; without
+    # it the proven ones count
     observed: FloatArray | None = None
 
     def sums(self, integer: IntegerPopulation, planes: tuple[IntegerProjection, ...]) -> FloatArray:
@@ -84,22 +75,13 @@ def layer_of(network: Network, post: int, calibration: Calibration | None = None
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Rounded:
-    """One population, with its synapses, in chip integers.
+    """One population, with its synapses, in chip integers."""
 
-    Parameters
-    ----------
-    form : Form
-        How it is stored.
-    population : IntegerPopulation
-    projections : tuple of IntegerProjection
-    reached : float
-        Largest one-sided sum of one step, weight units: proven, or observed with its margin. A current that outlasts
-        its step counts as the sum that fills the accumulator as far as it fills its own register.
-    """
-
-    form: Form
+    form: Form  # How it is stored
     population: IntegerPopulation
     projections: tuple[IntegerProjection, ...]
+    # Largest one-sided sum of one step, weight units: proven, or observed with its margin. A current that outlasts its
+    # step counts as the sum that fills the accumulator as far as it fills its own register.
     reached: float
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.fixedpoint import THRESHOLD_MANTISSA_MAX, IntArray, decay_registers, reach, step_units
+from spikeloom.compiler.fixedpoint import THRESHOLD_MANTISSA_MAX, decay_registers, reach, step_units
 from spikeloom.compiler.interpret import float_recurrence, product
 from spikeloom.compiler.ir import IntegerNetwork, Network
 from spikeloom.compiler.passes.calibrate import Calibration, fewer
@@ -28,6 +28,7 @@ from spikeloom.compiler.targets.loihi1.storage.quantize import (
 )
 from spikeloom.compiler.targets.loihi1.storage.scales import FloatLayer, finest_thresholds, flips, in_batches, layer_of
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import current_load
+from spikeloom.compiler.types import IntArray
 
 SHARED = 0.8
 """A neuron whose threshold is below this share of its own finest is held back by those it shares the threshold with."""
@@ -38,28 +39,17 @@ AT_LIMIT = 0.99
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Exactness:
-    """What was tried for one population, and what is in the way of exactness.
+    """What was tried for one population, and what is in the way of exactness."""
 
-    Parameters
-    ----------
-    layer : str
-        Population.
-    tried : tuple of (planes, groups, spikes that move)
-        In order, on ``calibrate.FEW`` recordings; the best was taken, and rounded anew on ``calibrate.MANY``.
-    flips, spikes : int
-        Spikes that move in what was taken, and all spikes of the float64 model, on all calibration recordings.
-    limits : tuple of (limit, spikes that move)
-        Spikes that still move, by what keeps their neuron's scale from being finer.
-    decay : int
-        Spikes that move if nothing but the 12-bit decay deviates.
-    """
-
-    layer: str
+    layer: str  # Population
+    # In order, on ``calibrate.FEW`` recordings; the best was taken, and rounded anew on ``calibrate.MANY``
     tried: tuple[tuple[int, int, int], ...]
+    # flips, spikes: Spikes that move in what was taken, and all spikes of the float64 model, on all calibration
+    # recordings
     flips: int
     spikes: int
-    limits: tuple[tuple[str, int], ...]
-    decay: int
+    limits: tuple[tuple[str, int], ...]  # Spikes that still move, by what keeps their neuron's scale from being finer
+    decay: int  # Spikes that move if nothing but the 12-bit decay deviates
 
 
 def make_exact(

@@ -21,8 +21,6 @@ from spikeloom.compiler.fixedpoint import (
     MEMBRANE_MAX,
     MEMBRANE_SHIFT,
     ONE_STEP_SUM_MAX,
-    FloatArray,
-    IntArray,
     decay_registers,
     encode_bias,
     round_steps,
@@ -39,6 +37,7 @@ from spikeloom.compiler.ir import (
     row_parts,
     with_data,
 )
+from spikeloom.compiler.types import FloatArray, IntArray
 
 FORGETS = DECAY_ONE - 1
 """`decay_u` of a current that forgets everything in one step."""

@@ -14,8 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from spikeloom.compiler.errors import CapacityError, ModelError, OptionError
-from spikeloom.compiler.fixedpoint import FloatArray, IntArray
-from spikeloom.compiler.interpret import BoolArray, cut, run_float, run_integer, vote
+from spikeloom.compiler.interpret import cut, run_float, run_integer, vote
 from spikeloom.compiler.ir import IntegerNetwork, Network
 from spikeloom.compiler.passes.calibrate import Calibration, calibrate, evenly_spaced
 from spikeloom.compiler.passes.prune import compact, disconnect, either, never_fires, removable
@@ -25,6 +24,7 @@ from spikeloom.compiler.targets.loihi1.layout.partition import partition
 from spikeloom.compiler.targets.loihi1.options import Recipe, check_recipes
 from spikeloom.compiler.targets.loihi1.storage.quantize import Candidate, assemble, settle, shortlist
 from spikeloom.compiler.targets.loihi1.storage.scales import layer_of
+from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 
 Widths = tuple[int, ...]
 """Storage width of each layer."""
@@ -35,49 +35,25 @@ Offers = list[dict[int, list[Candidate]]]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WidthPoint:
-    """One combination of widths.
+    """One combination of widths."""
 
-    Parameters
-    ----------
-    bits : tuple of int
-        Width of each layer.
-    words : int
-        64-bit words of synaptic memory: of the weights alone, or, of what was built, of all lists in the smaller of
-        their forms. A netlist uses the larger form where a core has room for it and it saves synaptic operations.
-    equal : int
-        Recordings that are decided as the float64 model does.
-    right : int or None
-        Recordings that are decided right; None where a label is unknown.
-    cores : int or None
-        Cores of the netlist; None where none was built.
-    """
-
-    bits: Widths
+    bits: Widths  # Width of each layer
+    # 64-bit words of synaptic memory: of the weights alone, or, of what was built, of all lists in the smaller of their
+    # forms. A netlist uses the larger form where a core has room for it and it saves synaptic operations.
     words: int
-    equal: int
-    right: int | None
-    cores: int | None = None
+    equal: int  # Recordings that are decided as the float64 model does
+    right: int | None  # Recordings that are decided right; None where a label is unknown
+    cores: int | None = None  # Cores of the netlist; None where none was built
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WidthSearch:
-    """Combinations that were tried, and the best of them as netlists.
+    """Combinations that were tried, and the best of them as netlists."""
 
-    Parameters
-    ----------
-    samples : int
-        Recordings that were decided.
-    float_right : int or None
-        Those of them that the float64 model decides right.
-    points : tuple of WidthPoint
-        Every combination that was tried, each layer at the scale that is best by itself.
-    built : tuple of WidthPoint
-        Those on a front (accuracy or agreement against memory) that fit the chip, as the compiler builds them.
-    """
-
-    samples: int
-    float_right: int | None
-    points: tuple[WidthPoint, ...]
+    samples: int  # Recordings that were decided
+    float_right: int | None  # Those of them that the float64 model decides right
+    points: tuple[WidthPoint, ...]  # Every combination that was tried, each layer at the scale that is best by itself
+    # Those on a front (accuracy or agreement against memory) that fit the chip, as the compiler builds them
     built: tuple[WidthPoint, ...]
 
 

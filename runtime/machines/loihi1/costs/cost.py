@@ -19,11 +19,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from spikeloom.compiler.errors import DataError
-from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.targets.base import EnergyTable, Target
 from spikeloom.compiler.targets.loihi1.layout.chips import chip_of_core
 from spikeloom.compiler.targets.loihi1.layout.place import hops
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.runtime.machines.loihi1.trace import Counts
 
 EVENTS = (

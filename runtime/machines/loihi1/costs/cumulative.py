@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from spikeloom.compiler.fixedpoint import DECAY_BITS, MEMBRANE_SHIFT, FloatArray, IntArray
-from spikeloom.compiler.interpret import BoolArray
+from spikeloom.compiler.fixedpoint import DECAY_BITS, MEMBRANE_SHIFT
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.layout.chips import chip_count
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, one_step_bounds
+from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.runtime.machines.integer import LONGEST, Cumulative
 from spikeloom.runtime.machines.loihi1 import engine, timing
 from spikeloom.runtime.machines.loihi1.costs import cost, simple_times

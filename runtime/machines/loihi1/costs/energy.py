@@ -11,11 +11,11 @@ from itertools import pairwise
 import numpy as np
 from scipy.sparse import csr_array
 
-from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.targets.base import EnergyTable, Target
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.runtime.machines.loihi1.costs.cost import EVENTS, price
-from spikeloom.runtime.machines.loihi1.trace import BoolArray, Counts
+from spikeloom.runtime.machines.loihi1.trace import Counts
 
 PARTS = {
     "synapse": ("synaptic_operation_dense", "synaptic_operation_sparse"),

@@ -16,15 +16,15 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.layout.chips import chip_count, require_one_chip
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.runtime.machines.loihi1 import engine, timing
 from spikeloom.runtime.machines.loihi1.costs import cost, energy, simple_times
 from spikeloom.runtime.machines.loihi1.costs.cost import Costs
 from spikeloom.runtime.machines.loihi1.timing import DetailedTimes, SimpleTimes
-from spikeloom.runtime.machines.loihi1.trace import BoolArray, Counts
+from spikeloom.runtime.machines.loihi1.trace import Counts
 
 PART = 16
 """Recordings whose spikes are kept at a time in detail ``cycle``."""

@@ -6,12 +6,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from spikeloom.compiler.fixedpoint import FloatArray, IntArray
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.layout.chips import chip_count, chip_of_core, chip_tiles
 from spikeloom.compiler.targets.loihi1.layout.core_graph import core_map
 from spikeloom.compiler.targets.loihi1.legalize import measure
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.runtime.machines.base import EventArray
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.costs import cost

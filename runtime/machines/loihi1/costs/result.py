@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from spikeloom.compiler.fixedpoint import FloatArray
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.layout.chips import chip_count
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.types import FloatArray
 from spikeloom.runtime.machines.loihi1.costs.cost import NOT_PRICED, Costs
 from spikeloom.runtime.machines.loihi1.costs.estimate import Estimate
 from spikeloom.runtime.machines.loihi1.timing import DetailedTimes, SimpleTimes

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from spikeloom.compiler.errors import DataError
-from spikeloom.compiler.fixedpoint import IntArray
+from spikeloom.compiler.types import IntArray
 from spikeloom.runtime.machines.loihi1.timing import Clock, SimpleTimes, simple_times
 from spikeloom.runtime.machines.loihi1.trace import Charges
 

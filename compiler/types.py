@@ -1,0 +1,17 @@
+"""Names of types that everything shares: arrays, and what JSON files hold."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+BoolArray = npt.NDArray[np.bool_]
+
+FloatArray = npt.NDArray[np.float64]
+
+IntArray = npt.NDArray[np.int64]
+
+JsonObject = dict[str, Any]
+"""A JSON object as Python reads it, or as it is to be written."""
