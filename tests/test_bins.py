@@ -38,7 +38,7 @@ def place(tmp_path_factory):
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.chdir(folder)
         splits = [
-            replace(synthetic_grasps(per_class=3, steps=20, seed=seed), split=split)
+            replace(synthetic_grasps(per_class=2, steps=20, seed=seed), split=split)
             for split, seed in (("train", 1), ("test", 2))
         ]
         write_released(folder / "fine", splits)
@@ -203,7 +203,7 @@ def test_a_netlist_of_other_bins_is_not_from_this_network(refusal):
             "taxels_dead,warm_state,longer,ties_fire",
         ),
         ("yardsticks", "CKPT", "--data", "DATA"),
-        ("bits", "CKPT", "--calibrate", "DATA", "--widths", "4,8", "--agreement", "0.5"),
+        ("bits", "CKPT", "--calibrate", "DATA", "--widths", "8", "--agreement", "0.5"),
         ("lean", "CKPT", "--data", "DATA"),
     ],
 )
@@ -289,7 +289,7 @@ def test_joined_networks_and_fine_tuned_ones_keep_them(report, refusal, place):
     assert (tuned.bins, plain.bins, len(tuned.forms)) == (BINS, 1, 4)
     assert_array_equal(tuned.dense[0].weight, plain.dense[0].weight)
     assert tuned.training["data_sha256"] == read_checkpoint(place / "x.pt").training["data_sha256"]
-    assert "bins of a step (x.pt: 3; plain.pt: 1)" in refusal("join", "x.pt", "plain.pt", "-o", "z.pt")
+    assert "bins of a step (plain.pt)" in refusal("join", "x.pt", "plain.pt", "-o", "z.pt")
 
 
 def test_inspect_tells(place, monkeypatch, capsys):

@@ -303,7 +303,7 @@ def test_another_beta_for_a_network_with_one_a_layer_is_refused(tmp_path):
     written(path)
     with pytest.raises(OptionError) as error:
         read_checkpoint(path, beta=0.5)
-    assert str(error.value) == (f"--beta 0.5: {path} has a decay for each layer, 0.2, 0.3, 0, 0.4; leave --beta away")
+    assert f"--beta 0.5: {path} has a decay for each layer, 0.2, 0.3, 0, 0.4" in str(error.value)
 
 
 # --- recipes -------------------------------------------------------------------------------------------------------

@@ -283,7 +283,7 @@ def test_own_files(tmp_path, system):
     assert (tmp_path / "y.pt").read_bytes() == content
     with pytest.raises(OptionError) as refused:
         read_checkpoint(tmp_path / "x.pt", system="tactilesgnet")
-    assert str(refused.value) == (f"--system tactilesgnet: {tmp_path / 'x.pt'} holds a {system}; leave --system away")
+    assert f"--system tactilesgnet: {tmp_path / 'x.pt'} holds a {system}" in str(refused.value)
 
 
 def test_a_tactilesgnet_is_stored_as_before():
@@ -463,12 +463,12 @@ def test_a_sensor_that_no_window_fits():
 @pytest.mark.recordings
 @pytest.mark.parametrize("system", NEW)
 def test_on_recordings_after_a_short_training(containers_zip, tmp_path, system):
-    """Two epochs on 60 of the 240 training recordings, without the part that chooses an epoch."""
+    """An epoch on 60 of the 240 training recordings, without the part that chooses an epoch."""
     training = load_recordings(containers_zip, "train", limit=60)
     test = load_recordings(containers_zip, "test", limit=20)
     sizes = Architecture(taxels=39, classes=20, system=system)
     seen = seen_by(system)
-    trained = train(training, test, seen, sizes, epochs=2)
+    trained = train(training, test, seen, sizes, epochs=1)
     network = SpikingNet(sizes, seen)
     network.load_weights(trained.last)
     checkpoint = saved(tmp_path, network)
