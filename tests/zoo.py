@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import atexit
+import shutil
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -193,7 +195,9 @@ FLOAT = tuple(name for name in MAKERS if name not in INTEGERS)
 
 @cache
 def place() -> Path:
-    return Path(tempfile.mkdtemp(prefix="spikeloom-zoo-"))
+    folder = Path(tempfile.mkdtemp(prefix="spikeloom-zoo-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder
 
 
 @cache
