@@ -386,7 +386,10 @@ def score(tree: Path, fault: Fault, tests: dict[str, Any], tried: list[str], lim
     found = places.find(fault)
     if len(found) <= fault["nth"]:
         closest = difflib.get_close_matches(_bare(fault["text"]), places.where, 1, 0.7)
-        return {"result": "gone", "closest": [(str(places.where[c][0][0].relative_to(tree)), c) for c in closest]}
+        return {
+            "result": "gone",
+            "closest": [(str(places.where[c][0][0].relative_to(tree)), c) for c in closest if places.where[c]],
+        }
     path, number = found[fault["nth"]]
     stamp, source = path.stat(), path.read_bytes()
     text = source.decode()
