@@ -29,7 +29,7 @@ def command(*words) -> tuple[int, dict]:
     """Run a command with ``--json`` in this process; exit code and object."""
     printed = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cli, "show", printed.append)
+        patch.setattr("spikeloom.runtime.report.console.show", printed.append)
         code = cli.main([*map(str, words), "--json"])
     return code, json.loads(printed[0])
 
