@@ -253,7 +253,7 @@ class Places:
     def find(self, fault: Fault) -> list[tuple[Path, int]]:
         """Lines that may be the one of the fault, all equally likely; none if it is gone."""
         ranked = defaultdict(list)
-        same = self.where[_bare(fault["text"])]
+        same = self.where.get(_bare(fault["text"]), [])
         for path, number in same:
             lines = ["", *map(_bare, self.lines[path]), ""]
             near = sum(a == b for a, b in zip((lines[number], lines[number + 2]), fault["near"], strict=True))
@@ -386,10 +386,7 @@ def score(tree: Path, fault: Fault, tests: dict[str, Any], tried: list[str], lim
     found = places.find(fault)
     if len(found) <= fault["nth"]:
         closest = difflib.get_close_matches(_bare(fault["text"]), places.where, 1, 0.7)
-        return {
-            "result": "gone",
-            "closest": [(str(places.where[c][0][0].relative_to(tree)), c) for c in closest if places.where[c]],
-        }
+        return {"result": "gone", "closest": [(str(places.where[c][0][0].relative_to(tree)), c) for c in closest]}
     path, number = found[fault["nth"]]
     stamp, source = path.stat(), path.read_bytes()
     text = source.decode()
