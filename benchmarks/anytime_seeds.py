@@ -14,7 +14,7 @@ import numpy as np
 
 from spikeloom.compiler import compile_network
 from spikeloom.compiler.dynamics import with_clocks
-from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.models.recordings.evtouch import load_recordings
 from spikeloom.runtime.commands.choose.anytime import ALLOWED

@@ -23,7 +23,7 @@ import numpy as np
 import workload
 from growth_chart import draw
 
-from spikeloom.compiler.atomic import write_atomically
+from spikeloom.compiler.files import write_atomically
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.runtime.machines.loihi1.engine import Engine, prepare, simulate
 

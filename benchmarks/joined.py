@@ -21,7 +21,7 @@ from paper.measured import float_decisions
 from spikeloom.compiler import Options, compile_network
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.dynamics import with_clocks
-from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.formats.towers import join
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.base import load_target

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from typing import Any
 
 from spikeloom.compiler import Options, compile_network
-from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.models.networks.reference import float_spikes

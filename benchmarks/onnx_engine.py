@@ -10,7 +10,6 @@ those of our engine.
 from __future__ import annotations
 
 import argparse
-import hashlib
 import json
 import platform
 import statistics
@@ -23,7 +22,7 @@ import onnx
 import onnxruntime
 
 from spikeloom.compiler import __version__
-from spikeloom.compiler.atomic import write_atomically
+from spikeloom.compiler.files import sha256_of, write_atomically
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.models.recordings.evtouch import load_recordings
@@ -96,7 +95,7 @@ def main() -> None:
     runs, ready = contenders(netlist)
     batches = {"1": [events[i : i + 1] for i in range(min(FEW, len(events)))], str(len(events)): [events]}
     report = {
-        "netlist_sha256": hashlib.sha256(Path(arguments.netlist).read_bytes()).hexdigest(),
+        "netlist_sha256": sha256_of(arguments.netlist),
         "recordings": Path(arguments.recordings).name,
         "steps": events.shape[2],
         "spikeloom": __version__,

@@ -30,7 +30,7 @@ import numpy as np
 import workload
 from rivals_chart import digits, draw
 
-from spikeloom.compiler.atomic import write_atomically
+from spikeloom.compiler.files import write_atomically
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist, write_netlist
 from spikeloom.models.recordings.evtouch import load_recordings

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 
 from spikeloom.compiler import Options, Recipe, compile_network
-from spikeloom.compiler.atomic import write_atomically
 from spikeloom.compiler.checkpoint import Checkpoint
-from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.files import write_atomically
+from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.base import load_target

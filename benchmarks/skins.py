@@ -25,7 +25,7 @@ from growth_chart import draw_skins
 from scipy import sparse
 
 from spikeloom.compiler import Options, compile_network
-from spikeloom.compiler.atomic import write_atomically
+from spikeloom.compiler.files import write_atomically
 from spikeloom.compiler.ir import INPUT, Input, Network, Population, Projection, Readout
 from spikeloom.compiler.passes.expand import expand_graph_convolution
 from spikeloom.compiler.targets.base import load_target

@@ -20,7 +20,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 from joined import measured
 
-from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.models.recordings.evtouch import load_recordings
 from spikeloom.runtime.report.intervals import of_mean
 

@@ -19,9 +19,9 @@ from typing import Any
 
 import numpy as np
 
-from spikeloom.compiler.atomic import write_atomically
 from spikeloom.compiler.dynamics import MOST_CLOCKS, MOST_STEPS
 from spikeloom.compiler.errors import FormatError
+from spikeloom.compiler.files import write_atomically
 
 Array = np.ndarray[Any, Any]
 
@@ -38,7 +38,9 @@ FORMATS = {
 SIZE_LIMIT = 2**32
 """Bytes that a netlist file may have, 4 GiB: some hundred times the synapses of a whole chip."""
 
-_EPOCH = (1980, 1, 1, 0, 0, 0)
+ZIP_DATE = (1980, 1, 1, 0, 0, 0)
+"""Of every member of a zip, so that equal content gives equal bytes."""
+
 _ZIP_ERRORS = (zipfile.BadZipFile, struct.error, ValueError, EOFError, OverflowError, MemoryError, RuntimeError)
 """What zipfile and numpy raise on content that is no netlist; a header may announce more than the memory holds."""
 
@@ -63,18 +65,33 @@ def digest(members: Mapping[str, Array]) -> str:
     return found.hexdigest()
 
 
+def arrays_digest(arrays: Mapping[str, Array]) -> str:
+    """The same in the order of their names."""
+    return digest(dict(sorted(arrays.items())))
+
+
+def npy_bytes(array: Array) -> bytes:
+    """Content of an npy file."""
+    content = io.BytesIO()
+    np.lib.format.write_array(content, array, version=(1, 0), allow_pickle=False)
+    return content.getvalue()
+
+
+def zip_bytes(members: Mapping[str, bytes | str]) -> bytes:
+    """A zip that stores its members plainly, in their order."""
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
+        for name, content in members.items():
+            archive.writestr(zipfile.ZipInfo(name, date_time=ZIP_DATE), content)
+    return file.getvalue()
+
+
 def archive_bytes(manifest: Mapping[str, Any], arrays: Mapping[str, Array]) -> bytes:
     """Content of a file: the manifest, the arrays in their order, and the hash over all of them."""
     members: dict[str, Array] = {"manifest": np.array(json.dumps(manifest, sort_keys=True))}
     members |= {name: narrow(array) for name, array in arrays.items()}
     members["sha256"] = np.array(digest(members))
-    file = io.BytesIO()
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
-        for name, array in members.items():
-            content = io.BytesIO()
-            np.lib.format.write_array(content, array, version=(1, 0), allow_pickle=False)
-            archive.writestr(zipfile.ZipInfo(f"{name}.npy", date_time=_EPOCH), content.getvalue())
-    return file.getvalue()
+    return zip_bytes({f"{name}.npy": npy_bytes(array) for name, array in members.items()})
 
 
 def write_archive(content: bytes, path: str | os.PathLike[str]) -> str:

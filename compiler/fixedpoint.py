@@ -128,6 +128,17 @@ def decay_registers(beta: float, alpha: float = 0.0) -> tuple[int, int]:
     return min(4095, max(0, round(4096 * (1 - alpha)) - 1)), min(4095, max(0, round(4096 * (1 - beta))))
 
 
+def kept_shares(decay_u: IntArray | int, decay_v: IntArray | int) -> tuple[Any, Any]:
+    """Shares of current and membrane that a step keeps, from their registers: what :func:`decay_registers` rounds to.
+
+    Examples
+    --------
+    >>> kept_shares(4095, 3277) == (0.0, 819 / 4096)
+    True
+    """
+    return (DECAY_ONE - 1 - decay_u) / DECAY_ONE, (DECAY_ONE - decay_v) / DECAY_ONE
+
+
 def plane_distance(bits: int) -> int:
     """Largest difference of exponents at which two planes leave no gap between their values.
 

@@ -160,7 +160,7 @@ def integer_recurrence(
     kept = np.empty(sums.shape, np.int64) if membranes else None
     threshold = (population.threshold << MEMBRANE_SHIFT).astype(np.float64)
     bias = population.bias.astype(np.float64)
-    keep_u, keep_v = (4096 - (population.decay_u + 1)) / 4096, (4096 - population.decay_v) / 4096
+    keep_u, keep_v = population.realised_alpha, population.realised_beta
     u = np.zeros(sums.shape[::2])
     v = np.zeros_like(u)
     inflow = np.empty_like(u)

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from scipy import sparse
 
 from spikeloom.compiler.dynamics import NO_CLOCKS, Clocks
-from spikeloom.compiler.fixedpoint import DECAY_BITS
+from spikeloom.compiler.fixedpoint import kept_shares
 from spikeloom.compiler.types import FloatArray, IntArray
 
 INPUT = -1
@@ -144,12 +144,12 @@ class IntegerPopulation:
     @property
     def realised_beta(self) -> float:
         """Decay factor of the membrane register."""
-        return ((1 << DECAY_BITS) - self.decay_v) / (1 << DECAY_BITS)
+        return float(kept_shares(self.decay_u, self.decay_v)[1])
 
     @property
     def realised_alpha(self) -> float:
-        """Decay factor of the current register, which loses one part more than it says."""
-        return ((1 << DECAY_BITS) - 1 - self.decay_u) / (1 << DECAY_BITS)
+        """Decay factor of the current register."""
+        return float(kept_shares(self.decay_u, self.decay_v)[0])
 
     @property
     def realised_theta(self) -> FloatArray:

@@ -54,7 +54,7 @@ def prove_ranges(network: IntegerNetwork) -> tuple[RangeProof, ...]:
         into = (projection for projection in network.projections if projection.post == post)
         positive, negative = one_sided(into, population.size)
         unit = 1 << MEMBRANE_SHIFT
-        kept_u = (4096 - (population.decay_u + 1)) / 4096
+        kept_u = population.realised_alpha
         up, down = _settled(positive * unit, kept_u), _settled(negative * unit, kept_u)
         rise = population.realised_beta * population.threshold * unit + up + np.maximum(population.bias, 0)
         fall = _settled(down + np.maximum(-population.bias, 0), population.realised_beta)

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from spikeloom.compiler.checkpoint import Checkpoint
-from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.models.graphs import Graph, normalised_adjacency
 from spikeloom.models.networks.checkpoint import save_checkpoint
 

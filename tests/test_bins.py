@@ -13,7 +13,7 @@ from test_checkpoint import rebuilt
 
 from spikeloom.compiler.dynamics import NO_CLOCKS
 from spikeloom.compiler.errors import FormatError, ModelError, OptionError
-from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.targets.loihi1.netlist_file import manifest_of, netlist_bytes, read_netlist, write_netlist
 from spikeloom.compiler.targets.truenorth.native import SYSTEM as NATIVE
 from spikeloom.models.recordings.events import BIN_S, joined_bins, load_data

@@ -8,7 +8,7 @@ from random_netlists import KEPT, Axon, Neuron, assert_equal, build, by_engine, 
 
 from spikeloom.compiler import Options, Recipe, compile_network
 from spikeloom.compiler.errors import NumericRangeError
-from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.runtime.machines.loihi1 import engine, spec

@@ -9,7 +9,7 @@ from browser import Page
 from made_chart import made_chart
 from made_files import own_file, recordings_folder
 
-from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.runtime import cli
 from spikeloom.runtime.report.encode import decode, encode
 from spikeloom.runtime.report.sections import terminal

@@ -17,8 +17,8 @@ import torch
 from made_files import state_dict
 
 from spikeloom.compiler.errors import ModelError, OptionError
-from spikeloom.compiler.formats.checkpoint import SIZE_LIMIT, read_checkpoint
-from spikeloom.compiler.formats.checkpoint_file import content_digest
+from spikeloom.compiler.formats.checkpoint_reader import SIZE_LIMIT, read_checkpoint
+from spikeloom.compiler.formats.spikeloom_checkpoint import content_digest
 from spikeloom.models.graphs import Graph
 from spikeloom.models.networks.checkpoint import checkpoint_bytes, save_checkpoint
 from spikeloom.models.networks.networks import Architecture
@@ -363,7 +363,7 @@ def test_own_format_round_trip(tmp_path):
 def test_own_format_needs_neither_torch_nor_pickle(tmp_path):
     write(tmp_path / "x.pt", own())
     program = (
-        "import sys; from spikeloom.compiler.formats.checkpoint import read_checkpoint; "
+        "import sys; from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint; "
         f"assert read_checkpoint({str(tmp_path / 'x.pt')!r}).classes == {CLASSES}; assert 'torch' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", program], check=True, cwd=Path(__file__).parents[1])

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from spikeloom.compiler import compile_network
-from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.layout.core_graph import core_map

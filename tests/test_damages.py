@@ -12,7 +12,7 @@ from timed_networks import written
 from spikeloom.compiler import Options, Recipe, compile_network, lift
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.fixedpoint import decay_registers
-from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.loihi1.alike import unplaced
 from spikeloom.models.graphs import normalised_adjacency

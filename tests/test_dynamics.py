@@ -14,7 +14,7 @@ from timed_networks import GRAPH, SMALL, TIMING, events_of, louder, written
 
 from spikeloom.compiler.dynamics import NO_CLOCKS, PLAIN, Clocks, Dynamics, clocks_over, dynamics_faults, with_clocks
 from spikeloom.compiler.errors import ModelError, OptionError
-from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.models.graphs import normalised_adjacency
 from spikeloom.models.networks.currents import accumulate, accumulate_steps, lasting_current
 from spikeloom.models.networks.layers import LifSteps, lif

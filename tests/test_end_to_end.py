@@ -11,7 +11,7 @@ import pytest
 from made_files import own_file, recordings_folder, weights
 
 from spikeloom.compiler import Options, compile_network
-from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import netlist_bytes, read_netlist

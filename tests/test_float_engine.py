@@ -13,7 +13,7 @@ from timed_networks import TIMING, events_of, written
 from spikeloom.compiler import Options, compile_network
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import SpikeloomError
-from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.interpret import run_float, vote
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.models.networks.reference import float_spikes

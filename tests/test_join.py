@@ -16,7 +16,7 @@ from spikeloom.compiler import Options, compile_network
 from spikeloom.compiler.checkpoint import SHARED, towers_of
 from spikeloom.compiler.dynamics import PLAIN, Clocks, Dynamics, with_clocks
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.formats.onnx.reader import read_onnx
 from spikeloom.compiler.formats.towers import arrays_of, join, members, side_by_side
 from spikeloom.compiler.interpret import channels_last, run_float, run_integer, vote

@@ -197,7 +197,7 @@ def test_the_proof_covers_the_netlist():
 @pytest.fixture(scope="module")
 def released(released_checkpoint):
     pytest.importorskip("torch")
-    from spikeloom.compiler.formats.checkpoint import read_checkpoint
+    from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 
     return read_checkpoint(released_checkpoint)
 

@@ -12,8 +12,8 @@ from made_files import ring, small_checkpoint, weights
 from spikeloom.compiler import Options, Recipe, compile_network, lift
 from spikeloom.compiler.errors import DataError, ModelError, OptionError
 from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX
-from spikeloom.compiler.formats.checkpoint import read_checkpoint
-from spikeloom.compiler.formats.checkpoint_file import content_digest
+from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
+from spikeloom.compiler.formats.spikeloom_checkpoint import content_digest
 from spikeloom.compiler.interpret import channels_last, run_integer
 from spikeloom.compiler.passes.calibrate import calibrate
 from spikeloom.compiler.passes.expand import expand

@@ -114,7 +114,7 @@ def test_weights_act_taxel_by_taxel(tmp_path):
 @pytest.fixture(scope="module")
 def released_run(released_checkpoint, objects_zip, shared_dir):
     """Checkpoint, propagation matrix, recordings, float32 spikes and the published outputs."""
-    from spikeloom.compiler.formats.checkpoint import read_checkpoint
+    from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 
     checkpoint, graph = read_checkpoint(released_checkpoint), build_graph("manual")
     adjacency = normalised_adjacency(graph.edges, graph.n_taxels)

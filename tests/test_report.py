@@ -16,7 +16,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from timed_networks import written
 
 from spikeloom.compiler.dynamics import with_clocks
-from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.systems import GRAPH_SYSTEMS, GRID_CNN, SYSTEMS
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist, write_netlist

@@ -23,7 +23,7 @@ from spikeloom.compiler import Options, compile_network
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.formats import sanafe
-from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.models.graphs import build_graph, normalised_adjacency

@@ -11,7 +11,7 @@ from timed_networks import events_of, written
 
 from spikeloom.compiler import Options, Recipe, compile_network, write_netlist
 from spikeloom.compiler.dynamics import with_clocks
-from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.formats.towers import join
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.passes.expand import expand

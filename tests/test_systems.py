@@ -14,7 +14,7 @@ from scipy import sparse
 
 from spikeloom.compiler import Options, compile_network
 from spikeloom.compiler.errors import CapacityError, DataError, ModelError, OptionError
-from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.interpret import channels_last, run_float
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.systems import GCN, GRAPH_SYSTEMS, GRID_CNN, MLP, SYSTEMS, Grid, in_order

@@ -24,7 +24,7 @@ from spikeloom.compiler.fixedpoint import (
     decay_registers,
     read_only,
 )
-from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.interpret import channels_last, run_float
 from spikeloom.compiler.ir import Input
 from spikeloom.compiler.passes.expand import expand

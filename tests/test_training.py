@@ -16,7 +16,7 @@ import pytest
 from commands import RUNTIME
 
 from spikeloom.compiler.errors import DataError, OptionError
-from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.models.recordings.evtouch import load_recordings
 from spikeloom.models.recordings.grasps import synthetic_grasps
 from spikeloom.models.recordings.release import write_released

@@ -21,7 +21,7 @@ from random_netlists import lively as lively_netlist
 from spikeloom.compiler import compile_network
 from spikeloom.compiler.errors import DataError, ModelError, OptionError
 from spikeloom.compiler.fixedpoint import read_only
-from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist

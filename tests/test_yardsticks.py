@@ -219,7 +219,7 @@ def test_equal_to_the_package(package, tmp_path, seed):
 
 @pytest.mark.recordings
 def test_the_released_network_in_round_figures(released_checkpoint, objects_zip):
-    from spikeloom.compiler.formats.checkpoint import read_checkpoint
+    from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 
     checkpoint = read_checkpoint(released_checkpoint)
     graph = build_graph("manual")

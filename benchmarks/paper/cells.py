@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from spikeloom.compiler.atomic import write_atomically
+from spikeloom.compiler.files import write_atomically
 from spikeloom.compiler.systems import GCN, GRAPH_SYSTEMS, GRID_CNN, MLP, SYSTEMS, TACTILESGNET
 
 Cell = dict[str, Any]

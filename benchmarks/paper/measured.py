@@ -11,7 +11,7 @@ import numpy as np
 from spikeloom.compiler import Compilation, Options, compile_network, without
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.errors import CapacityError
-from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.interpret import cut, vote
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.passes.expand import expand

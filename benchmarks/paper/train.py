@@ -5,7 +5,6 @@ again; figures go to FOLDER/cells.json, from which ``tables.py`` makes the table
 """
 
 import argparse
-import hashlib
 import os
 import subprocess
 import sys
@@ -15,7 +14,8 @@ from cells import EPOCHS, Cell, Row, planned, read_cells, write_cells
 from joblib import Parallel, delayed
 from measured import measure
 
-from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.files import sha256_of
+from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.models.recordings.events import load_data
 
 KEPT = ("command", "data_sha256", "test_samples", "best", "last", "clean", "validation", "spikeloom", "torch", "numpy")
@@ -32,7 +32,7 @@ def make(row: Row, seed: int, data: str, network: Path) -> tuple[str, Cell]:
     splits = (load_data(data, split)[0] for split in ("train", "test"))
     found = {"data": row.data, "system": row.system, "form": row.form, "epochs": row.epochs, "seed": seed}
     found |= {key: record[key] for key in KEPT}
-    found["checkpoint_sha256"] = hashlib.sha256(network.read_bytes()).hexdigest()
+    found["checkpoint_sha256"] = sha256_of(network)
     return row.cell(seed), found | {"chip": measure(network, *splits)}
 
 

@@ -30,11 +30,12 @@ from itertools import pairwise
 import numpy as np
 
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.fixedpoint import DECAY_BITS, MEMBRANE_SHIFT
+from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT, kept_shares
 from spikeloom.compiler.formats.names import plain_names
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.layout.chips import require_one_chip
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.targets.loihi1.storage.weight_storage import FORGETS
 from spikeloom.compiler.types import BoolArray, IntArray
 
 INPUT = "input"
@@ -50,7 +51,7 @@ def group_names(netlist: Netlist) -> tuple[str, ...]:
 
 def floating_layers(netlist: Netlist) -> tuple[str, ...]:
     """Names of the groups whose currents outlast their step."""
-    lasting = np.unique(netlist.layer[netlist.decay_u != 2**DECAY_BITS - 1])
+    lasting = np.unique(netlist.layer[netlist.decay_u != FORGETS])
     return tuple(group_names(netlist)[layer] for layer in lasting)
 
 
@@ -156,8 +157,7 @@ def _groups(netlist: Netlist, names: tuple[str, ...]) -> Iterator[str]:
     """Neurons of each layer; membranes count weight units."""
     dense = dense_neurons(netlist)
     bias = netlist.bias_mantissa * 2.0**netlist.bias_exponent / 2**MEMBRANE_SHIFT
-    leak = (2**DECAY_BITS - netlist.decay_v) / 2**DECAY_BITS
-    kept = (2**DECAY_BITS - 1 - netlist.decay_u) / 2**DECAY_BITS
+    kept, leak = kept_shares(netlist.decay_u, netlist.decay_v)
     for layer, name in enumerate(names):
         yield f"    - name: {name}"
         yield "      attributes: {soma_hw_name: loihi_lif, reset: 0.0, input_decay: 0.0, log_spikes: true}"

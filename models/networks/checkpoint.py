@@ -1,25 +1,22 @@
-"""Write our own checkpoint format; :mod:`formats.checkpoint_file` describes and reads it."""
+"""Write our own checkpoint format; :mod:`formats.spikeloom_checkpoint` describes and reads it."""
 
 from __future__ import annotations
 
-import io
 import json
 import os
-import zipfile
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.atomic import write_atomically
+from spikeloom.compiler.archive import npy_bytes, zip_bytes
 from spikeloom.compiler.dynamics import PLAIN, Dynamics
-from spikeloom.compiler.formats.checkpoint_file import FORMAT, VERSION, content_digest
+from spikeloom.compiler.files import write_atomically
+from spikeloom.compiler.formats.spikeloom_checkpoint import FORMAT, VERSION, content_digest
 from spikeloom.compiler.ir import Form
 from spikeloom.compiler.systems import TACTILESGNET, Grid
 from spikeloom.models.graphs import Graph
-
-_EPOCH = (1980, 1, 1, 0, 0, 0)
 
 Tensors = Mapping[str, npt.NDArray[np.float32]]
 
@@ -102,16 +99,8 @@ def checkpoint_bytes(
             for layer, form in zip(layers, forms, strict=True)
         ]
     manifest["sha256"] = content_digest(manifest, arrays)
-    file = io.BytesIO()
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
-        archive.writestr(
-            zipfile.ZipInfo("manifest.json", date_time=_EPOCH), json.dumps(manifest, indent=1, allow_nan=False)
-        )
-        for name, array in arrays.items():
-            content = io.BytesIO()
-            np.lib.format.write_array(content, array, version=(1, 0), allow_pickle=False)
-            archive.writestr(zipfile.ZipInfo(f"{name}.npy", date_time=_EPOCH), content.getvalue())
-    return file.getvalue()
+    members: dict[str, bytes | str] = {"manifest.json": json.dumps(manifest, indent=1, allow_nan=False)}
+    return zip_bytes(members | {f"{name}.npy": npy_bytes(array) for name, array in arrays.items()})
 
 
 def save_checkpoint(

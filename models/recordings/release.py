@@ -15,15 +15,14 @@ from pathlib import Path
 
 import numpy as np
 
-from spikeloom.compiler.atomic import beside, write_atomically
+from spikeloom.compiler.archive import ZIP_DATE
 from spikeloom.compiler.errors import DataError, OptionError
+from spikeloom.compiler.files import beside, write_atomically
 from spikeloom.models.recordings.events import need_labels
 from spikeloom.models.recordings.evtouch import Recordings
 
 SOURCES = "sources.csv"
 """Table of split, new name and old name of every recording."""
-
-_EPOCH = (1980, 1, 1, 0, 0, 0)  # equal recordings give equal zips
 
 
 def write_released(path: str | os.PathLike[str], splits: Sequence[Recordings]) -> None:
@@ -54,7 +53,7 @@ def write_released(path: str | os.PathLike[str], splits: Sequence[Recordings]) -
     if path.suffix.lower() == ".zip":
         with write_atomically(path) as target, zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as archive:
             for name, content in _members(splits):
-                info = zipfile.ZipInfo(name, _EPOCH)
+                info = zipfile.ZipInfo(name, ZIP_DATE)
                 info.compress_type = zipfile.ZIP_DEFLATED
                 info.external_attr = 0o644 << 16
                 archive.writestr(info, content)

@@ -24,9 +24,9 @@ import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from spikeloom.compiler.archive import arrays_digest
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.formats.checkpoint_file import arrays_digest
 from spikeloom.compiler.formats.towers import arrays_of
 from spikeloom.compiler.interpret import channels_last
 from spikeloom.compiler.ir import Form

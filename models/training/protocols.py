@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from spikeloom.compiler.archive import arrays_digest
 from spikeloom.compiler.errors import DataError
-from spikeloom.compiler.formats.checkpoint_file import arrays_digest
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.training.checks import Sizes
 from spikeloom.models.training.recipes import RELEASED, Recipe

@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass
 
 from spikeloom.compiler.dynamics import MOST_CLOCKS, Dynamics, clocks_over
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.fixedpoint import DECAY_ONE, decay_registers
+from spikeloom.compiler.fixedpoint import decay_registers, kept_shares
 from spikeloom.compiler.types import JsonObject
 from spikeloom.models.networks.surrogate import FAST_SIGMOID, RECTANGLE, Surrogate
 from spikeloom.models.systems import HOPS
@@ -114,8 +114,8 @@ def held_decays(beta: float, alpha: float) -> tuple[float, float]:
     >>> held_decays(0.5, 0.95) == (0.5, 3891 / 4096)
     True
     """
-    lost_u, lost_v = decay_registers(beta, alpha)
-    return (DECAY_ONE - lost_v) / DECAY_ONE, (DECAY_ONE - 1 - lost_u) / DECAY_ONE
+    held_alpha, held_beta = kept_shares(*decay_registers(beta, alpha))
+    return held_beta, held_alpha
 
 
 def decays_asked(words: str, option: str, layers: tuple[str, ...]) -> Decays:

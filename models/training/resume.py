@@ -17,8 +17,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from spikeloom.compiler.atomic import write_atomically
 from spikeloom.compiler.errors import ModelError, OptionError
+from spikeloom.compiler.files import write_atomically
 
 SIZE_LIMIT = 2**30
 

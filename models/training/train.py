@@ -26,7 +26,7 @@ import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from spikeloom.compiler.formats.checkpoint_file import arrays_digest
+from spikeloom.compiler.archive import arrays_digest
 from spikeloom.models.networks.networks import SpikingNet, TrainedModule, Weights
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.training.checks import Sizes, require_finite, require_options, require_suited

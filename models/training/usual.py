@@ -10,7 +10,7 @@ from typing import Any
 from spikeloom.compiler import systems
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.formats.towers import arrays_of
 from spikeloom.compiler.types import IntArray
 from spikeloom.models.networks.checkpoint import save_checkpoint

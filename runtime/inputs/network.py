@@ -15,7 +15,7 @@ import numpy as np
 from spikeloom.compiler.archive import FORMATS, TRAINED, stated_format
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.errors import ModelError, OptionError
-from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.formats.netx.layout import SUFFIX as NETX
 from spikeloom.compiler.formats.nir.reader import SUFFIX as NIR
 from spikeloom.compiler.formats.nir.reader import NirNetwork, read_nir

@@ -31,7 +31,7 @@ class ChipNeurons(nn.Module):
         super().__init__()
         self._threshold = torch.from_numpy((population.threshold << MEMBRANE_SHIFT).astype(np.float64))
         self._bias = torch.from_numpy(population.bias.astype(np.float64))
-        self._keeps = ((4095 - population.decay_u) / 4096, (4096 - population.decay_v) / 4096)
+        self._keeps = (population.realised_alpha, population.realised_beta)
         self.rest()
 
     def rest(self) -> None:

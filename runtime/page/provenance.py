@@ -14,6 +14,7 @@ import numpy as np
 
 from spikeloom import __version__
 from spikeloom.compiler import Netlist
+from spikeloom.compiler.files import sha256_of
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.types import JsonObject
 from spikeloom.models.recordings.evtouch import Recordings
@@ -52,7 +53,7 @@ def provenance(
     return Provenance(
         netlist=NetlistOrigin(
             file=Path(arguments.netlist).name,
-            sha256=hashlib.sha256(Path(arguments.netlist).read_bytes()).hexdigest(),
+            sha256=sha256_of(arguments.netlist),
             compiled=dict(netlist.provenance),
         ),
         checkpoint=CheckpointOrigin(

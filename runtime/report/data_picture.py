@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from spikeloom.compiler.atomic import write_atomically
+from spikeloom.compiler.files import write_atomically
 from spikeloom.compiler.types import FloatArray
 from spikeloom.models.recordings.describe import Description
 

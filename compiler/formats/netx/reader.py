@@ -13,7 +13,7 @@ from scipy import sparse
 
 from spikeloom.compiler.dynamics import MOST_CLOCKS, MOST_STEPS, NO_CLOCKS, Clocks
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.fixedpoint import BIAS_MANTISSA_MAX, THRESHOLD_MANTISSA_MAX
+from spikeloom.compiler.fixedpoint import BIAS_MANTISSA_MAX, THRESHOLD_MANTISSA_MAX, kept_shares
 from spikeloom.compiler.formats.hdf5 import Tree
 from spikeloom.compiler.formats.kernels import convolution
 from spikeloom.compiler.formats.netx.layout import BIAS_EXPONENT, DEFAULT_INPUT_WEIGHT, REMEDY, Block, read_blocks
@@ -247,11 +247,12 @@ def _population(block: Block, size: int, shape: tuple[int, ...]) -> IntegerPopul
     if not 0 <= threshold <= THRESHOLD_MANTISSA_MAX:
         raise block.fail(f"vThMant is {threshold}, allowed are 0 to {THRESHOLD_MANTISSA_MAX}; train it again")
     bias = _bias(block, size, shape)
+    alpha, beta = kept_shares(decay_u, decay_v)
     return IntegerPopulation(
         name=f"{block.type}{block.number}",
-        beta=(4096 - decay_v) / 4096,
+        beta=beta,
         theta=float(max(threshold, 1)),
-        alpha=(4095 - decay_u) / 4096,
+        alpha=alpha,
         scale=np.ones(size),
         decay_u=decay_u,
         decay_v=decay_v,

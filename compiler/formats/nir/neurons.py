@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.fixedpoint import decay_registers
+from spikeloom.compiler.fixedpoint import decay_registers, kept_shares
 from spikeloom.compiler.formats.nir.file import Node
 from spikeloom.compiler.types import FloatArray
 
@@ -194,6 +194,6 @@ def decay_words(beta: float) -> str:
     >>> decay_words(0.2), decay_words(0.5)
     ('decay 0.2 (0.199951 on the chip)', 'decay 0.5')
     """
-    realised = (4096 - decay_registers(beta)[1]) / 4096
+    _, realised = kept_shares(*decay_registers(beta))
     same = math.isclose(beta, realised, abs_tol=TOLERANCE)
     return f"decay {beta:.6g}" + ("" if same else f" ({realised:.6g} on the chip)")

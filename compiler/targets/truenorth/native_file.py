@@ -9,7 +9,6 @@ whole: what is in the file is what the chip computes.
 
 from __future__ import annotations
 
-import hashlib
 import os
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
@@ -32,6 +31,7 @@ from spikeloom.compiler.archive import (
 from spikeloom.compiler.checkpoint import WEIGHTS
 from spikeloom.compiler.dynamics import Clocks
 from spikeloom.compiler.errors import FormatError, ModelError
+from spikeloom.compiler.files import sha256_of
 from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.targets.truenorth.native import NativeNetwork, Stage, faults
 from spikeloom.compiler.types import IntArray
@@ -160,7 +160,7 @@ def read_trained(path: str | os.PathLike[str], *, weights: str | None = None) ->
         graph=manifest["graph"]["name"],
         edges=read_only(edges),
         training=manifest["training"],
-        sha256=hashlib.sha256(path.read_bytes()).hexdigest(),
+        sha256=sha256_of(path),
     )
 
 

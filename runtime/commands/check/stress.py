@@ -9,8 +9,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from spikeloom.compiler.atomic import write_atomically
 from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.files import write_atomically
 from spikeloom.runtime.commands.options import add_network, add_recordings
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.report.encode import encode

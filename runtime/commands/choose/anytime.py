@@ -7,8 +7,8 @@ import json
 
 import numpy as np
 
-from spikeloom.compiler.atomic import write_atomically
 from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.files import write_atomically
 from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.commands.options import MODEL, add_network, add_recordings

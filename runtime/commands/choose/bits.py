@@ -26,11 +26,10 @@ from spikeloom.compiler import (
     search_widths,
     widths_front,
 )
-from spikeloom.compiler.archive import is_netlist
-from spikeloom.compiler.atomic import write_atomically
+from spikeloom.compiler.archive import arrays_digest, is_netlist
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.errors import ModelError, OptionError
-from spikeloom.compiler.formats.checkpoint_file import arrays_digest
+from spikeloom.compiler.files import write_atomically
 from spikeloom.compiler.interpret import channels_last
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.base import COMPARTMENTS, Target, load_target

@@ -8,8 +8,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from spikeloom.compiler import __version__, write_netlist
-from spikeloom.compiler.atomic import write_atomically
 from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.files import write_atomically
 from spikeloom.models.recordings.counts import number
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.commands.options import add_network, add_recordings

@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
-from spikeloom.compiler.atomic import write_atomically
 from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.files import write_atomically
 from spikeloom.compiler.formats.onnx import writer_float
 from spikeloom.compiler.formats.onnx.builder import port_words
 from spikeloom.compiler.formats.onnx.writer import FORMS

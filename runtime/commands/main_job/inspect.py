@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import hashlib
-from pathlib import Path
 
 from spikeloom.compiler.archive import is_netlist
 from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.files import sha256_of
 from spikeloom.runtime.commands.main_job.checkpoint_facts import facts_of, sections
 from spikeloom.runtime.commands.options import add_model
 from spikeloom.runtime.inputs.files import require_inspectable
@@ -33,6 +32,6 @@ def run(arguments: argparse.Namespace) -> Outcome:
             if value is not None and (name, value) != ("run", 0):
                 raise OptionError(f"--{name} {value}: is for checkpoints, {arguments.path} is a netlist; omit it")
         machine = machine_for(arguments.path)
-        return machine.describe(hashlib.sha256(Path(arguments.path).read_bytes()).hexdigest())
+        return machine.describe(sha256_of(arguments.path))
     given = tuple(name for name in ("beta", "theta") if getattr(arguments, name) is not None)
     return Outcome(facts_of(load_checkpoint(arguments.path, arguments), given), sections)

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import hashlib
 from dataclasses import replace
 from difflib import get_close_matches
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from spikeloom.compiler import Netlist
-from spikeloom.compiler.atomic import write_atomically
 from spikeloom.compiler.errors import DataError, ModelError, OptionError
+from spikeloom.compiler.files import sha256_of, write_atomically
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.commands.options import add_explain_cost, add_network, add_recordings
 from spikeloom.runtime.costs.simulated import Account
@@ -68,7 +66,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     netlist = machine.netlist
     battery = None
     if arguments.stress is not None:
-        sha256 = hashlib.sha256(Path(arguments.netlist).read_bytes()).hexdigest()
+        sha256 = sha256_of(arguments.netlist)
         battery = read_stress(arguments.stress, arguments.netlist, sha256)
     loaded = load_network(arguments.checkpoint, arguments, netlist)
     _require_origin(arguments, netlist, loaded)

@@ -6,7 +6,7 @@ import argparse
 
 import numpy as np
 
-from spikeloom.compiler.atomic import write_atomically
+from spikeloom.compiler.files import write_atomically
 from spikeloom.runtime.commands.main_job.decisions import Decisions, sections
 from spikeloom.runtime.commands.main_job.estimate import priced
 from spikeloom.runtime.commands.options import add_detail, add_recordings

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import hashlib
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -12,10 +11,10 @@ import numpy as np
 
 from spikeloom.compiler import DEFAULT_TARGET, round_to_forms
 from spikeloom.compiler.archive import is_netlist
-from spikeloom.compiler.atomic import remove_leftovers
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.errors import ModelError, OptionError
-from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.files import remove_leftovers, sha256_of
+from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.systems import GRAPH_SYSTEMS
 from spikeloom.compiler.targets.base import COMPARTMENTS, load_target
@@ -226,7 +225,7 @@ def _finetuned(arguments: argparse.Namespace, output: Path) -> Finetuned:
     )
     round_to_forms(expand(read_checkpoint(output), adjacency), tuned.forms)  # it compiles, or says why not
     state.unlink(missing_ok=True)
-    sha256 = hashlib.sha256(output.read_bytes()).hexdigest()
+    sha256 = sha256_of(output)
     values = {each.name: getattr(record, each.name) for each in fields(record)}
     return Finetuned(**values, file=output.name, sha256=sha256)
 

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import argparse
-import hashlib
 from argparse import Namespace
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from spikeloom.compiler.archive import is_netlist
-from spikeloom.compiler.atomic import remove_leftovers
 from spikeloom.compiler.checkpoint import WEIGHTS, Checkpoint
 from spikeloom.compiler.errors import ModelError, OptionError
-from spikeloom.compiler.formats.checkpoint import read_checkpoint
+from spikeloom.compiler.files import remove_leftovers, sha256_of
+from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.formats.towers import arrays_of
 from spikeloom.compiler.formats.towers import join as join_networks
 from spikeloom.compiler.targets.native import SYSTEM as NATIVE
@@ -91,7 +90,7 @@ def run(arguments: Namespace) -> Outcome:
         classes=joined.classes,
         layers=joined_layers(joined.neurons),
         file=output.name,
-        sha256=hashlib.sha256(output.read_bytes()).hexdigest(),
+        sha256=sha256_of(output),
     )
     return Outcome(result, join_sections)
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from spikeloom.compiler.dynamics import Clocks
+from spikeloom.compiler.fixedpoint import kept_shares
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.layout.chips import chip_count
 from spikeloom.compiler.targets.loihi1.legalize import LimitUse
@@ -97,7 +98,7 @@ def _layer(netlist: Netlist, index: int) -> LayerFacts:
     axon = netlist.axon_of_synapse()[netlist.layer[netlist.synapse_compartment()] == index]
     source = netlist.axon_source[axon] - netlist.n_inputs
     from_itself = int(np.count_nonzero(netlist.layer[source[source >= 0]] == index))
-    alpha = (4095 - netlist.decay_u[ids]) / 4096
+    alpha, beta = kept_shares(netlist.decay_u[ids], netlist.decay_v[ids])
     return LayerFacts(
         name=layer.name,
         neurons=layer.neurons,
@@ -111,7 +112,7 @@ def _layer(netlist: Netlist, index: int) -> LayerFacts:
         theta=layer.theta,
         theta_realised=_one_or_many(netlist.threshold[ids] / netlist.scale[ids]),
         beta=layer.beta,
-        beta_realised=_one_or_many((4096 - netlist.decay_v[ids]) / 4096),
+        beta_realised=_one_or_many(beta),
         alpha=layer.alpha if alpha.any() else None,
         alpha_realised=_one_or_many(alpha) if alpha.any() else None,
         depth=layer.depth,

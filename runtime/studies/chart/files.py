@@ -7,8 +7,8 @@ import io
 import json
 from pathlib import Path
 
-from spikeloom.compiler.atomic import write_atomically
 from spikeloom.compiler.errors import DataError, ModelError
+from spikeloom.compiler.files import write_atomically
 from spikeloom.runtime.report import html
 from spikeloom.runtime.report.encode import decode, encode
 from spikeloom.runtime.studies.chart.requests import FORMAT

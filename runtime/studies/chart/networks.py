@@ -11,9 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from spikeloom.compiler import Recipe, check_recipes
-from spikeloom.compiler.archive import is_netlist
+from spikeloom.compiler.archive import arrays_digest, is_netlist
 from spikeloom.compiler.errors import ModelError, OptionError
-from spikeloom.compiler.formats.checkpoint_file import arrays_digest
 from spikeloom.compiler.formats.onnx.reader import SUFFIX
 from spikeloom.compiler.ir import Form
 from spikeloom.compiler.targets.base import Target

@@ -7,7 +7,6 @@ Everything here is a function of files and of a request, so that a netlist is th
 from __future__ import annotations
 
 import argparse
-import hashlib
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ import numpy as np
 
 from spikeloom.compiler import Options, lay_out_again, store, write_netlist
 from spikeloom.compiler.errors import CapacityError, DataError, FormatError, ModelError
+from spikeloom.compiler.files import sha256_of
 from spikeloom.compiler.interpret import cut, vote
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.types import FloatArray, IntArray
@@ -135,7 +135,7 @@ def _chart_of(source: Source, sha256: str) -> Any | None:
 @lru_cache(maxsize=1)
 def _machine(path: Path, sha256: str) -> Machine | None:
     """A netlist that is kept; None if it is gone, damaged or another one."""
-    if not path.is_file() or hashlib.sha256(path.read_bytes()).hexdigest() != sha256:
+    if not path.is_file() or sha256_of(path) != sha256:
         return None
     try:
         return machine_for(path)

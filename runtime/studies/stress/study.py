@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import hashlib
 import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -16,6 +15,7 @@ from typing import Any
 
 from spikeloom.compiler import __version__
 from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.files import sha256_of
 from spikeloom.compiler.types import JsonObject
 from spikeloom.runtime.inputs.network import LoadedNetwork
 from spikeloom.runtime.report.console import progress
@@ -169,7 +169,7 @@ def _require_measurable(plan: Plan, reasons: Mapping[str, str | None], taxels: i
 def _provenance(request: Request, loaded: LoadedNetwork, data: str) -> Provenance:
     return Provenance(
         spikeloom=__version__,
-        netlist_sha256=hashlib.sha256(Path(request.netlist).read_bytes()).hexdigest(),
+        netlist_sha256=sha256_of(request.netlist),
         checkpoint_sha256=loaded.sha256,
         **loaded.read_as,
         graph=loaded.graph,

@@ -8,8 +8,8 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
-from spikeloom.compiler.atomic import remove_leftovers
 from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.files import remove_leftovers
 from spikeloom.compiler.types import IntArray
 from spikeloom.runtime.studies import jobs as processes
 from spikeloom.runtime.studies.jobs import ProcessDied, ended_by_signal, only_one

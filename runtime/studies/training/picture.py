@@ -36,7 +36,7 @@ def draw_training(path: str, records: Sequence[TrainingRecord], labels: IntArray
     from matplotlib import pyplot as plt
     from matplotlib.ticker import MaxNLocator
 
-    from spikeloom.compiler.atomic import write_atomically
+    from spikeloom.compiler.files import write_atomically
 
     classes = int(max(labels.max(), *(p.max() for p in predictions))) + 1
     confusion = np.zeros((classes, classes), np.int64)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 from spikeloom.compiler import __version__
 from spikeloom.compiler.checkpoint import WEIGHTS
 from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.files import sha256_of
 from spikeloom.compiler.types import IntArray
 from spikeloom.models.recordings.events import joined_bins
 from spikeloom.models.recordings.evtouch import Recordings
@@ -148,4 +148,4 @@ def recall(job: Job) -> tuple[Finished, IntArray | None]:
 
 def _finished(job: Job, record: Any) -> Finished:
     values = {each.name: getattr(record, each.name) for each in fields(record)}
-    return Finished(**values, file=job.output.name, sha256=hashlib.sha256(job.output.read_bytes()).hexdigest())
+    return Finished(**values, file=job.output.name, sha256=sha256_of(job.output))

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.fixedpoint import THRESHOLD_MANTISSA_MAX, decay_registers, reach, step_units
+from spikeloom.compiler.fixedpoint import THRESHOLD_MANTISSA_MAX, decay_registers, kept_shares, reach, step_units
 from spikeloom.compiler.interpret import float_recurrence, product
 from spikeloom.compiler.ir import IntegerNetwork, Network
 from spikeloom.compiler.passes.calibrate import Calibration, fewer
@@ -150,8 +150,8 @@ def _limits(layer: FloatLayer, candidate: Candidate, moved: IntArray, slots: int
 
 def _decay_flips(layer: FloatLayer, calibration: Calibration) -> int:
     """Spikes that move if nothing but the decays is rounded."""
-    lost_u, lost_v = decay_registers(layer.population.beta, layer.population.alpha)
-    realised = replace(layer.population, alpha=(4095 - lost_u) / 4096, beta=(4096 - lost_v) / 4096)
+    alpha, beta = kept_shares(*decay_registers(layer.population.beta, layer.population.alpha))
+    realised = replace(layer.population, alpha=alpha, beta=beta)
     sources = [(p.weight, calibration.source(p.pre, layer.post)) for p in layer.projections]
 
     def moved(part: slice) -> IntArray:

@@ -45,12 +45,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.archive import read_npy, stored_members
+from spikeloom.compiler.archive import arrays_digest, read_npy, stored_members
 from spikeloom.compiler.checkpoint import WEIGHTS, Float32Array
 from spikeloom.compiler.dynamics import MOST_STEPS, PLAIN, Dynamics, dynamics_from_json
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.fixedpoint import THRESHOLD_MANTISSA_MAX, plane_distance
-from spikeloom.compiler.formats.released_file import DAMAGED, NOT_A_CHECKPOINT
 from spikeloom.compiler.formats.tensors import (
     Arrays,
     Contents,
@@ -61,6 +60,7 @@ from spikeloom.compiler.formats.tensors import (
     tower_faults,
     wanted_dense,
 )
+from spikeloom.compiler.formats.torch_checkpoint import DAMAGED, NOT_A_CHECKPOINT
 from spikeloom.compiler.ir import Form
 from spikeloom.compiler.systems import (
     GRAPH_SYSTEMS,
@@ -78,15 +78,6 @@ VERSION = 6
 
 
 _AGAIN = "copy or train it again"
-
-
-def arrays_digest(arrays: Mapping[str, npt.NDArray[Any]]) -> str:
-    """Hash over names, types, shapes and bytes of arrays, in the order of their names."""
-    digest = hashlib.sha256()
-    for name in sorted(arrays):
-        digest.update(f"{name} {arrays[name].dtype.str} {arrays[name].shape}\n".encode())
-        digest.update(np.ascontiguousarray(arrays[name]).tobytes())
-    return digest.hexdigest()
 
 
 def content_digest(manifest: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]]) -> str:

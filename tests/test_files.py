@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from spikeloom.compiler.atomic import remove_leftovers, write_atomically
+from spikeloom.compiler.files import remove_leftovers, write_atomically
 
 
 def interrupted_at(line: int, write):

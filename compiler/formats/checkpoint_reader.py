@@ -1,7 +1,4 @@
-"""Read trained checkpoints of all systems: our own files, the released layout and bare state dicts.
-
-Our own format is read by :mod:`formats.checkpoint_file`, files of ``torch.save`` by :mod:`formats.released_file`.
-"""
+"""Read trained checkpoints of all systems, from our own files and from files of ``torch.save``."""
 
 from __future__ import annotations
 
@@ -16,9 +13,9 @@ import numpy.typing as npt
 
 from spikeloom.compiler.checkpoint import WEIGHTS, Checkpoint, Dense, Float32Array
 from spikeloom.compiler.errors import ModelError, OptionError
-from spikeloom.compiler.formats.checkpoint_file import own_contents, own_members, require_constants
-from spikeloom.compiler.formats.released_file import GIVE, read_released
+from spikeloom.compiler.formats.spikeloom_checkpoint import own_contents, own_members, require_constants
 from spikeloom.compiler.formats.tensors import Arrays, Contents
+from spikeloom.compiler.formats.torch_checkpoint import GIVE, read_released
 from spikeloom.compiler.systems import (
     GRID_CNN,
     SYSTEMS,
