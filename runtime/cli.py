@@ -102,6 +102,7 @@ def build_parser(chosen: str | None = None) -> argparse.ArgumentParser:
     """Describe the command line, with the options of one command, of none (""), or of all (None)."""
     parser = Parser(
         prog="spikeloom",
+        usage="%(prog)s [-h] [--version] [--print-completion {bash,zsh,tcsh}] COMMAND …",
         description="Lower a trained spiking graph network for touch to a netlist for a neuromorphic chip, run it bit "
         "for bit, compare it with the float model and price it.",
         epilog=_overview() + "\n\nspikeloom COMMAND --help shows the options of a command",
@@ -111,7 +112,7 @@ def build_parser(chosen: str | None = None) -> argparse.ArgumentParser:
     parser.add_argument(
         "--print-completion", choices=("bash", "zsh", "tcsh"), help="print a completion script for a shell"
     )
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    commands = parser.add_subparsers(dest="command", required=True, help=argparse.SUPPRESS, prog="spikeloom")
     for name in COMMANDS if chosen is None else filter(None, [chosen]):
         sub = commands.add_parser(name, description=COMMANDS[name][1], help=COMMANDS[name][1])
         module = _module(name)

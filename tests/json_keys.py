@@ -4,7 +4,7 @@ LISTS = """
 anytime:
     bins chip_steps decisions files full labelled labels least_interval rules samples savings source split windows
 bits:
-    cached combinations command float_accuracy front layers netlist of recommended recordings scale_groups wanted
+    combinations command float_accuracy front layers netlist of recommended recordings scale_groups wanted
     widths
 chart:
     budget chosen_by command data digest expected format grid measured networks points recommended refused saving

@@ -26,7 +26,30 @@ MODEL: dict[str, object] = {
 }
 """Options of :func:`add_model`, and what they are where they are not given."""
 
+NETWORK_FILES = "CKPT|NET.onnx|NET.nir"
+"""What a float network is read from."""
+
 DATA_HELP = "recordings: released layout, event files (csv, npz), one recording, 'synthetic', 'objects' or 'containers'"
+
+
+def add_netlist(parser: argparse.ArgumentParser) -> None:
+    """Add the compiled network that a command is about."""
+    parser.add_argument("netlist", metavar="NET.loom", help="compiled network")
+
+
+def add_netlist_and_model(
+    parser: argparse.ArgumentParser, what: str = "its float model", *, required: bool = True
+) -> None:
+    """Add a netlist, the float network beside it as ``--checkpoint``, and how that is read."""
+    add_netlist(parser)
+    group(parser, "network").add_argument("--checkpoint", metavar=NETWORK_FILES, required=required, help=what)
+    add_network(parser)
+
+
+def add_checkpoint(parser: argparse.ArgumentParser, what: str = "trained network, or pretrained:NAME") -> None:
+    """Add the checkpoint that a command is about, and how it is read."""
+    parser.add_argument("checkpoint", metavar="CKPT", help=what)
+    add_model(parser)
 
 
 def add_bin_option(parser: argparse.ArgumentParser) -> None:
@@ -53,7 +76,9 @@ def add_graph_options(parser: argparse.ArgumentParser, purpose: str) -> None:
     """Add the options that name a taxel graph: the built-in sensor's, or one of the user's own."""
     options = group(parser, "network")
     options.add_argument("--graph", help=f"taxel graph {purpose}: {CHOICES}")
-    options.add_argument("--taxels", metavar="N|COORDS.csv", help="your own sensor: positions x,y[,z] in mm")
+    options.add_argument(
+        "--taxels", metavar="N|COORDS.csv", help="your own sensor: number of taxels, or their positions x,y[,z] in mm"
+    )
     options.add_argument("--edges", metavar="EDGES.csv", help="your own graph: source,target")
     options.add_argument("--directed", action="store_true", help="take --edges as they are, one way")
 

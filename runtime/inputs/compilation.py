@@ -63,11 +63,18 @@ def margin_of(arguments: argparse.Namespace) -> float:
     return float(MARGIN if arguments.margin is None else arguments.margin)
 
 
-def _numbers(text: str, option: str) -> list[int]:
+def whole_numbers(text: str, option: str) -> list[int]:
+    """Numbers between commas.
+
+    Raises
+    ------
+    OptionError
+        If they are none.
+    """
     try:
         return [int(part) for part in text.split(",")]
     except ValueError:
-        raise OptionError(f"{option} {text}: not a number; give one, or one for each layer as in 8,4,4,8") from None
+        raise OptionError(f"{option} {text}: not a number; give one, or several as in 8,4,4,8") from None
 
 
 def parse_recipes(arguments: argparse.Namespace) -> tuple[Recipe, ...] | None:
@@ -81,9 +88,9 @@ def parse_recipes(arguments: argparse.Namespace) -> tuple[Recipe, ...] | None:
     if not (arguments.weight_bits or arguments.planes or arguments.scale_groups):
         return None
     asked = {
-        "--weight-bits": _numbers(arguments.weight_bits or "8", "--weight-bits"),
-        "--planes": _numbers(arguments.planes or "1", "--planes"),
-        "--scale-groups": _numbers(arguments.scale_groups or "1", "--scale-groups"),
+        "--weight-bits": whole_numbers(arguments.weight_bits or "8", "--weight-bits"),
+        "--planes": whole_numbers(arguments.planes or "1", "--planes"),
+        "--scale-groups": whole_numbers(arguments.scale_groups or "1", "--scale-groups"),
     }
     layers = max(len(values) for values in asked.values())
     for option, values in asked.items():

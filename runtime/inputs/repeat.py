@@ -8,6 +8,7 @@ import shlex
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from spikeloom.compiler import DEFAULT_TARGET
 from spikeloom.compiler.types import JsonObject
 from spikeloom.models.recordings.events import BIN_S
 
@@ -26,6 +27,7 @@ def words(options: Mapping[str, Any]) -> list[str]:
     typed: list[str] = []
     for name, value in options.items():
         usual = (name == "run" and value == 0) or (name == "bin" and math.isclose(value, BIN_S))
+        usual |= name == "target" and value == DEFAULT_TARGET
         if value is None or value is False or usual:
             continue
         typed.append(f"--{name.replace('_', '-')}")

@@ -15,7 +15,7 @@ from spikeloom.compiler.interpret import channels_last
 from spikeloom.compiler.systems import GRAPH_SYSTEMS
 from spikeloom.compiler.targets.netlist import Netlist
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.runtime.commands.options import add_network, add_recordings
+from spikeloom.runtime.commands.options import add_netlist_and_model, add_recordings
 from spikeloom.runtime.equivalence.explanation.causes import Explanation, explain, observe
 from spikeloom.runtime.equivalence.explanation.sections import sections
 from spikeloom.runtime.equivalence.explanation.summary import Explained, cause_roots, layer_roots, root_entry
@@ -38,9 +38,7 @@ LIMIT = 10
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Describe the options of the command."""
-    parser.add_argument("netlist", metavar="NET.loom")
-    parser.add_argument("--checkpoint", required=True, metavar="CKPT|NET.onnx")
-    add_network(parser)
+    add_netlist_and_model(parser)
     add_recordings(parser)
     parser.add_argument("--sample", metavar="FILE", help="recording to explain (default: the first that differs)")
     parser.add_argument("--top", type=int, default=10, metavar="N", help="roots to show (default: 10)")

@@ -11,7 +11,7 @@ from typing import Any
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.files import write_atomically
-from spikeloom.runtime.commands.options import add_network, add_recordings
+from spikeloom.runtime.commands.options import add_netlist_and_model, add_recordings
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.report.encode import encode
 from spikeloom.runtime.report.sections import Outcome
@@ -32,9 +32,7 @@ KIND, VERSION = "stress", 1
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Describe the options of the command."""
-    parser.add_argument("netlist", metavar="NET.loom")
-    parser.add_argument("--checkpoint", required=True, metavar="CKPT|NET.onnx")
-    add_network(parser)
+    add_netlist_and_model(parser)
     add_recordings(parser)
     parser.add_argument("--only", metavar="NAME[,…]", help="some perturbations (default: all)")
     parser.add_argument("--full", action="store_true", help="dense curves")

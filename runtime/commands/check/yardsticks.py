@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from spikeloom.compiler.archive import is_netlist
 from spikeloom.compiler.errors import ModelError
-from spikeloom.runtime.commands.options import add_model, add_recordings
+from spikeloom.runtime.commands.options import add_checkpoint, add_recordings
 from spikeloom.runtime.costs import yardsticks
 from spikeloom.runtime.inputs.files import shipped
 from spikeloom.runtime.inputs.network import load_checkpoint, load_graph, propagation
@@ -17,8 +17,7 @@ from spikeloom.runtime.report.sections import Outcome
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Describe the options of the command."""
-    parser.add_argument("checkpoint")
-    add_model(parser)
+    add_checkpoint(parser)
     add_recordings(parser)
 
 

@@ -11,7 +11,7 @@ from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.files import write_atomically
 from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.runtime.commands.options import MODEL, add_network, add_recordings
+from spikeloom.runtime.commands.options import MODEL, add_netlist_and_model, add_recordings
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.inputs.recordings import recordings
@@ -45,9 +45,7 @@ PART = 16
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Describe the options of the command."""
-    parser.add_argument("netlist", metavar="NET.loom")
-    parser.add_argument("--checkpoint", metavar="CKPT|NET.onnx", help="float model to show beside the chip")
-    add_network(parser)
+    add_netlist_and_model(parser, "float model to show beside the chip", required=False)
     add_recordings(parser)
     parser.add_argument("--calibrate", metavar="PATH", help="recordings whose train split says when a vote is sure")
     parser.add_argument(

@@ -12,7 +12,7 @@ from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.files import write_atomically
 from spikeloom.models.recordings.counts import number
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.runtime.commands.options import add_network, add_recordings
+from spikeloom.runtime.commands.options import NETWORK_FILES, add_network, add_recordings
 from spikeloom.runtime.inputs.compilation import storage
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
@@ -34,7 +34,7 @@ DIFFER = 0.01
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Describe the options of the command."""
-    parser.add_argument("checkpoint", nargs="+", metavar="CKPT|NET.onnx")
+    parser.add_argument("checkpoint", nargs="+", metavar=NETWORK_FILES, help="trained networks for the same recordings")
     add_network(parser)
     add_recordings(parser)
     parser.add_argument(

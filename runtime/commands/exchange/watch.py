@@ -27,6 +27,7 @@ import numpy as np
 
 from spikeloom.compiler.errors import DataError, ModelError, OptionError
 from spikeloom.models.recordings.eventlines import Event, EventLines, Mark
+from spikeloom.runtime.commands.options import add_netlist
 from spikeloom.runtime.report.encode import OPTIONAL
 from spikeloom.runtime.report.sections import Outcome, Section, Text
 
@@ -345,7 +346,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Describe the options of the command."""
-    parser.add_argument("netlist", metavar="NET.loom")
+    add_netlist(parser)
     parser.add_argument("--input", default="-", metavar="FILE", help="event lines (default: -, standard input)")
     parser.add_argument(
         "--bin", default="0.02", metavar="SECONDS", help="length of a bin of the recordings (default: 0.02)"

@@ -10,7 +10,7 @@ from spikeloom.compiler import DEFAULT_TARGET, GOALS, MARGIN, RANGES, Compilatio
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.runtime.commands.main_job.integers import brings_integers, compile_integers
-from spikeloom.runtime.commands.options import add_bin_option, add_network, group
+from spikeloom.runtime.commands.options import NETWORK_FILES, add_bin_option, add_network, group
 from spikeloom.runtime.inputs.compilation import margin_of, parse_cores, parse_recipes, provenance
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import load_network
@@ -22,7 +22,7 @@ from spikeloom.runtime.report.sections import Outcome
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
     """Add the options."""
-    sub.add_argument("checkpoint", help="checkpoint, or a network as an ONNX, NIR or netx file")
+    sub.add_argument("checkpoint", metavar=NETWORK_FILES, help="checkpoint, or a network as an ONNX, NIR or netx file")
     add_network(sub)
     storage, layout, output = (group(sub, title) for title in ("storage", "layout", "output"))
     sub.add_argument("--target", default=DEFAULT_TARGET, help=f"chip: {DEFAULT_TARGET} (default), or truenorth")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.runtime.commands.options import add_detail, add_recordings
+from spikeloom.runtime.commands.options import add_detail, add_netlist, add_recordings
 from spikeloom.runtime.costs.simulated import Account, Accounted
 from spikeloom.runtime.inputs.recordings import netlist_recordings
 from spikeloom.runtime.machines.base import Machine, Price, Run, machine_for
@@ -15,7 +15,7 @@ from spikeloom.runtime.report.sections import Outcome
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options."""
-    parser.add_argument("netlist")
+    add_netlist(parser)
     add_recordings(parser, window=True)
     add_detail(parser, ("counts", "cycle"), "counts")
 

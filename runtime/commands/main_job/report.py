@@ -11,7 +11,7 @@ from spikeloom.compiler import Netlist
 from spikeloom.compiler.errors import DataError, ModelError, OptionError
 from spikeloom.compiler.files import sha256_of, write_atomically
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.runtime.commands.options import add_explain_cost, add_network, add_recordings
+from spikeloom.runtime.commands.options import add_explain_cost, add_netlist_and_model, add_recordings
 from spikeloom.runtime.costs.simulated import Account
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
@@ -33,9 +33,7 @@ and engine differ.
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Describe the options of the command."""
-    parser.add_argument("netlist", metavar="NET.loom")
-    parser.add_argument("--checkpoint", required=True, metavar="CKPT|NET.onnx")
-    add_network(parser)
+    add_netlist_and_model(parser)
     add_recordings(parser)
     parser.add_argument(
         "--recording", metavar="NAME|N", help="recording to draw, by name or from 0 (default: the first that differs)"

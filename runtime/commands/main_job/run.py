@@ -9,7 +9,7 @@ import numpy as np
 from spikeloom.compiler.files import write_atomically
 from spikeloom.runtime.commands.main_job.decisions import Decisions, sections
 from spikeloom.runtime.commands.main_job.estimate import priced
-from spikeloom.runtime.commands.options import add_detail, add_recordings
+from spikeloom.runtime.commands.options import add_detail, add_netlist, add_recordings
 from spikeloom.runtime.costs.simulated import Account, Accounted
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.recordings import netlist_recordings
@@ -20,7 +20,7 @@ from spikeloom.runtime.report.sections import Outcome
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options."""
-    parser.add_argument("netlist")
+    add_netlist(parser)
     add_recordings(parser, window=True)
     add_detail(parser, ("spikes", "counts", "cycle"), "spikes")
     parser.add_argument("--spikes", metavar="OUT.npz", help="write the spikes of every layer, aligned with the data")

@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 from spikeloom.compiler.errors import OptionError
-from spikeloom.runtime.commands.options import MIN_AGREEMENT, add_explain_cost, add_network, add_recordings
+from spikeloom.runtime.commands.options import MIN_AGREEMENT, add_explain_cost, add_netlist_and_model, add_recordings
 from spikeloom.runtime.costs.simulated import Account
 from spikeloom.runtime.equivalence.levels import parse_requirements
 from spikeloom.runtime.equivalence.sections import sections
@@ -21,9 +21,7 @@ from spikeloom.runtime.report.sections import Outcome
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options."""
-    parser.add_argument("netlist")
-    parser.add_argument("--checkpoint", required=True, metavar="CKPT|NET.onnx")
-    add_network(parser)
+    add_netlist_and_model(parser)
     add_recordings(parser, window=True)
     parser.add_argument(
         "--original", metavar="CKPT", help="float model for E2 and E3 (default: the weights of --checkpoint)"

@@ -21,13 +21,18 @@ from spikeloom.compiler.targets.base import COMPARTMENTS, load_target
 from spikeloom.models.graphs import Graph
 from spikeloom.models.recordings.events import joined_bins
 from spikeloom.models.recordings.grasps import SYNTHETIC
-from spikeloom.runtime.commands.options import DATA_HELP, add_bin_option, add_model
+from spikeloom.runtime.commands.options import DATA_HELP, add_bin_option, add_checkpoint
+from spikeloom.runtime.inputs import repeat
+from spikeloom.runtime.inputs.compilation import whole_numbers
 from spikeloom.runtime.inputs.files import require_place, shipped
-from spikeloom.runtime.inputs.network import graph_words, load_checkpoint, load_graph, propagation
-from spikeloom.runtime.inputs.recordings import bin_words, recordings
+from spikeloom.runtime.inputs.network import load_checkpoint, load_graph, propagation
+from spikeloom.runtime.inputs.recordings import recordings
 from spikeloom.runtime.report.numbers import percent
 from spikeloom.runtime.report.sections import Outcome, Section, Table, Text
 from spikeloom.runtime.studies.jobs import only_one
+
+REPEATED = ("weight_bits", "scale_groups", "epochs", "seed")
+"""Options of its own that decide the result."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,8 +83,7 @@ class Finetuned(FinetuneRecord):
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
-    parser.add_argument("checkpoint")
-    add_model(parser)
+    add_checkpoint(parser)
     parser.add_argument("--data", required=True, metavar="PATH", help=DATA_HELP)
     add_bin_option(parser)
     parser.add_argument("--target", default=DEFAULT_TARGET, help=f"chip (default: {DEFAULT_TARGET})")
@@ -91,15 +95,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of the order of recordings (default: 0)")
     parser.add_argument("--resume", action="store_true", help="go on with an interrupted one of the same options")
     parser.add_argument("-o", "--output", required=True, metavar="OUT.pt")
-
-
-def _widths(words: str) -> list[int]:
-    try:
-        return [int(word) for word in words.split(",")]
-    except ValueError:
-        raise OptionError(
-            f"--weight-bits {words}: not a number; give one, or one for each layer as in 8,4,4,8"
-        ) from None
 
 
 def stored_graph(checkpoint: Checkpoint, asked: Graph | None, name: str) -> Graph:
@@ -145,7 +140,7 @@ def _finetuned(arguments: argparse.Namespace, output: Path) -> Finetuned:
     """Fine-tune and write the checkpoint; return the report."""
     state = _state(output, resume=arguments.resume)
     target = load_target(arguments.target, COMPARTMENTS)
-    widths = _widths(arguments.weight_bits)
+    widths = whole_numbers(arguments.weight_bits, "--weight-bits")
     path = shipped(arguments.checkpoint)
     if Path(path).is_file() and is_netlist(path):
         raise ModelError(f"{path}: is a netlist, its weights are rounded already; give the checkpoint it was made from")
@@ -231,19 +226,11 @@ def _finetuned(arguments: argparse.Namespace, output: Path) -> Finetuned:
 
 
 def _words(arguments: argparse.Namespace, source: str) -> list[str]:
-    """The words that ask for the same fine-tuning."""
-    words = ["spikeloom", "finetune", Path(arguments.checkpoint).name, *graph_words(arguments).split()]
-    given = {
-        "--run": arguments.run or None,
-        "--weights": arguments.weights,
-        "--beta": arguments.beta,
-        "--theta": arguments.theta,
-        "--target": None if arguments.target == DEFAULT_TARGET else arguments.target,
-    }
-    words += [word for option, value in given.items() if value is not None for word in (option, str(value))]
-    words += ["--data", source, *bin_words(arguments.bin), "--weight-bits", arguments.weight_bits]
-    words += ["--scale-groups", str(arguments.scale_groups), "--epochs", str(arguments.epochs)]
-    return [*words, "--seed", str(arguments.seed)]
+    """The words that ask for the same fine-tuning, beside the files."""
+    files = {name: getattr(arguments, name) for name in ("taxels", "edges")}
+    options = repeat.given(arguments, (*repeat.NETWORK, "target", "bin", *REPEATED)) | {"data": source}
+    options |= {name: Path(file).name for name, file in files.items() if file}
+    return ["spikeloom", "finetune", Path(arguments.checkpoint).name, *repeat.words(options)]
 
 
 def finetune_sections(result: Finetuned) -> Iterable[Section]:
