@@ -5,6 +5,7 @@ Files are read and written by :mod:`compiler.formats`; :mod:`passes.expand` writ
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -44,16 +45,16 @@ class Checkpoint:
     # beta, theta: Membrane decay and threshold
     beta: float
     theta: float
-    assumed: tuple[str, ...]  # Which of ``beta`` and ``theta`` neither the file nor the user gave
-    graph: str | None  # Name of the graph that it was trained on
-    edges: IntArray | None  # (edges, 2) int64 or None; its edge list, (source, target)
     layout: str  # {"spikeloom", "released", "state_dict"}; kind of file
-    weights: str  # {"last", "best", "clean"}; epoch that the weights are from
-    sets: tuple[str, ...]  # All epochs that the file holds
-    runs: int  # Trainings that the file holds; this is one of them
-    training: Mapping[str, Any] | None  # JSON values: how it was made and what it reached
-    forms: tuple[Form, ...] | None  # How the chip stores each layer, where the network was fine-tuned for it
     sha256: str  # Of the file
+    assumed: tuple[str, ...] = ()  # Which of ``beta`` and ``theta`` neither the file nor the user gave
+    graph: str | None = None  # Name of the graph that it was trained on
+    edges: IntArray | None = None  # (edges, 2) int64; its edge list, (source, target)
+    weights: str = "last"  # {"last", "best", "clean"}; epoch that the weights are from
+    sets: tuple[str, ...] = ("last",)  # All epochs that the file holds
+    runs: int = 1  # Trainings that the file holds; this is one of them
+    training: Mapping[str, Any] | None = None  # JSON values: how it was made and what it reached
+    forms: tuple[Form, ...] | None = None  # How the chip stores each layer, where the network was fine-tuned for it
     system: str = TACTILESGNET  # One of ``SYSTEMS``
     grid: Grid | None = None  # Of a grid-based CNN
     dynamics: Dynamics = PLAIN  # Decays of single layers, and clocks
@@ -91,6 +92,29 @@ class Checkpoint:
         return Readout(population=len(self.dense), label=label)
 
 
+def layers_of(arrays: Mapping[str, npt.NDArray[Any]]) -> dict[str, Any]:
+    """Fields of a :class:`Checkpoint` that hold its weights, from tensors by name; read-only copies."""
+    held = {name: np.array(array, np.float32, order="C") for name, array in arrays.items()}
+    for array in held.values():
+        array.flags.writeable = False
+    stages = sorted(
+        (name.removesuffix(".weight") for name in held if name.startswith("fc") and name.endswith(".weight")),
+        key=lambda name: int(name[2:]),
+    )
+    dense = tuple(Dense(name=name, weight=held[f"{name}.weight"], bias=held[f"{name}.bias"]) for name in stages)
+    return {"hops": held["conv1.hops"], "conv_bias": held["conv1.bias"], "dense": dense}
+
+
+def constant_faults(beta: float | None, theta: float | None) -> list[str]:
+    """What is wrong about a decay or a threshold that no neuron has."""
+    faults = []
+    if beta is not None and not 0 <= beta < 1:
+        faults.append(f"beta {beta:g}: allowed are 0 <= beta < 1; it is the share of the membrane that a step keeps")
+    if theta is not None and not 0 < theta < math.inf:
+        faults.append(f"theta {theta:g}: allowed are numbers above 0; it is the threshold of a spike")
+    return faults
+
+
 SHARED = -1
 """Tower of the relays of clocks."""
 
@@ -106,6 +130,6 @@ def towers_of(checkpoint: Checkpoint) -> tuple[IntArray, ...]:
 
 
 def inputs_of(checkpoint: Checkpoint, layer: int) -> IntArray:
-    """Neurons of the layer before that each tower of a fully connected layer hears, (towers, inputs), in order."""
+    """Neurons of the layer before that each tower of a fully connected layer receives, (towers, inputs), in order."""
     before = towers_of(checkpoint)[layer - 1]
     return np.stack([np.flatnonzero((before == t) | (before == SHARED)) for t in range(checkpoint.towers)])

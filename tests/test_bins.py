@@ -122,7 +122,7 @@ def _with_bins(bins):
 def test_a_checkpoint_of_unusable_bins_is_refused(place, tmp_path, bins):
     content = rebuilt((place / "x.pt").read_bytes(), lambda manifest, _: manifest.update(bins=bins))
     (tmp_path / "y.pt").write_bytes(content)
-    with pytest.raises(ModelError, match=f"incomplete manifest .*{bins} bins"):
+    with pytest.raises(ModelError, match="the manifest has no usable bins"):
         read_checkpoint(tmp_path / "y.pt")
 
 

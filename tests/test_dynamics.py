@@ -293,7 +293,7 @@ def test_an_impossible_dynamic_in_a_file_is_refused(tmp_path):
     with pytest.raises(ModelError) as error:
         read_checkpoint(path)
     assert str(error.value) == (
-        f"{path}: has an incomplete manifest (ValueError('a current decay of 1.5, allowed are 0 <= decay < 1')); "
+        f"{path}: the manifest has an unusable grid or dynamics (a current decay of 1.5, allowed are 0 <= decay < 1); "
         "copy or train it again"
     )
 

@@ -272,7 +272,7 @@ def test_forms_that_cannot_be_used(tmp_path, change):
             archive.writestr(name, content)
     with pytest.raises(ModelError) as caught:
         read_checkpoint(path)
-    assert str(caught.value).startswith(f"{path}: has unusable forms of a fine-tuning (")
+    assert str(caught.value).startswith(f"{path}: the manifest has no usable forms")
 
 
 def test_biases_beyond_their_register(tmp_path):

@@ -2,31 +2,16 @@
 
 from __future__ import annotations
 
-import hashlib
-import math
 import os
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-
-from spikeloom.compiler.checkpoint import WEIGHTS, Checkpoint, Dense, Float32Array
+from spikeloom.compiler.checkpoint import WEIGHTS, Checkpoint, constant_faults
 from spikeloom.compiler.errors import ModelError, OptionError
-from spikeloom.compiler.formats.spikeloom_checkpoint import own_contents, own_members, require_constants
-from spikeloom.compiler.formats.tensors import Arrays, Contents
-from spikeloom.compiler.formats.torch_checkpoint import GIVE, read_released
-from spikeloom.compiler.systems import (
-    GRID_CNN,
-    SYSTEMS,
-    Grid,
-    kernel_of,
-    window_forms,
-)
+from spikeloom.compiler.formats.spikeloom_checkpoint import members_of, read_own
+from spikeloom.compiler.formats.torch_checkpoint import GIVE, read_torch
+from spikeloom.compiler.systems import SYSTEMS
 from spikeloom.compiler.types import IntArray
-
-BETA, THETA = 0.2, 0.5
-"""Decay and threshold of the released code; files in its layout do not hold them."""
 
 SIZE_LIMIT = 2**28
 """Bytes that a checkpoint may have: 256 MiB, a hundred times the released ones."""
@@ -73,48 +58,30 @@ def read_checkpoint(
         raise OptionError(f"--weights {weights}: unknown; choose from {', '.join(WEIGHTS)}")
     if system is not None and system not in SYSTEMS:
         raise OptionError(f"--system {system}: unknown; choose from {', '.join(SYSTEMS)}")
-    require_constants("", OptionError, beta, theta)
-    where, path = str(path), Path(path)
-    content = _content(where, path)
-    members = own_members(where, content)
+    if faults := constant_faults(beta, theta):
+        raise OptionError(faults[0])
+    where = str(path)
+    content = _content(where, Path(path))
+    members = members_of(where, content)
     if members is None:
-        found = read_released(where, content, run, system)
+        found = read_torch(where, content, run, system, cells)
         if weights not in (None, "last"):
             raise ModelError(f"{where}: --weights {weights}: the file holds the last epoch only; omit --weights")
     else:
         if run != 0:
             raise ModelError(f"{where}: --run {run}: the file holds only run 0; omit --run")
-        found = own_contents(where, members, weights)
+        found = read_own(where, content, members, weights)
         _require_fit(where, found, system, beta, theta)
-    arrays = {name: _plain(array) for name, array in found.arrays.items()}
-    stages = sorted({key.split(".")[0] for key in arrays if key.startswith("fc")}, key=lambda name: int(name[2:]))
-    constants = {"beta": (beta, found.beta, BETA), "theta": (theta, found.theta, THETA)}
-    known = {name: next(value for value in values if value is not None) for name, values in constants.items()}
-    return Checkpoint(
-        hops=arrays["conv1.hops"],
-        conv_bias=arrays["conv1.bias"],
-        dense=tuple(Dense(name=name, weight=arrays[f"{name}.weight"], bias=arrays[f"{name}.bias"]) for name in stages),
-        beta=known["beta"],
-        theta=known["theta"],
-        assumed=tuple(name for name, (given, held, _) in constants.items() if given is None and held is None),
-        graph=found.graph,
-        edges=found.edges,
-        layout=found.layout,
-        weights=found.weights,
-        sets=found.sets,
-        runs=found.runs,
-        training=found.training,
-        forms=found.forms,
-        sha256=hashlib.sha256(content).hexdigest(),
-        system=found.system,
-        grid=_released_grid(where, arrays, cells) if members is None and found.system == GRID_CNN else found.grid,
-        dynamics=found.dynamics,
-        towers=found.towers,
-        bins=found.bins,
+    given = [name for name, value in (("beta", beta), ("theta", theta)) if value is not None]
+    return replace(
+        found,
+        beta=found.beta if beta is None else beta,
+        theta=found.theta if theta is None else theta,
+        assumed=tuple(name for name in found.assumed if name not in given),
     )
 
 
-def _require_fit(where: str, found: Contents, system: str | None, beta: float | None, theta: float | None) -> None:
+def _require_fit(where: str, found: Checkpoint, system: str | None, beta: float | None, theta: float | None) -> None:
     """Refuse what contradicts a file of our own."""
     if system not in (None, found.system):
         raise OptionError(f"--system {system}: {where} holds a {found.system}; omit --system")
@@ -124,30 +91,6 @@ def _require_fit(where: str, found: Contents, system: str | None, beta: float | 
     if beta is not None and found.dynamics.betas:
         decays = ", ".join(f"{each:g}" for each in found.dynamics.betas)
         raise OptionError(f"--beta {beta:g}: {where} has a decay for each layer, {decays}; omit --beta")
-
-
-def _released_grid(where: str, arrays: Arrays, cells: IntArray | None) -> Grid:
-    """Grid of a file that does not say what it is: which of the two forms, the number of places tells."""
-    if cells is None:
-        raise ModelError(f"{where}: where the taxels lie on the grid is not in this file; name the sensor")
-    filters, features, _ = arrays["conv1.hops"].shape
-    places = arrays["fc1.weight"].shape[1] // features
-    forms = window_forms(cells, kernel_of(filters))
-    counts = {form: math.prod(grid.places(kernel_of(filters))) for form, grid in forms.items()}
-    for form, count in counts.items():
-        if count == places:
-            return forms[form]
-    sizes = " or ".join(f"{count} (padding {form})" for form, count in counts.items())
-    raise ModelError(
-        f"{where}: fc1 was trained on {places} places, a window of {kernel_of(filters)} * {kernel_of(filters)} on this "
-        f"sensor has {sizes}; give the sensor that it was trained on"
-    )
-
-
-def _plain(array: npt.NDArray[Any]) -> Float32Array:
-    copy = np.array(array, np.float32, order="C")
-    copy.flags.writeable = False
-    return copy
 
 
 def _content(where: str, path: Path) -> bytes:

@@ -36,46 +36,42 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.archive import arrays_digest, read_npy, stored_members
-from spikeloom.compiler.checkpoint import WEIGHTS, Float32Array
+from spikeloom.compiler.archive import Kind, arrays_digest, entry_faults, read_npy, stored_members
+from spikeloom.compiler.checkpoint import WEIGHTS, Checkpoint, constant_faults, layers_of
 from spikeloom.compiler.dynamics import MOST_STEPS, PLAIN, Dynamics, dynamics_from_json
-from spikeloom.compiler.errors import ModelError, OptionError
-from spikeloom.compiler.fixedpoint import THRESHOLD_MANTISSA_MAX, plane_distance
-from spikeloom.compiler.formats.tensors import (
-    Arrays,
-    Contents,
-    apart,
-    faults_of,
-    size,
-    taxel_faults,
-    tower_faults,
-    wanted_dense,
-)
+from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.fixedpoint import THRESHOLD_MANTISSA_MAX, plane_distance, read_only
+from spikeloom.compiler.formats.tensors import Arrays, apart, faults_of, size, taxel_faults, tower_faults, wanted_dense
 from spikeloom.compiler.formats.torch_checkpoint import DAMAGED, NOT_A_CHECKPOINT
 from spikeloom.compiler.ir import Form
-from spikeloom.compiler.systems import (
-    GRAPH_SYSTEMS,
-    GRID_CNN,
-    SYSTEMS,
-    TITLES,
-    Grid,
-    grid_from_json,
-    shape_faults,
-)
-from spikeloom.compiler.types import JsonObject
+from spikeloom.compiler.systems import GRAPH_SYSTEMS, GRID_CNN, SYSTEMS, TITLES, Grid, grid_from_json, shape_faults
 
 FORMAT = "spikeloom-checkpoint"
 VERSION = 6
 
+ENTRIES: dict[str, Kind] = {
+    "architecture": str,
+    **dict.fromkeys(("taxels", "classes"), (1, 2**31)),
+    **dict.fromkeys(("beta", "theta"), float),
+    "graph": {"name": str, "edges": [[(0, 2**31)]]},
+    "weights": [str, ...],
+    "training": dict,
+}
+MORE: dict[str, Kind] = {
+    "towers": (2, MOST_STEPS),
+    "bins": (2, MOST_STEPS),
+    "forms": [{"layer": str, "bits": (2, 8), "exponents": [(-1, 7), ...], "threshold": [(1, THRESHOLD_MANTISSA_MAX)]}],
+}
+"""What a manifest may leave out."""
 
 _AGAIN = "copy or train it again"
 
@@ -86,19 +82,7 @@ def content_digest(manifest: Mapping[str, Any], arrays: Mapping[str, npt.NDArray
     return hashlib.sha256(f"{json.dumps(stated, sort_keys=True)}\n{arrays_digest(arrays)}".encode()).hexdigest()
 
 
-def require_constants(
-    where: str, error: type[ModelError] | type[OptionError], beta: float | None, theta: float | None
-) -> None:
-    """Refuse a decay or a threshold that no neuron has, as an error of the given kind."""
-    if beta is not None and not 0 <= beta < 1:
-        raise error(
-            f"{where}beta {beta:g}: allowed are 0 <= beta < 1; it is the share of the membrane that a step keeps"
-        )
-    if theta is not None and not 0 < theta < math.inf:
-        raise error(f"{where}theta {theta:g}: allowed are numbers above 0; it is the threshold of a spike")
-
-
-def own_members(where: str, content: bytes) -> dict[str, bytes] | None:
+def members_of(where: str, content: bytes) -> dict[str, bytes] | None:
     """Members of a file in our own format, or None if it is something else; no zip may claim more than it has."""
     if content[:2] != b"PK":
         return None
@@ -109,9 +93,64 @@ def own_members(where: str, content: bytes) -> dict[str, bytes] | None:
     return members if "manifest.json" in members else None
 
 
-def _manifest(where: str, content: bytes) -> JsonObject:
+def read_own(where: str, content: bytes, members: dict[str, bytes], weights: str | None) -> Checkpoint:
+    """Check a file of our own format, called `where` in messages, and take one set of weights from its members.
+
+    Raises ModelError as :func:`read_checkpoint` says.
+    """
+    manifest, arrays = _signed_content(where, members)
+    if faults := _manifest_faults(manifest):
+        raise ModelError(f"{where}: {'; '.join(faults)}; {_AGAIN}")
+    sets = tuple(name for name in WEIGHTS if name in manifest["weights"])
+    weights = sets[0] if weights is None else weights
+    if weights not in sets:
+        raise ModelError(f"{where}: --weights {weights}: the file holds {', '.join(sets)}; choose one that it holds")
+    chosen = {name.removeprefix(f"{weights}/"): a for name, a in arrays.items() if name.startswith(f"{weights}/")}
+    system, towers = manifest["architecture"], manifest.get("towers", 1)
+    edges = read_only(np.array(manifest["graph"]["edges"], np.int64).reshape(-1, 2))
+    grid, dynamics = None, PLAIN
     try:
-        manifest = json.loads(content)
+        if system == GRID_CNN:
+            grid = grid_from_json(manifest["grid"])
+        if "dynamics" in manifest:
+            stages = sum(re.fullmatch(r"fc\d+\.weight", name) is not None for name in chosen)
+            dynamics = dynamics_from_json(manifest["dynamics"], 1 + stages)
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        faults.append(f"the manifest has an unusable grid or dynamics ({error})")
+    faults += tower_faults(chosen, towers)
+    for tower in () if faults else apart(chosen, towers):
+        faults = faults or _tower_faults(tower, manifest["taxels"], manifest["classes"], (system, grid, dynamics))
+    if edges.size and edges.max() >= manifest["taxels"]:
+        faults.append(f"the graph joins taxels outside 0..{manifest['taxels'] - 1}")
+    if faults:
+        raise ModelError(f"{where}: {'; '.join(faults)}; {_AGAIN}")
+    found = Checkpoint(
+        **layers_of(chosen),
+        beta=float(manifest["beta"]),
+        theta=float(manifest["theta"]),
+        layout="spikeloom",
+        graph=manifest["graph"]["name"],
+        edges=edges,
+        weights=weights,
+        sets=sets,
+        training=manifest["training"],
+        sha256=hashlib.sha256(content).hexdigest(),
+        system=system,
+        grid=grid,
+        dynamics=dynamics,
+        towers=towers,
+        bins=manifest.get("bins", 1),
+    )
+    return replace(found, forms=_forms(where, manifest["forms"], found)) if "forms" in manifest else found
+
+
+def _signed_content(where: str, members: Mapping[str, bytes]) -> tuple[dict[str, Any], Arrays]:
+    """Manifest and arrays that match the hash which the manifest states."""
+    try:
+        manifest = json.loads(members["manifest.json"])
+        arrays = {name.removesuffix(".npy"): read_npy(data) for name, data in members.items() if name.endswith(".npy")}
+        if len(arrays) + 1 != len(members) or any(array.dtype != "<f4" for array in arrays.values()):
+            raise ValueError("members that are no arrays of float32")
     except (ValueError, RecursionError) as error:
         raise ModelError(f"{where}: {DAMAGED}") from error
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
@@ -121,121 +160,38 @@ def _manifest(where: str, content: bytes) -> JsonObject:
         raise ModelError(
             f"{where}: has format version {version!r}, this program reads up to {VERSION}; update spikeloom"
         )
-    return manifest
-
-
-def own_contents(where: str, members: dict[str, bytes], weights: str | None) -> Contents:
-    """Check a file of our own format and take it apart.
-
-    Parameters
-    ----------
-    where : str
-        For messages.
-    members : dict of str to bytes
-        Of the file; the manifest is taken out.
-    weights : str, optional
-        Which set; by default the first of ``WEIGHTS`` that the file holds.
-
-    Raises
-    ------
-    ModelError
-        As :func:`checkpoint.read_checkpoint` says.
-    """
-    manifest = _manifest(where, members.pop("manifest.json"))
-    try:
-        arrays: Arrays = {name.removesuffix(".npy"): _read_float32(content) for name, content in members.items()}
-    except ValueError as error:
-        raise ModelError(f"{where}: {DAMAGED}") from error
     if content_digest(manifest, arrays) != manifest.get("sha256"):
         raise ModelError(f"{where}: its content does not match its hash, so it was altered; {_AGAIN}")
-    try:
-        sets = tuple(name for name in WEIGHTS if name in manifest["weights"])
-        graph, beta, theta = str(manifest["graph"]["name"]), float(manifest["beta"]), float(manifest["theta"])
-        edges = np.array(manifest["graph"]["edges"], np.int64).reshape(-1, 2)
-        edges.flags.writeable = False
-        taxels, classes, training = int(manifest["taxels"]), int(manifest["classes"]), dict(manifest["training"])
-        system = str(manifest["architecture"])
-        if system not in SYSTEMS:
-            raise ValueError(f"architecture {system}")
-        grid = grid_from_json(manifest["grid"]) if system == GRID_CNN else None
-        towers, bins = (_count(manifest, name) for name in ("towers", "bins"))
-        dynamics = PLAIN
-        if "dynamics" in manifest:
-            stages = sum(re.fullmatch(r"[a-z]+/fc\d+\.weight", name) is not None for name in arrays) // len(sets)
-            dynamics = dynamics_from_json(manifest["dynamics"], 1 + stages)
-    except (KeyError, TypeError, ValueError, OverflowError, ZeroDivisionError) as error:
-        raise ModelError(f"{where}: has an incomplete manifest ({error!r}); {_AGAIN}") from error
-    require_constants(f"{where}: ", ModelError, beta, theta)
-    weights = sets[0] if weights is None and sets else weights
-    if weights not in sets:
-        raise ModelError(f"{where}: --weights {weights}: the file holds {', '.join(sets)}; choose one that it holds")
-    chosen = {name.removeprefix(f"{weights}/"): a for name, a in arrays.items() if name.startswith(f"{weights}/")}
-    faults = tower_faults(chosen, towers)
-    for tower in () if faults else apart(chosen, towers):
-        faults = faults or _own_faults(tower, taxels, classes, (system, grid, dynamics))
-    if edges.size and (edges.min() < 0 or edges.max() >= taxels):
-        faults.append(f"the graph joins taxels outside 0..{taxels - 1}")
-    if faults:
-        raise ModelError(f"{where}: {'; '.join(faults)}; {_AGAIN}")
-    return Contents(
-        arrays=chosen,
-        layout="spikeloom",
-        system=system,
-        beta=beta,
-        theta=theta,
-        graph=graph,
-        edges=edges,
-        weights=weights,
-        sets=sets,
-        training=training,
-        forms=_forms(where, manifest, chosen, towers, dynamics.clocks.channels),
-        grid=grid,
-        dynamics=dynamics,
-        towers=towers,
-        bins=bins,
+    return manifest, arrays
+
+
+def _manifest_faults(manifest: Mapping[str, Any]) -> list[str]:
+    """What in the manifest is missing or of another kind."""
+    kinds = ENTRIES | {name: kind for name, kind in MORE.items() if name in manifest}
+    if faults := entry_faults(manifest, kinds):
+        return faults
+    fine = {
+        "architecture": manifest["architecture"] in SYSTEMS,
+        "weights": not set(WEIGHTS).isdisjoint(manifest["weights"]),
+        "graph": all(len(edge) == 2 for edge in manifest["graph"]["edges"]),
+    }
+    faults = [f"the manifest has no usable {name}" for name, good in fine.items() if not good]
+    return faults + constant_faults(manifest["beta"], manifest["theta"])
+
+
+def _forms(where: str, entries: list[dict[str, Any]], checkpoint: Checkpoint) -> tuple[Form, ...]:
+    """Storage of every layer of a fine-tuned network."""
+    fits = [(entry["layer"], len(entry["threshold"])) for entry in entries] == [*checkpoint.neurons.items()]
+    gaps = [(entry["bits"], b - a) for entry in entries for a, b in pairwise(entry["exponents"])]
+    if not fits or not all(0 < gap <= plane_distance(bits) for bits, gap in gaps):
+        raise ModelError(f"{where}: the manifest has no usable forms; {_AGAIN}")
+    return tuple(
+        Form(bits=entry["bits"], exponents=tuple(entry["exponents"]), threshold=read_only(entry["threshold"]))
+        for entry in entries
     )
 
 
-def _count(manifest: dict[str, Any], name: str) -> int:
-    """A number above 1; 1 where it is not there."""
-    count = manifest.get(name, 2)
-    if type(count) is not int or not 2 <= count <= MOST_STEPS:
-        raise ValueError(f"{count} {name}")
-    return count if name in manifest else 1
-
-
-def _forms(where: str, manifest: dict[str, Any], arrays: Arrays, towers: int, clocks: int) -> tuple[Form, ...] | None:
-    """Storage of every layer of a fine-tuned network; None for a plain file."""
-    if "forms" not in manifest:
-        return None
-    sizes = {"conv1": (arrays["fc1.weight"].shape[1] - clocks) * towers + clocks}
-    stages = sum(key.endswith(".weight") for key in arrays)
-    sizes |= {f"fc{stage}": len(arrays[f"fc{stage}.bias"]) for stage in range(1, stages + 1)}
-    found = []
-    try:
-        for name, size, entry in zip(sizes, sizes.values(), manifest["forms"], strict=True):
-            bits, exponents, thresholds = entry["bits"], entry["exponents"], entry["threshold"]
-            good = (
-                entry["layer"] == name
-                and all(type(number) is int for number in (bits, *exponents, *thresholds))
-                and len(thresholds) == size
-                and all(1 <= threshold <= THRESHOLD_MANTISSA_MAX for threshold in thresholds)
-                and bits in range(2, 9)
-                and bool(exponents)
-                and all(-1 <= e <= 7 for e in exponents)
-                and all(0 < b - a <= plane_distance(bits) for a, b in pairwise(exponents))
-            )
-            if not good:
-                raise ValueError(f"layer {name}")
-            threshold = np.array(thresholds, np.int64)
-            threshold.flags.writeable = False
-            found.append(Form(bits=bits, exponents=tuple(exponents), threshold=threshold))
-    except (KeyError, TypeError, ValueError) as error:
-        raise ModelError(f"{where}: has unusable forms of a fine-tuning ({error}); {_AGAIN}") from error
-    return tuple(found)
-
-
-def _own_faults(arrays: Arrays, taxels: int, classes: int, kind: tuple[str, Grid | None, Dynamics]) -> list[str]:
+def _tower_faults(arrays: Arrays, taxels: int, classes: int, kind: tuple[str, Grid | None, Dynamics]) -> list[str]:
     system, grid, dynamics = kind
     stages = max((int(m[1]) for key in arrays if (m := re.fullmatch(r"fc([1-9]\d?)\.weight", key))), default=1)
     features = size(arrays, "conv1.hops", 3, 1, "features")
@@ -254,10 +210,3 @@ def _own_faults(arrays: Arrays, taxels: int, classes: int, kind: tuple[str, Grid
                 f"the manifest says {taxels} taxels and {classes} classes"
             ]
     return faults
-
-
-def _read_float32(content: bytes) -> Float32Array:
-    array = read_npy(content)
-    if array.dtype != "<f4":
-        raise ValueError(f"an array of {array.dtype}")
-    return array

@@ -3,44 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.dynamics import PLAIN, Dynamics
 from spikeloom.compiler.formats.names import printable
-from spikeloom.compiler.ir import Form
-from spikeloom.compiler.systems import TACTILESGNET, Grid
-from spikeloom.compiler.types import IntArray
 
 Arrays = dict[str, npt.NDArray[Any]]
 
 Shape = tuple[int | str, ...]
 """A wanted shape; a word stands for any size from 1."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Contents:
-    """What a checkpoint of any layout says; see :class:`checkpoint.Checkpoint`. Constants that it lacks are None."""
-
-    arrays: Arrays
-    layout: str
-    system: str = TACTILESGNET
-    beta: float | None = None
-    theta: float | None = None
-    graph: str | None = None
-    edges: IntArray | None = None
-    weights: str = "last"
-    sets: tuple[str, ...] = ("last",)
-    runs: int = 1
-    training: Mapping[str, Any] | None = None
-    forms: tuple[Form, ...] | None = None
-    grid: Grid | None = None
-    dynamics: Dynamics = PLAIN
-    towers: int = 1
-    bins: int = 1
 
 
 def faults_of(

@@ -14,11 +14,11 @@ torch is imported here only, late, and always with ``weights_only=True``: files 
 
 from __future__ import annotations
 
+import hashlib
 import io
 import math
 import pickle
 import re
-import struct
 import warnings
 import zipfile
 from collections.abc import Collection, Mapping
@@ -26,11 +26,12 @@ from typing import Any, NoReturn
 
 import numpy as np
 
+from spikeloom.compiler.checkpoint import Checkpoint, layers_of
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.names import printable
-from spikeloom.compiler.formats.tensors import Arrays, Contents, Shape, faults_of, size, taxel_faults, wanted_dense
-from spikeloom.compiler.systems import GCN, GRID_CNN, MLP, TACTILESGNET, TITLES
-from spikeloom.compiler.types import JsonObject
+from spikeloom.compiler.formats.tensors import Arrays, Shape, faults_of, size, taxel_faults, wanted_dense
+from spikeloom.compiler.systems import GCN, GRID_CNN, MLP, TACTILESGNET, TITLES, Grid, kernel_of, window_forms
+from spikeloom.compiler.types import IntArray, JsonObject
 
 CHANNELS = 2
 """Polarities of a recording; old keys do not say how many channels a hop has."""
@@ -41,41 +42,13 @@ _OLD_TORCH = b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19."  # the pickled magic nu
 GIVE = "give a file of spikeloom train or of the released layout"
 NOT_A_CHECKPOINT = f"is not a checkpoint; {GIVE}"
 DAMAGED = "is truncated or damaged; copy it again"
-_ERRORS = (
-    pickle.UnpicklingError,
-    struct.error,
-    ArithmeticError,
-    AssertionError,
-    AttributeError,
-    EOFError,
-    LookupError,
-    MemoryError,
-    OSError,
-    RuntimeError,
-    TypeError,
-    ValueError,
-)  # what torch's reader was seen to raise on damaged files
+
+BETA, THETA = 0.2, 0.5
+"""Decay and threshold of the released code; files in its layout do not hold them."""
 
 
-def read_released(where: str, content: bytes, run: int, system: str | None = None) -> Contents:
-    """Read the content of a torch file; arrays are float32 under the names of our own format.
-
-    Parameters
-    ----------
-    where : str
-        For messages.
-    content : bytes
-        The whole file.
-    run : int
-        Which state dict of ``net_list``.
-    system : str, optional
-        What the tensors must be; by default their names tell.
-
-    Raises
-    ------
-    ModelError
-        As :func:`checkpoint.read_checkpoint` says.
-    """
+def read_torch(where: str, content: bytes, run: int, system: str | None, cells: IntArray | None) -> Checkpoint:
+    """Read the content of a torch file, called `where` in messages; raises as :func:`read_checkpoint`."""
     loaded = _load(where, content)
     if isinstance(loaded, dict) and "net_list" in loaded:
         states, layout = loaded["net_list"], "released"
@@ -83,19 +56,27 @@ def read_released(where: str, content: bytes, run: int, system: str | None = Non
             raise ModelError(f"{where}: net_list holds no run; give the file of a finished training")
     else:
         states, layout = [loaded], "state_dict"
-    _require_run(where, run, len(states))
+    if not 0 <= run < len(states):
+        held = "only run 0" if len(states) == 1 else f"runs 0 to {len(states) - 1}"
+        raise ModelError(f"{where}: --run {run}: the file holds {held}; choose one that it holds")
     arrays = _arrays(where, states[run], len(content), system)
-    known = system or _told(arrays)
-    return Contents(
-        arrays=_unified(where, arrays, known),
+    system = system or _system_of(arrays)
+    arrays = _unified(where, arrays, system)
+    return Checkpoint(
+        **layers_of(arrays),
+        beta=BETA,
+        theta=THETA,
+        assumed=("beta", "theta"),
         layout=layout,
-        system=known,
         runs=len(states),
         training=_training(loaded, run, len(states)) if layout == "released" else None,
+        sha256=hashlib.sha256(content).hexdigest(),
+        system=system,
+        grid=_grid(where, arrays, cells) if system == GRID_CNN else None,
     )
 
 
-def _told(names: Collection[str]) -> str:
+def _system_of(names: Collection[str]) -> str:
     """System that the names of the tensors belong to."""
     if "fc0.weight" in names:
         return MLP
@@ -106,10 +87,22 @@ def _told(names: Collection[str]) -> str:
     return TACTILESGNET
 
 
-def _require_run(where: str, run: int, runs: int) -> None:
-    if not 0 <= run < runs:
-        held = "only run 0" if runs == 1 else f"runs 0 to {runs - 1}"
-        raise ModelError(f"{where}: --run {run}: the file holds {held}; choose one that it holds")
+def _grid(where: str, arrays: Arrays, cells: IntArray | None) -> Grid:
+    """Which of the two forms of the grid a network was trained on, which the number of places tells."""
+    if cells is None:
+        raise ModelError(f"{where}: where the taxels lie on the grid is not in this file; name the sensor")
+    filters, features, _ = arrays["conv1.hops"].shape
+    kernel, places = kernel_of(filters), arrays["fc1.weight"].shape[1] // features
+    forms = window_forms(cells, kernel)
+    counts = {form: math.prod(grid.places(kernel)) for form, grid in forms.items()}
+    for form, count in counts.items():
+        if count == places:
+            return forms[form]
+    sizes = " or ".join(f"{count} (padding {form})" for form, count in counts.items())
+    raise ModelError(
+        f"{where}: fc1 was trained on {places} places, a window of {kernel} * {kernel} on this sensor has {sizes}; "
+        "give the sensor that it was trained on"
+    )
 
 
 def _load(where: str, content: bytes) -> Any:
@@ -127,7 +120,7 @@ def _load(where: str, content: bytes) -> Any:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # torch warns of its own old storage classes
             return torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
-    except _ERRORS as error:
+    except Exception as error:  # torch raises nearly anything on damaged files
         if isinstance(error, pickle.UnpicklingError) and (named := re.search(r"GLOBAL ([\w.]+)", str(error))):
             raise ModelError(
                 f"{where}: is a pickle that calls {named[1]}, allowed are tensors alone, since code in a file could "
@@ -158,7 +151,7 @@ def _arrays(where: str, state: Any, file_size: int, system: str | None) -> Array
         if (fault := _tensor_fault(value, file_size)) is not None
     ]
     if faults:
-        _refuse(where, faults, system or _told(set(map(str, state))))
+        _refuse(where, faults, system or _system_of(set(map(str, state))))
     return {str(name): value.detach().to(torch.float32).numpy() for name, value in state.items()}
 
 
