@@ -223,31 +223,8 @@ def _is(value: Any, kind: Kind) -> bool:
     return isinstance(value, list) and len(value) >= len(kind) - 1 and all(_is(one, kind[0]) for one in value)
 
 
-def bounds_faults(bounds: Mapping[str, tuple[Array, int, int]]) -> list[str]:
-    """Bounds (parts + 1,) that do not divide all entries; by name, with the numbers of parts and of entries."""
-    return [
-        f"{name} does not divide {total} entries in {parts} parts"
-        for name, (ends, parts, total) in bounds.items()
-        if len(ends) != parts + 1 or ends[0] != 0 or ends[-1] != total or np.any(np.diff(ends) < 0)
-    ]
-
-
-def is_outside(array: Array, low: int, high: int) -> bool:
-    """Whether an array has values below `low`, or `high` and above."""
-    return bool(array.size and (array.min() < low or array.max() >= high))
-
-
-def range_faults(ranges: Mapping[str, tuple[Array, int, int]]) -> list[str]:
-    """Arrays, by name with their ranges, that have values outside."""
-    return [
-        f"{name} has values outside {low} … {high - 1}"
-        for name, (a, low, high) in ranges.items()
-        if is_outside(a, low, high)
-    ]
-
-
 def read_archive(
-    path: Path, wanted: str, versions: tuple[int, ...], names: Callable[[Mapping[str, Any]], Iterable[str]]
+    path: Path, wanted: str, version: int, names: Callable[[Mapping[str, Any]], Iterable[str]]
 ) -> tuple[dict[str, Any], dict[str, Array]]:
     """Manifest and arrays of a file of a format, one of ``FORMATS``, that matches its hash.
 
@@ -279,10 +256,10 @@ def read_archive(
         raise FormatError(f"{path}: holds {FORMATS[kind]}, this is for {FORMATS[wanted]}; give such a file")
     if kind != wanted:
         raise FormatError(f"{path}: is not a netlist; write one with spikeloom compile")
-    if manifest.get("version") not in versions:
+    if manifest.get("version") != version:
         raise FormatError(
-            f"{path}: has format version {manifest.get('version')}, this program reads "
-            f"{', '.join(map(str, versions))}; compile it again or update spikeloom"
+            f"{path}: has format version {manifest.get('version')}, this program reads {version}; compile it again or "
+            "update spikeloom"
         )
     expected = tuple(names(manifest))
     if odd := sorted(set(expected) ^ set(members)):

@@ -58,7 +58,7 @@ def rewritten(source, path, change, *, sign=True):
     change(manifest, members)
     members["manifest"] = np.array(json.dumps(manifest, sort_keys=True))
     if sign:
-        held = {name: members[name] for name in netlist_file.ARRAYS if name in members}
+        held = {name: members[name] for name in netlist_file.FILE.arrays if name in members}
         stated = np.array(digest({"manifest": members["manifest"], **held}))
     with zipfile.ZipFile(path, "w") as archive:
         for name, array in (members | {"sha256": stated}).items():

@@ -17,13 +17,14 @@ from spikeloom.compiler.archive import is_netlist
 from spikeloom.compiler.errors import CapacityError, FormatError
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import (
-    ARRAYS,
-    LARGE,
+    FILE,
     inconsistencies,
     netlist_bytes,
     read_netlist,
     write_netlist,
 )
+
+ARRAYS, LARGE = FILE.arrays, FILE.as_stored
 
 
 @pytest.fixture(scope="module")
@@ -337,11 +338,11 @@ def with_value(name, value, place=0):
         (with_value("core_axons", 1), "core_axons does not divide 9 entries in 1 parts"),
         (with_value("axon_synapses", 99, 3), "axon_synapses does not divide 22 entries in 9 parts"),
         (with_value("axon_synapses", -1, 1), "axon_synapses does not divide 22 entries in 9 parts"),
-        (lengthened("neuron"), "neuron has 6 entries for 5 compartments"),
-        (lengthened("threshold"), "threshold has 6 entries for 5 compartments"),
-        (lengthened("axon_format"), "axon_format or synapse_target has the wrong length"),
-        (lengthened("synapse_target"), "axon_format or synapse_target has the wrong length"),
-        (lengthened("format_weight_bits"), "the format arrays have different lengths"),
+        (lengthened("neuron"), "neuron has 6 entries, 5 are needed"),
+        (lengthened("threshold"), "threshold has 6 entries, 5 are needed"),
+        (lengthened("axon_format"), "axon_format has 10 entries, 9 are needed"),
+        (lengthened("synapse_target"), "synapse_target has 23 entries, 22 are needed"),
+        (lengthened("format_weight_bits"), "format_weight_bits has 2 entries, 1 are needed"),
         (with_value("layer", 2), "layer has values outside 0 … 1"),
         (with_value("neuron", 1), "layer fc1 holds none of its 3 neurons, one twice or one that is not there"),
         (with_value("axon_source", 11), "axon_source has values outside 0 … 10"),

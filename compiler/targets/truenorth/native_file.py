@@ -37,7 +37,7 @@ from spikeloom.compiler.targets.truenorth.native import NativeNetwork, Stage, fa
 from spikeloom.compiler.types import IntArray
 
 FORMAT = TRAINED
-VERSIONS = (1,)
+VERSION = 1
 PARTS = ("inputs", "level", "threshold", "floor", "leak")
 """Arrays of a stage, in file order."""
 
@@ -89,7 +89,7 @@ def write_trained(
     one = next(iter(networks.values()))
     manifest = {
         "format": FORMAT,
-        "version": VERSIONS[0],
+        "version": VERSION,
         **{name: getattr(one, name) for name in ("taxels", "polarities", "classes", "copies")},
         "clocks": asdict(one.clocks),
         "graph": {"name": graph, "edges": edges.tolist()},
@@ -139,7 +139,7 @@ def read_trained(path: str | os.PathLike[str], *, weights: str | None = None) ->
         return _names(manifest)
 
     try:
-        manifest, members = read_archive(path, FORMAT, VERSIONS, names)
+        manifest, members = read_archive(path, FORMAT, VERSION, names)
     except FormatError as error:
         raise ModelError(f"{path}: damaged, altered or of another version ({_core(path, error)}); {_AGAIN}") from error
     sets = tuple(name for name in WEIGHTS if name in manifest["weights"])
