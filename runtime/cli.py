@@ -112,7 +112,8 @@ def build_parser(chosen: str | None = None) -> argparse.ArgumentParser:
     parser.add_argument(
         "--print-completion", choices=("bash", "zsh", "tcsh"), help="print a completion script for a shell"
     )
-    commands = parser.add_subparsers(dest="command", required=True, help=argparse.SUPPRESS, prog="spikeloom")
+    hidden = argparse.SUPPRESS if chosen == "" else None  # the overview names them, by group
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", help=hidden, prog="spikeloom")
     for name in COMMANDS if chosen is None else filter(None, [chosen]):
         sub = commands.add_parser(name, description=COMMANDS[name][1], help=COMMANDS[name][1])
         module = _module(name)

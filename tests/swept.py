@@ -6,17 +6,26 @@ import os
 import signal
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from spikeloom.compiler.errors import DataError
-from spikeloom.runtime.studies.jobs import Point, content_key, sweep
+from spikeloom.runtime.studies.jobs import Job, content_key, sweep
 
 KIND = "test"
 
 
-def square(payload: dict[str, Any]) -> dict[str, Any]:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Square(Job):
+    """A number to square, or trouble instead."""
+
+    payload: dict[str, Any]
+
+
+def square(job: Square) -> dict[str, Any]:
     """What is measured: a square, after a moment; a payload may ask for trouble instead."""
+    payload = job.payload
     number = payload["number"]
     with Path(payload["log"]).open("a") as log:
         log.write(f"{number}\n")
@@ -38,10 +47,10 @@ def begun(log: str | Path) -> list[int]:
     return [int(line) for line in Path(log).read_text().splitlines()] if Path(log).exists() else []
 
 
-def points(log: Path, count: int, **trouble: dict[int, Any]) -> list[Point]:
+def points(log: Path, count: int, **trouble: dict[int, Any]) -> list[Square]:
     """As many points; keywords: entries of the payload by number."""
     return [
-        Point(
+        Square(
             key=content_key({"number": number}),
             label=f"number {number}",
             payload={"number": number, "log": str(log)}

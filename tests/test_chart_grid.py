@@ -1,6 +1,5 @@
-"""The words of ``--grid``: what they mean, and where exactly they are wrong."""
+"""The words of ``--grid``: what they mean, and what they may be."""
 
-import re
 from itertools import product
 
 import pytest
@@ -10,7 +9,7 @@ from hypothesis import strategies as st
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.options import GOALS
-from spikeloom.runtime.studies.chart.grid import Grid, axes, parse_grid
+from spikeloom.runtime.studies.chart.grid import AXES, Grid, parse_grid
 
 TARGET = load_target("loihi1")
 WIDTHS = (2, 3, 4, 5, 6, 8)
@@ -63,43 +62,32 @@ def test_windows(text, windows):
 
 
 @pytest.mark.parametrize(
-    ("text", "at", "what"),
+    ("text", "telling"),
     [
-        ("bits=2-x", 8, "'x' is not a width"),
-        ("bits=2-8", 6, "'2-8' holds 7"),
-        ("bits=8+4+9", 10, "9 is not a width that the chip stores; allowed: 2, 3, 4, 5, 6, 8"),
-        ("bits=6-2", 6, "'6-2' runs backwards; write 2-6"),
-        ("bits=,planes=1", 6, "bits has an empty value"),
-        ("bits=3,,4", 8, "bits has an empty value"),
-        ("bits=3,", 8, "bits has an empty value"),
-        ("bits=3,bits=4", 8, "bits is given twice"),
-        ("planes=1, colour=2", 11, "'colour' is no axis; axes are bits, planes, groups, prune, cores, window, graph"),
-        ("3,4", 1, "'3' belongs to no axis"),
-        ("planes=4", 8, "4 is not a number of planes; allowed: 1 to 3"),
-        ("groups=0", 8, "0 is not a number of scale groups; allowed: 1 to 8"),
-        ("prune=2", 7, "2 is not 0 (keep) or 1 (leave out); allowed: 0, 1"),
-        ("window=50-101%", 11, "101 is not a part in per cent; allowed: 1 to 100"),
-        ("window=80-20%", 8, "'80-20%' runs backwards; write 20-80%"),
-        ("window=20-80%:0", 15, "0 is not a step in per cent"),
-        ("window=50%:5", 11, "'50%:5' is no range"),
-        ("cores=fast", 7, "'fast' is no layout; allowed: cores, energy, latency"),
-        ("cores=fc1:2+:3", 13, "':3' names no layer"),
-        ("cores=fc1:2+fc1:3", 13, "fc1 is given twice"),
-        ("bits=²", 6, "'²' is not a width"),
+        *((f"bits={value}", f"bits={value}: allowed are 2, 3, 4, 5, 6, 8") for value in ("2-x", "2-8", "7", "²", "")),
+        *((f"bits={value}", "or a width for each layer as in 8+4+4+8") for value in ("8+4+9", "8+", "8+2-4", "6-2")),
+        ("bits=3,,4", "bits=: allowed are 2"),
+        ("bits=3,", "bits=: allowed are 2"),
+        ("bits=3,bits=4", "bits: give each of bits, planes, groups, prune, cores, window, graph once"),
+        ("planes=1, colour=2", "colour: give each of bits, planes"),
+        ("3,4", "3: belongs to no axis; begin with one"),
+        ("", ": belongs to no axis; begin with one"),
+        ("planes=4", "planes=4: allowed are 1 to 3 planes"),
+        ("groups=0", "groups=0: allowed are 1 to 8 scale groups"),
+        ("prune=2", "prune=2: allowed are 0 (keep) and 1 (leave out)"),
+        *((f"window={value}", "1 to 100 per cent") for value in ("50-101%", "0", "80-20%", "20-80%:0", "50%:5")),
+        *((f"cores={value}", "cores, energy, latency, or LAYER:N") for value in ("fast", "a:2+:3", "a:2+a:3", "a:0")),
+        ("graph=", "graph=: allowed are names of graphs"),
     ],
 )
-def test_a_mistake_is_pointed_at(text, at, what):
+def test_a_mistake_names_the_value_and_what_is_allowed(text, telling):
     with pytest.raises(OptionError) as caught:
         parsed(text)
-    first, shown, caret = str(caught.value).split("\n")
-    assert first.startswith(f"--grid, character {at}: {what}")
-    assert (shown, caret) == (f"  {text}", f"  {' ' * (at - 1)}^")
+    assert str(caught.value).startswith("--grid ")
+    assert telling in str(caught.value)
 
 
-def test_an_empty_grid_and_one_that_is_too_large():
-    for text in ("", "   "):
-        with pytest.raises(OptionError, match="--grid: is empty"):
-            parsed(text)
+def test_a_grid_that_is_too_large():
     every = "/".join("+".join(map(str, widths)) for widths in product(WIDTHS, repeat=4))
     with pytest.raises(OptionError, match="388,800 points a network, allowed are 100,000"):
         parsed(f"bits={every},planes=1-3,window=1-100%:1")
@@ -135,7 +123,7 @@ GRIDS = st.builds(
 )
 
 
-@given(GRIDS, st.sampled_from([",", "/", " , ", "/ "]), st.permutations(axes(TARGET)))
+@given(GRIDS, st.sampled_from([",", "/", " , ", "/ "]), st.permutations(AXES))
 def test_what_is_written_is_read(grid, between, order):
     words = {
         "bits": ["+".join(map(str, widths)) for widths in grid.bits],
@@ -148,20 +136,3 @@ def test_what_is_written_is_read(grid, between, order):
     }
     text = ",".join(f"{axis}={between.join(map(str, words[axis]))}" for axis in order if words[axis])
     assert parsed(text) == grid
-
-
-@given(st.text(alphabet="bits=planewdocrgh0123456789-+,/:% x", max_size=30))
-def test_any_text_is_a_grid_or_a_mistake_with_a_place(text):
-    try:
-        found = parsed(text)
-    except OptionError as error:
-        lines = str(error).splitlines()
-        place = re.match(r"--grid, character ([0-9]+): .+", lines[0])
-        if place is None:
-            assert len(lines) == 1
-        else:
-            assert lines[1] == f"  {text}"
-            assert lines[2] == " " * (int(place[1]) + 1) + "^"
-            assert 1 <= int(place[1]) <= len(text) + 1
-    else:
-        assert all(getattr(found, name) for name in Grid.__slots__ if name != "graph")

@@ -17,12 +17,18 @@ from spikeloom.compiler.ir import INPUT
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.passes.prune import deaf_to
 from spikeloom.models.recordings.events import load_data
+from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.votes import predictions
 from spikeloom.runtime.studies.pruning import trials
 
 WORDS = ("lean", "net.pt", "--data", "data")
 STEPS = 40
+
+
+def recordings_of(made, labels):
+    files = tuple(map(str, range(len(made))))
+    return Recordings(events=made, labels=labels, files=files, split="train", source="made")
 
 
 def _recordings(seed, samples):
@@ -47,7 +53,7 @@ def compiled(tmp_path_factory):
     """A small network, what it was compiled to, and training recordings."""
     checkpoint, adjacency = small_checkpoint(tmp_path_factory.mktemp("small"), last=weights(3, gain=2.5))
     compilation = compile_network(expand(checkpoint, adjacency), Options(training_events=_recordings(1, 24)))
-    seen = trials.Scene(events=_recordings(1, 24), labels=np.arange(24) % CLASSES, lengths=None)
+    seen = recordings_of(_recordings(1, 24), np.arange(24) % CLASSES)
     return checkpoint, adjacency, compilation, seen
 
 
@@ -225,13 +231,6 @@ def test_bisection_finds_the_longest_beginning():
 
 def test_joined_bins():
     netlist = chain()
-    seen = trials.Scene(
-        events=np.array([[[[1, 0, 0, 0, 1], [0, 1, 1, 0, 0]]]], np.uint8), labels=np.array([0]), lengths=np.array([5])
-    )
-    joined = trials.coarser(seen, 2)
-    assert joined.events.tolist() == [[[[1, 0, 1], [1, 1, 0]]]]
-    assert joined.lengths.tolist() == [3]
-    assert trials.coarser(seen, 4).events.tolist() == [[[[1, 1], [1, 0]]]]
     slow = trials.coarse_netlist(netlist, 2, adapted=True)
     assert slow.decay_v.tolist() == [round(4096 * (1 - (819 / 4096) ** 2))] * 3
     assert slow.decay_u.tolist() == [4095] * 3

@@ -313,7 +313,7 @@ CLEAN = run_of(90)
 
 
 def curve_of(runs, name="taxels_dead"):
-    return curve(name, runs, CLEAN, 100, 10)
+    return curve(name, dict(runs), CLEAN, 100, 10)
 
 
 @pytest.mark.parametrize(

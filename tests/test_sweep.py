@@ -12,11 +12,11 @@ from pathlib import Path
 
 import pytest
 import swept
-from swept import KIND, begun, points, square
+from swept import KIND, Square, begun, points, square
 
 from spikeloom.compiler.errors import DataError, OptionError, UnfinishedError
 from spikeloom.runtime import cli
-from spikeloom.runtime.studies.jobs import Point, content_key, only_one, sweep
+from spikeloom.runtime.studies.jobs import content_key, only_one, sweep
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -56,7 +56,7 @@ def test_results_are_the_same_however_many_work(tmp_path, jobs):
 
 def test_equal_keys_are_measured_once_and_no_points_are_none(tmp_path):
     made = points(tmp_path / "log", 2)
-    twin = Point(key=made[0].key, label="twin", payload=made[1].payload)
+    twin = Square(key=made[0].key, label="twin", payload=made[1].payload)
     assert [each["square"] for each in swept_here(tmp_path, [made[0], twin, made[1]], jobs=1).values()] == [0, 1]
     assert begun(tmp_path / "log") == [0, 1]
     assert swept_here(tmp_path, []) == {}

@@ -67,6 +67,11 @@ class Recordings:
         """Time steps of the longest recording."""
         return int(self.events.shape[3])
 
+    @property
+    def step_counts(self) -> NDArray[np.int64]:
+        """Time steps of each recording; (samples,) int64."""
+        return np.full(len(self), self.steps) if self.lengths is None else self.lengths
+
     def steps_of(self, index: int) -> int:
         """Time steps of one recording."""
         return self.steps if self.lengths is None else int(self.lengths[index])

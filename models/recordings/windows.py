@@ -57,7 +57,7 @@ def first_part(recordings: Recordings, percent: int) -> Recordings:
     """
     if percent == WHOLE:
         return recordings
-    own = np.full(len(recordings), recordings.steps) if recordings.lengths is None else recordings.lengths
+    own = recordings.step_counts
     kept = steps_of(own, percent)
     longest = int(kept.max(initial=0))
     return replace(

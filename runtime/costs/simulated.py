@@ -10,8 +10,6 @@ import time
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.machines.base import Machine
 from spikeloom.runtime.report.console import progress
@@ -110,7 +108,7 @@ class Account:
 
     def __init__(self, machine: Machine, data: Recordings, *, checked: int = 0) -> None:
         self._machine, self._checked = machine, min(checked, len(data))
-        self._steps = np.full(len(data), data.steps) if data.lengths is None else data.lengths
+        self._steps = data.step_counts
         self._parts: list[tuple[str, float]] = []
 
     def begin(self, part: str) -> None:

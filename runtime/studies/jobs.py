@@ -31,18 +31,21 @@ from spikeloom.compiler.types import JsonObject
 
 APayload = TypeVar("APayload")
 AResult = TypeVar("AResult")
+AJob = TypeVar("AJob", bound="Job")
 
 CONNECT_S = 5.0
 """How long a scheduler may take to answer."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Point:
-    """One measurement of a sweep."""
+class Job:
+    """One measurement of a sweep; what is measured are the fields of a subclass.
+
+    It may travel to another machine: absolute paths and options, no large arrays.
+    """
 
     key: str  # Of everything that decides the result, see `content_key`
     label: str  # For messages
-    payload: Any  # What is measured: absolute paths and options, no arrays; it may travel to another machine
 
 
 class ProcessDied(Exception):  # noqa: N818 - it is handed over, not raised
@@ -74,8 +77,8 @@ def add_sweep_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def sweep(
-    points: Sequence[Point],
-    measure: Callable[[Any], Any],
+    points: Sequence[AJob],
+    measure: Callable[[AJob], Any],
     store: Path,
     *,
     kind: str,
@@ -85,42 +88,34 @@ def sweep(
     fresh: bool = False,
     label: str,
 ) -> JsonObject:
-    """Measure points, as far as the store does not know them.
+    """Measure jobs, as far as the store does not know them.
 
     Parameters
     ----------
-    points : sequence of Point
+    points : sequence of Job
         Begun in this order; of those with equal keys the first is measured.
     measure : callable
-        Payload to JSON values; a function of a module, since it crosses process borders.
+        Job to JSON values; a function of a module, since it crosses process borders.
     store : Path
-        SQLite file that keeps the results, in a folder that exists.
+        SQLite file that keeps the results, in a folder that exists; with `fresh` what it holds is forgotten.
     kind, version : str, int
         What is measured; a store of another one is refused. The version goes up when results mean something else.
-    jobs : int, optional
-        Processes at a time, whose libraries use one thread each; as many as there are cores by default.
-    scheduler : str, optional
-        Address of a Dask scheduler, on whose workers to measure instead.
-    fresh : bool
-        Forget what the store holds.
+    jobs, scheduler
+        Processes at a time (one a core), whose libraries use one thread each, or the address of a Dask scheduler.
     label : str
         Of the progress bar.
 
     Returns
     -------
     dict of str to JSON values
-        Result of each point by its key, in the order of the points, as JSON gives it back (tuples are lists).
+        Result of each job by its key, in their order, as JSON gives it back (tuples are lists).
 
     Raises
     ------
-    OptionError
-        If an option cannot be meant, the scheduler cannot be reached, or another sweep is writing to the store.
-    DataError
-        If the store is of something else.
     UnfinishedError
         If a process died; it carries the results that are there.
     SpikeloomError, OSError, MemoryError
-        What a measurement raised, with a note that names its point. Results that are there are kept.
+        What a measurement raised, with a note that names it; or an option or the store cannot be used.
     KeyboardInterrupt
         On an interrupt or a request to end; its text says what is kept.
     """
@@ -138,8 +133,7 @@ def sweep(
         there = tqdm(total=len(keys), initial=len(keys) - len(waiting), desc=label, unit="point", disable=None)
         with there as bar, ended_by_signal():
             try:
-                payloads = [point.payload for point in waiting]
-                for index, found in side_by_side(payloads, measure, jobs=jobs, scheduler=scheduler):
+                for index, found in side_by_side(waiting, measure, jobs=jobs, scheduler=scheduler):
                     if isinstance(found, ProcessDied):
                         raise UnfinishedError(f"{found}\n{standing()}", results)
                     if isinstance(found, Exception):
@@ -191,27 +185,10 @@ def side_by_side(
     jobs: int | None = None,
     scheduler: str | None = None,
 ) -> Iterator[tuple[int, AResult | Exception]]:
-    """Work on payloads in processes of their own, or on a cluster; a single one is worked on here.
+    """Work on payloads, begun in this order, in processes of their own or on a cluster; on a single one here.
 
-    Parameters
-    ----------
-    payloads : sequence
-        Begun in this order.
-    run : callable
-        Does the work; a function of a module.
-    jobs, scheduler
-        As for :func:`sweep`.
-
-    Yields
-    ------
-    (int, result)
-        Place of a payload and what `run` made of it, as they come: its value, the exception that it raised, or
-        `ProcessDied`, after which nothing comes.
-
-    Raises
-    ------
-    OptionError
-        If `jobs` or `scheduler` cannot be meant, or the scheduler cannot be reached.
+    Yields the place of a payload and what `run`, a function of a module, made of it, as they come: its value, the
+    exception that it raised, or `ProcessDied`, after which nothing comes.
     """
     if jobs is not None and jobs < 1:
         raise OptionError(f"--jobs {jobs}: allowed are 1 or more; choose another")
@@ -336,13 +313,7 @@ def ended_by_signal() -> Iterator[None]:
 
 @contextmanager
 def only_one(output: Path) -> Iterator[None]:
-    """Be the only process that works on `output`; ``NAME.lock`` beside it says so.
-
-    Raises
-    ------
-    OptionError
-        If another one works on it.
-    """
+    """Be the only process that works on `output`; ``NAME.lock`` beside it says so."""
     from filelock import FileLock, Timeout
 
     lock = FileLock(f"{output}.lock")

@@ -15,7 +15,7 @@ from spikeloom.runtime.commands.options import add_netlist_and_model, add_record
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.report.encode import encode
 from spikeloom.runtime.report.sections import Outcome
-from spikeloom.runtime.studies.jobs import Point, add_sweep_arguments, sweep
+from spikeloom.runtime.studies.jobs import Job, add_sweep_arguments, sweep
 from spikeloom.runtime.studies.stress.battery import NAMES, SEEDS
 from spikeloom.runtime.studies.stress.sections import picture, sections
 from spikeloom.runtime.studies.stress.study import Plan, Request, measure_task, study
@@ -51,19 +51,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> Outcome:
-    """Run the command; exit code 1 where a requirement is missed.
-
-    Raises
-    ------
-    SpikeloomError
-        If an option, the netlist, the checkpoint or the recordings cannot be used, or do not belong together.
-    """
+    """Run the command; exit code 1 where a requirement is missed."""
     plan, request = _plan(arguments), Request.of(arguments)
     apart = arguments.full or arguments.jobs is not None or arguments.scheduler
     with tempfile.TemporaryDirectory(prefix="spikeloom-") as folder:
         store = Path(folder) / "points" if arguments.output is None else Path(f"{arguments.output}.points")
 
-        def measured(points: Sequence[Point]) -> Mapping[str, Any]:
+        def measured(points: Sequence[Job]) -> Mapping[str, Any]:
             return sweep(
                 points,
                 measure_task,

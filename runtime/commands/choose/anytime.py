@@ -60,20 +60,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> Outcome:
-    """Run the command.
-
-    Raises
-    ------
-    SpikeloomError
-        If an option, the netlist, the checkpoint or the recordings cannot be used.
-    """
+    """Run the command."""
     for option, place in (("-o", arguments.output), ("--picture", arguments.picture)):
         if place is not None:
             require_place(place, option, arguments)
     allowed = _allowed(arguments)
     machine = integer_machine_for(arguments.netlist)
     data = _read(arguments.data, arguments.split, machine, arguments, limit=arguments.limit)
-    lengths = _lengths(data)
+    lengths = data.step_counts
     floats = _float_votes(arguments, machine, data)
     points = _races(arguments, machine)
     progress("running")
@@ -129,17 +123,13 @@ def _read(
     return data
 
 
-def _lengths(data: Recordings) -> IntArray:
-    return np.full(len(data), data.steps) if data.lengths is None else data.lengths.astype(np.int64)
-
-
 def _races(arguments: argparse.Namespace, machine: IntegerMachine) -> FloatArray | None:
     """Turning points of the races on the training split, if there is something to calibrate on."""
     if arguments.calibrate is None:
         return None
     training = _read(arguments.calibrate, "train", machine, arguments)
     progress("calibrating")
-    lengths = _lengths(training)
+    lengths = training.step_counts
     return exits.turning_points(exits.races(machine.votes_by_step(training.events, lengths), lengths))
 
 
@@ -155,7 +145,7 @@ def _float_votes(arguments: argparse.Namespace, machine: IntegerMachine, data: R
 
     loaded = load_network(arguments.checkpoint, arguments, machine.netlist)
     require_match(machine.netlist, loaded.model)
-    readout, lengths = loaded.network.readout, _lengths(data)
+    readout, lengths = loaded.network.readout, data.step_counts
     votes = []
     for first in range(0, len(data), PART):
         progress(f"float model: {first} of {len(data)}")

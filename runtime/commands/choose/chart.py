@@ -19,7 +19,7 @@ from spikeloom.runtime.studies.chart.choices import parse_budgets
 from spikeloom.runtime.studies.chart.grid import Grid, parse_grid
 from spikeloom.runtime.studies.chart.networks import given_networks, require_grid, require_suited
 from spikeloom.runtime.studies.chart.requests import FORMAT, Data, Facts
-from spikeloom.runtime.studies.jobs import Point, add_sweep_arguments, sweep
+from spikeloom.runtime.studies.jobs import Job, add_sweep_arguments, sweep
 
 STORE = "points.sqlite"
 
@@ -59,15 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> Outcome:
-    """Run the command; exit code 1 if no point fits a budget.
-
-    Raises
-    ------
-    SpikeloomError
-        If an option, a checkpoint, the recordings or the folder's store cannot be used.
-    KeyboardInterrupt
-        On an interrupt; its text says what is kept.
-    """
+    """Run the command; exit code 1 if no point fits a budget."""
     from spikeloom.models.training.protocols import data_digest  # torch: no other command waits for it
     from spikeloom.runtime.studies.chart import work
     from spikeloom.runtime.studies.chart.files import write_chart
@@ -93,7 +85,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     require_grid(networks, grid, stores)
     folder.mkdir(exist_ok=True)
 
-    def measured(jobs: Sequence[Point], label: str) -> Mapping[str, Any]:
+    def measured(jobs: Sequence[Job], label: str) -> Mapping[str, Any]:
         return sweep(
             jobs,
             work.measure,
@@ -129,13 +121,7 @@ def _command(arguments: argparse.Namespace) -> str:
 
 
 def _folder(words: str) -> Path:
-    """Folder of the chart.
-
-    Raises
-    ------
-    OptionError
-        If there cannot be one.
-    """
+    """Folder of the chart; refused if there cannot be one."""
     folder = Path(words)
     if folder.exists() and not folder.is_dir():
         raise OptionError(f"-o {words}: is not a folder; give the name of one")

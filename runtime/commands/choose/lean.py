@@ -50,13 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> Outcome:
-    """Run the command.
-
-    Raises
-    ------
-    SpikeloomError
-        If an option, a checkpoint or the recordings cannot be used.
-    """
+    """Run the command."""
     if not 0 <= arguments.differ < 1:
         raise OptionError(f"--differ {arguments.differ:g}: not a share; give a number from 0 to below 1")
     for option, place in (("-o", arguments.output), ("--report", arguments.report)):

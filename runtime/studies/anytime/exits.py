@@ -63,12 +63,8 @@ class Standing:
 def standing(votes: IntArray, lengths: IntArray) -> Standing:
     """Say who leads, by how much, and for how long that can still change.
 
-    Parameters
-    ----------
-    votes : (samples, steps, classes) int64
-        Votes so far after each step of the read-out; those of shorter recordings stay as they are from their end on.
-    lengths : (samples,) int64
-        Steps of each recording.
+    Votes so far, (samples, steps, classes); of recordings shorter than the longest they stay as they are from their
+    end on, `lengths` (samples,) says where.
     """
     ahead = votes[..., 0]
     if votes.shape[2] > 1:
@@ -91,14 +87,7 @@ def most_votes(machine: IntegerMachine, steps: int) -> IntArray:
 def proven(votes: IntArray, at: Standing, most: IntArray) -> BoolArray:
     """Whether the decision after each step is the last word, whatever follows; shape (samples, steps).
 
-    Parameters
-    ----------
-    votes : (samples, steps, classes) int64
-        As for :func:`standing`.
-    at : Standing
-        Of these votes.
-    most : (classes, longest + 1) int64
-        See :func:`most_votes`.
+    `most` (classes, longest + 1) is that of :func:`most_votes`.
     """
     classes = votes.shape[2]
     reach = votes + most.T[at.left]
@@ -109,35 +98,16 @@ def proven(votes: IntArray, at: Standing, most: IntArray) -> BoolArray:
 def exits(sure: BoolArray, at: Standing, factor: float = np.inf) -> IntArray:
     """Step of the read-out, from 0, after which each recording may end; shape (samples,).
 
-    Parameters
-    ----------
-    sure : (samples, steps) bool
-        See :func:`proven`.
-    at : Standing
-        Of the same votes.
-    factor : float
-        Votes per root of a step left by which the leader must be ahead; infinite for the proof alone.
+    By the proof, or where the leader is ahead by more than `factor` votes per root of a step left.
     """
     first: IntArray = np.argmax(sure | (at.confidence > factor), axis=1)
     return first
 
 
 def live(machine: IntegerMachine, bins: int, factor: float) -> Callable[[int, IntArray], bool]:
-    """Make the rule of a grasp of so many bins that is stepped live.
+    """The rule of a grasp of so many bins that is stepped live.
 
-    Parameters
-    ----------
-    machine : IntegerMachine
-        What is stepped.
-    bins : int
-        Length of the grasp.
-    factor : float
-        As for :func:`exits`.
-
-    Returns
-    -------
-    callable
-        Given a chip step, from 0, and the votes (classes,) after it, says whether the grasp may end.
+    It takes a chip step, from 0, and the votes (classes,) after it, and says whether the grasp may end.
     """
     most, depth = most_votes(machine, bins), machine.read_out_lag
 
@@ -191,13 +161,6 @@ def turning_points(at: Standing) -> FloatArray:
 
 def calibrate(points: FloatArray, allowed: float) -> Calibrated:
     """Smallest factor with which at most the share `allowed` of races ends otherwise, and so with every larger one.
-
-    Parameters
-    ----------
-    points : (races,) float64
-        See :func:`turning_points`.
-    allowed : float
-        From 0 to below 1.
 
     Examples
     --------

@@ -142,20 +142,7 @@ def study(
     calibrated_on: str | None = None,
     chosen: int | None = None,
 ) -> Anytime:
-    """Apply the proof and calibrated rules to recordings.
-
-    Parameters
-    ----------
-    machine : IntegerMachine
-    data : Recordings
-    ran : Cumulative
-        Their run.
-    calibrated : sequence of Calibrated
-    model_votes : (samples, steps, classes) int64, optional
-        Votes of the float model so far.
-    calibrated_on, chosen
-        To be remembered.
-    """
+    """Apply the proof and calibrated rules to recordings and their run; the float model's votes so far likewise."""
     at = exits.standing(ran.votes, ran.lengths)
     sure = exits.proven(ran.votes, at, exits.most_votes(machine, data.steps))
     model = None

@@ -181,12 +181,7 @@ class Budget:
 
 
 def parse_budgets(asked: Sequence[str]) -> tuple[Budget, ...]:
-    """Read the words of every ``--budget``.
-
-    Raises
-    ------
-    OptionError
-        If one cannot be understood, or one thing is limited twice.
+    """Read the words of every ``--budget``; an OptionError says which is none.
 
     Examples
     --------
@@ -221,11 +216,6 @@ def pick(points: Sequence[Point], budgets: Sequence[Budget], by: ChosenBy) -> Pi
 
     Where an accuracy is wanted, the cheapest point that fits; else the one that is expected to be right most often. If
     nothing fits, the point that misses by the smallest factor.
-
-    Raises
-    ------
-    OptionError
-        If time is limited and nothing is timed.
     """
     if not budgets:
         return None

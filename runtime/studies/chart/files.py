@@ -65,21 +65,12 @@ def csv_text(chart: Chart) -> str:
 
 
 def read_chart(words: str, sha256: str, checkpoint: str) -> Chart:
-    """A chart that a network is part of.
-
-    Parameters
-    ----------
-    words : str
-        Its ``chart.json``, or the folder that holds it.
-    sha256, checkpoint : str
-        Of the network's checkpoint, and its name for messages.
+    """The chart in a file or folder that a network with this checkpoint is part of.
 
     Raises
     ------
-    DataError
-        If there is no chart, or one of another version.
-    ModelError
-        If it is of other networks.
+    DataError, ModelError
+        If there is no chart, or one of another version or of other networks.
     """
     path = Path(words) / "chart.json" if Path(words).is_dir() else Path(words)
     if not path.is_file():

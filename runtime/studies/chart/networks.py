@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import product
+from dataclasses import dataclass, fields, replace
+from itertools import count, product
 from pathlib import Path
 from typing import Any
 
@@ -16,19 +16,82 @@ from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.formats.onnx.reader import SUFFIX
 from spikeloom.compiler.ir import Form
 from spikeloom.compiler.targets.base import Target
+from spikeloom.compiler.types import JsonObject
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.files import PRETRAINED, shipped
 from spikeloom.runtime.inputs.network import load_checkpoint, load_graph, propagation
 from spikeloom.runtime.machines.base import DEFAULT, chip_chart, trained_for
 from spikeloom.runtime.studies.chart.grid import Grid
-from spikeloom.runtime.studies.chart.requests import Source, Storage
-
-EPOCHS = 60
-"""Of a training on another graph that is suggested: most best epochs come before."""
 
 STORAGE_AXES = ("bits", "planes", "groups", "prune", "cores")
 """Axes of the grid that networks with a storage and layout of their own do not have."""
+
+
+def from_anywhere(path: str | None) -> str | None:
+    """A path that means the same in another folder; what is no file stays as it is."""
+    return str(Path(path).resolve()) if path and Path(path).exists() else path
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Source:
+    """A network's file, and how it is read; `target` is the chip of a network that was trained for one."""
+
+    path: str
+    graph: str | None = None
+    taxels: str | None = None
+    edges: str | None = None
+    directed: bool = False
+    system: str | None = None
+    run: int = 0
+    weights: str | None = None
+    beta: float | None = None
+    theta: float | None = None
+    target: str | None = None
+
+    def options(self) -> JsonObject:
+        """All but the file."""
+        return {field.name: getattr(self, field.name) for field in fields(self) if field.name != "path"}
+
+    def arguments(self) -> argparse.Namespace:
+        """As a command would have parsed them."""
+        others = dict.fromkeys(("polarities", "polarities_first", "dt", "convention"))
+        return argparse.Namespace(**self.options(), **others)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Storage:
+    """How a network is stored on the chip: width of all layers or of each, planes, scale groups, pruning.
+
+    It is a network's own if it was fine-tuned for it or trained in it; weights that have no width have `levels`.
+    """
+
+    bits: tuple[int, ...]
+    planes: int
+    groups: int
+    prune: bool
+    own: bool = False
+    levels: int | None = None
+
+    def options(self) -> JsonObject:
+        """Options of ``compile`` that ask for it, where it is not the usual one."""
+        if self.own:
+            return {}
+        return {
+            "weight_bits": None if self.bits == (8,) else ",".join(map(str, self.bits)),
+            "planes": None if self.planes == 1 else str(self.planes),
+            "scale_groups": None if self.groups == 1 else str(self.groups),
+            "prune_unused": self.prune,
+        }
+
+    def label(self) -> str:
+        """Short name: ``4b``, ``8-4-4-8b 2p 3g pruned``, ``7 levels``."""
+        if self.levels is not None:
+            return f"{self.levels} levels"
+        parts = [f"{'-'.join(map(str, self.bits))}b"]
+        parts += [] if self.planes == 1 else [f"{self.planes}p"]
+        parts += [] if self.groups == 1 else [f"{self.groups}g"]
+        return " ".join([*parts, *(["pruned"] if self.prune else [])])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -60,6 +123,17 @@ class Given:
             return None
         return float(counts["correct"] / counts["samples"])
 
+    @property
+    def identity(self) -> JsonObject:
+        """What tells it from others, wherever its file is."""
+        about = {"checkpoint": self.sha256, "weights": self.weights, "sees": self.sees}
+        return about | {"options": self.source.options()}
+
+    def from_anywhere(self) -> Given:
+        """The same for a process that works in another folder."""
+        files = {name: from_anywhere(getattr(self.source, name)) for name in ("path", "taxels", "edges")}
+        return replace(self, source=replace(self.source, **files))
+
     def storages(self, grid: Grid) -> Iterator[Storage]:
         """Every storage that a grid asks for; of a network that was trained in one its own and no other."""
         if self.levels is not None:
@@ -83,14 +157,7 @@ class Given:
 
 
 def given_networks(arguments: argparse.Namespace, grid: Grid) -> tuple[Given, ...]:
-    """Networks of a chart, those of graphs that the grid leaves out not among them.
-
-    Parameters
-    ----------
-    arguments : Namespace
-        ``checkpoints``, ``data`` and the options of :func:`options.add_model`.
-    grid : Grid
-        Whose graphs choose.
+    """Networks of ``checkpoints``, those of graphs that the grid leaves out not among them.
 
     Raises
     ------
@@ -102,13 +169,26 @@ def given_networks(arguments: argparse.Namespace, grid: Grid) -> tuple[Given, ..
         if paths.count(path) > 1:
             raise OptionError(f"{path}: is given twice; give each checkpoint once")
     networks = [_read(path, arguments) for path in paths]
+    trained = {_plain(network.graph): network.graph for network in networks}
     for graph in grid.graph:
-        if all(_plain(graph) != _plain(network.graph) for network in networks):
-            raise _untrained(graph, networks, arguments.data)
-    if grid.graph:
-        wanted = [_plain(graph) for graph in grid.graph]
-        networks = [network for network in networks if _plain(network.graph) in wanted]
-    return _named(networks)
+        if _plain(graph) not in trained:
+            raise OptionError(
+                f"--grid graph={graph}: no checkpoint was trained on that graph, those given on "
+                f"{', '.join(trained.values())}; spikeloom train --graph {graph} makes one"
+            )
+    wanted = [_plain(graph) for graph in grid.graph or trained]
+    named: dict[str, Given] = {}
+    for network in networks:
+        if _plain(network.graph) in wanted:
+            name = next(name for name in _names(network.name) if name not in named)
+            named[name] = replace(network, name=name)
+    return tuple(named.values())
+
+
+def _names(name: str) -> Iterator[str]:
+    """Names for networks whose files have the same: counted from the second."""
+    yield name
+    yield from (f"{name}-{number}" for number in count(2))
 
 
 def _read(path: str, arguments: argparse.Namespace) -> Given:
@@ -152,38 +232,8 @@ def _plain(graph: str) -> str:
     return re.sub(r"[^A-Za-z0-9.]", "", graph).strip(".")
 
 
-def _untrained(graph: str, there: Sequence[Given], data: str) -> OptionError:
-    """Error of a graph that no checkpoint was trained on; says which command trains one."""
-    bins = there[0].bins
-    options = {"data": data, "graph": graph, "epochs": EPOCHS, "join": bins if bins > 1 else None}
-    train = repeat.command("train", *repeat.words(options), "-o", f"{_plain(graph)}.pt")
-    others = ", ".join(dict.fromkeys(network.graph for network in there))
-    return OptionError(
-        f"--grid graph={graph}: no checkpoint was trained on that graph, those given on {others}; train one and "
-        f"name it: {train}"
-    )
-
-
-def _named(networks: Sequence[Given]) -> tuple[Given, ...]:
-    """Networks with names of their own: files of one name in different folders are counted."""
-    named: dict[str, Given] = {}
-    for network in networks:
-        name, again = network.name, 1
-        while name in named:
-            again += 1
-            name = f"{network.name}-{again}"
-        named[name] = replace(network, name=name)
-    return tuple(named.values())
-
-
 def require_suited(networks: Sequence[Given], splits: Mapping[str, Recordings], digest: str) -> None:
-    """Refuse networks that do not belong together, or were trained on other recordings than these of this hash.
-
-    Raises
-    ------
-    ModelError
-        Naming both.
-    """
+    """Refuse networks that do not belong together, or were trained on other recordings than these of this hash."""
     first = networks[0]
     for network in networks:
         sizes = [(each.taxels, each.classes) for each in (first, network)]
@@ -200,13 +250,7 @@ def require_suited(networks: Sequence[Given], splits: Mapping[str, Recordings], 
 
 
 def require_grid(networks: Sequence[Given], grid: Grid, target: Target) -> None:
-    """Refuse widths and layouts by layer that do not suit a network's layers, and those that no network has.
-
-    Raises
-    ------
-    OptionError
-        Naming the network, or the axis.
-    """
+    """Refuse widths and layouts by layer that do not suit a network's layers, and those that no network has."""
     own = [network.target for network in networks if network.levels is not None]
     if len(own) == len(networks):
         axes = [axis for axis in STORAGE_AXES if getattr(grid, axis) != getattr(Grid(), axis)]

@@ -5,9 +5,8 @@ A network is rounded once for any number of layouts, a netlist is compiled once 
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,8 @@ from spikeloom.compiler.types import JsonObject
 from spikeloom.models.recordings.windows import WHOLE
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.report.encode import encode
-from spikeloom.runtime.studies.jobs import content_key
+from spikeloom.runtime.studies.chart.networks import Given, Storage, from_anywhere
+from spikeloom.runtime.studies.jobs import Job, content_key
 
 FORMAT = 1
 """Of what is measured; goes up when a figure means something else."""
@@ -26,72 +26,98 @@ SPLITS = ("train", "test")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Source:
-    """A network's file and the options of :func:`options.add_model` that it is read with.
-
-    `target` is the chip of a network that was trained for one.
-    """
+class Data:
+    """Where recordings are, seconds of a bin, and the hash over both splits that every process must find."""
 
     path: str
-    graph: str | None = None
-    taxels: str | None = None
-    edges: str | None = None
-    directed: bool = False
-    system: str | None = None
-    run: int = 0
-    weights: str | None = None
-    beta: float | None = None
-    theta: float | None = None
-    target: str | None = None
-
-    def options(self) -> JsonObject:
-        """All but the file."""
-        return {field.name: getattr(self, field.name) for field in fields(self) if field.name != "path"}
-
-    def arguments(self) -> argparse.Namespace:
-        """As a command would have parsed them."""
-        others = dict.fromkeys(("polarities", "polarities_first", "dt", "convention"))
-        return argparse.Namespace(**self.options(), **others)
-
-    def from_anywhere(self) -> Source:
-        """The same for a process that works in another folder."""
-        taxels, edges = (path and whole(path) for path in (self.taxels, self.edges))
-        return replace(self, path=whole(self.path), taxels=taxels, edges=edges)
+    bin_s: float
+    sha256: str | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Storage:
-    """How a network is stored on the chip: width of all layers or of each, planes, scale groups, pruning.
+class Decide(Job):
+    """Decisions of a float model when parts of each recording have passed, in per cent."""
 
-    It is a network's own if it was fine-tuned for it or trained in it; weights that have no width have `levels`.
-    """
+    network: Given
+    data: Data
+    windows: tuple[int, ...]
 
-    bits: tuple[int, ...]
-    planes: int
-    groups: int
-    prune: bool
-    own: bool = False
-    levels: int | None = None
 
-    def options(self) -> JsonObject:
-        """Options of ``compile`` that ask for it, where it is not the usual one."""
-        if self.own:
-            return {}
-        return {
-            "weight_bits": None if self.bits == (8,) else ",".join(map(str, self.bits)),
-            "planes": None if self.planes == 1 else str(self.planes),
-            "scale_groups": None if self.groups == 1 else str(self.groups),
-            "prune_unused": self.prune,
-        }
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Build(Job):
+    """A network in one storage, rounded once for several layouts, and the file that keeps each netlist."""
 
-    def label(self) -> str:
-        """Short name: ``4b``, ``8-4-4-8b 2p 3g pruned``, ``7 levels``."""
-        if self.levels is not None:
-            return f"{self.levels} levels"
-        parts = [f"{'-'.join(map(str, self.bits))}b"]
-        parts += [] if self.planes == 1 else [f"{self.planes}p"]
-        parts += [] if self.groups == 1 else [f"{self.groups}g"]
-        return " ".join([*parts, *(["pruned"] if self.prune else [])])
+    network: Given
+    storage: Storage
+    files: Mapping[str, Path]
+    data: Data
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Built:
+    """Size and hash of a netlist, or the limits that it breaks."""
+
+    sha256: str = ""
+    cores: int = 0
+    neurons: int = 0
+    synapses: int = 0
+    refused: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Run(Job):
+    """A netlist, with what makes it should its file be gone, on a part of every recording."""
+
+    build: Build
+    layout: str
+    built: Built
+    window: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Facts:
+    """What decides every result, beside what a single one is about."""
+
+    data: Data
+    targets: Mapping[str, Target]
+    folder: Path
+
+    def _key(self, network: Given, what: str, **about: Any) -> str:
+        shared = {"format": FORMAT, "spikeloom": __version__, "data": self.data.sha256, "bin_s": self.data.bin_s}
+        return content_key(shared | {"target": repr(self.targets[network.target]), "what": what} | encode(about))
+
+    @property
+    def _data(self) -> Data:
+        return replace(self.data, path=str(from_anywhere(self.data.path)))
+
+    def decide(self, network: Given, windows: tuple[int, ...]) -> Decide:
+        """Work that finds the decisions of a float network."""
+        key = self._key(network, "float", **network.identity, windows=windows)
+        travelling = network.from_anywhere()
+        return Decide(key=key, label=f"{network.name} float", network=travelling, data=self._data, windows=windows)
+
+    def build(self, network: Given, storage: Storage, layouts: tuple[str, ...]) -> Build:
+        """Work that compiles a network in a storage."""
+        about = network.identity | {"storage": storage}
+        folder = self.folder.resolve() / "netlists"
+        names = {layout: self._key(network, "netlist", **about, layout=layout) for layout in layouts}
+        return Build(
+            key=self._key(network, "build", **about, layouts=layouts),
+            label=f"{network.name} {storage.label()}",
+            network=network.from_anywhere(),
+            storage=storage,
+            files={layout: folder / f"{name}.loom" for layout, name in names.items()},
+            data=self._data,
+        )
+
+    def run(self, build: Build, layout: str, built: Built, window: int) -> Run:
+        """Work that measures a netlist."""
+        key = self._key(build.network, "run", netlist=built.sha256, window=window)
+        label = f"{build.label} {layout} {window}%"
+        return Run(key=key, label=label, build=build, layout=layout, built=built, window=window)
+
+
+# -- commands ----------------------------------------------------------------------------------------------------------
 
 
 def layout_options(layout: str) -> JsonObject:
@@ -109,84 +135,12 @@ def layout_options(layout: str) -> JsonObject:
     return {"optimize": layout}
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Data:
-    """Where recordings are, seconds of a bin, and the hash over both splits that every process must find."""
-
-    path: str
-    bin_s: float
-    sha256: str | None = None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Decide:
-    """Decisions of a float model when parts of each recording have passed, in per cent."""
-
-    source: Source
-    sha256: str
-    data: Data
-    windows: tuple[int, ...]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Build:
-    """A network in one storage, rounded once for several layouts, and the file that keeps each netlist."""
-
-    source: Source
-    sha256: str
-    storage: Storage
-    files: Mapping[str, Path]
-    data: Data
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Run:
-    """A netlist, with what makes it should its file be gone, on a part of every recording."""
-
-    build: Build
-    layout: str
-    sha256: str
-    window: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Facts:
-    """What decides every result, beside what a single one is about."""
-
-    data: Data
-    targets: Mapping[str, Target]
-    folder: Path
-
-    @property
-    def data_anywhere(self) -> Data:
-        """The recordings for a process that works in another folder."""
-        return replace(self.data, path=whole(self.data.path))
-
-    def key(self, target: str, **about: Any) -> str:
-        """Content key of a piece of work for a chip."""
-        shared = {"format": FORMAT, "spikeloom": __version__, "data": self.data.sha256, "bin_s": self.data.bin_s}
-        return content_key(shared | {"target": repr(self.targets[target])} | encode(about))
-
-
-def whole(path: str) -> str:
-    """A path that means the same in another folder."""
-    return str(Path(path).resolve()) if Path(path).exists() else path
-
-
-# -- commands ----------------------------------------------------------------------------------------------------------
-
-
-def compile_command(name: str, source: Source, storage: Storage, layout: str, data: Data) -> tuple[str, str]:
-    """What to type for the netlist of a network of this name, and the name of the file that this writes."""
-    parts = [name, *storage.label().split(), *([] if layout == "cores" else [layout])]
+def commands(network: Given, storage: Storage, layout: str, window: int, data: Data) -> tuple[str, str]:
+    """What to type for the netlist of a network, and for its figures on a part of every recording."""
+    parts = [network.name, *storage.label().split(), *([] if layout == "cores" else [layout])]
     file = "-".join(parts).replace(":", "").replace("+", "-") + ".loom"
     calibrated = {} if storage.levels is not None else {"calibrate": data.path, "bin": data.bin_s}
-    options = source.options() | storage.options() | calibrated | layout_options(layout)
-    return repeat.command("compile", source.path, *repeat.words(options), "-o", file), file
-
-
-def run_command(file: str, window: int, data: Data) -> str:
-    """What to type for the figures of a netlist."""
+    stored = repeat.words(network.source.options() | storage.options() | calibrated | layout_options(layout))
     part = None if window == WHOLE else f"{window}%"
-    options = {"data": data.path, "bin": data.bin_s, "detail": "counts", "window": part}
-    return repeat.command("run", file, *repeat.words(options))
+    read = repeat.words({"data": data.path, "bin": data.bin_s, "detail": "counts", "window": part})
+    return repeat.command("compile", network.source.path, *stored, "-o", file), repeat.command("run", file, *read)

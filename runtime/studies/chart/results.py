@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from spikeloom.runtime.report.encode import key
 from spikeloom.runtime.report.intervals import wilson
@@ -255,7 +255,7 @@ def price(costs: Mapping[str, float], table: str) -> float:
     return costs[table] if table in costs else next(iter(costs.values()))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Axis:
     """A cost that accuracy is drawn over: its title, the words below the axis, the unit, and the cost of a point."""
 
@@ -270,24 +270,21 @@ def axes(chart: Chart, *, measured: bool = False) -> dict[str, Axis]:
     energy, time = chart.chosen_by.energy, chart.chosen_by.time
     _, beside = by_chip(chart.points, chart.target)
 
-    def others(costs: Callable[[Point], Mapping[str, float]], table: str) -> str:
-        """Tables by which the points of other chips are drawn."""
+    def tables(costs: Callable[[Point], Mapping[str, float]], table: str) -> str:
+        """The table of a cost, and those by which the points of other chips are drawn."""
         firsts = dict.fromkeys((point.target, next(iter(costs(point)))) for point in beside)
-        return "".join(f"; {target}: {first}" for target, first in firsts if first != table)
+        return "; ".join([table, *(f"{target}: {first}" for target, first in firsts if first != table)])
 
-    def axis(title: str, words: str, unit: str, value: Callable[[Point], float]) -> Axis:
-        return Axis(title=title, words=words, unit=unit, value=value)
-
-    named = f"energy of a mean inference ({energy}{others(lambda point: point.test.energy_j, energy)})"
-    found = {"energy": axis("energy", named, "J", lambda point: price(point.test.energy_j, energy))}
+    named = f"energy of a mean inference ({tables(lambda point: point.test.energy_j, energy)})"
+    found = {"energy": Axis("energy", named, "J", lambda point: price(point.test.energy_j, energy))}
     if time is not None:
-        named = f"time of a mean inference on the chip ({time}{others(lambda point: point.test.time_s, time)})"
-        found["latency"] = axis("time on the chip", named, "s", lambda point: price(point.test.time_s, str(time)))
+        named = f"time of a mean inference on the chip ({tables(lambda point: point.test.time_s, time)})"
+        found["latency"] = Axis("time on the chip", named, "s", lambda point: price(point.test.time_s, time))
     named = "synaptic operations of a mean inference"
-    found["operations"] = axis("synaptic operations", named, "", lambda point: point.test.synaptic_operations)
-    found["cores"] = axis("cores", "cores in use", "", lambda point: float(point.n_cores))
+    found["operations"] = Axis("synaptic operations", named, "", lambda point: point.test.synaptic_operations)
+    found["cores"] = Axis("cores", "cores in use", "", lambda point: float(point.n_cores))
     if measured:
-        rates: Any = chart.measured.recordings_per_s
+        rates = chart.measured.recordings_per_s
         named = "recordings a second on one thread, decisions only, measured where the chart was made"
-        found["speed"] = axis("speed of the simulator", named, "", lambda point: float(rates[str(point.number)]))
+        found["speed"] = Axis("speed of the simulator", named, "", lambda point: rates[str(point.number)])
     return found

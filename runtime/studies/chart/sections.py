@@ -48,13 +48,16 @@ def sections(chart: Chart) -> list[Section]:
         f"choices are made on the training split by what is expected: {chart.expected}; test figures are reported "
         "beside"
     )
+    _, others = by_chip(chart.points, chart.target)
+    meanings = [Text(MEANINGS), *([Text(BESIDE)] if others else [])]
+    saving = Section("Less energy than the usual mapping", [saved(chart)])
     return [
         Section("Networks", [Text(summary), Section("", [_networks(chart)])]),
+        Section("Which one to deploy", [Facts(_cards(chart)), Section("", taken(chart)), saving, *_budget(chart)]),
         Section(
-            "Which one to deploy",
-            [Facts(_cards(chart)), Section("", taken(chart)), *_saving(chart), *_budget(chart)],
+            "Accuracy against cost",
+            [*_figures(chart), *_fronts(chart), *_others(chart), Details("What is drawn", meanings, unfolded=True)],
         ),
-        Section("Accuracy against cost", [*_figures(chart), *_fronts(chart), *_others(chart), *_hint(chart)]),
         Section("Every point", [*_points(chart), *_refused(chart)]),
         Section("Provenance", [Details("Files, grid and tables", _provenance(chart), unfolded=True)]),
     ]
@@ -68,28 +71,23 @@ def printed(chart: Chart, folder: str) -> list[Section]:
 
 def taken(chart: Chart) -> list[Block]:
     """Recommended points, and the commands that make them; for the page of a network, too."""
-    named = [(number, name) for number, names in chart.taken.items() for name in names]
-    order = list(chart.recommended)
-    named.sort(key=lambda each: order.index(each[1]))
-    rows = [[NAMES[name], *_cells(chart.chosen_by, chart.point(number))] for number, name in named]
+    named = [(name, number) for name, number in chart.recommended.items() if number is not None]
+    rows = [[NAMES[name], *_cells(chart.chosen_by, chart.point(number))] for name, number in named]
     missing = [f"  {NAMES[name]}: no point" for name, number in chart.recommended.items() if number is None]
     return [
         Text("recommended:"),
         Table(["", *_head(chart.chosen_by)], rows, "Recommended points; test figures beside"),
         *(Text(line) for line in missing),
-        *_commands(chart.point(number) for number in dict.fromkeys(number for number, _ in named)),
+        *_commands(chart.point(number) for number in dict.fromkeys(number for _, number in named)),
     ]
 
 
 def figures(chart: Chart, prefix: str = "chart", *, measured: bool = False) -> list[Figure]:
     """Test accuracy over each cost."""
+    titles = {name: f"Test accuracy over {axis.title}" for name, axis in axes(chart, measured=measured).items()}
     return [
-        Figure(
-            f"{prefix}-{name}",
-            partial(panels, chart, [name], f"Test accuracy over {axis.title}", measured=measured),
-            f"Test accuracy over {axis.title}.",
-        )
-        for name, axis in axes(chart, measured=measured).items()
+        Figure(f"{prefix}-{name}", partial(panels, chart, [name], title, measured=measured), f"{title}.")
+        for name, title in titles.items()
     ]
 
 
@@ -158,8 +156,8 @@ def _tip(chart: Chart, point: Point) -> str:
 def _figures(chart: Chart) -> list[Block]:
     """One figure at a time, energy first."""
     return [
-        Details(f"over {figure.caption.removeprefix('Test accuracy over ').removesuffix('.')}", [figure], "cost", first)
-        for figure, first in ((each, each.name == "chart-energy") for each in figures(chart, measured=True))
+        Details(f"over {axis.title}", [figure], "cost", unfolded=name == "energy")
+        for (name, axis), figure in zip(axes(chart, measured=True).items(), figures(chart, measured=True), strict=True)
     ]
 
 
@@ -230,12 +228,15 @@ def _fronts(chart: Chart) -> list[Block]:
     blocks: list[Block] = []
     for name in ("energy", "latency"):
         on = sorted((p for p in chart.points if p.front.get(name)), key=lambda point: point.test.accuracy)
-        if on:
-            told = Text(f"front of test accuracy and {name} (a description, no choice):")
-            rows = [_cells(chart.chosen_by, point) for point in on]
-            caption = f"Front of test accuracy and {name}"
-            blocks.append(Section("", [told, Table(_head(chart.chosen_by), rows, caption, most=LISTED)]))
+        told, caption = "(a description, no choice)", f"Front of test accuracy and {name}"
+        blocks += _listed(f"front of test accuracy and {name} {told}:", on, chart.chosen_by, caption) if on else []
     return blocks
+
+
+def _listed(words: str, points: Sequence[Point], by: ChosenBy, caption: str) -> list[Block]:
+    """Some points as a table of their own."""
+    rows = [_cells(by, point) for point in points]
+    return [Section("", [Text(words), Table(_head(by), rows, caption, most=LISTED)])]
 
 
 def _others(chart: Chart) -> list[Block]:
@@ -244,16 +245,10 @@ def _others(chart: Chart) -> list[Block]:
     blocks: list[Block] = []
     for chip in dict.fromkeys(point.target for point in others):
         own = [point for point in others if point.target == chip]
-        told = Text(f"on {chip}, whose prices are others (no choice, no front):")
+        words = f"on {chip}, whose prices are others (no choice, no front):"
         by = ChosenBy(energy=next(iter(own[0].test.energy_j)), time=next(iter(own[0].test.time_s), None))
-        rows = [_cells(by, point) for point in own]
-        blocks.append(Section("", [told, Table(_head(by), rows, f"Points of {chip}", most=LISTED)]))
+        blocks += _listed(words, own, by, f"Points of {chip}")
     return blocks
-
-
-def _hint(chart: Chart) -> list[Block]:
-    _, others = by_chip(chart.points, chart.target)
-    return [Details("What is drawn", [Text(MEANINGS), *([Text(BESIDE)] if others else [])], unfolded=True)]
 
 
 def _times(ratios: Mapping[str, float | None], what: str) -> str:
@@ -277,10 +272,6 @@ def saved(chart: Chart) -> Text:
             f"accuracy {100 * other.accuracy:+.2f} points"
         )
     return Text("\n".join(lines))
-
-
-def _saving(chart: Chart) -> list[Block]:
-    return [Section("Less energy than the usual mapping", [saved(chart)])]
 
 
 def _budget(chart: Chart) -> list[Block]:

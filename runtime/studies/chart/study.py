@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 from spikeloom.compiler import __version__
@@ -19,16 +19,7 @@ from spikeloom.runtime.studies.chart import choices
 from spikeloom.runtime.studies.chart.choices import Budget
 from spikeloom.runtime.studies.chart.grid import Grid
 from spikeloom.runtime.studies.chart.networks import Given
-from spikeloom.runtime.studies.chart.requests import (
-    SPLITS,
-    Build,
-    Decide,
-    Facts,
-    Run,
-    Storage,
-    compile_command,
-    run_command,
-)
+from spikeloom.runtime.studies.chart.requests import SPLITS, Build, Built, Facts, Run, commands
 from spikeloom.runtime.studies.chart.results import (
     Chart,
     ChartedData,
@@ -42,48 +33,11 @@ from spikeloom.runtime.studies.chart.results import (
     by_chip,
     share,
 )
-from spikeloom.runtime.studies.chart.work import Built, Decisions, Ran, RanBoth
-from spikeloom.runtime.studies.jobs import Point as Job
+from spikeloom.runtime.studies.chart.work import Decisions, Ran, RanBoth
+from spikeloom.runtime.studies.jobs import Job
 
 Sweep = Callable[[Sequence[Job], str], Mapping[str, Any]]
 """Measures jobs under a heading; their JSON by key."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Stored:
-    """A network in one storage, in all layouts of the grid, and the work that compiles it."""
-
-    network: Given
-    storage: Storage
-    build: Build
-    job: Job
-
-    def named(self, layout: str) -> JsonObject:
-        """Fields of a :class:`results.Configuration`."""
-        network, storage = self.network, self.storage
-        return {
-            "network": network.name,
-            "target": network.target,
-            "graph": network.graph,
-            "bits": storage.bits,
-            "planes": storage.planes,
-            "groups": storage.groups,
-            "prune": storage.prune,
-            "fine_tuned": storage.own,
-            "storage": storage.label(),
-            "cores": layout,
-        }
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Planned:
-    """A netlist on a part of every recording."""
-
-    stored: Stored
-    layout: str
-    built: Built
-    window: int
-    job: Job
 
 
 def chart(
@@ -97,46 +51,38 @@ def chart(
     command: str,
     sweep: Sweep,
 ) -> Chart:
-    """Measure a grid and choose.
+    """Measure a grid and choose, by a table of energy, among points of the chip of the first network.
 
-    Parameters
-    ----------
-    networks : sequence of Given
-        The chip of the first is the one that points are chosen for.
-    grid, budgets
-        What was asked for.
-    splits : mapping of str to Recordings
-        ``train`` and ``test``.
-    facts : Facts
-    energy : str
-        Table of prices to choose by.
-    command : str
-        What to type for the same chart.
-    sweep : callable
-        Where the work is done.
-
-    Raises
-    ------
-    OptionError
-        If the chip refuses all configurations.
+    `command` repeats it; an OptionError says that the chip refuses all configurations.
     """
     target = networks[0].target
     times = {name: _times(facts, name) for name in facts.targets}
     by = ChosenBy(energy=energy, time=next(iter(times[target]), None))
-    floats = {network.name: _decisions(network, grid, facts) for network in networks}
-    stored = [_stored(network, storage, grid, facts) for network in networks for storage in network.storages(grid)]
-    first = sweep([*floats.values(), *(each.job for each in stored)], "compiling")
-    planned, refused = _plan(stored, first, grid, facts)
-    if not any(each.stored.network.target == target for each in planned):
+    windows = tuple(sorted(grid.window))
+    floats = {network.name: facts.decide(network, windows) for network in networks}
+    builds = [
+        facts.build(network, storage, network.layouts(grid))
+        for network in networks
+        for storage in network.storages(grid)
+    ]
+    first = sweep([*floats.values(), *builds], "compiling")
+    built = [(build, layout, decode(Built, found)) for build in builds for layout, found in first[build.key].items()]
+    runs = [facts.run(*each, window) for each in built if not each[2].refused for window in grid.window]
+    refused = [
+        Refused(**_configuration(build, layout), why=found.refused) for build, layout, found in built if found.refused
+    ]
+    if not any(run.build.network.target == target for run in runs):
         raise OptionError(f"--grid: {target} refuses all {len(refused)} configurations; the first: {refused[0].why[0]}")
-    second = sweep([each.job for each in planned], "measuring")
+    second = sweep(runs, "measuring")
     labels = {split: splits[split].labels for split in SPLITS}
     decided: dict[str, Decisions] = {name: first[job.key] for name, job in floats.items()}
-    ran = [decode(RanBoth, second[each.job.key]) for each in planned]
-    points = [
-        _point(number, each, both, decided[each.stored.network.name], labels, facts)
-        for number, (each, both) in enumerate(zip(planned, ran, strict=True), 1)
-    ]
+    ran = [decode(RanBoth, second[run.key]) for run in runs]
+    known = {network.name: network for network in networks}
+    points = []
+    for number, (run, both) in enumerate(zip(runs, ran, strict=True), 1):
+        name, storage = run.build.network.name, run.build.storage
+        typed = commands(known[name], storage, run.layout, run.window, facts.data)
+        points.append(_point(number, run, both, decided[name], labels, typed))
     charted = [_network(network, decided[network.name], labels) for network in networks]
     (own, others), (chosen_of, beside) = by_chip(points, target), by_chip(charted, target)
     own, chosen_of, expected = choices.with_expectations(own, chosen_of)
@@ -184,80 +130,42 @@ def _times(facts: Facts, target: str) -> dict[str, str]:
     return {table.name: table.title for table in chip.time}
 
 
-# -- work --------------------------------------------------------------------------------------------------------------
-
-
-def _identity(network: Given) -> JsonObject:
-    """What tells a network from others, wherever its file is."""
-    about = {"checkpoint": network.sha256, "weights": network.weights, "sees": network.sees}
-    return about | {"options": encode(network.source.options())}
-
-
-def _decisions(network: Given, grid: Grid, facts: Facts) -> Job:
-    """Work that finds the decisions of a float network."""
-    source = network.source.from_anywhere()
-    work = Decide(source=source, sha256=network.sha256, data=facts.data_anywhere, windows=tuple(sorted(grid.window)))
-    key = facts.key(network.target, what="float", **_identity(network), windows=work.windows)
-    return Job(key=key, label=f"{network.name} float", payload=work)
-
-
-def _stored(network: Given, storage: Storage, grid: Grid, facts: Facts) -> Stored:
-    """A network in a storage, with the work that compiles it."""
-    layouts = network.layouts(grid)
-    about = _identity(network) | {"storage": storage}
-    keys = {layout: facts.key(network.target, what="netlist", **about, layout=layout) for layout in layouts}
-    files = {layout: facts.folder.resolve() / "netlists" / f"{key}.loom" for layout, key in keys.items()}
-    build = Build(
-        source=network.source.from_anywhere(),
-        sha256=network.sha256,
-        storage=storage,
-        files=files,
-        data=facts.data_anywhere,
-    )
-    key = facts.key(network.target, what="build", **about, layouts=layouts)
-    job = Job(key=key, label=f"{network.name} {storage.label()}", payload=build)
-    return Stored(network=network, storage=storage, build=build, job=job)
-
-
-def _plan(
-    stored: Sequence[Stored], first: Mapping[str, Any], grid: Grid, facts: Facts
-) -> tuple[list[Planned], list[Refused]]:
-    """What is to be run, and what the chip refuses."""
-    planned, refused = [], []
-    for each in stored:
-        for layout, value in first[each.job.key].items():
-            built = decode(Built, value)
-            if built.refused:
-                refused.append(Refused(**each.named(layout), why=built.refused))
-                continue
-            for window in grid.window:
-                key = facts.key(each.network.target, what="run", netlist=built.sha256, window=window)
-                run = Run(build=each.build, layout=layout, sha256=built.sha256, window=window)
-                job = Job(key=key, label=f"{each.job.label} {layout} {window}%", payload=run)
-                planned.append(Planned(stored=each, layout=layout, built=built, window=window, job=job))
-    return planned, refused
-
-
 # -- results -----------------------------------------------------------------------------------------------------------
 
 
+def _configuration(build: Build, layout: str) -> JsonObject:
+    """Fields of a :class:`results.Configuration`."""
+    network, storage = build.network, build.storage
+    return {
+        "network": network.name,
+        "target": network.target,
+        "graph": network.graph,
+        "bits": storage.bits,
+        "planes": storage.planes,
+        "groups": storage.groups,
+        "prune": storage.prune,
+        "fine_tuned": storage.own,
+        "storage": storage.label(),
+        "cores": layout,
+    }
+
+
 def _point(
-    number: int, planned: Planned, ran: RanBoth, decided: Decisions, labels: Mapping[str, IntArray], facts: Facts
+    number: int, run: Run, ran: RanBoth, decided: Decisions, labels: Mapping[str, IntArray], typed: tuple[str, str]
 ) -> Point:
-    each, built, window = planned.stored, planned.built, str(planned.window)
-    compiled, file = compile_command(each.network.name, each.network.source, each.storage, planned.layout, facts.data)
+    built, window = run.built, str(run.window)
     return Point(
         number=number,
-        **each.named(planned.layout),
-        window=planned.window,
+        **_configuration(run.build, run.layout),
+        window=run.window,
         n_cores=built.cores,
         neurons=built.neurons,
         synapses=built.synapses,
-        netlist=f"netlists/{each.build.files[planned.layout].name}",
+        netlist=f"netlists/{run.build.files[run.layout].name}",
         netlist_sha256=built.sha256,
         train=_figures(ran.train, decided["train"][window], labels["train"]),
         test=_figures(ran.test, decided["test"][window], labels["test"]),
-        commands=(compiled, run_command(file, planned.window, facts.data)),
+        commands=typed,
     )
 
 

@@ -31,24 +31,14 @@ from spikeloom.runtime.inputs.recordings import recordings
 from spikeloom.runtime.machines.base import DEFAULT, Machine, chip_chart, machine_for
 from spikeloom.runtime.machines.votes import readout_counts
 from spikeloom.runtime.report.encode import encode
-from spikeloom.runtime.studies.chart.requests import SPLITS, Build, Data, Decide, Run, Source, layout_options
+from spikeloom.runtime.studies.chart.networks import Given, Source
+from spikeloom.runtime.studies.chart.requests import SPLITS, Build, Built, Data, Decide, Run, layout_options
 
 PART = 16
 """Recordings whose float spikes are held at a time."""
 
 Decisions = Mapping[str, Mapping[str, tuple[int, ...]]]
 """Of a float model, by split and window."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Built:
-    """Size and hash of a netlist, or the limits that it breaks."""
-
-    sha256: str = ""
-    cores: int = 0
-    neurons: int = 0
-    synapses: int = 0
-    refused: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,13 +63,7 @@ class RanBoth:
 
 
 def measure(work: Decide | Build | Run) -> Any:
-    """Do one piece of a chart's work; the JSON of `Decisions`, of `Built` by layout, or of `RanBoth`.
-
-    Raises
-    ------
-    SpikeloomError
-        If a file cannot be used.
-    """
+    """Do one piece of a chart's work; the JSON of `Decisions`, of `Built` by layout, or of `RanBoth`."""
     if isinstance(work, Decide):
         return encode(_decide(work))
     return encode(_build(work) if isinstance(work, Build) else _run(work))
@@ -90,13 +74,7 @@ def measure(work: Decide | Build | Run) -> Any:
 
 @lru_cache(maxsize=1)
 def both_splits(data: Data, taxels: int, classes: int) -> dict[str, Recordings]:
-    """Training and test recordings by split.
-
-    Raises
-    ------
-    DataError, OptionError
-        If they cannot be used, do not suit the network, or are others than those of who asks for the work.
-    """
+    """Training and test recordings by split; refused if they are others than those of who asks for the work."""
     from spikeloom.models.training.protocols import data_digest
 
     shared: dict[str, Any] = {"classes": classes, "taxels": taxels, "bin_s": data.bin_s, "labels_for": "chart"}
@@ -115,20 +93,21 @@ def _in_steps(data: Data, taxels: int, classes: int, bins: int) -> dict[str, Rec
 @lru_cache(maxsize=2)
 def _network(source: Source, sha256: str) -> LoadedNetwork:
     network = load_network(source.path, source.arguments())
-    _require_same(source.path, network.sha256, sha256)
+    _require_same(source, network.sha256, sha256)
     return network
 
 
-def _require_same(path: str, sha256: str, wanted: str) -> None:
+def _require_same(source: Source, sha256: str, wanted: str) -> None:
     if sha256 != wanted:
-        raise ModelError(f"{path}: is another file than where the chart was asked for; copy that here")
+        raise ModelError(f"{source.path}: is another file than where the chart was asked for; copy that here")
 
 
-def _chart_of(source: Source, sha256: str) -> Any | None:
+def _chart_of(network: Given) -> Any | None:
     """What its chip does for a chart, of a network that was trained for it."""
+    source = network.source
     chart = None if source.target is None else chip_chart(source.target)
     if chart is not None:
-        _require_same(source.path, chart.trained(source.path, source.weights).sha256, sha256)
+        _require_same(source, chart.trained(source.path, source.weights).sha256, network.sha256)
     return chart
 
 
@@ -150,20 +129,20 @@ def _decide(work: Decide) -> Decisions:
     """Decisions of the float32 model by split and window; one run each, since what comes later changes nothing."""
     from spikeloom.models.networks.reference import float_spikes  # torch, so only here
 
-    source, windows = work.source, work.windows
-    chart = _chart_of(source, work.sha256)
+    source, windows = work.network.source, work.windows
+    chart = _chart_of(work.network)
     if chart is not None:
         network = chart.trained(source.path, source.weights).network
         splits = both_splits(work.data, network.taxels, network.classes)
         return {split: chart.decisions(source.path, source.weights, data, windows) for split, data in splits.items()}
-    loaded = _network(source, work.sha256)
+    loaded = _network(source, work.network.sha256)
     checkpoint, adjacency = loaded.checkpoint, loaded.adjacency
     assert checkpoint is not None, "a chart takes checkpoints"
     assert adjacency is not None, "and these have a first layer that sees something"
     decided: dict[str, dict[str, tuple[int, ...]]] = {}
     for split, data in _in_steps(work.data, checkpoint.taxels, checkpoint.classes, checkpoint.bins).items():
         counts: dict[int, list[IntArray]] = {window: [] for window in windows}
-        steps = _steps(data)
+        steps = data.step_counts
         for first in range(0, len(data), PART):
             part = slice(first, first + PART)
             *_, spikes = float_spikes(checkpoint, adjacency, data.events[part]).values()
@@ -174,25 +153,20 @@ def _decide(work: Decide) -> Decisions:
     return decided
 
 
-def _steps(data: Recordings) -> IntArray:
-    return np.full(len(data), data.steps) if data.lengths is None else data.lengths
-
-
 # -- netlists ----------------------------------------------------------------------------------------------------------
 
 
 def _build(work: Build) -> dict[str, Built]:
     """Compile what is not there; by layout."""
-    chart = _chart_of(work.source, work.sha256)
+    source, chart = work.network.source, _chart_of(work.network)
     if chart is not None:
         try:
             return {
-                layout: _built(*chart.build(work.source.path, work.source.weights, file))
-                for layout, file in work.files.items()
+                layout: _built(*chart.build(source.path, source.weights, file)) for layout, file in work.files.items()
             }
         except CapacityError as error:
             return dict.fromkeys(work.files, _refused(error))
-    network = _network(work.source, work.sha256)
+    network = _network(source, work.network.sha256)
     options = {layout: _compile_options(work, layout) for layout in work.files}
     some = next(iter(options.values()))
     sensor = network.network.input
@@ -231,7 +205,7 @@ def _build(work: Build) -> dict[str, Built]:
 def _compile_options(work: Build, layout: str) -> argparse.Namespace:
     """What the command ``compile`` would have parsed."""
     return argparse.Namespace(
-        **{name: value for name, value in vars(work.source.arguments()).items() if name != "target"}
+        **{name: value for name, value in vars(work.network.source.arguments()).items() if name != "target"}
         | {"target": DEFAULT}
         | ROUNDING
         | PLACING
@@ -254,11 +228,11 @@ def _refused(error: CapacityError | ModelError) -> Built:
 def _run(work: Run) -> RanBoth:
     """What a netlist decides on both splits, what that costs, and how fast the simulator is."""
     path = work.build.files[work.layout]
-    machine = _machine(path, work.sha256)
+    machine = _machine(path, work.built.sha256)
     if machine is None:
         _machine.cache_clear()
         _build(work.build)
-        machine = _machine(path, work.sha256)
+        machine = _machine(path, work.built.sha256)
     if machine is None:
         raise FormatError(f"{path}: is not the netlist that was measured before; begin anew with --fresh")
     netlist, data = machine.netlist, work.build.data
@@ -273,7 +247,7 @@ def _run(work: Run) -> RanBoth:
 
 def _costs(machine: Machine, data: Recordings, bin_s: float) -> Ran:
     """Decisions, and the mean inference: operations, energy by table, time by table, the longest step."""
-    steps, size = _steps(data), machine.batch(data.steps)
+    steps, size = data.step_counts, machine.batch(data.steps)
     decided: list[int] = []
     operations: list[IntArray | FloatArray] = []
     energy: dict[str, list[FloatArray]] = {}

@@ -10,6 +10,7 @@ import numpy as np
 from spikeloom.compiler import Compilation, Netlist, Options, compile_network
 from spikeloom.compiler.systems import TACTILESGNET
 from spikeloom.compiler.types import IntArray
+from spikeloom.models.recordings.events import joined_bins
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs.network import LoadedNetwork
 from spikeloom.runtime.report.console import progress
@@ -25,14 +26,11 @@ from spikeloom.runtime.studies.pruning.results import (
     Tested,
 )
 from spikeloom.runtime.studies.pruning.trials import (
-    Scene,
     Trial,
     changed_alone,
     coarse_netlist,
-    coarser,
     decisions,
     priced,
-    scene,
     spikes_of,
     without_hops,
     without_taxels,
@@ -45,23 +43,10 @@ BINS = (2, 4)
 def study(
     networks: Mapping[str, LoadedNetwork], training: Recordings, test: Recordings, differ: float, output: str | None
 ) -> tuple[Lean, Netlist]:
-    """Choose the cheapest of several networks on the training split and take from it what that split does not need.
+    """Choose the cheapest of several networks, by file, on the training split and take from it what that does not need.
 
-    Parameters
-    ----------
-    networks : mapping of str to LoadedNetwork
-        By file; for the same recordings.
-    training, test : Recordings
-        On which is chosen, and what is reported.
-    differ : float
-        Share of training decisions that may change.
-    output : str or None
-        Where the netlist will be written.
-
-    Returns
-    -------
-    Lean, Netlist
-        The result, and the network without what is taken.
+    The share `differ` of training decisions may change. Hands back the network without what is taken, too, which will
+    be written to `output`.
     """
     made = {path: _candidate(path, loaded, training, test) for path, loaded in networks.items()}
     candidates = [candidate for candidate, _ in made.values()]
@@ -94,8 +79,8 @@ def _candidate(
     forms = None if loaded.checkpoint is None else loaded.checkpoint.forms
     compilation = compile_network(loaded.network, Options(forms=forms, training_events=training.events))
     netlist = compilation.netlist
-    decided, cost = priced(netlist, scene(training))
-    decided_test, cost_test = priced(netlist, scene(test))
+    decided, cost = priced(netlist, training)
+    decided_test, cost_test = priced(netlist, test)
     return Candidate(
         costs=cost_test,
         name=path,
@@ -129,7 +114,7 @@ class _Whole:
         self, loaded: LoadedNetwork, compilation: Compilation, training: Recordings, test: Recordings, allowed: int
     ) -> None:
         self.loaded, self.compilation, self.netlist = loaded, compilation, compilation.netlist
-        self.training, self.test = scene(training), scene(test)
+        self.training, self.test = training, test
         self.spikes = spikes_of(self.netlist, self.training)
         self.wanted, self.wanted_test = decisions(self.netlist, self.training), decisions(self.netlist, self.test)
         self.strict = Trial(
@@ -170,7 +155,7 @@ class _Whole:
         name: str,
         removed: Removed,
         netlist: Netlist,
-        scenes: tuple[Scene, Scene] | None = None,
+        scenes: tuple[Recordings, Recordings] | None = None,
         *,
         offered: bool = False,
     ) -> _Left:
@@ -226,7 +211,7 @@ class _Whole:
         """Join bins, with the decays as they are and with those of as many steps."""
         for bins in BINS:
             progress(f"{bins} bins joined")
-            scenes = coarser(self.training, bins), coarser(self.test, bins)
+            scenes = joined_bins(self.training, bins), joined_bins(self.test, bins)
             for adapted, how in ((False, "decays as they are"), (True, "decays of as many steps")):
                 netlist = coarse_netlist(self.netlist, bins, adapted=adapted)
                 yield self._left(f"{bins} bins joined, {how}", Removed(bins=bins), netlist, scenes)

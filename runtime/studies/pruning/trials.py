@@ -19,39 +19,24 @@ from spikeloom.compiler.ir import Form, IntegerNetwork
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.passes.prune import deaf_to
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
-from spikeloom.models.recordings.events import join_bins
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.runtime.machines.base import EventArray, machine_of
+from spikeloom.runtime.machines.base import machine_of
 from spikeloom.runtime.machines.integer import integer_machine_of
 from spikeloom.runtime.studies.pruning.results import Costs
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Scene:
-    """Recordings of a split, (samples, taxels, polarities, T), and the data steps of each where some are shorter."""
-
-    events: EventArray
-    labels: IntArray
-    lengths: IntArray | None
-
-
-def scene(data: Recordings) -> Scene:
-    """Recordings as they are."""
-    return Scene(events=data.events, labels=data.labels, lengths=data.lengths)
-
-
-def spikes_of(netlist: Netlist, of: Scene) -> IntArray:
+def spikes_of(netlist: Netlist, of: Recordings) -> IntArray:
     """Spikes of each compartment in all recordings; (compartments,)."""
     spikes: IntArray = integer_machine_of(netlist).spike_counts(of.events, of.lengths).sum(axis=0)
     return spikes
 
 
-def decisions(netlist: Netlist, of: Scene) -> IntArray:
+def decisions(netlist: Netlist, of: Recordings) -> IntArray:
     """Class of each recording."""
     return machine_of(netlist).run(of.events, lengths=of.lengths).decisions
 
 
-def priced(netlist: Netlist, of: Scene) -> tuple[IntArray, Costs]:
+def priced(netlist: Netlist, of: Recordings) -> tuple[IntArray, Costs]:
     """Class of each recording, and what an inference costs."""
     run, price = machine_of(netlist).price(of.events, bin_s=1.0, lengths=of.lengths)  # at full speed, whatever the pace
     return run.decisions, Costs(
@@ -114,7 +99,7 @@ class Trial:
 
     compilation: Compilation
     integer: IntegerNetwork
-    training: Scene
+    training: Recordings
     wanted: IntArray
     allowed: int
 
@@ -171,7 +156,7 @@ def without_taxels(integer: IntegerNetwork, netlist: Netlist, taxels: IntArray) 
     return deaf_to(integer, sources_of(netlist, taxels)[: netlist.n_inputs])
 
 
-def changed_alone(netlist: Netlist, of: Scene, wanted: IntArray) -> IntArray:
+def changed_alone(netlist: Netlist, of: Recordings, wanted: IntArray) -> IntArray:
     """Decisions that change without each taxel; shape (taxels,)."""
     machine, changed = machine_of(netlist), np.zeros(netlist.taxels, np.int64)
     for taxel in range(netlist.taxels):
@@ -202,12 +187,6 @@ def without_hops(
     if layer is None or layer.reached > ONE_STEP_SUM_MAX:
         return None
     return replace(integer, projections=(*layer.projections, *(p for p in integer.projections if p.post != 0)))
-
-
-def coarser(of: Scene, bins: int) -> Scene:
-    """Bins joined to longer ones: an event wherever there was one in any of them."""
-    lengths = None if of.lengths is None else -(-of.lengths // bins)
-    return Scene(events=join_bins(of.events, bins), labels=of.labels, lengths=lengths)
 
 
 def coarse_netlist(netlist: Netlist, bins: int, *, adapted: bool) -> Netlist:

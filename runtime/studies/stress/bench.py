@@ -135,7 +135,7 @@ def bench_of(arguments: argparse.Namespace) -> tuple[Bench, LoadedNetwork, str]:
         events=data.events,
         labels=data.labels,
         files=data.files,
-        lengths=np.full(len(data), data.steps) if data.lengths is None else np.asarray(data.lengths),
+        lengths=data.step_counts,
     )
     return bench, loaded, digest.hexdigest()
 

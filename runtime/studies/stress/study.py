@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import redirect_stderr
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields
 from functools import lru_cache
 from io import StringIO
 from pathlib import Path
@@ -20,7 +20,7 @@ from spikeloom.compiler.types import JsonObject
 from spikeloom.runtime.inputs.network import LoadedNetwork
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.encode import decode, encode
-from spikeloom.runtime.studies.jobs import Point, content_key
+from spikeloom.runtime.studies.jobs import Job, content_key
 from spikeloom.runtime.studies.stress.battery import NAMES, TAXELS, Level, levels_of, why_not
 from spikeloom.runtime.studies.stress.bench import Bench, bench_of
 from spikeloom.runtime.studies.stress.pair import Outcome
@@ -34,7 +34,7 @@ CHUNK = 5
 FILES = ("netlist", "checkpoint", "data", "taxels", "edges")
 """Options that name files."""
 
-Sweep = Callable[[Sequence[Point]], Mapping[str, Any]]
+Sweep = Callable[[Sequence[Job]], Mapping[str, Any]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,58 +92,31 @@ class Plan:
 
 
 def study(request: Request, plan: Plan, sweep: Sweep | None = None) -> Stress:
-    """Measure a plan and judge it.
-
-    Parameters
-    ----------
-    request : Request
-    plan : Plan
-    sweep : callable, optional
-        Measures points by :func:`measure_task`; without one they are measured in threads here.
-
-    Raises
-    ------
-    SpikeloomError
-        If a file cannot be used, or a requirement cannot be held against this network.
-    """
+    """Measure a plan and judge it; `sweep` measures tasks by :func:`measure_task`, else threads of this process do."""
     bench, loaded, data = request.load()
     reasons = {name: why_not(name, bench.pair, bench.sensor) for name in plan.names}
     _require_measurable(plan, reasons, bench.sensor.taxels)
     progress("clean recordings")
     reference, undisturbed = clean(bench)
     known = _provenance(request, loaded, data)
+    facts = encode(known) | {"options": request.readings(), "sensor": bench.sensor.digest()}
     tasks = [
-        Task(
-            request=request.from_anywhere(),
-            name=name,
-            level=level,
-            seeds=tuple(range(plan.seeds if NAMES[name].seeded else 1)),
-        )
-        for name in plan.names
+        _task(request.from_anywhere(), name, level, tuple(range(first, min(first + CHUNK, seeds))), facts)
+        for name, seeds in ((name, plan.seeds if NAMES[name].seeded else 1) for name in plan.names)
         if reasons[name] is None
-        for level in levels_of(
-            name,
-            bench.sensor.taxels,
-            full=plan.full,
-            also=[wanted.level for wanted in plan.requirements if wanted.name == name],
-        )
+        for level in _levels(name, plan, bench.sensor.taxels)
+        for first in range(0, seeds, CHUNK)
     ]
     if sweep is None:
         runs = _in_threads(tasks, bench, reference)
     else:
-        facts = encode(known) | {"options": request.readings(), "sensor": bench.sensor.digest()}
-        runs = _in_processes(tasks, facts, sweep)
+        found = sweep(tasks)
+        runs = [[decode(Run, run) for run in found[task.key]["runs"]] for task in tasks]
+    measured: dict[str, dict[Level, list[Run]]] = {}
+    for task, some in zip(tasks, runs, strict=True):
+        measured.setdefault(task.name, {}).setdefault(task.level, []).extend(some)
     recordings, classes = len(bench.labels), bench.pair.netlist.classes
-    curves = {
-        name: curve(
-            name,
-            [(t.level, each) for t, each in zip(tasks, runs, strict=True) if t.name == name],
-            undisturbed,
-            recordings,
-            classes,
-        )
-        for name in dict.fromkeys(task.name for task in tasks)
-    }
+    curves = {name: curve(name, each, undisturbed, recordings, classes) for name, each in measured.items()}
     return Stress(
         recordings=recordings,
         classes=classes,
@@ -166,6 +139,11 @@ def _require_measurable(plan: Plan, reasons: Mapping[str, str | None], taxels: i
             raise OptionError(f"--require {wanted}: the sensor has {taxels} taxels; give a smaller level")
 
 
+def _levels(name: str, plan: Plan, taxels: int) -> tuple[Level, ...]:
+    required = [wanted.level for wanted in plan.requirements if wanted.name == name]
+    return levels_of(name, taxels, full=plan.full, also=required)
+
+
 def _provenance(request: Request, loaded: LoadedNetwork, data: str) -> Provenance:
     return Provenance(
         spikeloom=__version__,
@@ -181,11 +159,11 @@ def _provenance(request: Request, loaded: LoadedNetwork, data: str) -> Provenanc
     )
 
 
-# -- where points are measured -----------------------------------------------------------------------------------------
+# -- where tasks are measured ------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Task:
+class Task(Job):
     """A perturbation at a level, and the seeds to draw it with."""
 
     request: Request
@@ -194,8 +172,13 @@ class Task:
     seeds: tuple[int, ...]
 
 
+def _task(request: Request, name: str, level: Level, seeds: tuple[int, ...], facts: Mapping[str, Any]) -> Task:
+    key = content_key({**facts, "perturbation": name, "level": level, "seeds": seeds})
+    return Task(key=key, label=f"{name} {shown(level)}", request=request, name=name, level=level, seeds=seeds)
+
+
 def _in_threads(tasks: Sequence[Task], bench: Bench, reference: Outcome) -> list[list[Run]]:
-    """Runs of each task, several tasks at a time in this process."""
+    """Runs of each task, several at a time in this process."""
     pool = ThreadPoolExecutor(os.cpu_count())
     try:
         waiting = [pool.submit(measure, bench, task.name, task.level, task.seeds, reference) for task in tasks]
@@ -205,21 +188,6 @@ def _in_threads(tasks: Sequence[Task], bench: Bench, reference: Outcome) -> list
     finally:
         pool.shutdown(cancel_futures=True)
     return [each.result() for each in waiting]
-
-
-def _in_processes(tasks: Sequence[Task], facts: Mapping[str, Any], sweep: Sweep) -> list[list[Run]]:
-    """Runs of each task, a few seeds at a time; kept by all that decides them."""
-    points = [
-        [_keyed(replace(task, seeds=task.seeds[i : i + CHUNK]), facts) for i in range(0, len(task.seeds), CHUNK)]
-        for task in tasks
-    ]
-    results = sweep([point for each in points for point in each])
-    return [[decode(Run, run) for point in each for run in results[point.key]["runs"]] for each in points]
-
-
-def _keyed(task: Task, facts: Mapping[str, Any]) -> Point:
-    about = {"perturbation": task.name, "level": task.level, "seeds": task.seeds}
-    return Point(key=content_key({**facts, **about}), label=f"{task.name} {shown(task.level)}", payload=task)
 
 
 def measure_task(task: Task) -> JsonObject:

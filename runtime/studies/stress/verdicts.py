@@ -105,19 +105,9 @@ def spread(right: Sequence[int], recordings: int) -> Spread:
     return Spread(mean=fmean(values), low=max(low, 0.0), high=min(high, 1.0), values=values)
 
 
-def curve(name: str, runs: Sequence[tuple[Level, Sequence[Run]]], clean: Run, recordings: int, classes: int) -> Curve:
-    """Curve and verdict of one perturbation.
-
-    Parameters
-    ----------
-    name : str
-    runs : sequence of (level, runs of each seed)
-        From mild to harsh.
-    clean : Run
-        Of the clean recordings.
-    recordings, classes : int
-    """
-    levels = tuple(_point(level, every, clean, recordings) for level, every in runs)
+def curve(name: str, runs: Mapping[Level, Sequence[Run]], clean: Run, recordings: int, classes: int) -> Curve:
+    """Curve and verdict of one perturbation, from the runs of each seed by level, from mild to harsh."""
+    levels = tuple(_point(level, every, clean, recordings) for level, every in runs.items())
     breaks = {}
     for side in SIDES:
         floor = wilson(clean.right[side], recordings)[0]
@@ -164,17 +154,7 @@ def reasons(
 ) -> tuple[str, ...]:
     """What is to be seen on one side, worst first: overflow, layers, decisions; rates where nothing else is.
 
-    Parameters
-    ----------
-    side : {"float", "chip"}
-    runs : sequence of Run
-        Of each seed.
-    layers : mapping of str to sequence of int
-        As in a run, over all seeds.
-    clean : Run
-        Of the clean recordings.
-    recordings : int
-        Of one run.
+    Counts of `layers` are as in a run, over all seeds; `recordings` are those of one run.
     """
     total, column = recordings * len(runs), SIDES.index(side)
     seen = []
