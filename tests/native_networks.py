@@ -22,25 +22,21 @@ def random_stage(rng, name, inputs, size, depth, *, copies, clocks) -> Stage:
 
 
 def random_network(
-    seed, *, copies=3, towers=1, blocks=2, taxels=4, features=2, hidden=(6, 4), classes=3, clocks=2, steps=12
+    seed, *, copies=3, blocks=2, taxels=4, features=2, hidden=(6, 4), classes=3, clocks=2, steps=12
 ) -> NativeNetwork:
-    """Towers of a first stage, hidden ones in blocks that receive a random half each, and two voters a class."""
-    rng = np.random.default_rng(seed)
-    made = []
-    for _ in range(towers):
-        heard = taxels * features
-        stages = [random_stage(rng, "conv1", np.arange(2 * taxels)[None], heard, 0, copies=copies, clocks=0)]
-        for depth, size in enumerate((*hidden, 2 * classes), 1):
-            inputs = rng.permutation(heard).reshape(blocks, -1)
-            stages.append(random_stage(rng, f"fc{depth}", inputs, size, depth, copies=copies, clocks=clocks))
-            heard = blocks * size
-        made.append(tuple(stages))
+    """A first stage, hidden ones in blocks that receive a random half each, and two voters a class."""
+    rng, fan_in = np.random.default_rng(seed), taxels * features
+    stages = [random_stage(rng, "conv1", np.arange(2 * taxels)[None], fan_in, 0, copies=copies, clocks=0)]
+    for depth, size in enumerate((*hidden, 2 * classes), 1):
+        inputs = rng.permutation(fan_in).reshape(blocks, -1)
+        stages.append(random_stage(rng, f"fc{depth}", inputs, size, depth, copies=copies, clocks=clocks))
+        fan_in = blocks * size
     return NativeNetwork(
         taxels=taxels,
         polarities=2,
         classes=classes,
         copies=copies,
-        towers=tuple(made),
+        stages=tuple(stages),
         clocks=clocks_over(clocks, steps),
     )
 
@@ -52,22 +48,18 @@ def random_events(seed, network, *, samples=2, steps=12):
 
 def defined_spikes(network, events) -> dict[str, np.ndarray]:
     """Spikes (steps, neurons) of each layer for one recording (taxels, polarities, steps), as they are defined."""
-    steps = events.shape[-1]
-    found = {}
-    for tower in network.towers:
-        before = events.reshape(-1, steps).T
-        ticks = network.clocks.events(steps).T
-        for stage in tower:
-            spikes = np.zeros((steps, stage.neurons), bool)
-            for n in range(stage.neurons):
-                block, own = divmod(n, stage.size)
-                held = 0
-                for t in range(steps):
-                    heard = [*before[t, stage.inputs[block]], *ticks[t, : stage.clocks]]
-                    levels = zip(stage.level[block, :, own].tolist(), heard, strict=True)
-                    held += UNIT * sum(level * int(x) for level, x in levels) + int(stage.leak[n])
-                    spikes[t, n] = held >= stage.threshold[n]
-                    held = 0 if spikes[t, n] else max(held, -int(stage.floor[n]))
-            found.setdefault(stage.name, []).append(spikes)
-            before = spikes
-    return {name: np.concatenate(parts, axis=1) for name, parts in found.items()}
+    steps, found = events.shape[-1], {}
+    before, ticks = events.reshape(-1, steps).T, network.clocks.events(steps).T
+    for stage in network.stages:
+        spikes = np.zeros((steps, stage.neurons), bool)
+        for n in range(stage.neurons):
+            block, column = divmod(n, stage.size)
+            held = 0
+            for t in range(steps):
+                active = [*before[t, stage.inputs[block]], *ticks[t, : stage.clocks]]
+                levels = zip(stage.level[block, :, column].tolist(), active, strict=True)
+                held += UNIT * sum(level * int(x) for level, x in levels) + int(stage.leak[n])
+                spikes[t, n] = held >= stage.threshold[n]
+                held = 0 if spikes[t, n] else max(held, -int(stage.floor[n]))
+        found[stage.name] = before = spikes
+    return found

@@ -37,13 +37,19 @@ def relays(*, delay: int = 1, tick: int = 0, first: int = 0) -> Draft:
     """Two cores; an input reaches neuron 0 of core 0, whose spikes reach neuron 0 of core 1, which votes."""
     draft = Draft()
     for x in (0, 1):
-        draft.core(x, 0)
-        draft.axon(x)
-        draft.neuron(x, Neuron(), layer=f"layer{x}")
-        draft.connect(x, 0, [0])
+        draft.axon(draft.core(x, 0), 0, [draft.neuron(x, Neuron(), layer=f"layer{x}")])
     draft.feed(0, 0, 0, tick=tick)
     draft.wire((0, 0), 1, 0, delay)
     draft.vote((1, 0), 0, first=first)
+    return draft
+
+
+def alone(neuron: Neuron, *, channels: int = 1) -> Draft:
+    """One neuron on one axon, which input channels reach."""
+    draft = Draft()
+    draft.axon(draft.core(), 0, [draft.neuron(0, neuron, layer="layer0")])
+    for channel in range(channels):
+        draft.feed(channel, 0, 0)
     return draft
 
 
@@ -54,11 +60,9 @@ def crossbars(draw, neurons=NEURONS, *, channels=3):
     cores = draw(st.integers(1, 3))
     for core in range(cores):
         draft.core(draw(st.integers(0, 4)), core)
-        for _ in range(draw(st.integers(1, 4))):
-            draft.axon(core, draw(st.integers(0, 3)))
         held = [draft.neuron(core, draw(neurons), layer=f"layer{core}") for _ in range(draw(st.integers(1, 4)))]
-        for line, _ in draft.cores[core].axons:
-            draft.connect(core, line, draw(st.lists(st.sampled_from(held), unique=True)))
+        for _ in range(draw(st.integers(1, 4))):
+            draft.axon(core, draw(st.integers(0, 3)), draw(st.lists(st.sampled_from(held), unique=True)))
 
     def axon():
         core = draw(st.integers(0, cores - 1))
@@ -79,10 +83,10 @@ def crossbars(draw, neurons=NEURONS, *, channels=3):
     return draft.netlist(taxels=channels, polarities=1, classes=2, bin_ticks=draw(st.integers(1, 3)))
 
 
-def events(draw_seed: int, channels: int, steps: int, *, samples: int | None = None):
+def events(seed: int, channels: int, steps: int, *, samples: int | None = None):
     """Recordings of a third of all events."""
     shape = (channels, steps) if samples is None else (samples, channels, steps)
-    return (np.random.default_rng(draw_seed).random(shape) < 1 / 3).astype(np.uint8)
+    return (np.random.default_rng(seed).random(shape) < 1 / 3).astype(np.uint8)
 
 
 def recording_of(batch: Trace, sample: int = 0) -> Trace:

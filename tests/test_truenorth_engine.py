@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_crossbars import CHIP, assert_same, both, crossbars, events, recording_of, relays
+from random_crossbars import CHIP, alone, assert_same, both, crossbars, events, recording_of, relays
 
 from spikeloom.compiler.errors import DataError, NumericRangeError
 from spikeloom.compiler.targets.truenorth.builder import Draft, Neuron, history_free
@@ -86,13 +86,7 @@ def test_votes_count_in_their_window_only(first, votes):
 
 
 def test_spikes_that_meet_on_an_axon_are_one():
-    draft = Draft()
-    draft.core(0, 0)
-    draft.axon(0)
-    draft.neuron(0, Neuron(threshold=2), layer="layer0")
-    draft.connect(0, 0, [0])
-    draft.feed(0, 0, 0)
-    draft.feed(1, 0, 0)
+    draft = alone(Neuron(threshold=2), channels=2)
     draft.clock(0, 0, period=2, phase=1)
     netlist = draft.netlist(taxels=2, polarities=1, classes=1)
     trace = both(netlist, np.array([[1, 1, 0, 0], [1, 0, 0, 0]], np.uint8))
@@ -100,24 +94,6 @@ def test_spikes_that_meet_on_an_axon_are_one():
     assert int(trace.counts.merged) == 2
     assert np.flatnonzero(trace.spikes[:, 0]).tolist() == [1]
     assert trace.membranes[:, 0].tolist() == [1, 0, 0, 1]
-
-
-def test_a_splitter_costs_one_tick():
-    draft = Draft()
-    for x in range(4):
-        draft.core(x, 0)
-    for x in (0, 1, 2):
-        draft.axon(x)
-        draft.neuron(x, Neuron(), layer=f"layer{min(x, 1)}", number=x)
-        draft.connect(x, 0, [0])
-    draft.feed(0, 0, 0)
-    draft.split((0, 0), [(1, 0), (2, 0)], 3)
-    for x in (1, 2):
-        draft.vote((x, 0), 0, first=2)
-    netlist = draft.netlist(taxels=1, polarities=1, classes=1)
-    assert faults(netlist, CHIP) == ()
-    trace = both(netlist, np.array([[1, 0]], np.uint8))
-    assert [np.flatnonzero(row).tolist() for row in trace.spikes.T] == [[0], [2], [2], [1], [1]]
 
 
 # -- engine = specification --------------------------------------------------------------------------------------------
@@ -144,14 +120,12 @@ def large():
     rng, draft = np.random.default_rng(7), Draft()
     for core in range(10):
         draft.core(core, 0)
-        for _ in range(256):
-            draft.axon(core, int(rng.integers(4)))
         for number in range(250):
             neuron = Neuron(leak=-1, leak_reversal=True, threshold=9, reset_mode=RESET_LINEAR, negative_threshold=50)
             weights = tuple(int(weight) for weight in rng.integers(-3, 5, 4))
             draft.neuron(core, history_free(weights, 6) if core % 2 else neuron, layer="layer0", number=number)
-        for line in range(256):
-            draft.connect(core, line, rng.choice(250, 60, replace=False).tolist())
+        for _ in range(256):
+            draft.axon(core, int(rng.integers(4)), rng.choice(250, 60, replace=False).tolist())
         for line in range(78):
             draft.feed(line, core, line)
     for core in range(10):
@@ -169,35 +143,18 @@ def test_full_cores_and_many_ticks():
     assert 1000 < both(netlist, recording).counts.spikes.sum() < 2500 * 60
 
 
-@pytest.mark.parametrize("most", [0, 1 << 15])
-def test_neurons_work_when_they_are_reached_or_all_at_once(most, monkeypatch):
-    netlist, recording = large(), (np.random.default_rng(2).random((78, 20)) < 0.05).astype(np.uint8)
-    expected = engine.simulate(netlist, recording[None], spikes=True, membranes=True)
-    monkeypatch.setattr(engine, "MOST_STEADY", most)
-    prepared = engine.prepare(netlist)
-    assert (prepared.wiring.steady.shape[1] == 0) == (most == 0)
-    assert_same(expected, engine.simulate(prepared, recording[None], spikes=True, membranes=True))
-
-
 def test_a_membrane_that_climbs_to_the_end_of_its_register():
     """A neuron that is given more in every tick than a spike takes from it."""
-    draft = Draft()
-    draft.core(0, 0)
-    draft.axon(0)
-    draft.neuron(0, Neuron(weights=(255, 0, 0, 0), reset_mode=RESET_LINEAR, negative_saturates=True), layer="layer0")
-    draft.connect(0, 0, [0])
+    draft = alone(Neuron(weights=(255, 0, 0, 0), reset_mode=RESET_LINEAR, negative_saturates=True), channels=0)
     draft.vote((0, 0), 0)
     draft.clock(0, 0, period=1)
     netlist = draft.netlist(taxels=1, polarities=1, classes=1)
     assert both(netlist, np.zeros((1, 2100), np.uint8)).counts.overflows.sum() > 0  # 254 a tick, 2**19 after 2,064
-    assert engine.prepare(netlist).wiring.steady.shape[1] == 1
-    assert engine.prepare(netlist, careful=True).wiring.steady.shape[1] == 0
+    assert [engine.prepare(netlist, careful=careful).wiring.steady.shape[1] for careful in (False, True)] == [1, 0]
 
 
 def test_random_thresholds_depend_on_the_seed_alone():
-    draft = Draft()
-    draft.core(0, 0)
-    draft.neuron(0, Neuron(threshold=0, leak=3, mask_bits=3, reset_mode=RESET_TO), layer="layer0")
+    draft = alone(Neuron(threshold=0, leak=3, mask_bits=3), channels=0)
     netlist = draft.netlist(taxels=1, polarities=1, classes=1)
     silence = np.zeros((1, 1, 400), np.uint8)
     runs = [engine.simulate(netlist, silence, seed=seed).counts.spikes.item() for seed in (0, 0, 1)]

@@ -36,9 +36,7 @@ def network() -> CrossbarNetlist:
     draft = Draft()
     core = draft.core(3, 4)
     for taxel in range(2):
-        draft.axon(core, taxel)
-        draft.neuron(core, history_free((1, 1, 0, 0), 1), layer="out", number=taxel)
-        draft.connect(core, taxel, [taxel])
+        draft.axon(core, taxel, [draft.neuron(core, history_free((1, 1, 0, 0), 1), layer="out", number=taxel)])
         for polarity in range(2):
             draft.feed(2 * taxel + polarity, core, taxel)
         draft.vote((core, taxel), taxel)

@@ -161,10 +161,9 @@ def test_shorter_recordings_count_for_their_own_length():
     ("network", "copies", "chip", "used"),
     [
         (forgetful(0, 252 * 60, 1), 2, with_limit("core.axons", 100), r"fc1, a neuron: 726 used, 100 .* 315 groups"),
-        (chain(np.full((1, 4), 1e-3), beta=0.0), 3, CHIP, r"fc1, neuron 0: 500 used, 255 .*leak_bits"),
         (forgetful(0, 300, 200, 4), 3, with_limit("chip.cores", 2), r"used, 2 allowed .*chip\.cores.* fewer features"),
     ],
-    ids=["axons", "leak", "cores"],
+    ids=["axons", "cores"],
 )
 def test_what_does_not_fit(network, copies, chip, used):
     with pytest.raises(CapacityError, match=used):

@@ -15,12 +15,7 @@ from spikeloom.compiler.targets.truenorth import codebook
 from spikeloom.compiler.targets.truenorth import legalize as rules
 from spikeloom.compiler.targets.truenorth.builder import crossing_points
 from spikeloom.compiler.targets.truenorth.lower import lower
-from spikeloom.compiler.targets.truenorth.native import (
-    BASES,
-    faults,
-    joined,
-    steepest_leak,
-)
+from spikeloom.compiler.targets.truenorth.native import BASES, faults, steepest_leak
 from spikeloom.models.truenorth.network import run_network
 from spikeloom.runtime.machines.truenorth import engine, spec
 from spikeloom.runtime.machines.truenorth.twins import find_twins
@@ -30,7 +25,6 @@ NETWORKS = st.builds(
     random_network,
     st.integers(0, 2**31),
     copies=st.sampled_from([2, 3, 4]),
-    towers=st.integers(1, 2),
     blocks=st.sampled_from([1, 2, 4]),
     hidden=st.sampled_from([(), (4,), (8, 4)]),
     clocks=st.integers(0, 3),
@@ -56,7 +50,7 @@ def test_chip_and_model_and_definition_agree_in_every_spike(network, seed):
     trace = engine.simulate(netlist, channels, spikes=True, membranes=True)
     assert_same(spec.simulate(netlist, channels[0]), recording_of(trace))
     model = run_network(network, events)
-    depths = {stage.name: depth for depth, stage in enumerate(network.towers[0])}
+    depths = {stage.name: depth for depth, stage in enumerate(network.stages)}
     for sample, recording in enumerate(events):
         defined = defined_spikes(network, recording)
         for name, depth in depths.items():
@@ -74,9 +68,9 @@ def test_leaks_rest_in_the_ticks_before_the_first_data():
     network = random_network(3, hidden=(4, 4))
     steep = tuple(
         replace(stage, leak=steepest_leak(stage.threshold, depth) * (-1) ** np.arange(stage.neurons))
-        for depth, stage in enumerate(network.towers[0])
+        for depth, stage in enumerate(network.stages)
     )
-    network = replace(network, towers=(steep,))
+    network = replace(network, stages=steep)
     netlist = lower(network, CHIP)
     nothing = np.zeros((1, netlist.n_inputs, 8), np.uint8)
     trace = engine.simulate(netlist, nothing, spikes=True, membranes=True)
@@ -105,45 +99,29 @@ def test_places_fill_a_square_and_the_chip_is_not_left():
     assert sorted(places) == places
 
 
-def test_too_many_inputs_for_a_core():
+def test_networks_beyond_the_chip():
     network = random_network(0, taxels=65, features=1, blocks=1, hidden=(), copies=2, clocks=0)
-    with pytest.raises(
-        CapacityError, match=r"tower 0, conv1: 260 used, 256 allowed .*core\.axons.* with 2 copies each"
-    ):
-        lower(network, CHIP)
-
-
-def test_too_many_cores_for_the_chip():
+    with pytest.raises(CapacityError, match=r"core 1: 260 axons, 256 allowed .*core\.axons"):
+        CHIP.compile(network)
     network = random_network(0, hidden=())
     assert lower(network, CHIP).n_cores == 3
-    with pytest.raises(CapacityError, match=r"chip: 6 used, 4 allowed .*chip\.cores.*; join fewer towers"):
-        lower(joined([network, network]), with_limit("chip.cores", 4))
+    with pytest.raises(CapacityError, match=r"chip: 3 used, 2 allowed .*chip\.cores.*; train with fewer"):
+        lower(network, with_limit("chip.cores", 2))
 
 
 def test_what_contradicts_itself_is_named():
     network = random_network(0)
-    first, *rest = network.towers[0]
+    first, *rest = network.stages
 
     def wrong(**changes):
-        return faults(replace(network, towers=((replace(first, **changes), *rest),)))
+        return faults(replace(network, stages=(replace(first, **changes), *rest)))
 
     assert faults(replace(network, copies=5)) == ["5 copies of an input, allowed are 2, 3, 4"]
-    assert faults(replace(network, towers=())) == ["no towers"]
-    assert wrong(level=first.level * 4)[0] == "tower 0, conv1: levels beyond 3, the most of 3 copies"
+    assert faults(replace(network, stages=())) == ["8 voting neurons for 3 classes"]
+    assert wrong(level=first.level * 4)[0] == "conv1: levels beyond 3, the most of 3 copies"
     assert wrong(threshold=0 * first.threshold)[0].endswith("outside 1 <= threshold <= floor <= 131072")
-    assert wrong(leak=first.leak + 300) == ["tower 0, conv1: leaks that the ticks before the first data cannot undo"]
-    assert wrong(leak=first.leak[1:]) == ["tower 0, conv1: 7 values of leak for 8 neurons"]
-    assert wrong(inputs=first.inputs * 0) == ["tower 0, conv1: 1 blocks do not share 8 inputs among them"]
-    assert faults(replace(network, classes=5)) == ["tower 0: 12 voting neurons for 5 classes"]
-    assert faults(replace(network, clocks=NO_CLOCKS)) == [
-        f"tower 0, {stage.name}: receives 2 clocks of 0" for stage in rest
-    ]
-
-
-def test_only_networks_of_one_kind_are_joined():
-    one = random_network(0)
-    assert len(joined([one, one, joined([one, one])]).towers) == 4
-    with pytest.raises(ValueError, match="differ in copies: 2, 3"):
-        joined([one, random_network(0, copies=2)])
-    with pytest.raises(ValueError, match="differ in their layers: conv1, fc1 and conv1, fc1, fc2, fc3"):
-        joined([one, random_network(0, hidden=())])
+    assert wrong(leak=first.leak + 300) == ["conv1: leaks that the ticks before the first data cannot undo"]
+    assert wrong(leak=first.leak[1:]) == ["conv1: 7 values of leak for 8 neurons"]
+    assert wrong(inputs=first.inputs * 0) == ["conv1: 1 blocks do not share 8 inputs among them"]
+    assert faults(replace(network, classes=5)) == ["12 voting neurons for 5 classes"]
+    assert faults(replace(network, clocks=NO_CLOCKS)) == [f"{stage.name}: receives 2 clocks of 0" for stage in rest]

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from made_files import recordings_folder
-from random_crossbars import WEIGHTS, crossbars, events
+from random_crossbars import WEIGHTS, alone, crossbars, events
 
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats import ranc
@@ -37,13 +37,11 @@ def small(**changes):
     draft = Draft()
     draft.core(5, 2)
     draft.core(6, 3)
-    draft.axon(0, 1)
-    draft.axon(1, 3, line=2)
     draft.neuron(0, Neuron(weights=(0, 4, 0, 0), threshold=3, negative_threshold=2, **changes), layer="layer0")
     for number in range(2):
         draft.neuron(1, Neuron(weights=(0, 0, 0, 1), reset_mode=RESET_LINEAR), layer="layer1", number=number)
-    draft.connect(0, 0, [0])
-    draft.connect(1, 2, [0, 1])
+    draft.axon(0, 1, [0])
+    draft.axon(1, 3, [0, 1], line=2)
     draft.feed(0, 0, 0, tick=1)
     draft.clock(1, 2, period=3, phase=1)
     draft.wire((0, 0), 1, 2, 15)
@@ -121,11 +119,7 @@ def test_the_command(tmp_path, capsys):
 
 
 def test_the_command_with_a_recording(tmp_path, capsys):
-    draft = Draft()
-    draft.core(0, 0)
-    draft.axon(0)
-    draft.neuron(0, Neuron(), layer="layer0")
-    draft.connect(0, 0, [0])
+    draft = alone(Neuron(), channels=0)
     draft.feed(3, 0, 0)
     draft.vote((0, 0), 0, first=2)
     write_crossbars(draft.netlist(taxels=2, polarities=2, classes=2), tmp_path / "net.loom")

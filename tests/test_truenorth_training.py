@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from made_files import own_file
+from made_files import CLASSES, TAXELS, own_file
 from native_networks import random_network
+from zoo import specimen
 
 from spikeloom.compiler.dynamics import clocks_over
 from spikeloom.compiler.errors import ModelError, OptionError
@@ -56,7 +57,7 @@ def slow_integrate(current, threshold, floor, surrogate):
 @pytest.mark.parametrize("surrogate", [SMOOTH, Surrogate(width=0.4)], ids=lambda s: s.shape)
 def test_neurons_and_their_gradient(surrogate):
     rng = np.random.default_rng(0)
-    current = torch.tensor(rng.integers(-40, 50, (30, 3, 7)), dtype=torch.float32)
+    current = torch.tensor(rng.integers(-40, 50, (20, 2, 7)), dtype=torch.float32)
     threshold = torch.tensor(rng.integers(8, 60, 7), dtype=torch.float32)
     floor = threshold * torch.tensor(rng.integers(1, 3, 7))
     weights = torch.tensor(rng.normal(size=current.shape), dtype=torch.float32)
@@ -127,12 +128,6 @@ def test_equal_votes_stay_equal():
     assert equal > 10
 
 
-def test_a_seed_gives_the_same_weights():
-    one, same, other = (network(seed).export_weights() for seed in (0, 0, 1))
-    assert all(np.array_equal(one[name], same[name]) for name in one)
-    assert not np.array_equal(one["fc1.level"], other["fc1.level"])
-
-
 def test_groups_fill_the_axons_of_a_core():
     found = sized(taxels=39, classes=20, hops=3, features=16, copies=3, clocks=clocks_over(5, 325))
     assert (found.groups, found.hidden) == (8, (80, 80))
@@ -162,7 +157,7 @@ def test_round_trip(tmp_path):
     for which, seed in (("last", 0), ("best", 1)):
         found, made = read_trained(path, weights=which), random_network(seed)
         assert (found.weights, found.sets, found.graph, found.sha256) == (which, ("last", "best"), "ring", sha256)
-        for one, other in zip(found.network.towers[0], made.towers[0], strict=True):
+        for one, other in zip(found.network.stages, made.stages, strict=True):
             for part in PARTS:
                 np.testing.assert_array_equal(getattr(one, part), getattr(other, part))
     assert read_trained(path).weights == "last"
@@ -182,9 +177,9 @@ def rewritten(path, **changes):
 
 
 def with_first(name, change):
-    first, *rest = random_network(0).towers[0]
+    first, *rest = random_network(0).stages
     first = replace(first, **{name: change(getattr(first, name))})
-    return {"last": replace(random_network(0), towers=((first, *rest),))}
+    return {"last": replace(random_network(0), stages=(first, *rest))}
 
 
 @pytest.mark.parametrize(
@@ -195,7 +190,7 @@ def with_first(name, change):
         (lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]), "is truncated"),
         (lambda path: rewritten(path, **{"last/0/conv1/leak": np.ones(8, np.int8)}), "does not match its hash"),
         (lambda path: rewritten(path, version=2), "version 2, this program reads 1"),
-        (lambda path: rewritten(path, towers=0, graph=1), "no usable graph; the manifest has no usable towers"),
+        (lambda path: rewritten(path, towers=2, graph=1), "no usable graph; the manifest has no usable towers"),
         (lambda path: written(path, with_first("level", lambda k: k * 4)), "conv1: levels beyond 3"),
         (lambda path: written(path, with_first("leak", lambda v: v[None])), "leak is no array of 1 axes"),
     ],
@@ -204,145 +199,118 @@ def test_files_that_are_refused(tmp_path, make, said):
     path = tmp_path / "x.pt"
     written(path)
     made = make(path)
-    with pytest.raises(ModelError, match=said):
+    with pytest.raises(ModelError, match=f"{said}.*; copy or train it again"):
         read_trained(made if isinstance(made, Path) else path)
 
 
 # -- commands ----------------------------------------------------------------------------------------------------------
 
-
-@pytest.fixture
-def data(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    splits = [
-        replace(synthetic_grasps(per_class=3, steps=12, seed=seed), split=split)
-        for split, seed in (("train", 1), ("test", 2))
-    ]
-    write_released(tmp_path / "data", splits)
-    return tmp_path
+TRAIN = "train --system tactilesgnet-truenorth --data data --graph manual --features 2 --epochs 1"
 
 
-SMALL = (
-    *("--system", "tactilesgnet-truenorth", "--data", "data"),
-    *("--graph", "manual", "--features", "2", "--epochs", "1"),
-)
-VERIFY = ("verify", "x.loom", "--data", "data", "--checkpoint")
-
-
-def as_json(capsys, *words):
-    assert main([*words, "--json"]) == 0
+def as_json(capsys, words):
+    assert main([*words.split(), "--json"]) == 0
     return json.loads(capsys.readouterr().out)
 
 
-def mistake(capsys, *words):
-    assert main(list(words)) == 2
+def mistake(capsys, words):
+    assert main(words.split()) == 2
     return capsys.readouterr().err.removeprefix("spikeloom: ").rstrip("\n")
 
 
-def test_from_recordings_to_the_chip(data, capsys):
-    (run,) = as_json(capsys, "train", *SMALL, "-o", "x.pt")["runs"]
+def test_from_recordings_to_the_chip(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    seeds = (("train", 1), ("test", 2))
+    grasps = [replace(synthetic_grasps(per_class=2, steps=12, seed=seed), split=split) for split, seed in seeds]
+    write_released(tmp_path / "data", grasps)
+    (run,) = as_json(capsys, f"{TRAIN} -o x.pt")["runs"]
     assert run["command"].endswith("--system tactilesgnet-truenorth --graph manual --features 2 --epochs 1 --seed 0")
     assert run["recipe"] == CROSSBARS.to_json() | {"features": 2}
-    shown = as_json(capsys, "inspect", "x.pt")
-    assert (shown["copies"], shown["levels"], shown["towers"], shown["sets"]) == (3, 7, 1, ["last", "best", "clean"])
-    made = as_json(capsys, "compile", "x.pt", "--target", "truenorth", "-o", "x.loom")
+    shown = as_json(capsys, "inspect x.pt")
+    assert (shown["copies"], shown["levels"], shown["sets"]) == (3, 7, ["last", "best", "clean"])
+    made = as_json(capsys, "compile x.pt --target truenorth -o x.loom")
     assert made["provenance"]["checkpoint_sha256"] == shown["sha256"] == run["sha256"]
-    found = as_json(capsys, *VERIFY, "x.pt", "--spec-samples", "1")
+    found = as_json(capsys, "verify x.loom --data data --checkpoint x.pt --spec-samples 1")
     assert found["exact"]
-    assert found["E0"] == {"samples": 1, "differences": 0}
-    assert found["E1"]["differences"] == 0
-    assert found["correct"] == run["last"]["correct"]
-    decided = as_json(capsys, "run", "x.loom", "--data", "data")
-    assert decided["accuracy"] == run["last"]["accuracy"]
-    assert as_json(capsys, "estimate", "x.loom", "--data", "data")["per_inference"]["ticks"] == 12 + 3
+    assert found["correct"] == run["last"]["correct"] == predict_correct("x.pt", grasps[1])
     # what was finished is not trained again
-    (again,) = as_json(capsys, "train", *SMALL, "-o", "x.pt", "--resume")["runs"]
+    (again,) = as_json(capsys, f"{TRAIN} -o x.pt --resume")["runs"]
     assert again == run
-    again = mistake(capsys, "train", *SMALL, "--seed", "1", "--resume", "-o", "x.pt")
-    assert "x.pt: holds another training (other seed)" in again
+    assert "x.pt: holds another training (other seed)" in mistake(capsys, f"{TRAIN} --seed 1 --resume -o x.pt")
 
 
-def test_joined_towers_vote_together(data, capsys):
-    for seed in ("0", "1"):
-        as_json(capsys, "train", *SMALL, "--seed", seed, "-o", f"{seed}.pt")
-    report = as_json(capsys, "join", "0.pt", "1.pt", "-o", "both.pt")
-    assert report["command"] == "spikeloom join 0.pt 1.pt"
-    assert [tower["seed"] for tower in report["towers"]] == [0, 1]
-    assert "test" not in report
-    measured = as_json(capsys, "join", "0.pt", "1.pt", "--data", "data", "-o", "both.pt")
-    assert measured["command"] == "spikeloom join 0.pt 1.pt --data data"
-    as_json(capsys, "compile", "both.pt", "--target", "truenorth", "-o", "both.loom")
-    found = as_json(capsys, "verify", "both.loom", "--checkpoint", "both.pt", "--data", "data", "--spec-samples", "1")
-    assert found["exact"]
-    assert (measured["test"]["correct"], measured["test"]["samples"]) == (found["correct"], found["samples"])
-    assert measured["test"]["accuracy"] == found["correct"] / found["samples"]
-    both, parts = read_trained("both.pt").network, [read_trained(f"{seed}.pt").network for seed in (0, 1)]
-    events = synthetic_grasps(per_class=1, steps=12, seed=3)
-    votes = [run_network(part, events.events)["fc3"].sum(axis=1).reshape(6, -1, 6).sum(axis=1) for part in parts]
-    np.testing.assert_array_equal(predict(both, events), sum(votes).argmax(axis=1))
+def predict_correct(path, recordings):
+    return int(np.count_nonzero(predict(read_trained(path).network, recordings) == recordings.labels))
 
 
 @pytest.fixture
-def placed(data, capsys):
-    """Two networks, and a netlist of the first."""
-    for name, seed in (("x.pt", 4), ("y.pt", 5)):
-        networks = {which: grasps_network(seed + late) for which, late in (("last", 0), ("best", 9))}
-        write_trained(name, networks, graph="none", edges=np.zeros((0, 2), np.int64), training={})
-    as_json(capsys, "compile", "x.pt", "--target", "truenorth", "-o", "x.loom")
+def native(tmp_path, monkeypatch):
+    """A network of the zoo, its netlist and recordings, another network, and one of floats."""
+    made = specimen("native")
+    for name in ("net.pt", "net.loom", "data"):
+        (tmp_path / name).symlink_to(made.folder / name)
+    monkeypatch.chdir(tmp_path)
+    written("two.pt", {which: random_network(seed, taxels=TAXELS, classes=CLASSES) for which, seed in WHICH.items()})
+    own_file(Path("own.pt"))
 
 
-def grasps_network(seed):
-    return random_network(seed, taxels=39, features=2, classes=6, blocks=2, hidden=(8,), steps=12)
+WHICH = {"last": 4, "best": 5}
+SYNTHETIC = TRAIN.replace("--data data", "--data synthetic")
+VERIFY = "verify net.loom --data data --checkpoint"
 
 
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("train", *SMALL, "--recipe", "timed", "-o", "z.pt"), "--recipe timed: "),
-        (("train", *SMALL, "--current-decay", "fc1=0.9", "-o", "z.pt"), "--current-decay fc1=0.9: "),
-        (("train", *SMALL, "--spike-penalty", "0.5", "-o", "z.pt"), "--spike-penalty 0.5: "),
-        (("train", "--data", "data", "--graph", "manual", "--copies", "2", "-o", "z.pt"), "--copies 2: is for"),
-        (("compile", "x.pt", "-o", "z.loom"), "--target loihi1: x.pt was trained for TrueNorth"),
-        (("compile", "x.pt", "--target", "truenorth", "--planes", "2", "-o", "z.loom"), "--planes 2: is not for"),
-        (("compile", "x.pt", "--target", "truenorth", "--in-time", "2", "-o", "z.loom"), "x.pt: --in-time 2: "),
-        (("inspect", "x.pt", "--beta", "0.3"), "--beta 0.3: x.pt is a network for TrueNorth and says that itself"),
-        (("export", "x.pt", "--to", "onnx-float", "-o", "x.onnx"), "x.pt: is a network trained for TrueNorth"),
-        ((*VERIFY, "x.pt", "--require", "E3=1"), "--require E3=1: a network for TrueNorth has one model"),
-        ((*VERIFY, "x.pt", "--weights", "best"), "--weights best: x.loom was compiled from last; give the same"),
-        ((*VERIFY, "y.pt"), "--checkpoint y.pt: x.loom was compiled from another file"),
-        (("join", "x.pt", "-o", "z.pt"), "join: x.pt is one network already"),
-        (("join", "x.pt", "y.pt", "--data", "data", "-o", "z.pt"), "--data data: the networks were trained on other"),
-        (("join", "own.pt", "own.pt", "--data", "data", "-o", "z.pt"), "--data data: is for tactilesgnet-truenorth"),
+        (f"{SYNTHETIC} --recipe timed -o z.pt", "--recipe timed: "),
+        (f"{SYNTHETIC} --current-decay fc1=0.9 -o z.pt", "--current-decay fc1=0.9: "),
+        (f"{SYNTHETIC} --spike-penalty 0.5 -o z.pt", "--spike-penalty 0.5: "),
+        ("train --data synthetic --graph manual --copies 2 -o z.pt", "--copies 2: is for"),
+        ("compile net.pt -o z.loom", "--target loihi1: net.pt was trained for TrueNorth"),
+        ("compile net.pt --target truenorth --planes 2 -o z.loom", "--planes 2: is not for"),
+        ("compile net.pt --target truenorth --in-time 2 -o z.loom", "--in-time 2: "),
+        ("inspect net.pt --beta 0.3", "--beta 0.3: net.pt is a network for TrueNorth and says that itself"),
+        ("export net.pt --to onnx-float -o x.onnx", "net.pt: is a network trained for TrueNorth"),
+        (f"{VERIFY} net.pt --require E3=1", "--require E3=1: a network for TrueNorth has one model"),
+        (f"{VERIFY} net.pt --weights best", "--weights best: the file holds last"),
+        (f"{VERIFY} two.pt", "--checkpoint two.pt: net.loom was compiled from another file"),
+        ("verify two.loom --data data --checkpoint two.pt", "--weights last: two.loom was compiled from best"),
+        ("join net.pt own.pt -o z.pt", "net.pt: holds whole numbers of a chip"),
+        ("compile own.pt --target truenorth -o z.loom", "conv1, all 30 neurons: keep 0.2 of their membranes a step"),
+        ("compile own.pt --target truenorth -o z.loom", "--in-time N"),
+        ("compile own.pt --target truenorth -o z.loom", "spikeloom train --system tactilesgnet-truenorth"),
+        ("compile own.pt --target truenorth --weight-bits 4 -o z.loom", "--weight-bits 4: is not for truenorth"),
     ],
 )
-@pytest.mark.usefixtures("placed")
+@pytest.mark.usefixtures("native")
 def test_mistakes(capsys, words, said):
-    own_file(Path("own.pt"))
-    assert said.removeprefix("x.pt: ") in mistake(capsys, *words)
-    assert not Path("z.pt").exists()
-    assert not Path("z.loom").exists()
+    as_json(capsys, "compile two.pt --weights best --target truenorth -o two.loom")
+    assert said in mistake(capsys, words)
+    assert not list(Path().glob("z.*"))
 
 
-@pytest.mark.usefixtures("placed")
+@pytest.mark.usefixtures("native")
 def test_a_spike_that_differs_fails(capsys):
-    netlist = read_crossbars("x.loom")
-    write_crossbars(replace(netlist, threshold=netlist.threshold + 9), "x.loom")
-    assert main([*VERIFY, "x.pt", "--spec-samples", "0", "--json"]) == 1
+    netlist = read_crossbars("net.loom")
+    write_crossbars(replace(netlist, threshold=netlist.threshold + 9), "other.loom")
+    words = f"{VERIFY.replace('net.loom', 'other.loom')} net.pt --spec-samples 0 --json"
+    assert main(words.split()) == 1
     report = json.loads(capsys.readouterr().out)
     assert report["E1"]["differences"] > 0
     assert not report["exact"]
 
 
-def test_what_is_printed(data, capsys, golden):
+@pytest.mark.usefixtures("native")
+def test_what_is_printed(capsys, golden):
     record = {"command": "by hand", "test_samples": 18, "last": {"epoch": 1, "correct": 3, "accuracy": 1 / 6}}
-    edges = np.zeros((0, 2), np.int64)
-    write_trained("made.pt", {"last": grasps_network(4)}, graph="none", edges=edges, training=record)
+    network = random_network(4, taxels=TAXELS, classes=CLASSES)
+    write_trained("made.pt", {"last": network}, graph="none", edges=np.zeros((0, 2), np.int64), training=record)
     printed = []
     for words in (
-        ("inspect", "made.pt"),
-        ("compile", "made.pt", "--target", "truenorth", "-o", "made.loom"),
-        ("verify", "made.loom", "--checkpoint", "made.pt", "--data", "data", "--spec-samples", "1"),
+        "inspect made.pt",
+        "compile made.pt --target truenorth -o made.loom",
+        "verify made.loom --checkpoint made.pt --data data --spec-samples 1",
     ):
-        assert main(list(words)) == 0
-        printed.append(f"$ spikeloom {' '.join(words)}\n{capsys.readouterr().out}")
+        assert main(words.split()) == 0
+        printed.append(f"$ spikeloom {words}\n{capsys.readouterr().out}")
     golden("truenorth_native.txt", "\n".join(printed))

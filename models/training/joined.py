@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 
@@ -16,22 +16,11 @@ class JoinedLayer:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class JoinedTest:
-    """Test recordings that the joined network decides right."""
-
-    correct: int
-    samples: int
-    accuracy: float
-    data: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Joined:
     """Networks that were put side by side; `towers` has of each its file, hash and training record."""
 
     command: str
     towers: Sequence[Mapping[str, Any]]
-    test: JoinedTest | None = field(default=None, metadata={"optional": True})
     system: str
     graph: str | None
     classes: int

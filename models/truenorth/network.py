@@ -58,6 +58,9 @@ References
 
 Arrays = dict[str, NDArray[np.float32]]
 
+VECTORS = ("threshold", "floor", "leak")
+"""What each neuron of a layer has, beside its levels."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NativeArchitecture:
@@ -217,7 +220,7 @@ class NativeNet(TrainedModule):
         found: Arrays = {}
         with torch.no_grad():
             for name, layer in zip(self.architecture.layers, self.rounded(), strict=True):
-                whole = {"level": layer.weight / UNIT} | {n: getattr(layer, n) for n in ("threshold", "floor", "leak")}
+                whole = {"level": layer.weight / UNIT} | {each: getattr(layer, each) for each in VECTORS}
                 found |= {f"{name}.{what}": np.round(values.numpy()) for what, values in whole.items()}
         return found
 
@@ -240,7 +243,7 @@ def run_layers(
     events: Tensor,
     surrogate: Surrogate = RECTANGLE,
 ) -> list[Tensor]:
-    """Spikes of every layer of a tower, each (steps, samples, neurons), for (steps, samples, taxels, channels).
+    """Spikes of every layer, each (steps, samples, neurons), for (steps, samples, taxels, channels).
 
     The first of the layers receives the sensor in one block; `inputs` (blocks, width) are what each block of the others
     receives from the layer before.
@@ -265,58 +268,54 @@ def _spikes(layer: Rounded, sums: Tensor, surrogate: Surrogate) -> Tensor:
 
 
 def native_network(architecture: NativeArchitecture, arrays: Mapping[str, NDArray[np.float32]]) -> NativeNetwork:
-    """Network of one tower from what `NativeNet.export_weights` returned."""
+    """Network from what `NativeNet.export_weights` returned."""
     channels = np.arange(architecture.taxels * architecture.channels)[None]
-    received = [channels, *architecture.inputs()]
-    tower = tuple(
-        Stage(
-            name=name,
-            inputs=inputs,
-            **{what: arrays[f"{name}.{what}"].astype(np.int64) for what in ("level", "threshold", "floor", "leak")},
-        )
-        for name, inputs in zip(architecture.layers, received, strict=True)
-    )
     return NativeNetwork(
         taxels=architecture.taxels,
         polarities=architecture.channels,
         classes=architecture.classes,
         copies=architecture.copies,
         clocks=architecture.clocks,
-        towers=(tower,),
+        stages=tuple(
+            Stage(name=name, inputs=inputs, **{n: arrays[f"{name}.{n}"].astype(np.int64) for n in ("level", *VECTORS)})
+            for name, inputs in zip(architecture.layers, [channels, *architecture.inputs()], strict=True)
+        ),
     )
 
 
 def predict(network: NativeNetwork, recordings: Recordings) -> NDArray[np.int64]:
-    """Class of each recording by the added votes of all towers; equal ones count for the lowest class."""
+    """Class of each recording; equal votes count for the lowest class."""
     found = []
     for index in range(len(recordings)):
         events = recordings.events[index : index + 1, ..., : recordings.steps_of(index)]
-        last = network.towers[0][-1].name
-        votes = run_network(network, events)[last].sum(axis=1)
-        found.append(votes.reshape(-1, network.classes).sum(axis=0).argmax())
+        found.append(votes_by_step(network, events).sum(axis=0).argmax())
     return np.array(found, np.int64)
 
 
+def votes_by_step(network: NativeNetwork, events: NDArray[np.uint8]) -> NDArray[np.int64]:
+    """Votes (steps, classes) in one recording (1, taxels, polarities, steps)."""
+    spikes = run_network(network, events)[network.stages[-1].name][0]
+    votes: NDArray[np.int64] = spikes.reshape(len(spikes), -1, network.classes).sum(axis=1)
+    return votes
+
+
 def run_network(network: NativeNetwork, events: NDArray[np.uint8]) -> dict[str, NDArray[np.bool_]]:
-    """Spikes of every layer (samples, steps, neurons), towers side by side, as the model computes them in training.
+    """Spikes of every layer (samples, steps, neurons), as the model computes them in training.
 
     `events` are (samples, taxels, polarities, steps) uint8.
     """
     given = torch.from_numpy(events.transpose(3, 0, 1, 2).astype(np.float32, order="C"))
-    parts: dict[str, list[NDArray[np.bool_]]] = {}
+    layers = [
+        Rounded(
+            weight=torch.from_numpy((stage.level * UNIT).astype(np.float32)),
+            **{name: torch.tensor(getattr(stage, name), dtype=torch.float32) for name in VECTORS},
+        )
+        for stage in network.stages
+    ]
     with torch.no_grad():
-        for tower in network.towers:
-            layers = [
-                Rounded(
-                    weight=torch.from_numpy((stage.level * UNIT).astype(np.float32)),
-                    **{n: torch.tensor(getattr(stage, n), dtype=torch.float32) for n in ("threshold", "floor", "leak")},
-                )
-                for stage in tower
-            ]
-            spikes = run_layers(layers, [stage.inputs for stage in tower[1:]], network.clocks, given)
-            for stage, found in zip(tower, spikes, strict=True):
-                parts.setdefault(stage.name, []).append(found.numpy().astype(np.bool_).swapaxes(0, 1))
-    return {name: np.concatenate(found, axis=2) for name, found in parts.items()}
+        found = run_layers(layers, [stage.inputs for stage in network.stages[1:]], network.clocks, given)
+    spikes = zip(network.stages, found, strict=True)
+    return {stage.name: held.numpy().astype(np.bool_).swapaxes(0, 1) for stage, held in spikes}
 
 
 def _past(real: Tensor, whole: Tensor) -> Tensor:

@@ -294,7 +294,7 @@ def chip_commands(name: str) -> Any | None:
     """What a chip does in its own way: its module ``commands``, if it has one.
 
     ``compile_network(arguments)`` and ``verify(arguments)`` for all networks; for checkpoints that were trained for the
-    chip, which ``takes(path)`` knows, ``inspect(arguments)`` and ``join(arguments)``.
+    chip, which ``takes(path)`` knows, ``inspect(arguments)``.
     """
     return _own_module(name, "commands")
 

@@ -5,12 +5,11 @@ A draft checks nothing that a chip limits: it may break any rule, and :mod:`true
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from spikeloom.compiler.dynamics import NO_CLOCKS, Clocks
 from spikeloom.compiler.fixedpoint import read_only
@@ -18,6 +17,8 @@ from spikeloom.compiler.targets.truenorth.netlist import AXON_TYPES, RESET_TO, C
 from spikeloom.compiler.types import IntArray
 
 Rows = list[tuple[int, ...]]
+Place = tuple[int, int]
+"""Core, and neuron or line on it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,18 +69,14 @@ def crossing_points(levels: IntArray, weights: Sequence[int]) -> IntArray:
     return np.stack(points, axis=-1).astype(np.int64)
 
 
-@dataclass(slots=True, kw_only=True)
+@dataclass(slots=True)
 class Core:
-    """A core in the making at a place: axons as (line, type), neurons as (Neuron, layer, number).
-
-    `synapses` has for each axon the neurons of the core at its crossing points.
-    """
+    """A core in the making at a place: axons as (line, type, neurons they join), neurons as (Neuron, layer, number)."""
 
     x: int
     y: int
-    axons: list[tuple[int, int]] = field(default_factory=list)
+    axons: list[tuple[int, int, list[int]]] = field(default_factory=list)
     neurons: list[tuple[Neuron, int, int]] = field(default_factory=list)
-    synapses: list[list[int]] = field(default_factory=list)
 
 
 @dataclass(slots=True, kw_only=True)
@@ -93,17 +90,10 @@ class Draft:
     clocks: Rows = field(default_factory=list)
     votes: Rows = field(default_factory=list)
 
-    def core(self, x: int, y: int) -> int:
+    def core(self, x: int = 0, y: int = 0) -> int:
         """Add a core at a place."""
-        self.cores.append(Core(x=x, y=y))
+        self.cores.append(Core(x, y))
         return len(self.cores) - 1
-
-    def axon(self, core: int, kind: int = 0, *, line: int | None = None) -> int:
-        """Add an axon of a type, on the next line by default; return its line."""
-        line = len(self.cores[core].axons) if line is None else line
-        self.cores[core].axons.append((line, kind))
-        self.cores[core].synapses.append([])
-        return line
 
     def neuron(self, core: int, neuron: Neuron, *, layer: str = "relays", number: int = 0) -> int:
         """Add a neuron; return its number on the core."""
@@ -112,18 +102,25 @@ class Draft:
         self.cores[core].neurons.append((neuron, self.layers.index(layer), number))
         return len(self.cores[core].neurons) - 1
 
-    def connect(self, core: int, line: int, neurons: Sequence[int]) -> None:
-        """Set the crossing points of the axon on a line with neurons of the core."""
-        lines = [held for held, _ in self.cores[core].axons]
-        self.cores[core].synapses[lines.index(line)] += neurons
+    def axon(self, core: int, kind: int = 0, neurons: Sequence[int] = (), *, line: int | None = None) -> int:
+        """Add an axon of a type that joins neurons of its core, on the next line by default; return its line."""
+        line = len(self.cores[core].axons) if line is None else line
+        self.cores[core].axons.append((line, kind, sorted(set(neurons))))
+        return line
 
-    def wire(self, source: tuple[int, int], core: int, line: int, delay: int = 1) -> None:
+    def inputs(self, core: int, points: IntArray, *, kept: int = 0) -> Iterator[tuple[int, int]]:
+        """Add axons for inputs by their crossing points (inputs, neurons, copies); yields each with its input.
+
+        A copy that joins nothing is left out, except those of the first `kept` inputs.
+        """
+        for row, copies in enumerate(points.transpose(0, 2, 1)):
+            for kind, joined in enumerate(map(np.flatnonzero, copies)):
+                if row < kept or joined.size:
+                    yield row, self.axon(core, kind, joined.tolist())
+
+    def wire(self, source: Place, core: int, line: int, delay: int = 1) -> None:
         """Lead the spikes of a neuron to the axon on a line of a core."""
-        self.wire_to(source, (self.cores[core].x, self.cores[core].y), line, delay)
-
-    def wire_to(self, source: tuple[int, int], place: tuple[int, int], line: int, delay: int = 1) -> None:
-        """The same, the core by its place."""
-        self.wires.append((*source, *place, line, delay))
+        self.wires.append((*source, core, line, delay))
 
     def feed(self, channel: int, core: int, line: int, *, tick: int = 0) -> None:
         """Lead the events of an input channel to an axon, so many ticks after the first of their data step."""
@@ -133,21 +130,9 @@ class Draft:
         """Let an axon have a spike every `period` ticks, from tick `phase` on."""
         self.clocks.append((core, line, period, phase))
 
-    def vote(self, source: tuple[int, int], label: int, *, first: int = 0) -> None:
+    def vote(self, source: Place, label: int, *, first: int = 0) -> None:
         """Let the spikes of a neuron count for a class, from tick `first` on."""
         self.votes.append((*source, label, first))
-
-    def split(self, source: tuple[int, int], targets: Sequence[tuple[int, int]], via: int, *, delay: int = 1) -> None:
-        """Lead the spikes of a neuron to several axons: an axon of the core `via`, and a relay for each.
-
-        Every spike arrives ``1 + delay`` ticks later: one to the relays, the rest from there.
-        """
-        line = self.axon(via)
-        relays = [self.neuron(via, RELAY) for _ in targets]
-        self.connect(via, line, relays)
-        self.wire(source, via, line)
-        for relay, (core, target) in zip(relays, targets, strict=True):
-            self.wire((via, relay), core, target, delay)
 
     def netlist(
         self,
@@ -162,25 +147,22 @@ class Draft:
     ) -> CrossbarNetlist:
         """What was drafted, as arrays."""
         neurons = [entry for core in self.cores for entry in core.neurons]
+        axons = [entry for core in self.cores for entry in core.axons]
         first = np.cumsum([0, *(len(core.neurons) for core in self.cores)])
 
-        def column(values: Sequence[Any]) -> npt.NDArray[np.int64]:
-            return read_only(np.array(values, np.int64).reshape(len(values)))
+        def columns(table: Sequence[Any], *names: str) -> dict[str, IntArray]:
+            values = np.array(table, np.int64).reshape(-1, len(names))
+            return {name: read_only(np.ascontiguousarray(column)) for name, column in zip(names, values.T, strict=True)}
 
-        def rows(table: Rows, width: int) -> list[npt.NDArray[np.int64]]:
-            return [read_only(part) for part in np.array(table, np.int64).reshape(-1, width).T]
-
-        wires, feeds, ticking, votes = rows(self.wires, 6), rows(self.feeds, 4), rows(self.clocks, 4), self.votes
+        wires = [
+            (first[core] + number, self.cores[end].x, self.cores[end].y, line, delay)
+            for core, number, end, line, delay in self.wires
+        ]
         label, opens = np.full(len(neurons), -1), np.zeros(len(neurons), np.int64)
-        for core, number, voted, tick in votes:
+        for core, number, voted, tick in self.votes:
             label[first[core] + number], opens[first[core] + number] = voted, tick
         weights = [(*neuron.weights, *[0] * (AXON_TYPES - len(neuron.weights))) for neuron, _, _ in neurons]
-        held = [sorted(set(points)) for core in self.cores for points in core.synapses]
-        parameters = {
-            name: column([getattr(neuron, name) for neuron, _, _ in neurons])
-            for name in Neuron.__dataclass_fields__
-            if name != "weights"
-        }
+        parameters = [name for name in Neuron.__dataclass_fields__ if name != "weights"]
         return CrossbarNetlist(
             target=target,
             taxels=taxels,
@@ -188,24 +170,20 @@ class Draft:
             classes=classes,
             bin_ticks=bin_ticks,
             layers=tuple(self.layers),
-            core_x=column([core.x for core in self.cores]),
-            core_y=column([core.y for core in self.cores]),
             core_neurons=read_only(first),
             core_axons=read_only(np.cumsum([0, *(len(core.axons) for core in self.cores)])),
-            axon_line=column([line for core in self.cores for line, _ in core.axons]),
-            axon_type=column([kind for core in self.cores for _, kind in core.axons]),
-            axon_synapses=read_only(np.cumsum([0, *map(len, held)])),
-            synapse_neuron=column([neuron for points in held for neuron in points]),
+            axon_synapses=read_only(np.cumsum([0, *(len(joined) for _, _, joined in axons)])),
+            synapse_neuron=read_only(np.array([neuron for _, _, joined in axons for neuron in joined], np.int64)),
             weight=read_only(np.array(weights, np.int64).reshape(-1, AXON_TYPES)),
-            layer=column([layer for _, layer, _ in neurons]),
-            neuron=column([number for _, _, number in neurons]),
             readout_class=read_only(label),
             readout_first=read_only(opens),
-            wire_neuron=read_only(first[wires[0]] + wires[1]),
-            **dict(zip(("wire_x", "wire_y", "wire_line", "wire_delay"), wires[2:], strict=True)),
-            **dict(zip(("feed_channel", "feed_core", "feed_line", "feed_tick"), feeds, strict=True)),
-            **dict(zip(("clock_core", "clock_line", "clock_period", "clock_phase"), ticking, strict=True)),
-            **parameters,
+            **columns([(core.x, core.y) for core in self.cores], "core_x", "core_y"),
+            **columns([(line, kind) for line, kind, _ in axons], "axon_line", "axon_type"),
+            **columns([(layer, number) for _, layer, number in neurons], "layer", "neuron"),
+            **columns([[getattr(neuron, name) for name in parameters] for neuron, _, _ in neurons], *parameters),
+            **columns(wires, "wire_neuron", "wire_x", "wire_y", "wire_line", "wire_delay"),
+            **columns(self.feeds, "feed_channel", "feed_core", "feed_line", "feed_tick"),
+            **columns(self.clocks, "clock_core", "clock_line", "clock_period", "clock_phase"),
             provenance=dict(provenance or {}),
             clocks=clocks,
         )

@@ -20,14 +20,14 @@ those of the others by copies of the neurons.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from spikeloom.compiler.errors import CapacityError
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.targets.truenorth.builder import RELAY, Draft, Neuron, crossing_points
+from spikeloom.compiler.targets.truenorth.builder import RELAY, Draft, Neuron, Place, crossing_points
 from spikeloom.compiler.targets.truenorth.codebook import (
     BIN_TICKS,
     EMPTYING,
@@ -39,7 +39,6 @@ from spikeloom.compiler.targets.truenorth.codebook import (
     LevelNetwork,
     gate_axons,
 )
-from spikeloom.compiler.targets.truenorth.legalize import signed_range
 from spikeloom.compiler.targets.truenorth.lower import exceeded, place_cores
 from spikeloom.compiler.targets.truenorth.netlist import AXON_TYPES, RESET_LINEAR, RESET_TO, CrossbarNetlist
 from spikeloom.compiler.types import IntArray
@@ -51,28 +50,21 @@ RELAYED = 2
 """Ticks that a spike of a split layer takes to the next one, by a relay or without."""
 
 
-Place = tuple[int, int]
-"""Core, and neuron or line on it."""
-
-
 def lower_in_time(
     network: LevelNetwork, chip: Target, *, provenance: Mapping[str, Any] | None = None
 ) -> CrossbarNetlist:
-    """Place a network in levels.
-
-    Raises
-    ------
-    CapacityError
-        If a threshold is too high, or a layer has more groups or targets than a core holds; cores are not counted here.
-    """
+    """Place a network in levels; CapacityError if a layer has more groups than a core holds, or too many cores."""
     placing = _Placing(network=network, chip=chip, starts=_starts(network))
     ends: list[list[Place]] | None = None
-    for depth in range(len(network.layers) - 1, -1, -1):
-        ends = placing.layer(depth, ends)
+    for depth, layer in reversed(list(enumerate(network.layers))):
+        inputs: list[list[Place]] = [[] for _ in range(layer.level.shape[1])]
+        add = placing.split if layer.is_split else placing.whole
+        add(depth, layer, ends, inputs)
+        ends = inputs
     for channel, places in enumerate(ends or []):
         for core, line in places:
-            placing.draft.feed(channel, core, line, tick=0)
-    place_cores(placing.draft, placing.wires, chip, "use fewer axons an input, or train with fewer features")
+            placing.draft.feed(channel, core, line)
+    place_cores(placing.draft, chip, "use fewer axons an input, or train with fewer features")
     return placing.draft.netlist(
         taxels=network.taxels,
         polarities=network.polarities,
@@ -104,34 +96,27 @@ def first_spikes(network: LevelNetwork) -> dict[str, int]:
 
 @dataclass(slots=True, kw_only=True)
 class _Placing:
-    """Cores as they are made, last layer first; `starts` are those of the layers."""
+    """Cores as they are made, last layer first; `starts` are those of the layers.
+
+    A layer is added with the axons `ends` that its neurons reach, and notes those that each of its `inputs` must reach.
+    """
 
     network: LevelNetwork
     chip: Target
     starts: list[int]
     draft: Draft = field(default_factory=Draft)
-    wires: list[tuple[Place, tuple[int, int, int]]] = field(default_factory=list)
     relay_core: int | None = None
 
-    def layer(self, depth: int, ends: list[list[Place]] | None) -> list[list[Place]]:
-        """Add a layer whose neurons reach axons `ends`; return the axons that each of its inputs must reach."""
-        layer = self.network.layers[depth]
-        inputs: list[list[Place]] = [[] for _ in range(layer.level.shape[1])]
-        add = self._split if layer.is_split else self._whole
-        add(depth, layer, ends, inputs)
-        return inputs
-
-    def _whole(self, depth: int, layer: Layer, ends: list[list[Place]] | None, inputs: list[list[Place]]) -> None:
+    def whole(self, depth: int, layer: Layer, ends: list[list[Place]] | None, inputs: list[list[Place]]) -> None:
         """A layer whose inputs fit a core: a neuron for each axon that it reaches, all in one tick."""
         aims = [(n, end) for n in range(len(layer.level)) for end in ([None] if ends is None else ends[n])]
         types, start = _types(layer.copies), self.starts[depth]
         for part in self._packed(layer, aims):
-            core = self.draft.core(0, 0)
+            core = self.draft.core()
             for n, end in part:
                 threshold = int(layer.threshold[n])
                 # one that would spike without inputs has to wait for a clock: its leak alone must not do
                 lift, leak = (types[CLOCK], -threshold) if threshold > 0 else (1 - threshold, -1)
-                self._require_leak(layer, n, max(-leak, lift))
                 made = Neuron(weights=(*types[:CLOCK], lift), leak=leak, threshold=0)
                 self._add(core, made, layer, n, None if end is None else [end], depth, 1)
             chosen = np.array([n for n, _ in part])
@@ -140,7 +125,7 @@ class _Placing:
             if waiting:
                 self._clock(core, CLOCK, waiting, start)
 
-    def _split(self, depth: int, layer: Layer, ends: list[list[Place]] | None, inputs: list[list[Place]]) -> None:
+    def split(self, depth: int, layer: Layer, ends: list[list[Place]] | None, inputs: list[list[Place]]) -> None:
         """A layer whose partial sums travel in time."""
         groups, start = layer.groups, self.starts[depth]
         sums = self._gated(depth, layer, len(groups), ends)
@@ -148,7 +133,7 @@ class _Placing:
         for number, group in enumerate(groups):
             aims = [(n, sign) for n in range(len(layer.level)) for sign in (1, -1)]
             for first in range(0, len(aims), most):
-                core, part = self.draft.core(0, 0), aims[first : first + most]
+                core, part = self.draft.core(), aims[first : first + most]
                 for n, sign in part:
                     made = Neuron(
                         weights=(*(sign * weight for weight in types[:CLOCK]), PULL),
@@ -157,7 +142,7 @@ class _Placing:
                     )
                     own_number = 2 * (number * len(layer.level) + n) + (sign < 0)
                     added = self.draft.neuron(core, made, layer=f"{layer.name} sums", number=own_number)
-                    self.wires.append(((core, added), (*sums[n][2 * number + (sign < 0)], 1)))
+                    self.draft.wire((core, added), *sums[n][2 * number + (sign < 0)])
                 chosen = np.array([n for n, _ in part])
                 self._inputs(core, layer, layer.level[chosen][:, group].T, range(group.start, group.stop), inputs)
                 for _ in range(EMPTYING):
@@ -174,7 +159,7 @@ class _Placing:
             raise CapacityError((exceeded(self.chip, f"{layer.name}, a neuron", "core.axons", used, remedy),))
         start, found = self.starts[depth], list[list[Place]]()
         for first in range(0, len(layer.level), a_core):
-            core, numbers = self.draft.core(0, 0), range(first, min(first + a_core, len(layer.level)))
+            core, numbers = self.draft.core(), range(first, min(first + a_core, len(layer.level)))
             for n in numbers:
                 made = Neuron(
                     weights=(1, -1, LIFT, PULL),
@@ -183,10 +168,9 @@ class _Placing:
                     negative_threshold=reach,
                 )
                 self._add(core, made, layer, n, None if ends is None else ends[n], depth, RELAYED)
-                lines = [self.draft.axon(core, sign) for _ in range(groups) for sign in (0, 1)]
-                for line in lines:
-                    self.draft.connect(core, line, [n - first])
-                found.append([(core, line) for line in lines])
+                found.append(
+                    [(core, self.draft.axon(core, sign, [n - first])) for _ in range(groups) for sign in (0, 1)]
+                )
             for _ in range(lifts):
                 self._clock(core, 2, range(len(numbers)), start + MOST)
             for _ in range(pulls):
@@ -201,9 +185,9 @@ class _Placing:
         if ends is None:
             self.draft.vote((core, number), int(self.network.label[n]), first=self.starts[depth])
         elif len(ends) == 1:
-            self.wires.append(((core, number), (*ends[0], delay)))
+            self.draft.wire((core, number), *ends[0], delay)
         elif ends:
-            self.wires.append(((core, number), (*self._relays(ends), 1)))
+            self.draft.wire((core, number), *self._relays(ends))
 
     def _relays(self, aims: Sequence[Place]) -> Place:
         """An axon, and a relay for each target on its core; the last core of relays is used as long as it has room."""
@@ -211,12 +195,11 @@ class _Placing:
         core = self.relay_core
         full = core is None or len(self.draft.cores[core].neurons) + len(aims) > most
         if core is None or full or len(self.draft.cores[core].axons) == lines:
-            core = self.relay_core = self.draft.core(0, 0)
-        line = self.draft.axon(core)
+            core = self.relay_core = self.draft.core()
         relays = [self.draft.neuron(core, RELAY) for _ in aims]
-        self.draft.connect(core, line, relays)
-        self.wires += [((core, relay), (*aim, 1)) for relay, aim in zip(relays, aims, strict=True)]
-        return core, line
+        for relay, aim in zip(relays, aims, strict=True):
+            self.draft.wire((core, relay), *aim)
+        return core, self.draft.axon(core, 0, relays)
 
     def _packed(self, layer: Layer, aims: list[tuple[int, Place | None]]) -> Iterator[list[tuple[int, Place | None]]]:
         """Neurons in their order, as many to a core as their inputs leave room for, with an axon for a clock."""
@@ -233,25 +216,9 @@ class _Placing:
             yield part
 
     def _inputs(self, core: int, layer: Layer, levels: IntArray, sources: range, inputs: list[list[Place]]) -> None:
-        """Add the axons of inputs (inputs, neurons of the core), a copy only where something is joined."""
-        points = crossing_points(levels, WEIGHTS[layer.copies])
-        for row, source in enumerate(sources):
-            for copy in range(layer.copies):
-                joined = np.flatnonzero(points[row, :, copy]).tolist()
-                if joined:
-                    line = self.draft.axon(core, copy)
-                    self.draft.connect(core, line, joined)
-                    inputs[source].append((core, line))
-
-    def _require_leak(self, layer: Layer, n: int, needed: int) -> None:
-        """A threshold is a leak, and a lift of a clock where it is not above zero."""
-        most = -signed_range(self.chip.limit("neuron.leak_bits"))[0] - 1
-        if needed > most:
-            remedy = "its threshold in steps of its weights; use fewer axons an input"
-            broken = exceeded(self.chip, f"{layer.name}, neuron {n}", "neuron.leak_bits", needed, remedy)
-            raise CapacityError((replace(broken, allowed=most),))
+        """Add the axons of inputs (inputs, neurons of the core)."""
+        for row, line in self.draft.inputs(core, crossing_points(levels, WEIGHTS[layer.copies])):
+            inputs[sources[row]].append((core, line))
 
     def _clock(self, core: int, kind: int, neurons: Sequence[int], phase: int) -> None:
-        line = self.draft.axon(core, kind)
-        self.draft.connect(core, line, list(neurons))
-        self.draft.clock(core, line, period=BIN_TICKS, phase=phase)
+        self.draft.clock(core, self.draft.axon(core, kind, neurons), period=BIN_TICKS, phase=phase)

@@ -1,8 +1,8 @@
 """A network of whole numbers that crossbar cores hold: what is trained for TrueNorth, before it is placed.
 
-A network is one or more *towers* side by side, whose votes add up. A tower is a chain of *stages*. A stage has blocks
-of neurons; all neurons of a block receive the same inputs, each input reaches one block, and every stage but the
-first may receive the clocks, too. With levels ``k`` of a neuron for its inputs,
+A network is a chain of *stages*. A stage has blocks of neurons; all neurons of a block receive the same inputs, each
+input reaches one block, and every stage but the first may receive the clocks, too. With levels ``k`` of a neuron for
+its inputs,
 
     ``m_t = c_{t-1} + UNIT * sum_i k_i x_i(t) + leak``,  ``s_t = m_t >= threshold``,
     ``c_t = 0`` after a spike, ``max(m_t, -floor)`` otherwise, from ``c = 0`` on:
@@ -16,8 +16,8 @@ seven, with ``(-7, 1, 2, 4)`` fifteen, each times ``UNIT``, which makes threshol
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -66,7 +66,7 @@ def steepest_leak(threshold: IntArray, depth: int) -> IntArray:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Stage:
-    """Neurons of one layer of a tower; neuron ``block * size + n``.
+    """Neurons of one layer; neuron ``block * size + n``.
 
     `inputs` (blocks, width) are the neurons of the stage before that each block receives, channels of the sensor in the
     first stage; `level` (blocks, width + clocks, size) is for each of these, for each clock as far as the stage
@@ -101,12 +101,9 @@ class Stage:
         return int(self.level.shape[1] - self.inputs.shape[1])
 
 
-Tower = tuple[Stage, ...]
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class NativeNetwork:
-    """Towers over one sensor: neuron n of a last stage votes for class ``n % classes``.
+    """Stages over a sensor: neuron n of the last votes for class ``n % classes``.
 
     An input is led to `copies` axons, 2 to 4; the `clocks` are channels after those of the sensor.
     """
@@ -115,34 +112,26 @@ class NativeNetwork:
     polarities: int
     classes: int
     copies: int
-    towers: tuple[Tower, ...]
+    stages: tuple[Stage, ...]
     clocks: Clocks = NO_CLOCKS
 
     @property
     def neurons(self) -> dict[str, int]:
-        """Neurons of each layer, over all towers."""
-        found: dict[str, int] = {}
-        for tower in self.towers:
-            for stage in tower:
-                found[stage.name] = found.get(stage.name, 0) + stage.neurons
-        return found
+        """Neurons of each layer."""
+        return {stage.name: stage.neurons for stage in self.stages}
 
 
 def faults(network: NativeNetwork) -> list[str]:
     """What in a network contradicts itself or the rules above; empty if it can be placed."""
     if network.copies not in BASES:
         return [f"{network.copies} copies of an input, allowed are {', '.join(map(str, BASES))}"]
-    found = []
-    for number, tower in enumerate(network.towers):
-        fan_in = network.taxels * network.polarities
-        for depth, stage in enumerate(tower):
-            found += [
-                f"tower {number}, {stage.name}: {fault}" for fault in _stage_faults(network, stage, depth, fan_in)
-            ]
-            fan_in = stage.neurons
-        if not tower or fan_in % network.classes:
-            found.append(f"tower {number}: {fan_in} voting neurons for {network.classes} classes")
-    return found if network.towers else ["no towers"]
+    found, fan_in = [], network.taxels * network.polarities
+    for depth, stage in enumerate(network.stages):
+        found += [f"{stage.name}: {fault}" for fault in _stage_faults(network, stage, depth, fan_in)]
+        fan_in = stage.neurons
+    if not network.stages or fan_in % network.classes:
+        found.append(f"{fan_in} voting neurons for {network.classes} classes")
+    return found
 
 
 def _stage_faults(network: NativeNetwork, stage: Stage, depth: int, fan_in: int) -> Iterator[str]:
@@ -162,16 +151,3 @@ def _stage_faults(network: NativeNetwork, stage: Stage, depth: int, fan_in: int)
         yield f"thresholds and floors outside 1 <= threshold <= floor <= {THRESHOLD_MOST}"
     elif np.any(np.abs(stage.leak) > steepest_leak(stage.threshold, depth)):
         yield "leaks that the ticks before the first data cannot undo"
-
-
-def joined(networks: Sequence[NativeNetwork]) -> NativeNetwork:
-    """One network with the towers of all, whose votes add up; the ValueError names in what they differ."""
-    one = networks[0]
-    for what in ("taxels", "polarities", "classes", "copies", "clocks"):
-        found = {str(getattr(network, what)) for network in networks}
-        if len(found) > 1:
-            raise ValueError(f"differ in {what}: {', '.join(sorted(found))}")
-    layers = {", ".join(stage.name for stage in tower) for network in networks for tower in network.towers}
-    if len(layers) > 1:
-        raise ValueError(f"differ in their layers: {' and '.join(sorted(layers))}")
-    return replace(one, towers=tuple(tower for network in networks for tower in network.towers))

@@ -1,10 +1,10 @@
 """File of a network trained for crossbar cores; an archive of :mod:`compiler.archive`.
 
 Members, format version 1: the ``manifest`` (``format`` "spikeloom-native", ``version``, ``taxels``, ``polarities``,
-``classes``, ``copies``, ``clocks``, ``graph`` with ``name`` and ``edges``, ``layers``, ``towers``, ``weights``: the
-sets in the file, and ``training``: how it was made and what it reached), for every set, tower and layer
-``SET/TOWER/LAYER/PART`` with the parts of :class:`native.Stage`, and the ``sha256``. All numbers are
-whole: what is in the file is what the chip computes.
+``classes``, ``copies``, ``clocks``, ``graph`` with ``name`` and ``edges``, ``layers``, ``towers``: 1, ``weights``: the
+sets in the file, and ``training``: how it was made and what it reached), for every set and layer ``SET/0/LAYER/PART``
+with the parts of :class:`native.Stage`, and the ``sha256``. All numbers are whole: what is in the file is what the chip
+computes.
 """
 
 from __future__ import annotations
@@ -41,8 +41,7 @@ VERSION = 1
 PARTS = ("inputs", "level", "threshold", "floor", "leak")
 """Arrays of a stage, in file order."""
 
-MOST_TOWERS, MOST_LAYERS = 4096, 64
-"""A tower has a core at least."""
+MOST_LAYERS = 64
 
 _AGAIN = "copy or train it again"
 
@@ -74,17 +73,7 @@ def write_trained(
 ) -> str:
     """Write a file, whole or not at all; return its sha256. Equal input gives equal bytes.
 
-    Parameters
-    ----------
-    networks : mapping of ``last``, ``best`` or ``clean`` to NativeNetwork
-        At least one; all of one shape.
-    graph, edges, training
-        As :class:`Trained`.
-
-    Raises
-    ------
-    OSError
-        If it cannot be written; an older file is left as it was.
+    The `networks`, ``last``, ``best`` or ``clean``, are of one shape; the rest is as in :class:`Trained`.
     """
     one = next(iter(networks.values()))
     manifest = {
@@ -93,16 +82,15 @@ def write_trained(
         **{name: getattr(one, name) for name in ("taxels", "polarities", "classes", "copies")},
         "clocks": asdict(one.clocks),
         "graph": {"name": graph, "edges": edges.tolist()},
-        "layers": [stage.name for stage in one.towers[0]],
-        "towers": len(one.towers),
+        "layers": [stage.name for stage in one.stages],
+        "towers": 1,
         "weights": list(networks),
         "training": dict(training),
     }
     arrays = {
-        f"{which}/{number}/{stage.name}/{part}": getattr(stage, part)
+        f"{which}/0/{stage.name}/{part}": getattr(stage, part)
         for which, network in networks.items()
-        for number, tower in enumerate(network.towers)
-        for stage in tower
+        for stage in network.stages
         for part in PARTS
     }
     return write_archive(archive_bytes(manifest, arrays), path)
@@ -125,23 +113,20 @@ def read_trained(path: str | os.PathLike[str], *, weights: str | None = None) ->
     ------
     ModelError
         If it is missing, damaged, altered, from a newer version or inconsistent, or has no such set.
-    OSError
-        If it cannot be read.
     """
     path = Path(path)
-    if not path.is_file():
-        found = "is not a file" if path.exists() else "no such file"
-        raise ModelError(f"{path}: {found}; make one with spikeloom train")
 
     def names(manifest: Mapping[str, Any]) -> Iterable[str]:
         if wrong := _kind_faults(manifest):
             raise ModelError(f"{path}: {'; '.join(wrong)}; {_AGAIN}")
-        return _names(manifest)
+        members = product(manifest["weights"], manifest["layers"], PARTS)
+        return [f"{which}/0/{layer}/{part}" for which, layer, part in members]
 
     try:
         manifest, members = read_archive(path, FORMAT, VERSION, names)
     except FormatError as error:
-        raise ModelError(f"{path}: damaged, altered or of another version ({_core(path, error)}); {_AGAIN}") from error
+        said = str(error).rpartition("; ")[0].replace("netlist", "network")  # without the remedy, which is a netlist's
+        raise ModelError(f"{said}; {_AGAIN}") from error
     sets = tuple(name for name in WEIGHTS if name in manifest["weights"])
     chosen = sets[0] if weights is None else weights
     if chosen not in sets:
@@ -164,11 +149,6 @@ def read_trained(path: str | os.PathLike[str], *, weights: str | None = None) ->
     )
 
 
-def _core(path: Path, error: FormatError) -> str:
-    """What an archive says is wrong, without its own remedy, which is for netlists."""
-    return str(error).removeprefix(f"{path}: ").rpartition("; ")[0].replace("netlist", "network")
-
-
 def _kind_faults(manifest: Mapping[str, Any]) -> list[str]:
     """What in the manifest is missing or of another kind."""
     counts = dict.fromkeys(("taxels", "polarities", "classes", "copies"), (1, 2**20))
@@ -178,7 +158,7 @@ def _kind_faults(manifest: Mapping[str, Any]) -> list[str]:
         "clocks": CLOCKS,
         "weights": [str, ...],
         "graph": {"name": str, "edges": [edge]},
-        "towers": (1, MOST_TOWERS),
+        "towers": (1, 1),
         "training": dict,
         **counts,
     }
@@ -193,15 +173,9 @@ def _kind_faults(manifest: Mapping[str, Any]) -> list[str]:
     return [f"the manifest has no usable {name}" for name, good in fine.items() if not good]
 
 
-def _names(manifest: Mapping[str, Any]) -> tuple[str, ...]:
-    """Array members, in file order."""
-    sets, towers, layers = manifest["weights"], range(manifest["towers"]), manifest["layers"]
-    return tuple(f"{which}/{n}/{layer}/{part}" for which, n, layer, part in product(sets, towers, layers, PARTS))
-
-
 def _network(manifest: Mapping[str, Any], members: Mapping[str, Array], which: str) -> NativeNetwork:
-    def stage(number: int, layer: str) -> Stage:
-        parts: dict[str, Any] = {part: members[f"{which}/{number}/{layer}/{part}"] for part in PARTS}
+    def stage(layer: str) -> Stage:
+        parts: dict[str, Any] = {part: members[f"{which}/0/{layer}/{part}"] for part in PARTS}
         return Stage(
             name=layer,
             **{p: read_only(a.astype(np.int64) if a.dtype.kind == "i" else a) for p, a in parts.items()},
@@ -210,17 +184,15 @@ def _network(manifest: Mapping[str, Any], members: Mapping[str, Array], which: s
     return NativeNetwork(
         **{name: manifest[name] for name in ("taxels", "polarities", "classes", "copies")},
         clocks=Clocks(**manifest["clocks"]),
-        towers=tuple(tuple(stage(n, layer) for layer in manifest["layers"]) for n in range(manifest["towers"])),
+        stages=tuple(map(stage, manifest["layers"])),
     )
 
 
 def _shape_faults(network: NativeNetwork) -> list[str]:
     """Arrays that are not of whole numbers, or have another number of axes."""
-    axes = dict(zip(PARTS, (2, 3, 1, 1, 1), strict=True))
     return [
-        f"{stage.name}: {part} is no array of {axes[part]} axes of whole numbers"
-        for tower in network.towers
-        for stage in tower
-        for part in PARTS
-        if getattr(stage, part).dtype.kind != "i" or getattr(stage, part).ndim != axes[part]
+        f"{stage.name}: {part} is no array of {axes} axes of whole numbers"
+        for stage in network.stages
+        for part, axes in zip(PARTS, (2, 3, 1, 1, 1), strict=True)
+        if getattr(stage, part).dtype.kind != "i" or getattr(stage, part).ndim != axes
     ]

@@ -172,6 +172,14 @@ class CrossbarNetlist:
         """Core at each place, -1 where there is none; (n,) of (n,) coordinates."""
         return _places((self.core_x, self.core_y), (x, y))
 
+    def aims(self) -> tuple[IntArray, IntArray, IntArray]:
+        """Axons that feeds, clocks and wires lead to, -1 where there is none; (feeds,), (clocks,), (wires,)."""
+        return (
+            self.axons_at(self.feed_core, self.feed_line),
+            self.axons_at(self.clock_core, self.clock_line),
+            self.axons_at(self.cores_at(self.wire_x, self.wire_y), self.wire_line),
+        )
+
     def hops(self) -> IntArray:
         """Cores that the spike of each wire passes, x first and then y; shape (wires,)."""
         core = self.core_of_neuron()[self.wire_neuron]

@@ -15,13 +15,10 @@ from spikeloom.compiler.files import remove_leftovers, sha256_of
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.formats.towers import arrays_of
 from spikeloom.compiler.formats.towers import join as join_networks
-from spikeloom.compiler.targets.native import SYSTEM as NATIVE
 from spikeloom.models.training.joined import Joined, joined_layers
 from spikeloom.runtime.commands.main_job.checkpoint_facts import tower_line
 from spikeloom.runtime.commands.training.finetune import stored_graph
 from spikeloom.runtime.inputs.files import require_place, shipped
-from spikeloom.runtime.machines.base import trained_for
-from spikeloom.runtime.report.numbers import percent
 from spikeloom.runtime.report.sections import Outcome, Section, Text
 
 KEPT = ("command", "seed", "epochs", "recipe", "data", "data_sha256", "test_samples", "fine_tuned_from")
@@ -34,9 +31,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--weights", choices=WEIGHTS, help="epoch to take from each (default: the first of these that it holds)"
     )
-    parser.add_argument(
-        "--data", metavar="PATH", help=f"measure the joined network on its test split and keep that ({NATIVE} only)"
-    )
     parser.add_argument("-o", "--output", required=True, metavar="OUT.pt")
 
 
@@ -48,11 +42,6 @@ def run(arguments: Namespace) -> Outcome:
     SpikeloomError
         If a network cannot be used, or they do not fit together.
     """
-    own = next(filter(None, map(trained_for, arguments.checkpoints)), None)
-    if own is not None:
-        return Outcome(own.join(arguments), join_sections)
-    if arguments.data is not None:
-        raise OptionError(f"--data {arguments.data}: is for {NATIVE}; omit it, and measure with spikeloom run")
     for name in arguments.checkpoints:
         require_place(arguments.output, "-o", Namespace(checkpoint=name))
     found = [_network(name, arguments.weights) for name in arguments.checkpoints]
@@ -98,7 +87,7 @@ def run(arguments: Namespace) -> Outcome:
 def _network(name: str, weights: str | None) -> Checkpoint:
     path = shipped(name)
     if Path(path).is_file() and is_netlist(path):
-        raise ModelError(f"{name}: is a netlist, its weights are rounded already; give the checkpoint it was made from")
+        raise ModelError(f"{name}: holds whole numbers of a chip; give checkpoints of float networks")
     checkpoint = read_checkpoint(path, weights=weights)
     if checkpoint.layout != "spikeloom":
         raise ModelError(f"{name}: does not say its graph and constants; give checkpoints that spikeloom train wrote")
@@ -126,5 +115,4 @@ def join_sections(result: Joined) -> Iterable[Section]:
     layers = ", ".join(f"{layer.name} {layer.neurons:,}" for layer in result.layers)
     lines = [result.command, f"  {len(result.towers)} towers: {layers}, {result.classes} classes"]
     lines += [f"    {index}: {tower_line(tower)}" for index, tower in enumerate(result.towers)]
-    lines += [] if result.test is None else [f"  test: {percent(result.test.correct, result.test.samples)}"]
     yield Section("Joined", [Text("\n".join([*lines, f"  written: {result.file}"]))])

@@ -20,7 +20,7 @@ from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.recordings.windows import steps_of
 from spikeloom.runtime.inputs.files import shipped
 from spikeloom.runtime.machines.truenorth.commands import provenance
-from spikeloom.runtime.machines.truenorth.machine import TICK
+from spikeloom.runtime.machines.truenorth.cost import TICK
 
 NAME = "truenorth"
 
@@ -56,15 +56,12 @@ def facts(path: str, weights: str | None) -> JsonObject:
 
 def decisions(path: str, weights: str | None, data: Recordings, windows: Sequence[int]) -> dict[str, list[int]]:
     """Decisions of the model, in torch, when parts of each recording have passed, by window in per cent."""
-    from spikeloom.models.truenorth.network import run_network  # torch, so only here
+    from spikeloom.models.truenorth.network import votes_by_step  # torch, so only here
 
-    network = trained(path, weights).network
-    last = network.towers[0][-1].name
-    counts: dict[int, list[IntArray]] = {window: [] for window in windows}
+    network, counts = trained(path, weights).network, {window: list[IntArray]() for window in windows}
     for index in range(len(data)):
         steps = data.steps_of(index)
-        votes = run_network(network, data.events[index : index + 1, ..., :steps])[last][0]
-        added = votes.reshape(steps, -1, network.classes).sum(axis=1).cumsum(axis=0)
+        added = votes_by_step(network, data.events[index : index + 1, ..., :steps]).cumsum(axis=0)
         for window in windows:
             counts[window].append(added[int(steps_of(np.array([steps]), window)[0]) - 1])
     return {str(window): vote(np.stack(each)).tolist() for window, each in counts.items()}

@@ -27,7 +27,7 @@ from spikeloom.compiler.types import BoolArray, JsonObject
 from spikeloom.runtime.inputs.files import shipped
 from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.inputs.recordings import netlist_recordings
-from spikeloom.runtime.machines.truenorth import joining, verdicts
+from spikeloom.runtime.machines.truenorth import verdicts
 from spikeloom.runtime.machines.truenorth.describe import describe, describe_trained
 from spikeloom.runtime.machines.truenorth.machine import load
 from spikeloom.runtime.machines.truenorth.verdicts import PartialSums, Verdict, compare
@@ -54,8 +54,6 @@ VERIFY: Mapping[str, Any] = {"original": None, "min_agreement": None, "require":
 
 SPEC_STEPS = 5
 """Data steps of a recording on which the specification runs, too: it takes a second for two hundred ticks."""
-
-join = joining.join
 
 
 def _refuse_options(arguments: argparse.Namespace, absent: Mapping[str, Any], why: str) -> None:
@@ -117,7 +115,7 @@ def provenance(trained: Trained) -> JsonObject:
         "weights": trained.weights,
         "graph": trained.graph,
         "copies": trained.network.copies,
-        "towers": len(trained.network.towers),
+        "towers": 1,
     }
 
 
@@ -153,7 +151,7 @@ def _verify_trained(arguments: argparse.Namespace, netlist: CrossbarNetlist, _: 
     def spikes(events: Any) -> dict[str, BoolArray]:
         return {name: held[0] for name, held in run_network(trained.network, events[None]).items()}
 
-    first = {stage.name: number for number, stage in enumerate(trained.network.towers[0])}
+    first = {stage.name: number for number, stage in enumerate(trained.network.stages)}
     return compare(netlist, spikes, first, data, spec_samples=arguments.spec_samples)
 
 

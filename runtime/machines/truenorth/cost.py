@@ -18,6 +18,7 @@ import numpy as np
 from spikeloom.compiler.targets.base import EnergyTable, Target
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
 from spikeloom.compiler.types import FloatArray, IntArray
+from spikeloom.runtime.machines.base import Price
 from spikeloom.runtime.machines.truenorth.trace import Counts
 from spikeloom.runtime.report.numbers import si
 from spikeloom.runtime.report.sections import Outcome, Section, Table, Text
@@ -29,74 +30,13 @@ NOT_PRICED = (
 """Said with every estimate."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Energy:
-    """Joules of recordings (samples,) by one reading: of events, and of the chip's floor where no event holds it."""
-
-    events_j: FloatArray
-    floor_j: FloatArray | None
-
-    @property
-    def total_j(self) -> FloatArray:
-        """Joules of each recording."""
-        return self.events_j if self.floor_j is None else self.events_j + self.floor_j
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Costs:
-    """Costs of recordings."""
-
-    ticks: IntArray  # (samples,) int64
-    time_s: FloatArray  # (samples,) float64; at the length of a tick in real time
-    # synaptic_events, spikes: (samples, layers) int64; by the layer that receives and that sends
-    synaptic_events: IntArray
-    spikes: IntArray
-    # packets, hops: (samples,) int64; spikes with a target on the chip, and the cores that they pass
-    packets: IntArray
-    hops: IntArray
-    energy: Mapping[str, Energy]
-
-
-def estimate(netlist: CrossbarNetlist, target: Target, counts: Counts) -> Costs:
-    """Count and price a batch of recordings: `counts` has one leading axis."""
-    layers = len(netlist.layers)
-    into = np.zeros((netlist.n_axons, layers), np.int64)
-    np.add.at(into, (netlist.axon_of_synapse(), netlist.layer[netlist.neuron_of_synapse()]), 1)
-    member = np.eye(layers, dtype=np.int64)[netlist.layer]
-    sent = counts.spikes[:, netlist.wire_neuron]
-    events = counts.axons @ into
-    time_s: FloatArray = counts.ticks.astype(np.float64) * (target.limit("tick.length") * 1e-6)
-    return Costs(
-        ticks=counts.ticks,
-        time_s=time_s,
-        synaptic_events=events,
-        spikes=counts.spikes @ member,
-        packets=sent.sum(axis=1),
-        hops=sent @ netlist.hops(),
-        energy={table.name: price(table, events.sum(axis=1), time_s) for table in target.energy},
-    )
-
-
-def price(table: EnergyTable, events: IntArray, time_s: FloatArray) -> Energy:
-    """Energy of recordings with so many synaptic events that take so long, both (samples,).
-
-    Examples
-    --------
-    >>> from spikeloom.compiler.targets.base import load_target
-    >>> all_in, marginal = load_target("truenorth").energy
-    >>> price(all_in, np.array([1_000_000]), np.array([0.25])).total_j.round(9).tolist()
-    [2.6e-05]
-    >>> price(marginal, np.array([1_000_000]), np.array([0.25])).total_j.round(7).tolist()
-    [0.0161023]
-    """
-    floor = table.floor_w
-    joules: FloatArray = events.astype(np.float64) * table.joule("synaptic_event")
-    return Energy(events_j=joules, floor_j=None if floor is None else floor * time_s)
+TICK = "tick"
+"""Name of the one time table: every tick takes the same time, whatever happens in it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Amounts:
-    """Of one inference."""
+    """Of one inference: `packets` are spikes with a target on the chip, `hops` the cores that they pass."""
 
     synaptic_events: float
     spikes: float
@@ -156,61 +96,92 @@ class Estimate:
     not_priced: tuple[str, ...] = NOT_PRICED
 
 
-def summarise(netlist: CrossbarNetlist, chip: Target, costs: Costs, counts: Counts, bin_s: float) -> Outcome:
-    """Costs of recordings put together."""
-
-    def amounts(reduce: Callable[[Any], Any]) -> Amounts:
-        return Amounts(
-            synaptic_events=float(reduce(costs.synaptic_events.sum(axis=1))),
-            spikes=float(reduce(costs.spikes.sum(axis=1))),
-            packets=float(reduce(costs.packets)),
-            hops=float(reduce(costs.hops)),
-            ticks=float(reduce(costs.ticks)),
-            merged_spikes=float(reduce(counts.merged)),
-            membranes_saturated=float(reduce(counts.overflows.sum(axis=1))),
-            time_s=float(reduce(costs.time_s)),
-            energy_j={name: float(reduce(found.total_j)) for name, found in costs.energy.items()},
-        )
-
-    share = netlist.n_cores / chip.limit("chip.cores")
-    step_s = netlist.bin_ticks * (chip.limit("tick.length") * 1e-6)
-    readings = []
+def price(netlist: CrossbarNetlist, chip: Target, counts: Counts, bin_s: float) -> Price:
+    """Count and price a batch of recordings: `counts` has one leading axis."""
+    layers = len(netlist.layers)
+    points = np.zeros((netlist.n_axons, layers), np.int64)
+    np.add.at(points, (netlist.axon_of_synapse(), netlist.layer[netlist.neuron_of_synapse()]), 1)
+    received = counts.axons @ points  # (samples, layers) synaptic events, by the layer that receives
+    sent = counts.spikes @ np.eye(layers, dtype=np.int64)[netlist.layer]
+    packets = counts.spikes[:, netlist.wire_neuron]
+    counted = {
+        "synaptic_events": received.sum(axis=1),
+        "spikes": sent.sum(axis=1),
+        "packets": packets.sum(axis=1),
+        "hops": packets @ netlist.hops(),
+        "ticks": counts.ticks,
+        "merged_spikes": counts.merged,
+        "membranes_saturated": counts.overflows.sum(axis=1),
+    }
+    tick_s = chip.limit("tick.length") * 1e-6
+    time_s: FloatArray = counts.ticks.astype(np.float64) * tick_s
+    step_s = netlist.bin_ticks * tick_s
+    energy, readings = {}, []
     for table in chip.energy:
-        found = costs.energy[table.name]
-        floor = None if found.floor_j is None else float(found.floor_j.mean())
+        events_j, floor_j = joules(table, counted["synaptic_events"], time_s)
+        energy[table.name] = events_j if floor_j is None else events_j + floor_j
+        floor = None if floor_j is None else float(floor_j.mean())
         readings.append(
             Reading(
                 table=table.name,
                 title=table.title,
-                events_j=float(found.events_j.mean()),
+                events_j=float(events_j.mean()),
                 floor_j=floor,
-                floor_of_used_cores_j=None if floor is None else floor * share,
-                total_j=float(found.total_j.mean()),
+                floor_of_used_cores_j=None if floor is None else floor * (netlist.n_cores / chip.limit("chip.cores")),
+                total_j=float(energy[table.name].mean()),
             )
         )
-    layers = zip(netlist.layers, costs.synaptic_events.mean(axis=0), costs.spikes.mean(axis=0), strict=True)
+
+    def amounts(reduce: Callable[[Any], Any]) -> Amounts:
+        return Amounts(
+            **{name: float(reduce(values)) for name, values in counted.items()},
+            time_s=float(reduce(time_s)),
+            energy_j={name: float(reduce(values)) for name, values in energy.items()},
+        )
+
+    means = zip(netlist.layers, received.mean(axis=0).tolist(), sent.mean(axis=0).tolist(), strict=True)
     result = Estimate(
-        samples=len(costs.ticks),
+        samples=len(time_s),
         cores=netlist.n_cores,
         cores_of_chip=chip.limit("chip.cores"),
         per_inference=amounts(np.mean),
         min=amounts(np.min),
         max=amounts(np.max),
-        layers=tuple(LayerCosts(name, float(events), float(spikes)) for name, events, spikes in layers),
+        layers=tuple(LayerCosts(*each) for each in means),
         energy=tuple(readings),
         pace=Pace(bin_s=bin_s, step_s=step_s, real_time=step_s <= bin_s),
         static_w={name: power.value * 1e-3 for name, power in chip.static.items()},
     )
-    return Outcome(result, sections)
+    return Price(
+        synaptic_operations=counted["synaptic_events"],
+        energy_j=energy,
+        time_s={TICK: time_s},
+        step_s={TICK: step_s},
+        outcome=Outcome(result, sections),
+    )
 
 
-COUNTED = ("synaptic_events", "spikes", "packets", "hops", "ticks", "merged_spikes", "membranes_saturated")
+def joules(table: EnergyTable, events: IntArray, time_s: FloatArray) -> tuple[FloatArray, FloatArray | None]:
+    """Joules of so many synaptic events, (samples,), and of the chip's floor in that time where no event holds it.
+
+    Examples
+    --------
+    >>> from spikeloom.compiler.targets.base import load_target
+    >>> all_in, marginal = load_target("truenorth").energy
+    >>> joules(all_in, np.array([1_000_000]), np.array([0.25]))
+    (array([2.6e-05]), None)
+    >>> joules(marginal, np.array([1_000_000]), np.array([0.25]))
+    (array([2.3e-06]), array([0.0161]))
+    """
+    spent: FloatArray = events.astype(np.float64) * table.joule("synaptic_event")
+    return spent, None if table.floor_w is None else table.floor_w * time_s
 
 
 def sections(found: Estimate) -> list[Section]:
     """The same for people."""
     columns = [found.per_inference, found.min, found.max]
-    rows = [[name.replace("_", " "), *(f"{getattr(column, name):,.0f}" for column in columns)] for name in COUNTED]
+    *counted, _, _ = Amounts.__dataclass_fields__
+    rows = [[name.replace("_", " "), *(f"{getattr(column, name):,.0f}" for column in columns)] for name in counted]
     rows.append(["time, 1 tick a millisecond", *(si(column.time_s, "s") for column in columns)])
     rows += [
         [f"energy, {name}", *(si(c.energy_j[name], "J") for c in columns)] for name in found.per_inference.energy_j

@@ -71,18 +71,17 @@ def describe(netlist: CrossbarNetlist, chip: Target, sha256: str) -> Outcome:
         "neuron.delay": netlist.wire_delay,
         "chip.cores": np.array([netlist.n_cores]),
     }
-    layers = []
-    for index, name in enumerate(netlist.layers):
+
+    def layer(index: int, name: str) -> LayerSize:
         members = netlist.layer == index
-        layers.append(
-            LayerSize(
-                name=name,
-                neurons=int(np.count_nonzero(members)),
-                distinct=len(np.unique(netlist.neuron[members])),
-                max_fan_in=int(fan_in[members].max(initial=0)),
-                cores=len(np.unique(core[members])),
-            )
+        return LayerSize(
+            name=name,
+            neurons=int(np.count_nonzero(members)),
+            distinct=len(np.unique(netlist.neuron[members])),
+            max_fan_in=int(fan_in[members].max(initial=0)),
+            cores=len(np.unique(core[members])),
         )
+
     found = Description(
         target=netlist.target,
         taxels=netlist.taxels,
@@ -97,7 +96,7 @@ def describe(netlist: CrossbarNetlist, chip: Target, sha256: str) -> Outcome:
         tick_clocks=len(netlist.clock_core),
         wires=len(netlist.wire_neuron),
         cores=netlist.n_cores,
-        layers=tuple(layers),
+        layers=tuple(layer(*each) for each in enumerate(netlist.layers)),
         limits=tuple(LimitFill(rule, int(used.max(initial=0)), chip.limit(rule)) for rule, used in fullest.items()),
         max_crossing_points_of_an_axon=int(degree.max(initial=0)),
         provenance=netlist.provenance,
@@ -129,7 +128,7 @@ def sections(found: Description) -> list[Section]:
 
 @dataclass(frozen=True, slots=True)
 class StageSize:
-    """A stage of one tower; `zeros` is the share of levels that are 0."""
+    """A stage; `zeros` is the share of levels that are 0."""
 
     name: str
     blocks: int
@@ -171,17 +170,10 @@ def describe_trained(trained: Trained) -> Outcome:
         copies=network.copies,
         levels=2 * highest_level(network.copies) + 1,
         clocks=network.clocks.channels,
-        towers=len(network.towers),
+        towers=1,
         layers=tuple(
-            StageSize(
-                name=stage.name,
-                blocks=stage.blocks,
-                inputs=int(stage.inputs.shape[1]),
-                clocks=stage.clocks,
-                neurons=stage.size,
-                zeros=float(np.mean(stage.level == 0)),
-            )
-            for stage in network.towers[0]
+            StageSize(s.name, s.blocks, s.inputs.shape[1], s.clocks, s.size, float(np.mean(s.level == 0)))
+            for s in network.stages
         ),
         weights=trained.weights,
         sets=tuple(trained.sets),
@@ -197,9 +189,7 @@ def trained_sections(found: TrainedDescription) -> list[Section]:
         [s.name, f"{s.blocks:,}", f"{s.inputs:,}", f"{s.clocks:,}", f"{s.neurons:,}", f"{100 * s.zeros:.0f} %"]
         for s in found.layers
     ]
-    lines = [
-        f"  groups, inputs and neurons of one tower; holds the epochs {', '.join(found.sets)}, shown is {found.weights}"
-    ]
+    lines = [f"  holds the epochs {', '.join(found.sets)}, shown is {found.weights}"]
     training = found.training
     if "command" in training:
         lines.append(f"  made by: {training['command']}")
@@ -212,9 +202,8 @@ def trained_sections(found: TrainedDescription) -> list[Section]:
                 if which == "test"
                 else f"  {which}: epoch {measured['epoch']}, {share} of {training['test_samples']} test recordings"
             )
-    towers = f"{found.towers} tower{'s' * (found.towers > 1)}"
     head = [
-        f"{found.system}: {found.taxels} taxels, graph {found.graph}, {found.classes} classes, {towers}",
+        f"{found.system}: {found.taxels} taxels, graph {found.graph}, {found.classes} classes",
         f"{found.copies} copies of an input, weights {', '.join(map(str, BASES[found.copies]))}: "
         f"{found.levels} levels; {found.clocks} clocks",
     ]

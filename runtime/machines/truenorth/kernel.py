@@ -1,11 +1,9 @@
 """Machine code of the engine: one recording, all its ticks; :mod:`truenorth.engine` makes the arrays.
 
-Work follows events: a tick visits the axons that have a spike and the neurons that are reached or awake. A neuron
-sleeps while a tick without arrivals would change nothing about it. *Steady* neurons, the first ones, live through every
-tick, all at once, and what an axon brings them is added in rows of neighbours. Those before `plain` are reset to a
-value and held at their negative threshold; the others are reset to values on both sides, or by their threshold. None of
-them can leave its register in a tick that it begins at its cap or below; all but those that are reset by their
-threshold provably do. Where one of these does not, the run is broken off.
+A tick visits the axons that have a spike. *Steady* neurons, the first ones, cannot leave their register in a tick that
+they begin at their cap or below, so they are computed all at once, and what an axon brings them is added in rows of
+neighbours. All but those that are reset by their threshold provably stay below their cap; where one of these does not,
+the run is broken off. The other neurons are computed one by one.
 """
 
 from __future__ import annotations
@@ -22,24 +20,13 @@ from spikeloom.runtime.machines.truenorth.trace import MIX_1, MIX_2, STEP_NEURON
 
 Int32 = npt.NDArray[np.int32]
 
-(
-    LEAK,
-    REVERSAL,
-    THRESHOLD,
-    MASK_BITS,
-    RESET_MODE,
-    RESET,
-    NEGATIVE,
-    SATURATES,
-    REST,
-    WIRE_AXON,
-    WIRE_DELAY,
-    VOTES_FROM,
-) = range(12)
-"""Columns of the parameters of a neuron. ``REST`` is a membrane that stays as it is without arrivals, or ``NO_REST``;
-``VOTES_FROM`` the tick from which on its spikes count, -1 for never; ``WIRE_AXON`` -1 where it has no target."""
-
-NO_REST = -(2**31)
+PARAMETERS = (
+    *("leak", "leak_reversal", "threshold", "mask_bits", "reset_mode", "reset", "negative_threshold"),
+    "negative_saturates",
+)
+LEAK, REVERSAL, THRESHOLD, MASK_BITS, RESET_MODE, RESET, NEGATIVE, SATURATES, AXON, DELAY, VOTES_FROM = range(11)
+"""Columns of the parameters of a neuron: those of the netlist, the axon that its spikes reach (-1 for none), the ticks
+until then, and the tick from which on they count as votes (-1 for never)."""
 
 HALF, LOWER = 32, 2**32 - 1
 """Positive and negative weights are added up in one number: in its upper half, and as magnitudes in its lower."""
@@ -65,7 +52,6 @@ class Wiring(NamedTuple):
     # (segments, 3) int64; first steady neuron, the one after the last, and where in `row` the weights for them begin
     segments: IntArray
     row: Int32  # (…) int32; weights of segments, zero where nothing is joined
-    plain: int  # Number of plain steady neurons, the first ones
     # (7, steady) int32; leak, threshold, reset, the negative threshold below zero, what a membrane below that becomes,
     # 1 for a reset by the threshold, and the cap
     steady: Int32
@@ -73,25 +59,20 @@ class Wiring(NamedTuple):
     synapse_neuron: Int32  # (synapses,) int32
     synapse_weight: IntArray  # (synapses,) int64; in halves
     number: IntArray  # (neurons,) int64; which neuron of the network it is, whose random numbers it draws
-    parameters: Int32  # (neurons, 12) int32
+    parameters: Int32  # (neurons, 11) int32
     # (neurons,) bool; whether a spike reaches steady neurons alone, in the next tick, on an axon that nothing else
     # leads to
     direct: npt.NDArray[np.bool_]
-    # (neurons,) int32; the leak, below zero, of neurons that start each tick at zero and spike where they do not end it
-    # below zero; 0 for all others
-    instant: Int32
     initial: Int32  # (neurons,) int32
 
 
 class State(NamedTuple):
-    """What changes: membranes, arrivals, who works this tick, and spikes on their way by the slot of their tick."""
+    """What changes: membranes, arrivals, and spikes on their way by the slot of their tick."""
 
     membrane: Int32
     steady_sum: Int32
     steady_spike: npt.NDArray[np.uint8]
     arrived: IntArray
-    listed: npt.NDArray[np.bool_]
-    work: Int32
     due: Int32
     dues: IntArray
     flagged: npt.NDArray[np.bool_]
@@ -144,17 +125,6 @@ def after(v: Any, spiked: Any, threshold: Any, random: Any, mode: Any, reset: An
 
 
 @compiled
-def _reach(state: Any, n: Any, weight: Any, working: Any) -> Any:
-    """Let a weight arrive at a neuron, which works then; returns the neurons that do."""
-    state.arrived[n] += weight
-    if not state.listed[n]:
-        state.listed[n] = True
-        state.work[working] = n
-        return working + 1
-    return working
-
-
-@compiled
 def _queue(state: Any, slot: Any, axon: Any) -> Any:
     """Let an axon have a spike in the tick of a slot; 1 where it has one already."""
     if state.flagged[slot, axon]:
@@ -190,8 +160,8 @@ def _add(total: Any, term: Any) -> None:
 
 
 @compiled
-def _integrate(slot: Any, wiring: Any, state: Any, axons: Any, working: Any) -> Any:
-    """Visit the crossing points of all axons with a spike; returns the neurons that work."""
+def _integrate(slot: Any, wiring: Any, state: Any, axons: Any) -> None:
+    """Visit the crossing points of all axons with a spike."""
     for k in range(state.dues[slot]):
         axon = state.due[slot, k]
         state.flagged[slot, axon] = False
@@ -200,18 +170,18 @@ def _integrate(slot: Any, wiring: Any, state: Any, axons: Any, working: Any) -> 
             first, end, at = wiring.segments[s, 0], wiring.segments[s, 1], wiring.segments[s, 2]
             _add(state.steady_sum[first:end], wiring.row[at : at + end - first])
         for s in range(wiring.axon_synapses[axon], wiring.axon_synapses[axon + 1]):
-            working = _reach(state, wiring.synapse_neuron[s], wiring.synapse_weight[s], working)
+            state.arrived[wiring.synapse_neuron[s]] += wiring.synapse_weight[s]
     state.dues[slot] = 0
-    return working
 
 
 @compiled
-def _update(n: Any, tick: Any, seed: Any, low: Any, high: Any, sums: Any, wiring: Any, state: Any, tallies: Any) -> Any:
-    """A tick of a neuron that remembers: whether it spiked, and whether it may sleep."""
+def _update(n: Any, tick: Any, seed: Any, low: Any, high: Any, wiring: Any, state: Any, tallies: Any) -> Any:
+    """A tick of a neuron that is not steady: whether it spiked."""
     p = wiring.parameters
     leak, threshold, below = np.int64(p[n, LEAK]), np.int64(p[n, THRESHOLD]), np.int64(p[n, NEGATIVE])
     random = draw(seed, wiring.number[n], tick, p[n, MASK_BITS]) if p[n, MASK_BITS] else np.int64(0)
-    before, positive, negative = np.int64(state.membrane[n]), sums >> HALF, sums & LOWER
+    before, positive, negative = np.int64(state.membrane[n]), state.arrived[n] >> HALF, state.arrived[n] & LOWER
+    state.arrived[n] = 0
     summed = min(max(before + positive - negative, low), high)
     wanted = leaked(summed, leak, p[n, REVERSAL])
     v = min(max(wanted, low), high)
@@ -221,27 +191,15 @@ def _update(n: Any, tick: Any, seed: Any, low: Any, high: Any, sums: Any, wiring
     state.membrane[n] = v
     if before + positive > high or before - negative < low or wanted < low or wanted > high or left != v:
         tallies.overflows[n] += 1
-    sleeps = v == p[n, REST] or (leak == 0 and -below <= v < threshold)
-    return spiked, sleeps and p[n, MASK_BITS] == 0
+    return spiked
 
 
 @compiled
-def _update_steady(membrane: Any, sums: Any, leak: Any, threshold: Any, reset: Any, lowest: Any, spikes: Any) -> None:
-    """A tick of all steady neurons; one-dimensional arrays, so that the compiler vectorises the loop."""
-    for n in range(len(sums)):
-        v = np.int32(membrane[n] + sums[n] + leak[n])
-        sums[n] = 0
-        spiked = v >= threshold[n]
-        spikes[n] = spiked
-        membrane[n] = reset[n] if spiked else max(v, lowest[n])
-
-
-@compiled
-def _update_others(
-    membrane: Any, sums: Any, leak: Any, threshold: Any, reset: Any, lowest: Any, under: Any, linear: Any, cap: Any,
-    spikes: Any,
+def _update_steady(
+    membrane: Any, sums: Any, spikes: Any,
+    leak: Any, threshold: Any, reset: Any, lowest: Any, under: Any, linear: Any, cap: Any,
 ) -> Any:  # fmt: skip
-    """A tick of the steady neurons that are not plain; whether one is above its cap."""
+    """A tick of all steady neurons: whether one ends above its cap; 1-D arrays, so that the loop is vectorised."""
     above = np.int32(0)
     for n in range(len(sums)):
         v = np.int32(membrane[n] + sums[n] + leak[n])
@@ -264,10 +222,10 @@ def _send(n: Any, tick: Any, ticks: Any, window: Any, slots: Any, wiring: Any, s
         tallies.raster[tick, n] = True
     first = wiring.parameters[n, VOTES_FROM]
     tallies.votes[n] += 0 <= first <= tick < first + window
-    if wiring.parameters[n, WIRE_AXON] < 0:
+    if wiring.parameters[n, AXON] < 0:
         return 0
-    later = tick + wiring.parameters[n, WIRE_DELAY]
-    twice = _queue(state, later & (slots - 1), wiring.parameters[n, WIRE_AXON])
+    later = tick + wiring.parameters[n, DELAY]
+    twice = _queue(state, later & (slots - 1), wiring.parameters[n, AXON])
     return twice * (later < ticks)
 
 
@@ -277,7 +235,7 @@ def _send_steady(
 ) -> Any:
     """Lead on all spikes of steady neurons; returns those that merge."""
     merged, last, traced = 0, tick + 1 >= ticks, len(tallies.raster) > 0
-    direct, axon_of, sums, row = wiring.direct, wiring.parameters[:, WIRE_AXON], state.steady_sum, wiring.row
+    direct, axon_of, sums, row = wiring.direct, wiring.parameters[:, AXON], state.steady_sum, wiring.row
     bounds, segments, spikes, axons = wiring.segment_bounds, wiring.segments, tallies.spikes, tallies.axons
     words = state.steady_spike.view(np.uint64)
     for word in range(len(words)):
@@ -314,60 +272,28 @@ def run(
     the slot of its lowest bits.
     """
     neurons, axons, window = len(wiring.initial), len(tallies.axons), len(events) * bin_ticks
-    leak, threshold, reset, lowest = wiring.steady[0], wiring.steady[1], wiring.steady[2], wiring.steady[3]
-    under, linear, cap = wiring.steady[4], wiring.steady[5], wiring.steady[6]
-    steady, plain = len(leak), wiring.plain
+    w = wiring.steady
+    steady, merged = w.shape[1], 0
     state = State(
         wiring.initial.copy(),
         np.zeros(steady, np.int32),
         np.zeros((steady + WORD - 1) // WORD * WORD, np.uint8),
         np.zeros(neurons, np.int64),
-        np.ones(neurons, np.bool_),
-        np.empty(neurons, np.int32),
         np.empty((slots, axons), np.int32),
         np.zeros(slots, np.int64),
         np.zeros((slots, axons), np.bool_),
     )
-    working, merged = neurons - steady, 0  # all are awake at first
-    for k in range(working):
-        state.work[k] = steady + k
     for tick in range(ticks):
         slot = tick & (slots - 1)
         merged += _inject(events, bin_ticks, tick, slot, wiring, state)
-        working = _integrate(slot, wiring, state, tallies.axons, working)
-        held, sums_in, spiking = state.membrane[:plain], state.steady_sum[:plain], state.steady_spike[:plain]
-        _update_steady(held, sums_in, leak[:plain], threshold[:plain], reset[:plain], lowest[:plain], spiking)
-        if steady > plain and _update_others(
-            state.membrane[plain:steady],
-            state.steady_sum[plain:],
-            leak[plain:],
-            threshold[plain:],
-            reset[plain:],
-            lowest[plain:],
-            under[plain:],
-            linear[plain:],
-            cap[plain:],
-            state.steady_spike[plain:steady],
-        ):
+        _integrate(slot, wiring, state, tallies.axons)
+        membrane, sums, spikes = state.membrane[:steady], state.steady_sum, state.steady_spike[:steady]
+        if _update_steady(membrane, sums, spikes, w[0], w[1], w[2], w[3], w[4], w[5], w[6]):
             return BROKEN_OFF
         merged += _send_steady(steady, tick, ticks, window, slots, wiring, state, tallies)
-        awake = 0
-        for k in range(working):
-            n = state.work[k]
-            sums = state.arrived[n]
-            state.arrived[n] = 0
-            if wiring.instant[n]:
-                spiked, sleeps = (sums >> HALF) - (sums & LOWER) + wiring.instant[n] >= 0, True
-            else:
-                spiked, sleeps = _update(n, tick, seed, low, high, sums, wiring, state, tallies)
-            if sleeps:
-                state.listed[n] = False
-            else:
-                state.work[awake] = n  # never ahead of k
-                awake += 1
-            if spiked:
+        for n in range(steady, neurons):
+            if _update(n, tick, seed, low, high, wiring, state, tallies):
                 merged += _send(n, tick, ticks, window, slots, wiring, state, tallies)
-        working = awake
         if len(tallies.membranes):
             tallies.membranes[tick] = state.membrane
     return merged

@@ -27,9 +27,6 @@ from spikeloom.runtime.report.sections import Outcome
 
 T = TypeVar("T", bound=np.generic)
 
-TICK = "tick"
-"""Name of the one time table: every tick takes the same time, whatever happens in it."""
-
 
 @dataclass(frozen=True)
 class TrueNorth(Machine):
@@ -62,7 +59,7 @@ class TrueNorth(Machine):
         threads: int | None = None,
     ) -> Run:
         """Decisions, and spikes by tick; one recording runs at a time, whatever `threads` says."""
-        return self._run(self._simulate(events, lengths, spikes=spikes, membranes=membranes))
+        return self._run(self.simulate(events, lengths, spikes=spikes, membranes=membranes))
 
     def check(self, events: EventArray, *, lengths: IntArray | None = None) -> int:
         """Every spike, membrane, vote and spike on an axon, one recording after another."""
@@ -86,15 +83,8 @@ class TrueNorth(Machine):
         """Decisions and costs."""
         self.require_detail(detail)
         chip = self.target if table is None else with_tables(self.target, table)
-        trace = self._simulate(events, lengths, spikes=spikes)
-        found = cost.estimate(self.netlist, chip, trace.counts)
-        return self._run(trace), Price(
-            synaptic_operations=found.synaptic_events.sum(axis=1),
-            energy_j={name: each.total_j for name, each in found.energy.items()},
-            time_s={TICK: found.time_s},
-            step_s={TICK: self.netlist.bin_ticks * chip.limit("tick.length") * 1e-6},
-            outcome=cost.summarise(self.netlist, chip, found, trace.counts, bin_s),
-        )
+        trace = self.simulate(events, lengths, spikes=spikes)
+        return self._run(trace), cost.price(self.netlist, chip, trace.counts, bin_s)
 
     def batch(self, steps: int) -> int:
         """Recordings whose counts are held at a time."""
@@ -110,9 +100,10 @@ class TrueNorth(Machine):
             f"{self.target.title}: runs whole recordings, not bin after bin; give a netlist for another chip"
         )
 
-    def _simulate(
-        self, events: EventArray, lengths: IntArray | None, *, spikes: bool, membranes: bool = False
+    def simulate(
+        self, events: EventArray, lengths: IntArray | None = None, *, spikes: bool, membranes: bool = False
     ) -> Trace:
+        """Everything that the engine counts and keeps; see :meth:`run`."""
         channels = with_clocks(events, self.netlist.clocks)
         return engine.simulate(self._engine, channels, lengths=lengths, spikes=spikes, membranes=membranes)
 

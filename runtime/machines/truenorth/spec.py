@@ -134,11 +134,10 @@ def neuron_tick(neuron: Neuron, positive: int, negative: int, random: int, bits:
 def injected(netlist: CrossbarNetlist, events: EventArray) -> defaultdict[int, list[int]]:
     """Axons that input events and clocks reach in each tick of a recording (n_inputs, T), once for each of them."""
     due: defaultdict[int, list[int]] = defaultdict(list)
-    fed = netlist.axons_at(netlist.feed_core, netlist.feed_line).tolist()
+    fed, clocked, _ = (aims.tolist() for aims in netlist.aims())
     for channel, axon, offset in zip(netlist.feed_channel.tolist(), fed, netlist.feed_tick.tolist(), strict=True):
         for step in np.flatnonzero(events[channel]).tolist():
             due[step * netlist.bin_ticks + offset].append(axon)
-    clocked = netlist.axons_at(netlist.clock_core, netlist.clock_line).tolist()
     periods, phases = netlist.clock_period.tolist(), netlist.clock_phase.tolist()
     for axon, period, phase in zip(clocked, periods, phases, strict=True):
         for tick in range(phase, netlist.ticks(events.shape[1]), period):
@@ -194,7 +193,7 @@ def simulate(netlist: CrossbarNetlist, events: EventArray, *, seed: int = 0) -> 
 
     # what leads to the axons: from outside by tick, from neurons by their wires
     due = injected(netlist, events)
-    wired = netlist.axons_at(netlist.cores_at(netlist.wire_x, netlist.wire_y), netlist.wire_line).tolist()
+    wired = netlist.aims()[2].tolist()
     wires: list[list[tuple[int, int]]] = [[] for _ in neurons]
     for source, axon, delay in zip(netlist.wire_neuron.tolist(), wired, netlist.wire_delay.tolist(), strict=True):
         wires[source].append((axon, delay))

@@ -27,6 +27,7 @@ _REGISTERS = (
 class Twins:
     """Which neurons and axons are of a kind."""
 
+    single: BoolArray  # (axons,); whether only one thing leads to an axon
     # neuron, axon: (neurons,), (axons,) int64; kind of each
     neuron: IntArray
     axon: IntArray
@@ -45,11 +46,12 @@ def find_twins(netlist: CrossbarNetlist, half: int) -> Twins:
 
     A neuron that draws random numbers, which are its own, is alone.
     """
-    neuron, axon = netlist.neuron_of_synapse(), netlist.axon_of_synapse()
+    neuron, axon, aims = netlist.neuron_of_synapse(), netlist.axon_of_synapse(), netlist.aims()
     weight = netlist.weight[neuron, netlist.axon_type[axon]]
     halves = np.where(weight > 0, weight << half, -weight)
-    sources, single = _sources(netlist)
-    registers = _registers(netlist, single)
+    single = np.bincount(np.concatenate(aims), minlength=netlist.n_axons) == 1
+    sources = _sources(netlist, aims, single)
+    registers = _registers(netlist, single[aims[_WIRE]])
     kind = np.arange(netlist.n_neurons)
     while True:
         axon_kind = _axon_kinds(sources, kind)
@@ -66,6 +68,7 @@ def find_twins(netlist: CrossbarNetlist, half: int) -> Twins:
     ends, starts, sums = kind[pairs[0][kept]], pairs[1][kept], weights[kept]
     order = np.lexsort((ends, starts))
     return Twins(
+        single=single,
         neuron=kind,
         axon=axon_kind,
         first_neuron=first_neuron,
@@ -76,33 +79,26 @@ def find_twins(netlist: CrossbarNetlist, half: int) -> Twins:
     )
 
 
-def _sources(netlist: CrossbarNetlist) -> tuple[IntArray, BoolArray]:
-    """What leads to each axon, (axons, 3), or ``_ITSELF`` where that is not one thing; and whether it is, (axons,)."""
-    aims = (
-        netlist.axons_at(netlist.feed_core, netlist.feed_line),
-        netlist.axons_at(netlist.clock_core, netlist.clock_line),
-        netlist.axons_at(netlist.cores_at(netlist.wire_x, netlist.wire_y), netlist.wire_line),
-    )
+def _sources(netlist: CrossbarNetlist, aims: tuple[IntArray, ...], single: BoolArray) -> IntArray:
+    """What leads to each axon, (axons, 3), or ``_ITSELF`` where that is not one thing."""
     columns_of = (
         (netlist.feed_channel, netlist.feed_tick),
         (netlist.clock_period, netlist.clock_phase),
         (netlist.wire_neuron, netlist.wire_delay),
     )
-    single = np.bincount(np.concatenate(aims), minlength=netlist.n_axons) == 1
     axons = np.arange(netlist.n_axons)
     sources = np.stack([np.full_like(axons, _ITSELF), axons, np.zeros_like(axons)], axis=1)
     for what, (aim, columns) in enumerate(zip(aims, columns_of, strict=True)):
         only = single[aim]
         sources[aim[only]] = np.stack([np.full(len(aim), what), *columns], axis=1)[only]
-    return sources, single
+    return sources
 
 
-def _registers(netlist: CrossbarNetlist, single: BoolArray) -> IntArray:
+def _registers(netlist: CrossbarNetlist, alone: BoolArray) -> IntArray:
     """Everything that neurons of a kind share, beside their inputs: registers, whether they vote, where they lead."""
-    aim = netlist.axons_at(netlist.cores_at(netlist.wire_x, netlist.wire_y), netlist.wire_line)
     leads = np.full((netlist.n_neurons, 2), -1)
-    # to an axon of its own with a delay; or to one that others reach, too, where two spikes of a tick merge
-    leads[netlist.wire_neuron, 0] = np.where(single[aim], -2, netlist.wire_neuron)
+    # to an axon that it has `alone`, with a delay; or to one that others reach, too, where two spikes of a tick merge
+    leads[netlist.wire_neuron, 0] = np.where(alone, -2, netlist.wire_neuron)
     leads[netlist.wire_neuron, 1] = netlist.wire_delay
     draws = np.where(netlist.mask_bits > 0, np.arange(netlist.n_neurons), -1)
     columns = [*(getattr(netlist, name) for name in _REGISTERS), netlist.readout_class >= 0, *leads.T, draws]
@@ -116,7 +112,8 @@ def _axon_kinds(sources: IntArray, kind: IntArray) -> IntArray:
     known = sources.copy()
     wired = known[:, 0] == _WIRE
     known[wired, 1] = kind[known[wired, 1]]
-    return _renumbered(np.unique(known, axis=0, return_inverse=True)[1].reshape(-1))
+    found: IntArray = np.unique(known, axis=0, return_inverse=True)[1].reshape(-1)
+    return found
 
 
 def _pairs(axon_kind: IntArray, neuron: IntArray, axon: IntArray, halves: IntArray) -> tuple[IntArray, IntArray]:
@@ -138,12 +135,3 @@ def _neuron_kinds(registers: IntArray, pairs: IntArray, sums: IntArray) -> IntAr
         for n, register in enumerate(registers.tolist())
     ]
     return np.array(found, np.int64)
-
-
-def _renumbered(kinds: IntArray) -> IntArray:
-    """The same kinds, numbered by their first member."""
-    _, first, index = np.unique(kinds, return_index=True, return_inverse=True)
-    rank = np.empty(len(first), np.int64)
-    rank[np.argsort(first)] = np.arange(len(first))
-    found: IntArray = rank[index.reshape(-1)]
-    return found

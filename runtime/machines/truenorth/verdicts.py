@@ -8,12 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
 from spikeloom.compiler.types import BoolArray
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.runtime.machines.truenorth import engine
 from spikeloom.runtime.machines.truenorth.machine import machine_of
 from spikeloom.runtime.machines.votes import class_counts
 from spikeloom.runtime.report.console import progress
@@ -93,24 +91,17 @@ def compare(
 ) -> Verdict:
     """Run the chip and the model on recordings, and count every spike that differs.
 
-    Parameters
-    ----------
-    model : callable
-        Spikes (steps, neurons) of each layer for events (taxels, polarities, steps).
-    first : mapping of str to int
-        Tick in which a layer spikes for the first data step; for others as many data steps later.
-    spec_samples, spec_steps : int
-        Recordings, from the first, on which the specification runs, too; first steps of each to which that is confined.
+    The `model` gives the spikes (steps, neurons) of each layer for events (taxels, polarities, steps); `first` is the
+    tick in which a layer spikes for the first data step. The specification runs on the first recordings, too, and
+    there on the first steps, where `spec_steps` says so.
     """
-    machine, prepared = machine_of(netlist), engine.prepare(netlist)
-    layers = list(netlist.layers)
+    machine, layers = machine_of(netlist), list(netlist.layers)
     spikes, differences = dict.fromkeys(first, 0), dict.fromkeys(first, 0)
     votes, overflows, wrong = np.zeros((len(data), netlist.classes), np.int64), 0, 0
     for index in range(len(data)):
         progress(f"comparing: {index} of {len(data)}")
         events = data.events[index : index + 1, ..., : data.steps_of(index)]
-        channels = with_clocks(events, netlist.clocks)
-        trace = engine.simulate(prepared, channels, spikes=True)
+        trace = machine.simulate(events, spikes=True)
         assert trace.spikes is not None, "spikes are kept"
         expected = model(events[0])
         steps = events.shape[-1]
@@ -139,38 +130,25 @@ def compare(
 def sections(found: Verdict) -> list[Section]:
     """The same for people."""
     part = "" if found.spec_steps is None else f" (the first {found.spec_steps} steps of each)"
-    head = [
-        f"E0 specification = engine: {_differences(found.spec.differences, found.spec.samples)}{part}, "
-        "membranes and counts too",
-        f"E1 model = chip: {_differences(found.model.differences, found.samples)}, every copy of every neuron",
-    ]
+    spec = _differences(found.spec.differences, found.spec.samples)
+    model = _differences(found.model.differences, found.samples)
     rows = [[layer.name, f"{layer.spikes:,}", f"{layer.differences:,}"] for layer in found.model.layers]
     accuracy = f"accuracy of the chip: {found.correct} of {found.samples}, {100 * found.correct / found.samples:.2f} %"
     if found.exact:
         low, high = wilson(found.correct, found.samples)
         accuracy += f" (95 %: {100 * low:.1f} … {100 * high:.1f}); the model's is the same, vote for vote"
-    sums = [
-        [
-            each.layer,
-            f"{each.partial:,}",
-            f"{each.saturated:,} ({100 * each.saturated / max(each.partial, 1):.2g} %)",
-            str(each.largest),
-        ]
-        for each in found.sums or ()
+    blocks: list[Text | Table] = [
+        Text(f"E0 specification = engine: {spec}{part}, membranes and counts too"),
+        Text(f"E1 model = chip: {model}, every copy of every neuron"),
+        Table(["layer", "spikes of the model", "different"], rows),
+        Text(f"membranes that left their register: {found.membranes_saturated:,}"),
     ]
-    saturated = f"membranes that left their register: {found.membranes_saturated:,}"
-    return [
-        Section(
-            "Verdict",
-            [
-                Text("\n".join(head)),
-                Table(["layer", "spikes of the model", "different"], rows),
-                Text(saturated),
-                *([Table(["layer", "partial sums", "saturated", "largest"], sums)] if sums else []),
-                Text(accuracy),
-            ],
-        )
-    ]
+    if found.sums:
+        shares = [f"{each.saturated:,} ({100 * each.saturated / max(each.partial, 1):.2g} %)" for each in found.sums]
+        each_sum = zip(found.sums, shares, strict=True)
+        sums = [[each.layer, f"{each.partial:,}", share, str(each.largest)] for each, share in each_sum]
+        blocks.append(Table(["layer", "partial sums", "saturated", "largest"], sums))
+    return [Section("Verdict", [*blocks, Text(accuracy)])]
 
 
 def _differences(differences: int, samples: int) -> str:
