@@ -1,5 +1,6 @@
 """Small checkpoints and recordings on disk, for the tests that go through files and the command line."""
 
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -67,6 +68,13 @@ def own_file(
     sets = {"last": last or weights()} | ({} if best is None else {"best": best})
     save_checkpoint(path, sets, graph or ring(), beta=beta, theta=theta, training=training or {"seed": 0})
     return path
+
+
+def checkpoint_bytes(sets: dict, graph: Graph, **options) -> bytes:
+    """What our own format makes of weights."""
+    with tempfile.TemporaryDirectory() as folder:
+        save_checkpoint(Path(folder) / "x.pt", sets, graph, **options)
+        return (Path(folder) / "x.pt").read_bytes()
 
 
 def small_checkpoint(folder: Path, **options) -> tuple[Checkpoint, np.ndarray]:

@@ -8,7 +8,7 @@ import torch
 from torch import nn
 
 from spikeloom.compiler import Options, Recipe
-from spikeloom.models.networks.lif import LIF, OneStep
+from spikeloom.models.networks.lif import LIF, OneStep, reset
 from spikeloom.models.networks.module import compile_module
 
 TAXELS, CLASSES = 6, 3
@@ -194,3 +194,19 @@ def one_step(net, example, **options):
     """The file of one step with its state as inputs and outputs."""
     step = OneStep(net, example)
     return exported(step, (example, *step.rest), **options)
+
+
+class AllSteps(nn.Module):
+    """All steps of a recording, from rest: the mean of a network's output, for an input whose last axis is time."""
+
+    def __init__(self, net: nn.Module) -> None:
+        super().__init__()
+        self.net = net
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        reset(self.net)
+        total = self.net(x[..., 0])
+        for step in range(1, x.shape[-1]):
+            total = total + self.net(x[..., step])
+        reset(self.net)
+        return total / x.shape[-1]

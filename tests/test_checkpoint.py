@@ -14,13 +14,13 @@ import made_files as made
 import numpy as np
 import pytest
 import torch
-from made_files import state_dict
+from made_files import checkpoint_bytes, state_dict
 
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.formats.checkpoint_reader import SIZE_LIMIT, read_checkpoint
 from spikeloom.compiler.formats.spikeloom_checkpoint import content_digest
 from spikeloom.models.graphs import Graph
-from spikeloom.models.networks.checkpoint import checkpoint_bytes, save_checkpoint
+from spikeloom.models.networks.checkpoint import save_checkpoint
 from spikeloom.models.networks.networks import Architecture
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.training.protocols import Reported

@@ -1,6 +1,4 @@
 import hashlib
-import io
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +10,9 @@ from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.models.recordings import fetch
 from spikeloom.models.recordings.counts import GAP_S
 from spikeloom.models.recordings.describe import describe
-from spikeloom.models.recordings.eventfiles import UNLABELLED, likely_unit, read_stream
+from spikeloom.models.recordings.eventfiles import likely_unit, read_stream
 from spikeloom.models.recordings.events import BIN_S, MAX_STEPS, bin_events, data_splits, load_data, need_labels
-from spikeloom.models.recordings.evtouch import load_recordings
+from spikeloom.models.recordings.evtouch import UNLABELLED, Recordings, load_recordings
 from spikeloom.models.recordings.fetch import DataSet
 from spikeloom.models.recordings.grasps import synthetic_grasps
 from spikeloom.models.recordings.release import write_released
@@ -48,6 +46,12 @@ def message(function, *arguments, error=DataError, **options) -> str:
         function(*arguments, **options)
     assert "\n" not in str(caught.value)
     return str(caught.value)
+
+
+def made(events, **changes) -> Recordings:
+    """Recordings of these events in the test split."""
+    known = {"labels": np.arange(len(events)), "files": tuple("abcdefghijklmnop"[: len(events)]), "split": "test"}
+    return Recordings(events=np.asarray(events, np.uint8), source="made", **known | changes)
 
 
 def one(path, **options):
@@ -102,11 +106,7 @@ def test_order_does_not_change_the_bins(write, save):
 def test_both_codes_of_polarity(write, falling):
     found, _ = one(write("a.csv", f"0,0,1\n0.02,0,{falling}\n"))
     assert found == [[0, 0, 1], [0, 1, 0]]
-
-
-def test_one_polarity_alone(write):
-    assert one(write("a.csv", "0,0,-1\n"))[0] == [[0, 0, 0]]
-    assert one(write("a.csv", "0,0,1\n"))[0] == [[0, 1, 0]]
+    assert one(write("a.csv", f"0,0,{falling}\n"))[0] == [[0, 0, 0]]
 
 
 @pytest.mark.parametrize(
@@ -227,8 +227,7 @@ def test_compressed_npz(tmp_path):
         ({"time_s": [[0.1]], "taxel": [[0]], "polarity": [[1]]}, "a.npz: shapes time_s (1, 1)"),
         ({"time_s": [], "taxel": [], "polarity": []}, "a.npz: no events, a recording needs one or more"),
         ({"polarity": ["up"]}, "a.npz: polarity: dtype '<U2', allowed are numbers"),
-        ({"taxel": np.array([0], dtype=object)}, "a.npz: taxel: dtype '|O', allowed are numbers"),
-        ({"label": [1, 1]}, "a.npz: 2 labels for 1 events, allowed is one"),
+        ({"taxel": np.array([0], dtype=object)}, "a.npz: taxel: not an npy file of numbers"),
         ({"time_s": [-1]}, "a.npz: event 0: time -1 s, allowed are finite times from 0"),
     ],
 )
@@ -238,16 +237,10 @@ def test_npz_that_cannot_be(save, change, words):
     assert message(load_data, path).startswith(words)
 
 
-def test_npz_that_lie(save, tmp_path):
+def test_damaged_npz(save, tmp_path):
     path = tmp_path / "a.npz"
     path.write_text("0,0,1\n")
     assert "neither a folder nor a whole zip" in message(load_data, path)
-    header = io.BytesIO()
-    np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (10**12,)})
-    with zipfile.ZipFile(path, "w") as archive:
-        for name in ("time_s", "taxel", "polarity"):
-            archive.writestr(f"{name}.npy", header.getvalue() + bytes(8))
-    assert "a.npz: time_s: 8 bytes of data, its header announces 8000000000000" in message(load_data, path)
     save("a.npz", time_s=np.arange(9.0), taxel=[0] * 9, polarity=[1] * 9)
     data = path.read_bytes()
     path.write_bytes(data[:200] + bytes([data[200] ^ 255]) + data[201:])
@@ -309,6 +302,8 @@ def test_one_released_recording(tmp_path):
         assert np.array_equal(recordings.events, grasps.events[3:4])
         assert recordings.labels.tolist() == [label]
         assert (counts.events, counts.duplicates, counts.steps) == (grasps.events[3].sum(), 0, (40,))
+    refused = message(load_data, tmp_path / "grasp.npy", bin_s=0.05, error=OptionError)
+    assert refused == "--bin 0.05: grasp.npy holds bins, not times; omit --bin"
     np.save(tmp_path / "bad.npy", np.full((3, 2, 4), 0.5))
     assert message(load_data, tmp_path / "bad.npy") == (
         "bad.npy: value 0.5 at taxel 0, polarity 0, step 0, allowed are 0 and 1; recordings are events, not pressures"
@@ -333,25 +328,22 @@ def test_what_is_no_recording(write, tmp_path):
 
 def test_the_released_layout_goes_its_own_way(tmp_path):
     grasps = synthetic_grasps(per_class=2, steps=30, seed=1)
-    split = type(grasps)(
-        events=grasps.events, labels=grasps.labels, files=grasps.files, split="test", source=grasps.source
-    )
-    for name in ("d", "d.zip"):
+    split = grasps.part(slice(None), "test")
+    for name in ("d", "d.zip", "again.zip"):
         write_released(tmp_path / name, [split])
         recordings, counts = load_data(tmp_path / name, classes=6, taxels=39)
         assert counts is None
         assert np.array_equal(recordings.events, grasps.events)
         assert recordings.files == tuple(f"sample_{i:02}_label_{i % 6}.npy" for i in range(12))
         assert data_splits(tmp_path / name) == ("test",)
+    assert (tmp_path / "d.zip").read_bytes() == (tmp_path / "again.zip").read_bytes()
 
 
 def test_names_of_fetched_data(tmp_path, monkeypatch):
     monkeypatch.setenv("SPIKELOOM_DATA", str(tmp_path))
     monkeypatch.chdir(tmp_path)
     grasps = synthetic_grasps(per_class=1, steps=30, seed=1)
-    test = type(grasps)(
-        events=grasps.events, labels=grasps.labels, files=grasps.files, split="test", source=grasps.source
-    )
+    test = grasps.part(slice(None), "test")
     path = tmp_path / "Ev-Objects.zip"
     assert "objects: not on this machine" in message(load_data, "objects")
     write_released(path, [test])
@@ -412,21 +404,12 @@ def test_a_released_recording_survives_as_events(objects_zip, tmp_path):
 
 
 def test_description():
-    grasps = synthetic_grasps(per_class=2, steps=20, seed=1)
     grid = np.zeros((2, 5, 2, 10), dtype=np.uint8)
     grid[:, :4, :, ::5] = 1
     grid[:, 1] = 0
     grid[:, 2, 1] = 0
     grid[1, :, :, 5:] = 0  # the second recording has 5 steps
-    recordings = type(grasps)(
-        events=grid,
-        labels=np.array([3, -1]),
-        files=("a", "b"),
-        split="test",
-        source="made for this",
-        lengths=np.array([10, 5]),
-    )
-    found = describe(recordings, 0.1)
+    found = describe(made(grid, labels=np.array([3, -1]), lengths=np.array([10, 5])), 0.1)
     assert found.duration_s == (0.5, 0.75, 1.0)
     assert (found.recordings, found.events, found.classes) == (2, 15, {-1: 1, 3: 1})
     assert found.rate.tolist() == [[2, 2], [0, 0], [2, 0], [2, 2], [0, 0]]  # 3 events in 1.5 s
@@ -436,23 +419,14 @@ def test_description():
     assert (found.dead, found.one_sided, found.hot) == ((1, 4), (2,), ())
 
 
-def test_hot_taxels_exceed_five_times_the_median():
-    grasps = synthetic_grasps(per_class=1, steps=20, seed=1)
+def test_hot_taxels_exceed_five_times_the_median_and_silence_is_dead():
     grid = np.zeros((1, 6, 2, 100), dtype=np.uint8)
     grid[0, :3, :, :5] = 1
     grid[0, 3, :, :25] = 1
     grid[0, 4, :, :26] = 1  # taxel 5 is dead and does not lower the median
-    recordings = type(grasps)(events=grid, labels=np.array([0]), files=("a",), split="test", source="x")
-    found = describe(recordings, 0.02)
+    found = describe(made(grid), 0.02)
     assert (found.dead, found.hot) == ((5,), (4,))
-
-
-def test_silence_is_described():
-    grasps = synthetic_grasps(per_class=1, steps=20, seed=1)
-    recordings = type(grasps)(
-        events=np.zeros((1, 3, 2, 4), dtype=np.uint8), labels=np.array([0]), files=("a",), split="test", source="x"
-    )
-    found = describe(recordings, 0.02)
+    found = describe(made(np.zeros((1, 3, 2, 4))), 0.02)
     assert (found.dead, found.hot, found.events) == ((0, 1, 2), (), 0)
 
 
@@ -484,13 +458,6 @@ def test_writing_is_all_or_nothing(tmp_path, monkeypatch):
         with pytest.raises(OSError, match="No space left on device"):
             write_released(tmp_path / name, [grasps])
     assert list(tmp_path.iterdir()) == []
-
-
-def test_equal_recordings_give_equal_zips(tmp_path):
-    grasps = synthetic_grasps(per_class=1, steps=20, seed=1)
-    write_released(tmp_path / "a.zip", [grasps])
-    write_released(tmp_path / "b.zip", [grasps])
-    assert (tmp_path / "a.zip").read_bytes() == (tmp_path / "b.zip").read_bytes()
 
 
 def test_places_to_write(tmp_path, write):
@@ -595,10 +562,3 @@ def test_a_table_of_something_else_is_passed_over(listed):
 )
 def test_a_table_that_cannot_be(listed, rows, line):
     assert message(load_data, listed("own/labels.csv", f"file,label\n{rows}").parent) == line
-
-
-def test_bins_have_their_width_already(write, tmp_path):
-    np.save(tmp_path / "a.npy", np.ones((3, 2, 4), np.uint8))
-    assert message(load_data, tmp_path / "a.npy", bin_s=0.05, error=OptionError) == (
-        "--bin 0.05: a.npy holds bins, not times; omit --bin"
-    )

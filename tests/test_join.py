@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from made_files import released, state_dict, weights
+from made_files import checkpoint_bytes, released, state_dict, weights
 from numpy.testing import assert_array_equal
 from test_checkpoint import rebuilt
 from timed_networks import GRAPH, TIMING, events_of, written
@@ -24,7 +24,6 @@ from spikeloom.compiler.ir import Form
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.loihi1.storage.quantize import round_to_forms
 from spikeloom.models.graphs import build_graph
-from spikeloom.models.networks.checkpoint import checkpoint_bytes
 from spikeloom.models.networks.quantised import quantised_spikes
 from spikeloom.models.networks.reference import float_membranes, float_spikes
 from spikeloom.runtime.cli import main

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 import torch
-from made_modules import CLASSES, NETS, TAXELS, example_of, graph_net, mlp, seeded
+from made_modules import CLASSES, NETS, TAXELS, AllSteps, example_of, graph_net, mlp, seeded
 from torch import nn
 
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.interpret import channels_last, run_float
-from spikeloom.models.networks.lif import LIF, AllSteps, OneStep, reset
+from spikeloom.models.networks.lif import LIF, OneStep, reset
 from spikeloom.models.networks.module import compile_module, module_network
 from spikeloom.runtime.equivalence.verify import verify
 

@@ -12,9 +12,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 from spikeloom.compiler.checkpoint import Checkpoint, Dense
 from spikeloom.compiler.passes.expand import expand_graph_convolution
 from spikeloom.models.graphs import build_graph, normalised_adjacency
-from spikeloom.models.networks.layers import SURROGATE_HALF_WIDTH, LifSteps, lif, spike_linear, tag_convolution
+from spikeloom.models.networks.layers import LifSteps, lif, spike_linear, tag_convolution
 from spikeloom.models.networks.networks import Architecture, SpikingNet
 from spikeloom.models.networks.reference import float_membranes, float_spikes
+from spikeloom.models.networks.surrogate import RECTANGLE
 
 BETA, THETA = 0.2, 0.5
 
@@ -31,7 +32,7 @@ class Spike(torch.autograd.Function):
     @staticmethod
     def backward(ctx, gradient):
         (membrane,) = ctx.saved_tensors
-        return gradient * ((membrane - ctx.theta).abs() < SURROGATE_HALF_WIDTH).to(gradient.dtype), None
+        return gradient * ((membrane - ctx.theta).abs() < RECTANGLE.width).to(gradient.dtype), None
 
 
 def lif_step_by_step(current, beta=BETA, theta=THETA):
@@ -111,7 +112,7 @@ def test_gradient_of_the_recurrence_equals_plain_autograd(seed, steps, beta):
         (spikes * weight).sum().backward()
         gradients.append(current.grad)
     assert_allclose(gradients[0], gradients[1], rtol=1e-12, atol=1e-12)
-    assert gradients[0].abs().max() > 0 or ((values[-1] - THETA).abs() >= SURROGATE_HALF_WIDTH).all()
+    assert gradients[0].abs().max() > 0 or ((values[-1] - THETA).abs() >= RECTANGLE.width).all()
 
 
 def test_the_surrogate_is_open_at_its_ends():

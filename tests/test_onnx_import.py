@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from made_files import recordings_folder
-from made_modules import NETS, at_a_tie, example_of, exported, one_step
+from made_modules import NETS, AllSteps, at_a_tie, example_of, exported, one_step
 from made_onnx import (
     BIAS,
     FIRES,
@@ -37,7 +37,7 @@ from spikeloom.compiler.formats.onnx.reader import read_onnx
 from spikeloom.compiler.interpret import channels_last, run_float
 from spikeloom.compiler.sensor_layout import sensor_layout
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
-from spikeloom.models.networks.lif import LIF, AllSteps
+from spikeloom.models.networks.lif import LIF
 from spikeloom.models.networks.module import compile_module, module_network
 from spikeloom.runtime import cli
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from made_files import released
+from made_files import checkpoint_bytes, released
 from numpy.testing import assert_allclose, assert_array_equal
 from oracles import probed
 from scipy import sparse
@@ -20,11 +20,12 @@ from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.systems import GCN, GRAPH_SYSTEMS, GRID_CNN, MLP, SYSTEMS, Grid, in_order
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.models.graphs import NEUTOUCH, build_graph
-from spikeloom.models.networks.checkpoint import checkpoint_bytes, save_checkpoint
-from spikeloom.models.networks.layers import SURROGATE_HALF_WIDTH, filter_places
+from spikeloom.models.networks.checkpoint import save_checkpoint
+from spikeloom.models.networks.layers import filter_places
 from spikeloom.models.networks.networks import Architecture, SpikingNet
 from spikeloom.models.networks.quantised import time_first
 from spikeloom.models.networks.reference import float_spikes
+from spikeloom.models.networks.surrogate import RECTANGLE
 from spikeloom.models.recordings.evtouch import load_recordings
 from spikeloom.models.recordings.grasps import synthetic_grasps
 from spikeloom.models.recordings.release import write_released
@@ -136,7 +137,7 @@ class Spike(torch.autograd.Function):
     @staticmethod
     def backward(ctx, gradient):
         (membrane,) = ctx.saved_tensors
-        return gradient * ((membrane - 0.5).abs() < SURROGATE_HALF_WIDTH).to(gradient.dtype)
+        return gradient * ((membrane - 0.5).abs() < RECTANGLE.width).to(gradient.dtype)
 
 
 def plain_spikes(system, state, events, *, padding="none"):

@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from made_files import checkpoint_bytes
 from numpy.testing import assert_allclose, assert_array_equal
 
 import spikeloom.models.training.train
 from spikeloom.compiler.errors import DataError, ModelError, OptionError
 from spikeloom.models.graphs import build_graph, normalised_adjacency
-from spikeloom.models.networks.checkpoint import checkpoint_bytes
 from spikeloom.models.networks.networks import Architecture, SpikingNet
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.recordings.grasps import synthetic_grasps

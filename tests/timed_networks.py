@@ -7,7 +7,7 @@ import torch
 
 from spikeloom.compiler.dynamics import Clocks, Dynamics
 from spikeloom.models.graphs import NEUTOUCH, build_graph
-from spikeloom.models.networks.checkpoint import checkpoint_bytes
+from spikeloom.models.networks.checkpoint import save_checkpoint
 from spikeloom.models.networks.networks import Architecture, SpikingNet
 from spikeloom.models.systems import filters_of, propagation_of, sensor_grid
 
@@ -33,7 +33,7 @@ def written(path, system="tactilesgnet", dynamics=TIMING, seed=1, **sizes):
     seen = propagation_of(system, GRAPH.edges, 39, grid, filters_of(system, 39, architecture.hops))
     network = louder(SpikingNet(architecture, seen, seed=seed))
     constants = {"beta": architecture.beta, "theta": architecture.theta, "training": {}, "system": system, "grid": grid}
-    path.write_bytes(checkpoint_bytes({"last": network.export_weights()}, GRAPH, dynamics=dynamics, **constants))
+    save_checkpoint(path, {"last": network.export_weights()}, GRAPH, dynamics=dynamics, **constants)
     return network, seen
 
 

@@ -21,7 +21,8 @@ from spikeloom.models.graphs import Graph
 Tensors = Mapping[str, npt.NDArray[np.float32]]
 
 
-def checkpoint_bytes(
+def save_checkpoint(
+    path: str | os.PathLike[str],
     weights: Mapping[str, Tensors],
     graph: Graph,
     *,
@@ -34,8 +35,8 @@ def checkpoint_bytes(
     dynamics: Dynamics = PLAIN,
     towers: int = 1,
     bins: int = 1,
-) -> bytes:
-    """File content of a checkpoint; equal input gives equal bytes.
+) -> None:
+    """Write a checkpoint, whole or not at all; equal input gives equal bytes.
 
     Parameters
     ----------
@@ -43,22 +44,19 @@ def checkpoint_bytes(
         ``conv1.hops`` (filters, features, channels), ``conv1.bias``, ``fc1.weight``, ``fc1.bias`` … float32.
     graph : Graph
         What it was trained on.
-    beta, theta : float
-        Decay and threshold.
     training : mapping
         JSON values: how it was made and what it reached.
     forms : sequence of Form, optional
         How the chip stores each layer, conv1 first, where the network was fine-tuned for it.
-    system : str
-        One of :data:`spikeloom.compiler.systems.SYSTEMS`.
-    grid : Grid, optional
-        Of a grid-based CNN.
-    dynamics : Dynamics
-        Decays of single layers, and clocks.
     towers : int
         Networks that lie side by side in the tensors, see :mod:`formats.towers`.
     bins : int
         Bins of the recordings that a step joins.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written; an older file is left as it was.
     """
     tensors_of_one = next(iter(weights.values()))
     stages = sum(name.startswith("fc") and name.endswith(".weight") for name in tensors_of_one)
@@ -100,43 +98,6 @@ def checkpoint_bytes(
         ]
     manifest["sha256"] = content_digest(manifest, arrays)
     members: dict[str, bytes | str] = {"manifest.json": json.dumps(manifest, indent=1, allow_nan=False)}
-    return zip_bytes(members | {f"{name}.npy": npy_bytes(array) for name, array in arrays.items()})
-
-
-def save_checkpoint(
-    path: str | os.PathLike[str],
-    weights: Mapping[str, Tensors],
-    graph: Graph,
-    *,
-    beta: float,
-    theta: float,
-    training: Mapping[str, Any],
-    forms: Sequence[Form] | None = None,
-    system: str = TACTILESGNET,
-    grid: Grid | None = None,
-    dynamics: Dynamics = PLAIN,
-    towers: int = 1,
-    bins: int = 1,
-) -> None:
-    """Write a checkpoint, whole or not at all; parameters as :func:`checkpoint_bytes`.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be written; an older file is left as it was.
-    """
-    content = checkpoint_bytes(
-        weights,
-        graph,
-        beta=beta,
-        theta=theta,
-        training=training,
-        forms=forms,
-        system=system,
-        grid=grid,
-        dynamics=dynamics,
-        towers=towers,
-        bins=bins,
-    )
+    content = zip_bytes(members | {f"{name}.npy": npy_bytes(array) for name, array in arrays.items()})
     with write_atomically(path) as file:
         file.write(content)

@@ -14,13 +14,6 @@ from spikeloom.models.networks.layers import kind_of, rows_of
 def lasting_current(drive: Tensor, alpha: float) -> Tensor:
     """Synaptic currents along the first axis, from rest: ``i_t = alpha * i_{t-1} + drive_t``.
 
-    Parameters
-    ----------
-    drive : (steps, ...)
-        What the spikes of a step bring.
-    alpha : float
-        Share of the current that a step keeps, 0 to 1.
-
     Examples
     --------
     >>> lasting_current(torch.tensor([1.0, 0.0, 2.0]), 0.5).tolist()

@@ -25,28 +25,12 @@ from torch import Tensor
 
 from spikeloom.models.networks.surrogate import FAST_SIGMOID, RECTANGLE, Surrogate
 
-SURROGATE_HALF_WIDTH = RECTANGLE.width
-"""The surrogate derivative of a spike is 1 where the membrane is nearer to the threshold than this, 0 elsewhere."""
-
 
 def tag_convolution(x: Tensor, adjacency: Tensor, hops: Tensor, bias: Tensor) -> Tensor:
     """K-hop filter ``y = sum_k A^k x g_k^T + b`` [1]_, summed in the order of the released operator.
 
-    Parameters
-    ----------
-    x : (steps, samples, taxels, channels)
-        Input; no gradient flows into it.
-    adjacency : (taxels, taxels)
-        Propagation matrix; row i gathers into taxel i.
-    hops : (K + 1, features, channels)
-        Filter of each hop.
-    bias : (features,)
-        Added after the last hop.
-
-    Returns
-    -------
-    (steps, samples, taxels * features)
-        Taxel-major: entry ``taxel * features + feature``.
+    For `x` (steps, samples, taxels, channels), into which no gradient flows, `adjacency` (taxels, taxels), whose row i
+    gathers into taxel i, and `hops` (K + 1, features, channels); (steps, samples, taxels * features), taxel-major.
     """
     steps, samples, taxels, channels = x.shape
     # Taxels first: a hop is then one product of (taxels, taxels) with a wide matrix.
@@ -82,19 +66,7 @@ class _HopSum(torch.autograd.Function):
 def filter_places(x: Tensor, propagation: Tensor, filters: Tensor, bias: Tensor) -> Tensor:
     """``y = sum_k M_k x g_k^T + b``, in one product: of what every place sees, with all filters side by side.
 
-    Parameters
-    ----------
-    x : (steps, samples, taxels, channels)
-        Input; no gradient flows into it.
-    propagation : (filters, places, taxels)
-        Stack of the M_k.
-    filters : (filters, features, channels)
-    bias : (features,)
-
-    Returns
-    -------
-    (steps, samples, places * features)
-        Place-major: entry ``place * features + feature``.
+    As :func:`tag_convolution`; `propagation` (filters, places, taxels) stacks the M_k, the output is place-major.
     """
     steps, samples, taxels, channels = x.shape
     n_filters, places, _ = propagation.shape
@@ -110,21 +82,8 @@ def lif(current: Tensor, beta: float, theta: float, surrogate: Surrogate = RECTA
 
     ``u_t = beta * u_{t-1} * (1 - s_{t-1}) + current_t`` and ``s_t = u_t > theta``, a strict comparison. The gradient
     runs through the decay and, where the surrogate says so, through the reset, with the surrogate [2]_ [3]_ for the
-    derivative of the spike.
-
-    Parameters
-    ----------
-    current : (steps, ...)
-        Input current.
-    beta, theta : float
-        Decay (0 to 1) and threshold.
-    surrogate : Surrogate
-        Derivative of a spike.
-
-    Returns
-    -------
-    spikes, membrane : (steps, ...)
-        Zeros and ones, and the membrane that was compared with `theta`; no gradient flows from the membrane.
+    derivative of the spike. Returns zeros and ones, and the membrane that was compared with `theta`, both (steps, ...);
+    no gradient flows from the membrane.
     """
     function = _Lif if current.device.type == "cpu" else LifSteps
     spikes, membrane = function.apply(current, beta, theta, surrogate)  # type: ignore[no-untyped-call]
@@ -198,20 +157,9 @@ class LifSteps(torch.autograd.Function):
 def spike_linear(spikes: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     """Affine layer over zeros and ones, which adds up the weights of the inputs that spiked.
 
-    Costs what the spikes cost (5 to 15 % of a dense product here); only the gradient of `spikes` is dense.
-
-    Parameters
-    ----------
-    spikes : (steps, samples, inputs)
-        Zeros and ones.
-    weight : (inputs, outputs)
-        Transposed against torch's ``Linear``, so that the weights of one input lie side by side.
-    bias : (outputs,)
-        Starts each sum; the inputs follow in ascending order.
-
-    Returns
-    -------
-    (steps, samples, outputs)
+    Costs what the spikes cost (5 to 15 % of a dense product here); only the gradient of `spikes` is dense. The weight
+    is (inputs, outputs), transposed against torch's ``Linear``, so that the weights of one input lie side by side; the
+    bias starts each sum, the inputs follow in ascending order.
     """
     if spikes.device.type != "cpu":
         return spikes @ weight + bias
@@ -239,6 +187,14 @@ class _SpikeLinear(torch.autograd.Function):
         source, bounds = ctx.events
         scatter(source, bounds, rows.numpy(), out.numpy())
         return above @ weight.t(), out, rows.sum(0)
+
+
+def rates_of(spikes: Tensor, lengths: Tensor | None) -> Tensor:
+    """Spikes per step of (steps, samples, neurons), without the steps by which shorter recordings were filled up."""
+    if lengths is None:
+        return spikes.mean(0)
+    inside = torch.arange(len(spikes), device=spikes.device)[:, None] < lengths
+    return torch.sum(spikes * inside[..., None], dim=0) / lengths[:, None]
 
 
 def rows_of(tensor: Tensor) -> np.ndarray[Any, Any]:

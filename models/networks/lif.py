@@ -1,4 +1,4 @@
-"""Spiking neurons as a torch module, one step a call, and wrappers that run or export a network made of them.
+"""Spiking neurons as a torch module, one step a call, and the form in which a network of them is exported.
 
 A network is any ``nn.Module`` with :class:`LIF` layers in it; whatever lies between two of them must be affine to be
 compiled (:func:`module.compile_module`). How it is trained is its own affair.
@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from spikeloom.models.networks.layers import SURROGATE_HALF_WIDTH
+from spikeloom.models.networks.surrogate import RECTANGLE
 
 
 class _Spike(torch.autograd.Function):
@@ -26,18 +26,14 @@ class _Spike(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
         (membrane,) = ctx.saved_tensors
-        return gradients[0] * ((membrane - ctx.theta).abs() < SURROGATE_HALF_WIDTH), None
+        return gradients[0] * ((membrane - ctx.theta).abs() < RECTANGLE.width), None
 
 
 class LIF(nn.Module):
     """Leaky integrate-and-fire neurons: ``u <- beta * u * (1 - s) + current``, ``s = u > theta``.
 
-    Keeps membrane and spikes from call to call, one call a step; :meth:`reset` before each recording.
-
-    Parameters
-    ----------
-    beta, theta : float
-        Share of the membrane that a step keeps, and threshold.
+    Keeps membrane and spikes from call to call, one call a step; :meth:`reset` before each recording. `beta` is the
+    share of the membrane that a step keeps, `theta` the threshold.
 
     Examples
     --------
@@ -73,20 +69,18 @@ class LIF(nn.Module):
 
 def reset(net: nn.Module) -> None:
     """Bring all neurons of a network to rest."""
-    for module in net.modules():
-        if isinstance(module, LIF):
-            module.reset()
+    for layer in _lif_layers(net):
+        layer.reset()
+
+
+def _lif_layers(net: nn.Module) -> list[LIF]:
+    return [module for module in net.modules() if isinstance(module, LIF)]
 
 
 class OneStep(nn.Module):
     """One step of a network as a function: ``(x, state …) -> (output, state …)``, the form to export.
 
-    Parameters
-    ----------
-    net : Module
-        Network with :class:`LIF` layers.
-    example : Tensor
-        Input of one step, for the shapes of the states.
+    The `example`, an input of one step, is for the shapes of the states.
 
     Examples
     --------
@@ -107,8 +101,7 @@ class OneStep(nn.Module):
 
     def forward(self, x: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
         """Output and new state, membranes and spikes of each layer in turn."""
-        layers = [module for module in self.net.modules() if isinstance(module, LIF)]
-        for index, layer in enumerate(layers):
+        for index, layer in enumerate(_lif_layers(self.net)):
             layer.membrane, layer.spikes = state[2 * index], state[2 * index + 1]
         output: Tensor = self.net(x)
         after = self._state()
@@ -116,22 +109,5 @@ class OneStep(nn.Module):
         return output, *after
 
     def _state(self) -> tuple[Tensor, ...]:
-        layers = [module for module in self.net.modules() if isinstance(module, LIF)]
-        return tuple(tensor for layer in layers for tensor in (layer.membrane, layer.spikes) if tensor is not None)
-
-
-class AllSteps(nn.Module):
-    """All steps of a recording, from rest: the mean of a network's output, for an input whose last axis is time."""
-
-    def __init__(self, net: nn.Module) -> None:
-        super().__init__()
-        self.net = net
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Mean output over the steps."""
-        reset(self.net)
-        total = self.net(x[..., 0])
-        for step in range(1, x.shape[-1]):
-            total = total + self.net(x[..., step])
-        reset(self.net)
-        return total / x.shape[-1]  # type: ignore[no-any-return]
+        both = ((layer.membrane, layer.spikes) for layer in _lif_layers(self.net))
+        return tuple(tensor for pair in both for tensor in pair if tensor is not None)

@@ -49,7 +49,7 @@ class _Probe:
         self.forced: list[Tensor] | None = None
         for module in self.net.modules():
             if isinstance(module, LIF):
-                module.register_forward_hook(self._heard)
+                module.register_forward_hook(self._record)
         self.example = example.detach().double()
         first, _ = self._forward(self.example, None)
         calls = [id(layer) for layer in self.order]
@@ -82,7 +82,7 @@ class _Probe:
         shapes = [self.example.shape, *self.shapes]
         return [int(np.prod(shape[1:] if self.batched else shape)) for shape in shapes]
 
-    def _heard(self, layer: nn.Module, inputs: tuple[Tensor, ...], output: Tensor) -> Tensor:
+    def _record(self, layer: nn.Module, inputs: tuple[Tensor, ...], output: Tensor) -> Tensor:
         assert isinstance(layer, LIF)
         place = len(self.currents)
         self.currents.append(inputs[0])
@@ -235,15 +235,7 @@ def compile_module(
     target: str = DEFAULT_TARGET,
     options: Options | None = None,
 ) -> Compilation:
-    """Compile a module: :func:`module_network`, then :func:`compiler.compile_network`.
-
-    Parameters
-    ----------
-    net, example, polarities, polarities_first
-        See :func:`module_network`.
-    target, options
-        See :func:`compiler.compile_network`.
-    """
+    """Compile a module: :func:`module_network`, then :func:`compiler.compile_network`."""
     network = module_network(net, example, polarities=polarities, polarities_first=polarities_first)
     options = options or Options()
     provenance = {"module": type(net).__name__, **options.provenance}

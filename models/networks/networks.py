@@ -9,7 +9,7 @@ References
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from spikeloom.compiler.dynamics import PLAIN, RELAY_WEIGHT, Clocks, Dynamics
 from spikeloom.compiler.systems import GCN, GRID_CNN, MLP, TACTILESGNET, feature_major, in_order
 from spikeloom.models.networks.currents import lasting_current
-from spikeloom.models.networks.layers import filter_places, lif, spike_linear, tag_convolution
+from spikeloom.models.networks.layers import filter_places, lif, rates_of, spike_linear, tag_convolution
 from spikeloom.models.networks.surrogate import RECTANGLE, Surrogate
 from spikeloom.models.systems import HOPS, filters_of
 
@@ -33,16 +33,14 @@ Weights = dict[str, NDArray[np.float32]]
 class Architecture:
     """Sizes and neuron constants of a `SpikingNet`; the defaults are those of [1]_."""
 
-    # taxels, classes: Sensor points and output neurons
-    taxels: int
-    classes: int
+    taxels: int  # Sensor points
+    classes: int  # Output neurons
     channels: int = 2  # Inputs per taxel (polarities)
     hops: int = HOPS  # K of the graph convolution of a TactileSGNet, which has K + 1 filters
     features: int = 64  # Outputs of the first layer per place
     hidden: tuple[int, ...] = (128, 256)  # Neurons of each dense layer before the last
-    # beta, theta: Membrane decay per step and firing threshold of every neuron
-    beta: float = 0.2
-    theta: float = 0.5
+    beta: float = 0.2  # Membrane decay per step
+    theta: float = 0.5  # Threshold of every neuron
     system: str = TACTILESGNET  # One of :data:`spikeloom.compiler.systems.SYSTEMS`
     dynamics: Dynamics = PLAIN  # Decays of single layers, and clocks
 
@@ -51,73 +49,34 @@ class Architecture:
         return SpikingNet(self, propagation, seed=seed, surrogate=surrogate)
 
 
-class TagConvolution(nn.Module):
-    """K-hop graph convolution with filters (K + 1, features, channels).
+class Affine(nn.Module):
+    """Parameters of a layer, and the function that is called with them: the network may scale the weight first.
 
-    As all layers here it holds its parameters, and is called with them: the network may scale them first.
+    They start uniform within 1/sqrt(fan-in), the bias at zero unless it is `biased`.
     """
 
-    def __init__(self, channels: int, features: int, hops: int, generator: torch.Generator) -> None:
+    def __init__(
+        self,
+        function: Callable[..., Tensor],
+        name: str,
+        shape: tuple[int, ...],
+        fan_in: float,
+        generator: torch.Generator,
+        *,
+        biased: bool = True,
+    ) -> None:
         super().__init__()
-        self.hops = nn.Parameter(torch.empty(hops + 1, features, channels))
-        self.bias = nn.Parameter(torch.zeros(features))
-        _uniform(self.hops, channels, generator)
+        self.function = function
+        self.register_parameter(name, nn.Parameter(torch.empty(shape)))
+        self.bias = nn.Parameter(torch.zeros(shape[1]))
+        bound = 1 / math.sqrt(fan_in)
+        with torch.no_grad():
+            for parameter in (self.get_parameter(name), *([self.bias] if biased else [])):
+                parameter.uniform_(-bound, bound, generator=generator)
 
-    def forward(self, x: Tensor, adjacency: Tensor, hops: Tensor, bias: Tensor) -> Tensor:
-        """See :func:`layers.tag_convolution`."""
-        return tag_convolution(x, adjacency, hops, bias)
-
-
-class PlaceFilters(nn.Module):
-    """Filters (filters, features, channels) over what each place sees: the first layer of a GCN or a grid-based CNN.
-
-    Starts as the layers of those names start in torch_geometric and torch: Glorot's uniform weights and no bias, or
-    weights and bias within 1/sqrt(fan-in).
-    """
-
-    def __init__(self, filters: int, channels: int, features: int, system: str, generator: torch.Generator) -> None:
-        super().__init__()
-        self.hops = nn.Parameter(torch.empty(filters, features, channels))
-        self.bias = nn.Parameter(torch.zeros(features))
-        if system == GCN:
-            _uniform(self.hops, (channels + features) / 6, generator)
-        else:
-            _uniform(self.hops, filters * channels, generator)
-            _uniform(self.bias, filters * channels, generator)
-
-    def forward(self, x: Tensor, propagation: Tensor, hops: Tensor, bias: Tensor) -> Tensor:
-        """See :func:`layers.filter_places`."""
-        return filter_places(x, propagation, hops, bias)
-
-
-class TaxelWeights(nn.Module):
-    """The first layer of an MLP: a weight (taxels * channels, features) for each input, which are few and spikes."""
-
-    def __init__(self, inputs: int, features: int, generator: torch.Generator) -> None:
-        super().__init__()
-        self.weight = nn.Parameter(torch.empty(inputs, features))
-        self.bias = nn.Parameter(torch.empty(features))
-        _uniform(self.weight, inputs, generator)
-        _uniform(self.bias, inputs, generator)
-
-    def forward(self, x: Tensor, _propagation: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-        """See :func:`layers.spike_linear`."""
-        return spike_linear(x.flatten(2), weight, bias)
-
-
-class SpikeLinear(nn.Module):
-    """Affine layer over spikes; the weight is (inputs, outputs), transposed against torch's ``Linear``."""
-
-    def __init__(self, inputs: int, outputs: int, generator: torch.Generator) -> None:
-        super().__init__()
-        self.weight = nn.Parameter(torch.empty(inputs, outputs))
-        self.bias = nn.Parameter(torch.empty(outputs))
-        _uniform(self.weight, inputs, generator)
-        _uniform(self.bias, inputs, generator)
-
-    def forward(self, spikes: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-        """See :func:`layers.spike_linear`."""
-        return spike_linear(spikes, weight, bias)
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """Currents of the layer, from its inputs, weight and bias."""
+        return self.function(*inputs)
 
 
 class TrainedModule(nn.Module):
@@ -172,7 +131,7 @@ class SpikingNet(TrainedModule):
         sizes = (inputs, *architecture.hidden, architecture.classes)
         self.dense = tuple(f"fc{i}" for i in range(1, len(sizes)))
         for name, inputs, outputs in zip(self.dense, sizes[:-1], sizes[1:], strict=True):
-            self.add_module(name, SpikeLinear(inputs, outputs, generator))
+            self.add_module(name, Affine(spike_linear, "weight", (inputs, outputs), inputs, generator))
         self.adjacency: Tensor
         self.register_buffer("adjacency", torch.tensor(propagation, dtype=torch.float32), persistent=False)
 
@@ -212,16 +171,13 @@ class SpikingNet(TrainedModule):
     def forward(self, events: Tensor, lengths: Tensor | None = None) -> Tensor:
         """Spikes per step of each output neuron, (samples, classes), for (steps, samples, taxels, channels).
 
-        Parameters
-        ----------
-        lengths : (samples,) int64, optional
-            Steps of each recording, where some were filled up with silence.
+        `lengths` (samples,) has the steps of each recording, where some were filled up with silence.
         """
         return self.rates(self.layers(events), lengths)
 
     def rates(self, layers: Mapping[str, tuple[Tensor, Tensor]], lengths: Tensor | None = None) -> Tensor:
         """Spikes per step of each output neuron, from what `layers` returned."""
-        return _rates(layers[self.dense[-1]][0], lengths)
+        return rates_of(layers[self.dense[-1]][0], lengths)
 
     def activity(self, layers: Mapping[str, tuple[Tensor, Tensor]], lengths: Tensor | None = None) -> Tensor:
         """Share of the synapses behind neurons that carry a spike, mean over steps and samples; one number."""
@@ -229,7 +185,7 @@ class SpikingNet(TrainedModule):
         for source, layer in zip(layers, self.dense, strict=False):
             inputs, outputs = self.get_submodule(layer).get_parameter("weight").shape
             spikes = layers[source][0]
-            share = spikes.mean() if lengths is None else _rates(spikes, lengths).mean()
+            share = spikes.mean() if lengths is None else rates_of(spikes, lengths).mean()
             used = used + share.cpu() * (inputs * outputs)
             there += inputs * outputs
         return used / there
@@ -275,33 +231,26 @@ def relayed(clocks: Clocks, like: Tensor) -> Tensor:
     return ticks[:, None].expand(steps, samples, clocks.channels)
 
 
-def _rates(spikes: Tensor, lengths: Tensor | None) -> Tensor:
-    """Spikes per step of (steps, samples, neurons), without the steps that were filled up."""
-    if lengths is None:
-        return spikes.mean(0)
-    inside = torch.arange(len(spikes), device=spikes.device)[:, None] < lengths
-    return torch.sum(spikes * inside[..., None], dim=0) / lengths[:, None]
-
-
-def _first_layer(architecture: Architecture, generator: torch.Generator) -> nn.Module:
+def _first_layer(architecture: Architecture, generator: torch.Generator) -> Affine:
+    """As the layers of those names start in torch and torch_geometric; a GCN with Glorot's weights and no bias."""
     channels, features, system = architecture.channels, architecture.features, architecture.system
-    match system:
-        case "tactilesgnet":
-            return TagConvolution(channels, features, architecture.hops, generator)
-        case "mlp":
-            return TaxelWeights(architecture.taxels * channels, features, generator)
-    assert system in (GCN, GRID_CNN), "systems are checked where they are named"
-    return PlaceFilters(
-        filters_of(system, architecture.taxels, architecture.hops), channels, features, system, generator
-    )
+    if system == MLP:  # a weight for each input, which are few and spikes
+        inputs = architecture.taxels * channels
+        return Affine(_over_all_taxels, "weight", (inputs, features), inputs, generator)
+    filters = filters_of(system, architecture.taxels, architecture.hops)
+    shape = (filters, features, channels)
+    if system == TACTILESGNET:
+        return Affine(tag_convolution, "hops", shape, channels, generator, biased=False)
+    if system == GCN:
+        return Affine(filter_places, "hops", shape, (channels + features) / 6, generator, biased=False)
+    assert system == GRID_CNN, "systems are checked where they are named"
+    return Affine(filter_places, "hops", shape, filters * channels, generator)
+
+
+def _over_all_taxels(x: Tensor, _propagation: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    return spike_linear(x.flatten(2), weight, bias)
 
 
 def _turned(name: str) -> bool:
     """Whether a weight lies transposed in this network."""
     return name.endswith(".weight")
-
-
-def _uniform(weight: Tensor, fan_in: float, generator: torch.Generator) -> None:
-    bound = 1 / math.sqrt(fan_in)
-    with torch.no_grad():
-        weight.uniform_(-bound, bound, generator=generator)

@@ -35,7 +35,7 @@ from spikeloom.compiler.formats.towers import members, side_by_side
 from spikeloom.compiler.ir import Form
 from spikeloom.compiler.passes.expand import effective_weight, stack_of
 from spikeloom.compiler.systems import in_order
-from spikeloom.models.networks.layers import differentiate, events_of, gather, scatter
+from spikeloom.models.networks.layers import differentiate, events_of, gather, rates_of, scatter
 from spikeloom.models.networks.surrogate import RECTANGLE
 
 SHRINK = 0.98
@@ -58,16 +58,9 @@ class Integers:
 
 
 class QuantisedNet(nn.Module):
-    """A network on chip integers.
+    """A network on chip integers: a checkpoint on what its first layer sees, see :func:`expand.stack_of`.
 
-    Parameters
-    ----------
-    checkpoint : Checkpoint
-        Weights, decay and threshold.
-    adjacency : (taxels, taxels) or (filters, places, taxels) float64
-        What the first layer sees, see :func:`expand.stack_of`.
-    forms : sequence of Form
-        How the chip stores each layer, conv1 first.
+    `forms` say how the chip stores each layer, conv1 first.
     """
 
     def __init__(self, checkpoint: Checkpoint, adjacency: Array, forms: Sequence[Form]) -> None:
@@ -96,13 +89,7 @@ class QuantisedNet(nn.Module):
         return layers
 
     def round(self) -> None:
-        """Round all weights; to be called after every change of them.
-
-        Raises
-        ------
-        ValueError
-            If a bias has no register value; `make_legal` prevents that.
-        """
+        """Round all weights, after every change of them; `make_legal` sees that every bias has a register value."""
         found = []
         for (weight, bias), form in zip(self.real_weights(), self.forms, strict=True):
             scale = form.threshold / self.theta
@@ -170,20 +157,11 @@ class QuantisedNet(nn.Module):
         return found
 
     def forward(self, events: Tensor, lengths: Tensor | None = None) -> Tensor:
-        """Spikes per step of each output neuron, (samples, classes).
+        """Spikes per step of each output neuron, (samples, classes), for events (steps, samples, channels).
 
-        Parameters
-        ----------
-        events : (steps, samples, channels)
-            Zeros and ones.
-        lengths : (samples,) int64, optional
-            Steps of each recording, where some were filled up with silence.
+        `lengths` (samples,) has the steps of each recording, where some were filled up with silence.
         """
-        spikes = self.spikes_of(events)[-1]
-        if lengths is None:
-            return spikes.mean(0)
-        inside = torch.arange(len(spikes))[:, None] < lengths
-        return torch.sum(spikes * inside[..., None], dim=0) / lengths[:, None]
+        return rates_of(self.spikes_of(events)[-1], lengths)
 
 
 class _ChipLayer(torch.autograd.Function):
@@ -238,22 +216,7 @@ def _integrate_chip(sums: Any, bias: Any, threshold: Any, unit: Any, keep: Any, 
 def quantised_spikes(
     checkpoint: Checkpoint, adjacency: NDArray[np.float64], events: NDArray[np.uint8]
 ) -> dict[str, NDArray[np.bool_]]:
-    """Spikes of every layer of a fine-tuned checkpoint as its torch model computes them.
-
-    Parameters
-    ----------
-    checkpoint : Checkpoint
-        With forms.
-    adjacency : (taxels, taxels) float64
-        Normalised propagation matrix.
-    events : (samples, taxels, channels, steps) uint8
-        Recordings.
-
-    Returns
-    -------
-    dict of str to (samples, steps, neurons) bool
-        One entry per layer, in order.
-    """
+    """Spikes of every layer of a fine-tuned checkpoint as its torch model computes them, (samples, steps, neurons)."""
     if checkpoint.towers > 1:
         return side_by_side(checkpoint, [quantised_spikes(m, adjacency, events) for m in members(checkpoint)])
     assert checkpoint.forms is not None, "only a fine-tuned checkpoint has a quantised model"

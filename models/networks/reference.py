@@ -89,23 +89,9 @@ def float_spikes(
     *,
     dtype: str = "float32",
 ) -> dict[str, npt.NDArray[np.bool_]]:
-    """Spikes of every layer on recordings.
+    """Spikes of every layer, (samples, steps, neurons) by name, on recordings (samples, taxels, channels, steps).
 
-    Parameters
-    ----------
-    checkpoint : Checkpoint
-        Trained weights.
-    adjacency : (taxels, taxels) or (filters, places, taxels) float64
-        What the first layer sees, see :func:`expand.stack_of`; rounded to `dtype`.
-    events : (samples, taxels, channels, steps) uint8
-        Recordings.
-    dtype : {"float32", "float64"}
-        Arithmetic; float32 is what the network was trained in.
-
-    Returns
-    -------
-    dict of str to (samples, steps, neurons) bool
-        One entry per layer, in order.
+    What the first layer sees, see :func:`expand.stack_of`, is rounded to `dtype`; networks are trained in float32.
     """
     if checkpoint.towers > 1:
         return side_by_side(checkpoint, [float_spikes(m, adjacency, events, dtype=dtype) for m in members(checkpoint)])

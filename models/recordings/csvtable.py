@@ -13,12 +13,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spikeloom.compiler.errors import DataError
+from spikeloom.compiler.types import FloatArray
 from spikeloom.models.recordings.counts import number
-
-FloatArray = NDArray[np.float64]
 
 MAX_TABLE_BYTES = 256 << 20  # some 15 million events
 
@@ -39,21 +37,9 @@ class Table:
 def read_table(
     path: str | os.PathLike[str], required: tuple[str, ...], optional: tuple[str, ...] = (), *, where: str | None = None
 ) -> Table:
-    """Read a CSV file.
+    """Read a CSV file with these columns, whose order counts where the file does not name them; `where` names the file.
 
-    Parameters
-    ----------
-    path : path
-        UTF-8 text of at most `MAX_TABLE_BYTES`.
-    required, optional : tuple of str
-        Names of the columns; the order counts where the file does not name them.
-    where : str, optional
-        What messages call the file; its name by default.
-
-    Returns
-    -------
-    Table
-        At least one row; values may be infinite or NaN.
+    The table has at least one row; values may be infinite or NaN.
 
     Raises
     ------
@@ -63,34 +49,34 @@ def read_table(
     where = where or Path(path).name
     known = (*required, *optional)
     expected = ", ".join(required) + "".join(f"[, {name}]" for name in optional)
-    lines, rows = _rows(_text(Path(path), where), known)
-    names: tuple[str, ...] = tuple(cell.strip().lower() for cell in rows[0].split(",")) if rows else ()
+    lines, rows = _rows(read_text(Path(path), where), known)
+    names = tuple(_cells(rows[0].lower())) if rows else ()
     if names and not any(map(_is_number, names)):
         if not (set(required) <= set(names) <= set(known) and len(set(names)) == len(names)):
             raise DataError(
                 f"{where}: line {lines[0]}: columns {', '.join(names)}, expected are {expected}; name them so"
             )
         del lines[0], rows[0]
-    else:
-        names = known[: len(names)] if len(names) <= len(known) else names
-    if not rows:
-        raise DataError(f"{where}: no rows, expected are lines of {expected}; check how the file was written")
-    if not len(required) <= len(names) <= len(known):
+    elif rows and not len(required) <= len(names) <= len(known):
         raise DataError(
             f"{where}: {number(len(names), 'column')} in its first row, expected are {expected}; separate by commas"
         )
+    else:
+        names = known[: len(names)]
+    if not rows:
+        raise DataError(f"{where}: no rows, expected are lines of {expected}; check how the file was written")
     try:
         values = np.loadtxt(rows, delimiter=",", ndmin=2)
-        if values.shape[1] != len(names):
-            raise ValueError("all rows lack or exceed what the header names")
-    except ValueError as error:
-        raise _fault(where, lines, rows, names) from error
+    except ValueError:
+        raise _fault(where, lines, rows, names) from None
+    if values.shape[1] != len(names):
+        raise _fault(where, lines, rows, names)
     columns = {name: np.ascontiguousarray(values[:, index]) for index, name in enumerate(names)}
     return Table(where=where, columns=columns, lines=lines)
 
 
-def _text(path: Path, where: str) -> str:
-    """The file as text, without a byte order mark."""
+def read_text(path: Path, where: str) -> str:
+    """A file of at most `MAX_TABLE_BYTES` as text, without a byte order mark; DataError if it cannot be read."""
     try:
         with path.open("rb") as file:
             data = file.read(MAX_TABLE_BYTES + 1)
@@ -111,17 +97,20 @@ def _rows(text: str, known: tuple[str, ...]) -> tuple[list[int], list[str]]:
         content = line.partition("#")[0].strip()
         if not (content or rows):
             named = line.strip().lstrip("# \t")
-            content = named if {cell.strip().lower() for cell in named.split(",")} <= set(known) else ""
+            content = named if set(_cells(named.lower())) <= set(known) else ""
         if content:
             lines.append(at)
             rows.append(content)
     return lines, rows
 
 
+def _cells(row: str) -> list[str]:
+    return [cell.strip() for cell in row.split(",")]
+
+
 def _fault(where: str, lines: Sequence[int], rows: Sequence[str], names: tuple[str, ...]) -> DataError:
     """Name the first line that is not a row of numbers."""
-    for line, content in zip(lines, rows, strict=True):
-        cells = [cell.strip() for cell in content.split(",")]
+    for line, cells in zip(lines, map(_cells, rows), strict=True):
         if len(cells) != len(names):
             return DataError(
                 f"{where}: line {line}: {number(len(cells), 'column')}, expected are {len(names)} "
@@ -130,7 +119,7 @@ def _fault(where: str, lines: Sequence[int], rows: Sequence[str], names: tuple[s
         for name, cell in zip(names, cells, strict=True):
             if not _is_number(cell):
                 return DataError(f"{where}: line {line}: {name} is {cell[:40]!r}, not a number; write plain numbers")
-    return DataError(f"{where}: cannot be read as numbers; write plain numbers between commas")
+    raise AssertionError("rows of numbers are a table")
 
 
 def _is_number(cell: str) -> bool:

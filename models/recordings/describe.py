@@ -6,11 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from spikeloom.compiler.types import FloatArray
 from spikeloom.models.recordings.evtouch import Recordings
-
-FloatArray = NDArray[np.float64]
 
 HOT = 5.0
 """A taxel is hot if its rate is above this many times the median over taxels that are not dead."""
@@ -26,11 +24,10 @@ RULES = {
 class Description:
     """Statistics of one split; polarity 0 is falling, 1 is rising."""
 
-    # recordings, events: How many; events that share taxel, polarity and bin count once
     recordings: int
-    events: int
+    events: int  # Those that share taxel, polarity and bin count once
     bin_s: float  # Width of a bin, seconds
-    duration_s: tuple[float, float, float]  # (float, float, float); shortest, median and longest recording, seconds
+    duration_s: tuple[float, float, float]  # Shortest, median and longest recording, seconds
     classes: Mapping[int, int]  # Recordings of each label
     rate: FloatArray  # (taxels, 2) float64; events per second, over the time that was recorded
     # (steps, 2) float64; events per second of the whole sensor, mean over the recordings that last so long
@@ -42,15 +39,7 @@ class Description:
 
 
 def describe(recordings: Recordings, bin_s: float) -> Description:
-    """Count events.
-
-    Parameters
-    ----------
-    recordings : Recordings
-        One split.
-    bin_s : float
-        Width of its bins, seconds.
-    """
+    """Count the events of one split, whose bins are so many seconds wide."""
     lengths = np.array([recordings.steps_of(index) for index in range(len(recordings))])
     per_taxel = recordings.events.sum(axis=(0, 3), dtype=np.int64)
     per_step = recordings.events.sum(axis=(0, 1), dtype=np.int64).T
@@ -63,11 +52,7 @@ def describe(recordings: Recordings, bin_s: float) -> Description:
         recordings=len(recordings),
         events=int(total.sum()),
         bin_s=bin_s,
-        duration_s=(
-            float(lengths.min() * bin_s),
-            float(np.median(lengths) * bin_s),
-            float(lengths.max() * bin_s),
-        ),
+        duration_s=(lengths.min() * bin_s, float(np.median(lengths)) * bin_s, lengths.max() * bin_s),
         classes=dict(zip(labels.tolist(), counts.tolist(), strict=True)),
         rate=per_taxel / (lengths.sum() * bin_s),
         course=per_step / (running[:, None] * bin_s),

@@ -8,7 +8,6 @@ one code per file. The label is the class of the whole recording: one constant, 
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,14 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spikeloom.compiler.errors import DataError
+from spikeloom.compiler.types import FloatArray
 from spikeloom.models.graphs import MAX_TAXELS
-from spikeloom.models.recordings.csvtable import FloatArray, read_table
-from spikeloom.models.recordings.evtouch import opened
-from spikeloom.models.recordings.npy import parse_npy, read_bounded
+from spikeloom.models.recordings.csvtable import read_table
+from spikeloom.models.recordings.evtouch import UNLABELLED, label_in_name, opened, parse_npy
 
 SUFFIXES = (".csv", ".npz")
 MAX_LABEL = 999_999
-UNLABELLED = -1
 
 UNITS = (("nanoseconds", 5e5), ("microseconds", 5e2), ("milliseconds", 0.5))
 """Units that times may have by mistake, and what half of the events then leave between them, at least."""
@@ -33,7 +31,6 @@ UNIT_EVENTS, UNIT_SPAN = 8, 60.0
 """Different times, and what lies between first and last, below which no unit is guessed."""
 
 _REQUIRED = ("time_s", "taxel", "polarity")
-_LABEL = re.compile(r"_label_([0-9]{1,6})(?![0-9])")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -49,21 +46,13 @@ class EventStream:
 
 
 def read_stream(path: str | os.PathLike[str], *, taxels: int | None = None, where: str | None = None) -> EventStream:
-    """Read one file of events.
-
-    Parameters
-    ----------
-    path : path
-        A ``.csv`` or a ``.npz`` of one-dimensional arrays; ``label`` may be one number.
-    taxels : int, optional
-        How many the sensor has.
-    where : str, optional
-        What messages call the file; its name by default.
+    """Read a ``.csv`` or a ``.npz`` of one-dimensional arrays, whose ``label`` may be one number.
 
     Raises
     ------
     DataError
-        If the file cannot be read, holds no events, or an event cannot be; the message names it.
+        If the file cannot be read, holds no events, or one that a sensor of so many `taxels` does not send; the
+        message names the event.
     """
     path = Path(path)
     where = where or path.name
@@ -96,18 +85,6 @@ def read_stream(path: str | os.PathLike[str], *, taxels: int | None = None, wher
         label=_label(where, path.name, columns.get("label")),
         at=at,
     )
-
-
-def label_in_name(name: str) -> int:
-    """Class in a file name, `UNLABELLED` if there is none.
-
-    Examples
-    --------
-    >>> label_in_name("sample_12_label_3.npy"), label_in_name("run_label_7_left.csv"), label_in_name("grasp.csv")
-    (3, 7, -1)
-    """
-    match = _LABEL.search(name)
-    return UNLABELLED if match is None else int(match[1])
 
 
 def likely_unit(times: NDArray[np.float64]) -> str | None:
@@ -145,7 +122,7 @@ def _polarity(where: str, values: FloatArray, at: Callable[[int], str]) -> NDArr
 def _label(where: str, name: str, column: FloatArray | None) -> int:
     """Class of the recording, from its column or its name."""
     named = label_in_name(name)
-    if column is None:
+    if column is None or not column.size:
         return named
     first = float(column[0])
     if not (0 <= first <= MAX_LABEL and first.is_integer()):
@@ -167,8 +144,7 @@ def _read_npz(path: Path, where: str) -> tuple[Mapping[str, FloatArray], Callabl
     with opened(path) as members:
         for name in (*_REQUIRED, "label"):
             if member := members.get(f"{name}.npy"):
-                place = f"{where}: {name}"
-                columns[name] = parse_npy(place, read_bounded(place, member)).astype(np.float64)
+                columns[name] = parse_npy(f"{where}: {name}", member).astype(np.float64)
         if missing := [name for name in _REQUIRED if name not in columns]:
             found = ", ".join(sorted(member.removesuffix(".npy") for member in members)) or "nothing"
             raise DataError(
@@ -178,13 +154,8 @@ def _read_npz(path: Path, where: str) -> tuple[Mapping[str, FloatArray], Callabl
     if len(set(shapes.values())) > 1 or columns["time_s"].ndim != 1:
         shown = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
         raise DataError(f"{where}: shapes {shown}, allowed is one number per event in each; save flat arrays")
-    events = columns["time_s"].size
-    if not events:
+    if not columns["time_s"].size:
         raise DataError(f"{where}: no events, a recording needs one or more; remove the file")
     if "label" in columns:
         columns["label"] = columns["label"].reshape(-1)
-        if columns["label"].size not in (1, events):
-            raise DataError(
-                f"{where}: {columns['label'].size} labels for {events} events, allowed is one; save one number"
-            )
     return columns, lambda row: f"{where}: event {row}"

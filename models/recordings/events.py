@@ -10,6 +10,7 @@ import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,16 +19,11 @@ from numpy.typing import NDArray
 
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.models.recordings.counts import GAP_S, EventCounts
-from spikeloom.models.recordings.eventfiles import (
-    SUFFIXES,
-    UNLABELLED,
-    EventStream,
-    label_in_name,
-    likely_unit,
-    read_stream,
-)
+from spikeloom.models.recordings.eventfiles import SUFFIXES, EventStream, likely_unit, read_stream
 from spikeloom.models.recordings.evtouch import (
+    UNLABELLED,
     Recordings,
+    label_in_name,
     load_recordings,
     opened,
     parse_bins,
@@ -38,7 +34,6 @@ from spikeloom.models.recordings.evtouch import (
 from spikeloom.models.recordings.fetch import DATA_SETS, find_data
 from spikeloom.models.recordings.labels import NAME as TABLE
 from spikeloom.models.recordings.labels import is_table, labels_beside
-from spikeloom.models.recordings.npy import read_bounded
 
 BIN_S = 0.02
 """Width of a time bin in the released recordings, seconds."""
@@ -69,7 +64,7 @@ def load_data(
     classes: int | None = None,
     limit: int | None = None,
 ) -> tuple[Recordings, EventCounts | None]:
-    """Read recordings, files in plain string order.
+    """Read the first `limit` recordings of a split, files in plain string order.
 
     Parameters
     ----------
@@ -77,19 +72,15 @@ def load_data(
         A folder or zip in the released layout; a folder of ``.csv``, ``.npz`` and ``.npy`` recordings, flat (it
         stands for any split) or with ``train/`` and ``test/``; one such file; or the name of a data set that was
         fetched.
-    split : str
-        Which split to read.
     bin_s : float
         Width of a time bin, seconds. The released layout and ``.npy`` files have bins already: see `require_events`.
     taxels, classes : int, optional
         What the network expects. Without `taxels` the highest taxel with an event decides.
-    limit : int, optional
-        Read only the first so many.
 
     Returns
     -------
     recordings : Recordings
-        Labels are `spikeloom.models.recordings.eventfiles.UNLABELLED` where nothing says them; see `need_labels`.
+        Labels are `UNLABELLED` where nothing says them; see `need_labels`.
     counts : EventCounts or None
         None for the released layout.
 
@@ -149,25 +140,13 @@ def load_data(
 
 
 def require_events(where: str, bin_s: float) -> None:
-    """Refuse a width of bins for what has bins already.
-
-    Raises
-    ------
-    OptionError
-        If it is another one than the default.
-    """
+    """Refuse a width of bins for what has bins already."""
     if bin_s != BIN_S:
         raise OptionError(f"--bin {bin_s:g}: {where} holds bins, not times; omit --bin")
 
 
 def data_splits(path: str | os.PathLike[str]) -> tuple[str, ...]:
-    """Splits that a data set has; none if it is flat or one recording.
-
-    Raises
-    ------
-    DataError
-        If there are no recordings.
-    """
+    """Splits that a data set has; none if it is flat or one recording, DataError if there are no recordings."""
     path = find_data(str(path)) if str(path) in DATA_SETS else Path(path)
     found = _event_files(path)
     if found is not None:
@@ -177,20 +156,7 @@ def data_splits(path: str | os.PathLike[str]) -> tuple[str, ...]:
 
 
 def need_labels(recordings: Recordings, what: str) -> Recordings:
-    """Return the recordings if all have labels.
-
-    Parameters
-    ----------
-    recordings : Recordings
-        Perhaps without some labels.
-    what : str
-        What needs them, for the message: ``training``.
-
-    Raises
-    ------
-    DataError
-        If one has none.
-    """
+    """Return the recordings if all have labels; else a DataError says `what` needs them, for example training."""
     missing = recordings.labels == UNLABELLED
     if missing.any():
         file = recordings.files[int(np.argmax(missing))]
@@ -206,20 +172,13 @@ def bin_events(
 ) -> tuple[NDArray[np.uint8], EventCounts]:
     """Put the events of one recording into bins.
 
-    Parameters
-    ----------
-    stream : EventStream
-        The events; their order does not matter.
-    bin_s : float
-        Width of a bin, seconds, above 0. Bin ``k`` holds the times from ``k * bin_s`` to before the next; a time
-        less than a billionth of a bin before an edge counts as on it, so that decimals fall where they say.
-    taxels : int, optional
-        How many the sensor has; without it the highest taxel with an event decides.
+    Bin ``k`` holds the times from ``k * bin_s`` to before the next; a time less than a billionth of a bin before an
+    edge counts as on it, so that decimals fall where they say. The last bin holds the last event.
 
     Returns
     -------
     events : (taxels, 2, steps) uint8
-        1 where there is at least one event; the last bin holds the last event.
+        1 where there is at least one event; without `taxels` the highest with an event decides how many there are.
     counts : EventCounts
         For this recording.
 
@@ -256,14 +215,9 @@ def bin_events(
 
 
 def joined_bins(recordings: Recordings, bins: int) -> Recordings:
-    """Recordings in bins as many times as long, which hold an event wherever one of theirs did.
+    """Recordings of which one bin was made of so many, with an event wherever one of theirs had one.
 
-    Parameters
-    ----------
-    recordings : Recordings
-        The last bin of a recording may be a shorter one.
-    bins : int
-        How many make one, at least 1.
+    The last bin of a recording may be made of fewer.
     """
     if bins == 1:
         return recordings
@@ -339,7 +293,7 @@ def _read(file: Path, where: str, bin_s: float, taxels: int | None, listed: int 
     """One recording; `listed` is its class in a table of labels."""
     if file.suffix.lower() == ".npy":
         require_events(where, bin_s)
-        grid = parse_bins(where, read_bounded(where, lambda: file.open("rb")), taxels)
+        grid = parse_bins(where, partial(file.open, "rb"), taxels)
         busy = np.flatnonzero(grid.any(axis=(0, 1)))
         gaps = int(np.count_nonzero((np.diff(busy) - 1) * bin_s > GAP_S))
         sent = int(np.count_nonzero(grid))

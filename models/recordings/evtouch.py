@@ -6,6 +6,7 @@ recording is (taxels, 2, steps), values 0 and 1; polarity 1 is the rising one (i
 
 from __future__ import annotations
 
+import io
 import os
 import re
 import zipfile
@@ -20,14 +21,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spikeloom.compiler.errors import DataError
-from spikeloom.models.recordings.npy import parse_npy, read_bounded
 
 MAX_TOTAL_BYTES = 4 << 30
+MAX_FILE_BYTES = 64 << 20  # the released recordings have 0.1 MB
 
-_LABEL = re.compile(r"_label_([0-9]{1,6})\.npy$")
+UNLABELLED = -1
+
+_LABEL = re.compile(r"_label_([0-9]{1,6})(?![0-9])")
 _GIVE = "give the folder or zip that holds train/ and test/"
 
-Members = Mapping[str, Callable[[], IO[bytes]]]
+Members = Mapping[str, Callable[[], IO[Any]]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -37,7 +40,7 @@ class Recordings:
     # (samples, taxels, 2, steps) uint8; 1 where a taxel sent an event of that polarity in that step; C-contiguous,
     # read-only
     events: NDArray[np.uint8]
-    labels: NDArray[np.int64]  # (samples,) int64; class of each recording; read-only
+    labels: NDArray[np.int64]  # (samples,) int64; class of each recording, or `UNLABELLED`; read-only
     files: tuple[str, ...]  # File name of each recording
     split: str  # For example ``test``
     source: str  # Name of the folder, zip or generator
@@ -76,6 +79,18 @@ class Recordings:
         """Time steps of one recording."""
         return self.steps if self.lengths is None else int(self.lengths[index])
 
+    def part(self, chosen: slice | NDArray[Any], split: str | None = None) -> Recordings:
+        """Some of the recordings, by indices, truth values or a slice; of another `split` if it has a name."""
+        indices = np.arange(len(self))[chosen]
+        return Recordings(
+            events=self.events[chosen],
+            labels=self.labels[chosen],
+            files=tuple(self.files[index] for index in indices),
+            split=split or self.split,
+            source=self.source,
+            lengths=None if self.lengths is None else self.lengths[chosen],
+        )
+
     def identity(self) -> dict[str, NDArray[Any]]:
         """Arrays that tell these recordings from others, whatever their names."""
         arrays: dict[str, NDArray[Any]] = {"events": self.events, "labels": self.labels}
@@ -90,19 +105,13 @@ def load_recordings(
     classes: int | None = None,
     taxels: int | None = None,
 ) -> Recordings:
-    """Read one split of a folder or zip in the released layout, files in plain string order.
-
-    Parameters
-    ----------
-    limit : int, optional
-        Read only the first so many.
-    classes, taxels : int, optional
-        What the network expects; labels and shapes are held against it.
+    """Read one split of a folder or zip in the released layout, the first `limit` files in plain string order.
 
     Raises
     ------
     DataError
-        If the data set or any recording in it cannot be used; the message names the file.
+        If the data set or any recording in it cannot be used, or a network of so many `classes` and `taxels` cannot
+        take it; the message names the file.
     """
     if limit is not None and limit < 1:
         raise DataError(f"limit: {limit} recordings, allowed are 1 or more; omit it to read all")
@@ -114,11 +123,16 @@ def load_recordings(
             present = ", ".join(sorted(found))
             raise DataError(f"{source}: split {split!r} is missing or empty; splits with recordings: {present}")
         files = sorted(found[split].items())[:limit]
-        labels = [_label(f"{source}: {split}/{name}", name, classes) for name, _ in files]
-        events = np.zeros((0, 0, 0, 0), np.uint8)
+        labels, events = [], np.zeros((0, 0, 0, 0), np.uint8)
         for index, (name, member) in enumerate(files):
             where = f"{source}: {split}/{name}"
-            recording = parse_bins(where, read_bounded(where, members[member]), taxels)
+            labels.append(label_in_name(name))
+            if labels[-1] == UNLABELLED:
+                raise DataError(
+                    f"{where}: no label in the name, allowed is sample_N_label_L.npy; rename or remove the file"
+                )
+            require_class(where, labels[-1], classes)
+            recording = parse_bins(where, members[member], taxels)
             if not index:
                 require_memory(source, len(files) * recording.size)
                 events = np.empty((len(files), *recording.shape), np.uint8)
@@ -128,13 +142,8 @@ def load_recordings(
                     "all of a split must agree"
                 )
             events[index] = recording
-    return Recordings(
-        events=events,
-        labels=np.array(labels, dtype=np.int64),
-        files=tuple(name for name, _ in files),
-        split=split,
-        source=source,
-    )
+    names = tuple(name for name, _ in files)
+    return Recordings(events=events, labels=np.array(labels, np.int64), files=names, split=split, source=source)
 
 
 @contextmanager
@@ -148,7 +157,7 @@ def opened(path: Path) -> Iterator[Members]:
     """
     if path.is_dir():
         files = [*path.glob("*.npy"), *path.glob("*/*.npy"), *path.glob("*/*/*.npy")]
-        yield {file.relative_to(path).as_posix(): _opener(file) for file in files if file.is_file()}
+        yield {file.relative_to(path).as_posix(): partial(file.open, "rb") for file in files if file.is_file()}
         return
     if not path.is_file():
         raise DataError(f"{path}: no such folder or file; {_GIVE}")
@@ -158,24 +167,12 @@ def opened(path: Path) -> Iterator[Members]:
         raise DataError(f"{path}: neither a folder nor a whole zip ({error}); {_GIVE}, or copy it again") from error
     with archive:
         infos = [info for info in archive.infolist() if info.filename.endswith(".npy")]
-        if len({info.filename for info in infos}) < len(infos):
-            raise DataError(f"{path.name}: lists a file twice; do not trust this zip")
         require_memory(path.name, sum(info.file_size for info in infos))  # no more than that is ever decompressed
         yield {info.filename: partial(archive.open, info) for info in infos}
 
 
-def _opener(file: Path) -> Callable[[], IO[bytes]]:
-    return lambda: file.open("rb")
-
-
 def splits_of(source: str, members: Members, splits: set[str]) -> dict[str, dict[str, str]]:
-    """Map split to file name to member name, for the one data set among `members`.
-
-    Raises
-    ------
-    DataError
-        If there are no recordings, or several data sets.
-    """
+    """Map split to file name to member name, for the one data set among `members`; DataError if there is not one."""
     found: dict[str, dict[str, str]] = {}
     roots: set[str] = set()
     for member in members:
@@ -191,15 +188,40 @@ def splits_of(source: str, members: Members, splits: set[str]) -> dict[str, dict
     return found
 
 
-def parse_bins(where: str, data: bytes, taxels: int | None) -> NDArray[np.uint8]:
-    """Events (taxels, 2, steps) of an npy file that holds zeros and ones.
+def label_in_name(name: str) -> int:
+    """Class in a file name, `UNLABELLED` if there is none.
 
-    Raises
-    ------
-    DataError
-        If it does not, or `taxels` are expected and it has another number.
+    Examples
+    --------
+    >>> label_in_name("sample_12_label_3.npy"), label_in_name("run_label_7_left.csv"), label_in_name("grasp.csv")
+    (3, 7, -1)
     """
-    values = parse_npy(where, data)
+    match = _LABEL.search(name)
+    return UNLABELLED if match is None else int(match[1])
+
+
+def parse_npy(where: str, opener: Callable[[], IO[Any]]) -> NDArray[Any]:
+    """Numbers or truth values of an npy file of at most `MAX_FILE_BYTES`; DataError if it is none."""
+    try:
+        with opener() as file:
+            data = file.read(MAX_FILE_BYTES + 1)
+    except Exception as error:  # zipfile answers damage with errors of many kinds
+        reason = getattr(error, "strerror", None) or error
+        raise DataError(f"{where}: cannot be read ({reason}); copy or download it again") from error
+    if len(data) > MAX_FILE_BYTES:
+        raise DataError(f"{where}: more than {MAX_FILE_BYTES} bytes, the limit of a recording; split it")
+    try:
+        values: NDArray[Any] = np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
+    except Exception as error:  # numpy answers a damaged header with errors of many kinds
+        raise DataError(f"{where}: not an npy file of numbers, or a damaged one; copy it again") from error
+    if values.dtype.kind not in "biuf":
+        raise DataError(f"{where}: dtype {values.dtype.str!r}, allowed are numbers; convert it")
+    return values
+
+
+def parse_bins(where: str, opener: Callable[[], IO[Any]], taxels: int | None) -> NDArray[np.uint8]:
+    """Events (taxels, 2, steps) of an npy file; DataError if it holds anything else, or has not so many `taxels`."""
+    values = parse_npy(where, opener)
     shape = values.shape
     if len(shape) != 3 or 0 in shape or shape[1] != 2:
         raise DataError(f"{where}: shape {shape}, allowed is (taxels, 2, steps); one recording per file")
@@ -218,36 +240,15 @@ def parse_bins(where: str, data: bytes, taxels: int | None) -> NDArray[np.uint8]
 
 
 def require_memory(source: str, size: int) -> None:
-    """Refuse a data set that would fill the memory.
-
-    Raises
-    ------
-    DataError
-        If it has more than `MAX_TOTAL_BYTES`.
-    """
+    """Refuse a data set that would fill the memory."""
     if size > MAX_TOTAL_BYTES:
         raise DataError(f"{source}: recordings of {size} bytes, limit {MAX_TOTAL_BYTES}; split the data set")
 
 
 def require_class(where: str, label: int, classes: int | None) -> None:
-    """Refuse a label that the network has no class for.
-
-    Raises
-    ------
-    DataError
-        If it is not below `classes`.
-    """
+    """Refuse a label that the network has no class for."""
     if classes is not None and label >= classes:
         raise DataError(
             f"{where}: label {label}, the network has {classes} classes (0..{classes - 1}); "
             "use the network that was trained on these objects"
         )
-
-
-def _label(where: str, name: str, classes: int | None) -> int:
-    """Class in a file name."""
-    match = _LABEL.search(name)
-    if match is None:
-        raise DataError(f"{where}: no label in the name, allowed is sample_N_label_L.npy; rename or remove the file")
-    require_class(where, int(match[1]), classes)
-    return int(match[1])

@@ -62,15 +62,7 @@ def data_folder() -> Path:
 
 
 def find_data(name: str) -> Path:
-    """Path of a data set that was fetched.
-
-    Raises
-    ------
-    DataError
-        If it was not, or is not the released file any more.
-    OptionError
-        If there is no data set of that name.
-    """
+    """Path of a data set that was fetched; DataError if it was not, or is not the released file any more."""
     data = _known(name)
     path = data_folder() / data.file
     if not path.is_file():
@@ -84,25 +76,14 @@ def find_data(name: str) -> Path:
 
 
 def fetch_data(name: str, *, url: str | None = None, folder: str | os.PathLike[str] | None = None) -> Fetched:
-    """Download a data set unless it is there; its name appears when size and hash are those of the released file.
+    """Download one of `DATA_SETS` unless it is there; its name appears when the hash is that of the released file.
 
-    Parameters
-    ----------
-    name : str
-        One of `DATA_SETS`.
-    url : str, optional
-        Another address of the same file, http or https.
-    folder : path, optional
-        Where to put it, made if needed; `data_folder` by default.
+    `url` is another address of the same file; the `folder`, `data_folder` by default, is made if needed.
 
     Raises
     ------
-    DataError
-        If the address does not serve the released file, after `RETRIES` more attempts.
-    OptionError
-        If there is no such data set or the address is no web address.
-    OSError
-        If the folder cannot be written.
+    OptionError, DataError
+        If there is no such data set, or the address does not serve the released file, after `RETRIES` more attempts.
     """
     data = _known(name)
     url = url or data.url

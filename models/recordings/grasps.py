@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.types import FloatArray
 from spikeloom.models.graphs import NEUTOUCH, check_coordinates
 from spikeloom.models.recordings.evtouch import Recordings
-
-FloatArray = NDArray[np.float64]
 
 SHAPES = ("sphere", "cylinder", "edge", "ring", "cone", "box")
 """Names of the shapes; the default classes, in this order."""
@@ -53,19 +52,8 @@ SPLIT_STEPS = 100
 def synthetic_split(split: str, *, limit: int | None = None, coordinates: ArrayLike = NEUTOUCH) -> Recordings:
     """Draw the split of the fixed synthetic data set that the shipped checkpoint was trained and tested on.
 
-    With `coordinates` the same grasps touch another sensor.
-
-    Parameters
-    ----------
-    split : {"train", "test"}
-        360 or 144 recordings of 100 steps, 6 classes.
-    limit : int, optional
-        First recordings only.
-
-    Raises
-    ------
-    OptionError
-        If there is no such split, or `limit` is below 1.
+    360 training or 144 test recordings of 100 steps, 6 classes, or the first `limit` of them. With `coordinates` the
+    same grasps touch another sensor.
     """
     if split not in SPLITS:
         raise OptionError(f"--split {split}: the synthetic grasps have no such split; allowed: {', '.join(SPLITS)}")
@@ -73,13 +61,7 @@ def synthetic_split(split: str, *, limit: int | None = None, coordinates: ArrayL
         raise OptionError(f"--limit {limit}: at least 1 recording is needed; give a positive number")
     per_class, seed = SPLITS[split]
     grasps = synthetic_grasps(coordinates=coordinates, per_class=per_class, steps=SPLIT_STEPS, seed=seed)
-    return Recordings(
-        events=grasps.events[:limit],
-        labels=grasps.labels[:limit],
-        files=grasps.files[:limit],
-        split=split,
-        source=grasps.source,
-    )
+    return grasps.part(slice(limit), split)
 
 
 def synthetic_grasps(
@@ -111,13 +93,6 @@ def synthetic_grasps(
     Recordings
         Classes in turn, so that the first recordings hold all of them.
 
-    Raises
-    ------
-    OptionError
-        If a number is too small or a class is unknown or repeated.
-    ModelError
-        If the coordinates are malformed.
-
     Examples
     --------
     >>> grasps = synthetic_grasps(per_class=2, steps=50, seed=0)
@@ -127,12 +102,8 @@ def synthetic_grasps(
     for name, value, least in (("per_class", per_class, 1), ("steps", steps, MIN_STEPS), ("seed", seed, 0)):
         if value < least:
             raise OptionError(f"grasps: {name} is {value}, allowed are {least} or more; choose another")
-    for name in classes:
-        if name not in SHAPES or classes.count(name) > 1:
-            what = "repeated" if name in SHAPES else "unknown"
-            raise OptionError(f"grasps: class {name!r} is {what}; choose from {', '.join(SHAPES)}, each once")
-    if not classes:
-        raise OptionError(f"grasps: no classes; choose from {', '.join(SHAPES)}, each once")
+    if not classes or len(set(classes) & set(SHAPES)) < len(classes):
+        raise OptionError(f"grasps: classes {', '.join(classes)}; choose from {', '.join(SHAPES)}, each once")
 
     place = _unit_layout(check_coordinates(coordinates))
     labels = np.tile(np.arange(len(classes), dtype=np.int64), per_class)

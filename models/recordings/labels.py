@@ -8,9 +8,9 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from spikeloom.compiler.errors import DataError
+from spikeloom.models.recordings.csvtable import read_text
 
 NAME = "labels.csv"
-MAX_BYTES = 16 << 20
 
 _FILE = ("file", "filename", "name", "recording")
 _LABEL = ("label", "class")
@@ -21,28 +21,13 @@ def is_table(file: Path) -> bool:
     return file.name.lower() == NAME
 
 
-def read_labels(path: Path, where: str) -> Mapping[str, int] | None:
+def _read_labels(path: Path, where: str) -> Mapping[str, int] | None:
     """Class by name of file in a table of labels; None if the file is another kind of table.
 
-    Its header names one of the columns ``file``, ``filename``, ``name`` and ``recording``, and one of ``label`` and
-    ``class``; others are passed over.
-
-    Raises
-    ------
-    DataError
-        If a row of the table lacks a class, or a file stands in it twice with different ones.
+    Columns beside that of the file and that of the class are passed over; DataError if a row lacks a class, or a file
+    stands in it twice with different ones.
     """
-    try:
-        with path.open("rb") as file:
-            content = file.read(MAX_BYTES + 1)
-    except OSError as error:
-        raise DataError(f"{where}: cannot be read ({error.strerror or error}); check the disk") from error
-    if len(content) > MAX_BYTES:
-        return None
-    try:
-        rows = list(csv.reader(io.StringIO(content.decode("utf-8-sig"), newline="")))
-    except (UnicodeDecodeError, csv.Error):
-        return None
+    rows = list(csv.reader(io.StringIO(read_text(path, where), newline="")))
     header = [cell.strip().lower() for cell in rows[0]] if rows else []
     files = [index for index, name in enumerate(header) if name in _FILE]
     classes = [index for index, name in enumerate(header) if name in _LABEL]
@@ -52,8 +37,7 @@ def read_labels(path: Path, where: str) -> Mapping[str, int] | None:
     for line, row in enumerate(rows[1:], 2):
         if not any(cell.strip() for cell in row):
             continue
-        cells = [row[index].strip() if index < len(row) else "" for index in (files[0], classes[0])]
-        name, label = cells
+        name, label = (row[index].strip() if index < len(row) else "" for index in (files[0], classes[0]))
         if not (name and label.isascii() and label.isdigit() and len(label) <= 6):
             raise DataError(f"{where}: row {line}: {name!r}, label {label!r}; give a file and a number from 0")
         if labels.setdefault(name, int(label)) != int(label):
@@ -62,22 +46,14 @@ def read_labels(path: Path, where: str) -> Mapping[str, int] | None:
 
 
 def labels_beside(path: Path, files: list[Path], source: str) -> tuple[dict[Path, int], list[str]]:
-    """Classes that tables beside recordings give, by file, and a note on each table.
-
-    `path` is the folder that was asked for, or one recording; `files` are the recordings in it.
-
-    Raises
-    ------
-    DataError
-        As `read_labels`.
-    """
+    """Classes by file that tables in the folder `path` or beside `files` give, and a note on each table."""
     labels: dict[Path, int] = {}
     notes = []
     folders = {} if path.is_file() else dict.fromkeys([path, *(file.parent for file in files)])
     for folder in folders:
         for table in sorted(file for file in folder.iterdir() if is_table(file) and file.is_file()):
             where = f"{source}: {table.relative_to(path).as_posix()}"
-            rows = read_labels(table, where)
+            rows = _read_labels(table, where)
             if rows is None:
                 notes.append(f"{where}: is not read; a table of labels has columns file and label")
                 continue

@@ -28,22 +28,13 @@ SOURCES = "sources.csv"
 def write_released(path: str | os.PathLike[str], splits: Sequence[Recordings]) -> None:
     """Write splits into a new folder, or a zip if the name ends so; all of it or nothing.
 
-    Parameters
-    ----------
-    path : path
-        A zip that exists is replaced, a folder must not exist.
-    splits : sequence of Recordings
-        Each goes into the folder named by its split. Numbers have leading zeros, so that the plain order of the
-        files is the order of the recordings.
+    A zip that exists is replaced, a folder must not exist. Numbers have leading zeros, so that the plain order of the
+    files is the order of the recordings.
 
     Raises
     ------
-    OptionError
-        If the folder exists, or there is none to put it in.
-    DataError
-        If a recording has no label.
-    OSError
-        If it cannot be written.
+    OptionError, DataError
+        If there is no place for it, or a recording has no label.
     """
     path = Path(path)
     for recordings in splits:
@@ -79,7 +70,13 @@ def _members(splits: Sequence[Recordings]) -> Iterator[tuple[str, bytes]]:
             buffer = io.BytesIO()
             np.lib.format.write_array(buffer, events.astype(np.float32), version=(1, 0), allow_pickle=False)
             yield f"{recordings.split}/{_name(recordings, index)}", buffer.getvalue()
-    yield SOURCES, _sources(splits)
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["split", "file", "source"])
+    for recordings in splits:
+        for index, file in enumerate(recordings.files):
+            writer.writerow([recordings.split, _name(recordings, index), file])
+    yield SOURCES, text.getvalue().encode()
 
 
 def _name(recordings: Recordings, index: int) -> str:
@@ -87,35 +84,13 @@ def _name(recordings: Recordings, index: int) -> str:
     return f"sample_{index:0{width}}_label_{recordings.labels[index]}.npy"
 
 
-def _sources(splits: Sequence[Recordings]) -> bytes:
-    """Which file became which."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["split", "file", "source"])
-    for recordings in splits:
-        for index, file in enumerate(recordings.files):
-            writer.writerow([recordings.split, _name(recordings, index), file])
-    return text.getvalue().encode()
-
-
 def write_event_lines(path: str | os.PathLike[str], splits: Sequence[Recordings], bin_s: float) -> None:
     """Write one recording as lines ``time_s,taxel,polarity``, each event at the middle of its bin.
-
-    Parameters
-    ----------
-    path : path
-        CSV file; replaced if it exists.
-    splits : sequence of Recordings
-        One recording in all.
-    bin_s : float
-        Seconds per step.
 
     Raises
     ------
     DataError
         If there are several recordings.
-    OSError
-        If it cannot be written.
     """
     count = sum(len(recordings) for recordings in splits)
     if count != 1:

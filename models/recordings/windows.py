@@ -16,12 +16,7 @@ WHOLE = 100
 
 
 def parse_window(words: str) -> int:
-    """Per cent of each recording, from the words of ``--window``.
-
-    Raises
-    ------
-    OptionError
-        If they are no whole number of per cent from 1 to 100.
+    """Per cent of each recording, a whole number from 1 to 100, from the words of ``--window``.
 
     Examples
     --------
@@ -46,15 +41,7 @@ def steps_of(lengths: IntArray, percent: int) -> IntArray:
 
 
 def first_part(recordings: Recordings, percent: int) -> Recordings:
-    """The first steps of every recording; labels, names and order stay.
-
-    Parameters
-    ----------
-    recordings : Recordings
-        All of their steps.
-    percent : int
-        1 to 100 of each recording's own length.
-    """
+    """The first steps of every recording, so many per cent of its own length; labels, names and order stay."""
     if percent == WHOLE:
         return recordings
     own = recordings.step_counts

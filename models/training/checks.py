@@ -40,13 +40,7 @@ class Sizes(Protocol):
 
 
 def require_options(epochs: int, decay_epochs: int, seed: int, device: str) -> None:
-    """Refuse numbers that are too small, and a device that is unknown or not there.
-
-    Raises
-    ------
-    OptionError
-        Saying which are allowed.
-    """
+    """Refuse numbers that are too small, and a device that is unknown or not there."""
     for name, value, least in (("epochs", epochs, 1), ("decay-epochs", decay_epochs, 1), ("seed", seed, 0)):
         if value < least:
             raise OptionError(f"--{name} {value}: allowed are {least} or more; choose another")
@@ -63,11 +57,6 @@ def require_finite(network: torch.nn.Module, loss: float, epoch: int, step: int)
 
     Spikes hide a weight that is no number, since it exceeds no threshold and leaves the loss finite; the gradients of
     the layers before it show it.
-
-    Raises
-    ------
-    DataError
-        If the loss or a gradient is no longer a number.
     """
     gradients = [parameter.grad for parameter in network.parameters() if parameter.grad is not None]
     for name, found in (("loss", loss), ("gradient", sum(float(each.sum()) for each in gradients))):
@@ -79,13 +68,7 @@ def require_finite(network: torch.nn.Module, loss: float, epoch: int, step: int)
 
 
 def require_suited(recordings: Recordings, architecture: Sizes) -> None:
-    """Refuse recordings that a network cannot take.
-
-    Raises
-    ------
-    DataError
-        If they are of another sensor, or have more classes.
-    """
+    """Refuse recordings of another sensor, or of more classes than a network has."""
     where = f"{recordings.source}: split {recordings.split!r}"
     found, wanted = recordings.events.shape[1:3], (architecture.taxels, architecture.channels)
     if found != wanted:

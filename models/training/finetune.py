@@ -70,13 +70,7 @@ class Tuned:
 
 
 def check_bits(bits: Sequence[int], layers: int, target: Target) -> tuple[int, ...]:
-    """One width for each layer.
-
-    Raises
-    ------
-    OptionError
-        If there are neither one nor as many as layers, or the chip does not store one.
-    """
+    """One width for each layer; OptionError if the chip does not store one, or they are as many as neither."""
     if len(bits) not in (1, layers):
         raise OptionError(
             f"--weight-bits: {len(bits)} widths, the network has {layers} layers; give one, or one for each"
@@ -104,21 +98,14 @@ def finetune(
     seed: int = 0,
     state: Path | None = None,
     resume: bool = False,
-    label: str = "finetune",
     after_epoch: Callable[[TunedEpoch], None] | None = None,
 ) -> Tuned:
     """Train a network on chip integers.
 
     Parameters
     ----------
-    checkpoint : Checkpoint
-        Trained network.
-    adjacency : (taxels, taxels) float64
-        Normalised propagation matrix of its graph.
     training, test : Recordings
         Both splits; nothing is chosen on `test`, it is read before the first epoch and after the last.
-    target : Target
-        Chip.
     bits : sequence of int
         Storage width, one or one for each layer.
     groups : int
@@ -129,8 +116,6 @@ def finetune(
         File that holds the state after each epoch; the caller removes it when the result is safe.
     resume : bool
         Continue from `state`; the result is that of an uninterrupted fine-tuning, bit for bit.
-    label : str
-        Name of the progress bar.
     after_epoch : callable, optional
         Called with the figures of each epoch.
 
@@ -176,7 +161,7 @@ def finetune(
             order.bit_generator.state = found.progress["order"]
             history = [TunedEpoch(**epoch) for epoch in found.progress["history"]]
             model.round()
-        with tqdm(total=epochs, initial=len(history), desc=label, unit="epoch", disable=None) as bar:
+        with tqdm(total=epochs, initial=len(history), desc="finetune", unit="epoch", disable=None) as bar:
             for index in range(len(history), epochs):
                 history.append(_epoch(model, optimizer, training, order.permutation(len(training)), index, epochs))
                 if state is not None:

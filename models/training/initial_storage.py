@@ -42,18 +42,7 @@ def initial_forms(
 ) -> tuple[Form, ...]:
     """Storage whose rounded weights are nearest to the trained ones, neurons grouped by scale.
 
-    Parameters
-    ----------
-    network : Network
-        Float stage.
-    calibration : Calibration
-        Spikes, for the rate of each input.
-    bits : sequence of int
-        Width of each layer.
-    groups : int
-        Scales of a layer, at most.
-    exponents : tuple of int
-        That the chip has.
+    `calibration` gives the rate of each input; every layer has its width in `bits` and so many scales at most.
 
     Raises
     ------

@@ -7,7 +7,8 @@ best on it; a second one, on the whole training split, is read on the test split
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -36,15 +37,7 @@ class Reported:
 def validation_split(training: Recordings) -> tuple[Recordings, Recordings]:
     """Leave a fifth of every class out, rounded down, one at least; the same recordings whatever the training's seed.
 
-    Returns
-    -------
-    fitted, held : Recordings
-        Both keep the order of `training`.
-
-    Raises
-    ------
-    DataError
-        If a class has a single recording.
+    Both parts keep the order of `training`.
     """
     held = np.zeros(len(training.labels), np.bool_)
     draw = np.random.default_rng(0)
@@ -56,19 +49,7 @@ def validation_split(training: Recordings) -> tuple[Recordings, Recordings]:
                 "record more or drop the class"
             )
         held[draw.permutation(members)[: max(1, int(len(members) * VALIDATION_SHARE))]] = True
-    return _part(training, ~held, "fitted"), _part(training, held, "validation")
-
-
-def _part(recordings: Recordings, chosen: NDArray[np.bool_], split: str) -> Recordings:
-    files = tuple(name for name, keep in zip(recordings.files, chosen, strict=True) if keep)
-    return replace(
-        recordings,
-        events=recordings.events[chosen],
-        labels=recordings.labels[chosen],
-        files=files,
-        split=split,
-        lengths=None if recordings.lengths is None else recordings.lengths[chosen],
-    )
+    return training.part(~held, "fitted"), training.part(held, "validation")
 
 
 def data_digest(training: Recordings, test: Recordings) -> str:
@@ -99,37 +80,20 @@ def train_both(
     Parameters as :func:`train.train`; `state` is the stem of two files.
     """
     files = state_files(state) if state is not None else (None, None)
-    fitted, held = validation_split(training)
-    validation = train(
-        fitted,
-        held,
-        propagation,
-        architecture,
+    once = partial(
+        train,
+        propagation=propagation,
+        architecture=architecture,
         epochs=epochs,
         seed=seed,
         recipe=recipe,
         device=device,
-        state=files[0],
         resume=resume,
-        label=f"seed {seed}, validation",
         position=position,
     )
+    validation = once(*validation_split(training), state=files[0], label=f"seed {seed}, validation")
     clean = max(validation.history, key=lambda epoch: (epoch.correct, -epoch.test_loss))
-    trained = train(
-        training,
-        test,
-        propagation,
-        architecture,
-        epochs=epochs,
-        seed=seed,
-        recipe=recipe,
-        device=device,
-        keep_epoch=clean.epoch,
-        state=files[1],
-        resume=resume,
-        label=f"seed {seed}, all data",
-        position=position,
-    )
+    trained = once(training, test, state=files[1], label=f"seed {seed}, all data", keep_epoch=clean.epoch)
     return Reported(trained=trained, validation=validation, clean_epoch=clean.epoch)
 
 

@@ -96,16 +96,10 @@ def train(
         Both splits; `test` is only looked at.
     propagation : (taxels, taxels) or (filters, places, taxels) float64
         What the first layer sees, see :func:`systems.propagation_of`.
-    architecture : Sizes
-        Sizes.
-    epochs : int
-        Passes over the training recordings.
     seed : int
         Of the initial weights and of the order of recordings.
     recipe : Recipe
         Batch, loss, surrogate, optimizer and schedule; its sizes and dynamics are already in the architecture.
-    device : {"cpu", "cuda"}
-        Where the network runs.
     keep_epoch : int, optional
         Epoch, counted from 1, whose weights are kept too.
     state : path, optional

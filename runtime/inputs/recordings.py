@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import math
-from dataclasses import replace
 
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.targets.netlist import Netlist
@@ -39,7 +38,9 @@ def recordings(
     """
     if isinstance(path, Recordings):
         require_suited(path, classes=classes, taxels=taxels)
-        data = path if limit is None else _first(path, limit)
+        if limit is not None and limit < 1:
+            raise OptionError(f"--limit {limit}: at least 1 recording is needed; give a positive number")
+        data = path.part(slice(limit))
         return joined_bins(data if labels_for is None else need_labels(data, labels_for), bins)
     if path != SYNTHETIC:
         data, counts = load_data(path, split, bin_s=bin_s, limit=limit, classes=classes, taxels=taxels)
@@ -51,16 +52,6 @@ def recordings(
     grasps = synthetic_split(split, limit=limit)
     require_suited(grasps, classes=classes, taxels=taxels)
     return joined_bins(grasps, bins)
-
-
-def _first(data: Recordings, limit: int) -> Recordings:
-    """The first recordings of those that Python handed over."""
-    if limit < 1:
-        raise OptionError(f"--limit {limit}: at least 1 recording is needed; give a positive number")
-    lengths = None if data.lengths is None else data.lengths[:limit]
-    return replace(
-        data, events=data.events[:limit], labels=data.labels[:limit], files=data.files[:limit], lengths=lengths
-    )
 
 
 def require_suited(data: Recordings, *, classes: int | None, taxels: int | None) -> None:

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 from spikeloom.models.recordings.counts import EventCounts, Oddities, number, oddities
 from spikeloom.models.recordings.describe import RULES, Description
-from spikeloom.models.recordings.eventfiles import UNLABELLED
-from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.models.recordings.evtouch import UNLABELLED, Recordings
 from spikeloom.runtime.report.sections import Section, Table, Text
 
 

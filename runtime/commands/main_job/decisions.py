@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from spikeloom.compiler.types import IntArray
-from spikeloom.models.recordings.eventfiles import UNLABELLED
+from spikeloom.models.recordings.evtouch import UNLABELLED
 from spikeloom.runtime.machines.base import Price
 from spikeloom.runtime.report.encode import HIDDEN, OPTIONAL
 from spikeloom.runtime.report.numbers import percent

@@ -8,8 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
-from spikeloom.models.recordings.eventfiles import UNLABELLED
-from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.models.recordings.evtouch import UNLABELLED, Recordings
 from spikeloom.runtime.machines.integer import Cumulative, IntegerMachine
 from spikeloom.runtime.report.encode import INLINE, OPTIONAL, key
 from spikeloom.runtime.report.intervals import wilson
