@@ -140,9 +140,9 @@ NAMES = "sphere, cylinder, edge, ring, cone, box"
         ({"per_class": 0}, "grasps: per_class is 0, allowed are 1 or more; choose another"),
         ({"steps": 9}, "grasps: steps is 9, allowed are 10 or more; choose another"),
         ({"seed": -1}, "grasps: seed is -1, allowed are 0 or more; choose another"),
-        ({"classes": ()}, f"grasps: no classes; choose from {NAMES}, each once"),
-        ({"classes": ("cube",)}, f"grasps: class 'cube' is unknown; choose from {NAMES}, each once"),
-        ({"classes": ("box", "box")}, f"grasps: class 'box' is repeated; choose from {NAMES}, each once"),
+        ({"classes": ()}, f"grasps: classes ; choose from {NAMES}, each once"),
+        ({"classes": ("cube",)}, f"grasps: classes cube; choose from {NAMES}, each once"),
+        ({"classes": ("box", "box")}, f"grasps: classes box, box; choose from {NAMES}, each once"),
     ],
 )
 def test_bad_options(options, message):
