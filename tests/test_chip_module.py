@@ -22,8 +22,8 @@ from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.interpret import run_integer, vote
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.runtime.cli import main
-from spikeloom.runtime.machines.chip_module import ChipModule, neurobench_model
-from spikeloom.runtime.machines.chip_module import vote as torch_vote
+from spikeloom.runtime.machines.loihi1.chip_module import ChipModule, neurobench_model
+from spikeloom.runtime.machines.loihi1.chip_module import vote as torch_vote
 from spikeloom.runtime.machines.votes import readout_counts
 
 SETTINGS = settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -77,7 +77,7 @@ from neurobench.benchmarks import Benchmark
 from neurobench.metrics.static import ConnectionSparsity, Footprint
 from neurobench.metrics.workload import ActivationSparsity, ClassificationAccuracy, SynapticOperations
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
-from spikeloom.runtime.machines.chip_module import neurobench_model, vote
+from spikeloom.runtime.machines.loihi1.chip_module import neurobench_model, vote
 
 with np.load(sys.argv[2]) as data:
     events, labels = torch.from_numpy(data["events"]).float(), torch.from_numpy(data["labels"])

@@ -1,28 +1,26 @@
 """onnxruntime on the integer graph: every spike and membrane of the specification."""
 
-import importlib
 import json
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from made_files import own_file, recordings_folder
 from random_netlists import Axon, Neuron, build, large_netlist, netlists, recordings
 from test_timing import six_steps
+from zoo import specimen
 
 from spikeloom.compiler.errors import DataError, NumericRangeError, OptionError
 from spikeloom.compiler.fixedpoint import read_only
-from spikeloom.compiler.formats.onnx import builder, writer_layers
+from spikeloom.compiler.formats.onnx import builder
 from spikeloom.compiler.formats.onnx import writer as onnx_writer
 from spikeloom.runtime import cli
 from spikeloom.runtime.machines.loihi1 import engine, onnx_engine, spec
 
 FORMS = onnx_writer.FORMS
-SETTINGS = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+SETTINGS = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 
 def by_onnx(netlist, events, form, **options):
@@ -61,56 +59,6 @@ def test_random_networks_are_the_specification(data):
     assert_as_specified(netlist, data.draw(recordings(netlist)))
 
 
-@st.composite
-def pipelines(draw):
-    """Networks in which each layer hears the one before it only, on two cores, with registers in range."""
-    sizes = draw(st.lists(st.integers(1, 6), min_size=1, max_size=3))
-    n_inputs = draw(st.integers(1, 4))
-    weight = st.integers(-127, 127).map(lambda half: 2 * half)
-    neurons, axons, before = [], [], range(n_inputs)
-    for layer, size in enumerate(sizes):
-        core = layer % 2
-        first = sum(neuron.core == core for neuron in neurons)
-        neuron = st.builds(
-            Neuron,
-            layer=st.just(layer),
-            core=st.just(core),
-            decay_u=st.sampled_from([4095, 4095, 2048]),
-            decay_v=st.sampled_from([3277, 3277, 100, 4095]),
-            threshold=st.sampled_from([0, 1, 60, 254, 2000]),
-            bias=st.sampled_from([0, -300, 64, 4095]),
-            bias_exponent=st.sampled_from([0, 0, 7]),
-        )
-        neurons += draw(st.lists(neuron, min_size=size, max_size=size))
-        for source in before:
-            targets = tuple((first + i, draw(weight)) for i in range(size))
-            axons.append(Axon(source=source, core=core, targets=targets, exponent=draw(st.sampled_from([-1, 0, 3]))))
-        axons.append(Axon(source=before[0], core=core, targets=((first, 2),)))
-        before = [(layer, i) for i in range(size)]
-    # compartments are numbered core after core
-    order = [i for core in (0, 1) for i, neuron in enumerate(neurons) if neuron.core == core]
-    ids = {}
-    for place, i in enumerate(order):
-        layer = neurons[i].layer
-        ids[layer, sum(neuron.layer == layer for neuron in neurons[:i])] = n_inputs + place
-    axons = [replace(axon, source=ids.get(axon.source, axon.source)) for axon in axons]
-    return build(neurons, axons, n_inputs=n_inputs, depths=list(range(len(sizes))))
-
-
-@SETTINGS
-@given(st.data())
-def test_random_pipelines_are_the_specification(data):
-    netlist = data.draw(pipelines())
-    layers = writer_layers.plan(netlist)
-    assert not any(layer.checked for layer in layers)
-    assume(writer_layers.is_pipeline(netlist, layers))  # weights may cancel in the one synapse of a layer
-    assert b"chip/" not in onnx_writer.export(netlist, "scan")
-    wide = data.draw(st.sampled_from([1, onnx_writer.WIDE]))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(onnx_writer, "WIDE", wide)
-        assert_as_specified(netlist, data.draw(recordings(netlist)))
-
-
 @pytest.mark.parametrize("proved", [True, False])
 def test_a_large_network_is_the_engine(proved):
     netlist = large_netlist(3, proved=proved)
@@ -124,14 +72,12 @@ def test_a_large_network_is_the_engine(proved):
             by_onnx(netlist, events, "scan", lengths=lengths)
         return
     for form in FORMS:
-        done = []
-        found = by_onnx(netlist, events, form, lengths=lengths, batch=2, progress=done.append)
+        found = by_onnx(netlist, events, form, lengths=lengths)
         np.testing.assert_array_equal(found.spikes, expected.spikes)
-        assert done == [2, 4]
 
 
 def three_neurons():
-    """A netlist by hand: two neurons that hear both inputs, one that hears these and votes for class 1."""
+    """A netlist by hand: two neurons that receive both inputs, one that receives these and votes for class 1."""
     netlist, _, _ = six_steps()
     return replace(netlist, bias_mantissa=read_only([0, -7, 0]), classes=2, readout_class=read_only([-1, -1, 1]))
 
@@ -186,13 +132,18 @@ def test_without_onnx_itself(monkeypatch):
 
 
 @pytest.fixture
-def verified(tmp_path, monkeypatch):
+def verified():
     """Words of a verify command on a small network."""
-    own_file(tmp_path / "net.pt")
-    recordings_folder(tmp_path / "data")
-    monkeypatch.chdir(tmp_path)
-    assert cli.main(["compile", "net.pt", "-o", "net.loom"]) == 0
-    return ["verify", "net.loom", "--checkpoint", "net.pt", "--data", "data", "--min-agreement", "0"]
+    made = specimen("mlp")
+    return [
+        "verify",
+        str(made.netlist),
+        "--checkpoint",
+        str(made.network),
+        "--data",
+        str(made.data),
+        "--min-agreement=0",
+    ]
 
 
 def test_verify_tells_which_engine(verified, capsys):
@@ -246,16 +197,3 @@ def test_verify_where_it_cannot_be(verified, monkeypatch, capsys):
         out, err = capsys.readouterr()
         assert not out
         assert err.startswith(f"spikeloom: {words}")
-
-
-def test_the_benchmark_compares_what_it_times(monkeypatch):
-    monkeypatch.syspath_prepend(str(Path(__file__).parent.parent / "benchmarks"))
-    benchmark = importlib.import_module("onnx_engine")
-    monkeypatch.setattr(benchmark, "FEW", 2)
-    events = np.random.default_rng(1).integers(0, 2, (3, 2, 20), np.uint8)
-    runs, ready = benchmark.contenders(three_neurons())
-    assert list(runs) == list(ready) == ["ours", "scan", "step"]
-    runs["scan"] = lambda given: ~benchmark.contenders(three_neurons())[0]["ours"](given)
-    found = benchmark.measure(runs, [events[:1], events[1:]], rounds=2)
-    assert [figures["differing_spikes"] for figures in found.values()] == [0, 2 * 3 * 21 * 3, 0]
-    assert found["ours"]["times_ours"] == 1

@@ -16,14 +16,13 @@ from random_netlists import Axon, Neuron, build, large_netlist
 from test_export import run
 from test_onnx_engine import three_neurons
 
-from spikeloom.compiler import Options, Recipe, __version__, compile_network
+from spikeloom.compiler import __version__
 from spikeloom.compiler.errors import FormatError, ModelError, OptionError
 from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.formats.onnx import writer as onnx_writer
 from spikeloom.compiler.formats.onnx import writer_float as onnx_float
 from spikeloom.compiler.formats.onnx.builder import port_words
-from spikeloom.compiler.formats.onnx.writer_layers import digits, is_pipeline, plan
-from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.formats.onnx.writer_layers import digits, plan
 from spikeloom.compiler.targets.loihi1.netlist_file import netlist_bytes, write_netlist
 from spikeloom.models.networks.reference import float_spikes
 from spikeloom.runtime.machines.loihi1 import engine, onnx_engine
@@ -90,17 +89,6 @@ def test_ranges_that_are_proven_are_not_checked():
     axons = [Axon(source=0, targets=((0, 254),), exponent=7), Axon(source=0, targets=((0, 256 - 2),), exponent=7)]
     assert plan(build([Neuron()], axons, n_inputs=1, depths=[0]))[0].checked
     assert not plan(build([Neuron()], axons[:1], n_inputs=1, depths=[0]))[0].checked
-
-
-def test_what_is_a_pipeline():
-    netlist = three_neurons()
-    assert is_pipeline(netlist, plan(netlist))
-    for source, target in ((0, 0), (4, 0), (2, 1)):  # input to the second layer, itself, the first layer itself
-        more = Axon(source=source, core=int(target == 0), targets=((0, 2),))
-        axons = [Axon(source=0, targets=((0, 60),)), Axon(source=2, core=1, targets=((0, 100),)), more]
-        neurons = [Neuron(), Neuron(), Neuron(layer=1, core=1)]
-        other = build(neurons, axons, n_inputs=2, depths=[0, 1])
-        assert not is_pipeline(other, plan(other))
 
 
 # -- files -------------------------------------------------------------------------------------------------------------
@@ -177,18 +165,6 @@ def test_the_reference_of_the_format_computes_the_same():
     np.testing.assert_array_equal(found["layer1.spikes"].transpose(1, 0, 2), expected[:, 1:13, 2:])
     assert found["votes"].tolist() == [[0, int(sample[:, 2].sum())] for sample in expected]
     assert found["class"].tolist() == [int(sample[:, 2].any()) for sample in expected]
-
-
-@pytest.mark.parametrize("recipe", [Recipe(bits=8, planes=2), Recipe(bits=4, groups=4), Recipe(bits=2)])
-def test_planes_groups_and_few_bits(tmp_path, recipe):
-    checkpoint, adjacency = small_checkpoint(tmp_path)
-    netlist = compile_network(expand(checkpoint, adjacency), Options(recipes=(recipe,))).netlist
-    given = events(3).reshape(-1, netlist.n_inputs, events(3).shape[3])
-    expected = engine.simulate(netlist, given, spikes=True).spikes
-    assert expected.any()
-    for form in FORMS:
-        found = onnx_engine.simulate(onnx_engine.prepare(netlist, form=form), given)
-        np.testing.assert_array_equal(found.spikes, expected)
 
 
 # -- the float network -------------------------------------------------------------------------------------------------

@@ -23,6 +23,12 @@ IR_VERSION = 8
 SIZE_LIMIT = 2**31 - 2**20
 """Bytes of weights that a file of this format can hold, a little below protobuf's 2 GiB."""
 
+INNER = "step/"
+"""Names inside the loop over steps start with this."""
+
+END = 2**63 - 1
+"""A slice with this end reaches to the end of its axis."""
+
 Proto = Any
 """A message of the onnx package, which ships no types."""
 
@@ -38,17 +44,13 @@ class Port:
 
 @dataclass(slots=True)
 class Nodes:
-    """Nodes in order, and the constants that they read; a body shares the constants of the graph around it."""
+    """Nodes in order, and the constants that they read."""
 
     nodes: list[Proto] = field(default_factory=list)
     constants: dict[str, npt.NDArray[Any]] = field(default_factory=dict)
 
-    def inner(self) -> Nodes:
-        """Nodes of a body, with the constants of this graph."""
-        return Nodes(constants=self.constants)
-
     def constant(self, name: str, value: npt.ArrayLike, kind: npt.DTypeLike) -> str:
-        """Hold an array under a name of its own; returns the name."""
+        """Hold an array; returns its name."""
         self.constants[name] = np.ascontiguousarray(value, dtype=kind).reshape(np.shape(value))
         return name
 
@@ -56,50 +58,33 @@ class Nodes:
         """Hold one number for each neuron, or a single number where all are the same; returns the name."""
         return self.constant(name, values[0] if np.all(values == values[0]) else values, kind)
 
-    def add(
-        self, operator: str, inputs: Sequence[str], output: str, attributes: Mapping[str, Any] | None = None
-    ) -> str:
+    def add(self, operator: str, inputs: Sequence[str], output: str, **attributes: Any) -> str:
         """Append a node with one output; returns the output's name."""
-        self.nodes.append(
-            onnx_package().helper.make_node(operator, inputs, [output], name=output, **(attributes or {}))
-        )
+        self.nodes.append(package("onnx").helper.make_node(operator, inputs, [output], name=output, **attributes))
         return output
 
     def cast(self, source: str, output: str, kind: npt.DTypeLike) -> str:
         """Append a conversion to a numpy type."""
-        return self.add("Cast", [source], output, {"to": proto_type(kind)})
+        return self.add("Cast", [source], output, to=_type(kind))
 
-    def scan(
-        self,
-        body: Nodes,
-        states: Sequence[tuple[str, Port, str, str]],
-        given: Sequence[tuple[str, Port]],
-        kept: Sequence[tuple[Port, str]],
-        name: str,
-    ) -> None:
-        """Append a loop over the first axis.
+    def filled(self, name: str, value: int, kind: npt.DTypeLike, sizes: Sequence[str]) -> str:
+        """Append an array of one number everywhere."""
+        shape = self.add("Concat", sizes, f"{name}/shape", axis=0)
+        return self.add("Expand", [self.constant(f"{name}/value", value, kind), shape], name)
 
-        body: what one iteration does.
-        states: sequence of (start, port, next, last); what goes from one iteration to the next: its first value, what
-            the body calls it, what the body leaves, and the name of what the last iteration leaves.
-        given: sequence of (array, port); arrays that are cut along the first axis, and what the body calls a slice.
-        kept: sequence of (port, array); what the body yields, and the name of all of them stacked.
-        name: of the node and its body.
-        """
-        onnx = onnx_package()
-        inputs = [value(port) for _, port, _, _ in states] + [value(port) for _, port in given]
-        outputs = [value(Port(name=after, kind=port.kind, shape=port.shape)) for _, port, after, _ in states]
-        outputs += [value(port) for port, _ in kept]
-        self.nodes.append(
-            onnx.helper.make_node(
-                "Scan",
-                [start for start, _, _, _ in states] + [array for array, _ in given],
-                [last for _, _, _, last in states] + [array for _, array in kept],
-                name=name,
-                num_scan_inputs=len(given),
-                body=onnx.helper.make_graph(body.nodes, f"{name}.body", inputs, outputs),
-            )
-        )
+    def graph(self, name: str, inputs: Sequence[Port], outputs: Sequence[Port]) -> Proto:
+        """All of it as a message."""
+        onnx = package("onnx")
+        ends = [
+            [onnx.helper.make_tensor_value_info(port.name, _type(port.kind), list(port.shape)) for port in side]
+            for side in (inputs, outputs)
+        ]
+        constants = [onnx.numpy_helper.from_array(array, key) for key, array in self.constants.items()]
+        return onnx.helper.make_graph(self.nodes, name, *ends, constants)
+
+
+Model = tuple[Nodes, list[Port], list[Port]]
+"""Nodes, inputs and outputs. Of the form ``step`` the first input is ``events`` (batch, channels)."""
 
 
 def package(name: str) -> Any:
@@ -113,26 +98,12 @@ def package(name: str) -> Any:
         raise OptionError(f"{name}: the package is not installed; install it with pip install {name}") from error
 
 
-def onnx_package() -> Any:
-    """The package ``onnx``."""
-    return package("onnx")
-
-
-def proto_type(kind: npt.DTypeLike) -> int:
-    """Number that ONNX gives to a numpy type."""
-    return int(onnx_package().helper.np_dtype_to_tensor_dtype(np.dtype(kind)))
-
-
-def value(port: Port) -> Proto:
-    """An input or output as a message."""
-    return onnx_package().helper.make_tensor_value_info(port.name, proto_type(port.kind), list(port.shape))
+def _type(kind: npt.DTypeLike) -> int:
+    return int(package("onnx").helper.np_dtype_to_tensor_dtype(np.dtype(kind)))
 
 
 def require_room(size: int) -> None:
-    """Refuse weights that no file of this format can hold.
-
-    Raises ModelError if they are more than ``SIZE_LIMIT`` bytes.
-    """
+    """Refuse weights of more bytes than a file of this format can hold: ModelError."""
     if size > SIZE_LIMIT:
         raise ModelError(
             f"onnx: the weights need {size} bytes as dense matrices, a file holds {SIZE_LIMIT}; "
@@ -140,44 +111,117 @@ def require_room(size: int) -> None:
         )
 
 
-def model_bytes(
-    graph: Nodes, inputs: Sequence[Port], outputs: Sequence[Port], *, name: str, about: str, facts: Mapping[str, Any]
-) -> bytes:
+def next_of(port: Port) -> Port:
+    """What a step leaves of a state."""
+    return Port(name=f"{port.name}_next", kind=port.kind, shape=port.shape)
+
+
+def whole_recordings(step: Model, layers: Mapping[str, tuple[int, int]], classes: int) -> Model:
+    """The form ``scan`` of a form ``step``: a loop over its steps, as many more as the deepest layer lags behind.
+
+    step: with ``LAYER/fired`` (bool) in its nodes; may read ``length``, the data steps.
+    layers: neurons and depth of each layer by name; its spikes are shifted back by its depth.
+    classes: for the votes.
+    """
+    onnx = package("onnx")
+    nodes, inputs, outputs = step
+    left = {port.name for port in outputs}
+    states = [port for port in inputs if f"{port.name}_next" in left]
+    channels, drain = inputs[0].shape[1], max(depth for _, depth in layers.values())
+    graph, sequence = Nodes(), "events"
+    graph.add("Shape", ["events"], "duration", start=0, end=1)
+    graph.add("Shape", ["events"], "batch", start=1, end=2)
+    graph.add("Squeeze", ["duration"], "length")
+    if drain:
+        sizes = [graph.constant("drain", [drain], np.int64), "batch", graph.constant("channels", [channels], np.int64)]
+        sequence = graph.add("Concat", ["events", graph.filled("tail", 0, np.uint8, sizes)], "filled", axis=0)
+    begun = [_rest(graph, state) for state in states]
+    kept = [Port(name=f"{name}/fired", kind=np.bool_, shape=("batch", size)) for name, (size, _) in layers.items()]
+    kept += [port for port in outputs if port.name == "overflow"]
+    body = nodes.graph("steps", [*states, inputs[0]], [*map(next_of, states), *kept])
+    graph.nodes.append(
+        onnx.helper.make_node(
+            "Scan",
+            [*begun, sequence],
+            [*(port.name if port.name == "votes" else f"{port.name}/last" for port in states)]
+            + [f"{port.name}/steps" for port in kept],
+            name="steps",
+            num_scan_inputs=1,
+            body=onnx.compose.add_prefix_graph(body, INNER),
+        )
+    )
+    found = []
+    for name, (size, depth) in layers.items():
+        trains = f"{name}/fired/steps"
+        if drain:
+            ends = [
+                graph.constant(f"{name}/{side}", [at], np.int64)
+                for side, at in (("begin", depth), ("end", depth - drain or END))
+            ]
+            trains = graph.add("Slice", [trains, *ends], f"{name}/trains")
+        graph.cast(trains, f"{name}.spikes", np.uint8)
+        found += [
+            Port(name=f"{name}.spikes", kind=np.uint8, shape=("time", "batch", size)),
+            Port(name=_counted(graph, name, size), kind=np.int32, shape=("batch", size)),
+        ]
+    if any(state.name == "votes" for state in states):
+        graph.add("ArgMax", ["votes"], "class", axis=1, keepdims=0)  # the lowest on a tie
+        found.append(Port(name="votes", kind=np.int32, shape=("batch", classes)))
+        found.append(Port(name="class", kind=np.int64, shape=("batch",)))
+    if "overflow" in left:
+        numbers = graph.cast("overflow/steps", "overflow/numbers", np.int32)
+        graph.cast(graph.add("ReduceMax", [numbers], "overflow/most", axes=[0], keepdims=0), "overflow", np.bool_)
+        found.append(kept[-1])
+    return graph, [Port(name="events", kind=np.uint8, shape=("time", "batch", channels))], found
+
+
+def _rest(graph: Nodes, state: Port) -> str:
+    """Zeros at the start of recordings, (batch, neurons) or a scalar."""
+    name = f"{state.name}/rest"
+    if not state.shape:
+        return graph.constant(name, 0, state.kind)
+    return graph.filled(name, 0, state.kind, ["batch", graph.constant(f"{state.name}/size", state.shape[1:], np.int64)])
+
+
+def _counted(graph: Nodes, name: str, size: int) -> str:
+    """Spikes of a recording. A product with ones adds up bytes ten times faster than ReduceSum, which wants int32."""
+    row = [graph.constant("single", [1], np.int64), "duration"]
+    ones = graph.filled(f"{name}/ones", 1, np.uint8, row)
+    flat = graph.add("Reshape", [f"{name}.spikes", graph.constant("flat", [0, -1], np.int64)], f"{name}/flat")
+    total = graph.add("MatMulInteger", [ones, flat], f"{name}/total")
+    form = graph.constant(f"{name}.counts/form", [-1, size], np.int64)
+    return graph.add("Reshape", [total, form], f"{name}.counts")
+
+
+def model_bytes(model: Model, *, name: str, about: str, facts: Mapping[str, Any]) -> bytes:
     """Content of a model file; it has passed the checker of the ``onnx`` package.
 
-    graph: nodes and constants.
-    inputs, outputs: what the model takes and gives.
     name, about: of the graph; what it says about itself.
     facts: JSON values for the metadata, beside the version of this program.
     """
-    onnx = onnx_package()
-    model = onnx.helper.make_model(
-        onnx.helper.make_graph(
-            graph.nodes,
-            name,
-            [value(port) for port in inputs],
-            [value(port) for port in outputs],
-            [onnx.numpy_helper.from_array(array, key) for key, array in graph.constants.items()],
-        ),
+    onnx = package("onnx")
+    nodes, inputs, outputs = model
+    message = onnx.helper.make_model(
+        nodes.graph(name, inputs, outputs),
         opset_imports=[onnx.helper.make_opsetid("", OPSET)],
         ir_version=IR_VERSION,
         producer_name="spikeloom",
         producer_version=__version__,
-        doc_string=about,
+        doc_string=about.replace("``", ""),
     )
     facts = {"version": __version__, **facts}
-    for key in sorted(facts):
-        entry = model.metadata_props.add()
-        entry.key = key
-        entry.value = facts[key] if isinstance(facts[key], str) else json.dumps(facts[key], sort_keys=True)
-    onnx.checker.check_model(model, full_check=True)
-    content: bytes = model.SerializeToString(deterministic=True)
+    words = {
+        key: facts[key] if isinstance(facts[key], str) else json.dumps(facts[key], sort_keys=True) for key in facts
+    }
+    onnx.helper.set_model_props(message, dict(sorted(words.items())))
+    onnx.checker.check_model(message, full_check=True)
+    content: bytes = message.SerializeToString(deterministic=True)
     return content
 
 
 def port_words(content: bytes) -> tuple[list[str], list[str]]:
     """Inputs and outputs of a model for people, such as ``events uint8 (time, batch, 78)``."""
-    onnx = onnx_package()
+    onnx = package("onnx")
     graph = onnx.load_from_string(content).graph
 
     def words(ports: Any) -> list[str]:
@@ -189,48 +233,3 @@ def port_words(content: bytes) -> tuple[list[str], list[str]]:
         return found
 
     return words(graph.input), words(graph.output)
-
-
-def read_sizes(graph: Nodes) -> None:
-    """Read ``duration`` and ``batch`` from the ``events`` (time, batch, channels); one number each."""
-    graph.add("Shape", ["events"], "duration", {"start": 0, "end": 1})
-    graph.add("Shape", ["events"], "batch", {"start": 1, "end": 2})
-
-
-def rest(graph: Nodes, port: Port) -> str:
-    """Zeros for a state, (batch, neurons) or a scalar, at the start of recordings."""
-    if not port.shape:
-        return graph.constant(f"{port.name}/rest", 0, port.kind)
-    size = graph.constant(f"{port.name}/size", port.shape[1:], np.int64)
-    return zeros(graph, f"{port.name}/rest", port.kind, ["batch", size])
-
-
-def zeros(graph: Nodes, name: str, kind: npt.DTypeLike, sizes: list[str]) -> str:
-    """Zeros of these sizes."""
-    return _filled(graph, name, graph.constant(f"{name}/zero", 0, kind), sizes)
-
-
-def _filled(graph: Nodes, name: str, value: str, sizes: list[str]) -> str:
-    return graph.add("Expand", [value, graph.add("Concat", sizes, f"{name}/shape", {"axis": 0})], name)
-
-
-def counted(graph: Nodes, name: str, size: int) -> list[Port]:
-    """Count the spikes of a layer, whose trains have its name; returns trains and counts as outputs."""
-    trains = Port(name=f"{name}.spikes", kind=np.uint8, shape=("time", "batch", size))
-    counts = Port(name=f"{name}.counts", kind=np.int32, shape=("batch", size))
-    # a product with ones adds up bytes ten times faster than ReduceSum, which wants them as int32
-    row = [graph.constant("single", [1], np.int64), "duration"]
-    ones = _filled(graph, f"{name}/ones", graph.constant("one", 1, np.uint8), row)
-    flat = graph.add("Reshape", [trains.name, graph.constant("flat", [0, -1], np.int64)], f"{name}/flat")
-    total = graph.add("MatMulInteger", [ones, flat], f"{name}/total")
-    graph.add("Reshape", [total, graph.constant(f"{name}.counts/form", [-1, size], np.int64)], counts.name)
-    return [trains, counts]
-
-
-def decided(graph: Nodes, classes: int) -> list[Port]:
-    """Choose the class with most ``votes``, the lowest on a tie; returns both as outputs."""
-    graph.add("ArgMax", ["votes"], "class", {"axis": 1, "keepdims": 0})
-    return [
-        Port(name="votes", kind=np.int32, shape=("batch", classes)),
-        Port(name="class", kind=np.int64, shape=("batch",)),
-    ]

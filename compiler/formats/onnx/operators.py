@@ -148,10 +148,11 @@ def _moved(node: Node, table: Table, values: Sequence[Value | None]) -> list[Val
         positions[place] = (start + np.arange(size_of(part.shape))).reshape(part.shape)
         start += size_of(part.shape)
     moved = evaluate(node, table, positions)  # type: ignore[arg-type]
-    return [_rows_of_all(list(parts.values()), rows, start) for rows in moved]
+    return [rows_of_all(list(parts.values()), rows, start) for rows in moved]
 
 
-def _rows_of_all(parts: list[Affine], rows: Array, total: int) -> Affine:
+def rows_of_all(parts: list[Affine], rows: Array, total: int) -> Affine:
+    """Elements of several values one after the other, of `total` with the constant zero in front."""
     flat = rows.ravel()
     if len(parts) == 1 and flat.size and flat.min() >= 1:
         return picked(parts[0], flat - 1, rows.shape)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -10,8 +10,8 @@ from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.names import printable
 from spikeloom.compiler.formats.onnx.evaluate import COMPARISONS, misfit
 from spikeloom.compiler.formats.onnx.file import Array, Graph, Node
-from spikeloom.compiler.formats.onnx.gates import present
-from spikeloom.compiler.formats.onnx.operators import apply, require_finite
+from spikeloom.compiler.formats.onnx.gates import as_affine, present
+from spikeloom.compiler.formats.onnx.operators import apply, require_finite, rows_of_all
 from spikeloom.compiler.formats.onnx.values import (
     INPUT_ATOM,
     MEMBRANE,
@@ -20,6 +20,7 @@ from spikeloom.compiler.formats.onnx.values import (
     Table,
     Value,
     diagonal,
+    picked,
     size_of,
 )
 
@@ -94,10 +95,8 @@ def _evaluate(node: Node, values: Mapping[str, Value], table: Table) -> list[Val
             results = [cut if node.op == "Shape" else np.array(size_of(present(operands[0]).shape))]
         case "If":
             results = run(node.attributes["then_branch" if _truth(operands[0]) else "else_branch"], values, {}, table)
-        case "Loop":
-            results = _loop(node, values, operands, table)
-        case "Scan":
-            results = _scan(node, values, operands, table)
+        case "Loop" | "Scan":
+            results = _repeated(node, values, operands, table)
         case _ if inner(node):
             raise ModelError("holds a graph; only If, Loop and Scan may")
         case _:
@@ -118,75 +117,62 @@ def _truth(value: Value | None) -> bool:
     return bool(value.reshape(()))
 
 
-def _taken(value: Value, step: int, take: Node, table: Table) -> Value:
+def _taken(value: Value, step: int, axis: int, table: Table) -> Value:
     """One step of a sequence."""
-    return apply(take, table, [value, np.array(step)])[0]
+    table.spend(size_of(value.shape))
+    if isinstance(value, np.ndarray):
+        return np.asarray(value.take(step, axis))
+    places = np.arange(size_of(value.shape)).reshape(value.shape).take(step, axis)
+    return picked(as_affine(table, value), places.ravel(), places.shape)
 
 
-def _takes(axis: int) -> Node:
-    return Node(name="step", op="Gather", inputs=("x", "step"), outputs=("y",), attributes={"axis": axis})
-
-
-def _stacked(parts: list[Value], axis: int, table: Table) -> Value:
+def _stacked(parts: Sequence[Value], axis: int, table: Table) -> Value:
     """Steps side by side again, along a new axis."""
-    apart = Node(name="stack", op="Reshape", inputs=("x", "shape"), outputs=("y",), attributes={})
-    names = tuple(f"x{place}" for place in range(len(parts)))
-    beside = Node(name="stack", op="Concat", inputs=names, outputs=("y",), attributes={"axis": axis})
-    shape = list(parts[0].shape)
-    at = axis if axis >= 0 else axis + len(shape) + 1
-    wide = np.array([*shape[:at], 1, *shape[at:]], np.int64)
-    return apply(beside, table, [apply(apart, table, [part, wide])[0] for part in parts])[0]
+    if all(isinstance(part, np.ndarray) for part in parts):
+        return np.stack(parts, axis)  # type: ignore[arg-type]
+    shape = table.room((len(parts), *parts[0].shape))
+    places = np.moveaxis(np.arange(1, size_of(shape) + 1).reshape(shape), 0, axis)
+    return rows_of_all([as_affine(table, part) for part in parts], places, size_of(shape) + 1)
 
 
-def _steps(count: int) -> range:
-    if not 1 <= count <= STEP_LIMIT:
-        raise ModelError(f"runs {count} steps, allowed are 1 to {STEP_LIMIT}; export a shorter recording")
-    return range(count)
+def _repeated(node: Node, values: Mapping[str, Value], operands: list[Value | None], table: Table) -> list[Value]:
+    """A Loop or a Scan, unrolled.
 
-
-def _loop(node: Node, values: Mapping[str, Value], operands: list[Value | None], table: Table) -> list[Value]:
-    body = node.attributes["body"]
-    count, going = operands[0], operands[1]
-    if not isinstance(count, np.ndarray):
-        raise ModelError("runs an unknown number of steps; only a fixed one can be unrolled")
-    state: list[Value] = [value for value in operands[2:] if value is not None]
-    carried = len(state)
-    if len(body.inputs) != carried + 2 or len(body.outputs) < carried + 1:
+    The body of a Loop takes the number of the step and whether to go on before the states, and leaves the latter; that
+    of a Scan takes a slice of each sequence after them.
+    """
+    attributes, body, loops = node.attributes, node.attributes["body"], node.op == "Loop"
+    if any(any(attributes.get(f"scan_{side}_directions", ())) for side in ("input", "output")):
+        raise ModelError("runs backwards in time; only forward can be lowered")
+    given = [value for value in operands[2 if loops else 0 :] if value is not None]
+    carried = len(given) - int(attributes.get("num_scan_inputs", 0))
+    state, sequences = given[:carried], given[carried:]
+    taken = attributes.get("scan_input_axes", [0] * len(sequences))
+    going: Value | None = None
+    if loops:
+        count, going = operands[:2]
+        if not isinstance(count, np.ndarray):
+            raise ModelError("runs an unknown number of steps; only a fixed one can be unrolled")
+        steps = int(count.reshape(()))
+    else:
+        steps = sequences[0].shape[taken[0]]
+    if not 1 <= steps <= STEP_LIMIT:
+        raise ModelError(f"runs {steps} steps, allowed are 1 to {STEP_LIMIT}; export a shorter recording")
+    if len(body.inputs) != len(given) + 2 * loops or len(body.outputs) < carried + loops:
         raise ModelError("has a body of other inputs or outputs than it carries; export it again")
-    kept: list[list[Value]] = [[] for _ in body.outputs[carried + 1 :]]
-    for step in _steps(int(count.reshape(()))):
+    kept: list[list[Value]] = []
+    for step in range(steps):
         if going is not None and not _truth(going):
             break
-        names = [value.name for value in body.inputs]
-        given = dict(zip(names, [np.array(step), np.array(True), *state], strict=True))
-        going, *results = run(body, values, given, table)
+        now: list[Value] = [np.array(step), np.array(True)] if loops else []
+        now += [*state, *(_taken(each, step, axis, table) for each, axis in zip(sequences, taken, strict=True))]
+        results = run(body, values, dict(zip((each.name for each in body.inputs), now, strict=True)), table)
+        if loops:
+            going = results.pop(0)
         state = results[:carried]
-        for parts, result in zip(kept, results[carried:], strict=True):
-            parts.append(result)
-    return [*state, *(_stacked(parts, 0, table) for parts in kept)]
-
-
-def _scan(node: Node, values: Mapping[str, Value], operands: list[Value | None], table: Table) -> list[Value]:
-    body, inputs = node.attributes["body"], int(node.attributes["num_scan_inputs"])
-    carried = len(operands) - inputs
-    if any(any(node.attributes.get(f"scan_{side}_directions", ())) for side in ("input", "output")):
-        raise ModelError("runs backwards in time; only forward can be lowered")
-    everything = [value for value in operands if value is not None]
-    if not 1 <= inputs <= len(operands) or len(everything) != len(operands) or len(body.inputs) != len(operands):
-        raise ModelError("has a body of other inputs than it is given; export it again")
-    state, sequences = everything[:carried], everything[carried:]
-    taken = node.attributes.get("scan_input_axes", [0] * inputs)
-    put = node.attributes.get("scan_output_axes", [0] * (len(body.outputs) - carried))
-    kept: list[list[Value]] = [[] for _ in body.outputs[carried:]]
-    takes = [_takes(axis) for axis in taken]
-    for step in _steps(sequences[0].shape[taken[0]]):
-        slices = [_taken(value, step, take, table) for value, take in zip(sequences, takes, strict=True)]
-        names = [value.name for value in body.inputs]
-        results = run(body, values, dict(zip(names, [*state, *slices], strict=True)), table)
-        state = results[:carried]
-        for parts, result in zip(kept, results[carried:], strict=True):
-            parts.append(result)
-    return [*state, *(_stacked(parts, axis, table) for parts, axis in zip(kept, put, strict=True))]
+        kept.append(results[carried:])
+    put = attributes.get("scan_output_axes", [0] * len(results[carried:]))
+    return [*state, *(_stacked(parts, axis, table) for parts, axis in zip(zip(*kept, strict=True), put, strict=True))]
 
 
 def inner(node: Node) -> tuple[Graph, ...]:

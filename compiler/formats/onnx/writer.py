@@ -17,8 +17,8 @@ Form ``step``: one chip step. Feed every output ``X_next`` back as input ``X``; 
 ``overflow``           (batch,)           output, bool, only where ranges are not proven: this step would stop the chip
 ====================== ================== =============================================================================
 
-Form ``scan``: whole recordings of the same length. Everything is aligned with the data: ``LAYER.spikes[t]`` is what the
-layer did with data step ``t``, in chip step ``t + depth``.
+Form ``scan``: whole recordings of the same length, a loop over the form ``step``. Everything is aligned with the data:
+``LAYER.spikes[t]`` is what the layer did with data step ``t``, in chip step ``t + depth``.
 
 ====================== ======================= ========================================================================
 ``events``             (time, batch, channels) input, uint8
@@ -28,60 +28,28 @@ layer did with data step ``t``, in chip step ``t + depth``.
 ``class``              (batch,)                int64, most votes, the lowest on a tie
 ``overflow``           (batch,)                bool, only where ranges are not proven: the chip would have stopped
 ====================== ======================= ========================================================================
-
-A network in which each layer receives the one before it only, with proven ranges, is run layer after layer: one product
-over all steps (in wide layers one a step), then a ``Scan`` of the recurrence. Any other is a ``Scan`` over the form
-``step``.
 """
 
 from __future__ import annotations
 
 import hashlib
-from dataclasses import replace
 
 import numpy as np
 
 from spikeloom.compiler.dynamics import Clocks
-from spikeloom.compiler.formats.onnx.builder import Nodes, Port, counted, decided, model_bytes, read_sizes, rest, zeros
-from spikeloom.compiler.formats.onnx.writer_layers import Layer, is_pipeline, plan
-from spikeloom.compiler.formats.onnx.writer_step import (
-    bias,
-    chip_step,
-    gathered,
-    integrate,
-    poll,
-    products,
-    states,
-    voters,
-)
+from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT
+from spikeloom.compiler.formats.onnx.builder import Model, Nodes, Port, model_bytes, next_of, whole_recordings
+from spikeloom.compiler.formats.onnx.writer_layers import Layer, digits, plan
 from spikeloom.compiler.ir import INPUT
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import netlist_bytes
+from spikeloom.compiler.types import IntArray
 
 FORMS = ("step", "scan")
 
-END = 2**63 - 1
-"""A slice with this end reaches to the end of its axis."""
-
-WIDE = 512
-"""Neurons from which on a layer's products are taken step by step too: sums of all steps would not fit the cache."""
-
-CHIP = "chip/"
-"""Names inside the loop over chip steps start with this."""
-
-Model = tuple[Nodes, list[Port], list[Port]]
-"""Nodes, inputs and outputs."""
-
 
 def export(netlist: Netlist, form: str) -> bytes:
-    """Content of the ONNX file of a netlist; equal netlists give equal bytes.
-
-    Parameters
-    ----------
-    netlist : Netlist
-        Network.
-    form : {"step", "scan"}
-        See the module.
+    """Content of the ONNX file of a netlist in a form, see the module; equal netlists give equal bytes.
 
     Raises
     ------
@@ -91,19 +59,17 @@ def export(netlist: Netlist, form: str) -> bytes:
         If the package ``onnx`` is not installed.
     """
     layers = plan(netlist)
-    build = _step_model if form == "step" else _scan_model
-    graph, inputs, outputs = build(netlist, layers)
+    model = _chip_step(netlist, layers)
+    if form == "scan":
+        model = whole_recordings(model, {each.name: (each.size, each.depth) for each in layers}, netlist.classes)
     return model_bytes(
-        graph,
-        inputs,
-        outputs,
+        model,
         name=f"spikeloom-{form}",
-        about=__doc__.replace("``", "") if __doc__ else "",
+        about=__doc__ or "",
         facts={
             "netlist_sha256": hashlib.sha256(netlist_bytes(netlist)).hexdigest(),
             "form": form,
-            "input": f"{netlist.taxels} taxels x {netlist.polarities} polarities; "
-            f"channel = taxel * {netlist.polarities} + polarity; 0 or 1{timing_words(netlist.clocks, netlist.bins)}",
+            "input": input_words(netlist.taxels, netlist.polarities, netlist.clocks, netlist.bins),
             "max_depth": netlist.max_depth,
             "layers": [
                 {
@@ -119,135 +85,134 @@ def export(netlist: Netlist, form: str) -> bytes:
     )
 
 
-def timing_words(clocks: Clocks, bins: int) -> str:
-    """What an input receives beside the events of a bin, for the metadata of a file."""
-    words = f"; a step joins {bins} bins of the recordings" if bins > 1 else ""
-    if not clocks.channels:
-        return words
-    return (
-        f"{words}; then {clocks.channels} clocks: the k-th, from 0, is 1 in the {clocks.steps} steps from k * "
-        f"{clocks.steps}"
-    )
+def input_words(taxels: int, polarities: int, clocks: Clocks, bins: int) -> str:
+    """What the events of a file are, for its metadata."""
+    words = f"{taxels} taxels x {polarities} polarities; channel = taxel * {polarities} + polarity; 0 or 1"
+    if bins > 1:
+        words += f"; a step joins {bins} bins of the recordings"
+    if clocks.channels:
+        words += (
+            f"; then {clocks.channels} clocks: the k-th, from 0, is 1 in the {clocks.steps} steps from k * "
+            f"{clocks.steps}"
+        )
+    return words
 
 
-def _step_model(netlist: Netlist, layers: tuple[Layer, ...]) -> Model:
+def _chip_step(netlist: Netlist, layers: tuple[Layer, ...]) -> Model:
+    """The form ``step``: each layer takes what the others left in the step before."""
     graph = Nodes()
-    chip_step(graph, layers, netlist.classes)
-    kept = states(layers, netlist.classes)
+    states = [Port(name="step", kind=np.int64, shape=())]
+    received = {INPUT: "events"} | {layer.index: f"{layer.name}.spikes" for layer in layers}
+    graph.add("Add", ["step", graph.constant("increment", 1, np.int64)], "step_next")
+    windows = {depth: _window(graph, depth) for depth in sorted({layer.depth for layer in layers})}
+    flags: list[str] = []
+    for layer in layers:
+        size = ("batch", layer.size)
+        states.append(Port(name=f"{layer.name}.spikes", kind=np.uint8, shape=size))
+        states.append(Port(name=f"{layer.name}.membrane", kind=layer.kind, shape=size))
+        if layer.remembers:
+            states.append(Port(name=f"{layer.name}.current", kind=layer.kind, shape=size))
+        spikes = [received[source.pre] for source in layer.sources]
+        flags += _integrate(graph, layer, spikes, windows[layer.depth])
+    outputs = []
+    if flags:
+        most = graph.add("Max", flags, "overflow/most")
+        graph.add("Greater", [most, graph.constant("nothing", 0, np.int32)], "overflow")
+        outputs.append(Port(name="overflow", kind=np.bool_, shape=("batch",)))
+    votes, voting = "votes", [layer for layer in layers if np.any(layer.label >= 0)]
+    for layer in voting:
+        poll = layer.label[:, None] == np.arange(netlist.classes)
+        label = graph.constant(f"{layer.name}/label", poll, np.uint8)
+        more = graph.add("MatMulInteger", [f"{layer.name}.spikes_next", label], f"{layer.name}/votes")
+        last = "votes_next" if layer is voting[-1] else f"{layer.name}/voted"
+        votes = graph.add("Add", [votes, more], last)
+    if voting:
+        states.append(Port(name="votes", kind=np.int32, shape=("batch", netlist.classes)))
     inputs = [
         Port(name="events", kind=np.uint8, shape=("batch", netlist.n_inputs)),
         Port(name="length", kind=np.int64, shape=()),
-        *kept,
+        *states,
     ]
-    outputs = [Port(name=f"{state.name}_next", kind=state.kind, shape=state.shape) for state in kept]
-    return graph, inputs, outputs + _stop(layers)
+    return graph, inputs, [*map(next_of, states), *outputs]
 
 
-def _stop(layers: tuple[Layer, ...]) -> list[Port]:
-    checked = any(layer.checked for layer in layers)
-    return [Port(name="overflow", kind=np.bool_, shape=("batch",))] if checked else []
+def _window(graph: Nodes, depth: int) -> str:
+    """Whether layers of a depth integrate in this chip step; bool scalar."""
+    name = f"window{depth}"
+    begin = graph.constant(f"{name}/begin", depth, np.int64)
+    begun = graph.add("GreaterOrEqual", ["step", begin], f"{name}/begun")
+    since = graph.add("Sub", ["step", begin], f"{name}/since")
+    return graph.add("And", [begun, graph.add("Less", [since, "length"], f"{name}/lasts")], name)
 
 
-def _scan_model(netlist: Netlist, layers: tuple[Layer, ...]) -> Model:
-    graph = Nodes()
-    read_sizes(graph)
-    if is_pipeline(netlist, layers) and not any(layer.checked for layer in layers):
-        _layerwise(graph, layers)
-    else:
-        _stepwise(graph, netlist, layers)
-    outputs = [port for layer in layers for port in counted(graph, layer.name, layer.size)]
-    votes, voting = "", voters(layers)
-    for layer in voting:
-        label = poll(graph, layer, netlist.classes, np.int32)
-        last = "votes" if layer is voting[-1] else f"{layer.name}/voted"
-        more = graph.add("MatMul", [f"{layer.name}.counts", label], f"{layer.name}/votes" if votes else last)
-        votes = graph.add("Add", [votes, more], last) if votes else more
-    if voting:
-        outputs += decided(graph, netlist.classes)
-    return (
-        graph,
-        [Port(name="events", kind=np.uint8, shape=("time", "batch", netlist.n_inputs))],
-        [*outputs, *_stop(layers)],
-    )
+def _integrate(graph: Nodes, layer: Layer, spikes: list[str], is_open: str) -> list[str]:
+    """One step of the neurons, as :mod:`loihi1.spec` defines them; the name of its overflow where that is checked.
 
-
-def _layerwise(graph: Nodes, layers: tuple[Layer, ...]) -> None:
-    """Each layer over all steps: its products, then a loop over the recurrence."""
-    received = {INPUT: "events"}
-    for layer in layers:
-        name, body = layer.name, graph.inner()
-        received[layer.index] = f"{name}.spikes"
-        spikes = [received[source.pre] for source in layer.sources]
-        size = ("batch", layer.size)
-        # a current that lasts must not take the bias along
-        early = layer.size < WIDE and not layer.remembers
-        if early:
-            sums = gathered(graph, layer, products(graph, layer, spikes, f"{name}/product"), name)
-            sums = bias(graph, layer, sums, f"{name}/inflow")
-            assert sums is not None, "a layer of a pipeline receives the one before"
-            inflow: str | None = f"{name}/now"
-            given = [(sums, Port(name=f"{name}/now", kind=layer.kind, shape=size))]
-        else:
-            now = [
-                Port(name=f"{name}/now{i}", kind=np.uint8, shape=("batch", len(source.positive)))
-                for i, source in enumerate(layer.sources)
-            ]
-            given = list(zip(spikes, now, strict=True))
-            found = products(body, layer, [port.name for port in now], f"{name}/product")
-            inflow = gathered(body, layer, found, name)
-        registers = [f"{name}.membrane", *([f"{name}.current"] if layer.remembers else [])]
-        state = registers[0], registers[1] if layer.remembers else None
-        fired = integrate(body, layer, inflow, state, biased=early)
-        left = [fired.membrane, *([fired.current] if fired.current is not None else [])]
-        graph.scan(
-            body,
-            [
-                (rest(graph, port), port, after, f"{port.name}/last")
-                for port, after in zip(
-                    [Port(name=register, kind=layer.kind, shape=size) for register in registers], left, strict=True
-                )
-            ],
-            given,
-            [(Port(name=fired.spiked, kind=np.bool_, shape=size), f"{name}/trains")],
-            f"{name}/scan",
-        )
-        graph.cast(f"{name}/trains", f"{name}.spikes", np.uint8)
-
-
-def _stepwise(graph: Nodes, netlist: Netlist, layers: tuple[Layer, ...]) -> None:
-    """All layers together, chip step after chip step; trains are shifted back by the depths of their layers."""
-    chip = tuple(replace(layer, name=f"{CHIP}{layer.name}") for layer in layers)
-    body, drain = graph.inner(), netlist.max_depth
-    chip_step(body, chip, netlist.classes, CHIP)
-    graph.add("Squeeze", ["duration"], f"{CHIP}length")
-    events = Port(name=f"{CHIP}events", kind=np.uint8, shape=("batch", netlist.n_inputs))
-    sizes = [
-        graph.constant("drain", [drain], np.int64),
-        "batch",
-        graph.constant("inputs", [netlist.n_inputs], np.int64),
-    ]
-    tail = zeros(graph, "tail", np.uint8, sizes)
-    filled = graph.add("Concat", ["events", tail], "filled", {"axis": 0})
-    kept = [
-        (Port(name=f"{after.name}/fired", kind=np.bool_, shape=("batch", after.size)), f"{layer.name}/steps")
-        for layer, after in zip(layers, chip, strict=True)
-    ]
-    if any(layer.checked for layer in layers):
-        kept.append((Port(name=f"{CHIP}overflow", kind=np.bool_, shape=("batch",)), "overflow/steps"))
-    begun = [
-        (rest(graph, port), port, f"{port.name}_next", f"{port.name}/last")
-        for port in states(chip, netlist.classes, CHIP)
-    ]
-    graph.scan(body, begun, [(filled, events)], kept, "chip")
-    for layer in layers:
-        end = layer.depth - drain or END
-        window = [
-            graph.constant(f"{layer.name}/{side}", [at], np.int64)
-            for side, at in (("begin", layer.depth), ("end", end))
+    A closed window holds all registers at zero.
+    """
+    name, kind, word = layer.name, layer.kind, np.dtype(layer.kind).name
+    window = graph.cast(is_open, f"{name}/window", kind)
+    sums = [_sums(graph, layer, spikes, sign) for sign in ((1, -1) if layer.checked else (0,))]
+    inflow = graph.add("Sub", sums, f"{name}/sum") if layer.checked else sums[0]
+    current = ""
+    if layer.remembers:
+        lasting = _decayed(graph, layer, f"{name}.current", layer.decay_u + 1, f"{name}/lasting")
+        current = inflow = graph.add("Add", [lasting, inflow], f"{name}/current") if inflow else lasting
+        graph.add("Mul", [current, window], f"{name}.current_next")
+    overflow = [_overflow(graph, layer, sums, current, is_open)] if layer.checked else []
+    if layer.bias.any():
+        bias = graph.column(f"{name}/bias", layer.bias, kind)
+        inflow = graph.add("Add", [inflow, bias], f"{name}/inflow") if inflow else bias
+    value = _decayed(graph, layer, f"{name}.membrane", layer.decay_v, f"{name}/decayed")
+    if inflow:
+        value = graph.add("Add", [value, inflow], f"{name}/driven")
+    if layer.saturates:
+        ends = [
+            graph.constant(f"{end}/{word}", sign * MEMBRANE_MAX, kind) for end, sign in (("lowest", -1), ("highest", 1))
         ]
-        graph.add("Slice", [f"{layer.name}/steps", *window], f"{layer.name}/trains")
-        graph.cast(f"{layer.name}/trains", f"{layer.name}.spikes", np.uint8)
-    if any(layer.checked for layer in layers):
-        numbers = graph.cast("overflow/steps", "overflow/numbers", np.int32)
-        most = graph.add("ReduceMax", [numbers], "overflow/most", {"axes": [0], "keepdims": 0})
-        graph.cast(most, "overflow", np.bool_)
+        value = graph.add("Clip", [value, *ends], f"{name}/clipped")
+    value = graph.add("Mul", [value, window], f"{name}/gated")
+    threshold = graph.column(f"{name}/threshold", layer.threshold, kind)
+    fired = graph.add("Greater", [value, threshold], f"{name}/fired")
+    graph.add("Where", [fired, graph.constant(f"zero/{word}", 0, kind), value], f"{name}.membrane_next")
+    graph.cast(fired, f"{name}.spikes_next", np.uint8)
+    return overflow
+
+
+def _sums(graph: Nodes, layer: Layer, spikes: list[str], sign: int) -> str:
+    """Synaptic sums, membrane units, of all weights (0) or magnitudes of those of a sign; empty where none feeds it."""
+    name = f"{layer.name}/{('product', 'positive', 'negative')[sign]}"
+    total, count = "", 0
+    for received, source in zip(spikes, layer.sources, strict=True):
+        for digit, factor in digits(source.weight(sign)):
+            own = f"{name}/{count}"
+            product = graph.add("MatMulInteger", [received, graph.constant(f"{own}/weight", digit, np.int8)], own)
+            if layer.kind is not np.int32:
+                product = graph.cast(product, f"{own}/wide", layer.kind)
+            unit = graph.column(f"{own}/unit", factor << MEMBRANE_SHIFT, layer.kind)
+            scaled = graph.add("Mul", [product, unit], f"{own}/scaled")
+            total = graph.add("Add", [total, scaled], f"{own}/sum") if total else scaled
+            count += 1
+    return total
+
+
+def _decayed(graph: Nodes, layer: Layer, register: str, lost: IntArray, name: str) -> str:
+    """Keep ``(4096 - lost) / 4096``: a product and an integer division, which truncates toward zero."""
+    kept = graph.column(f"{name}/kept", 2**DECAY_BITS - lost, layer.kind)
+    one = graph.constant(f"one/{np.dtype(layer.kind).name}", 2**DECAY_BITS, layer.kind)
+    return graph.add("Div", [graph.add("Mul", [register, kept], f"{name}/product"), one], name)
+
+
+def _overflow(graph: Nodes, layer: Layer, sums: list[str], current: str, is_open: str) -> str:
+    """Whether the chip would stop here, 0 or 1 (batch,): a sum of weights of one sign, or the current, is too large."""
+    name, kind = f"{layer.name}/overflow", np.dtype(layer.kind).name
+    found = [(register, graph.constant(f"sum/{kind}", ACCUMULATOR_MAX, layer.kind)) for register in sums]
+    if current:
+        size = graph.add("Abs", [current], f"{name}/size")
+        found.append((size, graph.constant(f"current/{kind}", CURRENT_MAX, layer.kind)))
+    over = [graph.add("Greater", list(pair), f"{name}/over{i}") for i, pair in enumerate(found)]
+    total = over[0]
+    for i, each in enumerate(over[1:], 1):
+        total = graph.add("Or", [total, each], f"{name}/any{i}")
+    gated = graph.add("And", [total, is_open], f"{name}/gated")
+    return graph.add("ReduceMax", [graph.cast(gated, f"{name}/number", np.int32)], name, axes=[-1], keepdims=0)

@@ -206,15 +206,3 @@ def _gathered(sources: tuple[Source, ...]) -> int:
             for digit, factor in digits(source.weight(sign)):
                 total += int((np.abs(digit.astype(np.int64)).sum(axis=0) * factor).max(initial=0)) << MEMBRANE_SHIFT
     return total
-
-
-def is_pipeline(netlist: Netlist, layers: tuple[Layer, ...]) -> bool:
-    """Whether every layer receives layers of the depth before it, the first ones the input, and no other.
-
-    Then none has to wait for another: each runs over the whole recording, aligned with the data.
-    """
-    received = [
-        {-1 if source.pre == INPUT else netlist.layers[source.pre].depth for source in layer.sources}
-        for layer in layers
-    ]
-    return all(depths == {layer.depth - 1} for layer, depths in zip(layers, received, strict=True))
