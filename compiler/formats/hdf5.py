@@ -11,6 +11,8 @@ import io
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +44,8 @@ SECONDS, MEMORY = 30, 4 * 2**30
 
 TRIAL = f"""
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 try:
     import resource
     resource.setrlimit(resource.RLIMIT_CPU, ({SECONDS}, {SECONDS}))
@@ -56,13 +60,26 @@ except ModelError:
 """
 
 
+class Part:
+    """A part of a file; printed, it says which."""
+
+    def fail(self, problem: str) -> ModelError:
+        """An error about this part, to be raised."""
+        return ModelError(f"{self}: {problem}")
+
+    @contextmanager
+    def named(self) -> Iterator[None]:
+        """Let errors of what is done to this part say so."""
+        try:
+            yield
+        except ModelError as error:
+            raise self.fail(str(error)) from error
+
+
 def read_hdf5(path: Path, what: str, remedy: str) -> tuple[Tree, str]:
-    """Content of a whole file, and its sha256.
+    """Content of a whole file, and its sha256; messages say `what` it should be and the `remedy` for a damaged one.
 
-    For messages: `what` it should be (``NIR file``), and the `remedy` for a damaged one.
-
-    Raises ModelError if it is missing, too large, no HDF5 file, damaged, or holds what may not be read, without the
-    path; OSError if it cannot be read.
+    Raises ModelError, without the path, if it is missing, too large, no HDF5 file, or holds what may not be read.
     """
     if not path.is_file():
         found = "is not a file" if path.exists() else "no such file"
@@ -81,10 +98,7 @@ def read_hdf5(path: Path, what: str, remedy: str) -> tuple[Tree, str]:
 
 
 def try_reading(content: bytes) -> None:
-    """Read a file in a process of its own.
-
-    Raises ModelError if that does not end well: the library spun, crashed, or ran out of its memory.
-    """
+    """Read a file in a process of its own; ModelError if the library spins, crashes, or runs out of its memory."""
     try:
         done = subprocess.run(  # noqa: S603
             [sys.executable, "-P", "-c", TRIAL],
@@ -101,10 +115,7 @@ def try_reading(content: bytes) -> None:
 
 
 def tree_of(content: bytes) -> Tree:
-    """Content of a file as a tree.
-
-    Raises ModelError if it is damaged, or holds what may not be read.
-    """
+    """Content of a file as a tree; ModelError if it is damaged, or holds what may not be read."""
     import h5py  # slow to load, so only where it is used
 
     try:
@@ -170,3 +181,25 @@ def _decoded(value: Any) -> Any:
     if isinstance(value, list):
         return [_decoded(one) for one in value]
     return value.decode("utf-8", "backslashreplace") if isinstance(value, bytes) else str(value)
+
+
+def hdf5_bytes(tree: Tree) -> bytes:
+    """An HDF5 file of groups, texts (pairs of texts in a list) and arrays; equal trees give equal bytes."""
+    import h5py
+
+    content = io.BytesIO()
+    with h5py.File(content, "w") as file:
+        _fill(file, tree)
+    return content.getvalue()
+
+
+def _fill(group: Any, tree: Tree) -> None:
+    import h5py
+
+    for name, value in tree.items():
+        if isinstance(value, dict):
+            _fill(group.create_group(name), value)
+        elif isinstance(value, str | list):
+            group.create_dataset(name, data=np.array(value, dtype=object), dtype=h5py.string_dtype())
+        else:
+            group.create_dataset(name, data=value, compression="gzip" if value.size > 1024 else None)

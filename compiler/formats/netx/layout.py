@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.formats.hdf5 import Tree, read_hdf5
+from spikeloom.compiler.formats.hdf5 import Part, Tree, read_hdf5
 from spikeloom.compiler.formats.names import printable
 from spikeloom.compiler.types import IntArray
 
@@ -36,7 +36,7 @@ LAYER_LIMIT = 1000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Block:
+class Block(Part):
     """One layer of a file, to be asked for its entries."""
 
     number: int
@@ -46,20 +46,13 @@ class Block:
     def __str__(self) -> str:
         return f"layer {self.number} ({printable(self.type) or 'no type'})"
 
-    def fail(self, problem: str) -> ModelError:
-        """An error about this layer, to be raised."""
-        return ModelError(f"{self}: {problem}")
-
     def inner(self, key: str) -> Tree | None:
         """A group of entries, or None."""
         found = self.entries.get(key)
         return found if isinstance(found, dict) else None
 
     def integers(self, key: str, within: Tree | None = None) -> IntArray:
-        """An entry as int64, of its own shape.
-
-        Raises ModelError if there is none, or it holds other numbers.
-        """
+        """An entry as int64, of its own shape; ModelError if there is none, or it holds other numbers."""
         found = (self.entries if within is None else within).get(key)
         if not isinstance(found, np.ndarray):
             raise self.fail(f"has no {key}; {REMEDY}")
@@ -96,10 +89,7 @@ class Block:
 
 
 def read_blocks(path: Path) -> tuple[list[Block], Tree, str]:
-    """Layers of a file, what else it holds, and its hash.
-
-    Raises ModelError if it is none; without the path.
-    """
+    """Layers of a file, what else it holds, and its hash; ModelError, without the path, if it is none."""
     tree, sha256 = read_hdf5(path, "netx file", REMEDY)
     return blocks_of(tree), tree, sha256
 

@@ -26,6 +26,7 @@ from spikeloom.compiler.ir import (
     IntegerProjection,
     Readout,
     Sparse,
+    with_data,
 )
 from spikeloom.compiler.sensor_layout import sensor_layout
 from spikeloom.compiler.types import IntArray
@@ -40,29 +41,17 @@ OWN = "spikeloom"
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class NetxNetwork:
-    """A network, and what was found about the file that it is from.
+    """A network, and what was found about the file that it is from."""
 
-    network: integer stage: the numbers of the file.
-    facts: what was read and what was assumed, for people.
-    sha256: of the file.
-    """
-
-    network: IntegerNetwork
-    facts: tuple[str, ...]
-    sha256: str
+    network: IntegerNetwork  # The numbers of the file
+    facts: tuple[str, ...]  # What was read and what was assumed, for people
+    sha256: str  # Of the file
 
 
 def read_netx(
     path: str | os.PathLike[str], *, polarities: int | None = None, polarities_first: bool | None = None
 ) -> NetxNetwork:
-    """Read a network.
-
-    Parameters
-    ----------
-    path : path
-        File.
-    polarities, polarities_first : optional
-        See :func:`sensor_layout.sensor_layout`.
+    """Read a network; polarities as of :func:`sensor_layout.sensor_layout`.
 
     Raises
     ------
@@ -179,19 +168,12 @@ def _conv(block: Block, shape: tuple[int, ...]) -> tuple[Sparse, tuple[int, ...]
             f"weight has the shape {list(weight.shape)} and its input {list(shape)}, wanted are (filters, channels, "
             f"height, width) and (channels, height, width); {REMEDY}"
         )
-    try:
+    stride, dilation, groups = block.pair("stride"), block.pair("dilation"), block.number_of("groups")
+    padding = [(zeros, zeros) for zeros in block.pair("padding")]
+    with block.named():
         matrix, out = convolution(
-            shape,
-            weight.astype(np.float64),
-            stride=block.pair("stride"),
-            padding=[(zeros, zeros) for zeros in block.pair("padding")],
-            dilation=block.pair("dilation"),
-            groups=block.number_of("groups"),
+            shape, weight.astype(np.float64), stride=stride, padding=padding, dilation=dilation, groups=groups
         )
-    except ModelError as error:
-        if str(error).startswith("layer "):
-            raise
-        raise block.fail(str(error)) from error
     declared = block.sizes()
     if declared != out:
         raise block.fail(f"gives {list(out)}, the file says {list(declared)}; {REMEDY}")
@@ -208,18 +190,13 @@ def _planes(block: Block, weight: Sparse) -> list[tuple[Sparse, int]]:
             f"has weights from {data.min()} to {data.max()}, allowed are -256 to 255; netx would clip them"
         )
     if not np.any(data % 2):
-        return [(_with(weight, data), 0)]
+        return [(with_data(weight, data.astype(MANTISSA)), 0)]
     if np.abs(data).max() <= 127:
-        return [(_with(weight, 2 * data), -1)]
-    odd = data % 2
-    units = _with(weight, 2 * odd)  # one half step, stored twice as large at half the value
+        return [(with_data(weight, (2 * data).astype(MANTISSA)), -1)]
+    odd = data % 2  # one half step, stored twice as large at half the value
+    units = with_data(weight, (2 * odd).astype(MANTISSA)).copy()
     units.eliminate_zeros()
-    return [(_with(weight, data - odd), 0), (units, -1)]
-
-
-def _with(weight: Sparse, data: IntArray) -> Sparse:
-    parts = (data.astype(MANTISSA), weight.indices.copy(), weight.indptr.copy())
-    return sparse.csr_array(parts, shape=weight.shape)
+    return [(with_data(weight, (data - odd).astype(MANTISSA)), 0), (units, -1)]
 
 
 def _population(block: Block, size: int, shape: tuple[int, ...]) -> IntegerPopulation:
@@ -278,21 +255,13 @@ def _bias(block: Block, size: int, shape: tuple[int, ...]) -> IntArray:
 
 
 def _own(tree: Tree, inputs: int, voters: int) -> tuple[Input, IntArray] | None:
-    """Sensor and vote that our own writer tells beside the layers, or None.
-
-    Raises ModelError if they do not fit the layers.
-    """
+    """Sensor and vote that our own writer tells beside the layers, or None; ModelError if they do not fit these."""
     entries = tree.get(OWN)
     if not isinstance(entries, dict):
         return None
     said = Block(number=-1, type=OWN, entries=entries)
-    limits = {
-        "taxels": 2**20,
-        "polarities": 2**20,
-        "clocks": MOST_CLOCKS,
-        "clock_steps": MOST_STEPS,
-        "bins": MOST_STEPS,
-    }
+    limits = {"taxels": 2**20, "polarities": 2**20, "clocks": MOST_CLOCKS}
+    limits |= {"clock_steps": MOST_STEPS, "bins": MOST_STEPS}
     stated = {"bins": 1} | {key: said.number_of(key) for key in limits if key in entries or key != "bins"}
     if any(not (key != "clocks") <= stated[key] <= most for key, most in limits.items()):
         raise ModelError(f"group {OWN} describes no sensor; {REMEDY}")

@@ -10,16 +10,14 @@ vote for.
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.fixedpoint import BIAS_MANTISSA_MAX, MEMBRANE_SHIFT, THRESHOLD_MANTISSA_MAX, round_half_even
-from spikeloom.compiler.formats.hdf5 import Tree
+from spikeloom.compiler.formats.hdf5 import Tree, hdf5_bytes
 from spikeloom.compiler.formats.netx.layout import blocks_of
 from spikeloom.compiler.formats.netx.reader import OWN, integers_of
 from spikeloom.compiler.interpret import run_integer
@@ -31,30 +29,19 @@ MOST_SHIFT = 8
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Block:
-    """One dense layer of the file, ``dense_rec`` if it is recurrent.
+    """One dense layer of the file, ``dense_rec`` if it is recurrent; weights and biases in whole weight steps."""
 
-    name: layer of the netlist.
-    weight: (neurons, inputs) int64; whole weight steps.
-    own: (neurons, neurons) int64, or None; likewise, from itself.
-    bias: (neurons,) int64; whole weight steps, rounded.
-    threshold, decay_u, decay_v: registers.
-    shift: power of two that everything was multiplied by.
-    rounded: biases that are no whole steps.
-    threshold_rounded: whether the threshold is none.
-    furthest: largest change of a bias, in weight steps of the netlist.
-    """
-
-    name: str
-    weight: IntArray
-    own: IntArray | None
-    bias: IntArray
+    name: str  # Layer of the netlist
+    weight: IntArray  # (neurons, inputs) int64
+    own: IntArray | None  # (neurons, neurons) int64; from itself
+    bias: IntArray  # (neurons,) int64, rounded
     threshold: int
     decay_u: int
     decay_v: int
-    shift: int
-    rounded: int
+    shift: int  # Power of two that everything was multiplied by
+    rounded: int  # Biases that are no whole steps
     threshold_rounded: bool
-    furthest: float
+    furthest: float  # Largest change of a bias, in weight steps of the netlist
 
     @property
     def synapses(self) -> int:
@@ -63,17 +50,13 @@ class Block:
 
 
 def blocks_for(network: IntegerNetwork) -> tuple[Block, ...]:
-    """Layers of the file.
-
-    Raises ModelError if the format cannot hold the network.
-    """
+    """Layers of the file; ModelError if the format cannot hold the network."""
     found = []
     for post, population in enumerate(network.populations):
         into = [projection for projection in network.projections if projection.post == post]
-        before = INPUT if not post else post - 1
-        if any(projection.pre not in (before, post) for projection in into) or network.readout.population + 1 != len(
-            network.populations
-        ):
+        before = post - 1 if post else INPUT
+        last = len(network.populations) - 1
+        if any(projection.pre not in (before, post) for projection in into) or network.readout.population != last:
             raise ModelError(
                 f"{population.name}: receives more than the layer before it; netx has layers in a row only"
             )
@@ -149,8 +132,8 @@ def tree_of(network: IntegerNetwork, blocks: Sequence[Block]) -> Tree:
             "shape": np.array([neurons]),
             "inFeatures": np.array(inputs),
             "outFeatures": np.array(neurons),
-            "weight": block.weight,
-            **({} if block.own is None else {"weight_rec": block.own}),
+            "weight": block.weight.astype(np.int16),
+            **({} if block.own is None else {"weight_rec": block.own.astype(np.int16)}),
             "bias": block.bias,
             "neuron": {
                 "type": "CUBA",
@@ -173,40 +156,24 @@ def tree_of(network: IntegerNetwork, blocks: Sequence[Block]) -> Tree:
 
 
 def file_bytes(tree: Tree) -> bytes:
-    """HDF5 of a tree; equal trees give equal bytes."""
-    import h5py  # slow to load, so only where it is used
-
-    content = io.BytesIO()
-    with h5py.File(content, "w") as file:
-        _fill(file, tree)
-    return content.getvalue()
+    """HDF5 of a tree as lava-dl writes it; equal trees give equal bytes."""
+    return hdf5_bytes(_texts_of_ten(tree))
 
 
-def _fill(group: Any, tree: Tree) -> None:
-    for name, value in tree.items():
-        if isinstance(value, dict):
-            _fill(group.create_group(name), value)
-        elif isinstance(value, str):
-            # neurons name their type by a single string, layers by a list of one
-            text = value.encode("ascii")
-            group.create_dataset(name, data=np.array(text if value == "CUBA" else [text], dtype="S10"))
-        else:
-            kind = np.int16 if name in ("weight", "weight_rec") else value.dtype
-            group.create_dataset(name, data=value.astype(kind), compression="gzip" if value.size > 1024 else None)
+def _texts_of_ten(tree: Tree) -> Tree:
+    """Neurons name their type by a single text of ten letters, layers by a list of one."""
+    return {
+        name: _texts_of_ten(value)
+        if isinstance(value, dict)
+        else np.array(value if value == "CUBA" else [value], "S10")
+        if isinstance(value, str)
+        else value
+        for name, value in tree.items()
+    }
 
 
 def moved_spikes(network: IntegerNetwork, blocks: Sequence[Block], events: BoolArray) -> dict[str, tuple[int, int]]:
-    """Spikes of each layer that the rounding moves, and how many the netlist has.
-
-    Parameters
-    ----------
-    network : IntegerNetwork
-        Of the netlist.
-    blocks : sequence of Block
-        What is written.
-    events : (samples, steps, channels) bool
-        Recordings.
-    """
+    """Spikes of each layer that the rounding moves, and how many the netlist has; events (samples, steps, channels)."""
     tree = tree_of(network, blocks)
     written, _ = integers_of(blocks_of(tree), tree)
     before, after = (run_integer(one, events).spikes for one in (network, written))

@@ -18,20 +18,13 @@ from spikeloom.compiler.types import FloatArray, IntArray
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SpikingNode:
-    """A spiking node in steps.
+    """A spiking node in steps."""
 
-    node: as the file has it.
-    value: what it gets, scaled to its membrane.
-    neurons: its numbers.
-    groups: its neurons by their decays.
-    recurrent: whether it is in a loop.
-    """
-
-    node: Node
-    value: Value
-    neurons: Neurons
-    groups: list[IntArray]
-    recurrent: bool
+    node: Node  # As the file has it
+    value: Value  # What it gets, scaled to its membrane
+    neurons: Neurons  # Its numbers
+    groups: list[IntArray]  # Its neurons by their decays
+    recurrent: bool  # Whether it is in a loop
 
 
 def stated_step(graph: Graph) -> float | None:
@@ -55,14 +48,7 @@ def _written(graph: Graph) -> float | None:
 
 
 def facts_of(graph: Graph, steps: Steps, spiking: Sequence[SpikingNode], sensor: str, clocked: Input) -> list[str]:
-    """Lines for people.
-
-    graph: the file.
-    steps: how it was read.
-    spiking: its layers.
-    sensor: what its input was taken for.
-    clocked: the network's input.
-    """
+    """Lines for people: how a file was read, its layers, and what its input (`sensor`, in words) was taken for."""
     version = printable(graph.version) or "of no version"
     facts = [f"NIR {version}, read in steps of {steps.dt:g} s ({steps.convention})", sensor]
     for one in spiking:

@@ -13,13 +13,13 @@ References
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.formats.hdf5 import Tree, read_hdf5
+from spikeloom.compiler.formats.hdf5 import Part, Tree, read_hdf5
 from spikeloom.compiler.formats.names import printable
 from spikeloom.compiler.types import FloatArray
 
@@ -33,36 +33,23 @@ NESTING = 8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Node:
-    """A node that is no graph.
+class Node(Part):
+    """A node that is no graph."""
 
-    name: with the names of the graphs that it is in, ``a.b``.
-    type: ``LIF`` …
-    values: its parameters.
-    metadata: what it says beside them.
-    """
-
-    name: str
-    type: str
-    values: Tree
-    metadata: Tree
+    name: str  # With the names of the graphs that it is in, ``a.b``
+    type: str  # ``LIF`` …
+    values: Tree  # Its parameters
+    metadata: Tree  # What it says beside them
 
     def __str__(self) -> str:
         return f"node {printable(self.name)} ({printable(self.type)})"
-
-    def fail(self, problem: str) -> ModelError:
-        """An error about this node, to be raised."""
-        return ModelError(f"{self}: {problem}")
 
     def has(self, key: str) -> bool:
         """Whether there is such a parameter."""
         return self.values.get(key) is not None
 
     def numbers(self, key: str) -> FloatArray:
-        """A parameter as float64, of its own shape.
-
-        Raises ModelError if there is none, or it is no finite numbers.
-        """
+        """A parameter as float64, of its own shape; ModelError if there is none, or it is no finite numbers."""
         found = self.values.get(key)
         if found is None:
             raise self.fail(f"has no {key}; {DAMAGED}")
@@ -75,10 +62,7 @@ class Node:
         return array
 
     def whole(self, key: str, length: int | None = None) -> tuple[int, ...]:
-        """A parameter as integers, flat; a single one is repeated to `length`.
-
-        Raises ModelError if it is something else.
-        """
+        """A parameter as integers, flat; a single one is repeated to `length`."""
         array = self.numbers(key).ravel()
         if not array.size or np.any(array != np.rint(array)) or np.any(np.abs(array) > 2**31):
             raise self.fail(f"{key} is no whole number; {DAMAGED}")
@@ -92,26 +76,16 @@ class Node:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Graph:
-    """Nodes by name, pairs of names, and what the file says about itself.
+    """Nodes by name, pairs of names, and what the file says about itself."""
 
-    nodes: no graphs; of Input and Output one each.
-    edges: tuple of (str, str); from, to.
-    version: of the format.
-    metadata: of the whole.
-    sha256: of the file.
-    """
-
-    nodes: Mapping[str, Node]
-    edges: tuple[tuple[str, str], ...]
-    version: str
-    metadata: Tree
-    sha256: str
+    nodes: Mapping[str, Node]  # No graphs
+    edges: tuple[tuple[str, str], ...]  # From, to
+    version: str  # Of the format
+    metadata: Tree  # Of the whole
+    sha256: str  # Of the file
 
     def one(self, kind: str) -> Node:
-        """The only node of a type.
-
-        Raises ModelError if there are none or several.
-        """
+        """The only node of a type; ModelError if there are none or several."""
         found = [node for node in self.nodes.values() if node.type == kind]
         if len(found) != 1:
             shown = f" ({', '.join(printable(node.name) for node in found)})" if found else ""
@@ -120,10 +94,7 @@ class Graph:
 
 
 def read_graph(path: Path) -> Graph:
-    """Read a file.
-
-    Raises ModelError if it is none, or inconsistent; without the path.
-    """
+    """Read a file; ModelError, without the path, if it is none or inconsistent."""
     return graph_of(*read_hdf5(path, "NIR file", DAMAGED))
 
 
@@ -176,7 +147,8 @@ def _flat(graph: Tree, above: str, nesting: int, left: list[int]) -> tuple[dict[
         if _type(entry) == GRAPH:
             inner, pairs = _flat(entry, full, nesting - 1, left)
             ends[name] = (_end(inner, full, INPUT_NODE), _end(inner, full, OUTPUT_NODE))
-            inner |= {end: _through(inner[end]) for end in ends[name]}
+            # Input and Output of a nested graph pass on what they get
+            inner |= {end: replace(inner[end], type="Identity", values={}) for end in ends[name]}
             nodes |= inner
             edges += pairs
         else:
@@ -200,11 +172,6 @@ def _end(inner: Mapping[str, Node], where: str, kind: str) -> str:
     if len(found) != 1:
         raise ModelError(f"graph {printable(where)} has {len(found)} nodes of type {kind}, one is allowed; {DAMAGED}")
     return found[0]
-
-
-def _through(node: Node) -> Node:
-    """Input or Output of a nested graph: passes on what it gets."""
-    return Node(name=node.name, type="Identity", values={}, metadata=node.metadata)
 
 
 def _pairs(graph: Tree, where: str) -> list[tuple[str, str]]:

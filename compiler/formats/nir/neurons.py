@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.fixedpoint import decay_registers, kept_shares
 from spikeloom.compiler.formats.nir.file import Node
 from spikeloom.compiler.types import FloatArray
@@ -34,20 +34,13 @@ SPIKING = ("CubaLIF", "IF", "LIF", "Threshold")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Steps:
-    """How time constants become decays.
+    """How time constants become decays."""
 
-    dt: seconds of a step.
-    convention: {"euler", "exponential"}; see the module.
-    """
-
-    dt: float
-    convention: str
+    dt: float  # Seconds of a step
+    convention: str  # {"euler", "exponential"}; see the module
 
     def keeps(self, node: Node, key: str, size: int, shape: tuple[int, ...]) -> FloatArray:
-        """Share that a step keeps, of a time constant; shape (size,).
-
-        Raises ModelError if there is none in this convention.
-        """
+        """Share that a step keeps, of a time constant, (size,); ModelError if there is none in this convention."""
         tau = spread(node, key, size, shape)
         if np.any(tau <= 0):
             raise node.fail(f"{key} is {tau.min():g}, allowed are numbers above 0; train it again")
@@ -87,10 +80,7 @@ def written_for(node: Node) -> float | None:
 
 
 def spread(node: Node, key: str, size: int, shape: tuple[int, ...]) -> FloatArray:
-    """A parameter for each neuron, (size,): one for all, one each, or one that broadcasts against `shape`.
-
-    Raises ModelError if it has another number.
-    """
+    """A parameter for each neuron, (size,): one for all, one each, or one that broadcasts against `shape`."""
     values = node.numbers(key)
     if values.size == 1:
         return np.full(size, float(values.ravel()[0]))
@@ -121,10 +111,7 @@ class Neurons:
 
 
 def neurons_of(node: Node, size: int, shape: tuple[int, ...], steps: Steps) -> Neurons:
-    """Neurons of a node of a type in ``SPIKING``.
-
-    Raises ModelError if its parameters are none of a neuron that the chip has.
-    """
+    """Neurons of a node of a type in ``SPIKING``; ModelError if the chip has no such neurons."""
     _require_reset(node)
     none = np.zeros(size)
     if node.type == "Threshold":
@@ -157,10 +144,7 @@ def _leaky(node: Node, size: int, shape: tuple[int, ...], steps: Steps) -> Neuro
 
 
 def one(node: Node, key: str, decay: FloatArray) -> float:
-    """The decay that all neurons of a node share.
-
-    Raises ModelError if they have several.
-    """
+    """The decay that all neurons of a node share; ModelError if they have several."""
     if np.ptp(decay) > TOLERANCE:
         raise node.fail(
             f"{key} is different from neuron to neuron, allowed is one for a layer's currents; use one node for each"
@@ -178,12 +162,9 @@ def _require_reset(node: Node) -> None:
 
 
 def require_steps(dt: float) -> None:
-    """Refuse a time step that is none.
-
-    Raises ModelError saying what is allowed.
-    """
+    """Refuse a time step that is none."""
     if not 0 < dt < math.inf:
-        raise ModelError(f"--dt {dt:g}: is no time step; give seconds above 0")
+        raise OptionError(f"--dt {dt:g}: is no time step; give seconds above 0")
 
 
 def decay_words(beta: float) -> str:

@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TypeVar
+from dataclasses import replace
 
 import numpy as np
 from scipy import sparse
 
-from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.kernels import Padding, block_diagonal, convolution, pooling, same_padding
 from spikeloom.compiler.formats.nir.file import Node
 from spikeloom.compiler.formats.nir.neurons import Steps, one, spread
-from spikeloom.compiler.formats.nir.values import Value, filtered, reshaped, scaled, shifted, through
+from spikeloom.compiler.formats.nir.values import Value, filtered, scaled, shifted, through
 from spikeloom.compiler.types import FloatArray
-
-Made = TypeVar("Made")
 
 DENSE_LIMIT = 2**28
 """Weights of a matrix that is written out once for each place of an axis."""
@@ -95,13 +92,12 @@ def _conv(node: Node, value: Value, _steps: Steps) -> Value:
             raise node.fail(f"is for inputs of {list(declared)}, it gets {list(shape[1:])}; export it again")
     stride, dilation = node.whole("stride", axes), node.whole("dilation", axes)
     padding, groups = _padding(node, kernel, dilation, stride), node.whole("groups", 1)[0]
-    matrix, out = _named(
-        node,
-        lambda: convolution(shape, weight, stride=stride, padding=padding, dilation=dilation, groups=groups),
-    )
-    bias = np.repeat(_each(node, "bias", out[0]), math.prod(out[1:])) if node.has("bias") else None
+    with node.named():
+        matrix, out = convolution(shape, weight, stride=stride, padding=padding, dilation=dilation, groups=groups)
     result = through(value, matrix, out)
-    return result if bias is None else shifted(result, bias)
+    if not node.has("bias"):
+        return result
+    return shifted(result, np.repeat(_each(node, "bias", out[0]), math.prod(out[1:])))
 
 
 def _pool(node: Node, value: Value, _steps: Steps) -> Value:
@@ -111,15 +107,9 @@ def _pool(node: Node, value: Value, _steps: Steps) -> Value:
     mean = node.type == "AvgPool2d"
     if max(kernel) > max(shape) + 2 * max(max(pair) for pair in padding):
         raise node.fail(f"has a window of {list(kernel)} for {list(shape[1:])} places; export it again")
-    matrix, out = _named(node, lambda: pooling(shape, kernel=kernel, stride=stride, padding=padding, mean=mean))
+    with node.named():
+        matrix, out = pooling(shape, kernel=kernel, stride=stride, padding=padding, mean=mean)
     return through(value, matrix, out)
-
-
-def _named(node: Node, make: Callable[[], Made]) -> Made:
-    try:
-        return make()
-    except ModelError as error:
-        raise node.fail(str(error)) from error
 
 
 def _flatten(node: Node, value: Value, _steps: Steps) -> Value:
@@ -133,7 +123,7 @@ def _flatten(node: Node, value: Value, _steps: Steps) -> Value:
             return value
         raise node.fail(f"flattens axes {first} to {last} of {list(value.shape)}; the shapes disagree, export it again")
     shape = value.shape
-    return reshaped(value, (*shape[:first], math.prod(shape[first : last + 1]), *shape[last + 1 :]))
+    return replace(value, shape=(*shape[:first], math.prod(shape[first : last + 1]), *shape[last + 1 :]))
 
 
 def _integrator(node: Node, value: Value, steps: Steps) -> Value:
@@ -144,7 +134,8 @@ def _integrator(node: Node, value: Value, steps: Steps) -> Value:
     drive = (1 - kept) * spread(node, "v_leak", value.size, value.shape)
     if not alpha:
         return shifted(scaled(value, gain), drive)
-    return _named(node, lambda: filtered(value, alpha, gain, drive))
+    with node.named():
+        return filtered(value, alpha, gain, drive)
 
 
 def _same(_node: Node, value: Value, _steps: Steps) -> Value:

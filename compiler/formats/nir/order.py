@@ -25,10 +25,7 @@ Late = Mapping[str, tuple[str, ...]]
 
 
 def loops(graph: Graph) -> Late:
-    """Recurrent nodes.
-
-    Raises ModelError if some feed each other in a circle that is no recurrent layer.
-    """
+    """Recurrent nodes; ModelError if some feed each other in a circle that is no recurrent layer."""
     every = set(graph.edges)
     found: dict[str, tuple[str, ...]] = {}
     for members in nx.strongly_connected_components(nx.DiGraph(graph.edges)):
@@ -60,10 +57,7 @@ def loops(graph: Graph) -> Late:
 
 
 def in_order(graph: Graph, late: Late) -> tuple[str, ...]:
-    """Names of the nodes, each after those that feed it, apart from what comes a step late.
-
-    Raises ModelError if some receive nothing at all.
-    """
+    """Names of the nodes, each after those that feed it, apart from what comes a step late."""
     received: dict[str, set[str]] = {name: set() for name in graph.nodes}
     for source, target in graph.edges:
         if source not in late.get(target, ()):

@@ -37,18 +37,12 @@ AXES, ELEMENTS = 8, 2**20
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class NirNetwork:
-    """A network, and what was found about the file that it is from.
+    """A network, and what was found about the file that it is from."""
 
-    network: float stage, in float64.
-    facts: what was read and what was assumed, for people.
-    sha256: of the file.
-    steps: how time constants were read.
-    """
-
-    network: Network
-    facts: tuple[str, ...]
-    sha256: str
-    steps: Steps
+    network: Network  # In float64
+    facts: tuple[str, ...]  # What was read and what was assumed, for people
+    sha256: str  # Of the file
+    steps: Steps  # How time constants were read
 
 
 def read_nir(
@@ -63,8 +57,6 @@ def read_nir(
 
     Parameters
     ----------
-    path : path
-        File.
     dt : float, optional
         Seconds of a time step; by default what the file says in its metadata, as those written here do.
     convention : {"euler", "exponential"}, optional
@@ -98,7 +90,7 @@ def network_of(
 ) -> NirNetwork:
     """Network of a graph that was read; parameters and errors as of :func:`read_nir`, without the path."""
     entry, end = graph.one("Input"), graph.one("Output")
-    shape = entry.whole("shape") if entry.values.get("shape") is not None else ()
+    shape = entry.whole("shape") if entry.has("shape") else ()
     if not shape or len(shape) > AXES or min(shape) < 1 or math.prod(shape) > ELEMENTS:
         raise entry.fail(f"has the shape {list(shape[:AXES])}, allowed are up to {ELEMENTS} values; export it again")
     sensor, positions, words = sensor_layout(shape, polarities=polarities, polarities_first=polarities_first)
@@ -132,7 +124,8 @@ def _walk(graph: Graph, steps: Steps, shape: tuple[int, ...]) -> tuple[list[Spik
                 raise node.fail("gets values from other nodes; remove these edges")
             values[name] = spikes_of(INPUT, shape)
             continue
-        value = _added(node, [values[source] for source in received[name] if source not in late.get(name, ())])
+        with node.named():
+            value = added([values[source] for source in received[name] if source not in late.get(name, ())])
         if node.type in SPIKING:
             values[name] = spikes_of(len(spiking), value.shape)
             spiking.append(_spiking(node, value, steps))
@@ -148,7 +141,8 @@ def _walk(graph: Graph, steps: Steps, shape: tuple[int, ...]) -> tuple[list[Spik
     for place, one in enumerate(spiking):
         name = one.node.name
         if name in late:
-            value = _added(one.node, [forward[name], *(values[source] for source in late[name])])
+            with one.node.named():
+                value = added([forward[name], *(values[source] for source in late[name])])
             spiking[place] = replace(_spiking(one.node, value, steps), recurrent=True)
             if len(one.groups) > 1:
                 raise one.node.fail(
@@ -158,25 +152,14 @@ def _walk(graph: Graph, steps: Steps, shape: tuple[int, ...]) -> tuple[list[Spik
     return spiking, result
 
 
-def _added(node: Node, values: Sequence[Value]) -> Value:
-    try:
-        return added(values)
-    except ModelError as error:
-        raise node.fail(str(error)) from error
-
-
 def _spiking(node: Node, value: Value, steps: Steps) -> SpikingNode:
     if not value.size:
         raise node.fail("has no neurons; export it again")
     neurons = neurons_of(node, value.size, value.shape, steps)
-    try:
-        own = (
-            filtered(value, neurons.alpha, neurons.gain, np.zeros(value.size))
-            if neurons.alpha
-            else scaled(value, neurons.gain)
-        )
-    except ModelError as error:
-        raise node.fail(str(error)) from error
+    own = scaled(value, neurons.gain)
+    if neurons.alpha:
+        with node.named():
+            own = filtered(value, neurons.alpha, neurons.gain, np.zeros(value.size))
     decays = np.round(neurons.beta / TOLERANCE).astype(np.int64)
     different = np.unique(decays)
     if len(different) > MOST_DECAYS:

@@ -16,20 +16,13 @@ from spikeloom.compiler.types import FloatArray
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Value:
-    """``f + bias`` with ``f <- alpha * f + (sum of terms) + held`` in every step.
+    """``f + bias`` with ``f <- alpha * f + (sum of terms) + held`` in every step."""
 
-    shape: of one step; its elements lie flat in C order.
-    terms: mapping of int to csr_array (size, neurons of the source); weights of the spikes of each source.
-    bias: (size,) float64; what is added past the filter.
-    alpha: share of the current that a step keeps; 0 without a filter.
-    held: (size,) float64; what flows into the filter in every step; zero without one.
-    """
-
-    shape: tuple[int, ...]
-    terms: Mapping[int, Sparse]
-    bias: FloatArray
-    alpha: float
-    held: FloatArray
+    shape: tuple[int, ...]  # Of one step; its elements lie flat in C order
+    terms: Mapping[int, Sparse]  # (size, neurons of the source); weights of the spikes of each source
+    bias: FloatArray  # (size,); what is added past the filter
+    alpha: float  # Share of the current that a step keeps; 0 without a filter
+    held: FloatArray  # (size,); what flows into the filter in every step; zero without one
 
     @property
     def size(self) -> int:
@@ -43,11 +36,6 @@ def spikes_of(source: int, shape: tuple[int, ...]) -> Value:
     nothing = np.zeros(size)
     own = sparse.csr_array(sparse.identity(size, format="csr"))
     return Value(shape=shape, terms={source: own}, bias=nothing, alpha=0.0, held=nothing)
-
-
-def reshaped(value: Value, shape: tuple[int, ...]) -> Value:
-    """The same elements in another shape."""
-    return replace(value, shape=shape)
 
 
 def scaled(value: Value, gain: FloatArray) -> Value:
@@ -69,10 +57,7 @@ def shifted(value: Value, bias: FloatArray) -> Value:
 
 
 def added(values: Sequence[Value]) -> Value:
-    """The sum of several, as a node with several edges gets.
-
-    Raises ModelError if their shapes or their filters differ.
-    """
+    """The sum of several, as a node with several edges gets; ModelError if their shapes or their filters differ."""
     first = values[0]
     if len(values) == 1:
         return first
@@ -98,7 +83,7 @@ def added(values: Sequence[Value]) -> Value:
 def filtered(value: Value, alpha: float, gain: FloatArray, drive: FloatArray) -> Value:
     """The state of a leaky integrator: ``f <- alpha * f + gain * value + drive``; `gain` and `drive` are (size,).
 
-    Raises ModelError if the value went through one before.
+    ModelError if the value went through one before.
     """
     if value.alpha:
         raise ModelError("filters a current that is filtered before; a neuron of the chip has one current")

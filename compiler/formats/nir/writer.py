@@ -15,16 +15,15 @@ Neurons that the chip leaves out are there and receive nothing.
 
 from __future__ import annotations
 
-import io
-from typing import Any
-
 import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler import lift
-from spikeloom.compiler.errors import ModelError, OptionError
+from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT
+from spikeloom.compiler.formats.hdf5 import Tree, hdf5_bytes
 from spikeloom.compiler.formats.names import plain_names
+from spikeloom.compiler.formats.nir.neurons import require_steps
 from spikeloom.compiler.ir import INPUT, IntegerNetwork, IntegerPopulation, Sparse
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import FORGETS
@@ -36,7 +35,6 @@ DENSE_LIMIT = 2**28
 """Weights of a matrix: NIR writes zeros out."""
 
 Float32 = npt.NDArray[np.float32]
-Params = dict[str, Any]
 
 
 def node_names(network: IntegerNetwork) -> tuple[str, ...]:
@@ -46,14 +44,7 @@ def node_names(network: IntegerNetwork) -> tuple[str, ...]:
 
 
 def export(netlist: Netlist, dt: float) -> bytes:
-    """Content of the file; equal netlists give equal bytes.
-
-    Parameters
-    ----------
-    netlist : Netlist
-        Compiled network.
-    dt : float
-        Seconds of a step.
+    """Content of the file, for steps of `dt` seconds; equal netlists give equal bytes.
 
     Raises
     ------
@@ -62,11 +53,10 @@ def export(netlist: Netlist, dt: float) -> bytes:
     OptionError
         If there is no such time step.
     """
-    if not 0 < dt < np.inf:
-        raise OptionError(f"--dt {dt:g}: is no time step; give seconds above 0")
+    require_steps(dt)
     network = lift(netlist)
     names = node_names(network)
-    nodes: dict[str, Params] = {"input": {"type": "Input", "shape": np.array([network.input.size])}}
+    nodes: dict[str, Tree] = {"input": {"type": "Input", "shape": np.array([network.input.size])}}
     edges: list[tuple[str, str]] = []
     for post, (population, name) in enumerate(zip(network.populations, names, strict=True)):
         _layer(network, post, population, name, names, dt, nodes, edges)
@@ -89,7 +79,7 @@ def _layer(
     name: str,
     names: tuple[str, ...],
     dt: float,
-    nodes: dict[str, Params],
+    nodes: dict[str, Tree],
     edges: list[tuple[str, str]],
 ) -> None:
     """Nodes and edges of one layer: its synapses from each source, its neurons."""
@@ -116,11 +106,11 @@ def _layer(
     nodes[name] = _neurons(population, bias, dt)
 
 
-def _neurons(population: IntegerPopulation, bias: npt.NDArray[np.float64], dt: float) -> Params:
+def _neurons(population: IntegerPopulation, bias: npt.NDArray[np.float64], dt: float) -> Tree:
     def each(value: float) -> Float32:
         return np.full(population.size, value, np.float32)
 
-    lost = population.decay_v / 4096
+    lost = 1 - population.realised_beta
     common = {"v_threshold": population.threshold.astype(np.float32), "v_reset": each(0)}
     if population.decay_u != FORGETS:
         if not lost:
@@ -128,7 +118,7 @@ def _neurons(population: IntegerPopulation, bias: npt.NDArray[np.float64], dt: f
                 f"{population.name}: keeps its whole membrane and has a current that outlasts its step, NIR's CubaLIF "
                 "always leaks; train with a decay below 1"
             )
-        drained = (population.decay_u + 1) / 4096
+        drained = 1 - population.realised_alpha
         return {
             "type": "CubaLIF",
             "tau_syn": each(dt / drained),
@@ -143,25 +133,7 @@ def _neurons(population: IntegerPopulation, bias: npt.NDArray[np.float64], dt: f
     return {"type": "LIF", "tau": each(dt / lost), "r": each(1 / lost), "v_leak": each(0), **common}
 
 
-def _file(nodes: dict[str, Params], edges: list[tuple[str, str]], dt: float) -> bytes:
-    import h5py  # slow to load, so only where it is used
-
-    content = io.BytesIO()
-    words = h5py.string_dtype()
-    with h5py.File(content, "w") as file:
-        file.create_dataset("version", data=VERSION, dtype=words)
-        graph = file.create_group("node")
-        graph.create_dataset("type", data="NIRGraph", dtype=words)
-        graph.create_dataset("edges", data=np.array(edges, dtype=object), dtype=words)
-        said = graph.create_group("metadata")
-        said.create_dataset("dt", data=dt)
-        said.create_dataset("writer", data="spikeloom", dtype=words)
-        group = graph.create_group("nodes")
-        for name, params in nodes.items():
-            node = group.create_group(name)
-            for key, value in params.items():
-                if isinstance(value, str):
-                    node.create_dataset(key, data=value, dtype=words)
-                else:
-                    node.create_dataset(key, data=value, compression="gzip" if value.size > 1024 else None)
-    return content.getvalue()
+def _file(nodes: dict[str, Tree], edges: list[tuple[str, str]], dt: float) -> bytes:
+    said = {"dt": np.array(dt), "writer": "spikeloom"}
+    graph = {"type": "NIRGraph", "edges": edges, "metadata": said, "nodes": nodes}
+    return hdf5_bytes({"version": VERSION, "node": graph})
