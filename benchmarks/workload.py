@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX, decay, decay_registers, encode_bias
+from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX, decay_registers, encode_bias
 from spikeloom.compiler.ir import INPUT, Input, IntegerNetwork, IntegerPopulation, IntegerProjection, Readout
 from spikeloom.compiler.passes.expand import expand_graph_convolution
 from spikeloom.compiler.targets.base import load_target
@@ -111,7 +111,7 @@ def recurrence(current: IntArray, threshold: IntArray | int) -> SpikeArray:
     spikes = np.zeros(current.shape, np.bool_)
     membrane = np.zeros(current[:, 0].shape, np.int64)
     for step in range(current.shape[1]):
-        membrane = decay(membrane, 4096 - 819) + current[:, step]
+        membrane = np.sign(membrane) * (np.abs(membrane) * 819 >> 12) + current[:, step]
         spikes[:, step] = membrane > threshold
         membrane[spikes[:, step]] = 0
     return spikes

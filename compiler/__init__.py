@@ -66,32 +66,20 @@ __all__ = [
 
 DEFAULT_TARGET = "loihi1"
 
-_PLACES = {
-    "GOALS": "options",
-    "MARGIN": "options",
-    "MAX_PLANES": "options",
-    "RANGES": "options",
-    "Compilation": "compilation",
-    "Netlist": "netlist",
-    "Options": "options",
-    "Recipe": "options",
-    "WidthPoint": "storage.width_search",
-    "WidthSearch": "storage.width_search",
-    "check_recipes": "options",
-    "check_widths": "storage.width_search",
-    "lay_out_again": "passes",
-    "layer_of": "storage.scales",
+_NAMES = {
+    "alike": "store_alike",
+    "compilation": "Compilation",
     "lift": "lift",
-    "read_netlist": "netlist_file",
-    "round_to_forms": "storage.quantize",
-    "rounded": "storage.scales",
-    "search_widths": "storage.width_search",
-    "store": "passes",
-    "store_alike": "alike",
-    "widths_front": "storage.width_search",
-    "without": "passes",
-    "write_netlist": "netlist_file",
+    "netlist": "Netlist",
+    "netlist_file": "read_netlist write_netlist",
+    "options": "GOALS MARGIN MAX_PLANES RANGES Options Recipe check_recipes",
+    "passes": "lay_out_again store without",
+    "storage.quantize": "round_to_forms",
+    "storage.scales": "layer_of rounded",
+    "storage.width_search": "WidthPoint WidthSearch check_widths search_widths widths_front",
 }
+_PLACES = {name: module for module, names in _NAMES.items() for name in names.split()}
+"""Module of the target that each public name is imported from when it is first used."""
 
 
 def __getattr__(name: str) -> Any:
@@ -121,7 +109,7 @@ def compile_network(
     target : str
         Chip.
     after : callable, optional
-        Called with the name of each pass of the target and the compilation as far as it is.
+        Called with the name of each pass and the compilation as far as it is.
 
     Raises
     ------

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler.dynamics import PLAIN, Dynamics
+from spikeloom.compiler.fixedpoint import frozen
 from spikeloom.compiler.ir import Form, Readout
 from spikeloom.compiler.systems import MLP, TACTILESGNET, Grid, in_order
 from spikeloom.compiler.types import IntArray
@@ -94,9 +95,7 @@ class Checkpoint:
 
 def layers_of(arrays: Mapping[str, npt.NDArray[Any]]) -> dict[str, Any]:
     """Fields of a :class:`Checkpoint` that hold its weights, from tensors by name; read-only copies."""
-    held = {name: np.array(array, np.float32, order="C") for name, array in arrays.items()}
-    for array in held.values():
-        array.flags.writeable = False
+    held = {name: frozen(np.array(array, np.float32, order="C")) for name, array in arrays.items()}
     stages = sorted(
         (name.removesuffix(".weight") for name in held if name.startswith("fc") and name.endswith(".weight")),
         key=lambda name: int(name[2:]),

@@ -4,10 +4,10 @@
 that outlasts its step. The bias goes to the membrane, past the current, and the reset leaves the current as it is.
 
 *Clocks.* K input channels beside those of the sensor. The k-th has an event in each of the steps
-``k * S … (k + 1) * S - 1``; after ``K * S`` steps there are none. A layer hears the one before it and nothing else, so
-each clock channel is relayed by a neuron of its own, one of K at the end of the first layer: its only synapse has
-twice the threshold, its bias is zero, so that it spikes when its channel has an event and at no other time. The first
-dense layer hears them: a bias that changes with time.
+``k * S … (k + 1) * S - 1``; after ``K * S`` steps there are none. A layer receives the one before it and nothing else,
+so each clock channel is relayed by a neuron of its own, one of K at the end of the first layer: its only synapse has
+twice the threshold, its bias is zero, so that it spikes when its channel has an event and at no other time. To the
+first dense layer they are a bias that changes with time.
 """
 
 from __future__ import annotations
@@ -66,16 +66,9 @@ def clocks_over(channels: int, steps: int) -> Clocks:
 
 
 def with_clocks(events: npt.NDArray[Any], clocks: Clocks) -> npt.NDArray[Any]:
-    """Recordings as the input channels of a network: those of the sensor, then its clocks.
+    """Recordings (samples, taxels, polarities, steps) as the input channels of a network, its clocks last.
 
-    Parameters
-    ----------
-    events : (samples, taxels, polarities, steps)
-        Zeros and ones.
-
-    Returns
-    -------
-    (samples, taxels * polarities + clocks, steps) of the same type
+    Gives (samples, taxels * polarities + clocks, steps) of the same type.
     """
     samples, taxels, polarities, steps = events.shape
     flat = events.reshape(samples, taxels * polarities, steps)
@@ -119,13 +112,7 @@ PLAIN = Dynamics()
 
 
 def dynamics_from_json(values: Mapping[str, Any], layers: int) -> Dynamics:
-    """Inverse of :meth:`Dynamics.to_json`, checked for a network of so many layers.
-
-    Raises
-    ------
-    KeyError, TypeError, ValueError
-        If they are no dynamics.
-    """
+    """Inverse of :meth:`Dynamics.to_json` for a network of so many layers; KeyError, TypeError, ValueError if none."""
     clocks = [values["clocks"][name] for name in ("channels", "steps")]
     if any(type(number) is not int for number in clocks):
         raise ValueError(f"clocks of {clocks}")

@@ -38,14 +38,8 @@ class NumericRangeError(SpikeloomError):
 class UnfinishedError(SpikeloomError):
     """Work of several parts ended without some of them: nothing is wrong with what the user gave; exit code 1.
 
-    Parameters
-    ----------
-    message : str
-        What is missing and what is kept.
-    results : mapping, optional
-        Of the parts that are there.
-    resume : tuple of str
-        Words to add to the command to go on.
+    The message says what is missing and what is kept; `results` are those of the other parts, `resume` the words to
+    add to the command to go on.
     """
 
     def __init__(self, message: str, results: Mapping[str, Any] | None = None, resume: tuple[str, ...] = ()) -> None:

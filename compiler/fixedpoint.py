@@ -1,7 +1,6 @@
-"""Integer arithmetic of the registers: decay, saturation, planes, bias encoding. Exact and small; int64 in, int64 out.
+"""How numbers are rounded to the registers: decays, planes of weights, biases. Exact and small; int64 out.
 
-Every rounding that a chip register performs is written here once, for arrays. (A machine's ``spec`` states the same
-rules a second time in plain Python integers, on purpose: the tests hold the two together.)
+What registers do with them from step to step stands in a machine's ``spec``.
 
 References
 ----------
@@ -49,39 +48,6 @@ ONE_STEP_SUM_MAX = ACCUMULATOR_MAX >> MEMBRANE_SHIFT
 """Largest sum of effective weights (mantissa times 2**exponent) that one step may bring: 32767."""
 
 
-def decay(x: IntArray, lost: IntArray | int) -> IntArray:
-    """Scale by ``(4096 - lost) / 4096``, rounding toward zero (magnitude floored).
-
-    Parameters
-    ----------
-    x : IntArray
-        Register values, any shape.
-    lost : IntArray or int
-        Share that is lost, in 1/4096, 0 to 4096; broadcasts against `x`.
-
-    Examples
-    --------
-    >>> decay(np.array([1, 5, 6, -5, -6, 64, -64, 3840, -1920, 8128, -8191, 8388607, -8388607]), 3277).tolist()
-    [0, 0, 1, 0, -1, 12, -12, 767, -383, 1625, -1637, 1677311, -1677311]
-    >>> decay(np.array([7, -7]), 0).tolist(), decay(np.array([7, -7]), 4096).tolist()
-    ([7, -7], [0, 0])
-    """
-    factor = 4096 - np.asarray(lost, np.int64)
-    kept: IntArray = np.right_shift(np.abs(x) * factor, DECAY_BITS)
-    return np.where(x < 0, -kept, kept)
-
-
-def saturate(x: IntArray, limit: int) -> IntArray:
-    """Clip to ``-limit … limit``.
-
-    Examples
-    --------
-    >>> saturate(np.array([8388607, 8388608, -8388609]), MEMBRANE_MAX).tolist()
-    [8388607, 8388607, -8388607]
-    """
-    return np.clip(x, -limit, limit)
-
-
 def round_half_even(x: FloatArray) -> IntArray:
     """Round to the nearest integer, ties to the even one.
 
@@ -98,11 +64,6 @@ def weight_step(bits: int) -> int:
 
     A mixed-sign format spends one bit on the sign and drops the least significant bits of a 9-bit span, so even
     8 bits only hold even mantissas.
-
-    Parameters
-    ----------
-    bits : int
-        Storage width, 2 to 8.
 
     Examples
     --------
@@ -171,12 +132,7 @@ def step_units(bits: int, exponents: tuple[int, ...]) -> float:
 def round_steps(weight: FloatArray, scale: FloatArray | float, bits: int, exponents: tuple[int, ...]) -> IntArray:
     """Round weights to whole steps of the finest plane and clip them to what the planes hold.
 
-    Parameters
-    ----------
-    weight : (...) float64
-        Real weights.
-    scale : (...) float64
-        Weight units per real unit; broadcasts against `weight`.
+    `scale`, which broadcasts against `weight`, is in weight units per real unit.
 
     Examples
     --------
@@ -209,22 +165,9 @@ def split_planes(steps: IntArray, bits: int, exponents: tuple[int, ...]) -> list
 
 
 def encode_bias(bias: FloatArray) -> tuple[IntArray, IntArray]:
-    """Round biases to mantissa and exponent, the smallest exponent that holds each.
+    """Round biases in membrane units (1/64 of a weight unit) to mantissa and exponent, the smallest that holds each.
 
-    Parameters
-    ----------
-    bias : FloatArray
-        Biases in membrane units (1/64 of a weight unit), any shape.
-
-    Returns
-    -------
-    mantissa, exponent : IntArray
-        ``mantissa * 2**exponent`` is the nearest value that the chip can hold.
-
-    Raises
-    ------
-    ValueError
-        If a magnitude exceeds ``4095 * 2**7``.
+    ``mantissa * 2**exponent`` is the nearest value that the chip can hold; ValueError beyond ``4095 * 2**7``.
 
     Examples
     --------
@@ -249,13 +192,9 @@ def frozen(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 def read_only(array: npt.ArrayLike) -> IntArray:
     """Copy to a read-only int64 array, as most fields of netlists are."""
-    copy = np.array(array, dtype=np.int64)
-    copy.flags.writeable = False
-    return copy
+    return frozen(np.array(array, dtype=np.int64))
 
 
 def read_only_float(array: npt.ArrayLike) -> FloatArray:
     """Copy to a read-only float64 array."""
-    copy = np.array(array, dtype=np.float64)
-    copy.flags.writeable = False
-    return copy
+    return frozen(np.array(array, dtype=np.float64))

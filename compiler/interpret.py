@@ -49,19 +49,7 @@ class Activity:
 
 
 def product(weight: Sparse, spikes: BoolArray, dtype: npt.DTypeLike) -> Floating:
-    """Synaptic sums of every step: ``spikes @ weight.T`` in `dtype`.
-
-    Parameters
-    ----------
-    weight : csr_array (n_post, n_pre)
-        Weights.
-    spikes : (samples, steps, n_pre) bool
-        Presynaptic spikes.
-
-    Returns
-    -------
-    (samples, steps, n_post) of `dtype`
-    """
+    """Synaptic sums of every step, (samples, steps, post) of `dtype`, from (samples, steps, pre) spikes."""
     samples, steps, n_pre = spikes.shape
     dense = weight.toarray().astype(dtype)
     sums: Floating = spikes.reshape(samples * steps, n_pre).astype(dtype) @ dense.T
@@ -92,7 +80,7 @@ def lasting_currents(sums: Floating, alpha: float) -> Floating:
 
 
 def step_late(spikes: BoolArray) -> BoolArray:
-    """Spikes (samples, steps, neurons) as their own population hears them: each in the step after.
+    """Spikes (samples, steps, neurons) as their own population receives them: each in the step after.
 
     Examples
     --------
@@ -191,19 +179,7 @@ def integer_recurrence(
 def run_float(
     network: Network, events: BoolArray, *, dtype: npt.DTypeLike = np.float64, membranes: bool = False
 ) -> Activity:
-    """Run the float stage.
-
-    Parameters
-    ----------
-    network : Network
-        Float stage.
-    events : (samples, steps, channels) bool
-        Input events.
-    dtype : float32 or float64
-        Arithmetic of the whole run.
-    membranes : bool
-        Keep the membranes too (8 bytes a neuron and step).
-    """
+    """Run the float stage on events (samples, steps, channels), in the arithmetic of `dtype`."""
 
     def layer(post: int, sums: Floating, own: Floating | None) -> tuple[BoolArray, Floating | None]:
         return float_recurrence(network.populations[post], sums, own=own, membranes=membranes)
@@ -215,7 +191,7 @@ def run_float(
 def run_integer(
     network: IntegerNetwork, events: BoolArray, *, membranes: bool = False, saturates: bool = True
 ) -> Activity:
-    """Run the integer stage, aligned with the data; parameters as :func:`run_float`, membranes in register values."""
+    """Run the integer stage, aligned with the data; membranes are register values."""
 
     def layer(post: int, sums: Floating, own: Floating | None) -> tuple[BoolArray, IntArray | None]:
         return integer_recurrence(network.populations[post], sums, own=own, membranes=membranes, saturates=saturates)
@@ -269,22 +245,12 @@ def _run(
 
 
 def channels_last(events: npt.NDArray[Any], clocks: Clocks = NO_CLOCKS) -> BoolArray:
-    """Reorder recordings (samples, taxels, polarities, steps) to the (samples, steps, channels) used here.
-
-    The clocks of the network that is to hear them come last.
-    """
+    """Recordings (samples, taxels, polarities, steps) as the (samples, steps, channels) used here, clocks last."""
     return np.ascontiguousarray(with_clocks(events, clocks).transpose(0, 2, 1)).astype(np.bool_)
 
 
 def cut(spikes: BoolArray, lengths: IntArray | None) -> BoolArray:
-    """Take away what a recording does after its own length, where it was filled up with silence.
-
-    Parameters
-    ----------
-    spikes : (samples, steps, neurons) bool
-        Of one population.
-    lengths : (samples,) int64, or None
-        Steps of each recording; None where all have `steps`.
+    """Take away spikes (samples, steps, neurons) after the end of each recording; None where all are equally long.
 
     Examples
     --------

@@ -187,12 +187,7 @@ class IntegerNetwork:
 
 
 def depths(network: Network | IntegerNetwork) -> tuple[int, ...]:
-    """Steps that each population lags behind the data: the longest path from the input, minus one.
-
-    Examples
-    --------
-    A population that listens to the input has depth 0, its listeners depth 1; what it hears of itself does not count.
-    """
+    """Steps that each population lags behind the data: the longest path from the input, loops aside, minus one."""
     found = [0] * len(network.populations)
     for post in range(len(network.populations)):
         sources = [projection.pre for projection in network.projections if projection.post == post]
@@ -201,9 +196,9 @@ def depths(network: Network | IntegerNetwork) -> tuple[int, ...]:
 
 
 def recurrent(network: Network | IntegerNetwork) -> tuple[str, ...]:
-    """Names of the populations that hear themselves."""
-    hears = {projection.post for projection in network.projections if projection.pre == projection.post}
-    return tuple(network.populations[post].name for post in sorted(hears))
+    """Names of the populations that receive their own spikes."""
+    loops = {projection.post for projection in network.projections if projection.pre == projection.post}
+    return tuple(network.populations[post].name for post in sorted(loops))
 
 
 def fan_in(network: Network | IntegerNetwork, post: int) -> IntArray:
@@ -235,10 +230,6 @@ def one_sided(projections: Iterable[IntegerProjection], neurons: int) -> tuple[I
     """Largest positive and negative synaptic sum that any input can bring to each neuron, as magnitudes, weight units.
 
     Planes count one by one, which covers every order of their arrival.
-
-    Returns
-    -------
-    positive, negative : (neurons,) int64
     """
     positive, negative = np.zeros((2, neurons), np.int64)
     for projection in projections:

@@ -43,11 +43,6 @@ def prove_ranges(network: IntegerNetwork) -> tuple[RangeProof, ...]:
     The accumulator is bounded by the positive and the negative weights of a neuron taken separately, which covers
     every order of arrival. A membrane is bounded above by its threshold (it is reset when it passes it) plus one
     step, and below by what the leak lets negative input add up to.
-
-    Returns
-    -------
-    tuple of RangeProof
-        One per population.
     """
     proofs = []
     for post, population in enumerate(network.populations):

@@ -29,6 +29,7 @@ from typing import Any
 
 import numpy as np
 
+from spikeloom.compiler.fixedpoint import frozen
 from spikeloom.compiler.types import FloatArray, IntArray, JsonObject
 
 TACTILESGNET, GRID_CNN, MLP, GCN = SYSTEMS = ("tactilesgnet", "grid-cnn", "mlp", "gcn")
@@ -81,21 +82,14 @@ class Grid:
 
 
 def grid_from_json(values: Mapping[str, Any]) -> Grid:
-    """Inverse of :meth:`Grid.to_json`.
-
-    Raises
-    ------
-    KeyError, TypeError, ValueError
-        If they are no grid.
-    """
+    """Inverse of :meth:`Grid.to_json`; KeyError, TypeError or ValueError if they are no grid."""
     sizes = [values[name] for name in ("rows", "columns", "stride", "padding")]
     cells = np.array(values["cells"], np.int64).reshape(-1, 2)
     if any(type(size) is not int or not 0 <= size <= SMALL_GRID for size in sizes) or 0 in sizes[:3]:
         raise ValueError(f"grid of {sizes}")
     if not len(cells) or cells.min() < 0 or np.any(cells >= sizes[:2]):
         raise ValueError("taxels outside the grid")
-    cells.flags.writeable = False
-    return Grid(rows=sizes[0], columns=sizes[1], stride=sizes[2], padding=sizes[3], cells=cells)
+    return Grid(rows=sizes[0], columns=sizes[1], stride=sizes[2], padding=sizes[3], cells=frozen(cells))
 
 
 def grid_over(cells: IntArray, *, stride: int, padding: int) -> Grid:

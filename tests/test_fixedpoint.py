@@ -1,3 +1,5 @@
+"""Rounding to registers: published values, exact fractions, nearest of the grid."""
+
 import re
 from fractions import Fraction
 
@@ -15,31 +17,17 @@ from spikeloom.compiler.fixedpoint import (
     MEMBRANE_SHIFT,
     ONE_STEP_SUM_MAX,
     THRESHOLD_MANTISSA_MAX,
-    decay,
     encode_bias,
     round_half_even,
     round_steps,
-    saturate,
     weight_step,
 )
+from spikeloom.runtime.machines.loihi1.spec import decayed
 
 # Published for decay_v = 3277, factor 819/4096.
-PUBLISHED = [
-    (1, 0),
-    (5, 0),
-    (6, 1),
-    (-5, 0),
-    (-6, -1),
-    (64, 12),
-    (-64, -12),
-    (3840, 767),
-    (-1920, -383),
-    (8128, 1625),
-    (-8191, -1637),
-    (8388607, 1677311),
-    (-8388607, -1677311),
-]
-BITS = (2, 3, 4, 5, 6, 8)
+PUBLISHED = {1: 0, 5: 0, 6: 1, 64: 12, 3840: 767, 1920: 383, 8128: 1625, 8191: 1637, 8388607: 1677311}
+LARGEST = {2: 128, 3: 192, 4: 224, 5: 240, 6: 248, 8: 254}
+"""Mantissa of each storage width."""
 
 
 def mantissas(weight, scale, bits):
@@ -54,57 +42,31 @@ def test_registers_have_their_published_widths():
     assert 64 * ONE_STEP_SUM_MAX <= ACCUMULATOR_MAX < 64 * (ONE_STEP_SUM_MAX + 1)
 
 
-@pytest.mark.parametrize(("before", "after"), PUBLISHED)
-def test_decay_of_beta_one_fifth_is_the_published_one(before, after):
-    assert decay(np.array([before]), 3277).tolist() == [after]
-    assert decay(np.array([4095, 4096, -4096, 8388607, -8388607]), 4095).tolist() == [0, 1, -1, 2047, -2047]
-
-
-@pytest.mark.parametrize(("lost", "expected"), [(0, [7, -7]), (1, [6, -6]), (4095, [0, 0]), (4096, [0, 0])])
-def test_decay_at_the_ends_of_its_register(lost, expected):
-    assert decay(np.array([7, -7]), lost).tolist() == expected
-
-
-def test_decay_broadcasts_a_decay_per_neuron():
-    assert decay(np.array([[100, -100], [64, 64]]), np.array([0, 3277])).tolist() == [[100, -19], [64, 12]]
+def test_decay_of_beta_one_fifth_is_the_published_one():
+    for before, after in PUBLISHED.items():
+        assert (decayed(before, 3277), decayed(-before, 3277)) == (after, -after)
 
 
 @given(st.integers(-(2**24), 2**24), st.integers(0, 4096))
 def test_decay_rounds_the_exact_product_toward_zero(x, lost):
-    exact = Fraction(x * (4096 - lost), 4096)
-    result = decay(np.array([x]), lost)
-    assert result.dtype == np.int64
-    assert result.tolist() == [int(exact)]  # int of a fraction truncates
-
-
-@pytest.mark.parametrize("limit", [MEMBRANE_MAX, 10])
-def test_saturate_at_the_limit_and_one_past_it(limit):
-    values = np.array([limit - 1, limit, limit + 1, -limit + 1, -limit, -limit - 1])
-    assert saturate(values, limit).tolist() == [limit - 1, limit, limit, -limit + 1, -limit, -limit]
+    assert decayed(x, lost) == int(Fraction(x * (4096 - lost), 4096))  # int of a fraction truncates
 
 
 def test_round_half_even_goes_to_the_even_neighbour():
     assert round_half_even(np.array([-1.5, -0.5, 0.5, 1.5, 2.5, 2.499, -2.501])).tolist() == [-2, 0, 0, 2, 2, 2, -3]
 
 
-@pytest.mark.parametrize(
-    ("bits", "step", "largest"),
-    [(2, 128, 128), (3, 64, 192), (4, 32, 224), (5, 16, 240), (6, 8, 248), (8, 2, 254)],
-)
-def test_each_width_has_its_step_and_largest_mantissa(bits, step, largest):
-    assert weight_step(bits) == step
-    ends = np.array([largest, largest + step / 2, largest + step, 1e6, -largest, -largest - step, -1e6])
-    assert mantissas(ends, 1.0, bits).tolist() == [largest] * 4 + [-largest] * 3
-
-
-@pytest.mark.parametrize("bits", BITS)
-def test_weights_at_half_a_step_and_just_beyond(bits):
+@pytest.mark.parametrize(("bits", "largest"), LARGEST.items())
+def test_weights_at_the_ends_of_each_width_and_half_a_step_off(bits, largest):
     step = weight_step(bits)
+    assert step == 2 ** (9 - bits)
+    ends = np.array([largest, largest + step / 2, largest + step, 1e6])
+    assert mantissas(ends, 1.0, bits).tolist() == [largest] * 4
     values = np.array([step / 2, -step / 2, step / 2 + 1e-6, -step / 2 - 1e-6])
     assert mantissas(values, 1.0, bits).tolist() == [0, 0, step, -step]
 
 
-@given(st.sampled_from(BITS), st.lists(st.floats(-3, 3), min_size=1, max_size=5), st.floats(0.1, 300))
+@given(st.sampled_from([*LARGEST]), st.lists(st.floats(-3, 3), min_size=1, max_size=5), st.floats(0.1, 300))
 def test_weights_are_the_nearest_of_their_grid_and_symmetric(bits, weights, scale):
     step, weight = weight_step(bits), np.array(weights)
     mantissa = mantissas(weight, scale, bits)
