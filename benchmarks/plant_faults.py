@@ -47,7 +47,7 @@ NUMERIC = {
     "runtime/costs": "yardsticks",
     "runtime/equivalence": "certainty certificates divergence float_engine levels rounding",
     "runtime/machines": "votes",
-    "runtime/machines/loihi1": "block_kernel blocks engine kernel segments spec timing timing_kernel",
+    "runtime/machines/loihi1": "block_kernel blocks engine kernel spec timing timing_kernel",
     "runtime/machines/loihi1/costs": "cost cumulative energy simple_times",
     "runtime/machines/truenorth": "cost engine kernel spec trace twins",
     "runtime/report": "intervals",

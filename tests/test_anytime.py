@@ -16,7 +16,7 @@ from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist, write_n
 from spikeloom.models.recordings.events import load_data
 from spikeloom.runtime import cli
 from spikeloom.runtime.machines.integer import integer_machine_of
-from spikeloom.runtime.machines.loihi1 import engine
+from spikeloom.runtime.machines.loihi1 import engine, kernel
 from spikeloom.runtime.machines.loihi1.costs import cost, cumulative, estimate
 from spikeloom.runtime.machines.loihi1.trace import Counts
 from spikeloom.runtime.machines.votes import class_counts, predictions
@@ -77,10 +77,11 @@ def test_all_figures_of_a_stopped_chip(spikeloom, place):
     assert report["decisions"] == predictions(netlist, full.counts.spikes).tolist()
     for rule in (report["rules"][0], report["rules"][6]):
         for i, ends in enumerate(rule["samples"]["chip_steps"]):
-            state = engine.start(stepped)
+            state = kernel.state_of(netlist)
             engine.advance(stepped, state, flat[i], length=STEPS, steps=ends)
+            updates = np.bincount(netlist.layer, state.updates)[None].astype(np.int64)
             counts = Counts(
-                **{name: getattr(state, name)[None] for name in ("inputs", "spikes", "updates", "saturations")}
+                inputs=state.inputs[None], spikes=state.spikes[None], updates=updates, saturations=0 * updates
             )
             assert rule["samples"]["decisions"][i] == predictions(netlist, counts.spikes)[0]
             found = cost.estimate(meter, counts, ends - netlist.max_depth)

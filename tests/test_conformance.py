@@ -9,7 +9,7 @@ import pytest
 from json_keys import KEYS
 from numpy.testing import assert_array_equal
 from random_crossbars import assert_same
-from random_netlists import assert_equal, by_checked_engine, by_engine, by_steps
+from random_netlists import assert_equal, by_engine, by_steps
 from test_cost import check as check_costs
 from test_onnx_engine import assert_as_specified
 from zoo import CROSSBARS, FLOAT, LAYERED, MAKERS, over, specimen
@@ -74,7 +74,7 @@ def test_every_kernel_is_the_specification(name):
     total = np.zeros(len(netlist.layers), int)
     for recording in channels(made):
         expected = spec.simulate(netlist, recording)
-        for simulate in (by_engine, by_steps, by_checked_engine):
+        for simulate in (by_engine, by_steps):
             assert_equal(simulate(netlist, recording), expected)
         total += [expected.counts.spikes[netlist.compartments_of(layer)].sum() for layer in range(len(total))]
     assert total.all(), "a layer is silent, so nothing is tested here"

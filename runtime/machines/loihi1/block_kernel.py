@@ -407,20 +407,6 @@ def _lowest(typing: Any, word: Any) -> Any:
 
 
 @_intrinsic
-def _spread(typing: Any, word: Any, out: Any, at: Any) -> Any:
-    """Write the bits of a word as 64 bytes."""
-    bits, flags = ir.VectorType(_BIT, LANES), ir.VectorType(ir.IntType(8), LANES)
-
-    def emit(context: Any, builder: Any, _signature: Any, values: Any) -> Any:
-        array = context.make_array(out)(context, builder, values[1]).data
-        place = builder.bitcast(builder.gep(array, [values[2]]), flags.as_pointer())
-        builder.store(builder.zext(builder.bitcast(values[0], bits), flags), place, align=1)
-        return context.get_dummy_value()
-
-    return types.void(types.uint64, out, types.int64), emit
-
-
-@_intrinsic
 def _gathered(typing: Any, flags: Any, at: Any) -> Any:
     """One word of 64 bytes: which are not zero."""
     kind = ir.VectorType(ir.IntType(8), LANES)
@@ -618,28 +604,11 @@ def _run_stages(
 
 
 @compiled
-def _unpack(blocks: Blocks, steps: int, words: AnyArray, out: AnyArray, inverse: Any) -> None:
-    """Write bits into a (chip steps, compartments) array; inverted, those of positions that hold a compartment."""
-    flat, row = out.reshape(-1), out.shape[1]
-    for s in range(blocks.stage.size - 1):
-        begin, end = blocks.stage[s], blocks.stage[s + 1]
-        for t in range(steps):
-            for block in range(begin, end):
-                left = words[steps * begin + t * (end - begin) + block - begin]
-                if inverse:
-                    left = ~left & blocks.held[block]
-                if blocks.whole[block] >= 0:
-                    _spread(left, flat, (t + blocks.depth[block]) * row + blocks.whole[block])
-                    continue
-                while left:
-                    position = block * LANES + _lowest(left)
-                    out[t + blocks.depth[block], blocks.compartment[position]] = True
-                    left &= left - np.uint64(1)
+def _pack_compartments(blocks: Blocks, steps: int, words: AnyArray, out: AnyArray, inverse: Any) -> None:
+    """Write bits into a (chip steps, words) array, compartment c at bit c % 64 of word c // 64.
 
-
-@compiled
-def _pack_spikes(blocks: Blocks, steps: int, words: AnyArray, out: AnyArray) -> None:
-    """Write bits into a (chip steps, words) array, compartment c at bit c % 64 of word c // 64."""
+    Inverted, those of positions that hold a compartment.
+    """
     n_words = out.shape[1]
     flat = out.reshape(-1)
     for s in range(blocks.stage.size - 1):
@@ -647,6 +616,8 @@ def _pack_spikes(blocks: Blocks, steps: int, words: AnyArray, out: AnyArray) -> 
         for t in range(steps):
             for block in range(begin, end):
                 left = words[steps * begin + t * (end - begin) + block - begin]
+                if inverse:
+                    left = ~left & blocks.held[block]
                 row = (t + blocks.depth[block]) * n_words
                 if blocks.whole[block] >= 0:
                     to, by = row + (blocks.whole[block] >> 6), np.uint64(blocks.whole[block] & 63)
@@ -696,31 +667,14 @@ def run_recordings(
     updated: AnyArray,
     charges: ChargeRows,
     charged: IntArray,
-    packed: AnyArray,
     keep_u: AnyArray | None,
 ) -> None:
-    """Run some recordings.
+    """Run some recordings: `events` (recordings, channels, columns) uint8, not zero where there is one.
 
-    Parameters
-    ----------
-    blocks : Blocks
-        The network.
-    events : (recordings, channels, columns) uint8
-        Any value but zero is an event.
-    lengths : (recordings,) int64
-        Data steps of each.
-    inputs, spikes, updates : (recordings, channels or compartments or layers) int64
-        Zeros; filled with counts, see :class:`trace.Counts`.
-    fired, membranes, updated : (recordings, chip steps, compartments) bool, int32, bool
-        Zeros; filled, see :class:`trace.Trace`. No recordings where it is not wanted.
-    charges : ChargeRows
-        What events add to the sums of each chip step.
-    charged : (recordings, chip steps * sums) int64
-        Zeros; filled with these sums.
-    packed : (recordings, chip steps, words) uint64
-        Zeros; filled, see :class:`trace.Trace`. No recordings where it is not wanted.
-    keep_u : (blocks,) uint32, or None
-        That of the blocks, where some current outlasts its step: other networks do without the code for it.
+    Filled, from zeros, are the counts `inputs`, `spikes`, `updates`; `fired` and `updated` (recordings, chip steps,
+    words) uint64 and `membranes` (recordings, chip steps, compartments) int32, or no recordings of what is not wanted;
+    and `charged` (recordings, chip steps * sums). `keep_u` is that of the blocks where some current outlasts its step:
+    other networks do without the code for it.
     """
     n_words, n_blocks = (events.shape[1] + LANES - 1) // LANES, blocks.keep.size
     for r in range(events.shape[0]):
@@ -752,11 +706,9 @@ def run_recordings(
                 if blocks.restful[block]:
                     worked -= _count_idle(blocks, block, s, steps, scratch.idle)
                 updates[r, blocks.layer[block]] += worked
-        if packed.shape[0]:
-            _pack_spikes(blocks, steps, scratch.raster, packed[r])
         if fired.shape[0]:
-            _unpack(blocks, steps, scratch.raster, fired[r], False)
+            _pack_compartments(blocks, steps, scratch.raster, fired[r], False)
         if updated.shape[0]:
-            _unpack(blocks, steps, scratch.idle, updated[r], True)
+            _pack_compartments(blocks, steps, scratch.idle, updated[r], True)
         if membranes.shape[0]:
             _copy_membranes(blocks, steps, scratch.membranes, membranes[r])

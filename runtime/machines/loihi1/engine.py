@@ -14,7 +14,6 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -24,8 +23,7 @@ from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.types import BoolArray, IntArray
 from spikeloom.runtime.machines.loihi1.block_kernel import Blocks, ChargeRows, run_recordings
 from spikeloom.runtime.machines.loihi1.blocks import charge_rows, lay_out_blocks
-from spikeloom.runtime.machines.loihi1.kernel import State, Tables, chip_steps
-from spikeloom.runtime.machines.loihi1.segments import lay_out_segments, padded
+from spikeloom.runtime.machines.loihi1.kernel import State, Tables, chip_steps, state_of, tables_of
 from spikeloom.runtime.machines.loihi1.trace import (
     REGISTER_LIMITS,
     Charges,
@@ -35,6 +33,7 @@ from spikeloom.runtime.machines.loihi1.trace import (
     check_channels,
     pack,
     range_error,
+    unpack,
 )
 
 EventArray = npt.NDArray[np.uint8 | np.bool_]
@@ -45,83 +44,34 @@ PART = 4
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Engine:
-    """A netlist prepared for the kernel by :func:`prepare`; holds no state and can be shared by threads.
+    """A netlist prepared for a kernel by :func:`prepare`; holds no state and can be shared by threads.
 
-    The kernel of layers reads `blocks` and `rows`, that of steps `tables`, `negative` (packed magnitudes of negative
-    weights; None where no register can overflow) and `charges`, what events add to sums of each chip step. A recording
-    takes `drain` chip steps beyond its data steps.
+    The kernel of layers reads `blocks` and `rows`, that of steps `tables` and `charges`, what events add to the
+    sums of each chip step. A recording takes `drain` chip steps beyond its data steps.
     """
 
     netlist: Netlist
     blocks: Blocks | None
+    rows: ChargeRows | None
     tables: Tables | None
-    negative: npt.NDArray[Any] | None
     drain: int
     charges: Charges | None
-    rows: ChargeRows | None
 
 
-def prepare(
-    netlist: Netlist,
-    *,
-    stepwise: bool = False,
-    checked: bool = False,
-    gated: bool = True,
-    charges: Charges | None = None,
-) -> Engine:
+def prepare(netlist: Netlist, *, stepwise: bool = False, gated: bool = True, charges: Charges | None = None) -> Engine:
     """Lay a netlist out for a kernel.
 
-    Parameters
-    ----------
-    netlist : Netlist
-        The placed network.
-    stepwise : bool
-        For :func:`advance`: use the kernel of steps even where that of layers would do.
-    checked : bool
-        Check registers in every step even where it is proven that they hold any input; so in steps.
-    gated : bool
-        Whether a layer integrates in its window only, see :func:`spec.simulate`; in steps if not.
-    charges : Charges, optional
-        What events add to the sums of each chip step that a trace shall hold.
+    `stepwise` is for :func:`advance`: the kernel of steps even where that of layers would do; it is also taken if not
+    `gated`, see :func:`spec.simulate`. `charges` are what events add to the sums of each chip step in a trace.
     """
-    blocks = lay_out_blocks(netlist) if gated and not checked and not stepwise else None
-    drain = netlist.max_depth if gated else 0
-    tables, negative, rows = None, None, None
-    if blocks is None:
-        tables, negative = lay_out_segments(netlist, checked=checked, gated=gated)
-    else:
-        rows = charge_rows(netlist, blocks, charges)
+    blocks = lay_out_blocks(netlist) if gated and not stepwise else None
     return Engine(
-        netlist=netlist, blocks=blocks, tables=tables, negative=negative, drain=drain, charges=charges, rows=rows
-    )
-
-
-def tables_of(engine: Engine) -> Tables:
-    """Tables of an engine that was prepared for single steps."""
-    assert engine.tables is not None, "single steps need prepare(netlist, stepwise=True)"
-    return engine.tables
-
-
-def start(engine: Engine) -> State:
-    """State of a chip before the first chip step of a recording."""
-    netlist = engine.netlist
-    size = padded(netlist.n_compartments)
-    scratch = 0 if engine.negative is None else size
-    return State(
-        clock=np.zeros(2, np.int64),
-        fired=np.zeros(size + 1, np.int64),
-        current=np.zeros(size, np.int32),
-        membrane=np.zeros(size, np.int32),
-        total=np.zeros(size, np.int32),
-        positive=np.zeros(scratch, tables_of(engine).weight.dtype),
-        negative=np.zeros(scratch, tables_of(engine).weight.dtype),
-        flags=np.zeros(size, np.uint8),
-        worked=np.zeros(size, np.uint8),
-        active=np.zeros(netlist.n_inputs + size + 1, np.int64),
-        inputs=np.zeros(netlist.n_inputs, np.int64),
-        spikes=np.zeros(netlist.n_compartments, np.int64),
-        updates=np.zeros(len(netlist.layers), np.int64),
-        saturations=np.zeros(len(netlist.layers), np.int64),
+        netlist=netlist,
+        blocks=blocks,
+        rows=None if blocks is None else charge_rows(netlist, blocks, charges),
+        tables=tables_of(netlist, gated=gated) if blocks is None else None,
+        drain=netlist.max_depth if gated else 0,
+        charges=charges,
     )
 
 
@@ -143,7 +93,7 @@ def advance(
     engine : Engine
         The network, prepared for single steps.
     state : State
-        Changed in place. After an error it is of no further use.
+        Of :func:`kernel.state_of`; changed in place. After an error it is of no further use.
     events : (n_inputs, columns) uint8 or bool
         Events of the data steps from ``state.clock[0]`` on; steps beyond the last column have none.
     length : int
@@ -151,7 +101,7 @@ def advance(
     steps : int, optional
         How many chip steps to run; by default one per column.
     spikes, membranes, updated : (steps, compartments), optional
-        Zeroed arrays to fill, see :class:`trace.Trace`.
+        Arrays to fill, see :class:`trace.Trace`.
 
     Raises
     ------
@@ -161,14 +111,13 @@ def advance(
         As :func:`spec.simulate` does, with the same message.
     """
     check_channels(engine.netlist, events.shape[0])
-    steps = events.shape[1] if steps is None else steps
+    assert engine.tables is not None, "single steps need prepare(netlist, stepwise=True)"
     n = engine.netlist.n_compartments
     step, compartment, register, value = chip_steps(
-        tables_of(engine),
-        engine.negative,
+        engine.tables,
         state,
         np.ascontiguousarray(events != 0).view(np.uint8),
-        steps,
+        events.shape[1] if steps is None else steps,
         length,
         np.zeros((0, n), np.bool_) if spikes is None else spikes,
         np.zeros((0, n), np.int32) if membranes is None else membranes,
@@ -227,9 +176,8 @@ def simulate(
     check_channels(netlist, events.shape[1])
     recordings, _, length = events.shape
     shape = (recordings, length + engine.drain, netlist.n_compartments)
-    rows, charges = engine.rows, engine.charges
-    sums = 0 if charges is None else charges.spikes.shape[1]
-    charged = np.zeros((*shape[:2], sums if rows is None else rows.width), np.int64)
+    sums = 0 if engine.charges is None else engine.charges.spikes.shape[1]
+    charged = np.zeros((*shape[:2], sums if engine.rows is None else engine.rows.width), np.int64)
     trace = Trace(
         counts=Counts(
             inputs=np.zeros((recordings, netlist.n_inputs), np.int64),
@@ -240,21 +188,22 @@ def simulate(
         spikes=np.zeros(shape, np.bool_) if spikes else None,
         membranes=np.zeros(shape, np.int32) if membranes else None,
         updated=np.zeros(shape, np.bool_) if updated else None,
-        charged=None if charges is None else charged[..., :sums],
+        charged=None if engine.charges is None else charged[..., :sums],
         packed=np.zeros((*shape[:2], -(-shape[2] // 64)), np.uint64) if packed else None,
     )
     ends = np.full(recordings, length) if lengths is None else np.asarray(lengths, np.int64)
+    size = PART
+    if engine.blocks is None:
+        size = 1
+    else:
+        events = np.ascontiguousarray(events)
 
     def run(part: slice) -> None:
-        if engine.blocks is not None and rows is not None:
-            _run_layers(engine.blocks, rows, events[part], ends[part], trace, charged, part)
+        if engine.blocks is None:
+            _run_steps(engine, events[part.start], int(ends[part.start]), trace, part.start)
         else:
-            for index in range(part.start, part.stop):
-                _run_steps(engine, events[index], int(ends[index]), trace, index)
+            _run_layers(engine, events[part], ends[part], trace, charged, part)
 
-    if engine.blocks is not None:
-        events = np.ascontiguousarray(events)
-    size = 1 if engine.blocks is None else PART
     parts = [slice(i, min(i + size, recordings)) for i in range(0, recordings, size)]
     workers = min(threads or os.cpu_count() or 1, len(parts))
     with ThreadPoolExecutor(workers) if workers > 1 else nullcontext() as pool:
@@ -265,10 +214,16 @@ def simulate(
 
 
 def _run_layers(
-    blocks: Blocks, rows: ChargeRows, events: EventArray, ends: IntArray, trace: Trace, charged: IntArray, part: slice
+    engine: Engine, events: EventArray, ends: IntArray, trace: Trace, charged: IntArray, part: slice
 ) -> None:
     """Run some recordings layer after layer; `part` is where they belong in the trace."""
-    nothing = (0, 0, 0)
+    blocks, rows, nothing = engine.blocks, engine.rows, (0, 0, 0)
+    assert blocks is not None, "laid out for the kernel of steps"
+    assert rows is not None, "laid out with the blocks"
+    steps, n = len(charged[0]) if len(charged) else 0, engine.netlist.n_compartments
+    words = len(events), steps, -(-n // 64)
+    spikes = np.zeros(words, np.uint64) if trace.packed is None else trace.packed[part]
+    updated = np.zeros(words if trace.updated is not None else nothing, np.uint64)
     run_recordings(
         blocks,
         events.view(np.uint8),
@@ -276,26 +231,25 @@ def _run_layers(
         trace.counts.inputs[part],
         trace.counts.spikes[part],
         trace.counts.updates[part],
-        np.zeros(nothing, np.bool_) if trace.spikes is None else trace.spikes[part],
+        spikes if trace.spikes is not None or trace.packed is not None else spikes[:0],
         np.zeros(nothing, np.int32) if trace.membranes is None else trace.membranes[part],
-        np.zeros(nothing, np.bool_) if trace.updated is None else trace.updated[part],
+        updated,
         rows,
         charged[part].reshape(len(events), -1),
-        np.zeros(nothing, np.uint64) if trace.packed is None else trace.packed[part],
         blocks.keep_u if blocks.keep_u.any() else None,
     )
+    if trace.spikes is not None:
+        trace.spikes[part] = unpack(spikes, n)
+    if trace.updated is not None:
+        trace.updated[part] = unpack(updated, n)
 
 
 def _run_steps(engine: Engine, events: EventArray, length: int, trace: Trace, index: int) -> None:
     """Run one recording step after step; `index` is its place in the trace."""
-    state, window, charges = start(engine), length + engine.drain, engine.charges
-    fired = None if trace.spikes is None else trace.spikes[index, :window]
-    worked = None if trace.updated is None else trace.updated[index, :window]
-    size = (window, engine.netlist.n_compartments)
-    if fired is None and (charges is not None or trace.packed is not None):
-        fired = np.zeros(size, np.bool_)
-    if worked is None and charges is not None:
-        worked = np.zeros(size, np.bool_)
+    netlist, charges, window = engine.netlist, engine.charges, length + engine.drain
+    state, size = state_of(netlist), (window, netlist.n_compartments)
+    fired = np.zeros(size, np.bool_) if trace.spikes is None else trace.spikes[index, :window]
+    worked = np.zeros(size, np.bool_) if trace.updated is None else trace.updated[index, :window]
     try:
         advance(
             engine,
@@ -312,11 +266,11 @@ def _run_steps(engine: Engine, events: EventArray, length: int, trace: Trace, in
         raise
     trace.counts.inputs[index] = state.inputs
     trace.counts.spikes[index] = state.spikes
-    trace.counts.updates[index] = state.updates
-    trace.counts.saturations[index] = state.saturations
-    if trace.packed is not None and fired is not None:
+    np.add.at(trace.counts.updates[index], netlist.layer, state.updates)
+    np.add.at(trace.counts.saturations[index], netlist.layer, state.saturations)
+    if trace.packed is not None:
         trace.packed[index, :window] = pack(fired)
-    if charges is not None and trace.charged is not None and fired is not None and worked is not None:
+    if charges is not None and trace.charged is not None:
         # float64 products of integers below 2**53 are exact
         found = fired.astype(np.float64) @ charges.spikes + worked.astype(np.float64) @ charges.updates
         found[:length] += (events[:, :length] != 0).T.astype(np.float64) @ charges.channels

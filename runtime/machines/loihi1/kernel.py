@@ -1,20 +1,10 @@
-"""The chip step of :mod:`loihi1.spec`, compiled with numba; :mod:`loihi1.engine` prepares what it reads.
+"""The chip step of :mod:`loihi1.spec`, compiled with numba: any network, any number of chip steps at a time.
 
-*Rows.* The synapses of a source are a few dense segments of positions, zeros included: delivering a spike is a
-handful of vector additions. Sources with the same segments have the same "shape"; four such neighbours are delivered
-at once.
-
-*Packing.* A row entry is ``weight << shift | 1`` for a synapse, so that one addition also counts arrivals: the low
-bits of an accumulator say whether any synapse reached the compartment, which the count of neuron updates needs.
-
-*Runs.* The compartments of a layer that follow each other and share decays are one vector loop.
+*Arrivals.* Each compartment has two sums, of positive and of negative weights. A synapse adds ``magnitude << 24 | 1`` to
+one of them, so that the low bits say whether anything arrived at all, which the count of neuron updates needs.
 
 *Decay in 32 bits.* With ``m = 4096 a + b``, ``floor(m f / 4096) = a f + floor(b f / 4096)``; for ``m < 2**23`` and
 ``f <= 4096`` nothing exceeds 2**24.
-
-*Specialisations.* Without `negative` weights no register can overflow, net weights add up and nothing is checked; with
-them positive and negative weights add up apart and every step is checked. Sums are kept in 64 bits where all synapses
-at once would not fit into 32.
 """
 
 from __future__ import annotations
@@ -27,63 +17,96 @@ import numpy.typing as npt
 from numba import njit
 
 from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.types import IntArray
 
 AnyArray = npt.NDArray[Any]
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-FOLDED_SHIFT = 1
-"""Shift of the accumulator that the checked kernel hands to the sweep."""
+
+ARRIVAL_BITS = 24
+"""Bits of a sum that count synapses."""
+
+SUM_MAX = ACCUMULATOR_MAX >> MEMBRANE_SHIFT
+"""Largest synaptic sum that the accumulator holds, in weight units."""
 
 
 class Tables(NamedTuple):
     """A netlist as the kernel reads it; nothing in here changes."""
 
-    # shape, base: (sources,) int64; shape of each source's row, and where its entries begin in `weight`
-    shape: IntArray
-    base: IntArray
-    first: IntArray  # (shapes + 1,) int64; bounds of each shape in the segment arrays
-    # start, stop, offset: (segments,) int64; positions of a segment, and where its entries begin within a row
-    start: IntArray
-    stop: IntArray
-    offset: IntArray
-    # (entries,) int32 or int64; packed net weights; where registers are checked, packed positive weights
-    weight: AnyArray
-    shift: np.int32  # Bits that count arrivals
-    run_start: IntArray  # (runs + 1,) int64; bounds of the runs in positions
-    # run_layer, run_depth: (runs,) int64; layer of a run and its depth
-    run_layer: IntArray
-    run_depth: IntArray
-    # keep_u, keep_v: (runs,) int32; what current and membrane keep in a step, in 1/4096
+    first: IntArray  # (sources + 1,) int64; bounds of each source, channels before compartments, in the synapses
+    # sum_of, entry: (synapses,) uint32, int64; the sum that a synapse adds to, and what: that of the positive weights of
+    # compartment c is 2 * c, that of the negative ones follows
+    sum_of: AnyArray
+    entry: IntArray
+    depth: AnyArray  # (compartments,) int32; of the layer of each, or zero where no window holds it at rest
+    # keep_u, keep_v, threshold, bias: (compartments,) int32; decays in 1/4096, the others in membrane units
     keep_u: AnyArray
     keep_v: AnyArray
-    # threshold, bias: (padded positions,) int32; in membrane units
     threshold: AnyArray
     bias: AnyArray
-    compartment: IntArray  # (positions,) int64; compartment id of each position
 
 
 class State(NamedTuple):
-    """Registers of a chip between two steps, and what was counted so far; changed in place by :func:`advance`."""
+    """Registers of a chip between two steps, and what was counted so far; changed in place by :func:`chip_steps`."""
 
     clock: IntArray  # (2,) int64; next chip step; number of compartments that spiked in the last one
-    fired: IntArray  # Sources that spiked in the last step, ``clock[1]`` of them
-    # current, membrane: (padded positions,) int32; the two registers of each position, after any reset
+    fired: IntArray  # Compartments that spiked in the last step, ``clock[1]`` of them, ascending
+    # current, membrane: (compartments,) int32; the two registers, after any reset
     current: AnyArray
     membrane: AnyArray
-    # total, positive, negative, flags, worked, active: Scratch of one step; `flags` and `worked` tell who spiked and
-    # who had work to do
-    total: AnyArray
-    positive: AnyArray
-    negative: AnyArray
-    flags: AnyArray
-    worked: AnyArray
+    # active, sums, integrates, worked, flags: Scratch of one step
     active: IntArray
-    # inputs, spikes, updates, saturations: See :class:`trace.Counts`
-    inputs: IntArray
+    sums: IntArray
+    integrates: AnyArray
+    worked: AnyArray
+    flags: AnyArray
+    inputs: IntArray  # (channels,) int64; events so far
+    # spikes, updates, saturations: (compartments,) int64; counts so far, see :class:`trace.Counts`
     spikes: IntArray
     updates: IntArray
     saturations: IntArray
+
+
+def tables_of(netlist: Netlist, *, gated: bool) -> Tables:
+    """Lay a netlist out for the kernel."""
+    source = netlist.axon_source[netlist.axon_of_synapse()]
+    order = np.argsort(source, kind="stable")
+    weight = netlist.effective_weight()[order]
+    depth = np.array([layer.depth if gated else 0 for layer in netlist.layers], np.int32)
+    return Tables(
+        first=np.searchsorted(source[order], np.arange(netlist.n_inputs + netlist.n_compartments + 1)),
+        sum_of=(2 * netlist.synapse_compartment()[order] + (weight < 0)).astype(np.uint32),
+        entry=(np.abs(weight) << ARRIVAL_BITS) + 1,
+        depth=depth[netlist.layer],
+        keep_u=(2**DECAY_BITS - 1 - netlist.decay_u).astype(np.int32),
+        keep_v=(2**DECAY_BITS - netlist.decay_v).astype(np.int32),
+        threshold=(netlist.threshold << MEMBRANE_SHIFT).astype(np.int32),
+        bias=(netlist.bias_mantissa << netlist.bias_exponent).astype(np.int32),
+    )
+
+
+def state_of(netlist: Netlist) -> State:
+    """State of a chip before the first chip step of a recording."""
+    n, channels = netlist.n_compartments, netlist.n_inputs
+    current, membrane = np.zeros((2, n), np.int32)
+    spikes, updates, saturations = np.zeros((3, n), np.int64)
+    integrates, worked, flags = np.zeros((3, n), np.bool_)
+    return State(
+        clock=np.zeros(2, np.int64),
+        fired=np.zeros(n + 1, np.int64),
+        current=current,
+        membrane=membrane,
+        active=np.zeros(channels + n + 1, np.int64),
+        sums=np.zeros(2 * n, np.int64),
+        integrates=integrates,
+        worked=worked,
+        flags=flags,
+        inputs=np.zeros(channels, np.int64),
+        spikes=spikes,
+        updates=updates,
+        saturations=saturations,
+    )
 
 
 def compiled(function: Function) -> Function:
@@ -110,13 +133,7 @@ def _kept(x: Any, factor: Any) -> Any:
 
 
 @compiled
-def _is_open(tables: Tables, run: int, step: int, length: int) -> Any:
-    """Whether a run integrates in this chip step."""
-    return 0 <= step - tables.run_depth[run] < length
-
-
-@compiled
-def _list_sources(state: State, events: AnyArray, t: int, length: int) -> int:
+def _list_sources(state: State, events: AnyArray, t: int, length: int) -> Any:
     """List the channels with an event in column `t` and the compartments that spiked one step ago."""
     n = 0
     if state.clock[0] < length and t < events.shape[1]:
@@ -124,183 +141,98 @@ def _list_sources(state: State, events: AnyArray, t: int, length: int) -> int:
             state.active[n] = channel
             n += events[channel, t]
             state.inputs[channel] += events[channel, t]
-    for k in range(state.clock[1]):
-        state.active[n] = state.fired[k]
-        n += 1
-    return n
+    fired = state.clock[1]
+    state.active[n : n + fired] = events.shape[0] + state.fired[:fired]
+    return n + fired
 
 
 @compiled
-def _deliver(tables: Tables, weight: AnyArray, sources: AnyArray, total: AnyArray) -> None:
-    """Add the rows of all sources to the accumulators."""
-    k = 0
-    while k < sources.size:
-        shape = tables.shape[sources[k]]
-        row = weight[tables.base[sources[k]] :]
-        if (
-            k + 3 < sources.size
-            and tables.shape[sources[k + 1]] == shape
-            and tables.shape[sources[k + 2]] == shape
-            and tables.shape[sources[k + 3]] == shape
-        ):
-            row1 = weight[tables.base[sources[k + 1]] :]
-            row2 = weight[tables.base[sources[k + 2]] :]
-            row3 = weight[tables.base[sources[k + 3]] :]
-            for g in range(tables.first[shape], tables.first[shape + 1]):
-                part = total[tables.start[g] : tables.stop[g]]
-                begin = tables.offset[g]
-                end = begin + part.size
-                a, b, c, d = row[begin:end], row1[begin:end], row2[begin:end], row3[begin:end]
-                for i in range(part.size):
-                    part[i] += a[i] + b[i] + c[i] + d[i]
-            k += 4
-        else:
-            for g in range(tables.first[shape], tables.first[shape + 1]):
-                part = total[tables.start[g] : tables.stop[g]]
-                a = row[tables.offset[g] : tables.offset[g] + part.size]
-                for i in range(part.size):
-                    part[i] += a[i]
-            k += 1
+def _deliver(tables: Tables, state: State, sources: IntArray) -> None:
+    """Let the synapses of the sources arrive."""
+    # an array taken out of a tuple costs as much as some synapses: take them out once
+    first, sum_of, entry, sums = tables.first, tables.sum_of, tables.entry, state.sums
+    sums[:] = 0
+    for source in sources:
+        for synapse in range(first[source], first[source + 1]):
+            sums[sum_of[synapse]] += entry[synapse]
 
 
 @compiled
-def _fold(positive: AnyArray, negative: AnyArray, shift: Any, current: AnyArray, keep_u: Any, total: AnyArray) -> bool:
-    """Turn the two sums of a run into one packed accumulator; return whether a register overflows."""
-    overflow = False
-    for i in range(total.size):
-        p = positive[i] >> shift
-        n = negative[i] >> shift
-        u = _kept(current[i], keep_u) + ((p - n) << MEMBRANE_SHIFT)
-        overflow |= (max(p, n) << MEMBRANE_SHIFT > ACCUMULATOR_MAX) | (abs(u) > CURRENT_MAX)
-        arrivals = (positive[i] | negative[i]) & ((1 << shift) - 1)
-        total[i] = ((p - n) << FOLDED_SHIFT) | (arrivals != 0)
-    return overflow
-
-
-@compiled
-def _deliver_checked(tables: Tables, negative: AnyArray, state: State, n: int, step: int, length: int) -> bool:
-    """Deliver the active sources; return whether a register overflows, and leave the sums in place if so."""
-    _deliver(tables, tables.weight, state.active[:n], state.positive)
-    _deliver(tables, negative, state.active[:n], state.negative)
-    overflow = False
-    for r in range(tables.run_layer.size):
-        if _is_open(tables, r, step, length):
-            run = slice(tables.run_start[r], tables.run_start[r + 1])
-            overflow |= _fold(
-                state.positive[run],
-                state.negative[run],
-                tables.shift,
-                state.current[run],
-                tables.keep_u[r],
-                state.total[run],
-            )
-    if not overflow:
-        state.positive[:] = 0
-        state.negative[:] = 0
-    return overflow
-
-
-@compiled
-def _find_overflow(tables: Tables, state: State, step: int, length: int) -> tuple[int, int, int]:
-    """Lowest compartment that overflows: its id, its register (0 sum, 1 current) and the value."""
-    found, register, value = tables.compartment.size, 0, 0
-    for r in range(tables.run_layer.size):
-        if _is_open(tables, r, step, length):
-            for i in range(tables.run_start[r], tables.run_start[r + 1]):
-                p = (state.positive[i] >> tables.shift) << MEMBRANE_SHIFT
-                n = (state.negative[i] >> tables.shift) << MEMBRANE_SHIFT
-                u = _kept(state.current[i], tables.keep_u[r]) + p - n
-                if tables.compartment[i] < found:
-                    if p > ACCUMULATOR_MAX:
-                        found, register, value = tables.compartment[i], 0, p
-                    elif n > ACCUMULATOR_MAX:
-                        found, register, value = tables.compartment[i], 0, -n
-                    elif abs(u) > CURRENT_MAX:
-                        found, register, value = tables.compartment[i], 1, u
-    return found, register, value
-
-
-@compiled
-def _sweep(
-    total: AnyArray,
-    shift: Any,
+def _find_work(
+    depth: AnyArray,
+    step: int,
+    length: int,
     current: AnyArray,
     membrane: AnyArray,
     bias: AnyArray,
-    threshold: AnyArray,
-    keep_u: Any,
-    keep_v: Any,
-    flags: AnyArray,
+    sums: IntArray,
+    integrates: AnyArray,
     worked: AnyArray,
-) -> tuple[Any, Any]:
-    """Let a run integrate; membranes are left before reset. All is int32: wider numbers would halve the speed."""
-    arrivals = np.int32((1 << shift) - 1)
-    updates = np.int32(0)
-    saturations = np.int32(0)
-    for i in range(total.size):
-        packed, u, v, b = total[i], current[i], membrane[i], bias[i]
-        total[i] = 0
-        works = np.int32(u | v | b | np.int32(packed & arrivals)) != 0
-        worked[i] = np.uint8(works)
-        updates = np.int32(updates + (np.int32(1) if works else np.int32(0)))
-        # gather input, decay current, add
-        u = np.int32(_kept(u, keep_u) + np.int32(np.int32(packed >> shift) << MEMBRANE_SHIFT))
-        # decay membrane, add bias
-        v = np.int32(np.int32(_kept(v, keep_v) + u) + b)
-        # saturate
+) -> None:
+    """Tell which windows are open, and who has work to do."""
+    for c in range(depth.size):
+        integrates[c] = (depth[c] <= step) & (step - depth[c] < length)
+        holds = (current[c] | membrane[c] | bias[c]) != 0
+        worked[c] = integrates[c] & (holds | ((sums[2 * c] | sums[2 * c + 1]) != 0))
+
+
+@compiled
+def _add_input(integrates: AnyArray, current: AnyArray, keep_u: AnyArray, sums: IntArray, overflows: AnyArray) -> bool:
+    """Let currents decay and add the sums; tell who overflows, and whether anybody does."""
+    any_overflow = False
+    for c in range(current.size):
+        positive, negative = sums[2 * c] >> ARRIVAL_BITS, sums[2 * c + 1] >> ARRIVAL_BITS
+        u = np.int32(_kept(current[c], keep_u[c]) + np.int32(np.int32(positive - negative) << MEMBRANE_SHIFT))
+        beyond = (max(positive, negative) > SUM_MAX) | (abs(u) > CURRENT_MAX)
+        overflows[c] = integrates[c] & beyond
+        any_overflow |= overflows[c]
+        current[c] = u if integrates[c] else np.int32(0)
+    return any_overflow
+
+
+@compiled
+def _fire(
+    integrates: AnyArray,
+    current: AnyArray,
+    membrane: AnyArray,
+    keep_v: AnyArray,
+    bias: AnyArray,
+    threshold: AnyArray,
+    fires: AnyArray,
+    saturations: AnyArray,
+) -> None:
+    """Let membranes decay, add currents and biases, saturate, compare; they are left before a reset."""
+    for c in range(membrane.size):
+        v = np.int32(np.int32(_kept(membrane[c], keep_v[c]) + current[c]) + bias[c])
         compared = np.int32(min(max(v, np.int32(-MEMBRANE_MAX)), np.int32(MEMBRANE_MAX)))
-        saturations = np.int32(saturations + (np.int32(1) if compared != v else np.int32(0)))
-        # compare
-        flags[i] = np.uint8(compared > threshold[i])
-        current[i] = u
-        membrane[i] = compared
-    return updates, saturations
+        saturations[c] += integrates[c] & (compared != v)
+        fires[c] = integrates[c] & (compared > threshold[c])
+        membrane[c] = compared if integrates[c] else np.int32(0)
 
 
 @compiled
-def _integrate(tables: Tables, state: State, shift: Any, step: int, length: int) -> None:
-    """Let all runs integrate whose window is open; hold the others at rest."""
-    for r in range(tables.run_layer.size):
-        run = slice(tables.run_start[r], tables.run_start[r + 1])
-        if _is_open(tables, r, step, length):
-            updates, saturations = _sweep(
-                state.total[run],
-                shift,
-                state.current[run],
-                state.membrane[run],
-                tables.bias[run],
-                tables.threshold[run],
-                tables.keep_u[r],
-                tables.keep_v[r],
-                state.flags[run],
-                state.worked[run],
-            )
-            state.updates[tables.run_layer[r]] += updates
-            state.saturations[tables.run_layer[r]] += saturations
-        else:
-            state.total[run] = 0
-            state.current[run] = 0
-            state.membrane[run] = 0
-            state.flags[run] = 0
-            state.worked[run] = 0
+def _first_overflow(state: State) -> tuple[Any, int, Any]:
+    """Lowest compartment that overflows: its id, its register (0 sum, 1 current) and the value."""
+    c = np.argmax(state.flags)
+    positive, negative = state.sums[2 * c] >> ARRIVAL_BITS, state.sums[2 * c + 1] >> ARRIVAL_BITS
+    if positive > SUM_MAX:
+        return c, 0, positive << MEMBRANE_SHIFT
+    if negative > SUM_MAX:
+        return c, 0, -(negative << MEMBRANE_SHIFT)
+    return c, 1, np.int64(state.current[c])
 
 
 @compiled
-def _reset_and_count(tables: Tables, state: State, n_inputs: int, spikes: AnyArray, t: int) -> None:
+def _reset_and_count(state: State) -> None:
     """Reset the membranes of the compartments that spiked, count and list them for the next step."""
-    fired = 0
-    words = state.flags.view(np.uint64)
-    for w in range(words.size):
-        if words[w]:  # most groups of eight flags are empty
-            for i in range(8 * w, 8 * w + 8):
-                state.fired[fired] = n_inputs + i
-                fired += state.flags[i]
+    fired, listed, flags, worked, updates = 0, state.fired, state.flags, state.worked, state.updates
+    for c in range(flags.size):
+        updates[c] += worked[c]
+        listed[fired] = c
+        fired += flags[c]
     for k in range(fired):
-        i = state.fired[k] - n_inputs
-        state.membrane[i] = 0
-        state.spikes[tables.compartment[i]] += 1
-        if spikes.shape[0]:
-            spikes[t, tables.compartment[i]] = True
+        state.membrane[listed[k]] = 0
+        state.spikes[listed[k]] += 1
     state.clock[0] += 1
     state.clock[1] = fired
 
@@ -308,7 +240,6 @@ def _reset_and_count(tables: Tables, state: State, n_inputs: int, spikes: AnyArr
 @compiled_and_cached
 def chip_steps(
     tables: Tables,
-    negative: AnyArray | None,
     state: State,
     events: AnyArray,
     steps: int,
@@ -323,21 +254,21 @@ def chip_steps(
     compartment, register and value of the first overflow; the chip step is -1 if there is none.
     """
     for t in range(steps):
-        step = state.clock[0]
+        step, current, membrane, integrates = state.clock[0], state.current, state.membrane, state.integrates
         n = _list_sources(state, events, t, length)
-        if negative is None:
-            _deliver(tables, tables.weight, state.active[:n], state.total)
-            _integrate(tables, state, tables.shift, step, length)
-        else:
-            if _deliver_checked(tables, negative, state, n, step, length):
-                found, register, value = _find_overflow(tables, state, step, length)
-                return step, found, register, value
-            _integrate(tables, state, np.int32(FOLDED_SHIFT), step, length)
+        _deliver(tables, state, state.active[:n])
+        _find_work(tables.depth, step, length, current, membrane, tables.bias, state.sums, integrates, state.worked)
+        if _add_input(integrates, current, tables.keep_u, state.sums, state.flags):
+            compartment, register, value = _first_overflow(state)
+            return step, compartment, register, value
+        _fire(
+            integrates, current, membrane, tables.keep_v, tables.bias, tables.threshold, state.flags, state.saturations
+        )
+        if spikes.shape[0]:
+            spikes[t] = state.flags
         if membranes.shape[0]:
-            for i in range(tables.compartment.size):
-                membranes[t, tables.compartment[i]] = state.membrane[i]
+            membranes[t] = membrane
         if updated.shape[0]:
-            for i in range(tables.compartment.size):
-                updated[t, tables.compartment[i]] = state.worked[i] != 0
-        _reset_and_count(tables, state, events.shape[0], spikes, t)
+            updated[t] = state.worked
+        _reset_and_count(state)
     return -1, 0, 0, 0

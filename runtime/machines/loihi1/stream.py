@@ -22,7 +22,8 @@ import numpy.typing as npt
 from spikeloom.compiler.errors import DataError, NumericRangeError
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.runtime.machines.base import Step
-from spikeloom.runtime.machines.loihi1.engine import Engine, advance, prepare, start, tables_of
+from spikeloom.runtime.machines.loihi1.engine import Engine, advance, prepare
+from spikeloom.runtime.machines.loihi1.kernel import state_of
 from spikeloom.runtime.machines.votes import class_counts
 
 NO_END = 2**62
@@ -41,12 +42,11 @@ class Stream:
         self._engine = engine
         netlist = engine.netlist
         ends = np.cumsum([layer.neurons for layer in netlist.layers]).tolist()
-        # the engine orders compartments by layer and neuron; a chip may hold fewer of them than the layer has neurons
-        compartment = tables_of(engine).compartment
-        self._place = np.array([0, *ends[:-1]])[netlist.layer[compartment]] + netlist.neuron[compartment]
+        # a chip may hold fewer compartments than a layer has neurons
+        self._place = np.array([0, *ends[:-1]])[netlist.layer] + netlist.neuron
         self._bounds = tuple(zip([0, *ends[:-1]], ends, strict=True))
         self._column = np.zeros((engine.netlist.n_inputs, 1), np.uint8)
-        self._state = start(engine)
+        self._state = state_of(netlist)
         self._ended = False
         # loads or compiles the kernel now, not within the first bin
         advance(engine, self._state, self._column, length=NO_END, steps=0)
@@ -108,7 +108,7 @@ class Stream:
 
     def reset(self) -> None:
         """Begin the next grasp, from rest; whatever was left of the last one is dropped."""
-        self._state = start(self._engine)
+        self._state = state_of(self._engine.netlist)
         self._ended = False
 
     def _advance(self, length: int) -> Step:
@@ -121,7 +121,7 @@ class Stream:
             self._ended = True
             raise
         spikes = np.zeros(self._bounds[-1][1], np.bool_)
-        spikes[self._place[state.fired[: state.clock[1]] - netlist.n_inputs]] = True
+        spikes[self._place[state.fired[: state.clock[1]]]] = True
         counts = class_counts(netlist, state.spikes[None])[0]
         spikes.flags.writeable = counts.flags.writeable = False
         return Step(index=index, spikes=tuple([spikes[begin:end] for begin, end in self._bounds]), counts=counts)
