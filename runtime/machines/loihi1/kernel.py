@@ -1,7 +1,7 @@
 """The chip step of :mod:`loihi1.spec`, compiled with numba: any network, any number of chip steps at a time.
 
-*Arrivals.* Each compartment has two sums, of positive and of negative weights. A synapse adds ``magnitude << 24 | 1`` to
-one of them, so that the low bits say whether anything arrived at all, which the count of neuron updates needs.
+*Arrivals.* Each compartment has two sums, of positive and of negative weights. A synapse adds ``magnitude << 24 | 1``
+to one of them, so that the low bits say whether anything arrived at all, which the count of neuron updates needs.
 
 *Decay in 32 bits.* With ``m = 4096 a + b``, ``floor(m f / 4096) = a f + floor(b f / 4096)``; for ``m < 2**23`` and
 ``f <= 4096`` nothing exceeds 2**24.
@@ -35,8 +35,8 @@ class Tables(NamedTuple):
     """A netlist as the kernel reads it; nothing in here changes."""
 
     first: IntArray  # (sources + 1,) int64; bounds of each source, channels before compartments, in the synapses
-    # sum_of, entry: (synapses,) uint32, int64; the sum that a synapse adds to, and what: that of the positive weights of
-    # compartment c is 2 * c, that of the negative ones follows
+    # sum_of, entry: (synapses,) uint32, int64; the sum that a synapse adds to, and what: that of the positive weights
+    # of compartment c is 2 * c, that of the negative ones follows
     sum_of: AnyArray
     entry: IntArray
     depth: AnyArray  # (compartments,) int32; of the layer of each, or zero where no window holds it at rest
