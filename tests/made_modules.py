@@ -1,4 +1,4 @@
-"""Torch networks of LIF layers and of layer types that the compiler has never heard of; small, with fixed weights."""
+"""Torch networks of LIF layers and of layer types of their own; small, with fixed weights."""
 
 import io
 import warnings
@@ -7,9 +7,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from spikeloom.compiler import Options, Recipe
 from spikeloom.models.networks.lif import LIF, OneStep, reset
-from spikeloom.models.networks.module import compile_module
 
 TAXELS, CLASSES = 6, 3
 RING = np.array([[i, (i + 1) % TAXELS] for i in range(TAXELS)] + [[(i + 1) % TAXELS, i] for i in range(TAXELS)])
@@ -60,13 +58,12 @@ class Chebyshev(nn.Module):
 
 
 class Messages(nn.Module):
-    """Attention-free message passing: gather, weigh by the degrees, scatter; normalised on the fly or beforehand."""
+    """Attention-free message passing: gather, weigh by the degrees, scatter."""
 
-    def __init__(self, channels, features, *, cached=False):
+    def __init__(self, channels, features):
         super().__init__()
         self.linear = nn.Linear(channels, features)
         self.register_buffer("edges", torch.tensor(RING.T.copy()))
-        self.register_buffer("norm", self.weigh() if cached else None)
 
     def weigh(self):
         source, target = self.edges[0], self.edges[1]
@@ -77,14 +74,13 @@ class Messages(nn.Module):
         return root[source] * root[target]
 
     def forward(self, x):
-        norm = self.weigh() if self.norm is None else self.norm
-        messages = norm.view(-1, 1) * x.index_select(-2, self.edges[0])
+        messages = self.weigh().view(-1, 1) * x.index_select(-2, self.edges[0])
         place = self.edges[1].view(-1, 1).expand_as(messages)
         return self.linear(torch.zeros_like(x).scatter_add_(-2, place, messages) + x)
 
 
 class Mean(nn.Module):
-    """A layer that nobody has heard of: each taxel beside the mean of all."""
+    """A layer that no library has: each taxel beside the mean of all."""
 
     def forward(self, x):
         return torch.cat([x, x.mean(-2, keepdim=True).expand_as(x)], dim=-1)
@@ -124,24 +120,6 @@ def tag():
 
 def gcn():
     return seeded(lambda: graph_net(Messages(2, 8)))
-
-
-def at_a_tie(*, cached):
-    """Message passing with a weight between two integers, nearer to the other one for float32 coefficients."""
-    net = seeded(lambda: graph_net(Messages(2, 8, cached=cached)))
-    two = (Recipe(planes=2),)
-    scale = (
-        2 * compile_module(gcn(), example_of("gcn"), options=Options(recipes=two)).integer.populations[0].threshold[0]
-    )
-    exact, rounded = 1 / 3, float((np.float32(3) ** np.float32(-0.5)) ** 2)
-    for middle in range(20, 4000):
-        weight = np.float32((middle + 0.5) / scale / exact)
-        sides = [round(float(weight) * coefficient * scale) for coefficient in (exact, rounded)]
-        if sides[0] != sides[1]:
-            break
-    with torch.no_grad():
-        net[0].linear.weight[0, 0] = float(weight)
-    return net
 
 
 def chebyshev():

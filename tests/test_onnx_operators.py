@@ -76,35 +76,33 @@ CASES = [
 ]
 
 
-def ours(op, attributes, outputs, inputs=2):
+def ours(op, attributes, outputs=("o0",), inputs=2):
     names = tuple(f"x{place}" for place in range(inputs))
     return Node(name="n", op=op, inputs=names, outputs=outputs, attributes=attributes)
 
 
-def reference(op, operands, attributes):
+def reference(op, operands, attributes, outputs):
     """Results of ONNX's own evaluator."""
     names = [f"i{k}" for k in range(len(operands))]
-    outputs = ["o0", "o1"] if op == "Split" else ["o0"]
-    node = helper.make_node(op, names, outputs, **attributes)
-    kinds = [helper.np_dtype_to_tensor_dtype(np.asarray(o).dtype) for o in operands]
+    kinds = [helper.np_dtype_to_tensor_dtype(operand.dtype) for operand in operands]
     inputs = [helper.make_tensor_value_info(n, k, None) for n, k in zip(names, kinds, strict=True)]
-    graph = helper.make_graph([node], "g", inputs, [helper.make_tensor_value_info(o, 11, None) for o in outputs])
+    ends = [helper.make_tensor_value_info(name, 11, None) for name in outputs]
+    graph = helper.make_graph([helper.make_node(op, names, outputs, **attributes)], "g", inputs, ends)
     session = ReferenceEvaluator(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 20)]))
-    return outputs, session.run(None, dict(zip(names, operands, strict=True)))
+    return session.run(None, dict(zip(names, operands, strict=True)))
 
 
 @pytest.mark.parametrize("case", range(len(CASES)), ids=[f"{i}-{case[0]}" for i, case in enumerate(CASES)])
 def test_numbers_and_coefficients(case):
     op, operands, attributes = CASES[case]
-    outputs, expected = reference(op, operands, attributes)
-    node = ours(op, attributes, tuple(outputs), len(operands))
-    found = apply(node, Table(), operands)
-    for mine, theirs in zip(found, expected, strict=True):
+    outputs = ("o0", "o1") if op == "Split" else ("o0",)
+    expected = reference(op, operands, attributes, outputs)
+    node = ours(op, attributes, outputs, len(operands))
+    for mine, theirs in zip(apply(node, Table(), operands), expected, strict=True):
         assert mine.shape == theirs.shape
         assert np.allclose(mine, theirs, rtol=1e-12, atol=1e-12)
-    floating = [k for k, o in enumerate(operands) if o.dtype == np.float64]
     ran = 0
-    for place in floating:
+    for place in [place for place, operand in enumerate(operands) if operand.dtype == np.float64]:
         table = Table()
         atom = table.atom(INPUT_ATOM, "x", operands[place].size)
         mixed = [table.value(atom, o.shape) if k == place else o for k, o in enumerate(operands)]
@@ -115,17 +113,15 @@ def test_numbers_and_coefficients(case):
         ran += 1
         for result, theirs in zip(results, expected, strict=True):
             assert isinstance(result, Affine)
-            value = result.bias.copy()
-            for index, terms in result.terms.items():
-                assert index == atom
-                value += terms @ operands[place].ravel()
+            assert set(result.terms) <= {atom}
+            value = sum((terms @ operands[place].ravel() for terms in result.terms.values()), start=result.bias)
             assert result.shape == theirs.shape
             assert np.allclose(value, theirs.ravel(), rtol=1e-9, atol=1e-9)
     assert ran >= 1
 
 
 def test_integers_are_divided_toward_zero():
-    node = ours("Div", {}, ("o",))
+    node = ours("Div", {})
     assert apply(node, Table(), [whole(-7, 7, -8), whole(2, -2, 4)])[0].tolist() == [-3, -3, -2]
 
 
@@ -133,4 +129,4 @@ def test_both_operands_of_a_product_may_not_vary():
     table = Table()
     x, y = (table.value(table.atom(INPUT_ATOM, name, 4), (2, 2)) for name in "xy")
     with pytest.raises(ModelError, match=r"^is not affine in its input; only affine operators"):
-        apply(ours("MatMul", {}, ("o",)), table, [x, y])
+        apply(ours("MatMul", {}), table, [x, y])
