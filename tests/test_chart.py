@@ -1,33 +1,32 @@
 """The command ``chart`` on small networks: what it writes, that its commands give its figures, resuming, refusals."""
 
+import argparse
 import csv
 import hashlib
 import json
-import os
 import re
 import shlex
-import signal
-import sqlite3
-import subprocess
-import time
-from contextlib import closing
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import RUNTIME
 from made_files import CLASSES, events, own_file, recordings_folder, ring, weights
+from zoo import STORAGE, tuned
 
 from spikeloom.compiler.errors import CapacityError, SpikeloomError, Violation
+from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
+from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.models.graphs import Graph
+from spikeloom.models.networks.checkpoint import save_checkpoint
 from spikeloom.models.recordings.evtouch import load_recordings
 from spikeloom.models.training.protocols import data_digest
 from spikeloom.runtime.studies.chart import requests as chart_requests
 from spikeloom.runtime.studies.chart import work as chart_work
-
-ROOT = Path(__file__).resolve().parents[1]
+from spikeloom.runtime.studies.chart.grid import Grid
+from spikeloom.runtime.studies.chart.networks import Storage, given_networks
 
 GRID = "bits=4,8,window=50-100%:50,cores=cores/fc1:2"
 VIOLATION = Violation(owner="core 0", rule="loihi1.core.axons_in", used=5, allowed=4, remedy="use fewer inputs")
@@ -52,6 +51,8 @@ def place(tmp_path_factory):
     own_file(folder / "ring.pt", training=known)
     own_file(folder / "chain.pt", last=weights(3), graph=chain(), training=known)
     own_file(folder / "unknown.pt", last=weights(4))
+    forms = tuned(read_checkpoint(folder / "ring.pt")).forms
+    save_checkpoint(folder / "tuned.pt", {"last": weights()}, ring(), beta=0.2, theta=0.5, training=known, forms=forms)
     own_file(folder / "elsewhere.pt", training={"data_sha256": "0" * 64, "data": "Grasps.zip"})
     own_file(folder / "small.pt", last=weights(taxels=4), graph=ring(4))
     (folder / "file").write_text("")
@@ -74,83 +75,42 @@ def made(spikeloom, place):
     return json.loads((place / "out" / "chart.json").read_text())
 
 
-def without_rates(report):
-    """A chart as text, without what is measured on this machine."""
-    return {key: value for key, value in report.items() if key != "measured"}
+@pytest.fixture
+def again(made, place):
+    """A copy of its folder."""
+    shutil.copytree(place / "out", place / "again", dirs_exist_ok=True)
+    return place / "again"
 
 
 # -- points ------------------------------------------------------------------------------------------------------------
 
 
-def test_every_point_of_the_grid_is_there(made):
+def test_every_point_of_the_grid_is_there(made, place):
     found = [(p["bits"], p["cores"], p["window"]) for p in made["points"]]
     assert found == [(b, c, w) for b in ([4], [8]) for c in ("cores", "fc1:2") for w in (50, 100)]
     assert [point["number"] for point in made["points"]] == list(range(1, 9))
     assert made["refused"] == []
     assert (made["data"]["train"], made["data"]["test"], made["data"]["steps"]) == (16, 8, 24)
-
-
-def test_the_commands_of_a_point_give_its_netlist_and_its_figures(made, spikeloom, place):
-    for point in made["points"]:
-        compiled, ran = (shlex.split(command) for command in point["commands"])
-        assert spikeloom(*compiled[1:])[0] == 0
-        netlist = (place / compiled[-1]).read_bytes()
-        assert netlist == (place / "out" / point["netlist"]).read_bytes()
-        assert hashlib.sha256(netlist).hexdigest() == point["netlist_sha256"]
-        code, out, _ = spikeloom(*ran[1:], "--json")
-        assert code == 0
-        found = json.loads(out)
-        assert found["accuracy"] == point["test"]["accuracy"]
-        mean = found["costs"]["per_inference"]
-        assert mean["energy_j"] == pytest.approx(point["test"]["energy_j"], rel=1e-12)
-        assert mean["synaptic_operations"] == point["test"]["synaptic_operations"]
-        (clock,) = found["costs"]["time"]
-        assert {clock["table"]: clock["inference_s"]["mean"]} == pytest.approx(point["test"]["time_s"], rel=1e-12)
-        assert found["costs"]["chip_steps"] == point["test"]["steps"] + read_netlist(place / compiled[-1]).max_depth
-
-
-def test_decisions_are_held_against_the_float_model_on_the_same_part_of_a_recording(made, spikeloom):
-    for point in made["points"]:
-        name = shlex.split(point["commands"][0])[-1]
-        words = ("verify", name, "--checkpoint", "ring.pt", "--data", "data", "--window", f"{point['window']}%")
-        _, out, _ = spikeloom(*words, "--spec-samples", "1", "--json")
-        found = json.loads(out)
-        assert found["accuracy"]["float"] == point["test"]["float"]["accuracy"]
-        assert found["decision_agreement"] == point["test"]["equal"] / 8
-
-
-def test_layouts_of_one_network_decide_alike(made):
-    decided = {}
-    for point in made["points"]:
-        figures = [point[split][key] for split in ("train", "test") for key in ("correct", "equal")]
-        assert decided.setdefault((str(point["bits"]), point["window"]), figures) == figures
-    assert len({point["n_cores"] for point in made["points"]}) > 1
-
-
-def test_numbers_follow_from_the_figures(made):
     (network,) = made["networks"]
     assert network["validation"] == network["expected"] == 0.75
+    decided = {}
     for point in made["points"]:
         kept = point["train"]["accuracy"] / network["float_training"]
         assert point["expected"] == pytest.approx(0.75 * kept)
         assert point["test"]["low"] <= point["test"]["accuracy"] <= point["test"]["high"]
+        figures = [point[split][key] for split in ("train", "test") for key in ("correct", "equal")]
+        assert decided.setdefault((str(point["bits"]), point["window"]), figures) == figures, "layouts decide alike"
     assert any(point["front"]["energy"] for point in made["points"])
+    assert len({point["n_cores"] for point in made["points"]}) > 1
     assert made["measured"]["recordings_per_s"].keys() == {str(point["number"]) for point in made["points"]}
     assert min(made["measured"]["recordings_per_s"].values()) > 0
-
-
-def test_the_digest_is_over_all_but_what_is_measured(made):
     content = {key: value for key, value in made.items() if key not in ("measured", "digest")}
     assert hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest() == made["digest"]
-
-
-def test_the_table_of_points(made, place):
-    with (place / "out" / "chart.csv").open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
     assert (place / "out" / "chart.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
     assert (place / "out" / "chart.svg").read_text("utf-8").startswith("<?xml")
     assert (place / "out" / "chart.html").read_text("utf-8").startswith("<!DOCTYPE html>")
-    assert len(rows) == len(made["points"])
+    with (place / "out" / "chart.csv").open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
     for row, point in zip(rows, made["points"], strict=True):
         assert row["bits"] == str(point["bits"][0])
         assert float(row["test_energy_j_davies2018"]) == point["test"]["energy_j"]["davies2018"]
@@ -159,10 +119,32 @@ def test_the_table_of_points(made, place):
         assert float(row["measured_recordings_per_s"]) >= 0
 
 
-# -- again, resumed, side by side --------------------------------------------------------------------------------------
+@pytest.mark.parametrize("number", [1, 4, 7])
+def test_the_commands_of_a_point_give_its_netlist_and_its_figures(made, spikeloom, place, number):
+    point = made["points"][number - 1]
+    compiled, ran = (shlex.split(command) for command in point["commands"])
+    assert spikeloom(*compiled[1:])[0] == 0
+    netlist = (place / compiled[-1]).read_bytes()
+    assert netlist == (place / "out" / point["netlist"]).read_bytes()
+    assert hashlib.sha256(netlist).hexdigest() == point["netlist_sha256"]
+    found = json.loads(spikeloom(*ran[1:], "--json")[1])
+    assert found["accuracy"] == point["test"]["accuracy"]
+    mean = found["costs"]["per_inference"]
+    assert mean["energy_j"] == pytest.approx(point["test"]["energy_j"], rel=1e-12)
+    assert mean["synaptic_operations"] == point["test"]["synaptic_operations"]
+    (clock,) = found["costs"]["time"]
+    assert {clock["table"]: clock["inference_s"]["mean"]} == pytest.approx(point["test"]["time_s"], rel=1e-12)
+    assert found["costs"]["chip_steps"] == point["test"]["steps"] + read_netlist(place / compiled[-1]).max_depth
+    words = ("--checkpoint", "ring.pt", "--data", "data", "--window", f"{point['window']}%", "--spec-samples", "1")
+    found = json.loads(spikeloom("verify", compiled[-1], *words, "--json")[1])
+    assert found["accuracy"]["float"] == point["test"]["float"]["accuracy"]
+    assert found["decision_agreement"] == point["test"]["equal"] / 8
 
 
-def test_asked_again_nothing_is_measured_and_every_byte_is_the_same(made, spikeloom, place, monkeypatch):
+# -- again -------------------------------------------------------------------------------------------------------------
+
+
+def test_once_more_nothing_is_measured_and_every_byte_is_the_same(made, spikeloom, place, monkeypatch):
     before = {file.name: file.read_bytes() for file in (place / "out").glob("chart.*")}
 
     def never(_work):
@@ -173,128 +155,48 @@ def test_asked_again_nothing_is_measured_and_every_byte_is_the_same(made, spikel
     assert {file.name: file.read_bytes() for file in (place / "out").glob("chart.*")} == before
 
 
-def test_one_more_window_compiles_nothing(made, spikeloom, monkeypatch):
-    worked, measure = [], chart_work.measure
-
-    def watched(work):
-        worked.append(work)
-        return measure(work)
-
-    monkeypatch.setattr("spikeloom.runtime.studies.chart.work.measure", watched)
-    words = [word if word != GRID else GRID.replace("50-100%:50", "25%,50%,100%") for word in CHART]
-    assert spikeloom(*words, "-o", "out", "--json")[0] == 0
-    runs = [work for work in worked if isinstance(work, chart_requests.Run)]
-    assert [work.window for work in runs] == [25] * 4
-    assert [type(work) for work in worked if work not in runs] == [chart_requests.Decide]
-    spikeloom(*CHART, "-o", "out", "--json")
-
-
-def test_a_netlist_that_is_gone_or_damaged_is_made_again(made, spikeloom, place):
-    gone, damaged = (place / "out" / made["points"][at]["netlist"] for at in (0, -1))
+def test_one_more_window_compiles_only_what_is_gone_or_damaged(made, again, spikeloom, monkeypatch):
+    gone, damaged = (again / made["points"][at]["netlist"] for at in (0, -1))
     kept = gone.read_bytes(), damaged.read_bytes()
     gone.unlink()
     damaged.write_bytes(kept[1][:100])
-    words = [word if word != GRID else GRID.replace("50-100%:50", "10%") for word in CHART]
-    assert spikeloom(*words, "-o", "out", "--json")[0] == 0
-    assert (gone.read_bytes(), damaged.read_bytes()) == kept
-    spikeloom(*CHART, "-o", "out", "--json")
-
-
-@pytest.mark.slow
-def test_two_processes_find_the_same(made, spikeloom, place):
-    words = [*CHART[:-1], "2", "-o", "two", "--json"]
-    code, out, _ = spikeloom(*words)
-    assert code == 0
-    other = without_rates(json.loads(out))
-    mine = without_rates(made)
-    for found in (other, mine):
-        found.pop("digest"), found.pop("command")
-    assert other == mine
-    pictures = ("chart.svg", "chart.png")
-    assert [(place / "two" / name).read_bytes() for name in pictures] == [
-        (place / "out" / name).read_bytes() for name in pictures
-    ]
-
-
-def kept(store):
-    """Keys of what a store holds, in their order."""
-    if not store.exists():
-        return []
-    with closing(sqlite3.connect(store)) as database:
-        try:
-            return [key for (key,) in database.execute("SELECT key FROM results ORDER BY rowid")]
-        except sqlite3.OperationalError:  # not yet made
-            return []
-
-
-def test_after_a_kill_the_same_command_goes_on(made, spikeloom, place):
-    started = subprocess.Popen(
-        [*RUNTIME, *CHART, "-o", "killed"], cwd=place, env=os.environ | {"PYTHONPATH": str(ROOT / "src")}
+    worked, measure = [], chart_work.measure
+    monkeypatch.setattr(
+        "spikeloom.runtime.studies.chart.work.measure", lambda work: worked.append(work) or measure(work)
     )
-    store = place / "killed" / "points.sqlite"
-    end = time.monotonic() + 120
-    while time.monotonic() < end and len(kept(store)) < 3:
-        time.sleep(0.01)
-    started.send_signal(signal.SIGKILL)
-    started.wait()
-    before = kept(store)
-    assert len(before) >= 3
-    code, out, _ = spikeloom(*CHART, "-o", "killed", "--json")
-    assert code == 0
-    after = kept(store)
-    assert after[: len(before)] == before
-    assert len(after) == 1 + 2 + 8
-    report = json.loads(out)
-    for name in ("points", "networks", "recommended", "saving"):
-        assert report[name] == made[name]
+    words = [word if word != GRID else GRID.replace("50-100%:50", "25%,50%,100%") for word in CHART]
+    assert spikeloom(*words, "-o", "again", "--json")[0] == 0
+    runs = [work for work in worked if isinstance(work, chart_requests.Run)]
+    assert [work.window for work in runs] == [25] * 4
+    assert [type(work) for work in worked if work not in runs] == [chart_requests.Decide]
+    assert (gone.read_bytes(), damaged.read_bytes()) == kept
 
 
 # -- choices -----------------------------------------------------------------------------------------------------------
 
 
-def test_a_budget_picks_a_point_and_gives_its_commands(made, spikeloom):
-    most = sorted(point["train"]["energy_j"]["davies2018"] for point in made["points"])[3]
-    code, out, err = spikeloom(*CHART, "-o", "out", "--budget", f"energy={most * 1e9 * 1.001:.3f}nJ")
-    assert (code, err) == (0, "")
-    assert "4 of 8 points fit; take #" in out
-    chosen = int(out.split("points fit; take #")[1].split()[0])
-    (point,) = (each for each in made["points"] if each["number"] == chosen)
-    assert all(f"$ {command}" in out for command in point["commands"])
-    assert "beside the best, #" in out or "it is the best of all points" in out
-
-
-def test_a_budget_that_nothing_fits(made, spikeloom):
-    code, out, _ = spikeloom(*CHART, "-o", "out", "--budget", "energy=1pJ", "--budget", "accuracy=100")
+def test_the_exit_code_says_that_no_point_fits_a_budget(again, spikeloom):
+    code, out, _ = spikeloom(*CHART, "-o", "again", "--budget", "energy=1pJ", "--budget", "accuracy=100")
     assert code == 1
     assert "energy=1pJ and accuracy=100: no point fits; the nearest is #" in out
-    assert "misses energy: it takes " in out
-    spikeloom(*CHART, "-o", "out", "--json")
 
 
-def test_the_graph_of_the_grid_chooses_among_the_networks(spikeloom):
-    both = ("chart", "ring.pt", "chain.pt", "--data", "data", "--jobs", "1", "-o", "graphs", "--json", "--grid")
-    code, out, _ = spikeloom(*both, "bits=8,window=100%,graph=knn:1")
-    assert code == 0
-    assert [net["name"] for net in json.loads(out)["networks"]] == ["chain"]
-    code, out, _ = spikeloom(*both, "bits=8,window=100%")
-    assert [(net["name"], net["graph"]) for net in json.loads(out)["networks"]] == [
-        ("ring", "ring"),
-        ("chain", "knn:1"),
-    ]
-    assert [point["network"] for point in json.loads(out)["points"]] == ["ring", "chain"]
+def read_as(*checkpoints):
+    """Options of a command that names checkpoints only."""
+    options = dict.fromkeys(("graph", "taxels", "edges", "system", "weights", "beta", "theta"))
+    return argparse.Namespace(checkpoints=list(checkpoints), directed=False, run=0, **options)
 
 
-def test_where_validation_is_not_known_the_text_says_what_chose(spikeloom):
-    words = ("chart", "unknown.pt", "--data", "data", "--jobs", "1", "-o", "unknown", "--grid", "bits=8,window=100%")
-    code, out, _ = spikeloom(*words)
-    assert code == 0
-    assert "by what is expected: accuracy on the training split (not every checkpoint knows" in out
+def test_the_graph_of_the_grid_chooses_among_the_networks(place, monkeypatch):
+    monkeypatch.chdir(place)
+    for grid, names in ((Grid(), ["ring", "chain"]), (Grid(graph=("knn1",)), ["chain"])):
+        assert [network.name for network in given_networks(read_as("ring.pt", "chain.pt"), grid)] == names
+    shutil.copy("ring.pt", "other/ring.pt")
+    assert [network.name for network in given_networks(read_as("ring.pt", "other/ring.pt"), Grid())][1] == "ring-2"
 
 
-@pytest.fixture
-def refusing(monkeypatch):
-    """A chip on which widths in a set do not fit."""
-    refused, store = set(), chart_work.store
+def test_what_the_chip_refuses_is_listed(spikeloom, place, monkeypatch):
+    refused, store = {4}, chart_work.store
 
     def picky(network, options, target):
         if options.recipes is not None and options.recipes[0].bits in refused:
@@ -302,38 +204,28 @@ def refusing(monkeypatch):
         return store(network, options, target)
 
     monkeypatch.setattr("spikeloom.runtime.studies.chart.work.store", picky)
-    return refused
-
-
-def test_what_the_chip_refuses_is_listed(spikeloom, refusing, place):
-    refusing.add(4)
-    words = ("chart", "ring.pt", "--data", "data", "--jobs", "1", "-o", "refused", "--grid", "bits=4,3,window=100%")
-    code, out, _ = spikeloom(*words)
+    words = ("chart", "ring.pt", "--data", "data", "--jobs", "1", "--grid")
+    code, out, _ = spikeloom(*words, "bits=4,3,window=100%", "-o", "refused")
     assert code == 0
     assert out.startswith("1 point of 1 network on 8 test and 16 training recordings, 1 more configuration refused\n")
     assert f"does not fit: ring 4b, cores: {VIOLATION}\n" in out
     found = json.loads((place / "refused" / "chart.json").read_text())
     assert [(each["bits"], each["why"]) for each in found["refused"]] == [([4], [str(VIOLATION)])]
-
-
-def test_where_nothing_fits_there_is_no_chart(spikeloom, refusing, place):
-    refusing |= {5, 6}
-    words = ("chart", "ring.pt", "--data", "data", "--jobs", "1", "-o", "nothing", "--grid", "bits=5-6,window=100%")
-    code, out, err = spikeloom(*words)
+    refused |= {5, 6}
+    code, out, err = spikeloom(*words, "bits=5-6,window=100%", "-o", "nothing")
     assert (code, out) == (2, "")
     assert f"refuses all 2 configurations; the first: {VIOLATION}\n" in err
     assert not (place / "nothing" / "chart.json").exists()
 
 
-def test_a_fine_tuned_network_keeps_its_storage(spikeloom, place):
-    tuned = ("finetune", "ring.pt", "--data", "data", "--weight-bits", "3", "--epochs", "1", "-o", "tuned.pt")
-    assert spikeloom(*tuned)[0] == 0
+def test_a_fine_tuned_network_keeps_its_storage(spikeloom):
     words = ("chart", "tuned.pt", "--data", "data", "--jobs", "1", "-o", "tuned", "--json", "--grid")
     code, out, _ = spikeloom(*words, "bits=2-6,8,window=50%,100%")
     assert code == 0
     points = json.loads(out)["points"]
-    found = [(point["bits"], point["fine_tuned"], point["window"]) for point in points]
-    assert found == [([3], True, 50), ([3], True, 100)]
+    found = [(tuple(point["bits"]), point["fine_tuned"], point["window"]) for point in points]
+    widths = tuple(bits for bits, _ in STORAGE)
+    assert found == [(widths, True, 50), (widths, True, 100)]
     assert "--weight-bits" not in points[0]["commands"][0]
 
 
@@ -391,24 +283,19 @@ def test_a_store_of_another_version(made, spikeloom, place, monkeypatch):
     assert len(err.splitlines()) == 1
 
 
-@pytest.mark.parametrize("what", ["data", "network"])
-def test_a_worker_that_has_other_files_says_so(made, spikeloom, place, monkeypatch, what):
-    handed, measure = [], chart_work.measure
-    monkeypatch.setattr(
-        "spikeloom.runtime.studies.chart.work.measure", lambda work: handed.append(work) or measure(work)
-    )
-    spikeloom(*[word if word != GRID else "bits=6,window=100%" for word in CHART], "-o", f"files-{what}")
-    work = next(each for each in handed if isinstance(each, chart_requests.Build))
+def test_a_worker_that_has_other_files_says_so(place, monkeypatch):
+    monkeypatch.chdir(place)
+    (network,) = given_networks(read_as("ring.pt"), Grid())
+    digest = data_digest(load_recordings("data", "train"), load_recordings("data", "test"))
+    data = chart_requests.Data(path="data", bin_s=0.02, sha256=digest)
+    facts = chart_requests.Facts(data=data, targets={"loihi1": load_target("loihi1")}, folder=place)
+    work = facts.build(network, Storage(bits=(6,), planes=1, groups=1, prune=False), ("cores",))
+    assert json.loads(json.dumps(chart_work.measure(work)))["cores"]["cores"] > 0
     chart_work.both_splits.cache_clear()
-    if what == "data":
-        other = place / "other"
-        changed = replace(work, data=replace(work.data, path=str(other)))
-        told = f"{other}: holds other recordings than where the chart was asked for; copy those here"
-    else:
-        other = place / "unknown.pt"
-        network = replace(work.network, source=replace(work.network.source, path=str(other)))
-        changed = replace(work, network=network)
-        told = f"{other}: is another file than where the chart was asked for; copy that here"
-    with pytest.raises(SpikeloomError) as caught:
-        measure(changed)
-    assert str(caught.value) == told
+    source = replace(work.network.source, path="unknown.pt")
+    for changed, told in (
+        (replace(work, data=replace(work.data, path="other")), "other: holds other recordings than where"),
+        (replace(work, network=replace(work.network, source=source)), "unknown.pt: is another file than where"),
+    ):
+        with pytest.raises(SpikeloomError, match=f"^{told} the chart was asked for; copy th"):
+            chart_work.measure(changed)
