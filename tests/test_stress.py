@@ -110,7 +110,8 @@ def test_clean_recordings_are_what_reference_and_engine_say(bench):
     flat = with_clocks(bench.events, bench.pair.netlist.clocks)
     trace = engine.simulate(bench.pair.netlist, flat)
     assert_array_equal(found.votes["chip"], class_counts(bench.pair.netlist, trace.counts.spikes))
-    layers = float_spikes(bench.sensor.checkpoint, _adjacency(bench), bench.events)
+    adjacency = normalised_adjacency(bench.sensor.checkpoint.edges, TAXELS)
+    layers = float_spikes(bench.sensor.checkpoint, adjacency, bench.events)
     counts = readout_counts(bench.pair.network.readout, CLASSES, layers["fc3"])
     assert_array_equal(found.votes["float"], counts)
     for layer, (name, spikes) in enumerate(layers.items()):
@@ -118,6 +119,9 @@ def test_clean_recordings_are_what_reference_and_engine_say(bench):
         ids = bench.pair.netlist.compartments_of(layer)
         assert counted.layers[name][1] == trace.counts.spikes[:, ids].sum()
         assert counted.layers[name][3] == len(ids) * 8 * STEPS
+    known = bench.pair.netlist, bench.sensor.checkpoint, adjacency, bench.events, bench.labels, bench.files
+    for name, spikes in verify(*known).spikes.items():
+        assert counted.layers[name][:3] == (spikes.float, spikes.chip, spikes.different)
     equal = np.count_nonzero(vote(found.votes["chip"]) == vote(counts))
     assert counted.equal == equal
     assert counted.right == {"float": 8, "chip": equal}
@@ -125,15 +129,6 @@ def test_clean_recordings_are_what_reference_and_engine_say(bench):
 
 def _adjacency(bench):
     return normalised_adjacency(bench.sensor.checkpoint.edges, TAXELS)
-
-
-def test_different_spikes_are_those_of_verify(bench):
-    verdict = verify(
-        bench.pair.netlist, bench.sensor.checkpoint, _adjacency(bench), bench.events, bench.labels, bench.files
-    )
-    _, counted = clean(bench)
-    for name, spikes in verdict.spikes.items():
-        assert counted.layers[name][:3] == (spikes.float, spikes.chip, spikes.different)
 
 
 def test_recordings_after_others_without_a_reset_are_one_long_run_of_the_specification(bench):
@@ -338,13 +333,6 @@ def test_verdicts(chip, verdict, leaves, chance):
     assert found.same_place != apart
 
 
-def test_it_is_the_mean_over_seeds_that_leaves():
-    seeds = [run_of(right, seed=i) for i, right in enumerate((95, 70, 84))]
-    found = curve_of([(1, seeds)])
-    assert found.levels[0].chip.mean == pytest.approx(0.83)
-    assert found.verdict == "robust"
-
-
 @pytest.mark.parametrize(
     ("model", "chip", "same"),
     [  # Wilson's interval of 82 in 100 ends at 88.3, that of 90 begins at 82.6, that of 60 ends at 69.1
@@ -360,7 +348,10 @@ def test_the_same_place_is_one_where_intervals_overlap(model, chip, same):
     assert curve_of(runs).same_place == same
 
 
-def test_intervals_of_one_run_and_of_several():
+def test_it_is_the_mean_over_seeds_that_counts():
+    found = curve_of([(1, [run_of(right, seed=i) for i, right in enumerate((95, 70, 84))])])
+    assert found.levels[0].chip.mean == pytest.approx(0.83)
+    assert found.verdict == "robust"
     low, high = wilson(90, 100)
     assert spread([90], 100) == Spread(mean=0.9, low=low, high=high, values=(0.9,))
     several = spread([80, 90, 100], 100)
@@ -392,19 +383,13 @@ def test_intervals_of_one_run_and_of_several():
 )
 def test_reasons(run, seen):
     assert list(reasons("chip", [run], run.layers, CLEAN, 100)) == seen
+    silent = replace(run, layers={"fc": (0, 1000, 1000, 10000)})
+    assert reasons("float", [silent], silent.layers, CLEAN, 100)[0] == "fc is silent", "each side has its own"
 
 
-def test_what_the_float_network_does_is_its_own():
-    run = run_of(50, spikes=(0, 1000, 1000, 10000), signs={"no vote": 100}, stopped=100, most=10)
-    assert reasons("float", [run], run.layers, CLEAN, 100) == ("fc is silent",)
-
-
-@pytest.mark.parametrize(("spikes", "common"), [((60, 40, 20, 1000), 0.8), ((0, 0, 0, 1000), 1.0)])
-def test_spikes_in_common_are_counted_as_verify_does(spikes, common):
-    assert curve_of([(1, [run_of(90, spikes=spikes)])]).levels[0].common == {"fc": common}
-
-
-def test_requirements_hold_at_the_share_itself():
+def test_spikes_in_common_and_requirements():
+    for spikes, common in (((60, 40, 20, 1000), 0.8), ((0, 0, 0, 1000), 1.0)):  # as verify counts them
+        assert curve_of([(1, [run_of(90, spikes=spikes)])]).levels[0].common == {"fc": common}
     found = {"taxels_dead": curve_of([(3, [run_of((90, 85))])])}
     kept, missed = (parse_requirement(f"taxels_dead:3>={share}") for share in ("0.85", "0.86"))
     assert unmet([kept, missed], found) == ("taxels_dead:3>=0.86: 0.8500 reached",)
@@ -445,65 +430,51 @@ def test_text(golden):
     assert decode(Stress, json.loads(json.dumps(encode(result)))) == result
 
 
-def test_the_same_command_says_the_same_in_threads_and_in_processes(spikeloom, place):
-    code, one, err = spikeloom(*FEW, "-o", "one.json")
+def test_threads_and_processes_say_the_same_and_go_on_from_what_is_there(spikeloom, place, monkeypatch):
+    code, out, err = spikeloom(*FEW, "-o", "one.json")
     assert (code, err) == (0, "")
-    assert spikeloom(*FEW, "-o", "two.json")[1] == one
-    assert spikeloom(*FEW, "--jobs", "1", "-o", "three.json")[1] == one
-    first, second, third = ((place / f"{name}.json").read_bytes() for name in ("one", "two", "three"))
-    assert first == second == third
-    report = json.loads(first)
+    assert spikeloom(*FEW, "--jobs", "1", "-o", "two.json")[1] == out
+    monkeypatch.setattr("spikeloom.runtime.commands.check.stress.measure_task", None)  # everything is known by now
+    assert spikeloom(*FEW, "--jobs", "1", "-o", "two.json", "--picture", "curves.png")[1] == out
+    assert (place / "one.json").read_bytes() == (place / "two.json").read_bytes()
+    assert (place / "two.json.points").exists()
+    assert (place / "curves.png").read_bytes().startswith(b"\x89PNG")
+    report = json.loads((place / "one.json").read_bytes())
     wanted = set(FEW[3].split(",")) - {"other_graph"}  # the positions of its taxels are not known
     assert list(report["perturbations"]) == [name for name in NAMES if name in wanted]
     assert list(report["not_applicable"]) == ["other_graph"]
-    assert [point["level"] for point in report["perturbations"]["taxels_dead"]["levels"]] == [1, 3, 5]
-    assert report["provenance"]["netlist"] == "net.loom"
-    assert report["perturbations"]["taxels_dead"]["levels"][0]["seeds"] == [0, 1]
+    levels = report["perturbations"]["taxels_dead"]["levels"]
+    assert [point["level"] for point in levels] == [1, 3, 5]
+    assert levels[0]["seeds"] == [0, 1]
     assert report["perturbations"]["longer"]["levels"][0]["seeds"] == [0]
-
-
-def test_a_sweep_goes_on_from_what_is_there(spikeloom, place, monkeypatch):
-    words = ("--only", "events_lost,longer", "--seeds", "2", "--jobs", "1", "-o", "kept.json")
-    code, once, _ = spikeloom(*words)
-    assert code == 0
-    # everything is known: nothing may be measured
-    monkeypatch.setattr("spikeloom.runtime.commands.check.stress.measure_task", None)
-    assert spikeloom(*words)[:2] == (0, once)
-    assert (place / "kept.json.points").exists()
+    assert report["provenance"]["netlist"] == "net.loom"
 
 
 def test_full_has_all_levels(spikeloom):
     code, out, _ = spikeloom("--full", "--jobs", "1", "--only", "fewer_bits,edges_doubled", "--seeds", "1", "--json")
     assert code == 0
-    found = json.loads(out)["perturbations"]
-    assert [point["level"] for point in found["fewer_bits"]["levels"]] == list(NAMES["fewer_bits"].scale.full)
-    assert [point["level"] for point in found["edges_doubled"]["levels"]] == list(NAMES["edges_doubled"].scale.full)
+    for name, found in json.loads(out)["perturbations"].items():
+        assert [point["level"] for point in found["levels"]] == list(NAMES[name].scale.full)
 
 
 def test_requirements_decide_about_the_exit_code(spikeloom):
-    words = ("--only", "taxels_dead", "--seeds", "2", "--json")
-    code, out, _ = spikeloom(*words, "--require", "taxels_dead:2>=0")
+    words = ("--only", "taxels_dead", "--seeds", "2", "--require", "taxels_dead:2>=0")
+    code, out, _ = spikeloom(*words, "--json")
     report = json.loads(out)
     assert (code, report["missed"], report["required"]) == (0, [], ["taxels_dead:2>=0"])
-    assert [point["level"] for point in report["perturbations"]["taxels_dead"]["levels"]] == [1, 2, 3, 5]
-    reached = report["perturbations"]["taxels_dead"]["levels"][1]["chip"]["mean"]
-    code, out, err = spikeloom(*words[:-1], "--require", "taxels_dead:2>=1")
+    levels = report["perturbations"]["taxels_dead"]["levels"]
+    assert [point["level"] for point in levels] == [1, 2, 3, 5]
+    code, out, err = spikeloom(*words, "--require", "taxels_dead:2>=1")
     assert (code, err) == (1, "")
-    assert out.endswith(f"\nrequired taxels_dead:2>=1: {reached:.4f} reached\n")
-    _, out, _ = spikeloom(*words[:-1], "--require", "taxels_dead:1>=0")
-    assert out.endswith("\nrequired taxels_dead:1>=0: kept\n")
+    last = ["required taxels_dead:2>=0: kept", f"required taxels_dead:2>=1: {levels[1]['chip']['mean']:.4f} reached"]
+    assert out.splitlines()[-2:] == last
 
 
-def test_picture_and_page(spikeloom, place, capsys):
-    assert spikeloom(*FEW, "-o", "page.json", "--picture", "curves.png")[0] == 0
-    assert (place / "curves.png").read_bytes().startswith(b"\x89PNG")
-    assert cli.main([*REPORT, "--stress", "page.json", "-o", "page.html"]) == 0
-    assert "Stability\n---------\n" in capsys.readouterr().out
-    assert ">taxels_dead: " in (place / "page.html").read_text("utf-8")
+def test_the_page_of_a_network_shows_it(spikeloom, place, capsys):
+    assert spikeloom("--only", "taxels_dead", "--seeds", "1", "-o", "page.json")[0] == 0
     assert cli.main([*REPORT, "--stress", "page.json", "-o", "page.html", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["stress"] == json.loads((place / "page.json").read_bytes())
-    assert cli.main([*REPORT, "-o", "plain.html"]) == 0
-    assert "Stability" not in (place / "plain.html").read_text("utf-8")
+    assert ">taxels_dead: " in (place / "page.html").read_text("utf-8")
 
 
 @pytest.mark.parametrize(
