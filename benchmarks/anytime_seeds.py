@@ -21,7 +21,7 @@ from spikeloom.runtime.commands.choose.anytime import ALLOWED
 from spikeloom.runtime.inputs.network import propagation
 from spikeloom.runtime.machines.integer import integer_machine_of
 from spikeloom.runtime.machines.loihi1.costs import cumulative
-from spikeloom.runtime.report.tables import table
+from spikeloom.runtime.report.sections import Table
 from spikeloom.runtime.studies.anytime import exits
 
 
@@ -62,7 +62,7 @@ def main() -> None:
         told = "proven" if name == "proven" else f"calibrated on {name}, {100 * allowed:g} %"
         cells = [f"{100 * saved.mean():.1f} %", f"{differ.sum()} of {total}", f"{100 * differ.sum() / total:.2f} %"]
         lines.append([told, *cells, " ".join(f"{n:+d}" for n in right)])
-    print(table(["stop when", "steps saved", "differ", "", "right, each network"], lines))
+    print(Table(["stop when", "steps saved", "differ", "", "right, each network"], lines))
 
 
 if __name__ == "__main__":

@@ -34,7 +34,7 @@ from spikeloom.compiler.files import write_atomically
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist, write_netlist
 from spikeloom.models.recordings.evtouch import load_recordings
-from spikeloom.runtime.report.tables import table
+from spikeloom.runtime.report.sections import Table
 
 HERE = Path(__file__).parent
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
@@ -321,7 +321,7 @@ def text(name: str, facts: dict[str, Any]) -> str:
         [
             f"{name}: {facts['compartments']} neurons, {facts['synapses']} synapses, {facts['steps']} steps; "
             f"{activity} % spikes a step; {facts['synaptic_operations']:,} synaptic operations",
-            table(head, rows),
+            str(Table(head, rows)),
             *notes,
         ]
     )

@@ -21,7 +21,7 @@ from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
 from spikeloom.compiler.targets.truenorth.netlist_file import read_crossbars
 from spikeloom.models.recordings.evtouch import Recordings, load_recordings
 from spikeloom.runtime.machines.truenorth import engine
-from spikeloom.runtime.report.tables import table
+from spikeloom.runtime.report.sections import Table
 
 
 def stretched(netlist: CrossbarNetlist) -> CrossbarNetlist:
@@ -70,7 +70,7 @@ def main() -> None:
                 ]
             )
     head = ["network", "ticks a step", "cores", "neurons", "ticks", "ms a recording", "slowest"]
-    print(table(head, rows))
+    print(Table(head, rows))
 
 
 if __name__ == "__main__":

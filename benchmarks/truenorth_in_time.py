@@ -25,7 +25,7 @@ from spikeloom.runtime.cli import build_parser
 from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.inputs.recordings import recordings
 from spikeloom.runtime.machines.votes import readout_counts
-from spikeloom.runtime.report.tables import table
+from spikeloom.runtime.report.sections import Table
 
 ENDLESS = 1 << 30
 """More than any partial sum."""
@@ -86,7 +86,7 @@ def main() -> None:
             ]
         )
     head = ["axons an input", "cores", "ticks", "saturating at 19", "not saturating", "saturated", "largest"]
-    print(table(head, rows))
+    print(Table(head, rows))
 
 
 if __name__ == "__main__":

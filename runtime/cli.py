@@ -13,10 +13,13 @@ import shlex
 import sys
 from collections.abc import Iterable, Sequence
 from importlib import import_module
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from spikeloom.compiler import __version__
 from spikeloom.compiler.errors import OptionError, SpikeloomError, UnfinishedError
+
+if TYPE_CHECKING:
+    from spikeloom.runtime.report.sections import Outcome
 
 GROUPS: dict[str, dict[str, str]] = {
     "main job": {
@@ -117,7 +120,7 @@ def build_parser(chosen: str | None = None) -> argparse.ArgumentParser:
     for name in COMMANDS if chosen is None else filter(None, [chosen]):
         sub = commands.add_parser(name, description=COMMANDS[name][1], help=COMMANDS[name][1])
         module = _module(name)
-        sub.set_defaults(action=getattr(module, "run", None), run_words=result_of)
+        sub.set_defaults(action=getattr(module, "run", None))
         module.add_arguments(sub)
         if sub.get_default("action"):  # else it has commands of its own
             import_module("spikeloom.runtime.commands.options").add_common(sub)
@@ -139,25 +142,6 @@ def _parse(words: Sequence[str]) -> Arguments | None:
     elif first not in COMMANDS:
         raise OptionError(f"{first}: no command{near(first, COMMANDS)}; see spikeloom --help")
     return build_parser(first).parse_args(words)
-
-
-def _outcome(arguments: Arguments) -> tuple[Any, str, int]:
-    """JSON value, text and exit code of a command."""
-    from spikeloom.runtime.report.encode import encode
-    from spikeloom.runtime.report.sections import Outcome, terminal
-
-    found = arguments.action(arguments)
-    if isinstance(found, Outcome):
-        return encode(found.result), "" if arguments.json else terminal(found.sections(found.result)), found.code
-    report, as_text, code = found
-    return report, "" if arguments.json else as_text(report), code
-
-
-def result_of(words: Sequence[str]) -> tuple[Any, str, int]:
-    """Run one command within another: JSON value, text and exit code."""
-    arguments = _parse(words)
-    assert arguments is not None
-    return _outcome(arguments)
 
 
 def _mistake(error: Exception) -> str:
@@ -184,16 +168,20 @@ def _go_on(words: Sequence[str], more: Sequence[str]) -> str:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; return its exit code."""
     from spikeloom.runtime.report.console import progress, show
+    from spikeloom.runtime.report.sections import terminal
 
     words = sys.argv[1:] if argv is None else argv
     try:
         arguments = _parse(words)
         if arguments is None:
             return 0
-        report, text, code = _outcome(arguments)
+        from spikeloom.runtime.report.encode import encode  # with numpy, which help need not wait for
+
+        found: Outcome = arguments.action(arguments)
+        text = json.dumps(encode(found.result)) if arguments.json else terminal(found.sections(found.result))
         progress("")
-        show(json.dumps(report) if arguments.json else text)
-        return int(code)
+        show(text)
+        return found.code
     except (SpikeloomError, OSError, MemoryError) as error:
         progress("")
         if "--debug" in words:

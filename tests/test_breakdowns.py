@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from made_files import CLASSES, STEPS, TAXELS, events, small_checkpoint, weights
+from made_files import CLASSES, events, small_checkpoint, weights
 
 from spikeloom.compiler import Options, Recipe, compile_network
 from spikeloom.compiler.passes.expand import expand
@@ -119,24 +119,3 @@ def test_an_outlier_that_eats_the_scale(tmp_path, capsys):
     words = ["compile", str(tmp_path / "small.pt"), "--planes", "2", "-o", str(tmp_path / "net.loom")]
     assert cli.main(words) == 0
     assert "round to zero" not in capsys.readouterr().out
-
-
-def test_one_class_always(tmp_path):
-    """A class whose bias outweighs what four bits leave of the others' weights."""
-    arrays = weights()
-    arrays["fc3.weight"][:, 0] = 30.0
-    arrays["fc2.weight"][0], arrays["fc2.bias"][0] = 0, 0
-    arrays["fc3.bias"][:] = 0.1
-    arrays["fc3.bias"][1] = 0.41
-    kinds, text = verified(tmp_path, arrays, events(2), Recipe(bits=2), keep_all=True)
-    assert kinds["one class"]["count"] == 6
-    assert "breakdown: the chip decides class 1 for every recording, the float model " in text
-
-
-def test_recordings_with_hardly_an_event(tmp_path):
-    recordings = np.zeros((6, TAXELS, 2, 300), np.uint8)
-    recordings[:, 0, 0, :2] = 1  # 2 of 3,000 entries
-    kinds, text = verified(tmp_path, weights(), recordings, Recipe())
-    assert kinds["nearly empty"]["count"] == 6
-    assert "breakdown: events in less than 0.1 % of all entries, decided equally 6 times: 6 of 6 recordings" in text
-    assert STEPS < 300

@@ -4,11 +4,9 @@ import hashlib
 import io
 import json
 import os
-import shutil
 import subprocess
 import sys
 import types
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -61,39 +59,28 @@ def as_json(spikeloom):
 # -- compile and inspect -----------------------------------------------------------------------------------------------
 
 
-def test_compile_prints_the_promised_keys(as_json, tmp_path, place):
+def test_compile_counts_and_says_what_was_realised(as_json, tmp_path, place):
     report = as_json("compile", "net.pt", "--calibrate", "data", "-o", tmp_path / "out.loom")
-    promised = {"target", "neurons", "synapses", "synapses_stored", "synapses_nonzero", "cores", "layers", "limits"}
-    assert promised | {"sha256"} <= set(report)
     content = (tmp_path / "out.loom").read_bytes()
     assert content == (place / "net.loom").read_bytes()
     assert report["sha256"] == hashlib.sha256(content).hexdigest()
-    assert report["target"] == "loihi1"
-    assert report["neurons"] == sum(SIZES.values())
+    assert (report["target"], report["neurons"]) == ("loihi1", sum(SIZES.values()))
     # ring of six taxels with K = 3: every taxel reaches every other
     fan_in = {"conv1": 2 * TAXELS, "fc1": SIZES["conv1"], "fc2": 9, "fc3": 8}
     structural = {name: SIZES[name] * fan_in[name] for name in SIZES}
     assert report["synapses"] == sum(structural.values())
-    keys = ["name", "neurons", "synapses", "max_fan_in", "weight_bits", "scale", "threshold", "cores"]
-    assert [[layer[key] for key in keys[:5]] for layer in report["layers"]] == [
-        [name, SIZES[name], structural[name], fan_in[name], 8] for name in SIZES
+    keys = ["name", "neurons", "synapses", "max_fan_in", "weight_bits", "cores"]
+    assert [[layer[key] for key in keys] for layer in report["layers"]] == [
+        [name, SIZES[name], structural[name], fan_in[name], 8, [0]] for name in SIZES
     ]
-    assert all(set(keys) <= set(layer) for layer in report["layers"])
-    assert all(layer["cores"] == [0] for layer in report["layers"])
+    for layer in report["layers"]:
+        assert (layer["theta"], layer["beta"], layer["beta_realised"]) == (0.5, 0.2, 819 / 4096)
+        assert layer["theta_realised"] == layer["threshold"] / layer["scale"]
     assert report["synapses"] >= report["synapses_stored"] >= report["synapses_nonzero"] > 0
-    assert all(set(limit) == {"name", "used", "allowed", "core"} for limit in report["limits"])
     assert {limit["name"] for limit in report["limits"]} <= set(load_target("loihi1").limits)
     assert [limit for limit in report["limits"] if limit["name"] == "chip.cores"] == [
         {"name": "chip.cores", "used": report["cores"], "allowed": 128, "core": None}
     ]
-
-
-def test_compile_states_what_was_realised(as_json, tmp_path):
-    for layer in as_json("compile", "net.pt", "-o", tmp_path / "out.loom")["layers"]:
-        assert (layer["beta"], layer["beta_realised"]) == (0.2, 819 / 4096)
-        assert layer["theta"] == 0.5
-        assert layer["theta_realised"] == layer["threshold"] / layer["scale"]
-        assert layer["exponents"][0] >= -1
 
 
 def test_compile_for_people_says_where_scales_come_from(spikeloom, tmp_path):
@@ -161,47 +148,6 @@ def test_no_step_is_expected_without_recordings(as_json, spikeloom, tmp_path):
     assert "expected step" not in spikeloom("compile", "net.pt", "-o", tmp_path / "out.loom")[1]
 
 
-@pytest.mark.parametrize(
-    ("words", "line"),
-    [
-        *(
-            (["--cores-for", text], f"--cores-for {text}: {word!r} is not LAYER=N, N from 1; write for example fc1=6")
-            for text, word in (("fc1", "fc1"), ("fc1=", "fc1="), ("fc1=2,=3", "=3"), ("fc1=0", "fc1=0"), ("", ""))
-        ),
-        *(
-            (["--cores-for", text], f"--cores-for {text}: {text!r} is not LAYER=N, N from 1; write for example fc1=6")
-            for text in ("fc1=-2", "fc1=2.5", "fc1=two", "fc1=²", "fc1:2")
-        ),
-        (["--cores-for", "fc1=2,fc1=3"], "--cores-for fc1=2,fc1=3: names fc1 twice; give it once"),
-        (["--cores-for", "fc4=2"], "--cores-for fc4=2: no such layer; layers are conv1, fc1, fc2, fc3"),
-        (["--cores-for", "fc1=10"], "--cores-for fc1=10: fc1 has 9 neurons on the chip; give 9 or fewer"),
-        (
-            ["--cores-for", "conv1=200"],
-            "--cores-for conv1=200: Intel Loihi 1 has 128 cores (loihi1.chip.cores); give 128 or fewer",
-        ),
-        (["--optimize", "speed"], "--optimize speed: no such goal; give one of cores, energy, latency"),
-        (["--optimize", "energy"], "--optimize energy: needs firing rates; give --calibrate"),
-        (["--optimize", "latency"], "--optimize latency: needs firing rates; give --calibrate"),
-        (
-            ["--optimize", "latency", "--calibrate", "data", "--cores-for", "fc1=2"],
-            "--optimize latency: chooses the cores of every layer itself; omit --cores-for",
-        ),
-    ],
-)
-def test_layouts_that_cannot_be(spikeloom, tmp_path, words, line):
-    code, out, err = spikeloom("compile", "net.pt", *words, "-o", tmp_path / "out.loom")
-    assert (code, out, err) == (2, "", f"spikeloom: {line}\n")
-    assert not (tmp_path / "out.loom").exists()
-
-
-@pytest.mark.parametrize("bits", [2, 3, 4, 5, 6, 8])
-def test_every_storage_width(as_json, tmp_path, bits):
-    report = as_json("compile", "net.pt", "--weight-bits", bits, "-o", tmp_path / "out.loom")
-    assert {layer["weight_bits"] for layer in report["layers"]} == {bits}
-    weight = read_netlist(tmp_path / "out.loom").synapse_weight
-    assert not np.any(weight % 2 ** (9 - bits))
-
-
 def test_provenance_names_everything_that_decided(as_json, place):
     report = as_json("inspect", "net.loom")
     assert report["provenance"] == {
@@ -231,11 +177,8 @@ def test_inspect_shows_a_netlist_as_compile_did(as_json, spikeloom, tmp_path):
     code, inspected_text, err = spikeloom("inspect", tmp_path / "out.loom")
     assert (code, err) == (0, "")
     assert compiled_text.startswith(inspected_text.rstrip("\n"))
-
-
-def test_inspect_knows_a_netlist_by_its_content(as_json, tmp_path, place):
-    shutil.copy(place / "net.loom", tmp_path / "renamed")
-    assert as_json("inspect", tmp_path / "renamed") == as_json("inspect", "net.loom")
+    (tmp_path / "out.loom").rename(tmp_path / "renamed")  # it is known by its content
+    assert as_json("inspect", tmp_path / "renamed") == inspected
 
 
 def test_inspect_shows_what_a_released_file_leaves_open(as_json, spikeloom, tmp_path):
@@ -281,7 +224,7 @@ def test_the_graph_of_a_released_file_comes_from_the_user(as_json, tmp_path):
     torch = pytest.importorskip("torch")
     torch.save(state_dict(made_weights(taxels=39, sizes=(6, 5, 4))), tmp_path / "net.pt")
     structural = {}
-    for name in ("manual", "knn:2", "released:mst:2.0"):
+    for name in ("manual", "knn:2"):
         report = as_json("compile", tmp_path / "net.pt", "--graph", name, "-o", tmp_path / "out.loom")
         graph = build_graph(name)
         assert report["provenance"]["graph"] == graph.name
@@ -292,13 +235,7 @@ def test_the_graph_of_a_released_file_comes_from_the_user(as_json, tmp_path):
             hops = step @ hops  # eye plus one step, three times: all paths of up to three
         structural[name] = 2 * FEATURES * int(np.count_nonzero(hops))
         assert report["layers"][0]["synapses"] == structural[name]
-    assert len(set(structural.values())) == 3
-
-
-def test_a_graph_that_agrees_with_the_checkpoint_may_be_named(as_json, tmp_path):
-    own_file(tmp_path / "net.pt", last=made_weights(taxels=39, sizes=(4, 4, 4)), graph=build_graph("manual"))
-    named = as_json("compile", tmp_path / "net.pt", "--graph", "manual", "-o", tmp_path / "a.loom")
-    assert named["sha256"] == as_json("compile", tmp_path / "net.pt", "-o", tmp_path / "b.loom")["sha256"]
+    assert len(set(structural.values())) == 2
 
 
 def test_last_and_best_weights(as_json, tmp_path):
@@ -320,52 +257,28 @@ def test_last_and_best_weights(as_json, tmp_path):
 # -- run ---------------------------------------------------------------------------------------------------------------
 
 
-def test_run_prints_the_promised_keys(as_json):
-    report = as_json("run", "net.loom", "--data", "data")
-    assert set(report) == {"samples", "labelled", "accuracy", "files", "labels", "predictions", "counts"}
-    assert report["samples"] == 6
-    assert report["files"] == [f"sample_{i}_label_{i % CLASSES}.npy" for i in range(6)]
-    assert report["labels"] == [i % CLASSES for i in range(6)]
-    assert np.shape(report["counts"]) == (6, CLASSES)
-    assert report["predictions"] == [counts.index(max(counts)) for counts in report["counts"]]
-    right = [a == b for a, b in zip(report["labels"], report["predictions"], strict=True)]
-    assert report["accuracy"] == sum(right) / 6
-
-
 def test_run_for_people_lists_wrong_decisions(spikeloom, as_json):
     report = as_json("run", "net.loom", "--data", "data")
+    assert report["files"] == [f"sample_{i}_label_{i % CLASSES}.npy" for i in range(6)]
+    assert report["labels"] == [i % CLASSES for i in range(6)]
+    assert report["predictions"] == [counts.index(max(counts)) for counts in report["counts"]]
+    right = sum(a == b for a, b in zip(report["labels"], report["predictions"], strict=True))
+    assert 0 < right < 6
+    assert report["accuracy"] == right / 6
     code, out, err = spikeloom("run", "net.loom", "--data", "data")
     assert (code, err) == (0, "")
-    right = round(6 * report["accuracy"])
-    assert 0 < right < 6
     assert out.startswith(f"chip accuracy: {100 * right / 6:.2f} % ({right} of 6; 95 % interval ")
     for file, label, found in zip(report["files"], report["labels"], report["predictions"], strict=True):
         assert (file in out) == (label != found)
 
 
-def test_limit_takes_the_first_recordings(as_json):
+def test_limit_and_split_choose_the_recordings(as_json):
     everything = as_json("run", "net.loom", "--data", "data")
     two = as_json("run", "net.loom", "--data", "data", "--limit", 2)
-    assert two["samples"] == 2
     for key in ("files", "labels", "predictions", "counts"):
         assert two[key] == everything[key][:2]
-    assert as_json("run", "net.loom", "--data", "data", "--limit", 100) == everything
-
-
-def test_split_chooses_the_recordings(as_json):
-    assert as_json("run", "net.loom", "--data", "data", "--split", "test") == as_json(
-        "run", "net.loom", "--data", "data"
-    )
-    train = as_json("run", "net.loom", "--data", "data", "--split", "train")
-    assert train["files"] == as_json("run", "net.loom", "--data", "data")["files"]
-    assert train["counts"] != as_json("run", "net.loom", "--data", "data")["counts"]
-
-
-def test_a_zip_is_read_like_a_folder(as_json, tmp_path, place):
-    with zipfile.ZipFile(tmp_path / "data.zip", "w", zipfile.ZIP_DEFLATED) as archive:
-        for file in sorted((place / "data").rglob("*.npy")):
-            archive.write(file, f"Set/{file.relative_to(place / 'data')}")
-    assert as_json("run", "net.loom", "--data", tmp_path / "data.zip") == as_json("run", "net.loom", "--data", "data")
+    assert as_json("run", "net.loom", "--data", "data", "--limit", 100, "--split", "test") == everything
+    assert as_json("run", "net.loom", "--data", "data", "--split", "train")["counts"] != everything["counts"]
 
 
 def test_spikes_are_written_aligned_with_the_data(as_json, tmp_path, place):
@@ -387,33 +300,6 @@ def test_spikes_are_written_aligned_with_the_data(as_json, tmp_path, place):
 
 
 # -- verify and estimate -----------------------------------------------------------------------------------------------
-
-
-def test_verify_prints_the_promised_keys(spikeloom):
-    code, out, err = spikeloom("verify", "net.loom", "--checkpoint", "net.pt", "--data", "data", "--json")
-    assert err == ""
-    report = json.loads(out)
-    promised = {"samples", "accuracy", "decision_agreement", "spikes", "spec_equals_engine", "first_divergence"}
-    assert promised | {"ladder"} <= set(report)
-    assert code == (0 if report["decision_agreement"] >= 0.95 else 1)
-    assert report["samples"] == 6
-    assert set(report["accuracy"]) == {"float", "chip"}
-    assert list(report["spikes"]) == list(SIZES)
-    for layer in report["spikes"].values():
-        assert {"float", "chip", "different"} <= set(layer)
-    assert report["spec_equals_engine"] is True
-    assert report["spec_samples"] == 3
-    assert report["same_checkpoint"] is True
-    assert [rung["stage"] for rung in report["ladder"]] == [
-        "float64",
-        "beta",
-        "weights",
-        "bias_threshold",
-        "rounding",
-        "saturation",
-    ]
-    assert all(list(rung["different"]) == list(SIZES) for rung in report["ladder"])
-    assert report["ladder"][-1]["different"] == {name: layer["different"] for name, layer in report["spikes"].items()}
 
 
 def test_verify_fails_when_decisions_agree_too_rarely(spikeloom, tmp_path):
@@ -477,50 +363,24 @@ def test_the_epoch_is_that_of_the_netlist(spikeloom, tmp_path):
     )
 
 
-def test_verify_at_most_all_recordings_by_the_specification(spikeloom):
-    words = ["verify", "net.loom", "--checkpoint", "net.pt", "--data", "data", "--min-agreement", "0", "--json"]
-    assert json.loads(spikeloom(*words, "--spec-samples", "99")[1])["spec_samples"] == 6
-    assert json.loads(spikeloom(*words, "--limit", "2")[1])["spec_samples"] == 2
-
-
-def test_estimate_prints_the_promised_keys(as_json):
+def test_layers_add_up_to_an_inference(as_json):
     report = as_json("estimate", "net.loom", "--data", "data")
-    assert {"per_inference", "min", "max", "layers", "not_modelled"} <= set(report)
-    keys = {"synaptic_operations", "spikes", "neuron_updates", "energy_j"}
-    for part in (report["per_inference"], report["min"], report["max"], *report["layers"]):
-        assert keys <= set(part)
-        assert set(part["energy_j"]) == {"davies2018", "sanafe"}
-        assert all(isinstance(value, float) for key, value in part.items() if key not in ("energy_j", "name"))
-        assert all(isinstance(value, float) for value in part["energy_j"].values())
     assert [layer["name"] for layer in report["layers"]] == list(SIZES)
-    assert report["not_modelled"] == []
-    flat = [
-        {key: value for key, value in report[part].items() if key != "energy_j"} | report[part]["energy_j"]
-        for part in ("min", "per_inference", "max")
-    ]
-    assert all(low[key] <= mean[key] <= high[key] for low, mean, high in [flat] for key in low)
-    for key in keys - {"energy_j"}:
+    for key in ("synaptic_operations", "spikes", "neuron_updates"):
+        assert report["min"][key] <= report["per_inference"][key] <= report["max"][key]
         assert sum(layer[key] for layer in report["layers"]) == pytest.approx(report["per_inference"][key], rel=1e-12)
+    for table in ("davies2018", "sanafe"):
+        low, mean, high = (report[part]["energy_j"][table] for part in ("min", "per_inference", "max"))
+        assert 0 < low <= mean <= high
 
 
-@pytest.mark.parametrize("detail", ["counts", "cycle"])
-def test_details_agree_and_add(as_json, detail):
+def test_details_agree_and_add(as_json):
     plain = as_json("run", "net.loom", "--data", "data")
-    deep = as_json("run", "net.loom", "--data", "data", "--detail", detail)
-    assert "costs" not in plain
+    deep = as_json("run", "net.loom", "--data", "data", "--detail", "cycle")
     costs = deep.pop("costs")
     assert deep == plain
-    assert costs == as_json("estimate", "net.loom", "--data", "data", "--detail", detail)
-    assert {entry["model"] for entry in costs["time"]} == {"simple", *(["detailed"] if detail == "cycle" else [])}
-
-
-def test_estimate_has_no_mode_that_estimates_nothing(spikeloom):
-    code, out, err = spikeloom("estimate", "net.loom", "--data", "data", "--detail", "spikes")
-    assert (code, out) == (2, "")
-    assert err.replace("'", "") == (  # later versions of Python quote no choices
-        "spikeloom: argument --detail: invalid choice: spikes (choose from counts, cycle); "
-        "see spikeloom estimate --help\n"
-    )
+    assert costs == as_json("estimate", "net.loom", "--data", "data", "--detail", "cycle")
+    assert {entry["model"] for entry in costs["time"]} == {"simple", "detailed"}
 
 
 def test_a_table_of_ones_own_prices_alone(as_json, tmp_path):
@@ -544,21 +404,11 @@ def test_faults_of_a_table_are_told_at_once(spikeloom, tmp_path):
     lines = err.splitlines()
     assert len(lines) == 2
     assert all(line.startswith(f"spikeloom: {path}: energy.mine.") for line in lines)
-    assert spikeloom("estimate", "net.loom", "--data", "data", "--table", "mine") == (
-        2,
-        "",
-        "spikeloom: --table mine: unknown; allowed: davies2018, sanafe, or a file that ends in .toml\n",
-    )
 
 
-def test_chips_are_counted(as_json, spikeloom, tmp_path):
+def test_chips_are_counted(as_json, tmp_path):
     report = as_json("compile", "net.pt", "--chips", "3", "-o", tmp_path / "out.loom")
     assert (report["chips"], report["provenance"]["chips"]) == (1, 3)
-    assert spikeloom("compile", "net.pt", "--chips", "0", "-o", tmp_path / "none.loom") == (
-        2,
-        "",
-        "spikeloom: --chips 0: not a number of chips; give 1 or more\n",
-    )
 
 
 def test_estimate_agrees_with_run(as_json, tmp_path):
@@ -693,3 +543,59 @@ def test_a_terminal_without_greek_letters(spikeloom, monkeypatch):
     out = plain.buffer.getvalue().decode("ascii")
     assert out.startswith("loihi1: 51 neurons, ")
     assert "?" in out
+
+
+# -- recordings without a label ----------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """Four recordings, the last two without a label, and a network; the working folder holds both."""
+    monkeypatch.chdir(tmp_path)
+    own_file(tmp_path / "x.pt")
+    (tmp_path / "data").mkdir()
+    for index, name in enumerate(("a_label_0", "b_label_1", "c", "d")):
+        rows = [f"0.{step:02d},{(step + index) % TAXELS},{step % 2}" for step in range(0, 60, 2)]
+        (tmp_path / "data" / f"{name}.csv").write_text("\n".join(rows))
+    assert cli.main(["compile", "x.pt", "-o", "x.loom"]) == 0
+    return tmp_path / "data"
+
+
+def ran(capsys, *words):
+    capsys.readouterr()
+    assert cli.main(["run", "x.loom", "--data", "data", *words]) == 0
+    return capsys.readouterr().out
+
+
+def test_labelled_recordings_are_scored_and_counted(folder, capsys):
+    report = json.loads(ran(capsys, "--json"))
+    right = sum(report["predictions"][i] == report["labels"][i] for i in range(2))
+    assert (report["samples"], report["labelled"], report["labels"]) == (4, 2, [0, 1, -1, -1])
+    assert report["accuracy"] == right / 2
+    lines = ran(capsys).splitlines()
+    assert lines[0].startswith(f"chip accuracy: {50 * right:.2f} % ({right} of 2; ")
+    assert lines[0].endswith(", 2 more without a label")
+    assert [line.split()[:2] for line in lines[-2:]] == [
+        [file, str(report["predictions"][i])] for i, file in ((2, "c.csv"), (3, "d.csv"))
+    ]
+    assert lines[-3].split("  ")[1] == "without a label"
+
+
+def test_without_labels_there_is_no_accuracy(folder, capsys):
+    for name in ("a_label_0", "b_label_1"):
+        (folder / f"{name}.csv").unlink()
+    report = json.loads(ran(capsys, "--json"))
+    assert (report["labelled"], report["accuracy"]) == (0, None)
+    assert ran(capsys).splitlines()[0].split() == ["recording", "decision", "votes"]
+
+
+def test_a_table_of_labels_scores_the_rest(folder, capsys):
+    (folder / "labels.csv").write_text("file,label\nc.csv,2\nd.csv,3\n")
+    report = json.loads(ran(capsys, "--json"))
+    assert (report["labels"], report["labelled"]) == ([0, 1, 2, 3], 4)
+    assert cli.main(["run", "x.loom", "--data", "data"]) == 0
+    assert capsys.readouterr().err.splitlines() == [
+        "data: 120 events read, 0 out of order, 0 duplicates in a bin, 0 gaps over 0.5 s, "
+        "0 recordings shorter than the longest",
+        "spikeloom: warning: data: labels.csv: gives the labels of 2 of 4 recordings",
+    ]

@@ -1,7 +1,6 @@
 """The verdict: every number in it a second time, by the specification and by plain loops."""
 
 import dataclasses
-import json
 
 import numpy as np
 import pytest
@@ -11,7 +10,6 @@ from made_files import STEPS, events, own_file, recordings_folder, small_checkpo
 from random_netlists import Neuron, build
 
 from spikeloom.compiler import Options, Recipe, compile_network, lift
-from spikeloom.compiler.errors import DataError, ModelError
 from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.interpret import channels_last, run_float
 from spikeloom.compiler.passes.expand import expand
@@ -83,23 +81,26 @@ def test_spikes_and_decisions(small, verdict):
     assert verdict.spec_samples == 3
 
 
-def test_the_first_divergence_is_the_first(small, verdict):
-    checkpoint, adjacency, netlist = small
-    reference = list(float_spikes(checkpoint, adjacency, events(2)).values())
-    chip, registers = by_specification(netlist, events(2))
-    membranes = list(float_membranes(checkpoint, adjacency, events(2)).values())
-    first = next(
+@pytest.mark.parametrize(("seed", "bits"), [(0, 4), (1, 6), (4, 6)])
+def test_the_first_divergence_is_the_first(tmp_path, seed, bits):
+    checkpoint, adjacency = small_checkpoint(tmp_path, last=weights(seed))
+    options = Options(recipes=(Recipe(bits=bits),), keep_all=bits == 6)
+    netlist, recordings = compile_network(expand(checkpoint, adjacency), options).netlist, events(2 + seed, samples=3)
+    found = verify(netlist, checkpoint, adjacency, recordings, LABELS[:3], FILES[:3], spec_samples=1).first_divergence
+    reference = list(float_spikes(checkpoint, adjacency, recordings).values())
+    chip, registers = by_specification(netlist, recordings)
+    sample, step, layer, neuron = next(
         (sample, step, layer, neuron)
-        for sample in range(6)
+        for sample in range(3)
         for step in range(STEPS)
         for layer in range(4)
         for neuron in range(reference[layer].shape[2])
         if reference[layer][sample, step, neuron] != chip[layer][sample, step, neuron]
     )
-    sample, step, layer, neuron = first
-    found, compartment = verdict.first_divergence, netlist.compartments_of(layer)[neuron]
+    compartment = netlist.compartments_of(layer)[neuron]
     assert (found.file, found.step, found.layer, found.neuron) == (FILES[sample], step, LAYERS[layer], neuron)
     assert (found.taxel, found.feature) == ((neuron // 5, neuron % 5) if layer == 0 else (None, None))
+    membranes = list(float_membranes(checkpoint, adjacency, recordings).values())
     assert found.float_membrane == membranes[layer][sample, step, neuron]
     assert found.chip_register == registers[layer][sample, step, neuron]
     assert found.chip_membrane == found.chip_register / (64 * netlist.scale[compartment])
@@ -107,23 +108,6 @@ def test_the_first_divergence_is_the_first(small, verdict):
     # one side fired, the other did not
     assert (found.float_membrane > found.theta) != (found.chip_membrane > found.chip_theta)
     assert not found.ill_posed
-
-
-@pytest.mark.parametrize("seed", range(6))
-def test_the_first_divergence_of_other_networks(tmp_path, seed):
-    checkpoint, adjacency = small_checkpoint(tmp_path, last=weights(seed))
-    netlist = compile_network(expand(checkpoint, adjacency), Options(recipes=(Recipe(bits=6),), keep_all=True)).netlist
-    recordings = events(seed, samples=3)
-    found = verify(netlist, checkpoint, adjacency, recordings, LABELS[:3], FILES[:3], spec_samples=1).first_divergence
-    reference = list(float_spikes(checkpoint, adjacency, recordings).values())
-    chip, _ = by_specification(netlist, recordings)
-    different = [a != b for a, b in zip(reference, chip, strict=True)]
-    sample, index = FILES.index(found.file), LAYERS.index(found.layer)
-    assert different[index][sample, found.step, found.neuron]
-    assert not any(d[:sample].any() or d[sample, : found.step].any() for d in different)
-    assert not any(d[sample, found.step].any() for d in different[:index])
-    assert not different[index][sample, found.step, : found.neuron].any()
-    assert (found.taxel is None) == (index > 0)
 
 
 # -- the ladder --------------------------------------------------------------------------------------------------------
@@ -216,17 +200,6 @@ def test_ill_posed_spikes_are_told_from_faults(tmp_path):
 # -- specification and engine ------------------------------------------------------------------------------------------
 
 
-def test_an_engine_of_another_netlist_is_found_out(small, monkeypatch):
-    checkpoint, adjacency, netlist = small
-    weight = netlist.synapse_weight.copy()
-    weight[np.argmax(np.abs(weight))] = 0
-    altered = dataclasses.replace(netlist, synapse_weight=read_only(weight))
-    prepare = engine.prepare
-    monkeypatch.setattr(engine, "prepare", lambda _netlist: prepare(altered))
-    found = verify(netlist, checkpoint, adjacency, events(2), LABELS, FILES)
-    assert not found.spec_equals_engine
-
-
 @pytest.mark.parametrize("field", ["spikes", "membranes", "inputs", "counted spikes", "updates", "saturations"])
 def test_a_single_wrong_bit_is_found_out(small, monkeypatch, field):
     checkpoint, adjacency, netlist = small
@@ -267,34 +240,11 @@ def test_a_disagreement_ends_with_exit_code_one(tmp_path, monkeypatch, capsys):
     recordings_folder(tmp_path / "data")
     monkeypatch.chdir(tmp_path)
     assert cli.main(["compile", "net.pt", "-o", "net.loom"]) == 0
-    words = ["verify", "net.loom", "--checkpoint", "net.pt", "--data", "data", "--min-agreement", "0"]
-    assert cli.main(words) == 0
     monkeypatch.setattr(Loihi, "check", lambda *_, **_options: 1)
     capsys.readouterr()
-    assert cli.main([*words, "--json"]) == 1
-    out, err = capsys.readouterr()
-    assert (json.loads(out)["spec_equals_engine"], err) == (False, "")
-    assert cli.main(words) == 1
-    assert (
-        "E0  specification = engine NOT in every spike, membrane and count of 3 recordings\n" in capsys.readouterr().out
-    )
-
-
-# -- parts that do not belong together ---------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("options", "theirs"),
-    [
-        ({"sizes": (9, 7, 4)}, "conv1 30, fc1 9, fc2 7, fc3 4"),
-        ({"sizes": (9, 8, 4, 4)}, "conv1 30, fc1 9, fc2 8, fc3 4, fc4 4"),
-        ({"features": 4}, "conv1 24, fc1 9, fc2 8, fc3 4"),
-    ],
-)
-def test_another_architecture(small, tmp_path, options, theirs):
-    checkpoint, adjacency = small_checkpoint(tmp_path, last=weights(**options))
-    with pytest.raises(ModelError, match=rf"fc1 9, fc2 8, fc3 4, the checkpoint taxels 6, channels 2, {theirs}; give"):
-        verify(small[2], checkpoint, adjacency, events(2), LABELS, FILES)
+    assert cli.main(["verify", "net.loom", "--checkpoint", "net.pt", "--data", "data", "--min-agreement", "0"]) == 1
+    said = "E0  specification = engine NOT in every spike, membrane and count of 3 recordings\n"
+    assert said in capsys.readouterr().out
 
 
 def test_the_checkpoint_is_known_by_its_hash(small, tmp_path):
@@ -304,16 +254,6 @@ def test_the_checkpoint_is_known_by_its_hash(small, tmp_path):
     found = verify(marked, small_checkpoint(tmp_path, last=weights(9))[0], adjacency, events(2), LABELS, FILES)
     assert (found.same_checkpoint, found.spec_equals_engine) == (False, True)
     assert found.spikes["fc1"].different > 0
-
-
-def test_graph_recordings_and_number_of_samples(small):
-    checkpoint, adjacency, netlist = small
-    with pytest.raises(ModelError, match=r"^graph and weights disagree: the graph has 3 taxels, "):
-        verify(netlist, checkpoint, adjacency[:3, :3], events(2), LABELS, FILES)
-    with pytest.raises(DataError, match=r"^recordings: 10 input channels found, the netlist has 12; "):
-        verify(netlist, checkpoint, adjacency, events(2, taxels=5), LABELS, FILES)
-    with pytest.raises(DataError, match=r"^--spec-samples 0: at least 1 recording is needed; "):
-        verify(netlist, checkpoint, adjacency, events(2), LABELS, FILES, spec_samples=0)
 
 
 def test_the_ladder_carries_thresholds_that_differ(small):

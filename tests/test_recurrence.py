@@ -38,7 +38,7 @@ from spikeloom.compiler.targets.loihi1.legalize import require_legal
 from spikeloom.compiler.targets.loihi1.storage.quantize import quantize
 from spikeloom.compiler.targets.loihi1.storage.width_search import search_widths
 from spikeloom.runtime.cli import main
-from spikeloom.runtime.equivalence.certainty import float_certainty
+from spikeloom.runtime.equivalence.certain_spikes import certain_spikes
 from spikeloom.runtime.equivalence.verify import verify
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.blocks import obstacle
@@ -226,7 +226,7 @@ def test_a_layer_is_cut_so_that_its_axons_to_itself_are_enough():
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.5]), st.sampled_from([0.5, 1.5]))
 def test_what_is_certain_is_so_in_float32_and_in_another_order(seed, alpha, gain):
     network, events = drawn(seed, gain=gain, alpha=alpha), events_for(seed, samples=2)
-    certainty = float_certainty(network, None, events)
+    certainty = certain_spikes(network, None, events)
     turned = np.random.default_rng(seed).permutation(12)
     first, last, own = (p.weight.toarray() for p in network.projections)
     other = chain(first[turned], last[:, turned], beta=0.6, biases=[network.populations[0].bias[turned], np.zeros(4)])
@@ -245,7 +245,7 @@ def test_a_loop_of_zeros_proves_as_much_as_none():
     network, events = drawn(7), events_for(8)
     zeros = replace(network.projections[2], weight=network.projections[2].weight * 0.0)
     none, still = (
-        float_certainty(replace(network, projections=(*network.projections[:2], *more)), None, events)
+        certain_spikes(replace(network, projections=(*network.projections[:2], *more)), None, events)
         for more in ((), (zeros,))
     )
     for ours, theirs in zip(none, still, strict=True):

@@ -111,6 +111,7 @@ def place(tmp_path_factory):
     torch.save(state_dict(made_weights(taxels=39, sizes=(3, 3, 3))), at / "finger.pt")
     assert cli.main(["compile", f"{at}/finger.pt", "--graph", "knn:1", "-o", f"{at}/finger.loom"]) == 0
     own_file(at / "other.pt", last=made_weights(sizes=(9, 7, CLASSES)))
+    own_file(at / "same.pt", last=made_weights(7))
     (at / "empty.pt").touch()
     (at / "words.pt").write_text("hello")
     (at / "words.txt").write_text("hello")
@@ -159,6 +160,8 @@ def place(tmp_path_factory):
 
 COMPILE = "compile {} -o out.loom"
 RUN = "run net.loom --data {}"
+EXPLAIN = "explain net.loom --checkpoint net.pt --data data {}"
+REPORT = "report net.loom --checkpoint net.pt --data data -o x.html {}"
 VERIFY = "verify net.loom --checkpoint net.pt --data data {}"
 
 TABLE = [
@@ -216,10 +219,36 @@ TABLE = [
     (COMPILE.format("net.pt --ranges nope"), "--ranges nope: unknown|proven, observed"),
     *((COMPILE.format(f"net.pt --ranges observed --margin {x}"), f"--margin {x}|from 0") for x in ("-0.1", "nan")),
     (COMPILE.format("net.pt --calibrate nowhere"), "nowhere: no such folder or file|train/ and test/"),
+    ("compile net.pt --chips 0 -o out.loom", "--chips 0: not a number of chips; give 1 or more"),
+    # layouts
+    *(
+        (COMPILE.format(f"net.pt --cores-for {text!r}"), f"{word!r} is not LAYER=N, N from 1; write for example fc1=6")
+        for text, word in (("fc1", "fc1"), ("fc1=2,=3", "=3"), ("fc1=0", "fc1=0"), ("", ""), ("fc1=²", "fc1=²"))
+    ),
+    *(
+        (COMPILE.format(f"net.pt --cores-for {text}"), f"--cores-for {text}: {why}")
+        for text, why in (
+            ("fc1=2,fc1=3", "names fc1 twice; give it once"),
+            ("fc4=2", "no such layer; layers are conv1, fc1, fc2, fc3"),
+            ("fc1=10", "fc1 has 9 neurons on the chip; give 9 or fewer"),
+            ("conv1=200", "Intel Loihi 1 has 128 cores (loihi1.chip.cores); give 128 or fewer"),
+        )
+    ),
+    (COMPILE.format("net.pt --optimize speed"), "--optimize speed: no such goal; give one of cores, energy, latency"),
+    (COMPILE.format("net.pt --optimize energy"), "--optimize energy: needs firing rates; give --calibrate"),
+    (COMPILE.format("net.pt --optimize latency --calibrate data --cores-for fc1=2"), "latency|omit --cores-for"),
+    # prices
+    ("estimate net.loom --data data --detail spikes", "argument --detail: invalid choice|counts|cycle"),
+    ("estimate net.loom --data data --table mine", "--table mine: unknown; allowed: davies2018, sanafe, or a file"),
     # places to write
     *(
         (f"{command} {where!r}", f"{command.split()[-1]} {where}: {why}")
-        for command in ("compile net.pt -o", "run net.loom --data data --spikes", "train --data data --graph manual -o")
+        for command in (
+            "compile net.pt -o",
+            "run net.loom --data data --spikes",
+            "train --data data --graph manual -o",
+            "report net.loom --checkpoint net.pt --data data -o",
+        )
         for where, why in (
             ("nowhere/out", "the folder does not exist"),
             ("data", "is not a regular file"),
@@ -237,12 +266,24 @@ TABLE = [
     ("verify net.loom --data data --checkpoint bare.pt", "bare.pt: the graph is not in this file"),
     ("verify net.loom --data data --checkpoint other.pt", "the netlist has taxels 6|fc2 8|fc2 7"),
     (VERIFY.format("--graph manual"), "trained on ring, --graph says manual"),
+    ("explain net.loom --checkpoint other.pt --data data", "netlist and checkpoint disagree|fc2 8|fc2 7"),
+    ("report net.loom --checkpoint other.pt --data data -o x.html", "the netlist has taxels 6|fc2 8|fc2 7"),
+    ("report net.loom --checkpoint same.pt --data data -o x.html", "compiled from a checkpoint of sha256"),
+    # one recording
+    (EXPLAIN.format("--top 0"), "--top 0|at least 1"),
+    (EXPLAIN.format("--sample sample_9_label_1.npy"), "among 6 of split test|near are sample_5_label_1.npy"),
+    (EXPLAIN.format("--sample sample_5_label_1.npy --limit 1"), "among 1 of split test|near are sample_0_label_0"),
+    (REPORT.format("--recording 6"), "--recording 6|0 to 5"),
+    (REPORT.format("--recording sample_9_label_3.npy"), "sample_9_label_3.npy|near are sample_3_label_3.npy"),
+    (REPORT.format("--spec-samples 0"), "--spec-samples 0|at least 1"),
     # recordings
     *((RUN.format(name), f"{name}: test/sample_0_label_0.npy: |{words}") for name, (_, words) in ARRAYS.items()),
     (RUN.format("five"), "five: test/sample_0_label_0.npy: has 5 taxels, the network has 6"),
     (COMPILE.format("net.pt --calibrate five"), "five: train/sample_0_label_0.npy: has 5 taxels, the network has 6"),
-    ("estimate net.loom --data five", "five: test/|has 5 taxels"),
-    ("verify net.loom --checkpoint net.pt --data five", "five: test/|has 5 taxels"),
+    *(
+        (f"{command} net.loom --data five", "five: test/|has 5 taxels")
+        for command in ("estimate", "verify --checkpoint net.pt", "report --checkpoint net.pt -o x.html")
+    ),
     ("estimate net.loom --data lengths", "test/sample_1_label_1.npy: shape (6, 2, 20)|(6, 2, 24)"),
     (RUN.format("label"), "label 4, the network has 4 classes (0..3)"),
     (RUN.format("short"), "1145 bytes of data, its header announces 1152"),

@@ -13,11 +13,10 @@ import pytest
 from browser import Page
 from made_files import CLASSES, FEATURES, STEPS, TAXELS, own_file, recordings_folder, weights
 from numpy.testing import assert_allclose, assert_array_equal
-from timed_networks import written
+from zoo import specimen
 
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
-from spikeloom.compiler.systems import GRAPH_SYSTEMS, GRID_CNN, SYSTEMS
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist, write_netlist
 from spikeloom.models.graphs import normalised_adjacency
@@ -27,7 +26,7 @@ from spikeloom.runtime import cli
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.costs import cost
 from spikeloom.runtime.machines.loihi1.trace import aligned
-from spikeloom.runtime.page.results import LayerSpikes
+from spikeloom.runtime.page.recording import LayerRaster
 from spikeloom.runtime.page.sections import ROWS, _raster
 
 REPORT = ("report", "net.loom", "--checkpoint", "net.pt", "--data", "data", "-o", "out.html")
@@ -90,8 +89,6 @@ def place(tmp_path_factory):
     folder = tmp_path_factory.mktemp("report")
     recordings_folder(folder / "data")
     own_file(folder / "net.pt", training={"seed": 17})
-    own_file(folder / "other.pt", last=weights(7))
-    own_file(folder / "wide.pt", last=weights(sizes=(10, 8, CLASSES)))
     words = ["compile", folder / "net.pt", "--weight-bits", "4", "--keep-all", "-o", folder / "net.loom", "--json"]
     assert cli.main([str(word) for word in words]) == 0
     return folder
@@ -286,13 +283,6 @@ def test_the_terminal_shows_the_same(spikeloom, made):
     assert out.endswith("page: out.html\n")
 
 
-@pytest.mark.parametrize(("asked", "file"), [("3", "sample_3_label_3.npy"), ("sample_4_label_0.npy",) * 2])
-def test_another_recording_is_drawn(spikeloom, asked, file):
-    code, out, _ = spikeloom(*REPORT[:-1], "chosen.html", "--limit", "5", "--recording", asked, "--json")
-    assert code == 0
-    assert json.loads(out)["recording"]["file"] == file
-
-
 def test_where_no_spike_differs_the_widest_membranes_are_shown(spikeloom, place):
     """Weights too small for a spike, so that every raster is empty, too."""
     own_file(place / "quiet.pt", last=weights(gain=0.05))
@@ -311,34 +301,47 @@ def test_where_no_spike_differs_the_widest_membranes_are_shown(spikeloom, place)
     assert drawings(Tags(text)).keys() == FIGURES
 
 
-# -- every system ------------------------------------------------------------------------------------------------------
+# -- other networks ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("system", SYSTEMS)
-def test_every_system_has_its_page(spikeloom, tmp_path, system):
-    from test_systems import network_of, saved
-
-    saved(tmp_path, network_of(system))
-    recordings_folder(tmp_path / "data", train=_grasps(1), test=_grasps(2))
-    net, checkpoint = tmp_path / "x.loom", tmp_path / "x.pt"
-    assert spikeloom("compile", checkpoint, "-o", net)[0] == 0
-    words = ("report", net, "--checkpoint", checkpoint, "--data", tmp_path / "data", "-o", tmp_path / "x.html")
-    code, out, err = spikeloom(*words, "--json")
-    assert (code, err) == (0, "")
-    found, page = json.loads(out), Tags((tmp_path / "x.html").read_text("utf-8"))
-    assert drawings(page).keys() == FIGURES
-    taxels = found["taxels"]
-    assert taxels["sensor"] == "NeuTouch"
-    assert len(taxels["positions_mm"]) == 39
-    graph = system in GRAPH_SYSTEMS
-    assert (taxels["graph"] is not None, taxels["spikes"] is not None, bool(taxels["edges"])) == (graph,) * 3
-    assert len(values((tmp_path / "x.html").read_text("utf-8"), "taxels-map")["tips"]) == 39 * (2 if graph else 1)
-    if system == GRID_CNN:
-        assert found["recording"]["membranes"][0]["of"].startswith("neuron ")
+def report_of(made, folder, capsys):
+    """The page of a network of the zoo, and its data."""
+    words = ("report", made.netlist, "--checkpoint", made.network, *made.reading, "--data", made.data)
+    capsys.readouterr()
+    assert cli.main([*map(str, words), "-o", str(folder / "x.html"), "--json"]) == 0
+    return (folder / "x.html").read_text("utf-8"), json.loads(capsys.readouterr().out)
 
 
-@pytest.mark.parametrize("asked", [None, "0"])
-def test_recordings_of_different_length(spikeloom, place, tmp_path, asked):
+@pytest.mark.parametrize("name", ["mlp", "onnx"])
+def test_networks_without_a_graph_show_their_taxels(name, tmp_path, capsys):
+    made = specimen(name)
+    text, found = report_of(made, tmp_path, capsys)
+    taxels, sensor = found["taxels"], made.machine.netlist.taxels
+    assert (taxels["graph"], taxels["spikes"], taxels["edges"]) == (None, None, [])
+    assert (taxels["sensor"], len(taxels["positions_mm"] or ())) == (("NeuTouch", 39) if sensor == 39 else (None, 0))
+    assert len(values(text, "taxels-map")["tips"]) == sensor
+    assert drawings(Tags(text)).keys() >= FIGURES - {f"raster-{name}" for name in LAYERS} - {"time-cores"}
+
+
+def test_clocks_and_lasting_currents_have_their_page(tmp_path, capsys):
+    made = specimen("timed")
+    text, found = report_of(made, tmp_path, capsys)
+    assert found["provenance"]["checkpoint"]["dynamics"]["clocks"] == {"channels": 3, "steps": 4}
+    assert "Decays by layer, and clocks" in text
+    channels = {channel for _, channel in found["recording"]["input"]}
+    assert channels >= {78, 79, 80}  # the clocks' come after those of 39 taxels
+    netlist = made.machine.netlist
+    counts = engine.simulate(netlist, with_clocks(made.events, netlist.clocks)).counts
+    received = (netlist.layer == 0) & (netlist.neuron < 39 * read_checkpoint(made.network).hops.shape[1])
+    assert len(found["taxels"]["spikes"]) == 39
+    assert_allclose(sum(found["taxels"]["spikes"]), counts.spikes[:, received].sum(axis=1).mean())
+    recording = found["recording"]
+    costs = cost.estimate(cost.prepare(netlist, load_target("loihi1")), counts, made.events.shape[-1])
+    for name, steps in recording["by_step"]["energy_j"].items():
+        assert_allclose(sum(steps), costs.energy[name][recording["index"]].sum())
+
+
+def test_recordings_of_different_length(spikeloom, place, tmp_path):
     """The one that is drawn may be shorter than others."""
     rng = np.random.default_rng(5)
     for name, steps in (("a_label_0", 7), ("b_label_1", 30)):
@@ -347,8 +350,7 @@ def test_recordings_of_different_length(spikeloom, place, tmp_path, asked):
         lines = [f"{(step + 0.5) * 0.02:.2f},{taxel},{polarity}" for step, taxel, polarity in np.argwhere(grid)]
         (tmp_path / "test").mkdir(exist_ok=True)
         (tmp_path / "test" / f"{name}.csv").write_text("\n".join(["time_s,taxel,polarity", *lines, ""]))
-    chosen = [] if asked is None else ["--recording", asked]
-    code, out, _ = spikeloom(*REPORT[:5], tmp_path, "-o", tmp_path / "x.html", *chosen, "--json")
+    code, out, _ = spikeloom(*REPORT[:5], tmp_path, "-o", tmp_path / "x.html", "--recording", "0", "--json")
     assert code == 0
     recording = json.loads(out)["recording"]
     assert (recording["file"], recording["steps"]) == ("a_label_0.csv", 7)
@@ -370,124 +372,33 @@ def test_several_chips_are_drawn_one_below_the_other(spikeloom, place):
     assert [core["chip"] for core in found["cores"]["cores"]] == (tiles // 32).tolist()
     figures = drawings(Tags((place / "wide.html").read_text("utf-8")))
     assert figures.keys() == FIGURES - {"time-cores", "energy-cores", "time-steps"}
-    assert spikeloom(*words)[0] == 0
 
 
 def test_large_layers_are_thinned_out():
     active = np.arange(0, 20_000, 2)
     pairs = {"both": np.stack([0 * active, active], axis=1), "float_only": np.zeros((0, 2), int)}
     counts = {"neurons": 20_000, "float_spikes": 0, "chip_spikes": 0, "different": 2}
-    layer = LayerSpikes(name="conv1", active=active, chip_only=np.array([[1, 0], [1, 2]]), **pairs, **counts)
+    layer = LayerRaster(name="conv1", active=active, chip_only=np.array([[1, 0], [1, 2]]), **pairs, **counts)
     rows = _raster(layer, 5).draw().cells[1]
     assert len(rows) == len(set(rows)) == ROWS
     assert set(rows) <= {f"neuron {neuron}" for neuron in active}
 
 
-def _grasps(seed):
-    return (np.random.default_rng(seed).random((3, 39, 2, 20)) < 0.15).astype(np.uint8)
-
-
-def test_clocks_and_lasting_currents_have_their_page(spikeloom, tmp_path):
-    written(tmp_path / "x.pt")
-    recordings_folder(tmp_path / "data", train=_grasps(1), test=_grasps(2))
-    net, checkpoint, data = tmp_path / "x.loom", tmp_path / "x.pt", tmp_path / "data"
-    assert spikeloom("compile", checkpoint, "--keep-all", "-o", net)[0] == 0
-    words = ("report", net, "--checkpoint", checkpoint, "--data", data, "-o", tmp_path / "x.html", "--json")
-    code, out, err = spikeloom(*words)
-    assert (code, err) == (0, "")
-    found = json.loads(out)
-    assert found["provenance"]["checkpoint"]["dynamics"]["clocks"] == {"channels": 3, "steps": 4}
-    assert "Decays by layer, and clocks" in (tmp_path / "x.html").read_text("utf-8")
-    channels = {channel for _, channel in found["recording"]["input"]}
-    assert channels >= {78, 79, 80}  # the clocks' come after those of 39 taxels
-    netlist = read_netlist(net)
-    events = with_clocks(load_data(str(data), "test")[0].events, netlist.clocks)
-    counts = engine.simulate(netlist, events).counts
-    features = read_checkpoint(checkpoint).hops.shape[1]
-    heard = (netlist.layer == 0) & (netlist.neuron < 39 * features)
-    assert_allclose(sum(found["taxels"]["spikes"]), counts.spikes[:, heard].sum(axis=1).mean())
-    assert len(found["taxels"]["spikes"]) == 39
-    recording = found["recording"]
-    costs = cost.estimate(cost.prepare(netlist, load_target("loihi1")), counts, events.shape[2])
-    for name, steps in recording["by_step"]["energy_j"].items():
-        assert_allclose(sum(steps), costs.energy[name][recording["index"]].sum())
-
-
-def test_an_onnx_network_has_its_page(spikeloom, place):
-    assert spikeloom("export", "net.pt", "--to", "onnx-float", "-o", "net.onnx")[0] == 0
-    assert spikeloom("compile", "net.onnx", "-o", "onnx.loom")[0] == 0
-    words = ("report", "onnx.loom", "--checkpoint", "net.onnx", "--data", "data", "-o", "onnx.html")
-    code, out, err = spikeloom(*words, "--json")
-    assert (code, err) == (0, "")
-    assert json.loads(out)["taxels"]["graph"] is None
-
-
-@pytest.mark.recordings
-def test_the_released_network_has_its_page(spikeloom, released_checkpoint, objects_zip, tmp_path):
-    model = ("--graph", "manual")
-    assert spikeloom("compile", released_checkpoint, *model, "-o", tmp_path / "x.loom")[0] == 0
-    words = ("report", tmp_path / "x.loom", "--checkpoint", released_checkpoint, *model, "--data", objects_zip)
-    code, out, err = spikeloom(*words, "--limit", "4", "--recording", "3", "-o", tmp_path / "x.html", "--json")
-    assert (code, err) == (0, "")
-    text = (tmp_path / "x.html").read_text("utf-8")
-    assert len(text.encode()) < MOST_BYTES
-    page, found = Tags(text), json.loads(out)
-    assert drawings(page).keys() == FIGURES
-    assert sum(layer["chip_spikes"] for layer in found["recording"]["layers"]) > 1000
-    assert len(values(text, "taxels-map")["tips"]) == 2 * 39
-
-
 # -- what is refused ---------------------------------------------------------------------------------------------------
 
 
-def refused(spikeloom, *words):
-    code, out, err = spikeloom(*words)
-    assert (code, out) == (2, "")
-    assert err.count("\n") == 1
-    return err.removeprefix("spikeloom: ").removesuffix("\n")
-
-
-def test_another_checkpoint_or_graph_is_refused(spikeloom, place):
-    def told(old, new):
-        return refused(spikeloom, *[word.replace(old, new) for word in REPORT])
-
-    made, other = (hashlib.sha256((place / name).read_bytes()).hexdigest()[:12] for name in ("net.pt", "other.pt"))
-    assert re.search(f"{made}….* other.pt has {other}…", told("net.pt", "other.pt"))
-    assert re.search("netlist has .*fc1 9, .*checkpoint .*fc1 10,", told("net.pt", "wide.pt"))
+def test_another_graph_is_refused(spikeloom, place):
     netlist = read_netlist(place / "net.loom")
     write_netlist(dataclasses.replace(netlist, provenance=netlist.provenance | {"graph": "line"}), place / "line.loom")
-    assert "compiled for graph line, this is ring; give --graph line" in told("net.loom", "line.loom")
-
-
-def test_recordings_of_another_sensor_or_other_objects_are_refused(spikeloom, place, tmp_path):
-    recordings_folder(tmp_path / "wide", test=np.ones((2, 7, 2, STEPS), np.uint8))
-    recordings_folder(tmp_path / "many", test=np.ones((2, TAXELS, 2, STEPS), np.uint8))
-    one = sorted((tmp_path / "many" / "test").iterdir())[0]
-    one.rename(one.with_name("sample_9_label_9.npy"))
-    for data, words in (("wide", "7 taxels"), ("many", "label 9")):
-        assert words in refused(spikeloom, *REPORT[:5], tmp_path / data, *REPORT[6:])
-
-
-@pytest.mark.parametrize(
-    ("words", "told"),
-    [
-        (("--recording", "6"), ["--recording 6", "0 to 5"]),
-        (("--recording", "sample_9_label_3.npy"), ["sample_9_label_3.npy", "near are sample_3_label_3.npy"]),
-        (("--spec-samples", "0"), ["--spec-samples 0", "at least 1"]),
-        (("-o", "net.loom"), ["-o net.loom", "is an input"]),
-        (("-o", "no/out.html"), ["-o no/out.html", "folder does not exist"]),
-        (("-o", "data"), ["-o data", "not a regular file"]),
-    ],
-)
-def test_options_that_are_refused(spikeloom, words, told):
-    message = refused(spikeloom, *REPORT, *words)
-    assert all(word in message for word in told)
+    code, _, err = spikeloom("report", "line.loom", *REPORT[2:])
+    assert code == 2
+    assert "line.loom: compiled for graph line, this is ring; give --graph line" in err
 
 
 def test_a_refused_report_leaves_an_old_page_alone(spikeloom, place):
     shutil.copyfile(place / "net.pt", place / "old.html")
     before = (place / "old.html").read_bytes()
-    refused(spikeloom, *REPORT, "-o", "old.html", "--recording", "99")
+    assert spikeloom(*REPORT, "-o", "old.html", "--recording", "99")[0] == 2
     assert (place / "old.html").read_bytes() == before
 
 

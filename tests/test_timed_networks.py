@@ -38,7 +38,7 @@ from spikeloom.compiler.targets.loihi1.storage.quantize import quantize
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import current_load
 from spikeloom.models.networks.reference import float_spikes
 from spikeloom.runtime.cli import main
-from spikeloom.runtime.equivalence.certainty import float_certainty
+from spikeloom.runtime.equivalence.certain_spikes import certain_spikes
 from spikeloom.runtime.equivalence.explanation.causes import explain, observe
 from spikeloom.runtime.equivalence.reference import require_match
 from spikeloom.runtime.equivalence.rounding import check_rounding
@@ -310,7 +310,7 @@ def test_what_is_certain_is_so_in_both_precisions(folder, seed, alpha, beta):
     dynamics = Dynamics(betas=(0.2, beta, beta, beta), alphas=(0.0, alpha, alpha, alpha), clocks=TIMING.clocks)
     checkpoint, seen, network = float_network(folder, dynamics=dynamics, seed=seed)
     events = events_of(seed, samples=2, steps=30)
-    certainty = float_certainty(checkpoint, seen, events)
+    certainty = certain_spikes(checkpoint, seen, events)
     runs = [list(float_spikes(checkpoint, seen, events, dtype=kind).values()) for kind in ("float32", "float64")]
     runs.append(list(run_float(network, channels_last(events, TIMING.clocks), dtype=np.float32).spikes))
     for layer, (sure, doubt) in enumerate(certainty):
@@ -326,7 +326,7 @@ def test_a_radius_covers_the_gathered_rounding():
     network = replace(network, populations=(replace(network.populations[0], alpha=0.95),))
     network = replace(network, input=Input(taxels=1, polarities=1))
     events = np.ones((1, 1, 1, 2000), np.uint8)  # the current climbs to 0.5, the threshold, and stays below
-    ((sure, doubt),) = float_certainty(network, None, events)
+    ((sure, doubt),) = certain_spikes(network, None, events)
     assert not sure[0, :100].any()
     assert not doubt[0, :100].any()
     assert doubt[0, -1].all()
@@ -360,9 +360,9 @@ def test_explain_finds_the_cause_of_every_root(timed, compiled):
             observe(integer_machine_of(compiled.netlist), events),
             absent=[np.zeros(p.size, np.bool_) for p in network.populations],
         )
-        causes |= {root.cause for root in found.roots}
-        for root in found.roots:
-            assert root.cause != "not known" or root.root.layer == 1
+        causes |= {root.cause for root in found.found}
+        for root in found.found:
+            assert root.cause != "not known" or root.layer == "fc1"
     assert causes <= {"weight rounding", "bias rounding", "realised beta", "round toward zero", "tie (> or >=)"}
     assert causes
 

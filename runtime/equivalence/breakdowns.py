@@ -52,22 +52,9 @@ def breakdowns(
 ) -> tuple[Breakdown, ...]:
     """Look for all of them.
 
-    Parameters
-    ----------
-    names : sequence of str
-        Layers.
-    reference, chip : sequence of (samples, steps, compared) bool
-        Spikes of each layer, of the neurons that can be compared.
-    neurons : sequence of (compared,) int64
-        Which neurons of the layer these are.
-    votes : pair of (samples, classes) int64
-        Spikes for each class, of the float model and of the chip.
-    events : (samples, channels, steps) uint8
-        Recordings.
-    files : sequence of str
-        Their names.
-    lengths : (samples,) int64, optional
-        Steps of each that count; all of them by default.
+    `reference` and `chip` are the spikes of each layer, (samples, steps, compared) bool, of those neurons that
+    `neurons` numbers; `votes` are those of float model and chip, (samples, classes). `events` is (samples, channels,
+    steps) uint8, named by `files`, of which the first `lengths` steps count.
     """
     found: list[Breakdown] = []
     for name, ours, theirs, ids in zip(names, reference, chip, neurons, strict=True):

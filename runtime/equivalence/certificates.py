@@ -1,8 +1,7 @@
 """How much of what the float model does in any order of summation the chip does, too.
 
-An entry (recording, step, neuron) that :mod:`equivalence.certainty` finds certain is certified to be equal to the float
-model's, or to be different. Registers of the chip are bounded by :func:`range_proof.prove_ranges`, for any
-input.
+An entry (recording, step, neuron) that is certain by :mod:`equivalence.certain_spikes` is certified to be equal to the
+float model's, or to be different. Registers of the chip are bounded by :func:`range_proof.prove_ranges`, for any input.
 """
 
 from __future__ import annotations
@@ -18,16 +17,13 @@ from spikeloom.compiler.interpret import cut
 from spikeloom.compiler.ir import IntegerNetwork, Network
 from spikeloom.compiler.range_proof import prove_ranges
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
-from spikeloom.runtime.equivalence.certainty import float_certainty
+from spikeloom.runtime.equivalence.certain_spikes import certain_spikes
 from spikeloom.runtime.machines.votes import readout_counts
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LayerCertificate:
-    """Entries (recording, step, neuron) of one layer.
-
-    Those that are equal, or differ, in whatever order the float model adds.
-    """
+    """Entries (recording, step, neuron) of a layer that are equal, or differ, in any order of float sums."""
 
     entries: int
     equal: int
@@ -58,12 +54,7 @@ class Certificate:
 def wins(decisions: IntArray, least: IntArray, most: IntArray) -> BoolArray:
     """Whether a class wins the vote whatever the counts between their bounds; ties go to the lowest class.
 
-    Parameters
-    ----------
-    decisions : (samples,) int64
-        The class in question.
-    least, most : (samples, classes) int64
-        Bounds of the votes.
+    `decisions` is the class in question, (samples,); `least` and `most` bound the votes, (samples, classes).
 
     Examples
     --------
@@ -93,29 +84,14 @@ def certify(
 ) -> Certificate:
     """Certify spikes and decisions of the chip on recordings, and its registers on any input.
 
-    Parameters
-    ----------
-    model : Checkpoint or Network
-        Float model; a network sums over its synapses.
-    adjacency : (taxels, taxels) float64, or None
-        Normalised propagation matrix of a checkpoint.
-    integer : IntegerNetwork
-        The chip's network.
-    events : (samples, taxels, polarities, steps) uint8
-        Recordings.
-    chip : sequence of (samples, steps, kept neurons) bool
-        The chip's spikes on them, per layer, aligned with the data and cut to `lengths`.
-    decisions : (samples,) int64
-        Its classes.
-    kept : sequence of slice or int64 array, optional
-        Neurons of each layer that `chip` holds; by default all of them. The last layer must be whole.
-    lengths : (samples,) int64, optional
-        Steps of each recording; by default all of them.
+    `chip` holds the spikes of each layer, (samples, steps, kept neurons) bool, aligned with the data and cut to
+    `lengths`, of those neurons that `kept` names: all by default, and always all of the last layer. Its classes
+    `decisions` are (samples,). The others are those of :func:`certain_spikes`.
     """
     neurons = [slice(None)] * len(chip) if kept is None else kept
     float_model = [
         (cut(certain[..., part], lengths), cut(doubt[..., part], lengths))
-        for part, (certain, doubt) in zip(neurons, float_certainty(model, adjacency, events), strict=True)
+        for part, (certain, doubt) in zip(neurons, certain_spikes(model, adjacency, events), strict=True)
     ]
     steps = events.shape[3] * len(events) if lengths is None else int(lengths.sum())
     layers = {}

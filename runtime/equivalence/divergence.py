@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
+from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT
-from spikeloom.compiler.types import BoolArray
-from spikeloom.runtime.machines.base import EventArray
+from spikeloom.compiler.ir import Network
+from spikeloom.compiler.types import BoolArray, FloatArray
+from spikeloom.runtime.equivalence.reference import membranes_of, taxel_and_feature
 from spikeloom.runtime.machines.integer import IntegerMachine
 
 
@@ -39,27 +40,18 @@ class Divergence:
 
 def first_divergence(
     machine: IntegerMachine,
+    model: Checkpoint | Network,
+    adjacency: FloatArray | None,
     reference: list[BoolArray],
     chip: list[BoolArray],
     wide: list[BoolArray],
-    events: EventArray,
+    events: npt.NDArray[np.uint8],
     files: tuple[str, ...],
-    membrane: Callable[[int, int], npt.NDArray[np.floating]],
 ) -> Divergence | None:
     """Look for it.
 
-    Parameters
-    ----------
-    machine : IntegerMachine
-        The chip.
-    reference, chip, wide : list of (samples, steps, compared) bool
-        Spikes of each layer of the float32 model, the chip and the float64 model, of neurons that can be compared.
-    events : (samples, taxels, polarities, steps) uint8
-        Recordings.
-    files : tuple of str
-        Their names.
-    membrane : callable
-        Given a recording and a layer, the float model's membranes (steps, neurons) before the comparison.
+    Spikes of each layer of the float32 model, the chip and the float64 model are (samples, steps, compared), of neurons
+    that can be compared.
     """
     differs = [(a != b) for a, b in zip(reference, chip, strict=True)]
     broken = np.any([d.any(axis=(1, 2)) for d in differs], axis=0)
@@ -71,24 +63,24 @@ def first_divergence(
         for layer, d in enumerate(differs)
         for step, neuron in np.argwhere(d[sample])[:1]
     )
-    layer, taxels = machine.integer.populations[index], machine.netlist.taxels
+    layer = machine.integer.populations[index]
     ill_posed = bool(wide[index][sample, step, neuron] != reference[index][sample, step, neuron])
     neuron = int(np.arange(layer.size)[machine.compared()[index]][neuron])
-    membranes = machine.run(events[sample : sample + 1], membranes=True).membranes
+    recording = events[sample : sample + 1]
+    membranes = machine.run(recording, membranes=True).membranes
     assert membranes is not None, "membranes were wanted"
     register = int(membranes[layer.name][0, step, neuron])
     held = not machine.absent[index][neuron]  # a neuron that the chip leaves out stays at zero
     scale = float(layer.scale[neuron])
-    graph = machine.lags[index] == 0 and layer.size % taxels == 0
-    features = layer.size // taxels
+    taxel, feature = taxel_and_feature(model, index, neuron)
     return Divergence(
         file=files[sample],
         step=step,
         layer=layer.name,
         neuron=neuron,
-        taxel=neuron // features if graph else None,
-        feature=neuron % features if graph else None,
-        float_membrane=float(membrane(sample, index)[step, neuron]),
+        taxel=taxel,
+        feature=feature,
+        float_membrane=float(membranes_of(model, adjacency, recording)[index][0, step, neuron]),
         chip_membrane=register / (scale * (1 << MEMBRANE_SHIFT)),
         chip_register=register,
         theta=layer.theta,

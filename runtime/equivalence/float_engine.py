@@ -2,9 +2,8 @@
 
 What :func:`interpret.run_float` means, in float32, without a dense product: a spike adds the weights that it
 has to others, source by source, those of the layer itself after all others, and the bias comes last. Sums are taken in
-another order than in the released code, so
-that a spike decided by the last bit of a sum may differ from :mod:`reference`; ``verify`` counts such spikes as
-ill-posed, and the released network has none on the released recordings.
+another order than in the released code, so that a spike decided by the last bit of a sum may differ from
+:mod:`reference`; ``verify`` counts such spikes as ill-posed, and the released network has none.
 
 Spikes are handed back at a bit each, at the place and in the chip step in which the chip would fire them: a trace of
 the chip (``Trace.packed``) is compared word by word.
@@ -12,9 +11,6 @@ the chip (``Trace.packed``) is compared word by word.
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -36,10 +32,9 @@ NOWHERE = -1
 
 
 class Runs(NamedTuple):
-    """Weights by source.
+    """Weights by source: bounds of each source's runs of neighbouring targets; of each run the first target and weight.
 
-    The bounds of each source's runs, (sources + 1,); the first target of each run, a stretch of neighbouring targets,
-    and where its weights begin; float32 weights, (synapses,).
+    Shapes: (sources + 1,), (runs,), (runs + 1,) and, float32, (synapses,).
     """
 
     run: IntArray
@@ -78,7 +73,7 @@ class Layer:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FloatEngine:
-    """A float network prepared by :func:`prepare`; holds no state and can be shared by threads."""
+    """A float network prepared by :func:`prepare`; holds no state."""
 
     layers: tuple[Layer, ...]
     voters: int
@@ -165,71 +160,49 @@ def run(
     *,
     lengths: IntArray | None = None,
     begin: IntArray | None = None,
-    threads: int | None = None,
 ) -> FloatRun:
     """Run a batch of recordings, each from rest.
 
-    Parameters
-    ----------
-    engine : FloatEngine
-        The network.
-    inputs : (recordings, channels, T) uint8
-        Events of all input channels, clocks among them.
-    lengths : (recordings,) int64, optional
-        Steps of each recording where some are shorter than T.
-    begin : (recordings,) int64, optional
-        Data step of each from which on spikes count; the first by default. ``packed`` holds all of them.
-    threads : int, optional
-        Recordings that run at the same time, by default one per processor.
+    `inputs` (recordings, channels, T) uint8 holds the events of all input channels, clocks among them; recordings may
+    be shorter, `lengths` (recordings,). Spikes count from the data step `begin` (recordings,) on, the first by default;
+    ``packed`` holds all of them.
     """
     n, _, steps = inputs.shape
     ends = np.full(n, steps) if lengths is None else lengths
     begins = np.zeros(n, np.int64) if begin is None else begin
     layers = len(engine.layers)
+    sizes = {INPUT: engine.inputs} | {number: len(layer.bias) for number, layer in enumerate(engine.layers)}
     found = FloatRun(
         votes=np.zeros((n, engine.classes), np.int64),
         spikes=np.zeros((n, layers), np.int64),
         elsewhere=np.zeros((n, layers), np.int64),
         packed=np.zeros((n, steps + engine.drain, -(-engine.compartments // 64)), np.uint64),
     )
-
-    def one(index: int) -> None:
-        _one(engine, inputs[index, :, : ends[index]], int(begins[index]), found, index)
-
-    workers = min(threads or os.cpu_count() or 1, n)
-    with ThreadPoolExecutor(workers) if workers > 1 else nullcontext() as pool:
-        for _ in pool.map(one, range(n)) if pool else map(one, range(n)):
-            pass
+    for index in range(n):
+        sent = {INPUT: _events(inputs[index, :, : ends[index]])}
+        for number, layer in enumerate(engine.layers):
+            source, bounds = _arrivals(layer.pres, sent, sizes)
+            counts = np.zeros(sizes[number], np.int64)
+            sent[number] = _integrate_layer(
+                source,
+                bounds,
+                layer.late,
+                layer.runs,
+                layer.own,
+                layer.bias,
+                np.float32(layer.beta),
+                np.float32(layer.theta),
+                np.float32(layer.alpha),
+                layer.seat,
+                found.packed[index, layer.depth : layer.depth + ends[index]],
+                int(begins[index]),
+                counts,
+            )
+            found.spikes[index, number] = counts[layer.compared].sum()
+            found.elsewhere[index, number] = counts[layer.compared & (layer.seat == NOWHERE)].sum()
+            if number == engine.voters:
+                np.add.at(found.votes[index], engine.label, counts)
     return found
-
-
-def _one(engine: FloatEngine, inputs: npt.NDArray[np.uint8], begin: int, found: FloatRun, index: int) -> None:
-    """Run one recording; `index` is its place in what is found."""
-    steps = inputs.shape[1]
-    sent = {INPUT: _events(inputs)}
-    widths = [len(layer.bias) for layer in engine.layers]
-    for number, layer in enumerate(engine.layers):
-        source, bounds = _arrivals(layer.pres, sent, {INPUT: engine.inputs} | dict(enumerate(widths)))
-        counts = np.zeros(widths[number], np.int64)
-        sent[number] = _integrate_layer(
-            source,
-            bounds,
-            layer.late,
-            layer.runs,
-            layer.own,
-            layer.bias,
-            np.float32(layer.beta),
-            np.float32(layer.theta),
-            np.float32(layer.alpha),
-            layer.seat,
-            found.packed[index, layer.depth : layer.depth + steps],
-            begin,
-            counts,
-        )
-        found.spikes[index, number] = counts[layer.compared].sum()
-        found.elsewhere[index, number] = counts[layer.compared & (layer.seat == NOWHERE)].sum()
-        if number == engine.voters:
-            np.add.at(found.votes[index], engine.label, counts)
 
 
 def _arrivals(

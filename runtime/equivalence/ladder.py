@@ -30,10 +30,7 @@ LADDER = ("float64", "beta", "weights", "bias_threshold", "rounding", "saturatio
 def realised(network: Network, integer: IntegerNetwork) -> tuple[Network, Network, Network]:
     """Float networks that carry the chip's decays; these and its weights; all of these, its biases and thresholds.
 
-    Returns
-    -------
-    tuple of three Network
-        In the float model's units, to be run in float64.
+    They are in the float model's units, to be run in float64.
     """
     beta = replace(
         network,

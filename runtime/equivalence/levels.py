@@ -34,14 +34,9 @@ def spike_agreement(spikes: LayerSpikes) -> float:
 
 
 def mcnemar(labels: IntArray, first: IntArray, second: IntArray) -> tuple[int, int, float]:
-    """Exact paired comparison of two classifiers: recordings that only one gets right, and a two-sided p-value.
+    """Exact paired comparison of two classifiers [1]_: recordings that only one gets right, and a two-sided p-value.
 
-    Returns
-    -------
-    only_first, only_second : int
-        Recordings that the other one gets wrong.
-    p : float
-        Probability of a split at least as uneven if both were equally good (binomial, 1/2).
+    That is the probability of a split at least as uneven if both were equally good (binomial, 1/2).
 
     References
     ----------
@@ -114,12 +109,7 @@ def _quantised_level(verdict: Verdict) -> Level:
 
 
 def parse_requirements(words: str) -> dict[str, float]:
-    """Read a gate such as ``E0,E2=0.99,E3=0.98``.
-
-    Raises
-    ------
-    OptionError
-        If a part is no level, repeats one, or has no or a wrong share.
+    """Read a gate such as ``E0,E2=0.99,E3=0.98``; OptionError if a part is no level, comes twice, or has a wrong share.
 
     Examples
     --------

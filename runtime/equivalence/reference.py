@@ -12,17 +12,12 @@ from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.interpret import channels_last, run_float
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.passes.expand import expand
+from spikeloom.compiler.systems import GRAPH_SYSTEMS
 from spikeloom.compiler.types import BoolArray, FloatArray
 
 
 def require_match(netlist: Netlist, model: Checkpoint | Network) -> None:
-    """Refuse a netlist and a checkpoint or float network of different architecture.
-
-    Raises
-    ------
-    ModelError
-        If taxels, channels, timing, or layer names or sizes differ.
-    """
+    """Refuse a netlist and a checkpoint or float network whose taxels, channels, timing or layers differ."""
     ours = {"taxels": netlist.taxels, "channels": netlist.polarities}
     ours |= _timing(netlist.clocks, netlist.bins) | {layer.name: layer.neurons for layer in netlist.layers}
     what = "network" if isinstance(model, Network) else "checkpoint"
@@ -73,14 +68,12 @@ def membranes_of(
     return list(float_membranes(model, adjacency, events).values())
 
 
-def tuned_spikes(
-    checkpoint: Checkpoint, adjacency: FloatArray | None, events: npt.NDArray[np.uint8]
-) -> list[BoolArray]:
-    """Spikes of each layer of a fine-tuned checkpoint's torch model, on chip integers."""
-    from spikeloom.models.networks.quantised import quantised_spikes
-
-    assert adjacency is not None, "a checkpoint has a graph"
-    return list(quantised_spikes(checkpoint, adjacency, events).values())
+def taxel_and_feature(model: Checkpoint | Network, layer: int, neuron: int) -> tuple[int, int] | tuple[None, None]:
+    """Where a neuron of a graph convolution lies; others, and relays of clocks, lie nowhere."""
+    if layer or isinstance(model, Network) or model.system not in GRAPH_SYSTEMS:
+        return None, None
+    taxel, feature = divmod(neuron, model.hops.shape[1])
+    return (taxel, feature) if taxel < model.taxels else (None, None)
 
 
 def float_network(model: Checkpoint | Network, adjacency: FloatArray | None) -> Network:

@@ -92,17 +92,10 @@ class Rounding:
 
 
 def check_rounding(machine: IntegerMachine, network: Network, *, fine_tuned: bool = False) -> Rounding:
-    """Hold what a netlist stores against a float network of the same architecture.
+    """Hold what a netlist stores against the float network that it should have been compiled from.
 
-    Parameters
-    ----------
-    machine : IntegerMachine
-        Of the netlist.
-    network : Network
-        What it should have been compiled from.
-    fine_tuned : bool
-        Whether the network was trained on the chip's integers, which compensates nothing. Otherwise the netlist
-        remembers which layers were compensated, or at least whether there were recordings to do it on.
+    A network that was `fine_tuned` on the chip's integers compensates nothing. Otherwise the netlist remembers which
+    layers were compensated, or at least whether there were recordings to do it on.
     """
     integer, provenance = machine.integer, machine.netlist.provenance
     names = [population.name for population in network.populations]

@@ -7,7 +7,6 @@ in which the two differ are ill-posed, decided by the rounding of a sum and not 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -18,20 +17,13 @@ from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import DataError
 from spikeloom.compiler.interpret import channels_last, cut, vote
 from spikeloom.compiler.ir import Network
-from spikeloom.compiler.systems import GRAPH_SYSTEMS
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.runtime.equivalence.breakdowns import breakdowns
 from spikeloom.runtime.equivalence.certificates import certify
 from spikeloom.runtime.equivalence.divergence import first_divergence
 from spikeloom.runtime.equivalence.ladder import rungs
 from spikeloom.runtime.equivalence.levels import judged
-from spikeloom.runtime.equivalence.reference import (
-    float_network,
-    membranes_of,
-    require_match,
-    spikes_of,
-    tuned_spikes,
-)
+from spikeloom.runtime.equivalence.reference import float_network, require_match, spikes_of
 from spikeloom.runtime.equivalence.rounding import check_rounding
 from spikeloom.runtime.equivalence.verdict import LayerSpikes, Rung, Verdict
 from spikeloom.runtime.machines.base import ENGINES
@@ -67,40 +59,26 @@ def verify(
 
     Parameters
     ----------
-    netlist : Netlist
-        Compiled network.
     checkpoint : Checkpoint or Network
-        What it was compiled from, or another of the same architecture.
+        What the netlist was compiled from, or another of the same architecture; `sha256` is that of a network's file.
     adjacency : (taxels, taxels) float64, or None
         Normalised propagation matrix of a checkpoint's graph.
-    events : (samples, taxels, polarities, steps) uint8
-        Recordings.
-    labels : (samples,) int64
-        Their classes.
-    files : tuple of str
-        Their names.
-    lengths : (samples,) int64, optional
-        Steps of each recording where some are shorter than the array.
+    events, labels, files, lengths
+        Recordings (samples, taxels, polarities, steps) uint8, their classes, names, and steps that count.
     original : Checkpoint or Network, optional
         Float model to compare with; by default the weights of `checkpoint` itself.
-    sha256 : str, optional
-        Of the file that a network was read from; a checkpoint knows its own.
-    spec_samples : int
-        Recordings on which the specification runs beside the engine.
-    engine_name : str
-        One of ``ENGINES``; any but the first runs beside ours.
+    spec_samples, engine_name
+        Recordings on which the specification runs beside the engine; which of ``ENGINES`` runs, too.
     required : mapping of level to share, optional
-        What has to be reached, see :func:`levels.parse_requirements`; the weights always have to be the checkpoint's.
+        What has to be reached, see :mod:`equivalence.levels`; the weights always have to be the checkpoint's.
     progress : callable, optional
         Called with the name of each part as it starts.
 
     Raises
     ------
-    ModelError, DataError, NumericRangeError
-        If the parts do not belong together, or a register of the chip overflows; ModelError also if the format of
-        the further engine cannot hold the netlist.
-    OptionError
-        If the further engine is not installed.
+    ModelError, DataError, NumericRangeError, OptionError
+        If the parts do not belong together, a register of the chip overflows, or the further engine is not installed or
+        cannot hold the netlist.
     """
     if not 1 <= spec_samples:
         raise DataError(f"--spec-samples {spec_samples}: at least 1 recording is needed; give a positive number")
@@ -133,7 +111,11 @@ def verify(
     quantised_different = None
     if isinstance(checkpoint, Checkpoint) and tuned:
         begin("fine-tuned model")
-        pairs = zip(compared(tuned_spikes(checkpoint, adjacency, events)), chip, strict=True)
+        from spikeloom.models.networks.quantised import quantised_spikes  # torch, so only here
+
+        assert adjacency is not None, "a checkpoint has a graph"
+        torch_spikes = [*quantised_spikes(checkpoint, adjacency, events).values()]
+        pairs = zip(compared(torch_spikes), chip, strict=True)
         quantised_different = sum(int(np.count_nonzero(a != b)) for a, b in pairs)
 
     begin("specification")
@@ -151,17 +133,7 @@ def verify(
     ladder.append(rung("saturation", chip))
 
     begin("first divergence")
-    divergence = first_divergence(
-        machine,
-        reference,
-        chip,
-        wide,
-        events,
-        files,
-        lambda sample, layer: membranes_of(model, adjacency, events[sample : sample + 1])[layer][0],
-    )
-    if divergence is not None and (isinstance(model, Network) or model.system not in GRAPH_SYSTEMS):
-        divergence = replace(divergence, taxel=None, feature=None)  # its neurons lie otherwise
+    divergence = first_divergence(machine, model, adjacency, reference, chip, wide, events, files)
     float_counts = readout_counts(network.readout, network.classes, reference[network.readout.population])
     neurons = [np.arange(each.size)[keep] for each, keep in zip(integer.populations, kept, strict=True)]
     flat = with_clocks(events, netlist.clocks)

@@ -58,6 +58,18 @@ class LoadedNetwork:
             return {"format": self.format, **self.read_as}
         return {"run": run, "weights": self.checkpoint.weights, "graph": self.graph}
 
+    def differs_from(self, made: Mapping[str, Any], run: int) -> str | None:
+        """How it is not what a netlist of this provenance was compiled from; `run` is which of a file's runs it is."""
+        if (sha256 := made.get("checkpoint_sha256", self.sha256)) != self.sha256:
+            return (
+                f"compiled from a checkpoint of sha256 {sha256[:12]}…, this one has {self.sha256[:12]}…; "
+                "give the one that it was compiled from"
+            )
+        for name, value in self.origin(run).items():
+            if made.get(name, value) != value:
+                return f"compiled for {name} {made[name]}, this is {value}; give --{name} {made[name]}"
+        return None
+
     @property
     def source(self) -> Factored | Network:
         """What the compiler starts from: the checkpoint on its graph where there is one."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+from difflib import get_close_matches
 
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.targets.netlist import Netlist
@@ -113,6 +114,21 @@ def netlist_recordings(arguments: argparse.Namespace, netlist: Netlist, *, label
     """Recordings that a netlist can take, as long a part of each as ``--window`` says."""
     percent = parse_window(arguments.window)
     return first_part(load_recordings(arguments, netlist, labels_for=labels_for), percent)
+
+
+def find_recording(data: Recordings, wanted: str, option: str) -> int:
+    """Index of the recording that an option names, by its file or by its number from 0."""
+    if wanted in data.files:
+        return data.files.index(wanted)
+    if wanted.isascii() and wanted.isdecimal():
+        if int(wanted) >= len(data):
+            raise OptionError(f"{option} {wanted}: there are {len(data)}; give a number from 0 to {len(data) - 1}")
+        return int(wanted)
+    near = get_close_matches(wanted, data.files, n=3, cutoff=0.5) or data.files[:3]
+    raise DataError(
+        f"{option} {wanted}: no such recording among {len(data)} of split {data.split}; near are {', '.join(near)}; "
+        "'spikeloom run --json' lists the names"
+    )
 
 
 def bin_words(bin_s: float) -> list[str]:

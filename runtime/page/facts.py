@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -13,7 +15,52 @@ from spikeloom.models.graphs import NEUTOUCH
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.equivalence.verdict import Verdict
 from spikeloom.runtime.inputs.network import LoadedNetwork, sensor_places
-from spikeloom.runtime.page.results import Decisions, Sides, Taxels
+from spikeloom.runtime.report.encode import key
+
+Kind = TypeVar("Kind")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Sides(Generic[Kind]):
+    """What the float model has, and what the chip."""
+
+    model: Kind = field(metadata=key("float"))
+    chip: Kind
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Decisions:
+    """Every recording's decisions; matrices (classes, classes) count them, rows by label."""
+
+    classes: int
+    matrices: Sides[IntArray]
+    files: tuple[str, ...]
+    labels: IntArray
+    model: IntArray = field(metadata=key("float"))
+    chip: IntArray
+
+    def confusions(self) -> list[tuple[int, int, int, int]]:
+        """Label, wrong decision, and how often float model and chip take it; the most frequent first."""
+        ours, chip = self.matrices.model, self.matrices.chip
+        pairs = [
+            (label, decided, int(ours[label, decided]), int(chip[label, decided]))
+            for label, decided in np.argwhere(ours + chip).tolist()
+            if label != decided
+        ]
+        return sorted(pairs, key=lambda pair: (-pair[2] - pair[3], pair[0], pair[1]))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Taxels:
+    """The sensor, its graph where there is one, and events and first-layer spikes of each taxel, on the mean."""
+
+    sensor: str | None
+    positions_mm: FloatArray | None
+    graph: str | None
+    edges: IntArray
+    events: FloatArray
+    layer: str
+    spikes: FloatArray | None
 
 
 def decisions(verdict: Verdict, classes: int) -> Decisions:

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from spikeloom.runtime.machines.page_parts import Core, Cores, Way
-from spikeloom.runtime.page.results import Taxels, Trace
+from spikeloom.runtime.page.facts import Taxels
+from spikeloom.runtime.page.recording import Trace
 from spikeloom.runtime.report.drawing import CHIP, COLOURS, DASHES, FLOAT, GREY, Drawing, sheet, styled
 
 if TYPE_CHECKING:

@@ -6,6 +6,7 @@ import argparse
 import hashlib
 import platform
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -20,17 +21,73 @@ from spikeloom.compiler.types import JsonObject
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.network import LoadedNetwork
-from spikeloom.runtime.page.results import (
-    CheckpointOrigin,
-    ChipOrigin,
-    Command,
-    DataOrigin,
-    NetlistOrigin,
-    Provenance,
-)
+from spikeloom.runtime.report.encode import key
 
 PACKAGES = ("numpy", "scipy", "torch", "numba", "networkx")
 """Packages whose versions may move a float spike."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NetlistOrigin:
+    """The netlist's file, and how it was compiled."""
+
+    file: str
+    sha256: str
+    compiled: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CheckpointOrigin:
+    """The float network's file, and what is known of its training."""
+
+    file: str
+    sha256: str
+    system: str | None
+    weights: str | None
+    graph: str | None
+    dynamics: Mapping[str, Any] | None
+    bins: int
+    training: Mapping[str, Any] | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DataOrigin:
+    """The recordings, with a hash over their events and labels."""
+
+    name: str
+    split: str
+    samples: int
+    bin_s: float
+    sha256: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChipOrigin:
+    """The chip, and titles of its tables by name."""
+
+    name: str
+    energy_tables: Mapping[str, str]
+    time_tables: Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Command:
+    """What to type, and what for."""
+
+    what: str = field(metadata=key("for"))
+    command: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Provenance:
+    """Files and their hashes, versions, and the commands that repeat the page."""
+
+    netlist: NetlistOrigin
+    checkpoint: CheckpointOrigin
+    data: DataOrigin
+    chip: ChipOrigin
+    versions: Mapping[str, str]
+    commands: tuple[Command, ...]
 
 
 def provenance(
@@ -116,14 +173,14 @@ def _commands(arguments: argparse.Namespace, netlist: Netlist, recording: str) -
 def _compile_options(made: Mapping[str, Any], data: str) -> JsonObject:
     """Options of the compilation as far as the netlist remembers them."""
     options: dict[str, Any] = {}
-    for key, usual in (("weight_bits", 8), ("planes", 1), ("scale_groups", 1)):
-        value = made.get(key, usual)
+    for name, usual in (("weight_bits", 8), ("planes", 1), ("scale_groups", 1)):
+        value = made.get(name, usual)
         if value != usual and not made.get("fine_tuned"):
-            options[key] = ",".join(map(str, value)) if isinstance(value, list) else value
-    options |= {key: made.get(key) or None for key in ("spike_exact", "keep_all", "prune_unused")}
+            options[name] = ",".join(map(str, value)) if isinstance(value, list) else value
+    options |= {name: made.get(name) or None for name in ("spike_exact", "keep_all", "prune_unused")}
     if made.get("ranges", "proven") != "proven":
         options |= {"ranges": made["ranges"], "margin": f"{made['margin']:g}"}
     if made.get("cores_for"):
-        options["cores_for"] = ",".join(f"{name}={count}" for name, count in made["cores_for"].items())
-    options |= {key: made.get(key) for key in ("chips", "optimize")}
+        options["cores_for"] = ",".join(f"{layer}={count}" for layer, count in made["cores_for"].items())
+    options |= {name: made.get(name) for name in ("chips", "optimize")}
     return options | {"calibrate": data if made.get("calibrated") else None}

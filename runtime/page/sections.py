@@ -12,7 +12,9 @@ import numpy as np
 from spikeloom.runtime.equivalence.sections import ladder_table
 from spikeloom.runtime.equivalence.sections import sections as verdict_sections
 from spikeloom.runtime.page import pictures
-from spikeloom.runtime.page.results import LayerSpikes, Provenance, Recording, Report, Trace
+from spikeloom.runtime.page.provenance import Provenance
+from spikeloom.runtime.page.recording import LayerRaster, Recording, Trace
+from spikeloom.runtime.page.results import Report
 from spikeloom.runtime.report import drawing
 from spikeloom.runtime.report.drawing import Drawing
 from spikeloom.runtime.report.figures import bar_figure
@@ -228,7 +230,7 @@ def _recording(found: Recording) -> list[Block]:
         for layer in found.layers
     ]
     nothing = np.zeros((0, 2), np.int64)
-    sent = LayerSpikes(
+    sent = LayerRaster(
         name="input",
         neurons=0,
         active=np.unique(found.input[:, 1]),
@@ -293,7 +295,7 @@ def _membrane_table(trace: Trace) -> Table:
     return Table(MEMBRANE, _membrane_rows(trace), title, most=0)
 
 
-def _raster(layer: LayerSpikes, steps: int) -> Figure:
+def _raster(layer: LayerRaster, steps: int) -> Figure:
     kind = "channel" if layer.name == "input" else "neuron"
     active = layer.active.tolist()
     rows = [active[i * len(active) // ROWS] for i in range(ROWS)] if len(active) > ROWS else active

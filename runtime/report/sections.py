@@ -34,6 +34,9 @@ class Table:
     words: bool = False
     most: int | None = None
 
+    def __str__(self) -> str:
+        return _aligned(self)
+
 
 @dataclass(frozen=True, slots=True)
 class Figure:

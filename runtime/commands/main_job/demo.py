@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import argparse
 import tempfile
-from collections.abc import Callable
 from typing import Any
 
 from spikeloom.models.recordings.grasps import SYNTHETIC
+from spikeloom.runtime.commands.main_job import compile, estimate, verify
+from spikeloom.runtime.report.sections import Code, Outcome, Section
+
+COMMANDS = {"compile": compile, "verify": verify, "estimate": estimate}
 
 STEPS = (
     ("compile", "pretrained:grasps", "--calibrate", SYNTHETIC, "-o", "{folder}/grasps.loom"),
@@ -21,15 +24,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Take no options of its own."""
 
 
-def run(arguments: argparse.Namespace) -> tuple[dict[str, Any], Callable[[dict[str, Any]], str], int]:
-    """Run the commands one after the other, by what the command line gives for that; the worst exit code counts."""
+def run(_arguments: argparse.Namespace) -> Outcome:
+    """Run the commands one after the other; the worst exit code counts."""
     results: dict[str, Any] = {}
-    texts: list[str] = []
+    shown: list[Section] = []
     worst = 0
     with tempfile.TemporaryDirectory(prefix="spikeloom-") as folder:
-        for words in STEPS:
-            results[words[0]], text, code = arguments.run_words([word.format(folder=folder) for word in words])
-            typed = " ".join(words).replace("{folder}/", "")
-            texts.append(f"$ spikeloom {typed}\n{text}")
-            worst = max(worst, code)
-    return results, lambda _: "\n\n".join(texts), worst
+        for name, *words in STEPS:
+            parser = argparse.ArgumentParser()
+            COMMANDS[name].add_arguments(parser)
+            found = COMMANDS[name].run(parser.parse_args([word.format(folder=folder) for word in words]))
+            typed = " ".join(["spikeloom", name, *words]).replace("{folder}/", "")
+            first, *others = found.sections(found.result)
+            shown += [Section(first.title, [Code([typed]), *first.blocks]), *others]
+            results[name], worst = found.result, max(worst, found.code)
+    return Outcome(results, lambda _: shown, worst)

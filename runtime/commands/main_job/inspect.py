@@ -3,16 +3,54 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
 
 from spikeloom.compiler.archive import is_netlist
+from spikeloom.compiler.dynamics import Dynamics
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.files import sha256_of
-from spikeloom.runtime.commands.main_job.checkpoint_facts import facts_of, sections
+from spikeloom.compiler.systems import GRAPH_SYSTEMS, TACTILESGNET
 from spikeloom.runtime.commands.options import add_model
 from spikeloom.runtime.inputs.files import require_inspectable
 from spikeloom.runtime.inputs.network import load_checkpoint
 from spikeloom.runtime.machines.base import machine_for, trained_for
-from spikeloom.runtime.report.sections import Outcome
+from spikeloom.runtime.report.encode import OPTIONAL
+from spikeloom.runtime.report.sections import Outcome, Section, Text
+
+LONG = 100
+"""Letters of a training note that are shown."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LayerSize:
+    """Neurons of a layer."""
+
+    name: str
+    neurons: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CheckpointFacts:
+    """A checkpoint; `given` and `assumed` name the constants that the user gave, or neither user nor file."""
+
+    layout: str
+    system: str
+    taxels: int
+    classes: int
+    hops: int | None = field(metadata=OPTIONAL)
+    towers: int | None = field(metadata=OPTIONAL)
+    bins: int | None = field(metadata=OPTIONAL)
+    layers: Sequence[LayerSize]
+    beta: float
+    theta: float
+    dynamics: Dynamics | None = field(metadata=OPTIONAL)
+    given: Sequence[str]
+    assumed: Sequence[str]
+    graph: str | None
+    training: Mapping[str, Any] | None
+    sha256: str
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -34,4 +72,69 @@ def run(arguments: argparse.Namespace) -> Outcome:
         machine = machine_for(arguments.path)
         return machine.describe(sha256_of(arguments.path))
     given = tuple(name for name in ("beta", "theta") if getattr(arguments, name) is not None)
-    return Outcome(facts_of(load_checkpoint(arguments.path, arguments), given), sections)
+    checkpoint = load_checkpoint(arguments.path, arguments)
+    facts = CheckpointFacts(
+        layout=checkpoint.layout,
+        system=checkpoint.system,
+        taxels=checkpoint.taxels,
+        classes=checkpoint.classes,
+        hops=len(checkpoint.hops) - 1 if checkpoint.system == TACTILESGNET else None,
+        towers=checkpoint.towers if checkpoint.towers > 1 else None,
+        bins=checkpoint.bins if checkpoint.bins > 1 else None,
+        layers=[LayerSize(name=name, neurons=neurons) for name, neurons in checkpoint.neurons.items()],
+        beta=checkpoint.beta,
+        theta=checkpoint.theta,
+        dynamics=None if checkpoint.dynamics.is_plain else checkpoint.dynamics,
+        given=given,
+        assumed=checkpoint.assumed,
+        graph=checkpoint.graph,
+        training=checkpoint.training,
+        sha256=checkpoint.sha256,
+    )
+    return Outcome(facts, sections)
+
+
+def tower_line(tower: Mapping[str, Any]) -> str:
+    """Where a tower of a joined network is from, in one line."""
+    notes = (f"{key} {tower[key]}" for key in ("weights", "seed", "sha256") if key in tower)
+    return f"{tower.get('file')}, {', '.join(notes)}"
+
+
+def sections(facts: CheckpointFacts) -> Iterator[Section]:
+    """A checkpoint for people."""
+    yield Section("", [*map(Text, _lines(facts))])
+
+
+def _lines(facts: CheckpointFacts) -> Iterator[str]:
+    layers = ", ".join(f"{layer.name} {layer.neurons:,}" for layer in facts.layers)
+    system = facts.system if facts.hops is None else f"K = {facts.hops}"
+    yield f"checkpoint, {facts.layout} layout: {facts.taxels} taxels, {system}, {layers}, {facts.classes} classes"
+    graph = facts.graph or "not in the file; name it with --graph"
+    yield f"  graph: {graph if facts.system in GRAPH_SYSTEMS else 'none, as the system has none'}"
+    for name, value in (("beta", facts.beta), ("theta", facts.theta)):
+        source = "given" if name in facts.given else "read from the file"
+        yield f"  {name}: {value:g} ({f'assumed; override with --{name}' if name in facts.assumed else source})"
+    if facts.dynamics is not None:
+        yield from _dynamics(facts.layers, facts.dynamics)
+    if facts.bins is not None:
+        yield f"  a step joins {facts.bins} bins of the recordings"
+    training = dict(facts.training or {})
+    if facts.towers is not None:
+        yield f"  {facts.towers} towers vote together, each with a neuron for every class"
+        for index, tower in enumerate(training.pop("towers", ())):
+            yield f"    {index}: {tower_line(tower)}"
+    for key, value in training.items():
+        text = str(value)
+        yield f"  {key}: {text if len(text) <= LONG else text[: LONG - 3] + '…'}"
+    yield f"  sha256: {facts.sha256}"
+
+
+def _dynamics(layers: Sequence[LayerSize], dynamics: Dynamics) -> Iterator[str]:
+    for decays, word in ((dynamics.betas, "membrane"), (dynamics.alphas, "current")):
+        if decays:
+            shown = ", ".join(f"{layer.name} {decay:g}" for layer, decay in zip(layers, decays, strict=True))
+            yield f"  {word} decay by layer: {shown}"
+    clocks = dynamics.clocks
+    if clocks.channels:
+        total = clocks.channels * clocks.steps
+        yield f"  {clocks.channels} clocks of {clocks.steps} steps each, {total} in all, beside the sensor"

@@ -4,25 +4,27 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import replace
-from difflib import get_close_matches
-from typing import TYPE_CHECKING
 
-from spikeloom.compiler import Netlist
-from spikeloom.compiler.errors import DataError, ModelError, OptionError
+from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.files import sha256_of, write_atomically
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.commands.options import add_explain_cost, add_netlist_and_model, add_recordings
 from spikeloom.runtime.costs.simulated import Account
+from spikeloom.runtime.equivalence.reference import require_match
+from spikeloom.runtime.equivalence.verify import verify
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
-from spikeloom.runtime.inputs.recordings import load_recordings
+from spikeloom.runtime.inputs.recordings import find_recording, load_recordings
 from spikeloom.runtime.machines.integer import IntegerMachine, integer_machine_for
+from spikeloom.runtime.page import facts
+from spikeloom.runtime.page.provenance import provenance
+from spikeloom.runtime.page.recording import recording
+from spikeloom.runtime.page.results import Report
+from spikeloom.runtime.page.sections import about, sections
 from spikeloom.runtime.report import html
 from spikeloom.runtime.report.sections import Outcome, Section, Text
 from spikeloom.runtime.studies.chart.files import read_chart
-
-if TYPE_CHECKING:
-    from spikeloom.runtime.page.results import Report
+from spikeloom.runtime.studies.stress.results import read_stress
 
 NOTES = """\
 The page opens from disk and loads nothing; its figures are inline SVG, each with its numbers as a table. What is
@@ -49,16 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> Outcome:
-    """Run the command; nothing is written before everything is known.
-
-    Raises
-    ------
-    SpikeloomError
-        If an option, the netlist, the checkpoint or the recordings cannot be used, or do not belong together.
-    """
-    from spikeloom.runtime.page.sections import about, sections
-    from spikeloom.runtime.studies.stress.results import read_stress
-
+    """Run the command; nothing is written before everything is known."""
     require_place(arguments.output, "-o", arguments)
     machine = integer_machine_for(arguments.netlist)
     netlist = machine.netlist
@@ -67,81 +60,29 @@ def run(arguments: argparse.Namespace) -> Outcome:
         sha256 = sha256_of(arguments.netlist)
         battery = read_stress(arguments.stress, arguments.netlist, sha256)
     loaded = load_network(arguments.checkpoint, arguments, netlist)
-    _require_origin(arguments, netlist, loaded)
+    require_match(netlist, loaded.model)
+    if (difference := loaded.differs_from(netlist.provenance, arguments.run)) is not None:
+        raise ModelError(f"{arguments.netlist}: {difference}")  # the page would blame the chip for it
     chart = None if arguments.chart is None else read_chart(arguments.chart, loaded.sha256, arguments.checkpoint)
     data = load_recordings(arguments, netlist, labels_for="report")
     machine.require_sensor(data.events)
-    chosen = None if arguments.recording is None else find_recording(data, arguments.recording)
+    chosen = None if arguments.recording is None else find_recording(data, arguments.recording, "--recording")
     report = replace(_report(arguments, machine, loaded, data, chosen), stress=battery, chart=chart)
     made = report.provenance
     title = f"{made.netlist.file} on {made.data.name}"
     with write_atomically(arguments.output) as file:
         file.write(html.page(title, about(report), sections(report)).encode())
-    return Outcome(report, _printed, 1 if report.verify.missed else 0)
 
+    def printed(report: Report) -> list[Section]:
+        return [*sections(report), Section("", [Text(f"page: {report.output}")])]
 
-def _printed(report: Report) -> list[Section]:
-    from spikeloom.runtime.page.sections import sections
-
-    return [*sections(report), Section("", [Text(f"page: {report.output}")])]
-
-
-def _require_origin(arguments: argparse.Namespace, netlist: Netlist, loaded: LoadedNetwork) -> None:
-    """Refuse a netlist that says that it is from another network; the page would blame the chip for it.
-
-    Raises
-    ------
-    ModelError
-        Naming what differs.
-    """
-    from spikeloom.runtime.equivalence.reference import require_match
-
-    require_match(netlist, loaded.model)
-    made, where = netlist.provenance, arguments.netlist
-    own = loaded.sha256
-    if made.get("checkpoint_sha256", own) != own:
-        raise ModelError(
-            f"{where}: compiled from a checkpoint of sha256 {made['checkpoint_sha256'][:12]}…, {arguments.checkpoint} "
-            f"has {own[:12]}…; give the one that it was compiled from"
-        )
-    if loaded.checkpoint is None:
-        return
-    told = {"graph": loaded.graph, "weights": loaded.checkpoint.weights, "run": arguments.run}
-    for name, value in told.items():
-        if made.get(name, value) != value:
-            raise ModelError(f"{where}: compiled for {name} {made[name]}, this is {value}; give --{name} {made[name]}")
-
-
-def find_recording(data: Recordings, asked: str) -> int:
-    """Index of a recording by name or number.
-
-    Raises
-    ------
-    DataError, OptionError
-        If there is none.
-    """
-    if asked in data.files:
-        return data.files.index(asked)
-    if asked.isascii() and asked.isdecimal():
-        if int(asked) >= len(data):
-            raise OptionError(f"--recording {asked}: there are {len(data)}; give a number from 0 to {len(data) - 1}")
-        return int(asked)
-    near = get_close_matches(asked, data.files, n=3, cutoff=0.5) or data.files[:3]
-    raise DataError(
-        f"--recording {asked}: no such recording among {len(data)} of split {data.split}; near are {', '.join(near)}"
-    )
+    return Outcome(report, printed, 1 if report.verify.missed else 0)
 
 
 def _report(
     arguments: argparse.Namespace, machine: IntegerMachine, loaded: LoadedNetwork, data: Recordings, chosen: int | None
 ) -> Report:
     """All that the page shows, but for what other commands found."""
-    from spikeloom.runtime.equivalence.verify import verify
-    from spikeloom.runtime.page import facts
-    from spikeloom.runtime.page.provenance import provenance
-    from spikeloom.runtime.page.recording import recording
-    from spikeloom.runtime.page.results import Report
-
     netlist = machine.netlist
     account = Account(machine, data, checked=arguments.spec_samples)
     verdict = verify(

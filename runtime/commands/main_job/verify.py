@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import sys
 from dataclasses import replace
-from typing import Any
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.runtime.commands.options import MIN_AGREEMENT, add_explain_cost, add_netlist_and_model, add_recordings
@@ -49,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_explain_cost(parser)
 
 
-def run(arguments: argparse.Namespace) -> Outcome | tuple[Any, Any, int]:
+def run(arguments: argparse.Namespace) -> Outcome:
     """Run the command."""
     machine = machine_for(arguments.netlist)
     if (own := chip_commands(machine.netlist.target)) is not None:
@@ -65,29 +64,26 @@ def run(arguments: argparse.Namespace) -> Outcome | tuple[Any, Any, int]:
             )
         required = parse_requirements(arguments.require)
     netlist = machine.netlist
-    asked = load_network(arguments.checkpoint, arguments, netlist)
+    loaded = load_network(arguments.checkpoint, arguments, netlist)
     original = None if arguments.original is None else load_network(arguments.original, arguments)
     data = netlist_recordings(arguments, netlist, labels_for="verify")
     account = Account(machine, data, checked=arguments.spec_samples)
     verdict = verify(
         netlist,
-        asked.model,
-        asked.adjacency,
+        loaded.model,
+        loaded.adjacency,
         data.events,
         data.labels,
         data.files,
         original=None if original is None else original.model,
-        sha256=asked.sha256,
+        sha256=loaded.sha256,
         spec_samples=arguments.spec_samples,
         engine_name=arguments.engine,
         lengths=data.lengths,
         required=required,
         progress=account.begin,
     )
-    compiled_for = netlist.provenance.get("graph", asked.graph)
-    if asked.graph not in (None, compiled_for):
-        sys.stderr.write(
-            f"spikeloom: warning: the netlist was compiled for graph {compiled_for}, this is {asked.graph}\n"
-        )
+    if (difference := loaded.differs_from(netlist.provenance, arguments.run)) is not None:
+        sys.stderr.write(f"spikeloom: warning: {arguments.netlist}: {difference}\n")
     verdict = replace(verdict, explained_cost=account.explained(arguments.explain_cost))
     return Outcome(verdict, sections, 1 if verdict.missed else 0)

@@ -16,7 +16,7 @@ from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.formats.towers import arrays_of
 from spikeloom.compiler.formats.towers import join as join_networks
 from spikeloom.models.training.joined import Joined, joined_layers
-from spikeloom.runtime.commands.main_job.checkpoint_facts import tower_line
+from spikeloom.runtime.commands.main_job.inspect import tower_line
 from spikeloom.runtime.commands.training.finetune import stored_graph
 from spikeloom.runtime.inputs.files import require_place, shipped
 from spikeloom.runtime.report.sections import Outcome, Section, Text

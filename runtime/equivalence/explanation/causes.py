@@ -11,26 +11,32 @@ this order,
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT
 from spikeloom.compiler.interpret import Activity, run_float, step_late
 from spikeloom.compiler.ir import INPUT, IntegerNetwork, Network
-from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
-from spikeloom.runtime.equivalence.explanation.deviations import (
+from spikeloom.compiler.types import BoolArray, FloatArray
+from spikeloom.runtime.equivalence.explanation.replay import (
     LEFT_OUT,
     TIE,
+    UNCLIPPED,
     UNKNOWN,
+    UNROUNDED,
     WEIGHTS,
-    LayerValues,
-    layer_values,
+    run_variants,
     sources_into,
+    variants_of,
+    weights_into,
 )
-from spikeloom.runtime.equivalence.explanation.replay import UNCLIPPED, run_variants, variants_of
+from spikeloom.runtime.equivalence.explanation.results import Explanation, LayerRoots, RootCause, remedy
 from spikeloom.runtime.equivalence.explanation.roots import Root, find_roots, sources_of
+from spikeloom.runtime.equivalence.reference import taxel_and_feature
 from spikeloom.runtime.equivalence.rounding import Rounding
 from spikeloom.runtime.machines.base import EventArray
 from spikeloom.runtime.machines.integer import IntegerMachine
@@ -39,79 +45,21 @@ UNDECIDED = 256 * float(np.finfo(np.float64).eps)
 """Distance to threshold, as a share of all that the neuron adds up, that the order of a sum decides."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Observed:
-    """What a machine did on one recording, aligned with the data.
-
-    Of each population spikes and, before the reset, membrane registers, (steps, neurons).
-    """
-
-    spikes: tuple[BoolArray, ...]
-    membranes: tuple[IntArray, ...]
-
-
-def observe(machine: IntegerMachine, events: EventArray) -> Observed:
-    """What the simulator shows of one recording, (1, taxels, polarities, steps)."""
+def observe(machine: IntegerMachine, events: EventArray) -> Activity:
+    """Spikes and membrane registers of each layer on recordings (samples, taxels, polarities, steps)."""
     ran = machine.run(events, spikes=True, membranes=True)
     assert ran.spikes is not None, "spikes were wanted"
     assert ran.membranes is not None, "membranes were wanted"
-    return Observed(
-        spikes=tuple(spikes[0] for spikes in ran.spikes.values()),
-        membranes=tuple(membranes[0] for membranes in ran.membranes.values()),
-    )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RootCause:
-    """A root, and why it differs.
-
-    Membranes before the comparison and thresholds are in the float model's units, registers as the chip compares them.
-    Each of the `sufficient` causes, if it alone were gone, would give the float model's spike, and so would weights
-    that the range does not cut off if `clipped`. `moved` says how far each cause moved the chip's membrane against its
-    threshold, largest first. The chip may not even have `held` the neuron.
-    """
-
-    root: Root
-    cause: str
-    held: bool
-    clipped: bool
-    sufficient: tuple[str, ...]
-    moved: tuple[tuple[str, float], ...]
-    float_fires: bool
-    float_membrane: float
-    chip_membrane: float
-    theta: float
-    chip_theta: float
-    chip_register: int
-    chip_threshold: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Explanation:
-    """Why one recording differs.
-
-    Entries of each population that fire in the float64 model, on the chip, in one of them only; and the roots, those
-    first that drag most along.
-    """
-
-    float_spikes: tuple[int, ...]
-    chip_spikes: tuple[int, ...]
-    different: tuple[int, ...]
-    roots: tuple[RootCause, ...]
-
-    @property
-    def diagnosis(self) -> str | None:
-        """The cause of most roots; None if nothing differs."""
-        names = [root.cause for root in self.roots]
-        return max(names, key=lambda name: (names.count(name), -names.index(name))) if names else None
+    return Activity(spikes=tuple(ran.spikes.values()), membranes=tuple(ran.membranes.values()))
 
 
 def explain(
     network: Network,
     integer: IntegerNetwork,
     events: BoolArray,
-    observed: Observed,
+    observed: Activity,
     *,
+    model: Checkpoint | Network | None = None,
     rounding: Rounding | None = None,
     absent: Sequence[BoolArray] | None = None,
     unused: Sequence[BoolArray] | None = None,
@@ -119,32 +67,19 @@ def explain(
 ) -> Explanation:
     """Find the roots of all differences between float64 model and chip on one recording, and their causes.
 
-    Parameters
-    ----------
-    network : Network
-        Float stage.
-    integer : IntegerNetwork
-        What the netlist holds; its populations are those of the float stage.
-    events : (steps, channels) bool
-        Input events.
-    observed : Observed
-        What the chip did.
-    rounding : Rounding, optional
-        What is known of the stored weights; by default each is the nearest.
-    absent, unused : sequence of (neurons,) bool, optional
-        Neurons of each population that the chip does not hold, and those of them whose spikes reach no neuron,
-        which are not compared.
-    pruned : bool
-        Whether neurons were left out on evidence; otherwise only those that their rounded weights cannot fire.
+    `network` is the float stage of `model`, `integer` what the netlist holds, `events` (steps, channels) bool, and
+    `observed` what the chip did on this recording. `rounding` is what is known of the stored weights; by default each
+    is the nearest. The chip does not hold the `absent` neurons of each population, of which the `unused` reach no
+    neuron and are not compared; they were `pruned` on evidence, or cannot fire with their rounded weights.
     """
     ideal = run_float(network, events[None], membranes=True)
-    truth = tuple(spikes[0] for spikes in ideal.spikes)
+    truth, chip = ([spikes[0] for spikes in side.spikes] for side in (ideal, observed))
     none = [np.zeros(population.size, np.bool_) for population in network.populations]
     absent, unused = absent or none, unused or none
-    differs = [(a != b) & ~mute for a, b, mute in zip(truth, observed.spikes, unused, strict=True)]
+    differs = [(a != b) & ~mute for a, b, mute in zip(truth, chip, unused, strict=True)]
     resets = [
         a & b if population.decay_u == 4095 else np.zeros_like(a)
-        for a, b, population in zip(truth, observed.spikes, integer.populations, strict=True)
+        for a, b, population in zip(truth, chip, integer.populations, strict=True)
     ]
     roots = find_roots(differs, resets, sources_of(network, integer))
     causes: dict[Root, RootCause] = {}
@@ -155,25 +90,32 @@ def explain(
         inputs = []
         for pre in sources_into(network, integer, post):
             # what the chip does not hold, it has no weights from: the float model's spikes say what it lacks
-            sent = events if pre == INPUT else np.where(absent[pre], truth[pre], observed.spikes[pre])
+            sent = events if pre == INPUT else np.where(absent[pre], truth[pre], chip[pre])
             inputs.append(step_late(sent[None])[0] if pre == post else sent)
-        compensated = rounding is not None and rounding.layers[population.name].compensated
         layer = _Layer(
             network=network,
             integer=integer,
-            values=layer_values(network, integer, post, compensated=compensated),
+            model=model or network,
+            post=post,
             absent=absent[post],
             pruned=pruned,
-            post=post,
+            compensated=rounding is not None and rounding.layers[population.name].compensated,
         )
         arrived = np.concatenate(inputs, axis=1).astype(np.float64)
-        seen = observed.spikes[post], np.asarray(observed.membranes[post], np.int64)
-        causes |= zip(here, layer.name_causes(here, arrived, ideal, seen), strict=True)
+        causes |= zip(here, layer.name_causes(here, arrived, ideal, observed), strict=True)
+    counts = Counter(root.layer for root in roots)
     return Explanation(
-        float_spikes=tuple(int(np.count_nonzero(spikes)) for spikes in truth),
-        chip_spikes=tuple(int(np.count_nonzero(spikes)) for spikes in observed.spikes),
-        different=tuple(int(np.count_nonzero(d)) for d in differs),
-        roots=tuple(causes[root] for root in roots),
+        layers=tuple(
+            LayerRoots(
+                name=population.name,
+                float_spikes=int(np.count_nonzero(truth[post])),
+                chip_spikes=int(np.count_nonzero(chip[post])),
+                different=int(np.count_nonzero(differs[post])),
+                roots=counts[post],
+            )
+            for post, population in enumerate(integer.populations)
+        ),
+        found=tuple(causes[root] for root in roots),
     )
 
 
@@ -183,31 +125,33 @@ class _Layer:
 
     network: Network
     integer: IntegerNetwork
-    values: LayerValues
+    model: Checkpoint | Network
+    post: int
     absent: BoolArray
     pruned: bool
-    post: int
+    compensated: bool
 
     def name_causes(
-        self, roots: list[Root], arrived: FloatArray, ideal: Activity, seen: tuple[BoolArray, IntArray]
+        self, roots: list[Root], arrived: FloatArray, ideal: Activity, observed: Activity
     ) -> list[RootCause]:
         """Causes of roots of this population, which are sorted by the length of what they remember."""
         assert ideal.membranes is not None, "membranes were wanted"
+        assert observed.membranes is not None, "membranes were wanted"
+        post, population, chip = self.post, self.network.populations[self.post], self.integer.populations[self.post]
         rows = np.array([root.neuron for root in roots])
         steps = np.array([root.step for root in roots])
         begins = np.array([root.begin for root in roots])
-        variants = variants_of(self.values, rows)
-        stored, real = self.values.stored.weight[rows], self.values.ideal.weight[rows]
-        unclipped = np.where(self.values.clipped[rows], real, stored)
-        inflows = np.stack([arrived @ weight.T for weight in (stored, real, unclipped)])
-        both = (ideal.spikes[self.post][0] & seen[0])[:, rows]
-        margins, early = run_variants(variants, inflows, begins, steps, both)
+        variants = variants_of(self.network, self.integer, post, rows, compensated=self.compensated)
+        weights = weights_into(self.network, self.integer, post, rows)
+        inflows = np.stack([arrived @ weight.T for weight in weights])
+        fires, fired = ideal.spikes[post][0], observed.spikes[post][0]
+        threshold = chip.threshold[rows].astype(np.float64) * (1 << MEMBRANE_SHIFT)
+        margins, early = run_variants(variants, threshold, inflows, begins, steps, (fires & fired)[:, rows])
 
-        unit = self.integer.populations[self.post].scale[rows] * (1 << MEMBRANE_SHIFT)
-        threshold = self.values.stored.threshold[rows]
-        register = seen[1][steps, rows]
-        truth = ideal.spikes[self.post][0, steps, rows]
-        membrane = ideal.membranes[self.post][0, steps, rows]
+        unit = chip.scale[rows] * (1 << MEMBRANE_SHIFT)
+        register = np.asarray(observed.membranes[post][0], np.int64)[steps, rows]
+        truth = fires[steps, rows]
+        membrane = ideal.membranes[post][0, steps, rows]
 
         # what the margin would be without each deviation; the first variant is the netlist itself
         margin = register - threshold
@@ -215,9 +159,11 @@ class _Layer:
         moved = np.abs(without - margin) / unit
         mended = ((without > 0) == truth) & ~early & (moved > 0)
 
-        population = self.network.populations[self.post]
-        magnitude = population.theta + np.abs(real / unit[:, None]).sum(axis=1) + np.abs(population.bias[rows])
+        sums = np.abs(weights[UNROUNDED] / unit[:, None]).sum(axis=1)
+        magnitude = population.theta + sums + np.abs(population.bias[rows])
         undecided = np.abs(membrane - population.theta) <= UNDECIDED * magnitude
+        stored = [p for p in self.integer.projections if p.post == post]
+        bits, planes = max(p.bits for p in stored), len({p.exponent for p in stored})
         found = []
         for i, root in enumerate(roots):
             held = not self.absent[root.neuron]
@@ -227,30 +173,37 @@ class _Layer:
             cause = TIE if undecided[i] else UNKNOWN if first is None else variants[first].cause
             if not held:
                 cause = LEFT_OUT if self.pruned else WEIGHTS
+            amounts: dict[str, float] = {}  # the largest of each cause
+            for k in order:
+                if moved[k, i] > 0:
+                    amounts.setdefault(variants[k].cause, float(moved[k, i]))
+            clipped = any(variants[k].weights == UNCLIPPED for k in enough)
+            taxel, feature = taxel_and_feature(self.model, post, root.neuron)
             found.append(
                 RootCause(
-                    root=root,
-                    cause=cause,
-                    held=held,
-                    clipped=any(variants[k].weights == UNCLIPPED for k in enough),
-                    sufficient=tuple(dict.fromkeys(variants[k].cause for k in enough)) if held else (),
-                    moved=_largest([(variants[k].cause, float(moved[k, i])) for k in order]) if held else (),
+                    layer=population.name,
+                    neuron=root.neuron,
+                    taxel=taxel,
+                    feature=feature,
+                    step=root.step,
+                    remembers_from_step=root.begin,
                     float_fires=bool(truth[i]),
                     float_membrane=float(membrane[i]),
-                    chip_membrane=float(register[i] / unit[i]),
+                    float_distance=float(membrane[i]) - population.theta,
                     theta=population.theta,
-                    chip_theta=float(threshold[i] / unit[i]),
-                    chip_register=int(register[i]),
-                    chip_threshold=int(threshold[i]),
+                    chip_membrane=float(register[i] / unit[i]) if held else None,
+                    chip_distance=float(register[i] / unit[i]) - float(threshold[i] / unit[i]) if held else None,
+                    chip_theta=float(threshold[i] / unit[i]) if held else None,
+                    chip_register=int(register[i]) if held else None,
+                    chip_threshold_register=int(threshold[i]) if held else None,
+                    cause=cause,
+                    held=held,
+                    clipped_weights=clipped,
+                    sufficient=tuple(dict.fromkeys(variants[k].cause for k in enough)) if held else (),
+                    moved=amounts if held else {},
+                    change=remedy(cause, population.name, bits=bits, planes=planes, clipped=clipped, held=held),
+                    dragged=root.dragged,
+                    dragged_alone=root.alone,
                 )
             )
         return found
-
-
-def _largest(moved: list[tuple[str, float]]) -> tuple[tuple[str, float], ...]:
-    """The largest amount of each cause, largest first, from a sorted list."""
-    found: dict[str, float] = {}
-    for cause, amount in moved:
-        if amount > 0:
-            found.setdefault(cause, amount)
-    return tuple(found.items())

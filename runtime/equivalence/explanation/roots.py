@@ -57,25 +57,14 @@ def sources_of(network: Network, integer: IntegerNetwork) -> Sources:
 
 
 def find_roots(differs: Sequence[BoolArray], resets: Sequence[BoolArray], sources: Sources) -> tuple[Root, ...]:
-    """Separate roots from what follows, in one pass over steps and layers.
+    """Separate roots from what follows, in one pass over steps and layers; those that drag most along come first.
 
-    Parameters
-    ----------
-    differs : sequence of (steps, neurons) bool
-        Diverging entries of each population, aligned with the data; populations in order of depth.
-    resets : sequence of (steps, neurons) bool
-        Entries after which a neuron remembers nothing: both fired, and its current does not outlast a step.
-    sources : Sources
+    `differs` are the diverging entries of each population, (steps, neurons) bool, aligned with the data, populations in
+    order of depth; `resets` entries after which a neuron remembers nothing: both fired, and its current does not
+    outlast a step.
 
-    Returns
-    -------
-    tuple of Root
-        Those that drag most along first; then by step, layer and neuron.
-
-    Notes
-    -----
-    Sets of roots are Python integers, one bit a root: a layer that is densely connected needs one union a step, and
-    as many additions to its neurons' sets.
+    Sets of roots are Python integers, one bit a root: a layer that is densely connected needs one union a step, and as
+    many additions to its neurons' sets.
     """
     remembered = [[0] * array.shape[1] for array in differs]
     begin = [np.zeros(array.shape[1], np.int64) for array in differs]

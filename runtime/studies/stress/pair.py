@@ -81,7 +81,7 @@ def ready(pair: Pair) -> Ready:
 def evaluate(prepared: Ready, inputs: Inputs) -> Outcome:
     """Run both sides from rest."""
     netlist = prepared.chip.netlist
-    model = float_engine.run(prepared.model, inputs.events, lengths=inputs.lengths, begin=inputs.begin, threads=1)
+    model = float_engine.run(prepared.model, inputs.events, lengths=inputs.lengths, begin=inputs.begin)
     packed, stopped, saturated = _chip(prepared.chip, inputs)
     spikes = np.zeros((len(inputs.events), len(netlist.layers), 3), np.int64)
     votes = np.zeros((len(inputs.events), netlist.classes), np.int64)
