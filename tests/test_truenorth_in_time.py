@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from made_files import STEPS, own_file, recordings_folder
+from made_files import CLASSES, own_file, recordings_folder, weights
 from random_crossbars import CHIP, both, with_limit
 from random_networks import chain
 
@@ -63,8 +63,8 @@ def assert_equal(levels, netlist, recording):
 @pytest.mark.parametrize("largest", [1, 2, 3, -4])
 def test_weights_in_levels_are_found_again(largest):
     weight = 0.37 * np.array([[largest, 0, 1, -1], [largest, largest, 0, 0]])
-    book = codebook(weight, 3)
-    np.testing.assert_allclose(book.level * book.step[:, None], weight, rtol=1e-6)
+    level, step = codebook(weight, 3)
+    np.testing.assert_allclose(level * step[:, None], weight, rtol=1e-6)
 
 
 def test_a_network_in_levels_is_the_float_network_with_rounded_weights():
@@ -72,7 +72,7 @@ def test_a_network_in_levels_is_the_float_network_with_rounded_weights():
     levels = in_levels(network, 3, CHIP)
     books = [codebook(projection.weight.toarray(), 3) for projection in network.projections]
     rounded = chain(
-        *((book.level * book.step[:, None]).astype(np.float64) for book in books),
+        *(level * step[:, None] for level, step in books),
         biases=[population.bias for population in network.populations],
         beta=0.0,
     )
@@ -177,45 +177,25 @@ def test_what_does_not_fit(network, copies, chip, used):
 def place(tmp_path_factory):
     folder = tmp_path_factory.mktemp("in_time")
     own_file(folder / "free.pt", beta=0.0)
+    own_file(folder / "other.pt", beta=0.0, theta=0.6)
     own_file(folder / "keeps.pt")
+    own_file(folder / "wide.pt", beta=0.0, last=weights(features=60, sizes=(9, CLASSES)))
     recordings_folder(folder / "data")
     return folder
 
 
-COMPILE = ("compile", "free.pt", "--target", "truenorth", "--in-time", "3", "-o", "free.loom")
-VERIFY = ("verify", "free.loom", "--checkpoint", "free.pt", "--data", "data")
+COMPILE = "compile free.pt --target truenorth --in-time 3 -o free.loom"
 
 
-def test_from_a_checkpoint_to_decisions(spikeloom):
-    made, found, decided, costs = (
-        json.loads(spikeloom(*words, "--json")[1])
-        for words in (
-            COMPILE,
-            VERIFY,
-            ("run", "free.loom", "--data", "data"),
-            ("estimate", "free.loom", "--data", "data"),
-        )
-    )
-    assert (made["ticks_per_step"], made["provenance"]["in_time"]) == (BIN_TICKS, 3)
-    assert found["exact"]
-    assert (found["E0"], found["spec_steps"]) == ({"samples": 3, "differences": 0}, 5)
-    assert sum(layer["spikes"] for layer in found["E1"]["layers"]) > 0
-    assert decided["accuracy"] == found["correct"] / found["samples"]
-    assert costs["per_inference"]["ticks"] == STEPS * BIN_TICKS + made["drain_ticks"]
-
-
-def test_what_verify_says_of_sums(spikeloom, place):
-    rng = np.random.default_rng(0)
-    free = {"conv1.hops": rng.normal(0, 1, (2, 60, 2)), "conv1.bias": np.zeros(60)}
-    sizes = (6 * 60, 9, 4)
-    for i, (before, after) in enumerate(pairwise(sizes), 1):
-        free |= {f"fc{i}.weight": rng.normal(0, 0.3, (after, before)), f"fc{i}.bias": np.zeros(after)}
-    own_file(place / "wide.pt", beta=0.0, last={name: array.astype(np.float32) for name, array in free.items()})
-    words = ("compile", "wide.pt", "--target", "truenorth", "--in-time", "3", "-o", "wide.loom")
-    assert spikeloom(*words)[0] == 0
-    code, out, _ = spikeloom("verify", "wide.loom", "--checkpoint", "wide.pt", "--data", "data", "--spec-samples", "1")
-    assert code == 0
+def test_what_verify_says_of_sums(spikeloom):
+    code, out, _ = spikeloom(*COMPILE.replace("free", "wide").split(), "--json")
+    made = json.loads(out)
+    assert (code, made["ticks_per_step"], made["provenance"]["in_time"]) == (0, BIN_TICKS, 3)
+    words = "verify wide.loom --checkpoint wide.pt --data data --spec-samples 1"
+    assert json.loads(spikeloom(*words.split(), "--json")[1])["spec_steps"] == 5
+    code, out, _ = spikeloom(*words.split())
     lines = out.splitlines()
+    assert code == 0
     assert lines[0].startswith("E0 specification = engine: equal in every spike on 1 recording (the first 5 steps of")
     (head,) = (at for at, line in enumerate(lines) if line.split()[:3] == ["layer", "partial", "sums"])
     assert lines[head + 1].split()[0] == "fc1"
@@ -224,21 +204,18 @@ def test_what_verify_says_of_sums(spikeloom, place):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ((*COMPILE[:4], "--in-time", "5", *COMPILE[6:]), "--in-time 5: allowed are 2, 3, 4"),
-        ((*COMPILE, "--calibrate", "data"), "--calibrate data: is not for truenorth"),
-        (("compile", "free.pt", "--in-time", "3", "-o", "x.loom"), "--in-time 3: loihi1 has no such option"),
-        (("compile", "keeps.pt", *COMPILE[2:]), "keeps.pt: conv1: keeps 0.2 of its membranes a step"),
+        (COMPILE.replace("3", "5"), "--in-time 5: allowed are 2, 3, 4"),
+        (f"{COMPILE} --calibrate data", "--calibrate data: is not for truenorth"),
+        ("compile free.pt --in-time 3 -o x.loom", "--in-time 3: loihi1 has no such option"),
+        (COMPILE.replace("free.pt", "keeps.pt"), "keeps.pt: conv1: keeps 0.2 of its membranes a step"),
+        (
+            "verify free.loom --checkpoint other.pt --data data",
+            "--checkpoint other.pt: free.loom was compiled from another file",
+        ),
     ],
 )
 def test_mistakes(spikeloom, words, said):
-    code, out, err = spikeloom(*words)
+    assert spikeloom(*COMPILE.split())[0] == 0
+    code, out, err = spikeloom(*words.split())
     assert (code, out) == (2, "")
     assert err.startswith(f"spikeloom: {said}")
-
-
-def test_another_checkpoint_is_refused(spikeloom, place):
-    assert spikeloom(*COMPILE)[0] == 0
-    own_file(place / "other.pt", beta=0.0, theta=0.6)
-    code, _, err = spikeloom("verify", "free.loom", "--checkpoint", "other.pt", "--data", "data")
-    assert code == 2
-    assert "--checkpoint other.pt: free.loom was compiled from another file" in err

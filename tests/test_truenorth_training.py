@@ -20,6 +20,7 @@ from spikeloom.models.networks.surrogate import FAST_SIGMOID, Surrogate
 from spikeloom.models.recordings.grasps import synthetic_grasps
 from spikeloom.models.recordings.release import write_released
 from spikeloom.models.systems import propagation_of
+from spikeloom.models.truenorth.kind import CROSSBARS
 from spikeloom.models.truenorth.network import (
     NativeArchitecture,
     native_network,
@@ -29,7 +30,6 @@ from spikeloom.models.truenorth.network import (
     sized,
 )
 from spikeloom.models.truenorth.neurons import block_sums, integrate
-from spikeloom.models.truenorth.recipe import CROSSBARS
 from spikeloom.runtime.cli import main
 
 SMOOTH = Surrogate(shape=FAST_SIGMOID, width=0.5, reset=False)

@@ -11,14 +11,30 @@ from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.targets.truenorth.native import BASES, SYSTEM, USUAL_COPIES
 from spikeloom.compiler.targets.truenorth.native_file import Trained, read_trained, write_trained
 from spikeloom.compiler.types import IntArray
+from spikeloom.models.networks.surrogate import FAST_SIGMOID, Surrogate
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.training.kinds import Plan, same_graph
-from spikeloom.models.training.recipes import Recipe
+from spikeloom.models.training.recipes import ADAMW, COSINE, CROSS_ENTROPY, Recipe
 from spikeloom.models.truenorth import network
-from spikeloom.models.truenorth.recipe import CROSSBARS
 
 SYSTEMS = (SYSTEM,)
 COPIES = tuple(BASES)
+
+CROSSBARS = Recipe(
+    name="truenorth",
+    epochs=30,
+    batch=4,
+    loss=CROSS_ENTROPY,
+    gain=60.0,
+    surrogate=Surrogate(shape=FAST_SIGMOID, width=0.5, reset=False),
+    optimizer=ADAMW,
+    weight_decay=0.01,
+    learning_rate=3e-3,
+    schedule=COSINE,
+    features=16,
+    clocks=5,
+)
+"""How such networks are trained; they have no other recipe."""
 
 REFUSED = {
     "--recipe": "has a recipe of its own",

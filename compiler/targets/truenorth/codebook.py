@@ -44,37 +44,29 @@ SEARCHED = np.linspace(0.1, 1.0, 19)
 """Shares of the largest weight that are tried as the largest level of a codebook."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Levels:
-    """Weights as whole multiples, `level` (neurons, inputs), of a `step` (neurons,) of each neuron; float32."""
+def codebook(weight: FloatArray, copies: int) -> tuple[IntArray, FloatArray]:
+    """Weights (neurons, inputs) as whole multiples, the levels, of a step (neurons,) of each neuron, in float32.
 
-    level: npt.NDArray[np.float32]
-    step: npt.NDArray[np.float32]
-
-
-def codebook(weight: FloatArray, copies: int) -> Levels:
-    """Weights (neurons, inputs) in the levels that so many axons an input give: for 2, 3, 4 copies -1…1, -4…3, -8…7.
-
-    The weights of the types are 1 and -1; 1, 2 and -4; 1, 2, 4 and -8, times a step that each neuron has of its own:
-    of those tried, the one of least squared error.
+    The weights of the types are 1 and -1; 1, 2 and -4; 1, 2, 4 and -8 steps, which gives for 2, 3, 4 copies the levels
+    -1…1, -4…3, -8…7. Of the steps that are tried a neuron has the one of least squared error.
 
     Examples
     --------
-    >>> found = codebook(np.array([[0.5, -0.4, 0.02]]), 2)
-    >>> found.level.tolist(), [f"{step:.2f}" for step in found.step]
-    ([[1.0, -1.0, 0.0]], ['0.45'])
+    >>> level, step = codebook(np.array([[0.5, -0.4, 0.02]]), 2)
+    >>> level.tolist(), [f"{each:.2f}" for each in step]
+    ([[1, -1, 0]], ['0.45'])
     """
     low, high = min(WEIGHTS[copies]), sum(WEIGHTS[copies][:-1])
     largest = np.maximum(np.abs(weight).max(axis=1, keepdims=True), 1e-12)
     best = np.full(len(weight), np.inf)
-    step, level = np.ones(len(weight)), np.zeros(weight.shape)
-    for share in (*SEARCHED, *(-low / level for level in range(1, -low))):  # the latter: the largest is that level
+    step, level = np.ones(len(weight)), np.zeros(weight.shape, np.int64)
+    for share in (*SEARCHED, *(-low / k for k in range(1, -low))):  # the latter: the largest weight is level k
         tried = share * largest / -low
         rounded = np.clip(np.rint(weight / tried), low, high)
         error = ((rounded * tried - weight) ** 2).sum(axis=1)
         better = error < best
         best[better], step[better], level[better] = error[better], tried[better, 0], rounded[better]
-    return Levels(level=level.astype(np.float32), step=step.astype(np.float32))
+    return level, step.astype(np.float32).astype(np.float64)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -113,20 +105,10 @@ class LevelNetwork:
     label: IntArray
 
 
-def group_width(copies: int, chip: Target) -> int:
-    """Inputs of a group, with the axons of a clock beside: 126 with two axons each, 84 with three."""
-    return (chip.limit("core.axons") - EMPTYING) // copies
-
-
 def in_levels(network: Network, copies: int, chip: Target) -> LevelNetwork:
-    """Round a history-free chain of layers to levels.
+    """Round a history-free chain of layers to levels; ModelError if it is none, has clocks, or a step joins bins.
 
     An input has `copies` axons, 2 to 4; layers that receive a clock take three at the most.
-
-    Raises
-    ------
-    ModelError
-        If a layer remembers, a step joins bins, or the network is no chain without clocks.
     """
     if network.input.clocks.channels:
         raise ModelError("has clocks; sums in time are for networks without")
@@ -154,17 +136,18 @@ def _layer(population: Population, weight: FloatArray, copies: int, chip: Target
     """Levels of a layer: in as many copies as were asked for, if its inputs fit a core so and it receives no clock."""
     fan_in = int(np.count_nonzero(weight, axis=1).max(initial=0))
     for tried in dict.fromkeys((copies, min(copies, MOST_COPIES))):
-        book = codebook(weight, tried)
-        threshold = np.floor((population.theta - population.bias) / book.step.astype(np.float64)).astype(np.int64) + 1
+        level, step = codebook(weight, tried)
+        threshold = np.floor((population.theta - population.bias) / step).astype(np.int64) + 1
         whole = fan_in * tried < chip.limit("core.axons")
         if tried <= MOST_COPIES or (whole and threshold.min(initial=1) > 0):
             break
     return Layer(
         name=population.name,
-        level=read_only(book.level.astype(np.int64)),
+        level=read_only(level),
         threshold=read_only(threshold),
         copies=tried,
-        width=weight.shape[1] if whole else group_width(tried, chip),
+        # with the axons of a clock beside: groups of 126 inputs with two axons each, 84 with three
+        width=weight.shape[1] if whole else (chip.limit("core.axons") - EMPTYING) // tried,
     )
 
 
@@ -194,19 +177,18 @@ class Run:
 
 
 def run_levels(network: LevelNetwork, events: npt.NDArray[np.uint8], *, most: int = MOST) -> Run:
-    """Run one recording (channels, steps) through a network in levels; every sum is exact.
-
-    Partial sums count `most` at the most; on the chip that is ``MOST``.
-    """
+    """Run one recording (channels, steps) through a network in levels; partial sums count `most` at the most."""
     active = (events > 0).T.astype(np.float64)  # whole numbers, so that the products are exact and fast
-    spikes, partial, saturated, largest = [], [], [], []
+    spikes, counts = [], []
     for layer in network.layers:
-        sums = [active[:, group] @ layer.level[:, group].T.astype(np.float64) for group in layer.groups]
-        split = layer.is_split
-        partial.append(sum(part.size for part in sums) if split else 0)
-        saturated.append(sum(int(np.count_nonzero(np.abs(part) > most)) for part in sums) if split else 0)
-        largest.append(max(int(np.abs(part).max(initial=0)) for part in sums) if split else 0)
-        total = sum(np.clip(part, -most, most) for part in sums) if split else sums[0]
-        spikes.append(total >= layer.threshold)
+        sums = np.stack([active[:, group] @ layer.level[:, group].T.astype(np.float64) for group in layer.groups])
+        if layer.is_split:
+            held = np.abs(sums)
+            counts.append((sums.size, int(np.count_nonzero(held > most)), int(held.max(initial=0))))
+            sums = np.clip(sums, -most, most)
+        else:
+            counts.append((0, 0, 0))
+        spikes.append(sums.sum(axis=0) >= layer.threshold)
         active = spikes[-1].astype(np.float64)
-    return Run(spikes=tuple(spikes), partial=tuple(partial), saturated=tuple(saturated), largest=tuple(largest))
+    partial, saturated, largest = zip(*counts, strict=True)
+    return Run(spikes=tuple(spikes), partial=partial, saturated=saturated, largest=largest)

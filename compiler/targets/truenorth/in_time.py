@@ -83,9 +83,9 @@ def _starts(network: LevelNetwork) -> list[int]:
     return starts
 
 
-def _types(copies: int) -> tuple[int, ...]:
-    """Weights of the four axon types where an input has so many axons."""
-    return (*WEIGHTS[copies], *[0] * (AXON_TYPES - copies))
+def _first_types(layer: Layer) -> tuple[int, ...]:
+    """Weights of the axon types of inputs, without that of clocks."""
+    return (*WEIGHTS[layer.copies], 0)[:CLOCK]
 
 
 def first_spikes(network: LevelNetwork) -> dict[str, int]:
@@ -110,33 +110,33 @@ class _Placing:
     def whole(self, depth: int, layer: Layer, ends: list[list[Place]] | None, inputs: list[list[Place]]) -> None:
         """A layer whose inputs fit a core: a neuron for each axon that it reaches, all in one tick."""
         aims = [(n, end) for n in range(len(layer.level)) for end in ([None] if ends is None else ends[n])]
-        types, start = _types(layer.copies), self.starts[depth]
+        weights = WEIGHTS[layer.copies]
         for part in self._packed(layer, aims):
             core = self.draft.core()
             for n, end in part:
                 threshold = int(layer.threshold[n])
-                # one that would spike without inputs has to wait for a clock: its leak alone must not do
-                lift, leak = (types[CLOCK], -threshold) if threshold > 0 else (1 - threshold, -1)
-                made = Neuron(weights=(*types[:CLOCK], lift), leak=leak, threshold=0)
+                made = Neuron(weights=weights, leak=-threshold, threshold=0)
+                if threshold <= 0:  # it would spike without inputs and has to wait for a clock: its leak must not do
+                    made = Neuron(weights=(*_first_types(layer), 1 - threshold), leak=-1, threshold=0)
                 self._add(core, made, layer, n, None if end is None else [end], depth, 1)
             chosen = np.array([n for n, _ in part])
             self._inputs(core, layer, layer.level[chosen].T, range(layer.level.shape[1]), inputs)
             waiting = np.flatnonzero(layer.threshold[chosen] <= 0).tolist()
             if waiting:
-                self._clock(core, CLOCK, waiting, start)
+                self._clock(core, CLOCK, waiting, self.starts[depth])
 
     def split(self, depth: int, layer: Layer, ends: list[list[Place]] | None, inputs: list[list[Place]]) -> None:
         """A layer whose partial sums travel in time."""
         groups, start = layer.groups, self.starts[depth]
         sums = self._gated(depth, layer, len(groups), ends)
-        most, types = self.chip.limit("core.neurons"), _types(layer.copies)
+        most = self.chip.limit("core.neurons")
         for number, group in enumerate(groups):
             aims = [(n, sign) for n in range(len(layer.level)) for sign in (1, -1)]
             for first in range(0, len(aims), most):
                 core, part = self.draft.core(), aims[first : first + most]
                 for n, sign in part:
                     made = Neuron(
-                        weights=(*(sign * weight for weight in types[:CLOCK]), PULL),
+                        weights=(*(sign * weight for weight in _first_types(layer)), PULL),
                         reset_mode=RESET_LINEAR,
                         negative_saturates=True,
                     )

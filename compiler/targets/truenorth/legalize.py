@@ -62,18 +62,14 @@ def _owner(core: int, who: str, others: int) -> str:
 
 def _cores(netlist: CrossbarNetlist, chip: Target) -> Iterator[Broken]:
     places = list(zip(netlist.core_x.tolist(), netlist.core_y.tolist(), strict=True))
-    off = [(core, "", f"at ({x}, {y})") for core, (x, y) in enumerate(places) if not _inside(x, y, chip)]
+    named = [(core, f"at ({x}, {y})", places.index((x, y))) for core, (x, y) in enumerate(places)]
+    off = [(core, "", where) for core, where, _ in named if not _inside(*places[core], chip)]
     yield off, _mesh(chip), "mesh", "place it on the mesh"
-    double = [
-        (core, "", f"at ({x}, {y}) as core {places.index((x, y))}")
-        for core, (x, y) in enumerate(places)
-        if places.index((x, y)) != core
-    ]
+    double = [(core, "", f"{where} as core {first}") for core, where, first in named if first != core]
     yield double, "one core to a place", "mesh", "place it elsewhere"
     most = chip.limit("chip.cores")
-    if netlist.n_cores > most:
-        found = [(-1, "chip", f"{netlist.n_cores} cores")]
-        yield found, str(most), "chip.cores", "fewer neurons, inputs or copies"
+    many = [(-1, "chip", f"{netlist.n_cores} cores")] if netlist.n_cores > most else []
+    yield many, str(most), "chip.cores", "fewer neurons, inputs or copies"
     for what, bounds, remedy in (
         ("neurons", netlist.core_neurons, "use more cores"),
         ("axons", netlist.core_axons, "fewer inputs or copies of inputs, or more cores"),
@@ -119,26 +115,26 @@ def _parameters(netlist: CrossbarNetlist, chip: Target) -> Iterator[Broken]:
     """Numbers that do not fit their registers."""
     unsigned = (0, (1 << chip.limit("neuron.threshold_bits")) - 1)
     signed = {what: signed_range(chip.limit(f"neuron.{what}_bits")) for what in ("weight", "leak", "reset", "membrane")}
-    columns: list[tuple[str, IntArray, tuple[int, int], str, str]] = [
-        ("leak", netlist.leak, signed["leak"], "neuron.leak_bits", "a smaller scale"),
-        ("threshold", netlist.threshold, unsigned, "neuron.threshold_bits", "a smaller scale"),
-        ("negative threshold", netlist.negative_threshold, unsigned, "neuron.threshold_bits", "a smaller scale"),
-        ("random bits", netlist.mask_bits, (0, chip.limit("neuron.mask_bits")), "neuron.mask_bits", "fewer bits"),
-        ("reset value", netlist.reset, signed["reset"], "neuron.reset_bits", "reset nearer to zero"),
-        ("initial membrane", netlist.initial, signed["membrane"], "neuron.membrane_bits", "start nearer to zero"),
-        ("reset mode", netlist.reset_mode, (RESET_TO, RESET_NONE), "neuron.reset_mode", "use one of the modes"),
-        ("leak reversal", netlist.leak_reversal, (0, 1), "neuron.leak_reversal", "use a flag"),
-        ("saturation", netlist.negative_saturates, (0, 1), "neuron.negative_saturates", "use a flag"),
-    ]
-    kinds = range(netlist.weight.shape[1])
     remedy = "a smaller scale, or the input on several axons"
     weights = [
-        (f"weight of type {g}", netlist.weight[:, g], signed["weight"], "neuron.weight_bits", remedy) for g in kinds
+        (f"weight of type {kind}", values, signed["weight"], "weight_bits", remedy)
+        for kind, values in enumerate(netlist.weight.T)
     ]
-    for name, values, (low, high), rule, mend in (*weights, *columns):
+    for name, values, (low, high), rule, mend in (
+        *weights,
+        ("leak", netlist.leak, signed["leak"], "leak_bits", "a smaller scale"),
+        ("threshold", netlist.threshold, unsigned, "threshold_bits", "a smaller scale"),
+        ("negative threshold", netlist.negative_threshold, unsigned, "threshold_bits", "a smaller scale"),
+        ("random bits", netlist.mask_bits, (0, chip.limit("neuron.mask_bits")), "mask_bits", "fewer bits"),
+        ("reset value", netlist.reset, signed["reset"], "reset_bits", "reset nearer to zero"),
+        ("initial membrane", netlist.initial, signed["membrane"], "membrane_bits", "start nearer to zero"),
+        ("reset mode", netlist.reset_mode, (RESET_TO, RESET_NONE), "reset_mode", "use one of the modes"),
+        ("leak reversal", netlist.leak_reversal, (0, 1), "leak_reversal", "use a flag"),
+        ("saturation", netlist.negative_saturates, (0, 1), "negative_saturates", "use a flag"),
+    ):
         bad = np.flatnonzero((values < low) | (values > high))
-        offenders = _on_cores(netlist, bad, [f"{name} {values[neuron]}" for neuron in bad])
-        yield offenders, f"{low} … {high}", rule, mend
+        found = [f"{name} {value}" for value in values[bad]]
+        yield _on_cores(netlist, bad, found), f"{low} … {high}", f"neuron.{rule}", mend
 
 
 def _on_cores(netlist: CrossbarNetlist, neurons: IntArray, found: list[str]) -> list[Offender]:
@@ -151,11 +147,8 @@ def _on_cores(netlist: CrossbarNetlist, neurons: IntArray, found: list[str]) -> 
 def _targets(netlist: CrossbarNetlist, chip: Target) -> Iterator[Broken]:
     """Neurons with more than one target: an axon, or the way out of the chip."""
     limit = chip.limit("neuron.targets")
-    places = sorted({*zip(netlist.wire_x.tolist(), netlist.wire_y.tolist(), strict=True)})
-    place_id = [places.index(place) for place in zip(netlist.wire_x.tolist(), netlist.wire_y.tolist(), strict=True)]
-    pairs = np.unique(np.stack([netlist.wire_neuron, np.array(place_id, np.int64)]), axis=1)
-    wires = np.bincount(netlist.wire_neuron, minlength=netlist.n_neurons)
-    cores = np.bincount(pairs[0], minlength=netlist.n_neurons)
+    ends = np.unique(np.stack([netlist.wire_neuron, netlist.wire_x, netlist.wire_y]), axis=1)
+    wires, cores = (np.bincount(each, minlength=netlist.n_neurons) for each in (netlist.wire_neuron, ends[0]))
     fans = np.flatnonzero((wires > limit) & (cores > 1))
     within = np.flatnonzero((wires > limit) & (cores == 1))
     out = np.flatnonzero((wires > 0) & (netlist.readout_class >= 0))
@@ -170,25 +163,25 @@ def _targets(netlist: CrossbarNetlist, chip: Target) -> Iterator[Broken]:
 def _wires(netlist: CrossbarNetlist, chip: Target) -> Iterator[Broken]:
     longest, reach = chip.limit("neuron.delay"), chip.limit("mesh.reach")
     source = netlist.core_of_neuron()[netlist.wire_neuron]
-    order = np.argsort(source, kind="stable")
+    number = netlist.wire_neuron - netlist.core_neurons[source]
     aim = netlist.cores_at(netlist.wire_x, netlist.wire_y)
     axon = netlist.axons_at(aim, netlist.wire_line)
     far = np.maximum(np.abs(netlist.core_x[source] - netlist.wire_x), np.abs(netlist.core_y[source] - netlist.wire_y))
     late, off, nowhere, beyond = (list[Offender]() for _ in range(4))
-    columns = netlist.wire_x, netlist.wire_y, netlist.wire_line, netlist.wire_delay, source
-    for row in order.tolist():
-        x, y, line, delay, core = (int(column[row]) for column in columns)
-        who = f"neuron {netlist.wire_neuron[row] - netlist.core_neurons[core]}"
+    columns = netlist.wire_x, netlist.wire_y, netlist.wire_line, netlist.wire_delay, source, number, aim, axon, far
+    rows = np.stack(columns, axis=1)[np.argsort(source, kind="stable")]
+    for x, y, line, delay, core, neuron, end, found, distance in rows.tolist():
+        who = core, f"neuron {neuron}"
         if not 1 <= delay <= longest:
-            late.append((core, who, f"delay {delay}"))
+            late.append((*who, f"delay {delay}"))
         if not _inside(x, y, chip):
-            off.append((core, who, f"target at ({x}, {y})"))
-        elif aim[row] < 0:
-            nowhere.append((core, who, f"target at ({x}, {y}), where no core is"))
-        elif axon[row] < 0:
-            nowhere.append((core, who, f"target line {line} of core {aim[row]}, which has no axon there"))
-        elif far[row] > reach:
-            beyond.append((core, who, f"{far[row]} cores away"))
+            off.append((*who, f"target at ({x}, {y})"))
+        elif end < 0:
+            nowhere.append((*who, f"target at ({x}, {y}), where no core is"))
+        elif found < 0:
+            nowhere.append((*who, f"target line {line} of core {end}, which has no axon there"))
+        elif distance > reach:
+            beyond.append((*who, f"{distance} cores away"))
     yield late, f"1 … {longest} ticks", "neuron.delay", "add relays for longer ways"
     yield off, _mesh(chip), "mesh", "aim at a core of the mesh"
     yield nowhere, "an axon of a core", "target", "add the axon, or omit the wire"
@@ -196,27 +189,26 @@ def _wires(netlist: CrossbarNetlist, chip: Target) -> Iterator[Broken]:
 
 
 def _feeds(netlist: CrossbarNetlist, _chip: Target) -> Iterator[Broken]:
-    rows = zip(netlist.feed_channel, netlist.feed_core, netlist.feed_line, netlist.feed_tick, strict=True)
-    axons = netlist.axons_at(netlist.feed_core, netlist.feed_line).tolist()
-    lost, early = list[Offender](), list[Offender]()
-    for axon, (channel, core, line, tick) in zip(axons, rows, strict=True):
-        if axon < 0:
-            lost.append((-1, f"input channel {channel}", f"line {line} of core {core}"))
-        if tick < 0:
-            early.append((-1, f"input channel {channel}", f"tick {tick} of a data step"))
+    columns = netlist.aims()[0], netlist.feed_channel, netlist.feed_core, netlist.feed_line, netlist.feed_tick
+    rows = [(f"input channel {row[1]}", *row) for row in np.stack(columns, axis=1).tolist()]
+    lost = [(-1, who, f"line {line} of core {core}") for who, axon, _, core, line, _ in rows if axon < 0]
+    early = [(-1, who, f"tick {tick} of a data step") for who, *_, tick in rows if tick < 0]
     yield lost, "an axon of a core", "target", "add the axon, or omit the feed"
     yield early, "0 or later", "feed", "feed it when it is there"
 
 
 def _clocks(netlist: CrossbarNetlist, _chip: Target) -> Iterator[Broken]:
-    axon = netlist.axons_at(netlist.clock_core, netlist.clock_line)
-    for row in range(len(axon)):
-        who, period, phase = f"clock {row}", int(netlist.clock_period[row]), int(netlist.clock_phase[row])
+    columns = netlist.aims()[1], netlist.clock_core, netlist.clock_line, netlist.clock_period, netlist.clock_phase
+    for row, (axon, core, line, period, phase) in enumerate(np.stack(columns, axis=1).tolist()):
+        who = -1, f"clock {row}"
         if period < 1:
-            found = [(-1, who, f"a period of {period} ticks")]
-            yield found, "1 or more", "clock", "say every how many ticks it spikes"
+            yield [(*who, f"a period of {period} ticks")], "1 or more", "clock", "say every how many ticks it spikes"
         if phase < 0:
-            yield [(-1, who, f"phase {phase}")], "0 or later", "clock", "start it with the recording"
-        if axon[row] < 0:
-            found = [(-1, who, f"line {netlist.clock_line[row]} of core {netlist.clock_core[row]}")]
-            yield found, "an axon of a core", "target", "add the axon, or omit the clock"
+            yield [(*who, f"phase {phase}")], "0 or later", "clock", "start it with the recording"
+        if axon < 0:
+            yield (
+                [(*who, f"line {line} of core {core}")],
+                "an axon of a core",
+                "target",
+                "add the axon, or omit the clock",
+            )

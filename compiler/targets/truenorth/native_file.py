@@ -38,10 +38,8 @@ from spikeloom.compiler.types import IntArray
 
 FORMAT = TRAINED
 VERSION = 1
-PARTS = ("inputs", "level", "threshold", "floor", "leak")
-"""Arrays of a stage, in file order."""
-
-MOST_LAYERS = 64
+PARTS = {"inputs": 2, "level": 3, "threshold": 1, "floor": 1, "leak": 1}
+"""Arrays of a stage, in file order, and their axes."""
 
 _AGAIN = "copy or train it again"
 
@@ -97,22 +95,14 @@ def write_trained(
 
 
 def is_trained(path: str | os.PathLike[str]) -> bool:
-    """Whether a file is an archive that says it holds such a network; whatever else it is, its own reader says."""
+    """Whether a file is an archive that says it holds such a network."""
     return stated_format(Path(path)) == FORMAT
 
 
 def read_trained(path: str | os.PathLike[str], *, weights: str | None = None) -> Trained:
-    """Read and check a file.
+    """Read and check a file; `weights` is the set to take, the first of ``last``, ``best`` and ``clean`` by default.
 
-    Parameters
-    ----------
-    weights : str, optional
-        Set to take; the first of ``last``, ``best`` and ``clean`` that the file holds by default.
-
-    Raises
-    ------
-    ModelError
-        If it is missing, damaged, altered, from a newer version or inconsistent, or has no such set.
+    ModelError if it is missing, damaged, altered, from a newer version or inconsistent, or has no such set.
     """
     path = Path(path)
 
@@ -131,8 +121,20 @@ def read_trained(path: str | os.PathLike[str], *, weights: str | None = None) ->
     chosen = sets[0] if weights is None else weights
     if chosen not in sets:
         raise ModelError(f"{path}: --weights {weights}: the file holds {', '.join(sets)}; choose one that it holds")
-    network = _network(manifest, members, chosen)
-    wrong = _shape_faults(network) or faults(network)
+    stages: dict[str, dict[str, Any]] = {
+        layer: {part: members[f"{chosen}/0/{layer}/{part}"] for part in PARTS} for layer in manifest["layers"]
+    }
+    if wrong := _shape_faults(stages):
+        raise ModelError(f"{path}: {'; '.join(wrong)}; {_AGAIN}")
+    network = NativeNetwork(
+        **{name: manifest[name] for name in ("taxels", "polarities", "classes", "copies")},
+        clocks=Clocks(**manifest["clocks"]),
+        stages=tuple(
+            Stage(name=layer, **{part: read_only(array.astype(np.int64)) for part, array in parts.items()})
+            for layer, parts in stages.items()
+        ),
+    )
+    wrong = faults(network)
     edges = np.array(manifest["graph"]["edges"], np.int64).reshape(-1, 2)
     if edges.size and (edges.min() < 0 or edges.max() >= network.taxels):
         wrong.append(f"the graph joins taxels outside 0..{network.taxels - 1}")
@@ -151,48 +153,29 @@ def read_trained(path: str | os.PathLike[str], *, weights: str | None = None) ->
 
 def _kind_faults(manifest: Mapping[str, Any]) -> list[str]:
     """What in the manifest is missing or of another kind."""
-    counts = dict.fromkeys(("taxels", "polarities", "classes", "copies"), (1, 2**20))
-    edge = [(-(2**31), 2**31)]
     kinds = {
         "layers": [str, ...],
         "clocks": CLOCKS,
         "weights": [str, ...],
-        "graph": {"name": str, "edges": [edge]},
+        "graph": {"name": str, "edges": [[(-(2**31), 2**31)]]},
         "towers": (1, 1),
         "training": dict,
-        **counts,
+        **dict.fromkeys(("taxels", "polarities", "classes", "copies"), (1, 2**20)),
     }
     if found := entry_faults(manifest, kinds):
         return found
-    layers, edges = manifest["layers"], manifest["graph"]["edges"]
     fine = {
-        "layers": len(set(layers)) == len(layers) <= MOST_LAYERS and all(name and "/" not in name for name in layers),
         "weights": set(manifest["weights"]) <= set(WEIGHTS),
-        "graph": all(len(edge) == 2 for edge in edges),
+        "graph": all(len(edge) == 2 for edge in manifest["graph"]["edges"]),
     }
     return [f"the manifest has no usable {name}" for name, good in fine.items() if not good]
 
 
-def _network(manifest: Mapping[str, Any], members: Mapping[str, Array], which: str) -> NativeNetwork:
-    def stage(layer: str) -> Stage:
-        parts: dict[str, Any] = {part: members[f"{which}/0/{layer}/{part}"] for part in PARTS}
-        return Stage(
-            name=layer,
-            **{p: read_only(a.astype(np.int64) if a.dtype.kind == "i" else a) for p, a in parts.items()},
-        )
-
-    return NativeNetwork(
-        **{name: manifest[name] for name in ("taxels", "polarities", "classes", "copies")},
-        clocks=Clocks(**manifest["clocks"]),
-        stages=tuple(map(stage, manifest["layers"])),
-    )
-
-
-def _shape_faults(network: NativeNetwork) -> list[str]:
+def _shape_faults(stages: Mapping[str, Mapping[str, Array]]) -> list[str]:
     """Arrays that are not of whole numbers, or have another number of axes."""
     return [
-        f"{stage.name}: {part} is no array of {axes} axes of whole numbers"
-        for stage in network.stages
-        for part, axes in zip(PARTS, (2, 3, 1, 1, 1), strict=True)
-        if getattr(stage, part).dtype.kind != "i" or getattr(stage, part).ndim != axes
+        f"{name}: {part} is no array of {PARTS[part]} axes of whole numbers"
+        for name, parts in stages.items()
+        for part, array in parts.items()
+        if array.dtype.kind != "i" or array.ndim != PARTS[part]
     ]

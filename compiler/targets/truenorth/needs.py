@@ -14,24 +14,46 @@ from spikeloom.compiler.ir import Network, fan_in
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.types import IntArray
 
-MOST_COPIES = 4
-"""Axons of an input beyond which types repeat: there are four."""
-
 
 def needs(network: Network, chip: Target) -> tuple[Violation, ...]:
     """Every need that the chip does not meet, layer by layer."""
-    return tuple(need for layer in range(len(network.populations)) for need in _layer(network, layer, chip))
+    return tuple(
+        Violation(owner=owner, used=used, allowed=allowed, rule=f"{chip.name}.{rule}", remedy=remedy)
+        for layer in range(len(network.populations))
+        for owner, used, allowed, rule, remedy in _needs_of(network, layer, chip)
+    )
 
 
-def _axons_reached(network: Network, layer: int, chip: Target) -> int:
-    """Axons that each neuron of a layer must reach at the least.
-
-    Its spikes go to every core that holds neurons which receive them, and there to two axons of different types: with
-    one each, all neurons of a core would have to divide their inputs into the same four groups of equal weights.
-    """
-    held = chip.limit("core.neurons")
-    sizes = [network.populations[projection.post].size for projection in network.projections if projection.pre == layer]
-    return sum(2 * -(-size // held) for size in sizes)
+def _needs_of(network: Network, layer: int, chip: Target) -> Iterator[tuple[str, str, str, str, str]]:
+    """Owner, what is needed, what is allowed, the rule, and what to do."""
+    population, axons = network.populations[layer], chip.limit("core.axons")
+    name = population.name
+    everyone = f"{name}, all {population.size:,} neurons"
+    if 0 < population.beta < 1:
+        kept = f"keep {population.beta:g} of their membranes a step"
+        yield everyone, kept, "an added leak", "neuron.leak", "forget within a step, or leak by a constant"
+    if population.alpha:
+        kept = f"keep {population.alpha:g} of their currents a step"
+        yield everyone, kept, "no current", "neuron.leak", "omit the current"
+    inputs = fan_in(network, layer)
+    most = int(inputs.max(initial=0))
+    if most > axons:
+        remedy = "split the sum, or give the layer fewer inputs"
+        yield _worst(name, inputs, axons), f"{most:,} inputs", str(axons), "core.axons", remedy
+    copies = min(max(axons // max(most, 1), 1), chip.limit("core.axon_types"))
+    distinct, allowed = _distinct_weights(network, layer), 2**copies - 1
+    if distinct.max(initial=0) > allowed:
+        where, found = _worst(name, distinct, allowed), f"{distinct.max():,} different weights"
+        beside = f"{allowed} with {copies} axon{'s' * (copies > 1)} an input"
+        remedy = "fewer weights, or each input on several axons of different types"
+        yield where, found, beside, "neuron.weight_bits", remedy
+    # spikes go to every core that holds neurons which receive them, and there to two axons of different types: with one
+    # each, all neurons of a core would have to divide their inputs into the same four groups of equal weights
+    receivers = [network.populations[each.post].size for each in network.projections if each.pre == layer]
+    reached = sum(2 * -(-size // chip.limit("core.neurons")) for size in receivers)
+    if reached > (targets := chip.limit("neuron.targets")):
+        remedy = "copy the neurons, or split their spikes by relays"
+        yield everyone, f"send spikes to {reached} axons at least", str(targets), "neuron.targets", remedy
 
 
 def _distinct_weights(network: Network, layer: int) -> IntArray:
@@ -42,40 +64,6 @@ def _distinct_weights(network: Network, layer: int) -> IntArray:
             rows = np.split(projection.weight.data, projection.weight.indptr[1:-1])
             found = np.maximum(found, [len(np.unique(row[row != 0])) for row in rows])
     return found
-
-
-def _layer(network: Network, layer: int, chip: Target) -> Iterator[Violation]:
-    population = network.populations[layer]
-    name, axons = population.name, chip.limit("core.axons")
-    everyone = f"{name}, all {population.size:,} neurons"
-
-    def need(owner: str, found: str, allowed: str, rule: str, remedy: str) -> Violation:
-        return Violation(owner=owner, used=found, allowed=allowed, rule=f"{chip.name}.{rule}", remedy=remedy)
-
-    if 0 < population.beta < 1:
-        kept = f"keep {population.beta:g} of their membranes a step"
-        yield need(everyone, kept, "an added leak", "neuron.leak", "forget within a step, or leak by a constant")
-    if population.alpha:
-        kept = f"keep {population.alpha:g} of their currents a step"
-        yield need(everyone, kept, "no current", "neuron.leak", "omit the current")
-    inputs = fan_in(network, layer)
-    most = int(inputs.max(initial=0))
-    if most > axons:
-        remedy = "split the sum, or give the layer fewer inputs"
-        where = _worst(name, inputs, axons)
-        yield need(where, f"{most:,} inputs", str(axons), "core.axons", remedy)
-    copies = min(max(axons // max(most, 1), 1), MOST_COPIES, chip.limit("core.axon_types"))
-    distinct, allowed = _distinct_weights(network, layer), 2**copies - 1
-    if distinct.max(initial=0) > allowed:
-        beside = f"{allowed} with {copies} axon{'s' * (copies > 1)} an input"
-        remedy = "fewer weights, or each input on several axons of different types"
-        where, found = _worst(name, distinct, allowed), f"{distinct.max():,} different weights"
-        yield need(where, found, beside, "neuron.weight_bits", remedy)
-    reached, targets = _axons_reached(network, layer, chip), chip.limit("neuron.targets")
-    if reached > targets:
-        remedy = "copy the neurons, or split their spikes by relays"
-        found = f"send spikes to {reached} axons at least"
-        yield need(everyone, found, str(targets), "neuron.targets", remedy)
 
 
 def _worst(name: str, amounts: IntArray, allowed: int) -> str:

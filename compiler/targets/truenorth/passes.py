@@ -145,10 +145,7 @@ PASSES = (
 def start(
     source: NativeNetwork | expand.Factored | Network, options: Options, target: Target
 ) -> tuple[Compilation, tuple[Pass[Compilation], ...]]:
-    """What the passes begin with, and which of them are due: whole numbers need no rounding.
-
-    OptionError if there is no such number of axons, or it is asked of whole numbers.
-    """
+    """What the passes begin with, and which of them are due; OptionError if whole numbers are to be rounded again."""
     native = isinstance(source, NativeNetwork)
     if native and options.in_time is not None:
         raise OptionError(f"--in-time {options.in_time}: the network was trained for the chip; omit it")

@@ -173,20 +173,11 @@ def simulate(
     spikes: bool = False,
     membranes: bool = False,
 ) -> Trace:
-    """Run recordings through the cores, as :func:`spec.simulate` does each.
+    """Run recordings (samples, n_inputs, T) through the cores, as :func:`spec.simulate` does each.
 
-    Parameters
-    ----------
-    network : CrossbarNetlist or Engine
-        A network that breaks no rule of its chip, or what :func:`prepare` made of it.
-    events : (samples, n_inputs, T) uint8 or bool
-        Input events; any value but zero is an event.
-    lengths : (samples,) int64, optional
-        Data steps of each recording where some are shorter than T; what comes after them is not run.
-    seed : int
-        Of the random numbers; the same for all recordings, so that none depends on its neighbours.
-    spikes, membranes : bool
-        Keep them, at one and four bytes a neuron and tick.
+    `lengths` (samples,) are their data steps where some are shorter than T. All draw the same random numbers, so that
+    none depends on its neighbours. Spikes and membranes are kept where they are wanted, at one and four bytes a neuron
+    and tick.
 
     Raises
     ------

@@ -65,24 +65,11 @@ def saturated(value: int, bits: int) -> int:
 
 
 def neuron_tick(neuron: Neuron, positive: int, negative: int, random: int, bits: int) -> tuple[bool, bool]:
-    """Let one neuron live through a tick.
+    """Let one neuron live through a tick: its membrane is replaced.
 
-    Parameters
-    ----------
-    neuron : Neuron
-        Its membrane is replaced.
-    positive, negative : int
-        Sums of the weights that arrived, as magnitudes.
-    random : int
-        This tick's random number under the neuron's mask.
-    bits : int
-        Of the membrane register.
-
-    Returns
-    -------
-    spiked : bool
-    left : bool
-        Whether the register was left, or would have been in some order of arrivals.
+    `positive` and `negative` are the sums of the weights that arrived, as magnitudes, `random` is this tick's random
+    number under the neuron's mask, `bits` the width of the register. Returns whether it spiked, and whether the
+    register was left, or would have been in some order of arrivals.
 
     Examples
     --------
@@ -146,45 +133,18 @@ def injected(netlist: CrossbarNetlist, events: EventArray) -> defaultdict[int, l
 
 
 def simulate(netlist: CrossbarNetlist, events: EventArray, *, seed: int = 0) -> Trace:
-    """Run one recording through the cores.
+    """Run one recording (n_inputs, T), uint8 or bool, through the cores of a network that breaks no rule of its chip.
 
-    Parameters
-    ----------
-    netlist : CrossbarNetlist
-        A network that breaks no rule of its chip.
-    events : (n_inputs, T) uint8 or bool
-        Input events; any value but zero is an event.
-    seed : int
-        Of the random numbers, from 0.
-
-    Returns
-    -------
-    Trace
-        With spikes and membranes, no leading axis.
-
-    Raises
-    ------
-    DataError
-        If the recording has another number of input channels than the network.
+    Any value but zero is an event; the `seed` is that of the random numbers. The trace holds spikes and membranes and
+    has no leading axis. DataError if the recording has another number of input channels than the network.
     """
     check_channels(netlist, events.shape[0])
     bits = load_target(netlist.target).limit("neuron.membrane_bits")
     steps = events.shape[1]
     ticks = netlist.ticks(steps)
-    neurons = [
-        Neuron(
-            leak=int(netlist.leak[n]),
-            leak_reversal=bool(netlist.leak_reversal[n]),
-            threshold=int(netlist.threshold[n]),
-            mask_bits=int(netlist.mask_bits[n]),
-            reset_mode=int(netlist.reset_mode[n]),
-            reset=int(netlist.reset[n]),
-            negative_threshold=int(netlist.negative_threshold[n]),
-            negative_saturates=bool(netlist.negative_saturates[n]),
-            membrane=int(netlist.initial[n]),
-        )
-        for n in range(netlist.n_neurons)
-    ]
+    *registers, _ = Neuron.__dataclass_fields__
+    columns = [getattr(netlist, name).tolist() for name in (*registers, "initial")]
+    neurons = [Neuron(*values) for values in zip(*columns, strict=True)]
 
     # the crossing points of each axon, as pairs of neuron and weight
     points: list[list[tuple[int, int]]] = [[] for _ in range(netlist.n_axons)]
