@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from spikeloom.compiler.formats import hdf5
 from spikeloom.runtime import cli
 
 SHARED = Path(os.environ.get("SPIKELOOM_SHARED", Path(__file__).resolve().parents[2] / "shared"))
@@ -65,6 +66,12 @@ def golden(request: pytest.FixtureRequest) -> Callable[[str, str], None]:
         assert text == path.read_text(encoding="utf-8"), f"{path} differs; --update-golden writes it anew"
 
     return compare
+
+
+@pytest.fixture
+def hdf5_in_one_process(monkeypatch):
+    """Read HDF5 files at once: those of most tests make no library spin."""
+    monkeypatch.setattr(hdf5, "try_reading", len)
 
 
 @pytest.fixture

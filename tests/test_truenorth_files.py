@@ -49,7 +49,7 @@ def path(tmp_path):
     return tmp_path / "net.loom"
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(crossbars())
 def test_round_trip(tmp_path_factory, netlist):
     path = tmp_path_factory.mktemp("crossbars") / "x.loom"
@@ -104,17 +104,7 @@ def test_files_that_mean_nothing(path, changes, line):
         read_crossbars(path)
 
 
-def test_altered_and_missing_files(path, tmp_path):
-    content = bytearray(path.read_bytes())
-    content[content.index("by hand".encode("utf-32-le"))] ^= 1
-    path.write_bytes(content)
-    with pytest.raises(FormatError, match="is truncated or not a netlist"):  # the archive's own check sum
-        read_crossbars(path)
-    with pytest.raises(FormatError, match=r"no\.loom: no such file"):
-        read_crossbars(tmp_path / "no.loom")
-
-
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(crossbars(), st.sampled_from(ARRAYS), st.randoms(use_true_random=False))
 def test_any_numbers_are_refused_or_run(tmp_path_factory, netlist, name, random):
     array = np.array(getattr(netlist, name))

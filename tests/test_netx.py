@@ -1,0 +1,389 @@
+"""lava-dl's ``.net`` files: read as the integers that they are, written within their limits, refused."""
+
+import json
+import os
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from made_netx import conv, dense, even, events, flatten, given_input, neuron, write
+from numpy.testing import assert_array_equal
+from random_networks import chain
+from zoo import specimen
+
+from spikeloom.compiler import Options, Recipe, compile_network, lift
+from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.formats.netx import writer as netx_export
+from spikeloom.compiler.formats.netx.layout import blocks_of, read_blocks
+from spikeloom.compiler.formats.netx.reader import integers_of, read_netx
+from spikeloom.compiler.interpret import run_integer
+from spikeloom.compiler.invariants import verify
+from spikeloom.compiler.sensor_layout import sensor_layout
+from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
+from spikeloom.runtime.cli import main
+from spikeloom.runtime.machines.loihi1 import engine
+
+pytestmark = pytest.mark.usefixtures("hdf5_in_one_process")
+
+W = np.full((4, 6), 2)
+
+
+def recurrent(**more):
+    return dense(W) | {"type": ["dense_rec"]} | more
+
+
+def of_type(kind):
+    return [given_input(6), dense(W) | {"type": [kind]}]
+
+
+OWN = {"taxels": 3, "polarities": 2, "clocks": 0, "clock_steps": 1, "label": np.zeros(3, int)}
+
+REFUSED = [
+    ("0 (dense): weight holds 0.5, allowed are whole numbers", [dense(W / 4)]),
+    ("0 (dense): has weights from 300 to 300, allowed are -256", [dense(W * 150)]),
+    ("0 (dense): has biases up to 5000, allowed are 4095 steps", [dense(W, bias=[5000] * 4)]),
+    ("0 (dense): bias has 2 values for 4 neurons", [dense(W, bias=[1, 2])]),
+    ("0 (dense): weight has the shape [4, 6], wanted [6, 6]", [dense(W, shape=[6])]),
+    ("1 (dense): weight has the shape [4, 6], wanted [4, 8]", [given_input(8), dense(W)]),
+    ("0 (dense): has the shape [0], which is none", [dense(W, shape=[0])]),
+    ("0 (dense): has synaptic delays", [dense(W, delay=np.array([0, 0, 3, 0]))]),
+    ("0 (dense): has iDecay 0 and vDecay 1024, allowed are 1", [dense(W, neuron=neuron(u=0))]),
+    ("0 (dense): vThMant is 131072, allowed are 0 to 131071", [dense(W, neuron=neuron(threshold=2**17))]),
+    ("0 (dense): refDelay is 2, allowed is 1", [dense(W, neuron=neuron(refDelay=2))]),
+    ("0 (dense): wgtExp is 1, allowed is 0", [dense(W, neuron=neuron(wgtExp=1))]),
+    ("0 (dense): has neurons of type 'SDNN', allowed are CUBA", [dense(W, neuron=neuron(kind="SDNN"))]),
+    ("0 (dense): sends graded spikes", [dense(W, neuron=neuron(gradedSpike=True))]),
+    ("0 (dense): has no neuron", [{key: value for key, value in dense(W).items() if key != "neuron"}]),
+    ("0 (dense_rec): has no weight_rec", [recurrent()]),
+    ("0 (dense_rec): weight_rec has the shape [4, 6], wanted [4, 4]", [recurrent(weight_rec=W)]),
+    ("0 (conv): the shape of its input is nowhere", [{"type": ["conv"], "shape": [1, 2, 2]}]),
+    (
+        "1 (conv): gives [2, 4, 5], the file says [2, 5, 4]",
+        [given_input(2, 5, 6), conv(np.full((2, 2, 2, 2), 2), (2, 5, 4))],
+    ),
+    *[(f"1 ({kind}): is of a type that has no place", of_type(kind)) for kind in ("pool", "average", "strange")],
+]
+
+
+@pytest.mark.parametrize(("words", "layers"), REFUSED, ids=[words for words, _ in REFUSED])
+def test_layers_that_cannot_be_used(tmp_path, words, layers):
+    with pytest.raises(ModelError) as caught:
+        read_netx(write(tmp_path / "bad.net", *layers))
+    assert str(caught.value).startswith(f"{tmp_path}/bad.net: layer {words}")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("words", "layers", "more"),
+    [
+        ("has no layers, so it is no netx file", [], {"other": {"a": 1}}),
+        ("has no layer of neurons", [given_input(6)], {}),
+        ("group spikeloom is for 6 inputs and 3 voting neurons, the", [dense(W)], {"spikeloom": OWN}),
+        ("group spikeloom describes no sensor", [dense(W)], {"spikeloom": OWN | {"taxels": 0}}),
+        ("group spikeloom describes no sensor", [dense(W)], {"spikeloom": OWN | {"clock_steps": 0}}),
+    ],
+)
+def test_structure(tmp_path, words, layers, more):
+    with pytest.raises(ModelError, match=words):
+        read_netx(write(tmp_path / "bad.net", *layers, **more))
+
+
+def test_files_and_options_of_the_command(tmp_path, capsys):
+    good, cut, out = write(tmp_path / "a.net", dense(W)), tmp_path / "cut.net", f"{tmp_path}/x.loom"
+    cut.write_bytes(good.read_bytes()[:3000])
+    assert main(["compile", f"{good}", "-o", out]) == 0
+    for words, said in (
+        (["compile", f"{cut}"], f"{cut}: is truncated or damaged (OSError)"),
+        (["compile", f"{good}", "--weight-bits", "4"], f"--weight-bits: is for float networks, {good}"),
+        (["compile", f"{good}", "--optimize", "energy"], "--optimize: weighs layouts by what a float network"),
+        (["compile", f"{good}", "--graph", "manual"], f"--graph: is for checkpoints, the netx file {good} holds"),
+        (["verify", out, "--checkpoint", f"{good}", "--data", "synthetic"], f"{good}: holds integers, no float"),
+    ):
+        capsys.readouterr()
+        assert main([*words, *(["-o", f"{tmp_path}/y.loom"] if words[0] == "compile" else [])]) == 2
+        assert capsys.readouterr().err.startswith(f"spikeloom: {said}")
+
+
+# --- reading ----------------------------------------------------------------------------------------------------------
+
+
+def lif(weight, bias, spikes, *, u, v, threshold, own=None):
+    """A second reading of a block: spikes of (steps, inputs) integers, in plain Python arithmetic."""
+    rows = [np.zeros(len(weight), bool)]
+    current, membrane = np.zeros(len(weight), np.int64), np.zeros(len(weight), np.int64)
+    for now in spikes.astype(np.int64):
+        arrived = weight @ now + (0 if own is None else own @ rows[-1].astype(np.int64))
+        current = np.sign(current) * (np.abs(current) * (4096 - u) >> 12) + 64 * arrived
+        membrane = np.sign(membrane) * (np.abs(membrane) * (4096 - v) >> 12) + current + 64 * bias
+        rows.append(membrane > 64 * threshold)
+        membrane = np.where(rows[-1], 0, membrane)
+    return np.stack(rows[1:])
+
+
+def test_dense_blocks(tmp_path):
+    rng = np.random.default_rng(0)
+    first, last, bias = even(rng, 12, 6), even(rng, 5, 12), even(rng, 12, most=20)
+    block = dense(last, neuron=neuron(u=1024, v=128, threshold=80, kind="LOIHI", wgtExp=0, theta=1600))
+    path = write(tmp_path / "a.net", dense(first, bias=bias), block, simulation={"Ts": 1, "tSample": 64})
+    found = read_netx(path)
+    verify(found.network)
+    given_ = events(rng, 6)
+    ours = run_integer(found.network, given_[None]).spikes
+    hidden = lif(first, bias, given_, u=4096, v=1024, threshold=25)
+    out = lif(last, np.zeros(5, int), hidden, u=1024, v=128, threshold=80)
+    assert hidden.sum() > 20
+    assert out.sum() > 20
+    assert_array_equal(ours[0][0], hidden)
+    assert_array_equal(ours[1][0], out)
+    assert found.facts[0] == "netx, 2 layers, read as they stand"
+    assert found.facts[3:] == (
+        "dense1: 5 neurons, decay_u 1023, decay_v 128, fires at v > 64 * 80",
+        "classes: the spikes of dense1, a neuron each",
+    )
+
+
+@pytest.mark.parametrize("groups", [1, 2])
+def test_convolutions_are_those_of_torch(tmp_path, groups):
+    rng = np.random.default_rng(1)
+    kernel, bias = even(rng, 4, 2 // groups, 3, 2), even(rng, 4, most=10)
+    torch_out = torch.nn.functional.conv2d
+    given_ = events(rng, 2 * 5 * 6)
+    images = torch.from_numpy(given_.reshape(-1, 2, 5, 6).astype(np.float64))
+    more = {"stride": (2, 1), "padding": (1, 0), "dilation": (1, 2), "groups": groups}
+    sums = torch_out(images, torch.from_numpy(kernel.astype(np.float64)), **more).numpy()
+    shape = sums.shape[1:]
+    last = even(rng, 3, int(np.prod(shape)))
+    blocks = [
+        given_input(2, 5, 6),
+        conv(kernel[..., None] if groups == 2 else kernel, shape, bias=bias, **more),
+        flatten(last.shape[1]),
+        dense(last),
+    ]
+    found = read_netx(write(tmp_path / "a.net", *blocks)).network
+    _, positions, _ = sensor_layout((2, 5, 6))
+    ours = run_integer(found, given_[None][:, :, positions]).spikes
+    flat = sums.reshape(len(sums), -1).astype(np.int64)
+    hidden = lif(
+        np.eye(flat.shape[1], dtype=int), np.repeat(bias, np.prod(shape[1:])), flat, u=4096, v=1024, threshold=25
+    )
+    assert hidden.sum() > 20
+    assert_array_equal(ours[0][0], hidden)
+    assert_array_equal(ours[1][0], lif(last, np.zeros(3, int), hidden, u=4096, v=1024, threshold=25))
+
+
+def test_an_input_block_with_neurons_is_a_layer(tmp_path):
+    rng = np.random.default_rng(2)
+    weight = even(rng, 3, 6)
+    block = given_input(6) | {"weight": np.array([36.0]), "bias": np.array([4.0]), "neuron": neuron()}
+    found = read_netx(write(tmp_path / "a.net", block, dense(weight)))
+    assert "it turns events into currents" in found.facts[2]
+    given_ = events(rng, 6)
+    hidden = lif(36 * np.eye(6, dtype=int), np.full(6, 4), given_, u=4096, v=1024, threshold=25)
+    assert_array_equal(run_integer(found.network, given_[None]).spikes[0][0], hidden)
+
+
+@pytest.mark.parametrize(("most", "exponents"), [(60, [-1]), (200, [0, -1])])
+def test_odd_weights_are_exact(tmp_path, most, exponents):
+    rng = np.random.default_rng(3)
+    weight = rng.integers(-most, most + 1, (6, 4))
+    weight[0, 0] = most | 1
+    network = read_netx(write(tmp_path / "a.net", dense(weight))).network
+    verify(network)
+    assert [projection.exponent for projection in network.projections] == exponents
+    assert_array_equal(sum(projection.effective().toarray() for projection in network.projections), weight)
+    placed = compile_network(network)
+    given_ = events(rng, 4)
+    fast = engine.simulate(placed.netlist, given_.T[None].astype(np.uint8), spikes=True)
+    back = lift(placed.netlist)
+    assert_array_equal(
+        fast.spikes[0][:40, placed.netlist.compartments_of(0)], run_integer(back, given_[None]).spikes[0][0]
+    )
+
+
+@pytest.mark.parametrize("most", [60, 127, 250])
+def test_a_block_that_hears_itself(tmp_path, most):
+    rng = np.random.default_rng(8)
+    first, own, last = even(rng, 12, 6), rng.integers(-most, most + 1, (12, 12)), even(rng, 5, 12)
+    block = dense(first) | {"type": ["dense_rec"], "weight_rec": own.astype(np.float32)}
+    found = read_netx(write(tmp_path / "a.net", block, dense(last)))
+    verify(found.network)
+    given_ = events(rng, 6)
+    ours = run_integer(found.network, given_[None]).spikes
+    hidden = lif(first, 0, given_, u=4096, v=1024, threshold=25, own=own)
+    assert np.count_nonzero(hidden != lif(first, 0, given_, u=4096, v=1024, threshold=25)) > 20
+    assert_array_equal(ours[0][0], hidden)
+    assert_array_equal(ours[1][0], lif(last, 0, hidden, u=4096, v=1024, threshold=25))
+    assert found.facts[2].split("; ")[1] == "it is recurrent, fed by its own spikes of the step before"
+    placed = compile_network(found.network).netlist
+    fast = engine.simulate(placed, given_.T[None].astype(np.uint8), spikes=True)
+    ids = placed.compartments_of(0)
+    assert_array_equal(fast.spikes[0][:40, ids], hidden[:, placed.neuron[ids]])
+
+
+def recorded(name):
+    """A file of a checkout of lava-dl."""
+    folder = os.environ.get("SPIKELOOM_LAVA_DL")
+    if not folder:
+        pytest.skip("set SPIKELOOM_LAVA_DL to a checkout of lava-dl")
+    return Path(folder) / "tests/lava/lib/dl/netx" / name
+
+
+def test_spikes_that_lava_dl_recorded():
+    path = recorded("tiny.net")
+    blocks, tree, _ = read_blocks(path)
+    # the recording starts behind the input layer
+    first = replace(blocks[0], entries={k: v for k, v in blocks[0].entries.items() if k != "neuron"})
+    network, _ = integers_of([first, *blocks[1:]], tree, 3)
+    _, positions, _ = sensor_layout((3, 16, 16), polarities=3)
+
+    def spikes(name, size):
+        return np.load(recorded(f"gts/tinynet/{name}.npy"))[0].reshape(size, 16).T > 0
+
+    given_, hidden, out = spikes("input", 768)[:, positions], spikes("layer1", 864), spikes("output", 36)
+    ours = run_integer(network, given_[None, 1:]).spikes  # a layer starts a step after the one before it
+    assert hidden.sum() > 1000
+    assert_array_equal(ours[0][0], hidden[1:])
+    assert_array_equal(ours[1][0], out[1:])
+
+
+# --- writing ----------------------------------------------------------------------------------------------------------
+
+
+SETTINGS = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+
+
+@st.composite
+def whole_networks(draw):
+    """Networks that the format holds as they are."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    sizes = draw(st.lists(st.integers(1, 6), min_size=2, max_size=4))
+    blocks = [
+        dense(
+            even(rng, rows, columns, most=draw(st.sampled_from([4, 60, 254]))),
+            bias=rng.integers(-30, 31, rows),
+            neuron=neuron(
+                u=draw(st.sampled_from([4096, 1024, 1])),
+                v=draw(st.integers(0, 4095)),
+                threshold=draw(st.integers(1, 300)),
+            ),
+        )
+        for columns, rows in pairwise(sizes)
+    ]
+    for block in draw(st.lists(st.sampled_from(blocks), unique_by=id)):
+        neurons = block["outFeatures"]
+        block |= {"type": ["dense_rec"], "weight_rec": even(rng, neurons, neurons).astype(np.float32)}
+    return blocks, rng
+
+
+@SETTINGS
+@given(whole_networks())
+def test_what_the_format_holds_comes_back_exactly(drawn):
+    blocks, rng = drawn
+    tree = {"layer": {str(i): _as_read(block) for i, block in enumerate(blocks)}}
+    network, _ = integers_of(blocks_of(tree), tree, 1)
+    made = netx_export.blocks_for(network)
+    assert not any(block.rounded or block.threshold_rounded or block.shift for block in made)
+    written_ = netx_export.tree_of(network, made)
+    again, _ = integers_of(blocks_of(written_), written_)
+    for ours, back in zip(network.projections, again.projections, strict=True):
+        assert_array_equal(ours.effective().toarray(), back.effective().toarray())
+    for ours, back in zip(network.populations, again.populations, strict=True):
+        for name in ("decay_u", "decay_v", "threshold", "bias"):
+            assert_array_equal(getattr(ours, name), getattr(back, name))
+    given_ = events(rng, network.input.size)
+    moved = netx_export.moved_spikes(network, made, given_[None])
+    assert all(changed == 0 for changed, _ in moved.values())
+
+
+def _as_read(entries):
+    return {
+        key: _as_read(value) if isinstance(value, dict) else value if isinstance(value, str) else _leaf(key, value)
+        for key, value in entries.items()
+    }
+
+
+def _leaf(key, value):
+    return value if key == "type" else np.asarray(value)
+
+
+def test_written_files_are_laid_out_as_documented(tmp_path):
+    netlist = compile_network(chain(np.full((3, 4), 0.3), np.full((2, 3), 0.4), biases=[[0.01] * 3, [0.0] * 2])).netlist
+    network = lift(netlist)
+    blocks = netx_export.blocks_for(network)
+    path = tmp_path / "a.net"
+    path.write_bytes(netx_export.file_bytes(netx_export.tree_of(network, blocks)))
+    with h5py.File(path) as file:
+        assert [file[f"layer/{i}/type"][0] for i in range(3)] == [b"input", b"dense", b"dense"]
+        for number, population in enumerate(network.populations, 1):
+            block = file[f"layer/{number}"]
+            assert block["neuron/type"][()] == b"CUBA"
+            assert block["neuron/iDecay"][()] == population.decay_u + 1
+            assert block["neuron/vDecay"][()] == population.decay_v
+            assert block["neuron/refDelay"][()] == 1
+            assert block["weight"].shape == (block["outFeatures"][()], block["inFeatures"][()])
+            assert block["shape"][()].tolist() == [population.size]
+            weight = block["weight"][()].astype(int)
+            assert not np.any(weight % 2)
+            assert weight.min() >= -256
+            assert weight.max() <= 254
+    assert path.read_bytes() == netx_export.file_bytes(netx_export.tree_of(network, blocks))
+
+
+def run(capsys, *words):
+    code = main([str(word) for word in words])
+    said = capsys.readouterr()
+    return code, said.out, said.err
+
+
+def test_the_command_counts_what_it_moves(tmp_path, capsys):
+    made, out = specimen("timed"), tmp_path / "g.net"
+    net = made.netlist
+    code, text, _ = run(capsys, "export", net, "--to", "netx", "-o", out, "--data", made.data, "--json")
+    report = json.loads(text)
+    assert (code, report["exact"], report["recordings"]) == (0, False, len(made.events))
+    network = lift(made.machine.netlist)
+    blocks = netx_export.blocks_for(network)
+    assert sum(layer["biases_rounded"] for layer in report["layers"]) == sum(block.rounded for block in blocks) > 0
+    assert any(layer["spikes_moved"] for layer in report["layers"])
+    back = read_netx(out).network
+    assert back.input == network.input
+    assert [population.decay_u for population in back.populations] == [p.decay_u for p in network.populations]
+    assert_array_equal(back.readout.label, network.readout.label)
+    before = out.read_bytes()
+    code, _, said = run(capsys, "export", net, "--to", "netx", "-o", out, "--strict")
+    assert code == 2
+    assert said.startswith(f"spikeloom: --strict: netx cannot hold {net} as it is (conv1: ")
+    assert out.read_bytes() == before
+
+
+def test_strict_writes_what_is_exact(tmp_path, capsys):
+    rng = np.random.default_rng(6)
+    path = write(tmp_path / "a.net", dense(even(rng, 12, 6), bias=even(rng, 12, most=8)), dense(even(rng, 5, 12)))
+    assert run(capsys, "compile", path, "--keep-all", "-o", tmp_path / "a.loom")[0] == 0
+    code, text, _ = run(capsys, "export", tmp_path / "a.loom", "--to", "netx", "--strict", "-o", tmp_path / "b.net")
+    assert code == 0
+    assert text.splitlines()[1] == "biases, thresholds and weights are the netlist's"
+    assert run(capsys, "compile", tmp_path / "b.net", "--keep-all", "-o", tmp_path / "b.loom")[0] == 0
+    ours, back = (lift(read_netlist(tmp_path / name)) for name in ("a.loom", "b.loom"))
+    for one, other in zip(ours.projections, back.projections, strict=True):
+        assert_array_equal(one.effective().toarray(), other.effective().toarray())
+
+
+@pytest.mark.parametrize(
+    ("recipe", "words"),
+    [
+        (Recipe(groups=4), "fc1: has 4 thresholds, netx has one for a layer; compile with --scale-groups 1"),
+        (Recipe(planes=2), "netx holds 8 bits without an exponent; compile with --planes 1 --weight-bits 8"),
+    ],
+)
+def test_netlists_that_the_format_cannot_hold(recipe, words):
+    weight = np.random.default_rng(7).normal(size=(20, 6)) * np.geomspace(0.01, 1, 20)[:, None]
+    netlist = compile_network(chain(weight), Options(recipes=[recipe])).netlist
+    with pytest.raises(ModelError, match=words):
+        netx_export.blocks_for(lift(netlist))
