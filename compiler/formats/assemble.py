@@ -19,24 +19,16 @@ from spikeloom.compiler.types import FloatArray, IntArray
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Layer:
-    """A spiking layer.
+    """A spiking layer."""
 
-    name: for messages and as the population's name.
-    beta, theta: decay and threshold.
-    bias: (neurons,) float64
-    sources: mapping of int to csr_array (neurons, neurons of the source); stages from other layers by their place
-        in the sequence, or from ``INPUT``; from its own place the spikes of the step before.
-    alpha: share of the synaptic current that a step keeps.
-    relays: how many of the last neurons relay a channel that always has an event, see :mod:`compiler.dynamics`.
-    """
-
-    name: str
+    name: str  # for messages and as the population's name
     beta: float
     theta: float
     bias: FloatArray
+    # by the place of their source in the sequence, or INPUT; from the own place the spikes of the step before
     sources: Mapping[int, Sparse]
-    alpha: float = 0.0
-    relays: int = 0
+    alpha: float = 0.0  # share of the synaptic current that a step keeps
+    relays: int = 0  # last neurons that relay a channel that always has an event, see :mod:`compiler.dynamics`
 
 
 def class_of_each(counts: Sparse) -> IntArray | None:
@@ -83,12 +75,7 @@ def in_order(layers: Sequence[Layer]) -> list[int]:
 
 
 def assemble(layers: Sequence[Layer], sensor: Input, voters: int, label: IntArray) -> Network:
-    """Network of the layers.
-
-    layers: in any order.
-    sensor: where the events come from.
-    voters: layer whose spikes are counted.
-    label: (neurons,) int64; class that each of its neurons votes for.
+    """Network of layers in any order; the spikes of `voters` are counted, `label` is the class of each of its neurons.
 
     Raises ModelError if the layers are in a circle, some are not reached from the input, skip a layer, or have
     constants or weights that no chip's neuron has.

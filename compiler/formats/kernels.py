@@ -93,34 +93,26 @@ def convolution(
             f"channels; export it again"
         )
     out = places(space, kernel, stride, padding, dilation)
-    if max(weight.size, 1) * math.prod(out) > COEFFICIENT_LIMIT:
+    points, taps = math.prod(out), math.prod(kernel)
+    padded = channels * math.prod(size + sum(zeros) for size, zeros in zip(space, padding, strict=True))
+    if max(weight.size * points, points, padded) > COEFFICIENT_LIMIT:
         raise ModelError(
-            f"has {weight.size * math.prod(out):,} weights once written out, {COEFFICIENT_LIMIT:,} are allowed; this "
+            f"has {weight.size * points:,} weights once written out, {COEFFICIENT_LIMIT:,} are allowed; this "
             "is no network of one chip"
         )
-    # For each place and tap: where in the input it looks, and whether that is inside.
-    flat = np.zeros((1,) * (2 * len(space)), np.int64)
-    inside = np.ones((1,) * (2 * len(space)), np.bool_)
-    for axis, size in enumerate(space):
-        looks = np.add.outer(
-            np.arange(out[axis]) * stride[axis] - padding[axis][0], np.arange(kernel[axis]) * dilation[axis]
-        )
-        spread = [1] * (2 * len(space))
-        spread[axis], spread[len(space) + axis] = out[axis], kernel[axis]
-        flat = flat * size + looks.reshape(spread)
-        inside = inside & ((looks >= 0) & (looks < size)).reshape(spread)
-    points, taps = math.prod(out), math.prod(kernel)
-    looked = np.broadcast_to(flat, (*out, *kernel)).reshape(points, taps)
-    counts = np.broadcast_to(inside, (*out, *kernel)).reshape(points, taps)
-    channel = np.arange(filters)[:, None] // (filters // groups) * each + np.arange(each)
-    rows = np.arange(filters)[:, None, None, None] * points + np.arange(points)[None, None, :, None]
-    columns = channel[:, :, None, None] * math.prod(space) + looked[None, None]
-    values = weight.reshape(filters, each, 1, taps)
-    whole = (filters, each, points, taps)
-    kept = np.broadcast_to(counts[None, None], whole) & (np.broadcast_to(values, whole) != 0)
-    parts = [np.broadcast_to(part, whole)[kept] for part in (values, rows, columns)]
+    # where in the input each tap looks from each place; -1 is the padding
+    positions = np.pad(np.arange(math.prod(shape)).reshape(shape), [(0, 0), *padding], constant_values=-1)
+    spans = [apart * (length - 1) + 1 for length, apart in zip(kernel, dilation, strict=True)]
+    windows = np.lib.stride_tricks.sliding_window_view(positions, (1, *spans))
+    looks = windows[:, *(slice(None, None, step) for step in (*stride, 1, *dilation))]
+    inner = filters // groups
+    rows = np.arange(filters * points).reshape(groups, inner, 1, points, 1)
+    columns = looks.reshape(groups, 1, each, points, taps)
+    values = weight.reshape(groups, inner, each, 1, taps)
+    kept = (columns >= 0) & (values != 0)
+    rows, columns, values = (np.broadcast_to(part, kept.shape)[kept] for part in (rows, columns, values))
     matrix = sparse.coo_array(
-        (parts[0].astype(np.float64), (parts[1], parts[2])), shape=(filters * points, math.prod(shape))
+        (values.astype(np.float64), (rows, columns)), shape=(filters * points, math.prod(shape))
     ).tocsr()
     matrix.sort_indices()
     return matrix, (filters, *out)

@@ -32,10 +32,7 @@ NOT_AFFINE = "is not affine in its input; only affine operators between two spik
 
 
 def present(value: Value | None) -> Value:
-    """An operand that must be there.
-
-    Raises ModelError.
-    """
+    """An operand that must be there, else ModelError."""
     if value is None:
         raise ModelError("lacks an operand; export it again")
     return value
@@ -111,14 +108,9 @@ def chosen(table: Table, values: Sequence[Value | None]) -> Value:
 
 def is_binary(table: Table, value: Affine) -> bool:
     """Whether a value is zeros and ones: spikes, or an input of truth values, one for each element."""
-    counts = np.zeros(len(value.bias), np.int64)
-    for terms in value.terms.values():
-        counts += np.diff(terms.indptr)
-    return is_whole(table, value) and not np.any(value.bias) and bool(np.all(counts <= 1)) and _all_ones(value)
-
-
-def _all_ones(value: Affine) -> bool:
-    return all(np.all(terms.data == 1) for terms in value.terms.values())
+    counts = sum((np.diff(terms.indptr) for terms in value.terms.values()), start=np.zeros(len(value.bias), np.int64))
+    ones = all(np.all(terms.data == 1) for terms in value.terms.values())
+    return is_whole(table, value) and not np.any(value.bias) and bool(np.all(counts <= 1)) and ones
 
 
 def is_whole(table: Table, value: Affine) -> bool:

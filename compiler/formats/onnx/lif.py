@@ -38,36 +38,22 @@ RESET = (
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Neurons:
-    """A layer in one step.
+    """A layer in one step; what are called atoms are places in the table."""
 
-    membrane: atom.
-    node: operator that makes the membrane.
-    previous: atom of the membrane, or of the state input, that it comes from.
-    gate: state input that holds the spikes of the step before, where there is one.
-    spike: atom of its spikes.
-    beta, theta: decay and threshold; no decay in a first step that starts at zero.
-    strict: fires above the threshold; else at it, too.
-    current: what else it is made of, by atom.
-    bias: (neurons,) float64
-    """
-
-    membrane: int
-    node: str
-    previous: int | None
-    gate: int | None
-    spike: int
-    beta: float | None
+    membrane: int  # atom
+    node: str  # operator that makes the membrane
+    previous: int | None  # atom of the membrane, or of the state input, that it comes from
+    gate: int | None  # state input that holds the spikes of the step before, where there is one
+    spike: int  # atom
+    beta: float | None  # none in a first step that starts at zero
     theta: float
-    strict: bool
-    current: Mapping[int, Sparse]
+    strict: bool  # fires above the threshold; else at it, too
+    current: Mapping[int, Sparse]  # what else the membrane is made of, by atom
     bias: FloatArray
 
 
 def neurons_of(table: Table, outputs: Mapping[str, Affine]) -> list[Neurons]:
-    """Every layer in every step, in the order in which a graph computes them.
-
-    table: after the graph was run.
-    outputs: its outputs by name.
+    """Every layer in every step, in the order in which a graph that was run computes them.
 
     Raises ModelError naming the operator of the first membrane that is none of such neurons, and why.
     """

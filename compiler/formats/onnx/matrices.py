@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
-from spikeloom.compiler.formats.kernels import Padding, block_diagonal, convolution
+from spikeloom.compiler.formats.kernels import block_diagonal, convolution
 from spikeloom.compiler.formats.onnx.file import Array, Node
 from spikeloom.compiler.formats.onnx.values import COEFFICIENT_LIMIT, Table, size_of
 from spikeloom.compiler.ir import Sparse
@@ -59,14 +59,11 @@ def _positions(array: Array) -> Array:
 
 
 def _matmul_matrix(_node: Node, table: Table, operands: Operands, which: int) -> Sparse:
-    first, second = operands
-    sides = [_positions(first), second] if which == 0 else [first, _positions(second)]
-    sides[0] = sides[0][None] if first.ndim == 1 else sides[0]
-    sides[1] = sides[1][:, None] if second.ndim == 1 else sides[1]
+    sides = [_positions(each) if place == which else each for place, each in enumerate(operands)]
+    sides[0] = sides[0][None] if sides[0].ndim == 1 else sides[0]
+    sides[1] = sides[1][:, None] if sides[1].ndim == 1 else sides[1]
     batch = table.room(np.broadcast_shapes(sides[0].shape[:-2], sides[1].shape[:-2]))
-    for side, array in enumerate(sides):
-        table.room((*batch, *array.shape[-2:]))
-        sides[side] = np.broadcast_to(array, (*batch, *array.shape[-2:]))
+    sides = [np.broadcast_to(each, table.room((*batch, *each.shape[-2:]))) for each in sides]
     letters = string.ascii_lowercase[: len(batch)]
     labels = [f"{letters}yz", f"{letters}zx"]
     spelled = f"{labels[which]},{labels[1 - which]}->{letters}yx"
@@ -75,25 +72,20 @@ def _matmul_matrix(_node: Node, table: Table, operands: Operands, which: int) ->
 
 def _gemm_matrix(node: Node, table: Table, operands: Operands, which: int) -> Sparse:
     labels = ["zy" if node.attributes.get("transA", 0) else "yz", "xz" if node.attributes.get("transB", 0) else "zx"]
-    spelled = f"{labels[which]},{labels[1 - which]}->yx"
     weight = node.attributes.get("alpha", 1.0) * operands[1 - which]
+    spelled = f"{labels[which]},{labels[1 - which]}->yx"
     return _contract(table, spelled, _positions(operands[which]), weight, operands[which].size)
 
 
-def _equation(node: Node, operands: Operands) -> str:
+def _einsum_matrix(node: Node, table: Table, operands: Operands, which: int) -> Sparse:
     spelled = str(node.attributes["equation"]).replace(" ", "").lower()
     if "->" not in spelled or "." in spelled or len(operands) > 2:
         raise ValueError("an equation that is not known")
-    return spelled
-
-
-def _einsum_matrix(node: Node, table: Table, operands: Operands, which: int) -> Sparse:
-    spelled = _equation(node, operands)
-    parts, out = spelled.split("->")[0].split(","), spelled.split("->")[1]
-    other = (parts[1 - which], operands[1 - which]) if len(parts) == 2 else ("", np.array(1.0))
-    return _contract(
-        table, f"{parts[which]},{other[0]}->{out}", _positions(operands[which]), other[1], operands[which].size
-    )
+    inputs, out = spelled.split("->")
+    labels = [*inputs.split(","), ""]
+    weight = operands[1 - which] if len(operands) == 2 else np.array(1.0)
+    spelled = f"{labels[which]},{labels[1 - which]}->{out}"
+    return _contract(table, spelled, _positions(operands[which]), weight, operands[which].size)
 
 
 def _reduce_axes(node: Node, operands: Operands) -> tuple[int, ...]:
@@ -114,30 +106,26 @@ def _reduce_matrix(node: Node, table: Table, operands: Operands, _which: int) ->
     return _contract(table, f"{letters},->{out}", _positions(operands[0]), np.array(share), operands[0].size)
 
 
-def _window_words(node: Node, axes: int) -> tuple[list[int], Padding, list[int]]:
-    """Strides, padding and dilations of windows over so many axes."""
-    if node.attributes.get("auto_pad", "NOTSET") not in ("NOTSET", "VALID") or node.attributes.get("ceil_mode", 0):
-        raise ValueError("auto_pad and ceil_mode are not known")
-    ones, zeros = [1] * axes, [0] * 2 * axes
-    strides, pads, dilations = (
-        [int(n) for n in node.attributes.get(key, default)]
-        for key, default in (("strides", ones), ("pads", zeros), ("dilations", ones))
-    )
-    return strides, list(zip(pads[:axes], pads[axes:], strict=True)), dilations
+def _conv_matrix(node: Node, table: Table, operands: Operands, _which: int) -> Sparse:
+    return _convolved(node, table, operands[0], operands[1], int(node.attributes.get("group", 1)))
 
 
 def _convolved(node: Node, table: Table, data: Array, weight: Array, groups: int) -> Sparse:
     """Matrix of a convolution of each recording of a batch; its size is checked before."""
-    strides, padding, dilations = _window_words(node, data.ndim - 2)
+    if node.attributes.get("auto_pad", "NOTSET") not in ("NOTSET", "VALID") or node.attributes.get("ceil_mode", 0):
+        raise ValueError("auto_pad and ceil_mode are not known")
+    axes = data.ndim - 2
+    pads = node.attributes.get("pads", [0] * 2 * axes)
     matrix, out = convolution(
-        data.shape[1:], weight, stride=strides, padding=padding, dilation=dilations, groups=groups
+        data.shape[1:],
+        weight,
+        stride=node.attributes.get("strides", [1] * axes),
+        padding=list(zip(pads[:axes], pads[axes:], strict=True)),
+        dilation=node.attributes.get("dilations", [1] * axes),
+        groups=groups,
     )
     table.room([len(data), math.prod(out) * math.prod(weight.shape[1:])], COEFFICIENT_LIMIT)
     return block_diagonal(matrix, len(data))
-
-
-def _conv_matrix(node: Node, table: Table, operands: Operands, _which: int) -> Sparse:
-    return _convolved(node, table, operands[0], operands[1], int(node.attributes.get("group", 1)))
 
 
 def _pool_matrix(node: Node, table: Table, operands: Operands, _which: int) -> Sparse:

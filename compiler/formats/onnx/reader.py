@@ -37,18 +37,12 @@ OPEN_STEPS = 3
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class OnnxNetwork:
-    """A network, and what was found about the file that it is from.
+    """A network, and what was found about the file that it is from."""
 
-    network: float stage, in float64.
-    steps: steps that the file holds; 1 where state goes in and out.
-    facts: what was read and what was assumed, for people.
-    sha256: of the file and of its external data.
-    """
-
-    network: Network
-    steps: int
-    facts: tuple[str, ...]
-    sha256: str
+    network: Network  # float stage, in float64
+    steps: int  # that the file holds; 1 where state goes in and out
+    facts: tuple[str, ...]  # what was read and what was assumed, for people
+    sha256: str  # of the file and of its external data
 
 
 def read_onnx(
@@ -107,16 +101,15 @@ def _network(model: Model, polarities: int | None, polarities_first: bool | None
     double = any(declared.kind == DOUBLE for declared in graph.inputs)
     layers = [
         Layer(
-            name=names[index],
-            beta=found.beta[index],
-            theta=_threshold(found.layers[index][0], double=double),
-            bias=found.bias[index],
+            name=name,
+            beta=layer[-1].beta or 0.0,
+            theta=_threshold(layer[0], double=double),
+            bias=layer[0].bias,
             sources={
-                source: _columns(weight, positions) if source == INPUT else weight
-                for source, weight in found.sources[index].items()
+                source: _columns(weight, positions) if source == INPUT else weight for source, weight in sources.items()
             },
         )
-        for index in range(len(found.layers))
+        for name, layer, sources in zip(names, found.layers, found.sources, strict=True)
     ]
     network = assemble(layers, sensor, voters, label)
     facts += _facts(model, table, found, outputs, names, words)
@@ -209,17 +202,17 @@ def _facts(
         f"input {printable(table.atoms[found.data].label)}: {words}",
     ]
     used = {found.data}
-    for name, layer, beta in zip(names, found.layers, found.beta, strict=True):
-        n = layer[0]
+    for name, layer in zip(names, found.layers, strict=True):
+        n, beta = layer[0], layer[-1].beta or 0.0
         sign = ">" if n.strict else ">="
-        told = f"layer {name}: {len(n.bias)} neurons, decay {beta:g}, fires at u {sign} {n.theta:g}"
+        line = f"layer {name}: {len(n.bias)} neurons, decay {beta:g}, fires at u {sign} {n.theta:g}"
         if n.previous is not None:
             held = is_output(outputs, {n.membrane: 1.0}) or "after the reset"
-            told += f", membrane {printable(table.atoms[n.previous].label)} -> {printable(held)}"
+            line += f", membrane {printable(table.atoms[n.previous].label)} -> {printable(held)}"
             used |= {n.previous} | ({n.gate} if n.gate is not None else set())
         if not n.strict:
-            told += "; >= is read as > the next number below"
-        facts.append(told)
+            line += "; >= is read as > the next number below"
+        facts.append(line)
     ignored = [
         printable(atom.label) for index, atom in enumerate(table.atoms) if atom.kind == INPUT_ATOM and index not in used
     ]

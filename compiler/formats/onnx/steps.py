@@ -13,37 +13,22 @@ from spikeloom.compiler.formats.names import printable
 from spikeloom.compiler.formats.onnx.lif import EQUAL, RESET, Neurons
 from spikeloom.compiler.formats.onnx.values import INPUT_ATOM, MEMBRANE, Affine, Table
 from spikeloom.compiler.ir import INPUT, Sparse
-from spikeloom.compiler.types import FloatArray, IntArray
+from spikeloom.compiler.types import IntArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Unrolled:
-    """Layers, each with its neurons in every step.
+    """Layers, each with its neurons in every step."""
 
-    layers: by layer, then step; one step where state goes in and out of the graph.
-    data: atom of the input that brings the events.
-    shape: of that input in one step.
-    sources: stages into each layer by the place of the source or ``INPUT``; columns of the input are flat
-        positions in it.
-    bias: list of (neurons,) float64
-    beta, theta: list of float
-    """
-
-    layers: list[list[Neurons]]
-    data: int
-    shape: tuple[int, ...]
+    layers: list[list[Neurons]]  # by layer, then step; one step where state goes in and out of the graph
+    data: int  # atom of the input that brings the events
+    shape: tuple[int, ...]  # of that input in one step
+    # stages into each layer by the place of the source or INPUT; columns of the input are flat positions in it
     sources: list[dict[int, Sparse]]
-    bias: list[FloatArray]
-    beta: list[float]
-    theta: list[float]
 
 
 def group(table: Table, neurons: Sequence[Neurons], shapes: Mapping[int, tuple[int, ...]]) -> Unrolled:
-    """Bring steps together.
-
-    table: Table
-    neurons: in every step, in order.
-    shapes: shape of each input of the graph by its atom.
+    """Bring steps together; `shapes` are those of each input of the graph by its atom.
 
     Raises ModelError if there are no neurons, steps are unlike each other, or it is not clear which input brings the
     events.
@@ -55,7 +40,6 @@ def group(table: Table, neurons: Sequence[Neurons], shapes: Mapping[int, tuple[i
     step_of = {n.spike: (index, step) for index, layer in enumerate(layers) for step, n in enumerate(layer)}
     shape, positions = _time(table, layers, data, shapes[data])
     sources: list[dict[int, Sparse]] = []
-    bias = []
     for layer in layers:
         every = [
             _sources(table, n, step, step_of, data, positions[step] if positions is not None else None)
@@ -64,21 +48,12 @@ def group(table: Table, neurons: Sequence[Neurons], shapes: Mapping[int, tuple[i
         for step in range(1, len(layer)):
             _require_like(layer, step, every)
         sources.append(every[0])
-        bias.append(layer[0].bias)
         if layer[-1].beta is None:
             raise ModelError(
                 f"{layer[0].node}: keeps no membrane from step to step, so its decay is unknown; export one "
                 "step with its state as inputs and outputs, or at least two steps"
             )
-    return Unrolled(
-        layers=layers,
-        data=data,
-        shape=shape,
-        sources=sources,
-        bias=bias,
-        beta=[float(layer[-1].beta or 0.0) for layer in layers],
-        theta=[layer[0].theta for layer in layers],
-    )
+    return Unrolled(layers=layers, data=data, shape=shape, sources=sources)
 
 
 def _chains(table: Table, neurons: Sequence[Neurons]) -> list[list[Neurons]]:
@@ -212,9 +187,7 @@ def _require_like(layer: list[Neurons], step: int, every: list[dict[int, Sparse]
 
 
 def _equal(first: Sparse, second: Sparse) -> bool:
-    if first is second:
-        return True
-    return (
+    return first is second or (
         first.shape == second.shape
         and np.array_equal(first.indptr, second.indptr)
         and np.array_equal(first.indices, second.indices)
@@ -242,9 +215,8 @@ def readout(table: Table, found: Unrolled, outputs: Mapping[str, Affine]) -> tup
             label = class_of_each(first)
             if label is not None and all(_equal(first, value.terms[spike]) for spike in spikes):
                 votes.append((index, label, name))
-    plain = [vote for vote in votes if np.array_equal(vote[1], np.arange(len(vote[1])))]
     summed = [vote for vote in votes if not np.array_equal(vote[1], np.arange(len(vote[1])))]
-    chosen = summed or plain
+    chosen = summed or votes
     if not chosen:
         shown = ", ".join(printable(name) for name in outputs)
         raise ModelError(

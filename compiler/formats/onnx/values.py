@@ -38,22 +38,14 @@ INPUT_ATOM, MEMBRANE, SPIKE, PRODUCT = "input", "membrane", "spike", "product"
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Atom:
-    """Something that varies.
+    """Something that varies."""
 
-    kind: one of the four kinds.
-    label: name of the value in the file, for messages.
-    eye: csr_array (size, size); its own coefficients.
-    binary: whether it is zeros and ones.
-    of: the two factors of a product; the point of a spike.
-    strict: of a spike: fires above the threshold, not at it.
-    """
-
-    kind: str
-    label: str
-    eye: Sparse
-    binary: bool = False
-    of: tuple[int, ...] = ()
-    strict: bool = True
+    kind: str  # one of the four
+    label: str  # name of the value in the file, for messages
+    eye: Sparse  # (size, size), its own coefficients
+    binary: bool = False  # zeros and ones
+    of: tuple[int, ...] = ()  # the two factors of a product; the point of a spike
+    strict: bool = True  # of a spike: fires above the threshold, not at it
 
     @property
     def size(self) -> int:
@@ -63,25 +55,16 @@ class Atom:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Affine:
-    """``sum_a terms[a] @ atom_a + bias``.
-
-    shape: of the tensor; everything else is flat.
-    terms: dict of int to csr_array (size, size of the atom)
-    bias: (size,) float64
-    """
+    """``sum_a terms[a] @ atom_a + bias``, flat; `shape` is the tensor's."""
 
     shape: tuple[int, ...]
-    terms: dict[int, Sparse]
-    bias: FloatArray
+    terms: dict[int, Sparse]  # (size, size of the atom)
+    bias: FloatArray  # (size,)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Decision:
-    """A value that each element takes by its membrane: below, at and above the threshold.
-
-    point: comparison that decides.
-    values: three arrays of equal shape
-    """
+    """A value that each element takes by a comparison: below, at and above the threshold."""
 
     point: int
     values: tuple[Array, Array, Array]
@@ -97,12 +80,7 @@ Value = Array | Affine | Decision
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Point:
-    """A comparison of a membrane with a threshold.
-
-    node: where it is, for messages.
-    membrane: atom.
-    theta: (size,) float64
-    """
+    """A comparison of a membrane, an atom, with a threshold (size,), made by a node."""
 
     node: str
     membrane: int
@@ -141,24 +119,13 @@ class Table:
         if self.done > WORK_LIMIT:
             raise ModelError(f"needs more than {WORK_LIMIT} coefficients in all; export one step instead of all")
 
-    def atom(
-        self,
-        kind: str,
-        label: str,
-        size: int,
-        *,
-        binary: bool = False,
-        of: tuple[int, ...] = (),
-        strict: bool = True,
-    ) -> int:
-        """Add an atom, if there may be one of that size."""
+    def atom(self, kind: str, label: str, size: int, **facts: Any) -> int:
+        """Add an atom, if there may be one of that size; `facts` are more fields of it."""
         if size > ATOM_LIMIT:
             raise ModelError(
                 f"{printable(label)} has {size} elements, allowed are {ATOM_LIMIT}; no chip holds such a layer"
             )
-        eye = sparse.eye_array(size, format="csr")
-        found = Atom(kind=kind, label=label, eye=eye, binary=binary, of=of, strict=strict)
-        self.atoms.append(found)
+        self.atoms.append(Atom(kind=kind, label=label, eye=sparse.eye_array(size, format="csr"), **facts))
         return len(self.atoms) - 1
 
     def value(self, atom: int, shape: tuple[int, ...]) -> Affine:
@@ -171,19 +138,16 @@ class Table:
         key = (SPIKE, point, strict)
         if key not in self.known:
             membrane = self.atoms[self.points[point].membrane]
-            found = self.atom(SPIKE, membrane.label, membrane.size, binary=True, of=(point,), strict=strict)
-            self.known[key] = found
+            self.known[key] = self.atom(SPIKE, membrane.label, membrane.size, binary=True, of=(point,), strict=strict)
         return self.known[key]
 
     def product(self, first: int, second: int) -> int:
         """The atom of an elementwise product of two atoms."""
         pair = (min(first, second), max(first, second))
-        key = (PRODUCT, *pair)
-        if key not in self.known:
+        if (PRODUCT, *pair) not in self.known:
             one, other = (self.atoms[index] for index in pair)
-            label = f"{one.label} * {other.label}"
-            self.known[key] = self.atom(PRODUCT, label, one.size, of=pair)
-        return self.known[key]
+            self.known[PRODUCT, *pair] = self.atom(PRODUCT, f"{one.label} * {other.label}", one.size, of=pair)
+        return self.known[PRODUCT, *pair]
 
 
 def size_of(shape: Sequence[int]) -> int:
@@ -221,11 +185,9 @@ def added(values: Sequence[tuple[float, Affine]], shape: tuple[int, ...]) -> Aff
 
 def scaled(value: Affine, factor: FloatArray) -> Affine:
     """Each element times a constant of its own."""
-    terms = {}
-    for atom, own in value.terms.items():
-        copy = own.copy()
-        copy.data = copy.data * np.repeat(factor, np.diff(copy.indptr))
-        terms[atom] = copy
+    terms = {atom: own.copy() for atom, own in value.terms.items()}
+    for own in terms.values():
+        own.data = own.data * np.repeat(factor, np.diff(own.indptr))
     return Affine(shape=value.shape, terms=terms, bias=value.bias * factor)
 
 

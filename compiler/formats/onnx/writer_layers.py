@@ -32,51 +32,36 @@ Digit = tuple[npt.NDArray[np.int8], IntArray]
 class Source:
     """What a layer receives from another one, or from the input.
 
-    pre: index into ``netlist.layers``, or ``INPUT``.
-    positive, negative: (neurons of the source, neurons) int64; sums of its positive and of its negative effective
-        weights, as magnitudes.
+    Sums of positive and of negative effective weights, as magnitudes, (neurons of the source, neurons).
     """
 
-    pre: int
+    pre: int  # index into ``netlist.layers``, or ``INPUT``
     positive: IntArray
     negative: IntArray
 
-    def weight(self, sign: int = 0) -> IntArray:
+    def weight(self, sign: int) -> IntArray:
         """All weights (0), or magnitudes of the positive (1) or the negative ones (-1)."""
         return {0: self.positive - self.negative, 1: self.positive, -1: self.negative}[sign]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Layer:
-    """One population as the graph computes it; arrays have an entry per compartment, ordered by neuron.
+    """One population as the graph computes it; arrays (n,) have an entry per compartment, ordered by neuron."""
 
-    index: index into ``netlist.layers``.
-    name: unique, without dots.
-    ids: (n,) int64; compartments.
-    depth: steps that it lags behind the data.
-    sources: what it receives.
-    decay_u, decay_v, threshold, bias: (n,) int64; registers; thresholds and biases in membrane units.
-    label: (n,) int64; class of a vote, -1 for none.
-    remembers: whether a current outlasts its step.
-    checked: whether some input could make the synaptic sum or the current overflow.
-    saturates: whether some input could bring the membrane to the end of its register.
-    kind: int32 where no input brings any product or sum beyond it, int64 otherwise.
-    """
-
-    index: int
-    name: str
-    ids: IntArray
-    depth: int
+    index: int  # into ``netlist.layers``
+    name: str  # unique, without dots
+    ids: IntArray  # compartments
+    depth: int  # steps that it lags behind the data
     sources: tuple[Source, ...]
     decay_u: IntArray
     decay_v: IntArray
-    threshold: IntArray
+    threshold: IntArray  # membrane units, as the bias
     bias: IntArray
-    label: IntArray
-    remembers: bool
-    checked: bool
-    saturates: bool
-    kind: type[np.int32] | type[np.int64]
+    label: IntArray  # class of a vote, -1 for none
+    remembers: bool  # a current outlasts its step
+    checked: bool  # some input could make the synaptic sum or the current overflow
+    saturates: bool  # some input could bring the membrane to the end of its register
+    kind: type[np.int32] | type[np.int64]  # int32 where no input brings any product or sum beyond it
 
     @property
     def size(self) -> int:
