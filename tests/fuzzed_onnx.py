@@ -6,15 +6,9 @@ from functools import cache
 from fuzzed_bytes import changed_bytes
 from made_modules import NETS, example_of, one_step
 from made_onnx import looped, scanned, two_layers
-from onnx import AttributeProto, ModelProto
+from onnx import AttributeProto, ModelProto, defs
 
-NAMES = """
-Add Sub Mul Div Pow MatMul Gemm Conv AveragePool GlobalAveragePool BatchNormalization Relu Sigmoid Sign Greater
-Less Equal Where Not And Cast Reshape Transpose Squeeze Unsqueeze Flatten Concat Split Slice Gather GatherND
-GatherElements ScatterElements ScatterND Expand Tile Pad Shape Size ConstantOfShape Range ReduceSum ReduceMean
-Einsum NonZero Identity Clip Min Max Sum Mean Loop Scan If LSTM Softmax MaxPool Dropout Constant Mod Neg CumSum
-"""
-OPERATORS = NAMES.split()
+OPERATORS = sorted({schema.name for schema in defs.get_all_schemas()})
 NUMBERS = (-(2**63), -(2**31), -100, -2, -1, 0, 1, 2, 3, 4, 7, 100, 2**20, 2**31, 2**40, 2**63 - 1)
 
 

@@ -1,4 +1,4 @@
-"""Torch modules compiled from Python: layer types that the compiler has never heard of, and what it refuses."""
+"""Torch modules compiled from Python: layer types of their own, and what is refused."""
 
 import numpy as np
 import pytest
@@ -54,33 +54,14 @@ def test_spikes_are_the_modules_own(name):
     assert network.classes == CLASSES
 
 
-@pytest.mark.parametrize("name", ["chebyshev", "averaged", "grid"])
-def test_a_layer_type_of_ones_own_is_compiled_and_verified(name):
-    net, example = NETS[name](), example_of(name)
-    compilation = compile_module(net, example)
-    network = module_network(net, example)
-    events = events_of(network)
-    files = tuple("abc")
-    verdict = verify(compilation.netlist, network, None, events, np.arange(3), files, sha256="x")
-    assert verdict.spec_equals_engine
-    assert not verdict.same_checkpoint
-    chip = {name: layer.chip for name, layer in verdict.spikes.items()}
-    reference = [int(spikes.sum()) for spikes in run_float(network, channels_last(events), dtype=np.float32).spikes]
-    assert [layer.float for layer in verdict.spikes.values()] == reference
-    assert sum(chip.values()) > 0
-    assert verdict.certificate.samples == 3
-
-
-def test_constants_and_names():
-    network = module_network(mlp(), torch.zeros(1, 12))
-    told = [(p.name, p.size, p.beta, p.theta) for p in network.populations]
-    assert told == [("1", 16, 0.9, 1.0), ("3", 3, 0.3, 0.25)]
-    assert (network.input.taxels, network.input.polarities) == (6, 2)
-
-
-def test_weights_are_the_layers_own_to_the_last_bit():
+def test_weights_and_constants_are_the_modules_to_the_last_bit():
     net = mlp()
     network = module_network(net, torch.zeros(1, 12))
+    assert [(p.name, p.size, p.beta, p.theta) for p in network.populations] == [
+        ("1", 16, 0.9, 1.0),
+        ("3", 3, 0.3, 0.25),
+    ]
+    assert (network.input.taxels, network.input.polarities) == (6, 2)
     for linear, population, projection in zip([net[0], net[2]], network.populations, network.projections, strict=True):
         assert np.array_equal(projection.weight.toarray(), linear.weight.detach().double().numpy())
         assert np.array_equal(population.bias, linear.bias.detach().double().numpy())
@@ -93,7 +74,7 @@ def test_convolution_stores_no_synapse_that_is_not_there():
 
 
 class TwoWays(nn.Module):
-    """Two layers beside each other, heard by a third."""
+    """Two layers beside each other, received by a third."""
 
     def __init__(self, *, skip=False):
         super().__init__()
@@ -177,37 +158,24 @@ class Pair(nn.Module):
 
 
 REFUSED = {
-    "module: the stage before 3 is not affine (a random combination of inputs is off by 1 of the response, 1e-09 "
-    "allowed); only affine stages between LIF layers can become synapses": lambda: nn.Sequential(
+    "module: the stage before 3 is not affine (a random combination": lambda: nn.Sequential(
         nn.Linear(4, 3), LIF(), nn.Sequential(nn.Linear(3, 2), nn.ReLU()), LIF()
     ),
-    "module: has no LIF layer, so nothing spikes; put spikeloom.LIF between its stages": lambda: nn.Linear(4, 2),
-    "module 1: is called 2 times in a step, each LIF layer holds the neurons of one place; use one for each": twice,
-    "module: returns a tuple, wanted one tensor, the spikes of its classes": Pair,
-    "module: its output is no count of the spikes of its last LIF layer; return these spikes, or their sum over a "
-    "group of neurons for each class": lambda: nn.Sequential(nn.Linear(4, 3), LIF(), nn.Linear(3, 2)),
-    "layer lif_c: receives the input and lif_a and lif_b, which lie differently deep; a spike takes one step on the "
-    "chip and would arrive too early, so put a spiking layer into the shorter way": lambda: TwoWays(skip=True),
-    "layer 1: keeps 1.5 of its membrane in a step, allowed are 0 to 1; train it again": lambda: nn.Sequential(
-        nn.Linear(4, 2), LIF(beta=1.5)
-    ),
-    "layer 1: has the threshold 0, allowed are numbers above 0; train it again": lambda: nn.Sequential(
-        nn.Linear(4, 2), LIF(theta=0)
-    ),
+    "module: has no LIF layer, so nothing spikes": lambda: nn.Linear(4, 2),
+    "module 1: is called 2 times in a step": twice,
+    "module: returns a tuple, wanted one tensor": Pair,
+    "module: its output is no count of the spikes": lambda: nn.Sequential(nn.Linear(4, 3), LIF(), nn.Linear(3, 2)),
+    "layer lif_c: receives the input and lif_a and lif_b, which lie differently deep": lambda: TwoWays(skip=True),
+    "layer 1: keeps 1.5 of its membrane in a step": lambda: nn.Sequential(nn.Linear(4, 2), LIF(beta=1.5)),
+    "layer 1: has the threshold 0, allowed are numbers above 0": lambda: nn.Sequential(nn.Linear(4, 2), LIF(theta=0)),
 }
 
 
-@pytest.mark.parametrize("line", REFUSED)
-def test_refused(line):
+@pytest.mark.parametrize("words", REFUSED)
+def test_refused(words):
     with pytest.raises(ModelError) as caught:
-        module_network(seeded(REFUSED[line]), torch.zeros(1, 4))
-    found = str(caught.value)
-    if "random combination" in line:
-        start, end = line.split("off by 1")[0], line.split("off by 1")[1]
-        assert found.startswith(start)
-        assert found.endswith(end)
-    else:
-        assert found == line
+        module_network(seeded(REFUSED[words]), torch.zeros(1, 4))
+    assert str(caught.value).startswith(words)
 
 
 def test_max_pooling_is_refused():

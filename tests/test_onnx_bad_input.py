@@ -82,8 +82,8 @@ SUM = node("Add", "k current", "u0_new")
 
 REFUSED = [
     # operators
-    *[(f"node stage ({op}): {AFFINE}", one(op)) for op in ("Relu", "Sigmoid", "Softmax")],
-    (f"node stage (Max): {AFFINE}", one("Max", "current zero")),
+    *[(f"node stage ({op}): {AFFINE}", one(op)) for op in ("Relu", "Softmax")],
+    (f"node stage (MaxPool): {AFFINE}", one("MaxPool", "current", kernel_shape=[1])),
     (f"node stage (Div): {AFFINE}", one("Div", "one current")),
     (f"node stage (Mul): multiplies x by x, so it {AFFINE}", one("Mul", "x x")),
     (f"node stage (Cast): rounds its input to whole numbers, so it {AFFINE}", one("Cast", to=7)),
@@ -92,15 +92,6 @@ REFUSED = [
     (
         f"node stage (MatMul): {AFFINE}",
         lambda: with_stage(node("Transpose", "current", "t", perm=[1, 0]), node("MatMul", "current t", "stage")),
-    ),
-    (
-        f"node pooled (MaxPool): {AFFINE}",
-        lambda: with_stage(
-            node("Unsqueeze", "current axis", "deep"),
-            node("MaxPool", "deep", "pooled", kernel_shape=[1]),
-            node("Squeeze", "pooled axis", "stage"),
-            axis=np.array([1]),
-        ),
     ),
     (
         "node stage (Strange): is of the domain my.own, allowed are the",
@@ -206,25 +197,12 @@ REFUSED = [
     ("is not an ONNX file, or is truncated", lambda: b"PK\x03\x04 not at all"),
     ("no such file", lambda: None),
     ("operators of version 99, allowed are", lambda: changed(lambda _, m: setattr(m.opset_import[0], "version", 99))),
-    ("(No Op registered for Strange", one("Strange")),
     ("(Nodes in a graph must be topologically sorted, however input 'nobody'", one("Add", "current nobody")),
-    (
-        "sorted, however input 'back'",
-        lambda: with_stage(node("Add", "current back", "stage"), node("Identity", "stage", "back")),
-    ),
-    (
-        "'stage' has been used as output names multiple times",
-        lambda: with_stage(node("Add", "current one", "stage"), node("Relu", "current", "stage")),
-    ),
-    ("Graph output 'more' is not an output of any node", lambda: model(STAGE, [("x", [1, 4])], ["more"])),
-    ("w initializer name is not unique", lambda: changed(lambda w, m: m.graph.initializer.add().CopyFrom(w))),
     ("too small for the declared shape", lambda: changed(lambda w, _: w.dims.__setitem__(0, 2 * 10**12))),
     ("tensor w: cannot be read", lambda: changed(lambda w, _: w.dims.__setitem__(0, 2))),
-    ("Negative dimension value (tensor name: w)", lambda: changed(lambda w, _: w.dims.__setitem__(0, -4))),
     ("tensor w: has element type 16", lambda: changed(lambda w, _: setattr(w, "data_type", TensorProto.BFLOAT16))),
     ("makes 1000000000000 values or", lambda: plain(inputs=[("x", [10**6, 10**6]), *STATE_IN[:2]])),
     ("input x: has an open size 'taxels', allowed", lambda: plain(inputs=[("x", [1, "taxels"]), *STATE_IN[:2]])),
-    ("input x: has an open size '?', allowed", lambda: plain(inputs=[("x", [1, None]), *STATE_IN[:2]])),
     ("has graphs nested deeper than 8", deep),
 ]
 
@@ -259,14 +237,9 @@ def beside(location, **more):
     [
         ("../secret.bin", {}, "'../secret.bin'"),
         ("/etc/passwd", {}, "'/etc/passwd'"),
-        ("a/../../secret.bin", {}, "'a/../../secret.bin'"),
-        ("", {}, "''"),
-        ("link/secret.bin", {}, "outside model directory"),
         ("link.bin", {}, "symbolic link"),
         ("gone.bin", {}, "'gone.bin'"),
         ("few.bin", {"length": 48}, "exceeds available data (8 bytes"),
-        ("few.bin", {"offset": -1}, "must be non-negative"),
-        ("few.bin", {"offset": "x"}, "invalid literal"),
         ("large.bin", {}, "more than 10000 bytes, the limit of a network"),
         ("few.bin", {}, "raw_data size (8 bytes) is too small"),
     ],
@@ -278,7 +251,6 @@ def test_data_beside_the_file(refusal, tmp_path, monkeypatch, location, more, wo
     (tmp_path / "secret.bin").write_bytes(bytes(48))
     (folder / "few.bin").write_bytes(bytes(8))
     (folder / "large.bin").write_bytes(bytes(10_001))
-    (folder / "link").symlink_to(tmp_path)
     (folder / "link.bin").symlink_to(tmp_path / "secret.bin")
     assert words in refusal(beside(location, **more), name="inner/net.onnx")
 
@@ -315,25 +287,9 @@ class Drifting(torch.nn.Module):
         return sum(self.lif(self.linear(x[..., step]) * (step + 1)) for step in range(3))
 
 
-class Discarding(torch.nn.Module):
-    """A spike also discards the input of the step after it; that is another neuron."""
-
-    def forward(self, x, membrane):
-        fired = (membrane > 0.5).float()
-        base = membrane * 0.2 + x
-        membrane = base - fired * base
-        return (membrane > 0.5).float(), membrane
-
-
-@pytest.mark.parametrize(
-    ("net", "shapes", "words"),
-    [
-        (Drifting, [(1, 4, 3)], "step 1 differs from step 0 in weights, bias, decay or threshold"),
-        (Discarding, [(1, 4), (1, 4)], AFFINE),
-    ],
-)
-def test_modules_that_are_no_such_network(refusal, net, shapes, words):
-    assert words in refusal(exported(net(), tuple(map(torch.zeros, shapes))))
+def test_steps_that_differ(refusal):
+    content = exported(Drifting(), (torch.zeros(1, 4, 3),))
+    assert "step 1 differs from step 0 in weights, bias, decay or threshold" in refusal(content)
 
 
 def outcome(path, content):
