@@ -32,14 +32,11 @@ from spikeloom.compiler.passes.prune import never_fires
 from spikeloom.compiler.range_proof import prove_ranges
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.netlist import one_step_bounds
-from spikeloom.compiler.targets.loihi1.netlist_file import netlist_bytes, read_netlist, write_netlist
-from spikeloom.compiler.targets.loihi1.netlist_text import netlist_text
 from spikeloom.compiler.targets.loihi1.storage.quantize import quantize
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import current_load
 from spikeloom.models.networks.reference import float_spikes
 from spikeloom.runtime.cli import main
 from spikeloom.runtime.equivalence.certain_spikes import certain_spikes
-from spikeloom.runtime.equivalence.explanation.causes import explain, observe
 from spikeloom.runtime.equivalence.reference import require_match
 from spikeloom.runtime.equivalence.rounding import check_rounding
 from spikeloom.runtime.equivalence.verify import verify
@@ -47,9 +44,8 @@ from spikeloom.runtime.machines.integer import integer_machine_of
 from spikeloom.runtime.machines.loihi1 import engine, spec
 from spikeloom.runtime.machines.loihi1.stream import open_stream
 from spikeloom.runtime.machines.loihi1.trace import aligned
-from spikeloom.runtime.machines.votes import class_counts
 
-REPEATABLE = settings(max_examples=25, deadline=None, derandomize=True)
+REPEATABLE = settings(max_examples=8, deadline=None, derandomize=True)
 
 LAYERS = ("conv1", "fc1", "fc2", "fc3")
 
@@ -59,11 +55,6 @@ def float_network(path, system="tactilesgnet", dynamics=TIMING, **options):
     _, seen = written(path / "x.pt", system, dynamics, **options)
     checkpoint = read_checkpoint(path / "x.pt")
     return checkpoint, seen, expand(checkpoint, seen)
-
-
-def rungs(verdict):
-    """Different entries of each layer by rung of the ladder."""
-    return {rung.stage: rung.different for rung in verdict.ladder}
 
 
 @pytest.fixture(scope="module")
@@ -172,19 +163,6 @@ def test_a_neuron_that_only_fires_from_its_gathered_current_is_kept():
 # --- rounding ------------------------------------------------------------------------------------------------------
 
 
-def test_the_chip_follows_the_float_network(timed, compiled):
-    _, _, network = timed
-    events = events_of(9, samples=8, steps=40)
-    inputs = channels_last(events, TIMING.clocks)
-    truth = run_float(network, inputs).spikes
-    trace = engine.simulate(compiled.netlist, with_clocks(events, TIMING.clocks), spikes=True)
-    for layer, (name, wanted) in enumerate(zip(LAYERS, truth, strict=True)):
-        found = aligned(compiled.netlist, trace.spikes, layer)
-        heard = ~np.isin(np.arange(wanted.shape[2]), compiled.netlist.layers[layer].unreceived)
-        assert np.mean(found[..., heard] != wanted[..., heard]) < 0.02, name
-        assert wanted.any(), name
-
-
 def test_recordings_without_their_clocks_are_refused(compiled):
     events = events_of(12, samples=2).reshape(2, 78, -1)
     for simulate in (
@@ -213,22 +191,12 @@ def test_ranges_are_proven_for_any_input(compiled):
     assert np.all(np.maximum(positive, negative)[ids] * 64 * 4096 // 205 <= CURRENT_MAX)
 
 
-@pytest.mark.parametrize("value", [0, 1])
-def test_no_input_leaves_a_register(compiled, value):
-    """Everything or nothing at once for long, the clocks too: what the proof is about."""
-    events = np.full((compiled.netlist.n_inputs, 150), value, np.uint8)
-    trace = spec.simulate(compiled.netlist, events)
-    assert not trace.counts.saturations.any()
-
-
 @pytest.mark.parametrize(
     "options",
     [
         {"recipes": (Recipe(bits=2),)},
-        {"recipes": (Recipe(bits=4, groups=4),)},
         {"recipes": (Recipe(planes=2, groups=8),)},
         {"spike_exact": True},
-        {"keep_all": True},
         {"ranges": "observed"},
         {"recipes": (Recipe(bits=2),), "training_events": None},
     ],
@@ -274,17 +242,6 @@ def test_observed_ranges_count_what_a_current_gathers(timed):
 
 
 # --- files ---------------------------------------------------------------------------------------------------------
-
-
-def test_a_netlist_survives_its_file(compiled, tmp_path):
-    write_netlist(compiled.netlist, tmp_path / "x.loom")
-    back = read_netlist(tmp_path / "x.loom")
-    assert back.clocks == TIMING.clocks
-    assert back.layers == compiled.netlist.layers
-    assert netlist_bytes(back) == (tmp_path / "x.loom").read_bytes()
-    assert netlist_text(back) == netlist_text(compiled.netlist)
-    assert "(input 39 taxels x 2, 3 clocks of 4 steps)" in netlist_text(back)
-    assert "(alpha 0.95)" in netlist_text(back)
 
 
 def test_a_netlist_of_other_clocks_does_not_match(timed, compiled, tmp_path):
@@ -343,28 +300,10 @@ def test_the_decay_alone_is_a_rung_of_the_ladder(tmp_path):
         events = events_of(21, samples=8, steps=200)
         netlist = compile_network(network).netlist
         verdict = verify(netlist, checkpoint, seen, events, np.zeros(8, np.int64), ("r",) * 8, spec_samples=1)
-        moved.append(sum(rungs(verdict)["beta"].values()) - sum(rungs(verdict)["float64"].values()))
+        different = {rung.stage: sum(rung.different.values()) for rung in verdict.ladder}
+        moved.append(different["beta"] - different["float64"])
     assert moved[0] == 0
     assert moved[1] > 0
-
-
-def test_explain_finds_the_cause_of_every_root(timed, compiled):
-    _, _, network = timed
-    causes = set()
-    for seed in range(6):
-        events = events_of(30 + seed, samples=1, steps=40)
-        found = explain(
-            network,
-            lift(compiled.netlist),
-            channels_last(events, TIMING.clocks)[0],
-            observe(integer_machine_of(compiled.netlist), events),
-            absent=[np.zeros(p.size, np.bool_) for p in network.populations],
-        )
-        causes |= {root.cause for root in found.found}
-        for root in found.found:
-            assert root.cause != "not known" or root.layer == "fc1"
-    assert causes <= {"weight rounding", "bias rounding", "realised beta", "round toward zero", "tie (> or >=)"}
-    assert causes
 
 
 def test_a_wrong_current_register_is_named(timed, compiled):
@@ -381,16 +320,8 @@ def test_a_wrong_current_register_is_named(timed, compiled):
 # --- live ----------------------------------------------------------------------------------------------------------
 
 
-def test_a_stream_lets_the_clocks_tick_by_itself(compiled):
-    events = events_of(50, samples=1, steps=20)[0]
-    whole = engine.simulate(compiled.netlist, with_clocks(events[None], TIMING.clocks))
+def test_a_stream_takes_the_channels_of_the_sensor_alone(compiled):
     stream = open_stream(compiled.netlist)
-    for _ in range(2):
-        for step in range(20):
-            stream.step(events[..., step])
-        last = stream.finish()[-1]
-        assert_array_equal(last.counts, class_counts(compiled.netlist, whole.counts.spikes)[0])
-        stream.reset()
     with pytest.raises(DataError) as error:
         stream.step(np.zeros(81))
     assert str(error.value) == (
