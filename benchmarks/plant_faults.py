@@ -48,7 +48,7 @@ NUMERIC = {
     "runtime/equivalence": "certain_spikes certificates divergence float_engine levels rounding",
     "runtime/machines": "votes",
     "runtime/machines/loihi1": "block_kernel blocks engine kernel spec timing timing_kernel",
-    "runtime/machines/loihi1/costs": "cost cumulative energy simple_times",
+    "runtime/machines/loihi1/costs": "cost cumulative",
     "runtime/machines/truenorth": "cost engine kernel spec trace twins",
     "runtime/report": "intervals",
     "runtime/studies/anytime": "exits",

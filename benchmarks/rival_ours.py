@@ -13,7 +13,7 @@ from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.compiler.types import BoolArray
 from spikeloom.runtime.machines.loihi1 import timing
-from spikeloom.runtime.machines.loihi1.costs import cost, simple_times
+from spikeloom.runtime.machines.loihi1.costs import cost
 from spikeloom.runtime.machines.loihi1.engine import prepare, simulate
 from spikeloom.runtime.machines.loihi1.trace import Trace, unpack
 
@@ -37,13 +37,13 @@ def counts(netlist: Netlist) -> Run:
     """Events and energy of every recording, and the time of every step by the simple model."""
     chip = load_target(netlist.target)
     clock, meter = timing.prepare(netlist, chip, chip.time[0]), cost.prepare(netlist, chip)
-    engine = prepare(netlist, charges=simple_times.charges(clock))
+    engine = prepare(netlist, charges=timing.charges(clock))
 
     def run(events: Any) -> Trace:
         trace = simulate(engine, events, threads=1)
         assert trace.charged is not None
         steps = np.full(len(events), events.shape[2])
-        simple_times.simple_from(clock, trace.charged, steps + engine.drain)
+        timing.simple_times(clock, trace.charged, steps + engine.drain)
         cost.estimate(meter, trace.counts, steps)
         return trace
 
@@ -54,7 +54,7 @@ def cycle(netlist: Netlist) -> Run:
     """The same, and the time of every step with queues and mesh."""
     chip = load_target(netlist.target)
     clock, meter = timing.prepare(netlist, chip, chip.time[0]), cost.prepare(netlist, chip)
-    engine = prepare(netlist, charges=simple_times.charges(clock))
+    engine = prepare(netlist, charges=timing.charges(clock))
 
     def run(events: Any) -> Trace:
         trace = simulate(engine, events, threads=1, spikes=True, updated=True)
@@ -62,7 +62,7 @@ def cycle(netlist: Netlist) -> Run:
         assert trace.updated is not None
         assert trace.charged is not None
         steps = np.full(len(events), events.shape[2])
-        simple_times.simple_from(clock, trace.charged, steps + engine.drain)
+        timing.simple_times(clock, trace.charged, steps + engine.drain)
         timing.detailed(clock, trace.spikes, trace.updated, events)
         cost.estimate(meter, trace.counts, events.shape[2])
         return trace

@@ -16,7 +16,6 @@ from spikeloom.runtime.machines.loihi1.costs import cost as cost_of
 from spikeloom.runtime.machines.loihi1.costs.estimate import estimate
 from spikeloom.runtime.machines.loihi1.costs.result import cost_report
 from spikeloom.runtime.machines.loihi1.costs.sections import sections
-from spikeloom.runtime.machines.loihi1.costs.simple_times import charges, simple_from
 from spikeloom.runtime.report.encode import encode
 from spikeloom.runtime.report.sections import terminal
 
@@ -44,14 +43,14 @@ def test_sums_of_the_engine_give_the_simple_times(small, stepwise):
     netlist, recordings = small
     (times,) = LOIHI.time
     clock = timing.prepare(netlist, LOIHI, times)
-    prepared = engine.prepare(netlist, stepwise=stepwise, charges=charges(clock))
+    prepared = engine.prepare(netlist, stepwise=stepwise, charges=timing.charges(clock))
     trace = engine.simulate(prepared, recordings, lengths=LENGTHS, spikes=True, updated=True)
     ran = LENGTHS + netlist.max_depth
     cut = recordings.copy()
     for recording, length in zip(cut, LENGTHS, strict=True):
         recording[:, length:] = 0
     expected = timing_oracle.simple(clock, trace.spikes, trace.updated, cut, steps=ran)
-    quick = simple_from(clock, trace.charged, ran)
+    quick = timing.simple_times(clock, trace.charged, ran)
     for field in dataclasses.fields(expected):
         np.testing.assert_array_equal(getattr(quick, field.name), getattr(expected, field.name), err_msg=field.name)
     assert (expected.duration_ns > 0).sum() == ran.sum()
@@ -129,7 +128,9 @@ def test_the_range_names_both_ends(small, found):
 def test_a_trace_that_does_not_belong_to_the_netlist(small):
     netlist, recordings = small
     clock = timing.prepare(netlist, LOIHI, LOIHI.time[0])
-    trace = engine.simulate(engine.prepare(netlist, charges=charges(clock)), recordings, spikes=True, updated=True)
+    trace = engine.simulate(
+        engine.prepare(netlist, charges=timing.charges(clock)), recordings, spikes=True, updated=True
+    )
     n, inputs, cores = netlist.n_compartments, netlist.n_inputs, netlist.n_cores
     less = trace.spikes[..., :-1]
     for spikes, updated, given in (
@@ -141,7 +142,7 @@ def test_a_trace_that_does_not_belong_to_the_netlist(small):
         with pytest.raises(DataError, match=f"updates .* found, the netlist has {n} compartments and {inputs} input"):
             timing.detailed(clock, spikes, updated, given)
     with pytest.raises(DataError, match=rf"{2 * cores - 1}\) of 4 recordings found, the netlist has {cores} cores"):
-        simple_from(clock, trace.charged[..., :-1], LENGTHS)
+        timing.simple_times(clock, trace.charged[..., :-1], LENGTHS)
     counts = dataclasses.replace(trace.counts, spikes=trace.counts.spikes[:, 1:])
     layers = len(netlist.layers)
     with pytest.raises(

@@ -29,7 +29,7 @@ from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.models.recordings.evtouch import load_recordings
 from spikeloom.runtime.machines.loihi1 import engine, timing
-from spikeloom.runtime.machines.loihi1.costs import energy
+from spikeloom.runtime.machines.loihi1.costs import cost
 
 FIT = next(table for table in LOIHI.energy if table.name == "sanafe")
 
@@ -107,8 +107,8 @@ def compare(python: str, netlist: Netlist, events: np.ndarray, folder: Path) -> 
     clock = timing.prepare(netlist, LOIHI, SANAFE, **as_priced)
     batch = trace.spikes, updated, shifted
     simple, detailed = timing_oracle.simple(clock, *batch), timing.detailed(clock, *batch)
-    updates = energy.updates_by_core(netlist, updated)
-    parts = energy.by_part(FIT, energy.count_by_core(netlist, LOIHI, trace.counts, updates, steps, **as_priced))
+    updates = cost.updates_by_core(netlist, updated)
+    parts = cost.by_part(FIT, cost.count_by_core(netlist, LOIHI, trace.counts, updates, steps, **as_priced))
 
     names, number = sanafe.group_names(netlist), sanafe.members(netlist)
     compartment = {(names[netlist.layer[c]], int(number[c])): c for c in range(netlist.n_compartments)}
@@ -124,8 +124,8 @@ def compare(python: str, netlist: Netlist, events: np.ndarray, folder: Path) -> 
                 expected_spikes=trace.spikes[i],
                 simple=1e9 * np.array(first["trace"]["sim_time"]),
                 detailed=1e9 * np.array(second["trace"]["sim_time"]),
-                energy={part: first["energy"][part] for part in energy.PARTS},
-                steps_energy={part: np.array(first["trace"][f"{part}_energy"]) for part in energy.PARTS},
+                energy={part: first["energy"][part] for part in cost.PARTS},
+                steps_energy={part: np.array(first["trace"][f"{part}_energy"]) for part in cost.PARTS},
                 ours_simple=simple.duration_ns[i],
                 ours_detailed=detailed.duration_ns[i],
                 ours_energy={part: float(joules[i].sum()) for part, joules in parts.items()},

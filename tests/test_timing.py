@@ -16,7 +16,7 @@ from spikeloom.compiler.formats import sanafe
 from spikeloom.compiler.targets.base import Quantity, load_target
 from spikeloom.compiler.targets.price_tables import LATENCIES
 from spikeloom.runtime.machines.loihi1 import engine, timing
-from spikeloom.runtime.machines.loihi1.costs import cost, energy
+from spikeloom.runtime.machines.loihi1.costs import cost
 
 LOIHI = load_target("loihi1")
 (SANAFE,) = LOIHI.time
@@ -115,10 +115,10 @@ def test_the_published_energies_to_the_decimal():
     updated = sanafe_counts.updates(netlist, events[None], trace.spikes[None], trace.membranes[None])[0]
     # o fired in step 2 on what arrived; its current still holds that in step 3, and nothing else happens to it
     assert np.argwhere(trace.updated & ~updated).tolist() == [[3, 2]]
-    updates = energy.updates_by_core(netlist, updated[:, None])
-    amounts = energy.count_by_core(netlist, LOIHI, counts, updates, 1, input_tiles=(0,))
+    updates = cost.updates_by_core(netlist, updated[:, None])
+    amounts = cost.count_by_core(netlist, LOIHI, counts, updates, 1, input_tiles=(0,))
     (fit,) = (entry for entry in LOIHI.energy if entry.name == "sanafe")
-    parts = energy.by_part(fit, amounts)
+    parts = cost.by_part(fit, amounts)
     assert {part: (1e12 * joules.sum(axis=1)).round(1).tolist() for part, joules in parts.items()} == ENERGY_PJ
 
 
@@ -309,23 +309,23 @@ def test_parts_and_cores_add_up_to_the_estimate():
     lengths = np.array([12, 5, 0])
     trace = engine.simulate(netlist, events, lengths=lengths, spikes=True, updated=True)
     estimate = cost.estimate(cost.prepare(netlist, LOIHI), trace.counts, lengths)
-    updates = energy.updates_by_core(netlist, trace.updated)
-    amounts = energy.count_by_core(netlist, LOIHI, trace.counts, updates, lengths + netlist.max_depth)
+    updates = cost.updates_by_core(netlist, trace.updated)
+    amounts = cost.count_by_core(netlist, LOIHI, trace.counts, updates, lengths + netlist.max_depth)
     assert all(amount.shape == (3, netlist.n_cores) for amount in amounts.values())
     for event, amount in amounts.items():
         np.testing.assert_allclose(amount.sum(axis=1), estimate.events[event].sum(axis=1), err_msg=event)
         assert amount.any(), event
     for priced in LOIHI.energy:
         for found in (amounts, estimate.events):
-            whole = sum(joules.sum(axis=1) for joules in energy.by_part(priced, found).values())
+            whole = sum(joules.sum(axis=1) for joules in cost.by_part(priced, found).values())
             np.testing.assert_allclose(whole, estimate.energy[priced.name].sum(axis=1), rtol=1e-12)
 
 
 def test_amounts_of_a_core_are_its_own():
     netlist, _, trace = six_steps()
     counts = replace(trace.counts, inputs=trace.counts.inputs[None], spikes=trace.counts.spikes[None])
-    updates = energy.updates_by_core(netlist, trace.updated[None])
-    amounts = energy.count_by_core(netlist, LOIHI, counts, updates, 6)
+    updates = cost.updates_by_core(netlist, trace.updated[None])
+    amounts = cost.count_by_core(netlist, LOIHI, counts, updates, 6)
     # h0 fires twice and h1 once, all to o; o fires twice, to nobody; six events reach two neurons each
     assert amounts["spike"].tolist() == [[3, 2]]
     assert amounts["packet"].tolist() == amounts["hop_east_west"].tolist() == [[3, 0]]
@@ -333,11 +333,11 @@ def test_amounts_of_a_core_are_its_own():
     assert amounts["synaptic_operation_dense"].tolist() == [[12, 3]]
     assert amounts["neuron_active"].tolist() == updates.tolist()
     assert amounts["neuron_idle"].tolist() == [[12 - updates[0, 0], 6 - updates[0, 1]]]
-    fed = energy.count_by_core(netlist, LOIHI, counts, updates, 6, input_tiles=(0,))
+    fed = cost.count_by_core(netlist, LOIHI, counts, updates, 6, input_tiles=(0,))
     assert fed["packet"].tolist() == [[3, 0, 6]]
     assert fed["hop_north_south"].tolist() == [[0, 0, 6]]
     assert fed["neuron_idle"][:, 2:].tolist() == [[0]]
-    sparse = energy.count_by_core(netlist, LOIHI, counts, updates, 6, dense=np.zeros(netlist.n_synapses, np.bool_))
+    sparse = cost.count_by_core(netlist, LOIHI, counts, updates, 6, dense=np.zeros(netlist.n_synapses, np.bool_))
     assert sparse["synaptic_operation_sparse"].tolist() == [[12, 3]]
     assert not sparse["synaptic_operation_dense"].any()
 
@@ -345,12 +345,12 @@ def test_amounts_of_a_core_are_its_own():
 def test_a_table_that_lacks_a_price_says_so():
     netlist, _, trace = six_steps()
     counts = replace(trace.counts, inputs=trace.counts.inputs[None], spikes=trace.counts.spikes[None])
-    amounts = energy.count_by_core(netlist, LOIHI, counts, energy.updates_by_core(netlist, trace.updated[None]), 6)
+    amounts = cost.count_by_core(netlist, LOIHI, counts, cost.updates_by_core(netlist, trace.updated[None]), 6)
     (davies,) = (entry for entry in LOIHI.energy if entry.name == "davies2018")
     prices = {event: price for event, price in davies.prices.items() if event != "packet"}
-    assert energy.by_part(replace(davies, prices=prices), amounts) == ("packet",)
-    assert set(energy.PARTS) == {"synapse", "soma", "network"}
-    assert sorted(event for events in energy.PARTS.values() for event in events) == sorted(cost.EVENTS)
+    assert cost.by_part(replace(davies, prices=prices), amounts) == ("packet",)
+    assert set(cost.PARTS) == {"synapse", "soma", "network"}
+    assert sorted(event for events in cost.PARTS.values() for event in events) == sorted(cost.EVENTS)
 
 
 @pytest.mark.parametrize("dense", [True, False])

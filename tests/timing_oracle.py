@@ -216,8 +216,7 @@ def simple(clock: Clock, spikes: BoolArray, updated: BoolArray, events: EventArr
         return matrix
 
     own = np.arange(slots)
-    sweep = by(own, tables.sender, tables.access[tables.sender], slots).sum(axis=0)
-    generation = fired @ by(own, tables.sender, tables.sending, slots) + sweep
+    generation = fired @ by(own, tables.sender, tables.sending, slots)
     generation += works @ by(own, tables.sender, tables.update[tables.sender], slots)
     slot = np.repeat(own, np.diff(tables.first))
     processing = fired @ by(slot, tables.destination, tables.processing, slots)
@@ -225,4 +224,4 @@ def simple(clock: Clock, spikes: BoolArray, updated: BoolArray, events: EventArr
         channel = np.repeat(np.arange(clock.netlist.n_inputs), np.diff(tables.channel_first))
         processing += seen @ by(channel, tables.channel_destination, tables.channel_processing, seen.shape[2])
     sums = np.concatenate([generation, processing], axis=2) * within[..., None]
-    return simple_times(clock, sums, np.zeros(cores, np.int64), ran)
+    return simple_times(clock, sums, ran)

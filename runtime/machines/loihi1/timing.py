@@ -35,6 +35,7 @@ from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.runtime.machines.loihi1.engine import EventArray
 from spikeloom.runtime.machines.loihi1.timing_kernel import Steps, Tables, conclude, schedule
+from spikeloom.runtime.machines.loihi1.trace import Charges
 
 EAST, WEST, NORTH, SOUTH, PORTS = range(5)
 """Links of a tile: one that messages enter by for each direction in which they travel, then its cores' own ports."""
@@ -217,17 +218,40 @@ def _slots(
     return np.concatenate([fired, sent], 2), np.concatenate([worked, sent], 2), seen[:, :, :0]
 
 
-def simple_times(clock: Clock, sums: IntArray, sweep: IntArray, steps: IntArray) -> SimpleTimes:
-    """Times of the simple model from what each core does in each step.
+def charges(clock: Clock) -> Charges:
+    """What events add to each core's picoseconds of sweep and sending, then to those of receiving: ``2 * cores`` sums.
 
-    `sums` (samples, chip steps, 2 * cores) are picoseconds of each core's sweep and sending, then of its receiving;
-    `sweep` (cores,) those that each sweep takes beyond that; `steps` (samples,) the chip steps of each recording.
+    The engine adds them up as it runs, without spike trains. The input channels of the clock's netlist are on no core.
     """
-    samples, length = sums.shape[:2]
-    cores = len(sweep)
+    tables, netlist = clock.tables, clock.netlist
+    cores, core, every = netlist.n_cores, netlist.core_of_compartment(), np.arange(netlist.n_compartments)
+    spikes, updates = np.zeros((2, netlist.n_compartments, 2 * cores), np.int64)
+    messages = np.diff(tables.first)
+    spikes[every, core] = tables.spike[core] + messages * tables.axon_out
+    np.add.at(spikes, (np.repeat(every, messages), cores + tables.destination), tables.processing)
+    updates[every, core] = tables.update[core]
+    channels = np.zeros((netlist.n_inputs, 2 * cores), np.int64)
+    channel = np.repeat(np.arange(netlist.n_inputs), np.diff(tables.channel_first))
+    np.add.at(channels, (channel, cores + tables.channel_destination), tables.channel_processing)
+    return Charges(channels=channels, spikes=spikes, updates=updates)
+
+
+def simple_times(clock: Clock, charged: IntArray, steps: IntArray) -> SimpleTimes:
+    """Times of the simple model from what :func:`charges` added up to, (samples, chip steps, 2 * cores) int64.
+
+    `steps` (samples,) are the chip steps of each recording. Raises DataError if the sums are of another netlist.
+    """
+    cores = len(clock.core_tile)
+    if charged.ndim != 3 or charged.shape[::2] != (len(steps), 2 * cores):
+        raise DataError(
+            f"trace: sums {charged.shape} of {len(steps)} recordings found, the netlist has {cores} "
+            "cores; give (recordings, chip steps, twice the cores), charged for this netlist"
+        )
+    samples, length = charged.shape[:2]
     duration, critical = np.zeros((samples, length)), np.full((samples, length), -1)
     each, receiving = np.zeros((samples, 2 * cores), np.int64), np.zeros((samples, length), np.bool_)
-    conclude(sums, sweep, steps, clock.barrier, duration, each, critical, receiving)
+    sweep = np.diff(clock.tables.start) * clock.tables.access
+    conclude(charged, sweep, steps, clock.barrier, duration, each, critical, receiving)
     return SimpleTimes(
         duration_ns=duration / PICOSECONDS,
         generation_ns=each[:, :cores] / PICOSECONDS,

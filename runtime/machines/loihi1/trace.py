@@ -6,6 +6,7 @@ order of the netlist's ids. A batch of recordings adds one leading axis to every
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -44,6 +45,12 @@ class Charges:
     spikes: IntArray  # (compartments, sums) int64; by a spike of each compartment
     # (compartments, sums) int64; by an update of each compartment. All three are below 2**31 in magnitude.
     updates: IntArray
+
+
+def side_by_side(parts: Sequence[Charges]) -> Charges:
+    """Several charges as one: the sums of each after those before it."""
+    names = ("channels", "spikes", "updates")
+    return Charges(**{name: np.concatenate([getattr(part, name) for part in parts], axis=1) for name in names})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

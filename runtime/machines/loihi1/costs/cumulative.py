@@ -15,8 +15,8 @@ from spikeloom.compiler.targets.loihi1.netlist import Netlist, one_step_bounds
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.runtime.machines.integer import LONGEST, Cumulative
 from spikeloom.runtime.machines.loihi1 import engine, timing
-from spikeloom.runtime.machines.loihi1.costs import cost, simple_times
-from spikeloom.runtime.machines.loihi1.trace import Charges
+from spikeloom.runtime.machines.loihi1.costs import cost
+from spikeloom.runtime.machines.loihi1.trace import Charges, side_by_side
 
 
 def read_out_depth(netlist: Netlist) -> int:
@@ -82,8 +82,8 @@ def run(netlist: Netlist, target: Target, events: engine.EventArray, lengths: In
     timed = target.time if chip_count(netlist.core_tile, target) == 1 else ()
     clocks = [timing.prepare(netlist, target, table) for table in timed]
     meter = cost.prepare(netlist, target)
-    parts = [vote_charges(netlist), _event_charges(meter), *(simple_times.charges(clock) for clock in clocks)]
-    prepared = engine.prepare(netlist, charges=simple_times.side_by_side(parts))
+    parts = [vote_charges(netlist), _event_charges(meter), *(timing.charges(clock) for clock in clocks)]
+    prepared = engine.prepare(netlist, charges=side_by_side(parts))
     trace = engine.simulate(prepared, events, lengths=lengths)
     assert trace.charged is not None, "sums were wanted"
     ends = np.cumsum([part.spikes.shape[1] for part in parts])[:-1]
@@ -101,7 +101,7 @@ def run(netlist: Netlist, target: Target, events: engine.EventArray, lengths: In
         operations=np.cumsum(operations, axis=1),
         energy={name: np.cumsum(each, axis=1) for name, each in found.items() if not isinstance(each, tuple)},
         time={
-            table.name: np.cumsum(simple_times.simple_from(clock, own, chip_steps).duration_ns, axis=1) * 1e-9
+            table.name: np.cumsum(timing.simple_times(clock, own, chip_steps).duration_ns, axis=1) * 1e-9
             for table, clock, own in zip(timed, clocks, times, strict=True)
         },
     )

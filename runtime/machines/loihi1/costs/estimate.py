@@ -21,10 +21,10 @@ from spikeloom.compiler.targets.loihi1.layout.chips import chip_count, require_o
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.runtime.machines.loihi1 import engine, timing
-from spikeloom.runtime.machines.loihi1.costs import cost, energy, simple_times
+from spikeloom.runtime.machines.loihi1.costs import cost
 from spikeloom.runtime.machines.loihi1.costs.cost import Costs
 from spikeloom.runtime.machines.loihi1.timing import DetailedTimes, SimpleTimes
-from spikeloom.runtime.machines.loihi1.trace import Counts
+from spikeloom.runtime.machines.loihi1.trace import Counts, side_by_side
 
 PART = 16
 """Recordings whose spikes are kept at a time in detail ``cycle``."""
@@ -95,14 +95,14 @@ def estimate(
     if charged is not None:
         sums = np.split(charged, len(clocks), axis=2)
         simple = {
-            name: simple_times.simple_from(clock, own, steps + prepared.drain)
+            name: timing.simple_times(clock, own, steps + prepared.drain)
             for (name, clock), own in zip(clocks.items(), sums, strict=True)
         }
     costs = cost.estimate(cost.prepare(netlist, target), counts, steps)
-    parts = {prices.name: energy.by_part(prices, costs.events) for prices in target.energy}
+    parts = {prices.name: cost.by_part(prices, costs.events) for prices in target.energy}
     cores: dict[str, FloatArray] = {}
     if detail == "cycle":
-        by_core = energy.count_by_core(netlist, target, counts, updates, steps + netlist.max_depth)
+        by_core = cost.count_by_core(netlist, target, counts, updates, steps + netlist.max_depth)
         for prices in target.energy:
             found = cost.price(prices, by_core)
             if not isinstance(found, tuple):
@@ -121,7 +121,7 @@ def _charged(netlist: Netlist, clocks: Mapping[str, timing.Clock]) -> engine.Eng
     """An engine that adds up the times of the simple model, one table's after the other's."""
     if not clocks:
         return engine.prepare(netlist)
-    wanted = simple_times.side_by_side([simple_times.charges(clock) for clock in clocks.values()])
+    wanted = side_by_side([timing.charges(clock) for clock in clocks.values()])
     return engine.prepare(netlist, charges=wanted)
 
 
@@ -143,7 +143,7 @@ def _deep(
         assert trace.updated is not None, "updates were wanted"
         counts.append(trace.counts)
         charged += [] if trace.charged is None else [trace.charged]
-        updates.append(energy.updates_by_core(prepared.netlist, trace.updated))
+        updates.append(cost.updates_by_core(prepared.netlist, trace.updated))
         own = steps[part] + prepared.drain
         given = events[part] * (np.arange(events.shape[2]) < steps[part, None, None])  # nothing after a recording's end
         for name, clock in clocks.items():
