@@ -36,14 +36,14 @@ def totals(netlist: Netlist) -> Run:
 def counts(netlist: Netlist) -> Run:
     """Events and energy of every recording, and the time of every step by the simple model."""
     chip = load_target(netlist.target)
-    clock, meter = timing.prepare(netlist, chip, chip.time[0]), cost.prepare(netlist, chip)
-    engine = prepare(netlist, charges=timing.charges(clock))
+    latencies, meter = timing.prepare(netlist, chip, chip.time[0]), cost.prepare(netlist, chip)
+    engine = prepare(netlist, charges=timing.charges(latencies))
 
     def run(events: Any) -> Trace:
         trace = simulate(engine, events, threads=1)
         assert trace.charged is not None
         steps = np.full(len(events), events.shape[2])
-        timing.simple_times(clock, trace.charged, steps + engine.drain)
+        timing.simple_times(latencies, trace.charged, steps + engine.drain)
         cost.estimate(meter, trace.counts, steps)
         return trace
 
@@ -53,8 +53,8 @@ def counts(netlist: Netlist) -> Run:
 def cycle(netlist: Netlist) -> Run:
     """The same, and the time of every step with queues and mesh."""
     chip = load_target(netlist.target)
-    clock, meter = timing.prepare(netlist, chip, chip.time[0]), cost.prepare(netlist, chip)
-    engine = prepare(netlist, charges=timing.charges(clock))
+    latencies, meter = timing.prepare(netlist, chip, chip.time[0]), cost.prepare(netlist, chip)
+    engine = prepare(netlist, charges=timing.charges(latencies))
 
     def run(events: Any) -> Trace:
         trace = simulate(engine, events, threads=1, spikes=True, updated=True)
@@ -62,8 +62,8 @@ def cycle(netlist: Netlist) -> Run:
         assert trace.updated is not None
         assert trace.charged is not None
         steps = np.full(len(events), events.shape[2])
-        timing.simple_times(clock, trace.charged, steps + engine.drain)
-        timing.detailed(clock, trace.spikes, trace.updated, events)
+        timing.simple_times(latencies, trace.charged, steps + engine.drain)
+        timing.detailed(latencies, trace.spikes, trace.updated, events)
         cost.estimate(meter, trace.counts, events.shape[2])
         return trace
 

@@ -180,7 +180,7 @@ def test_any_split_into_steps_is_the_batch(cuts, seed):
     for begin, end in itertools.pairwise(sorted({0, *cuts, 30 + netlist.max_depth})):
         part = {name: array[begin:end] for name, array in kept.items()}
         engine.advance(prepared, state, events[0, :, begin:end], length=30, steps=end - begin, **part)
-        assert state.clock[0] == end
+        assert state.counter[0] == end
     for name in KEPT:
         np.testing.assert_array_equal(kept[name], getattr(whole, name), strict=True)
     np.testing.assert_array_equal(state.spikes, whole.counts.spikes)

@@ -42,15 +42,15 @@ def found(small):
 def test_sums_of_the_engine_give_the_simple_times(small, stepwise):
     netlist, recordings = small
     (times,) = LOIHI.time
-    clock = timing.prepare(netlist, LOIHI, times)
-    prepared = engine.prepare(netlist, stepwise=stepwise, charges=timing.charges(clock))
+    latencies = timing.prepare(netlist, LOIHI, times)
+    prepared = engine.prepare(netlist, stepwise=stepwise, charges=timing.charges(latencies))
     trace = engine.simulate(prepared, recordings, lengths=LENGTHS, spikes=True, updated=True)
     ran = LENGTHS + netlist.max_depth
     cut = recordings.copy()
     for recording, length in zip(cut, LENGTHS, strict=True):
         recording[:, length:] = 0
-    expected = timing_oracle.simple(clock, trace.spikes, trace.updated, cut, steps=ran)
-    quick = timing.simple_times(clock, trace.charged, ran)
+    expected = timing_oracle.simple(latencies, trace.spikes, trace.updated, cut, steps=ran)
+    quick = timing.simple_times(latencies, trace.charged, ran)
     for field in dataclasses.fields(expected):
         np.testing.assert_array_equal(getattr(quick, field.name), getattr(expected, field.name), err_msg=field.name)
     assert (expected.duration_ns > 0).sum() == ran.sum()
@@ -127,9 +127,9 @@ def test_the_range_names_both_ends(small, found):
 
 def test_a_trace_that_does_not_belong_to_the_netlist(small):
     netlist, recordings = small
-    clock = timing.prepare(netlist, LOIHI, LOIHI.time[0])
+    latencies = timing.prepare(netlist, LOIHI, LOIHI.time[0])
     trace = engine.simulate(
-        engine.prepare(netlist, charges=timing.charges(clock)), recordings, spikes=True, updated=True
+        engine.prepare(netlist, charges=timing.charges(latencies)), recordings, spikes=True, updated=True
     )
     n, inputs, cores = netlist.n_compartments, netlist.n_inputs, netlist.n_cores
     less = trace.spikes[..., :-1]
@@ -140,9 +140,9 @@ def test_a_trace_that_does_not_belong_to_the_netlist(small):
         (trace.spikes, trace.updated, recordings[:2]),
     ):
         with pytest.raises(DataError, match=f"updates .* found, the netlist has {n} compartments and {inputs} input"):
-            timing.detailed(clock, spikes, updated, given)
+            timing.detailed(latencies, spikes, updated, given)
     with pytest.raises(DataError, match=rf"{2 * cores - 1}\) of 4 recordings found, the netlist has {cores} cores"):
-        timing.simple_times(clock, trace.charged[..., :-1], LENGTHS)
+        timing.simple_times(latencies, trace.charged[..., :-1], LENGTHS)
     counts = dataclasses.replace(trace.counts, spikes=trace.counts.spikes[:, 1:])
     layers = len(netlist.layers)
     with pytest.raises(

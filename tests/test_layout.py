@@ -93,8 +93,8 @@ def test_expectations_are_the_simple_model_and_the_prices_of_the_same_spikes(dat
     spikes = np.zeros((len(events), length + depth, netlist.n_compartments), bool)
     for layer, late in enumerate(depths(network)):
         spikes[:, late : late + length, netlist.compartments_of(layer)] = calibration.spikes[layer]
-    clock = timing.prepare(netlist, target, target.time[0])
-    found = timing_oracle.simple(clock, spikes, np.ones_like(spikes), events.transpose(0, 2, 1).astype(np.uint8))
+    latencies = timing.prepare(netlist, target, target.time[0])
+    found = timing_oracle.simple(latencies, spikes, np.ones_like(spikes), events.transpose(0, 2, 1).astype(np.uint8))
     expected = layout.expected
     assert expected.step_ns == pytest.approx(found.duration_ns.mean(), rel=1e-12)
     often = np.bincount(found.critical_core.ravel(), minlength=netlist.n_cores)

@@ -104,9 +104,9 @@ def compare(python: str, netlist: Netlist, events: np.ndarray, folder: Path) -> 
     trace = engine.simulate(engine.prepare(netlist, gated=False), shifted, spikes=True, membranes=True)
     updated = sanafe_counts.updates(netlist, shifted, trace.spikes, trace.membranes)
     as_priced = {"input_tiles": sanafe.input_tiles(netlist, LOIHI), "dense": sanafe_counts.dense_synapses(netlist)}
-    clock = timing.prepare(netlist, LOIHI, SANAFE, **as_priced)
+    latencies = timing.prepare(netlist, LOIHI, SANAFE, **as_priced)
     batch = trace.spikes, updated, shifted
-    simple, detailed = timing_oracle.simple(clock, *batch), timing.detailed(clock, *batch)
+    simple, detailed = timing_oracle.simple(latencies, *batch), timing.detailed(latencies, *batch)
     updates = cost.updates_by_core(netlist, updated)
     parts = cost.by_part(FIT, cost.count_by_core(netlist, LOIHI, trace.counts, updates, steps, **as_priced))
 

@@ -37,9 +37,9 @@ def table(link_buffer=16, **latencies):
 
 def both(netlist, trace, events, *, times=SANAFE, input_tiles=()):
     """Simple and detailed times of one recording."""
-    clock = timing.prepare(netlist, LOIHI, times, input_tiles=input_tiles)
+    latencies = timing.prepare(netlist, LOIHI, times, input_tiles=input_tiles)
     batch = trace.spikes[None], trace.updated[None], events[None]
-    return timing_oracle.simple(clock, *batch), timing.detailed(clock, *batch)
+    return timing_oracle.simple(latencies, *batch), timing.detailed(latencies, *batch)
 
 
 def assert_as_defined(netlist, trace, events, *, times=SANAFE, input_tiles=()):
@@ -263,12 +263,12 @@ def test_a_sender_waits_while_its_links_are_full():
 
 def test_a_recording_ends_with_its_own_steps():
     netlist, events, trace = six_steps()
-    clock = timing.prepare(netlist, LOIHI, SANAFE)
+    latencies = timing.prepare(netlist, LOIHI, SANAFE)
     batch = [np.stack([a, a]) for a in (trace.spikes, trace.updated, events)]
     cut = [a[:4].copy() for a in (trace.spikes, trace.updated)]
     for model in (timing_oracle.simple, timing.detailed):
-        found = model(clock, *batch, steps=np.array([6, 4]))
-        alone = model(clock, cut[0][None], cut[1][None], events[None])
+        found = model(latencies, *batch, steps=np.array([6, 4]))
+        alone = model(latencies, cut[0][None], cut[1][None], events[None])
         for field in fields(found):
             whole, part = getattr(found, field.name), getattr(alone, field.name)
             if whole.shape[1] == 6:
@@ -292,10 +292,10 @@ def test_input_cores_go_where_there_is_room():
 
 def test_input_channels_spread_over_their_cores():
     netlist = replace(six_steps()[0], taxels=1500)
-    clock = timing.prepare(netlist, LOIHI, SANAFE, input_tiles=(3, 4))
+    latencies = timing.prepare(netlist, LOIHI, SANAFE, input_tiles=(3, 4))
     size = netlist.n_compartments
-    assert clock.tables.start.tolist() == [0, 2, size, size + 1024, size + 1500]
-    assert clock.barrier == 1400 * PICO  # four tiles
+    assert latencies.tables.start.tolist() == [0, 2, size, size + 1024, size + 1500]
+    assert latencies.barrier == 1400 * PICO  # four tiles
 
 
 # -- energy by part and core -------------------------------------------------------------------------------------------

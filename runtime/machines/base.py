@@ -1,7 +1,8 @@
-"""What every chip offers to those who run, price, show and stream netlists; nobody else asks which chip it is.
+"""What every chip offers to those who run, price, show and stream netlists.
 
 A machine is found by the target that its netlist names: the module ``machines/NAME/machine.py`` of the target
-``compiler/targets/NAME``. A further chip is these two folders and no line elsewhere.
+``compiler/targets/NAME``. What only some chips do in their own way stands in modules beside it, see
+:func:`chip_commands` and :func:`chip_chart`; formats of other programs are listed in ``machines/exports.py``.
 """
 
 from __future__ import annotations
@@ -40,10 +41,7 @@ ENGINES = ("spikeloom", "onnx")
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Run:
-    """What a chip made of recordings: votes (samples, classes) int64, and by layer what was kept.
-
-    Spikes and membranes are (samples, steps, neurons), bool and int32.
-    """
+    """Votes (samples, classes) int64 and, by layer, spikes and membranes (samples, steps, neurons) where kept."""
 
     votes: IntArray
     spikes: Mapping[str, BoolArray] | None = None
@@ -60,13 +58,11 @@ class Price:
     """What recordings cost, in the terms that all chips share."""
 
     synaptic_operations: IntArray | FloatArray  # (samples,)
-    # energy_j, time_s: Joules and seconds of each recording
-    energy_j: Mapping[str, FloatArray]
+    energy_j: Mapping[str, FloatArray]  # By table, of each recording
     time_s: Mapping[str, FloatArray]
     step_s: Mapping[str, float]  # Seconds of the longest data step
     outcome: Outcome  # All that the chip's own price model knows, with its layout
-    # The same in nanoseconds, not rounded to seconds, where the time model counts them
-    time_ns: Mapping[str, FloatArray] = field(default_factory=dict)
+    time_ns: Mapping[str, FloatArray] = field(default_factory=dict)  # Not rounded to seconds, where counted
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,10 +77,9 @@ class Beside:
 class Step:
     """What one chip step brought."""
 
-    index: int  # Chip step, from 0; while events come in, also the index of the bin
-    # Who spiked in this chip step: one array for each layer, ordered by neuron; read-only
-    spikes: tuple[BoolArray, ...]
-    counts: IntArray  # (classes,) int64; votes for each class since the grasp began; read-only
+    index: int  # From 0; while events come in, also the index of the bin
+    spikes: tuple[BoolArray, ...]  # Who spiked in it, by layer and neuron; read-only
+    counts: IntArray  # (classes,) int64; votes since the grasp began; read-only
 
     @property
     def decision(self) -> int:
@@ -168,23 +163,11 @@ class Machine(ABC):
         membranes: bool = False,
         threads: int | None = None,
     ) -> Run:
-        """Run recordings, each from rest.
+        """Run recordings, each from rest, some `threads` at a time (by default one per processor).
 
-        Parameters
-        ----------
-        events : (samples, taxels, polarities, steps) uint8 or bool
-            Any value but zero is an event; the network's clocks tick by themselves.
-        lengths : (samples,) int64, optional
-            Data steps of each where some are shorter.
-        spikes, membranes : bool
-            Keep them.
-        threads : int, optional
-            Recordings at a time, by default one per processor.
-
-        Raises
-        ------
-        DataError, NumericRangeError
-            If they are of another sensor, or a register overflows.
+        `events` are (samples, taxels, polarities, steps), any value but zero an event; the network's clocks tick by
+        themselves. `lengths` (samples,) are the data steps of each; `spikes` and `membranes` say what to keep. Raises
+        DataError for another sensor, NumericRangeError where a register overflows.
         """
 
     @abstractmethod
@@ -199,25 +182,11 @@ class Machine(ABC):
         spikes: bool = False,
         progress: Callable[[int], object] | None = None,
     ) -> tuple[Run, Price]:
-        """Run recordings and price them.
+        """Run recordings as :meth:`run` does, and price them.
 
-        Parameters
-        ----------
-        events, lengths, spikes
-            As for `run`.
-        bin_s : float
-            Seconds of a bin at the pace of the sensor.
-        detail : str
-            One of `details`.
-        table : str, optional
-            Name of a table of prices, or a TOML file with some.
-        progress : callable, optional
-            Called with the number of recordings that are done.
-
-        Raises
-        ------
-        OptionError
-            If there is no such table or detail.
+        `bin_s` are the seconds of a bin at the pace of the sensor, `detail` is one of `details`, `table` the name of a
+        table of prices or a TOML file with some; `progress` is called with the number of recordings done. Raises
+        OptionError if there is no such table or detail.
         """
 
     @abstractmethod
@@ -225,13 +194,7 @@ class Machine(ABC):
         """Spikes, membranes and counts in which simulator and specification differ; events and lengths as for `run`."""
 
     def require_engine(self, engine: str) -> None:
-        """Make ready whatever :meth:`beside` will run.
-
-        Raises
-        ------
-        OptionError, ModelError
-            If the other program cannot run this chip's netlists, is not installed, or cannot hold this one.
-        """
+        """Make ready what :meth:`beside` will run; OptionError or ModelError if it cannot."""
         if engine != ENGINES[0]:
             raise OptionError(f"--engine {engine}: is not for {self.target.title}; omit it")
 
@@ -240,13 +203,7 @@ class Machine(ABC):
         raise NotImplementedError
 
     def require_sensor(self, events: EventArray) -> None:
-        """Refuse recordings of another sensor.
-
-        Raises
-        ------
-        DataError
-            If they have another number of input channels.
-        """
+        """Refuse recordings with another number of input channels: a DataError."""
         found, due = events.shape[1] * events.shape[2], self.netlist.taxels * self.netlist.polarities
         if found != due:
             raise DataError(
@@ -318,16 +275,9 @@ def trained_for(path: object) -> Any | None:
 
 
 def compiled(compilation: Any, sha256: str, facts: Sequence[str]) -> Outcome:
-    """What a compilation chose, proved and removed, as its chip shows it: its module ``compiled``.
+    """What the target's ``compile`` chose, proved and removed, as the chip's module ``compiled`` shows it.
 
-    Parameters
-    ----------
-    compilation
-        What the target's ``compile`` gave.
-    sha256 : str
-        Of the file that its netlist was written to.
-    facts : sequence of str
-        What was read from a file of another format.
+    `sha256` is of the netlist's file; `facts` are what was read from a file of another format.
     """
     own: Any = _own_module(compilation.netlist.target, "compiled")
     outcome: Outcome = own.outcome(compilation, sha256, facts)

@@ -72,14 +72,7 @@ class IntegerMachine(Machine):
 
     @abstractmethod
     def cumulative(self, events: EventArray, lengths: IntArray) -> Cumulative:
-        """Votes and costs step by step, from one run.
-
-        Parameters
-        ----------
-        events : (samples, taxels, polarities, steps) uint8 or bool
-        lengths : (samples,) int64
-            Data steps of each.
-        """
+        """Votes and costs step by step, from one run; `lengths` (samples,) are the data steps of each recording."""
 
     @abstractmethod
     def votes_by_step(self, events: EventArray, lengths: IntArray) -> IntArray:
@@ -106,12 +99,8 @@ class IntegerMachine(Machine):
     def packed(self, channels: EventArray, lengths: IntArray) -> tuple[npt.NDArray[np.uint64], IntArray]:
         """Spikes at a bit each, (samples, chip steps, words), and membranes that were clipped, (samples,), on a thread.
 
-        Bits are in the order of the netlist's neurons; channels (samples, channels, steps) include the clocks.
-
-        Raises
-        ------
-        NumericRangeError
-            If a register overflows in any recording.
+        Bits are in the order of the netlist's neurons; channels (samples, channels, steps) include the clocks. Raises
+        NumericRangeError if a register overflows in any recording.
         """
 
     @abstractmethod
@@ -132,13 +121,7 @@ LONGEST = 4096
 
 
 def integer_machine(machine: Machine) -> IntegerMachine:
-    """The same machine, if a float model can be compared with it.
-
-    Raises
-    ------
-    OptionError
-        If not.
-    """
+    """The same machine, if a float model can be compared with it; else an OptionError."""
     if not isinstance(machine, IntegerMachine):
         raise OptionError(
             f"{machine.target.title}: is not compared with a float model neuron by neuron; give a netlist for "

@@ -86,29 +86,13 @@ def advance(
     membranes: MembraneArray | None = None,
     updated: BoolArray | None = None,
 ) -> None:
-    """Run some chip steps; any split of a recording into calls gives the same result.
+    """Run some chip steps, by default one per column; any split of a recording into calls gives the same result.
 
-    Parameters
-    ----------
-    engine : Engine
-        The network, prepared for single steps.
-    state : State
-        Of :func:`kernel.state_of`; changed in place. After an error it is of no further use.
-    events : (n_inputs, columns) uint8 or bool
-        Events of the data steps from ``state.clock[0]`` on; steps beyond the last column have none.
-    length : int
-        Data steps of the whole recording, which close each layer's window; any large number if it has no end.
-    steps : int, optional
-        How many chip steps to run; by default one per column.
-    spikes, membranes, updated : (steps, compartments), optional
-        Arrays to fill, see :class:`trace.Trace`.
-
-    Raises
-    ------
-    DataError
-        If the events have another number of input channels than the network.
-    NumericRangeError
-        As :func:`spec.simulate` does, with the same message.
+    Column 0 of `events` (n_inputs, columns) belongs to the next step of `state`, see :func:`kernel.state_of`; steps
+    beyond the last column have no events. `length` are the data steps of the whole recording, which close each layer's
+    window; any large number if it has no end. `spikes`, `membranes`, `updated` (steps, compartments) are filled, see
+    :class:`trace.Trace`. Raises DataError and NumericRangeError as :func:`spec.simulate` does, with the same message;
+    after that the state is of no further use.
     """
     check_channels(engine.netlist, events.shape[0])
     assert engine.tables is not None, "single steps need prepare(netlist, stepwise=True)"
@@ -139,37 +123,15 @@ def simulate(
     threads: int | None = None,
     progress: Callable[[int], object] | None = None,
 ) -> Trace:
-    """Run a batch of recordings through the chip, each from rest.
+    """Run a batch of recordings (recordings, n_inputs, T) uint8 or bool, each from rest; the trace has a leading axis.
 
-    Parameters
-    ----------
-    netlist : Netlist or Engine
-        The placed network; :func:`prepare` it once to run several batches.
-    events : (recordings, n_inputs, T) uint8 or bool
-        Input events; any value but zero is an event.
-    lengths : (recordings,) int64, optional
-        Steps of each recording where some are shorter than T. What comes after them is not run: zeros in the trace.
-    spikes, membranes, updated : bool
-        Whether to keep these per chip step: one, four and one bytes for each recording, chip step and compartment.
-    packed : bool
-        Whether to keep spikes at a bit each.
-    threads : int, optional
-        Recordings that run at the same time, by default one per processor. Results do not depend on it.
-    progress : callable, optional
-        Called in the calling thread with the number of recordings finished so far.
+    `lengths` (recordings,) are the data steps of each where some are shorter: what comes after them is not run and
+    zero in the trace. `spikes`, `membranes`, `updated` say what to keep per chip step (one, four and one bytes for each
+    compartment), `packed` keeps spikes at a bit each. Recordings run on `threads` at a time, by default one per
+    processor; `progress` is called with the number that is done.
 
-    Returns
-    -------
-    Trace
-        With one leading axis for the recordings.
-
-    Raises
-    ------
-    DataError
-        If the recordings have another number of input channels than the network.
-    NumericRangeError
-        As :func:`spec.simulate` does, with the same message, for the first recording that overflows; a note
-        on the exception says which.
+    Raises DataError for another number of channels, and NumericRangeError as :func:`spec.simulate` does, for the first
+    recording that overflows; a note on the exception says which.
     """
     engine = netlist if isinstance(netlist, Engine) else prepare(netlist)
     netlist = engine.netlist

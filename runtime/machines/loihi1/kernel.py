@@ -50,8 +50,8 @@ class Tables(NamedTuple):
 class State(NamedTuple):
     """Registers of a chip between two steps, and what was counted so far; changed in place by :func:`chip_steps`."""
 
-    clock: IntArray  # (2,) int64; next chip step; number of compartments that spiked in the last one
-    fired: IntArray  # Compartments that spiked in the last step, ``clock[1]`` of them, ascending
+    counter: IntArray  # (2,) int64; next chip step; number of compartments that spiked in the last one
+    fired: IntArray  # Compartments that spiked in the last step, ``counter[1]`` of them, ascending
     # current, membrane: (compartments,) int32; the two registers, after any reset
     current: AnyArray
     membrane: AnyArray
@@ -93,7 +93,7 @@ def state_of(netlist: Netlist) -> State:
     spikes, updates, saturations = np.zeros((3, n), np.int64)
     integrates, worked, flags = np.zeros((3, n), np.bool_)
     return State(
-        clock=np.zeros(2, np.int64),
+        counter=np.zeros(2, np.int64),
         fired=np.zeros(n + 1, np.int64),
         current=current,
         membrane=membrane,
@@ -136,12 +136,12 @@ def _kept(x: Any, factor: Any) -> Any:
 def _list_sources(state: State, events: AnyArray, t: int, length: int) -> Any:
     """List the channels with an event in column `t` and the compartments that spiked one step ago."""
     n = 0
-    if state.clock[0] < length and t < events.shape[1]:
+    if state.counter[0] < length and t < events.shape[1]:
         for channel in range(events.shape[0]):
             state.active[n] = channel
             n += events[channel, t]
             state.inputs[channel] += events[channel, t]
-    fired = state.clock[1]
+    fired = state.counter[1]
     state.active[n : n + fired] = events.shape[0] + state.fired[:fired]
     return n + fired
 
@@ -233,8 +233,8 @@ def _reset_and_count(state: State) -> None:
     for k in range(fired):
         state.membrane[listed[k]] = 0
         state.spikes[listed[k]] += 1
-    state.clock[0] += 1
-    state.clock[1] = fired
+    state.counter[0] += 1
+    state.counter[1] = fired
 
 
 @compiled_and_cached
@@ -254,7 +254,7 @@ def chip_steps(
     compartment, register and value of the first overflow; the chip step is -1 if there is none.
     """
     for t in range(steps):
-        step, current, membrane, integrates = state.clock[0], state.current, state.membrane, state.integrates
+        step, current, membrane, integrates = state.counter[0], state.current, state.membrane, state.integrates
         n = _list_sources(state, events, t, length)
         _deliver(tables, state, state.active[:n])
         _find_work(tables.depth, step, length, current, membrane, tables.bias, state.sums, integrates, state.worked)

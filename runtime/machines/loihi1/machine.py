@@ -24,6 +24,10 @@ from spikeloom.runtime.machines.base import Beside, EventArray, Price, Run, one_
 from spikeloom.runtime.machines.integer import Cumulative, IntegerMachine
 from spikeloom.runtime.machines.loihi1 import description, engine, spec
 from spikeloom.runtime.machines.loihi1.blocks import obstacle
+from spikeloom.runtime.machines.loihi1.costs import cumulative
+from spikeloom.runtime.machines.loihi1.costs.estimate import estimate
+from spikeloom.runtime.machines.loihi1.costs.result import cost_report
+from spikeloom.runtime.machines.loihi1.costs.sections import sections
 from spikeloom.runtime.machines.loihi1.stream import Stream, open_stream
 from spikeloom.runtime.machines.loihi1.trace import MembraneArray, aligned, differences
 from spikeloom.runtime.machines.page_parts import BatchParts, RecordingParts
@@ -147,28 +151,20 @@ class Loihi(IntegerMachine):
 
     def cumulative(self, events: EventArray, lengths: IntArray) -> Cumulative:
         """Sums that the engine adds up itself: no spike is kept."""
-        from spikeloom.runtime.machines.loihi1.costs import cumulative
-
         return cumulative.run(self.netlist, self.target, with_clocks(events, self.netlist.clocks), lengths)
 
     def votes_by_step(self, events: EventArray, lengths: IntArray) -> IntArray:
         """The same of votes."""
-        from spikeloom.runtime.machines.loihi1.costs import cumulative
-
         return cumulative.votes_of(self.netlist, with_clocks(events, self.netlist.clocks), lengths)
 
     @property
     def read_out_lag(self) -> int:
         """Depth of the latest layer that votes."""
-        from spikeloom.runtime.machines.loihi1.costs import cumulative
-
         return cumulative.read_out_depth(self.netlist)
 
     @property
     def least_intervals(self) -> IntArray:
         """From the largest sums of each compartment that votes."""
-        from spikeloom.runtime.machines.loihi1.costs import cumulative
-
         return cumulative.least_intervals(self.netlist)
 
     def spike_counts(self, events: EventArray, lengths: IntArray | None) -> IntArray:
@@ -208,10 +204,6 @@ class Loihi(IntegerMachine):
         progress: Callable[[int], object] | None = None,
     ) -> tuple[Run, Price]:
         """Decisions and costs, of the cores' tiles and times too."""
-        from spikeloom.runtime.machines.loihi1.costs.estimate import estimate
-        from spikeloom.runtime.machines.loihi1.costs.result import cost_report
-        from spikeloom.runtime.machines.loihi1.costs.sections import sections
-
         self.require_detail(detail)
         chip = self.target if table is None else with_tables(self.target, table)
         shape = len(events), events.shape[-1] + self.netlist.max_depth, self.netlist.n_compartments

@@ -54,7 +54,7 @@ class Stream:
     @property
     def index(self) -> int:
         """Chip steps run so far in this grasp."""
-        return int(self._state.clock[0])
+        return int(self._state.counter[0])
 
     def step(self, events: npt.ArrayLike) -> Step:
         """Run the chip step of one bin.
@@ -84,20 +84,9 @@ class Stream:
         return self._advance(NO_END)
 
     def finish(self) -> tuple[Step, ...]:
-        """End the grasp: run the chip steps by which the slowest layer lags behind the data.
+        """End the grasp: run the chip steps by which the slowest layer lags; the last one has the final counts.
 
-        Returns
-        -------
-        tuple of Step
-            ``netlist.max_depth`` of them, the last one with the final counts; none for a network without lag, whose
-            last step was final.
-
-        Raises
-        ------
-        DataError
-            If the stream has ended already.
-        NumericRangeError
-            If a register would overflow.
+        None for a network without lag, whose last step was final. Raises as :meth:`step` does.
         """
         if self._ended:
             raise DataError("stream: a second end found, a grasp has one; call reset() to begin the next grasp")
@@ -121,7 +110,7 @@ class Stream:
             self._ended = True
             raise
         spikes = np.zeros(self._bounds[-1][1], np.bool_)
-        spikes[self._place[state.fired[: state.clock[1]]]] = True
+        spikes[self._place[state.fired[: state.counter[1]]]] = True
         counts = class_counts(netlist, state.spikes[None])[0]
         spikes.flags.writeable = counts.flags.writeable = False
         return Step(index=index, spikes=tuple([spikes[begin:end] for begin, end in self._bounds]), counts=counts)

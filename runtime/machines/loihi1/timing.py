@@ -42,7 +42,7 @@ EAST, WEST, NORTH, SOUTH, PORTS = range(5)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Clock:
+class Latencies:
     """A netlist prepared for the time models by :func:`prepare`.
 
     `core_tile` has the tiles of the netlist's cores, then of those that hold input channels; `barrier` are the
@@ -115,7 +115,7 @@ def prepare(
     *,
     input_tiles: tuple[int, ...] = (),
     dense: BoolArray | None = None,
-) -> Clock:
+) -> Latencies:
     """Lay a netlist out for the time models.
 
     Parameters
@@ -190,14 +190,14 @@ def prepare(
         capacity=int(table.link_buffer.value),
     )
     used = len(np.unique(core_tile))
-    return Clock(netlist=netlist, tables=tables, core_tile=core_tile, barrier=table.barrier(used))
+    return Latencies(netlist=netlist, tables=tables, core_tile=core_tile, barrier=table.barrier(used))
 
 
 def _slots(
-    clock: Clock, spikes: BoolArray, updated: BoolArray, events: EventArray
+    latencies: Latencies, spikes: BoolArray, updated: BoolArray, events: EventArray
 ) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8], npt.NDArray[np.uint8]]:
     """Firing slots, working slots and events that nobody sends, as the kernels want them; refuses another's trace."""
-    netlist = clock.netlist
+    netlist = latencies.netlist
     if (
         spikes.ndim != 3
         or spikes.shape[2] != netlist.n_compartments
@@ -210,20 +210,20 @@ def _slots(
             "steps, compartments) twice and (recordings, channels, steps) of one run of this netlist"
         )
     fired, worked, seen = (np.ascontiguousarray(bits).view(np.uint8) for bits in (spikes, updated, events != 0))
-    if len(clock.core_tile) == clock.netlist.n_cores:
+    if len(latencies.core_tile) == latencies.netlist.n_cores:
         return fired, worked, seen
-    sent = np.zeros((*spikes.shape[:2], clock.netlist.n_inputs), np.uint8)
+    sent = np.zeros((*spikes.shape[:2], latencies.netlist.n_inputs), np.uint8)
     ahead = seen[:, :, 1 : spikes.shape[1] + 1]
     sent[:, : ahead.shape[2]] = ahead.transpose(0, 2, 1)
     return np.concatenate([fired, sent], 2), np.concatenate([worked, sent], 2), seen[:, :, :0]
 
 
-def charges(clock: Clock) -> Charges:
+def charges(latencies: Latencies) -> Charges:
     """What events add to each core's picoseconds of sweep and sending, then to those of receiving: ``2 * cores`` sums.
 
-    The engine adds them up as it runs, without spike trains. The input channels of the clock's netlist are on no core.
+    The engine adds them up as it runs, without spike trains. The netlist's input channels are on no core.
     """
-    tables, netlist = clock.tables, clock.netlist
+    tables, netlist = latencies.tables, latencies.netlist
     cores, core, every = netlist.n_cores, netlist.core_of_compartment(), np.arange(netlist.n_compartments)
     spikes, updates = np.zeros((2, netlist.n_compartments, 2 * cores), np.int64)
     messages = np.diff(tables.first)
@@ -236,12 +236,12 @@ def charges(clock: Clock) -> Charges:
     return Charges(channels=channels, spikes=spikes, updates=updates)
 
 
-def simple_times(clock: Clock, charged: IntArray, steps: IntArray) -> SimpleTimes:
+def simple_times(latencies: Latencies, charged: IntArray, steps: IntArray) -> SimpleTimes:
     """Times of the simple model from what :func:`charges` added up to, (samples, chip steps, 2 * cores) int64.
 
     `steps` (samples,) are the chip steps of each recording. Raises DataError if the sums are of another netlist.
     """
-    cores = len(clock.core_tile)
+    cores = len(latencies.core_tile)
     if charged.ndim != 3 or charged.shape[::2] != (len(steps), 2 * cores):
         raise DataError(
             f"trace: sums {charged.shape} of {len(steps)} recordings found, the netlist has {cores} "
@@ -250,8 +250,8 @@ def simple_times(clock: Clock, charged: IntArray, steps: IntArray) -> SimpleTime
     samples, length = charged.shape[:2]
     duration, critical = np.zeros((samples, length)), np.full((samples, length), -1)
     each, receiving = np.zeros((samples, 2 * cores), np.int64), np.zeros((samples, length), np.bool_)
-    sweep = np.diff(clock.tables.start) * clock.tables.access
-    conclude(charged, sweep, steps, clock.barrier, duration, each, critical, receiving)
+    sweep = np.diff(latencies.tables.start) * latencies.tables.access
+    conclude(charged, sweep, steps, latencies.barrier, duration, each, critical, receiving)
     return SimpleTimes(
         duration_ns=duration / PICOSECONDS,
         generation_ns=each[:, :cores] / PICOSECONDS,
@@ -262,7 +262,7 @@ def simple_times(clock: Clock, charged: IntArray, steps: IntArray) -> SimpleTime
 
 
 def detailed(
-    clock: Clock, spikes: BoolArray, updated: BoolArray, events: EventArray, *, steps: IntArray | None = None
+    latencies: Latencies, spikes: BoolArray, updated: BoolArray, events: EventArray, *, steps: IntArray | None = None
 ) -> DetailedTimes:
     """Time a batch of recordings by the detailed model.
 
@@ -270,7 +270,7 @@ def detailed(
     (samples, n_inputs, T); `steps` (samples,) are the chip steps of each recording, by default all. Raises DataError if
     the trace is of another netlist.
     """
-    fired, worked, events = _slots(clock, spikes, updated, events)
+    fired, worked, events = _slots(latencies, spikes, updated, events)
     samples, length = spikes.shape[:2]
     own = np.full(samples, length) if steps is None else steps
     sent, processed, blocked, peak = np.zeros((4, samples, length))
@@ -278,10 +278,10 @@ def detailed(
     receives = np.zeros((samples, length), np.bool_)
     for i in range(samples):
         found = Steps(sent[i], processed[i], blocked[i], core[i], receives[i], peak[i])
-        schedule(clock.tables, fired[i], worked[i], events[i], int(own[i]), found)
+        schedule(latencies.tables, fired[i], worked[i], events[i], int(own[i]), found)
     runs = np.arange(length) < own[:, None]
     return DetailedTimes(
-        duration_ns=np.where(runs, np.maximum(sent, processed) + clock.barrier, 0) / PICOSECONDS,
+        duration_ns=np.where(runs, np.maximum(sent, processed) + latencies.barrier, 0) / PICOSECONDS,
         sent_ns=sent / PICOSECONDS,
         processed_ns=processed / PICOSECONDS,
         blocked_ns=blocked / PICOSECONDS,

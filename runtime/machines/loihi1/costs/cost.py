@@ -247,18 +247,10 @@ def count_by_core(
 ) -> dict[str, FloatArray]:
     """Amount of every event of `EVENTS` per recording and core, (samples, cores) float64 each.
 
-    Synaptic operations belong to the core that receives them, packets and hops to the core that sends them.
-
-    Parameters
-    ----------
-    counts : Counts
-        Of a batch: arrays have one leading axis of recordings.
-    updates : (samples, cores) int64
-        Neuron updates on each core, for example :func:`updates_by_core` of a trace.
-    chip_steps : int or (samples,) int64
-        Chip steps of all recordings, or of each.
-    input_tiles, dense
-        As for :func:`timing.prepare`; cores of inputs come after the others and cost only their packets and hops.
+    Synaptic operations belong to the core that receives them, packets and hops to the core that sends them. `updates`
+    (samples, cores) are :func:`updates_by_core` of a trace, `chip_steps` those of all recordings or of each;
+    `input_tiles` and `dense` are as for :func:`timing.prepare`: cores of inputs come after the others and cost only
+    their packets and hops.
     """
     cores = netlist.n_cores + len(input_tiles)
     tile = np.append(netlist.core_tile, np.array(input_tiles, np.int64))

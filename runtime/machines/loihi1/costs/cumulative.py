@@ -25,13 +25,7 @@ def read_out_depth(netlist: Netlist) -> int:
 
 
 def least_intervals(netlist: Netlist) -> IntArray:
-    """Least number of steps from one spike to the next of each output neuron, whatever its input; 0 if it never spikes.
-
-    Returns
-    -------
-    (output neurons,) int64
-        In the order of their compartments.
-    """
+    """See :attr:`IntegerMachine.least_intervals`; in the order of compartments."""
     voters = np.flatnonzero(netlist.readout_class >= 0)
     positive = one_step_bounds(netlist)[0][voters]
     # a current that loses lost/4096 a step and gains x stays at or below x * 4096 / lost
@@ -68,21 +62,21 @@ def votes_of(netlist: Netlist, events: engine.EventArray, lengths: IntArray) -> 
     prepared = engine.prepare(netlist, charges=vote_charges(netlist))
     trace = engine.simulate(prepared, events, lengths=lengths)
     assert trace.charged is not None, "votes were wanted"
-    return _aligned(netlist, np.cumsum(trace.charged, axis=1), events.shape[2])
+    return _by_step(netlist, trace.charged, events.shape[2])
+
+
+def _by_step(netlist: Netlist, votes: IntArray, steps: int) -> IntArray:
+    """Votes so far after each step of the read-out, from those of each chip step."""
+    depth = read_out_depth(netlist)
+    return np.cumsum(votes, axis=1)[:, depth : depth + steps]
 
 
 def run(netlist: Netlist, target: Target, events: engine.EventArray, lengths: IntArray) -> Cumulative:
-    """Run recordings (samples, n_inputs, T), each for its own length in data steps (samples,), once.
-
-    Raises
-    ------
-    DataError, NumericRangeError
-        As the engine says.
-    """
+    """Run recordings (samples, n_inputs, T), each for its own length in data steps (samples,), once."""
     timed = target.time if chip_count(netlist.core_tile, target) == 1 else ()
-    clocks = [timing.prepare(netlist, target, table) for table in timed]
+    latencies = [timing.prepare(netlist, target, table) for table in timed]
     meter = cost.prepare(netlist, target)
-    parts = [vote_charges(netlist), _event_charges(meter), *(timing.charges(clock) for clock in clocks)]
+    parts = [vote_charges(netlist), _event_charges(meter), *map(timing.charges, latencies)]
     prepared = engine.prepare(netlist, charges=side_by_side(parts))
     trace = engine.simulate(prepared, events, lengths=lengths)
     assert trace.charged is not None, "sums were wanted"
@@ -94,15 +88,15 @@ def run(netlist: Netlist, target: Target, events: engine.EventArray, lengths: In
     found = {table.name: cost.price(table, events_by_step) for table in target.energy}
     operations = events_by_step["synaptic_operation_dense"] + events_by_step["synaptic_operation_sparse"]
     return Cumulative(
-        votes=_aligned(netlist, np.cumsum(votes, axis=1), events.shape[2]),
+        votes=_by_step(netlist, votes, events.shape[2]),
         depth=read_out_depth(netlist),
         lengths=lengths,
         chip_steps=chip_steps,
         operations=np.cumsum(operations, axis=1),
         energy={name: np.cumsum(each, axis=1) for name, each in found.items() if not isinstance(each, tuple)},
         time={
-            table.name: np.cumsum(timing.simple_times(clock, own, chip_steps).duration_ns, axis=1) * 1e-9
-            for table, clock, own in zip(timed, clocks, times, strict=True)
+            table.name: np.cumsum(timing.simple_times(each, own, chip_steps).duration_ns, axis=1) * 1e-9
+            for table, each, own in zip(timed, latencies, times, strict=True)
         },
     )
 
@@ -122,9 +116,3 @@ def _events(meter: cost.Meter, happened: IntArray, runs: BoolArray) -> dict[str,
     amounts = dict(zip((*meter.names, "neuron_active"), np.moveaxis(happened.astype(np.float64), 2, 0), strict=True))
     amounts["neuron_idle"] = runs * meter.neurons.sum() - amounts["neuron_active"]
     return {event: amounts[event] for event in cost.EVENTS}
-
-
-def _aligned(netlist: Netlist, votes: IntArray, steps: int) -> IntArray:
-    """Votes after each step of the read-out, from those after each chip step."""
-    depth = read_out_depth(netlist)
-    return votes[:, depth : depth + steps]

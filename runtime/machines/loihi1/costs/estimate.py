@@ -1,12 +1,6 @@
-"""What a run costs, as deep as wanted: spikes alone, events and simple times, or every message of every step.
+"""What a run costs: events, energies and simple times, added up in the run; in detail ``cycle`` also detailed times.
 
-==========  ==========================================================================================================
-``spikes``  decisions only
-``counts``  events, energy by table, part and layer, and the simple time model: next to no work more
-``cycle``   the detailed time model too, and energy by core
-==========  ==========================================================================================================
-
-Spikes are the same in all three.
+Every message is scheduled for these, and energy is told by core. Spikes are the same in both details.
 """
 
 from __future__ import annotations
@@ -58,16 +52,8 @@ def estimate(
 ) -> tuple[Counts, Estimate]:
     """Run recordings and say what they cost.
 
-    Parameters
-    ----------
-    events : (samples, n_inputs, T) uint8 or bool
-    lengths : (samples,) int64, optional
-        Data steps of each where some are shorter than T.
-    detail : {"counts", "cycle"}
-    spikes : (samples, chip steps, compartments) bool, optional
-        Array to fill, see :class:`trace.Trace`.
-    progress : callable, optional
-        Called with the number of recordings that are done.
+    `events` are (samples, n_inputs, T), `lengths` (samples,) the data steps of each, `detail` is ``counts`` or
+    ``cycle``; `spikes` (samples, chip steps, compartments) bool is filled, `progress` called with the recordings done.
 
     Raises
     ------
@@ -80,12 +66,13 @@ def estimate(
     if detail == "cycle":
         require_one_chip(netlist.core_tile, target, "--detail cycle")
     timed = target.time if chip_count(netlist.core_tile, target) == 1 else ()
-    clocks = {times.name: timing.prepare(netlist, target, times) for times in timed}
-    prepared = _charged(netlist, clocks)
+    latencies = {table.name: timing.prepare(netlist, target, table) for table in timed}
+    charges = side_by_side([timing.charges(each) for each in latencies.values()]) if latencies else None
+    prepared = engine.prepare(netlist, charges=charges)
     steps = np.full(len(events), events.shape[2]) if lengths is None else np.asarray(lengths, np.int64)
     detailed: dict[str, DetailedTimes] = {}
     if detail == "cycle":
-        counts, charged, detailed, updates = _deep(prepared, clocks, events, steps, spikes, progress)
+        counts, charged, detailed, updates = _deep(prepared, latencies, events, steps, spikes, progress)
     else:
         trace = engine.simulate(prepared, events, lengths=steps, spikes=spikes is not None)
         counts, charged = trace.counts, trace.charged
@@ -93,10 +80,10 @@ def estimate(
             spikes[:] = trace.spikes
     simple = {}
     if charged is not None:
-        sums = np.split(charged, len(clocks), axis=2)
+        sums = np.split(charged, len(latencies), axis=2)
         simple = {
-            name: timing.simple_times(clock, own, steps + prepared.drain)
-            for (name, clock), own in zip(clocks.items(), sums, strict=True)
+            name: timing.simple_times(each, own, steps + prepared.drain)
+            for (name, each), own in zip(latencies.items(), sums, strict=True)
         }
     costs = cost.estimate(cost.prepare(netlist, target), counts, steps)
     parts = {prices.name: cost.by_part(prices, costs.events) for prices in target.energy}
@@ -117,24 +104,16 @@ def estimate(
     )
 
 
-def _charged(netlist: Netlist, clocks: Mapping[str, timing.Clock]) -> engine.Engine:
-    """An engine that adds up the times of the simple model, one table's after the other's."""
-    if not clocks:
-        return engine.prepare(netlist)
-    wanted = side_by_side([timing.charges(clock) for clock in clocks.values()])
-    return engine.prepare(netlist, charges=wanted)
-
-
 def _deep(
     prepared: engine.Engine,
-    clocks: Mapping[str, timing.Clock],
+    latencies: Mapping[str, timing.Latencies],
     events: engine.EventArray,
     steps: IntArray,
     spikes: BoolArray | None,
     progress: Callable[[int], object] | None,
 ) -> tuple[Counts, IntArray | None, dict[str, DetailedTimes], IntArray]:
     """Counts, charges, detailed times and updates of each core; some recordings at a time, as their spikes are kept."""
-    found: dict[str, list[DetailedTimes]] = {name: [] for name in clocks}
+    found: dict[str, list[DetailedTimes]] = {name: [] for name in latencies}
     counts, charged, updates = [], [], []
     for first in range(0, len(events), PART):
         part = slice(first, first + PART)
@@ -146,8 +125,8 @@ def _deep(
         updates.append(cost.updates_by_core(prepared.netlist, trace.updated))
         own = steps[part] + prepared.drain
         given = events[part] * (np.arange(events.shape[2]) < steps[part, None, None])  # nothing after a recording's end
-        for name, clock in clocks.items():
-            found[name].append(timing.detailed(clock, trace.spikes, trace.updated, given, steps=own))
+        for name, each in latencies.items():
+            found[name].append(timing.detailed(each, trace.spikes, trace.updated, given, steps=own))
         if spikes is not None:
             spikes[part] = trace.spikes
         if progress is not None:

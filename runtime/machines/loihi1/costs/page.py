@@ -75,17 +75,7 @@ def recording_parts(netlist: Netlist, target: Target, events: EventArray, *, bin
 
 
 def _energy_by_step(netlist: Netlist, target: Target, events: EventArray, trace: Trace) -> dict[str, FloatArray]:
-    """Joules of each chip step of one recording by table; they add up to what :func:`cost.estimate` says.
-
-    Parameters
-    ----------
-    netlist, target : Netlist, Target
-        What ran, on which chip.
-    events : (channels, steps) uint8
-        The recording, with the network's clocks.
-    trace : Trace
-        Of a batch of this one recording, with spikes and updates.
-    """
+    """Joules of each chip step of one recording (channels, steps) by table; they add up to :func:`cost.estimate`'s."""
     assert trace.spikes is not None, "spikes were asked for"
     assert trace.updated is not None, "updates were asked for"
     spikes: IntArray = trace.spikes[0].astype(np.int64)
