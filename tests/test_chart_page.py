@@ -5,7 +5,7 @@ import re
 from dataclasses import replace
 
 import pytest
-from browser import Page
+from browser import browsed
 from made_chart import made_chart
 from made_files import own_file, recordings_folder
 
@@ -111,35 +111,23 @@ def page_file(chart, tmp_path):
     return file
 
 
-def test_in_a_browser_keys_and_pointer_read_the_points(page_file, tmp_path):
-    with Page(tmp_path / "browser", page_file) as browser:
-        assert browser.requested[1:] == []
-        readout = "document.querySelector('#chart-energy ~ .readout').textContent"
-        browser.run("document.getElementById('chart-energy').focus()")
-        browser.press("ArrowRight")
-        assert browser.run(readout).startswith("#7 grasps-knn1 2b, 50 %")  # the cheapest
-        browser.press("ArrowLeft")  # round to the dearest
-        assert browser.run(readout).startswith("#6 grasps 8b, 100 %")
-        place = """(() => {
-            const drawing = document.getElementById('chart-energy'), svg = drawing.querySelector('svg');
-            const [x, y] = JSON.parse(drawing.nextElementSibling.textContent)
-                .tips.find((tip) => tip[2].startsWith('#2 '));
-            drawing.scrollIntoView();
-            const there = new DOMPoint(x, y).matrixTransform(svg.getScreenCTM());
-            return [there.x, there.y];
-        })()"""
-        browser.point(*browser.run(place))
-        assert browser.run(readout).startswith("#2 grasps 2b, 100 %")
-        assert browser.console == []
+def test_in_a_browser_keys_and_pointer_read_the_points(page_file):
+    script = """
+    const tips = JSON.parse(drawing("chart-energy").nextElementSibling.textContent).tips;
+    const [x, y] = tips.find((tip) => tip[2].startsWith("#2 "));
+    return [press("chart-energy", "ArrowRight"), press("chart-energy", "ArrowLeft"), point("chart-energy", x, y)];"""
+    cheapest, dearest, second = browsed(page_file, script)
+    assert cheapest.startswith("#7 grasps-knn1 2b, 50 %")
+    assert dearest.startswith("#6 grasps 8b, 100 %")
+    assert second.startswith("#2 grasps 2b, 100 %")
 
 
-@pytest.mark.parametrize(("width", "scheme"), [(1100, "light"), (420, "dark")])
-def test_the_page_fits_any_width_and_scheme(page_file, tmp_path, width, scheme):
-    with Page(tmp_path / "browser", page_file, width=width) as browser:
-        browser.media(scheme=scheme)
-        assert browser.run("document.documentElement.scrollWidth") <= width
-        colour = browser.run("getComputedStyle(document.body).backgroundColor")
-        assert colour == ("rgb(255, 255, 255)" if scheme == "light" else "rgb(20, 23, 27)")
+@pytest.mark.parametrize(("width", "scheme"), [(1100, "light"), (500, "dark")])
+def test_the_page_fits_any_width_and_scheme(page_file, width, scheme):
+    script = "return [document.documentElement.scrollWidth, background];"
+    wide, colour = browsed(page_file, script, width=width, scheme=scheme)
+    assert wide <= width
+    assert colour == ("rgb(255, 255, 255)" if scheme == "light" else "rgb(20, 23, 27)")
 
 
 # -- in a report -------------------------------------------------------------------------------------------------------

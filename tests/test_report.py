@@ -10,7 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from browser import Page
+from browser import browsed
 from made_files import CLASSES, FEATURES, STEPS, TAXELS, own_file, recordings_folder, weights
 from numpy.testing import assert_allclose, assert_array_equal
 from zoo import specimen
@@ -405,44 +405,20 @@ def test_a_refused_report_leaves_an_old_page_alone(spikeloom, place):
 # -- in a browser ------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def page(made, place, tmp_path):
-    with Page(tmp_path / "profile", place / "out.html") as page:
-        yield page
+def test_a_browser_shows_every_figure_and_unfolds_one_raster_at_a_time(made, place):
+    script = """
+    const shown = () => [...document.querySelectorAll(".drawing")].filter((d) => d.checkVisibility()).map((d) => d.id);
+    const before = shown();
+    [...document.querySelectorAll("summary")].find((s) => s.textContent == "fc1").parentElement.open = true;
+    return [before, shown()];"""
+    before, after = browsed(place / "out.html", script)
+    assert set(before) == FIGURES - {f"raster-{name}" for name in ("input", *LAYERS[1:])}
+    assert set(after) == set(before) - {"raster-conv1"} | {"raster-fc1"}
 
 
-def shown(page):
-    """Drawings that are not folded away."""
-    return page.run("[...document.querySelectorAll('.drawing')].filter(d => d.checkVisibility()).map(d => d.id)")
-
-
-def readout(page, name):
-    return page.run(f"document.querySelector('#{name} ~ .readout').textContent")
-
-
-def test_a_browser_shows_every_figure_without_complaint(page):
-    assert set(shown(page)) == FIGURES - {f"raster-{name}" for name in ("input", *LAYERS[1:])}
-    page.run("[...document.querySelectorAll('summary')].find(s => s.textContent == 'fc1').click()")
-    page.run("new Promise(requestAnimationFrame)")
-    assert "raster-fc1" in shown(page)
-    assert "raster-conv1" not in shown(page)  # one at a time
-    assert page.console == []
-    assert [url for url in page.requested if not url.startswith(("file:", "data:"))] == []
-    assert page.picture()[:4] == b"\x89PNG"
-    assert page.pdf()[:4] == b"%PDF"
-
-
-def test_arrow_keys_walk_through_the_differences_and_the_pointer_reads_cells(page, made):
-    tips = values(made[0], "raster-conv1")["tips"]
-    page.run("document.getElementById('raster-conv1').focus()")
-    for _, _, tip in tips[:4]:
-        page.press("ArrowRight")
-        assert readout(page, "raster-conv1") == tip
-    for _ in range(4):
-        page.press("ArrowLeft")
-    assert readout(page, "raster-conv1") == tips[-1][2]
-    cells = values(made[0], "raster-conv1")["cells"]
-    layer = made[1]["recording"]["layers"][0]
+def test_arrow_keys_walk_through_the_differences_and_the_pointer_reads_cells(made, place):
+    held, layer = values(made[0], "raster-conv1"), made[1]["recording"]["layers"][0]
+    tips, cells = held["tips"], held["cells"]
     different = {tuple(pair) for side in ("float", "chip") for pair in layer[f"{side}_only"]}
     row, step = next(
         (row, step)
@@ -453,34 +429,15 @@ def test_arrow_keys_walk_through_the_differences_and_the_pointer_reads_cells(pag
     )
     x = cells["from"][0] + (step + 0.5) * (cells["to"][0] - cells["from"][0]) / STEPS
     y = cells["from"][1] + (row + 0.5) * (cells["to"][1] - cells["from"][1]) / len(cells["rows"])
-    at = page.run(f"""(() => {{
-        const svg = document.querySelector('#raster-conv1 svg');
-        svg.scrollIntoView({{block: 'center'}});
-        const there = new DOMPoint({x}, {y}).matrixTransform(svg.getScreenCTM());
-        return [there.x, there.y];
-    }})()""")
-    page.point(*at)
-    assert readout(page, "raster-conv1").startswith(f"neuron {layer['active'][row]}, step {step}")
-    page.run("document.getElementById('energy-layers').focus()")
-    page.press("ArrowRight")
-    assert readout(page, "energy-layers").startswith("conv1, davies2018: ")
-    assert page.console == []
+    script = f"""
+    const walked = ["Right", "Right", "Left", "Left"].map((way) => press("raster-conv1", `Arrow${{way}}`));
+    return [walked, point("raster-conv1", {x}, {y}), press("energy-layers", "ArrowRight")];"""
+    walked, pointed, energy = browsed(place / "out.html", script)
+    assert walked == [tips[index][2] for index in (0, 1, 0, -1)]
+    assert pointed.startswith(f"neuron {layer['active'][row]}, step {step}")
+    assert energy.startswith("conv1, davies2018: ")
 
 
-def test_dark_is_dark_and_paper_is_light(page):
-    background = "getComputedStyle(document.body).backgroundColor"
-    light = page.run(background)
-    page.media(scheme="dark")
-    assert page.run(background) != light == "rgb(255, 255, 255)"
-    page.media(scheme="dark", kind="print")
-    assert page.run(background) == light
-
-
-def test_all_is_readable_without_script(made, place, tmp_path):
-    with Page(tmp_path / "profile", place / "out.html", script=False) as page:
-        assert page.console == []
-        document = page.call("DOM.getDocument", depth=1)["root"]["nodeId"]
-        nodes = page.call("DOM.querySelectorAll", nodeId=document, selector="details[open] svg")["nodeIds"]
-        heights = [page.call("DOM.getBoxModel", nodeId=node)["model"]["height"] for node in nodes]
-        assert len(heights) == 1
-        assert heights[0] > 50
+def test_dark_is_dark(made, place):
+    assert browsed(place / "out.html", "return background;") == "rgb(255, 255, 255)"
+    assert browsed(place / "out.html", "return background;", scheme="dark") == "rgb(20, 23, 27)"
