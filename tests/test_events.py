@@ -9,13 +9,13 @@ from hypothesis import strategies as st
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.models.recordings import fetch
 from spikeloom.models.recordings.counts import GAP_S
-from spikeloom.models.recordings.describe import describe
 from spikeloom.models.recordings.eventfiles import likely_unit, read_stream
 from spikeloom.models.recordings.events import BIN_S, MAX_STEPS, bin_events, data_splits, load_data, need_labels
 from spikeloom.models.recordings.evtouch import UNLABELLED, Recordings, load_recordings
 from spikeloom.models.recordings.fetch import DataSet
 from spikeloom.models.recordings.grasps import synthetic_grasps
 from spikeloom.models.recordings.release import write_released
+from spikeloom.runtime.commands.exchange.described import describe
 
 HEADER = "time_s,taxel,polarity\n"
 
@@ -410,9 +410,11 @@ def test_description():
     grid[:, 2, 1] = 0
     grid[1, :, :, 5:] = 0  # the second recording has 5 steps
     found = describe(made(grid, labels=np.array([3, -1]), lengths=np.array([10, 5])), 0.1)
-    assert found.duration_s == (0.5, 0.75, 1.0)
-    assert (found.recordings, found.events, found.classes) == (2, 15, {-1: 1, 3: 1})
-    assert found.rate.tolist() == [[2, 2], [0, 0], [2, 0], [2, 2], [0, 0]]  # 3 events in 1.5 s
+    lasts = found.duration_s
+    assert (lasts.shortest, lasts.median, lasts.longest) == (0.5, 0.75, 1.0)
+    assert (found.recordings, found.events, found.labels, found.unlabelled) == (2, 15, {3: 1}, 1)
+    rates = [[taxel.falling, taxel.rising] for taxel in found.rate.taxels]
+    assert rates == [[2, 2], [0, 0], [2, 0], [2, 2], [0, 0]]  # 3 events in 1.5 s
     assert found.course[0].tolist() == [30, 20]
     assert found.course[5].tolist() == [30, 20]  # of the recording that is left
     assert found.course[[1, 2, 3, 4, 6, 7, 8, 9]].sum() == 0

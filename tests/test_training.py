@@ -23,7 +23,7 @@ from spikeloom.models.recordings.release import write_released
 from spikeloom.runtime.cli import main
 from spikeloom.runtime.studies.jobs import only_one
 from spikeloom.runtime.studies.training import parallel
-from spikeloom.runtime.studies.training.picture import draw_training
+from spikeloom.runtime.studies.training.picture import picture
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -80,22 +80,14 @@ def test_seeds_side_by_side_equal_single_ones(data, capsys):
     assert single["runs"][0]["sha256"] == report["runs"][1]["sha256"]
 
 
-def test_pictures_of_equal_trainings_are_equal(tmp_path):
-    record = SimpleNamespace(
-        seed=0,
-        test_samples=4,
-        history=[[0.2, 0.3, 1], [0.1, 0.2, 3]],
-        clean=SimpleNamespace(epoch=2, accuracy=0.75),
-        recipe=None,
-    )
+def test_pictures_of_equal_trainings_are_equal():
+    clean = SimpleNamespace(epoch=2, accuracy=0.75)
+    history = [[0.2, 0.3, 1], [0.1, 0.2, 3]]
+    record = SimpleNamespace(seed=0, test_samples=4, history=history, clean=clean, recipe=None)
     labels = np.array([0, 1, 2, 2])
-    for suffix in ("png", "svg"):
-        files = [tmp_path / f"{name}.{suffix}" for name in "ab"]
-        for file in files:
-            draw_training(str(file), [record], labels, [np.array([0, 1, 2, 1])])
-        if suffix == "png":
-            assert files[0].read_bytes() == files[1].read_bytes()
-        assert files[0].stat().st_size > 1000
+    first, second = (picture([record], labels, [np.array([0, 1, 2, 1])]).file("svg") for _ in range(2))
+    assert first == second
+    assert len(first) > 1000
 
 
 @pytest.mark.parametrize(

@@ -10,17 +10,17 @@ from pathlib import Path
 import numpy as np
 
 from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.files import write_atomically
 from spikeloom.compiler.types import FloatArray
 from spikeloom.models.graphs import NEUTOUCH
 from spikeloom.models.recordings.counts import EventCounts, Oddities, number, oddities, show_notes
-from spikeloom.models.recordings.describe import describe
 from spikeloom.models.recordings.events import data_splits, joined_bins, load_data, require_events
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.recordings.fetch import DATA_SETS, data_folder, fetch_data
 from spikeloom.models.recordings.grasps import SPLITS, SYNTHETIC, synthetic_split
 from spikeloom.models.recordings.release import SOURCES, write_event_lines, write_released
 from spikeloom.models.sensors import read_layout
-from spikeloom.runtime.commands.exchange.described import described, described_sections
+from spikeloom.runtime.commands.exchange.described import describe, described_sections
 from spikeloom.runtime.commands.options import add_bin_option, add_common
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.recordings import require_bins
@@ -138,14 +138,15 @@ def _describe(arguments: Arguments) -> Outcome:
     count, places = _layout(arguments.taxels)
     recordings, counts = _load(arguments.source, arguments.split, arguments.bin, count)
     show_notes(counts)
-    description = describe(recordings, arguments.bin)
+    result = describe(recordings, arguments.bin, counts, arguments.picture)
     if places is None and recordings.taxels == len(NEUTOUCH):
         places = NEUTOUCH
     if arguments.picture is not None:
-        from spikeloom.runtime.report.data_picture import draw
+        from spikeloom.runtime.commands.exchange.data_picture import picture  # Matplotlib, so only here
 
-        draw(arguments.picture, description, places, title=f"{recordings.source}, {recordings.split}")
-    return Outcome(described(recordings, description, counts, arguments.picture), described_sections)
+        with write_atomically(arguments.picture) as file:
+            file.write(picture(result, places).file("png"))
+    return Outcome(result, described_sections)
 
 
 def _convert(arguments: Arguments) -> Outcome:

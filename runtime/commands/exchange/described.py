@@ -1,14 +1,26 @@
-"""What ``data describe`` says of recordings."""
+"""What ``data describe`` says of recordings: rates per taxel and polarity, their course, taxels that look broken."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+import numpy as np
+
+from spikeloom.compiler.types import FloatArray
 from spikeloom.models.recordings.counts import EventCounts, Oddities, number, oddities
-from spikeloom.models.recordings.describe import RULES, Description
 from spikeloom.models.recordings.evtouch import UNLABELLED, Recordings
+from spikeloom.runtime.report.encode import HIDDEN
 from spikeloom.runtime.report.sections import Section, Table, Text
+
+HOT = 5.0
+"""A taxel is hot if its rate is above this many times the median over taxels that are not dead."""
+
+RULES = {
+    "dead": "no event in any of these recordings",
+    "one-sided": "events of one polarity only",
+    "hot": f"more than {HOT:g} times the median rate of the taxels that are not dead",
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,17 +41,15 @@ class Rate:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SensorRate:
-    """Events per second by polarity, of the sensor and of each taxel."""
+class SensorRate(Rate):
+    """Events per second by polarity, of the sensor and of each taxel, over the time that was recorded."""
 
-    falling: float
-    rising: float
     taxels: tuple[Rate, ...]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Described:
-    """Statistics of one split under the keys that scripts rely on; see :class:`describe.Description`."""
+    """Statistics of one split under the keys that scripts rely on; polarity 0 is falling, 1 is rising."""
 
     source: str
     split: str
@@ -48,7 +58,7 @@ class Described:
     bin_s: float
     steps: int
     duration_s: Duration
-    events: int
+    events: int  # Those that share taxel, polarity and bin count once
     found: Oddities | None
     labels: Mapping[int, int]
     unlabelled: int
@@ -58,36 +68,48 @@ class Described:
     hot: tuple[int, ...]
     rules: Mapping[str, str]
     picture: str | None
+    # (steps, 2); events per second of the whole sensor, mean over the recordings that last so long
+    course: FloatArray = field(metadata=HIDDEN)
 
 
-def described(
-    recordings: Recordings, description: Description, counts: EventCounts | None, picture: str | None
+def describe(
+    recordings: Recordings, bin_s: float, counts: EventCounts | None = None, picture: str | None = None
 ) -> Described:
-    """Statistics, what was odd about the events of a file, and where the picture is."""
-    shortest, median, longest = description.duration_s
-    falling, rising = (float(description.rate[:, polarity].sum()) for polarity in (0, 1))
+    """Count the events of one split, whose bins are so many seconds wide."""
+    lengths = np.array([recordings.steps_of(index) for index in range(len(recordings))])
+    per_taxel = recordings.events.sum(axis=(0, 3), dtype=np.int64)
+    per_step = recordings.events.sum(axis=(0, 1), dtype=np.int64).T
+    running = (lengths[:, None] > np.arange(recordings.steps)).sum(axis=0)
+    total = per_taxel.sum(axis=1)
+    alive = total > 0
+    middle = float(np.median(total[alive])) if alive.any() else 0.0
+    rate = per_taxel / (lengths.sum() * bin_s)
+    falling, rising = rate.sum(axis=0).tolist()
+    labels = dict(zip(*(found.tolist() for found in np.unique(recordings.labels, return_counts=True)), strict=True))
+    shortest, median, longest = (float(of(lengths) * bin_s) for of in (np.min, np.median, np.max))
     return Described(
         source=recordings.source,
         split=recordings.split,
-        recordings=description.recordings,
+        recordings=len(recordings),
         taxels=recordings.taxels,
-        bin_s=description.bin_s,
+        bin_s=bin_s,
         steps=recordings.steps,
         duration_s=Duration(shortest=shortest, median=median, longest=longest),
-        events=description.events,
+        events=int(total.sum()),
         found=None if counts is None else oddities(counts),
-        labels={label: count for label, count in description.classes.items() if label != UNLABELLED},
-        unlabelled=description.classes.get(UNLABELLED, 0),
+        unlabelled=labels.pop(UNLABELLED, 0),
+        labels=labels,
         rate=SensorRate(
             falling=falling,
             rising=rising,
-            taxels=tuple(Rate(falling=low, rising=high) for low, high in description.rate.tolist()),
+            taxels=tuple(Rate(falling=low, rising=high) for low, high in rate.tolist()),
         ),
-        dead=description.dead,
-        one_sided=description.one_sided,
-        hot=description.hot,
+        dead=tuple(np.flatnonzero(~alive).tolist()),
+        one_sided=tuple(np.flatnonzero((per_taxel > 0).sum(axis=1) == 1).tolist()),
+        hot=tuple(np.flatnonzero(total > HOT * middle).tolist()),
         rules=RULES,
         picture=picture,
+        course=per_step / (running[:, None] * bin_s),
     )
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 from spikeloom.compiler.checkpoint import WEIGHTS
 from spikeloom.compiler.errors import DataError, OptionError
+from spikeloom.compiler.files import write_atomically
 from spikeloom.compiler.systems import GRAPH_SYSTEMS, GRID_CNN, TACTILESGNET, TITLES, Grid
 from spikeloom.compiler.targets.native import BASES, USUAL_COPIES
 from spikeloom.compiler.targets.native import SYSTEM as NATIVE
@@ -25,8 +26,9 @@ from spikeloom.runtime.inputs.network import graph_words, load_graph, sensor_pla
 from spikeloom.runtime.inputs.recordings import bin_words, recordings, require_bins
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.sections import Outcome
-from spikeloom.runtime.studies.training.picture import PICTURES, draw_training
 from spikeloom.runtime.studies.training.training import Job, output_of
+
+PICTURES = (".png", ".svg", ".pdf")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -109,7 +111,11 @@ def run(arguments: argparse.Namespace) -> Outcome:
     records = [record for record, _ in results]
     if arguments.picture is not None:
         decided = [predicted for _, predicted in results if predicted is not None]
-        draw_training(arguments.picture, records, test.labels, decided)
+        from spikeloom.runtime.studies.training.picture import picture  # Matplotlib, so only here
+
+        kind = Path(arguments.picture).suffix.removeprefix(".")
+        with write_atomically(arguments.picture) as file:
+            file.write(picture(records, test.labels, decided).file(kind))
     return Outcome(TrainingReport(runs=records, protocols=summary(records)), training_sections)
 
 
