@@ -2,10 +2,8 @@
 
 import json
 import os
-import random
 import signal
 import subprocess
-import sys
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,7 +15,6 @@ from commands import RUNTIME
 
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
-from spikeloom.models.recordings.evtouch import load_recordings
 from spikeloom.models.recordings.grasps import synthetic_grasps
 from spikeloom.models.recordings.release import write_released
 from spikeloom.runtime.cli import main
@@ -26,6 +23,7 @@ from spikeloom.runtime.studies.training import parallel
 from spikeloom.runtime.studies.training.picture import picture
 
 ROOT = Path(__file__).resolve().parents[1]
+WORDS = ("train", "--data", "data", "--graph", "manual")
 
 
 @pytest.fixture
@@ -67,17 +65,40 @@ def test_one_seed_reports_both_protocols_and_stores_three_epochs(data, capsys):
     assert read_checkpoint("x.pt").weights == "last"
 
 
-def test_seeds_side_by_side_equal_single_ones(data, capsys):
-    words = ("train", "--data", "data", "--graph", "manual", "--epochs", "1")
-    report = as_json(capsys, *words, "--seeds", "2", "--seed", "4", "-o", "x.pt", "--picture", "curves.png")
+def test_seeds_side_by_side_equal_single_ones_and_finished_ones_are_left_alone(data, capsys):
+    words = (*WORDS, "--epochs", "1")
+    several = (*words, "--seeds", "2", "--seed", "4", "-o", "x.pt")
+    report = as_json(capsys, *several, "--picture", "a.png")
     assert [run["file"] for run in report["runs"]] == ["x-seed4.pt", "x-seed5.pt"]
-    assert (data / "curves.png").read_bytes()[:4] == b"\x89PNG"
+    assert (data / "a.png").read_bytes()[:4] == b"\x89PNG"
     single = as_json(capsys, *words, "--seed", "5", "-o", "y.pt")
     assert (data / "y.pt").read_bytes() == (data / "x-seed5.pt").read_bytes()
     accuracies = [run["last"]["accuracy"] for run in report["runs"]]
     assert report["protocols"]["last"]["mean"] == pytest.approx(np.mean(accuracies))
     assert report["protocols"]["last"]["std"] == pytest.approx(np.std(accuracies, ddof=1))
     assert single["runs"][0]["sha256"] == report["runs"][1]["sha256"]
+
+    Path("x-seed5.pt").unlink()
+    before = Path("x-seed4.pt").stat().st_mtime_ns
+    assert main([*several, "--resume", "--picture", "b.png", "--json"]) == 0
+    out, err = capsys.readouterr()
+    assert err == (
+        "spikeloom: x-seed4.pt: is finished, not trained again\n"
+        "spikeloom: x-seed5.pt: was not begun, trained from the start\n"
+    )
+    assert json.loads(out) == report
+    assert Path("x-seed4.pt").stat().st_mtime_ns == before
+    assert (data / "y.pt").read_bytes() == (data / "x-seed5.pt").read_bytes()
+    assert Path("a.png").read_bytes() == Path("b.png").read_bytes()
+
+    assert main([*several, "--resume"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "spikeloom train --data data --graph manual --epochs 1 --seed 4 --seeds 2"
+    assert lines[1].split() == ["epoch", "correct", "accuracy", "95", "%", "interval"]
+    assert [line.split(", ")[0].strip() for line in lines[2:8]] == ["seed 4"] * 3 + ["seed 5"] * 3
+    assert lines[8].startswith("  mean of 2 seeds: last ")
+    assert lines[9] == "  written: x-seed4.pt, x-seed5.pt"
+    assert max(map(len, lines)) <= 120
 
 
 def test_pictures_of_equal_trainings_are_equal():
@@ -125,11 +146,6 @@ def test_a_class_that_only_the_test_split_has(data, capsys):
     assert "label 5, the training recordings have 0..4" in refused(capsys, "--epochs", "1", "-o", "x.pt")
 
 
-def test_a_graph_must_be_named(data, capsys):
-    assert main(["train", "--data", "data", "-o", "x.pt"]) == 2
-    assert "train: no graph; name it with --graph: manual, knn:K" in capsys.readouterr().err
-
-
 def test_isolated_taxels_warn_and_train_all_the_same(data, capsys):
     Path("edges.csv").write_text("source,target\n0,1\n1,2\n")
     words = ["train", "--data", "data", "--taxels", "39", "--edges", "edges.csv", "--epochs", "1", "-o", "x.pt"]
@@ -138,40 +154,6 @@ def test_isolated_taxels_warn_and_train_all_the_same(data, capsys):
     assert "warning: " in err
     assert out.startswith("spikeloom train --data data --taxels 39 --edges edges.csv --epochs 1 --seed 0\n")
     assert read_checkpoint("x.pt").graph == "edges:edges.csv"
-
-
-def test_killed_at_random_points_it_resumes_to_the_same_bytes(data):
-    # the seed of the delays is fixed, the moment of a kill is not: wherever it falls, the result must be the same
-    delays = random.Random(7)
-    epochs = "40"
-    words = [sys.executable, "-m", "spikeloom", "train", "--data", "data", "--graph", "manual", "--epochs", epochs]
-    environment = os.environ | {"PYTHONPATH": str(ROOT / "src")}
-    subprocess.run([*words, "-o", "whole.pt"], check=True, env=environment, capture_output=True)
-    killed = 0
-    for attempt in range(6):
-        resume = ["--resume"] if attempt else []
-        process = subprocess.Popen(
-            [*words, "-o", "parts.pt", *resume],
-            env=environment,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-        )
-        deadline = time.monotonic() + 120
-        while not list(data.glob("parts.pt.state.*")) and process.poll() is None and time.monotonic() < deadline:
-            time.sleep(0.01)
-        time.sleep(delays.uniform(0.0, 0.4))
-        if process.poll() is None:
-            process.send_signal(signal.SIGKILL)
-            killed += 1
-        process.communicate()
-    last = subprocess.run([*words, "-o", "parts.pt", "--resume"], env=environment, capture_output=True, check=False)
-    assert last.returncode == 0, last.stderr
-    assert killed >= 1
-    assert Path("parts.pt").read_bytes() == Path("whole.pt").read_bytes()
-    assert load_recordings("data", "train").steps == 12
-
-
-WORDS = ("train", "--data", "data", "--graph", "manual")
 
 
 def started(*words, until):
@@ -218,25 +200,31 @@ def gone(pids: list[int]) -> bool:
     return True
 
 
-def test_an_interrupt_says_what_is_kept_and_a_later_run_does_not_lose_it(data, capsys):
-    process = started("--epochs", "5000", "-o", "x.pt", until=lambda: list(data.glob("x.pt.state.*")))
+def test_interrupted_and_killed_it_says_what_is_kept_and_resumes_to_the_same_bytes(data, capsys):
+    """The moment of a signal is not fixed: wherever it falls, the result must be the same."""
+    kept, words = Path("x.pt.state.validation"), ("--epochs", "40", "-o", "x.pt")
+    process = started(*words, until=kept.exists)
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)
     assert process.returncode == 2
     assert err == (
-        "spikeloom: interrupted; the epochs so far are kept in x.pt.state.validation; go on with the same command "
-        "and --resume\n"
+        f"spikeloom: interrupted; the epochs so far are kept in {kept}; go on with the same command and --resume\n"
     )
     assert not list(data.glob(".*")), "half-written files are left"
-    kept = Path("x.pt.state.validation").read_bytes()
-    assert refused(capsys, "--epochs", "5000", "-o", "x.pt") == (
-        "x.pt.state.validation: an interrupted training is kept here; go on with --resume, or delete it to train anew"
+    content = kept.read_bytes()
+    assert refused(capsys, *words) == (
+        f"{kept}: an interrupted training is kept here; go on with --resume, or delete it to train anew"
     )
-    assert Path("x.pt.state.validation").read_bytes() == kept
     assert refused(capsys, "--epochs", "2", "-o", "x.pt", "--resume") == (
-        "x.pt.state.validation: belongs to a training with other epochs; give the same options and data, "
-        "or delete it to train anew"
+        f"{kept}: belongs to a training with other epochs; give the same options and data, or delete it to train anew"
     )
+    assert kept.read_bytes() == content
+    process = started(*words, "--resume", until=lambda: kept.read_bytes() != content)
+    process.kill()
+    process.communicate()
+    as_json(capsys, *WORDS, *words, "--resume")
+    as_json(capsys, *WORDS, "--epochs", "40", "-o", "whole.pt")
+    assert Path("x.pt").read_bytes() == Path("whole.pt").read_bytes()
 
 
 def test_an_interrupt_before_the_first_epoch(data, capsys, monkeypatch):
@@ -246,24 +234,6 @@ def test_an_interrupt_before_the_first_epoch(data, capsys, monkeypatch):
     monkeypatch.setattr("spikeloom.models.training.train._train_epoch", interrupt)
     assert refused(capsys, "--epochs", "2", "-o", "x.pt") == "interrupted; nothing was written"
     assert not list(data.glob("x.pt*"))
-
-
-def test_resume_leaves_finished_seeds_alone_and_trains_the_rest(data, capsys):
-    whole = as_json(capsys, *WORDS, "--epochs", "1", "--seeds", "2", "-o", "x.pt", "--picture", "a.png")
-    contents = {file.name: file.read_bytes() for file in data.glob("x-seed*.pt")}
-    before = Path("x-seed0.pt").stat().st_mtime_ns
-    Path("x-seed1.pt").unlink()
-    words = [*WORDS, "--epochs", "1", "--seeds", "2", "-o", "x.pt", "--resume", "--picture", "b.png", "--json"]
-    assert main(words) == 0
-    out, err = capsys.readouterr()
-    assert err == (
-        "spikeloom: x-seed0.pt: is finished, not trained again\n"
-        "spikeloom: x-seed1.pt: was not begun, trained from the start\n"
-    )
-    assert json.loads(out) == whole
-    assert Path("x-seed0.pt").stat().st_mtime_ns == before
-    assert {file.name: file.read_bytes() for file in data.glob("x-seed*.pt")} == contents
-    assert Path("a.png").read_bytes() == Path("b.png").read_bytes()
 
 
 def test_another_decay_is_stored_and_told_apart(data, capsys):
@@ -331,7 +301,7 @@ def test_resume_does_not_take_another_training_for_this_one(data, capsys):
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes under /proc")
-@pytest.mark.parametrize("sent", [signal.SIGTERM, signal.SIGKILL, signal.SIGINT])
+@pytest.mark.parametrize("sent", [signal.SIGTERM, signal.SIGKILL])
 def test_no_worker_outlives_the_command(data, capsys, sent):
     process = started(
         "--epochs", "5000", "--seeds", "2", "-o", "x.pt", until=lambda: len(list(data.glob("x-seed?.pt.state.*"))) == 2
@@ -381,14 +351,3 @@ def test_a_worker_that_fails_ends_all(run, error, told, monkeypatch):
     job = Named(output=Path("x.pt"))
     with pytest.raises(error, match=told):
         parallel._side_by_side([job, job], [0, 1], {})
-
-
-def test_the_report_fits_a_terminal(data, capsys):
-    assert main([*WORDS, "--epochs", "1", "--seeds", "2", "--seed", "3", "-o", "x.pt"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[0] == "spikeloom train --data data --graph manual --epochs 1 --seed 3 --seeds 2"
-    assert lines[1].split() == ["epoch", "correct", "accuracy", "95", "%", "interval"]
-    assert [line.split(", ")[0].strip() for line in lines[2:8]] == ["seed 3"] * 3 + ["seed 4"] * 3
-    assert lines[8].startswith("  mean of 2 seeds: last ")
-    assert lines[9] == "  written: x-seed3.pt, x-seed4.pt"
-    assert max(map(len, lines)) <= 120
