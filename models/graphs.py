@@ -16,18 +16,13 @@ import math
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from spikeloom.compiler.errors import ModelError, OptionError
-
-if TYPE_CHECKING:
-    import networkx
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from spikeloom.compiler.types import FloatArray, IntArray
 
 CHOICES = "manual, knn:K (K 1..8) or mst:SIGMA (mm, 0 = tree only), each also as released:NAME"
 MAX_TAXELS = 4096  # twice what fills a chip with 64 features each
@@ -43,13 +38,7 @@ NEUTOUCH.flags.writeable = False
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Graph:
-    """Taxels and the directed edges between them.
-
-    Raises
-    ------
-    ModelError
-        If the coordinates or the edges are malformed.
-    """
+    """Taxels and the directed edges between them; ModelError if either is malformed."""
 
     name: str  # For humans and for provenance, for example ``released:knn:3``
     coordinates: FloatArray  # (n, d) float64; positions in millimetres
@@ -69,42 +58,30 @@ class Graph:
         return len(self.coordinates)
 
 
-def check_coordinates(coordinates: ArrayLike, *, where: str = "coordinates") -> FloatArray:
-    """Return the coordinates as (n, d) float64, or raise.
-
-    Raises
-    ------
-    ModelError
-        If the array is not (n, d) with n and d at least 1, or holds a value that is not finite.
-    """
+def check_coordinates(coordinates: ArrayLike) -> FloatArray:
+    """Return the coordinates as (n, d) float64; ModelError if they are not, or not finite."""
     array = np.asarray(coordinates, dtype=np.float64)
     if array.ndim != 2 or 0 in array.shape:
-        raise ModelError(f"{where}: shape {array.shape}, allowed is (taxels, dimensions); give one row per taxel")
+        raise ModelError(f"coordinates: shape {array.shape}, allowed is (taxels, dimensions); give one row per taxel")
     if not np.isfinite(array).all():
         row = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
-        raise ModelError(f"{where}: taxel {row} has a position that is not finite; give millimetres")
+        raise ModelError(f"coordinates: taxel {row} has a position that is not finite; give millimetres")
     return array
 
 
-def check_edges(edges: ArrayLike, n: int, *, where: str = "edges") -> IntArray:
-    """Return the edges of a graph with `n` taxels as (e, 2) int64, or raise.
-
-    Raises
-    ------
-    ModelError
-        If the array is not (e, 2), does not hold integers, or names a taxel outside 0 to n - 1.
-    """
+def check_edges(edges: ArrayLike, n: int) -> IntArray:
+    """Return the edges of a graph with `n` taxels as (e, 2) int64; ModelError if they are none."""
     array = np.asarray(edges)
     if array.ndim != 2 or array.shape[1] != 2:
-        raise ModelError(f"{where}: shape {array.shape}, allowed is (edges, 2); give source and target taxel per row")
+        raise ModelError(f"edges: shape {array.shape}, allowed is (edges, 2); give source and target taxel per row")
     if array.dtype.kind not in "iu":
-        raise ModelError(f"{where}: dtype {array.dtype}, allowed are integers; give taxel indices")
+        raise ModelError(f"edges: dtype {array.dtype}, allowed are integers; give taxel indices")
     outside = ((array < 0) | (array >= n)).any(axis=1)
     if outside.any():
         row = int(np.flatnonzero(outside)[0])
         source, target = (int(index) for index in array[row])
         raise ModelError(
-            f"{where}: row {row} joins {source} and {target}, taxels are 0..{n - 1}; "
+            f"edges: row {row} joins {source} and {target}, taxels are 0..{n - 1}; "
             "count from 0 and use the layout that the edges were drawn on"
         )
     return array.astype(np.int64)
@@ -197,19 +174,6 @@ def normalised_adjacency(edges: ArrayLike, n: int) -> FloatArray:
     scale = np.zeros(n)
     scale[degree > 0] = 1.0 / np.sqrt(degree[degree > 0])
     return scale[:, None] * adjacency * scale[None, :]
-
-
-def to_networkx(graph: Graph) -> networkx.DiGraph[int]:
-    """Directed networkx graph: nodes are taxels with ``pos`` in mm; ``weight`` counts repeated edges."""
-    import networkx
-
-    result: networkx.DiGraph[int] = networkx.DiGraph(name=graph.name)
-    for taxel, position in enumerate(graph.coordinates.tolist()):
-        result.add_node(taxel, pos=tuple(position))
-    for source, target in graph.edges.tolist():
-        repeats = result.edges[source, target]["weight"] if result.has_edge(source, target) else 0
-        result.add_edge(source, target, weight=repeats + 1)
-    return result
 
 
 def _read_k(name: str, value: str, n: int) -> int:

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.systems import GCN, GRID_CNN, MLP, TACTILESGNET, Grid, taxel_propagation, window_forms
+from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.models.graphs import NEUTOUCH, Graph, normalised_adjacency
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 KERNEL = 3
 """Side of the window of a grid-based CNN."""
@@ -59,13 +56,7 @@ def grid_cells(coordinates: FloatArray = NEUTOUCH) -> IntArray:
 
 
 def sensor_grid(coordinates: FloatArray, padding: str) -> Grid:
-    """Grid over a sensor.
-
-    Raises
-    ------
-    OptionError, DataError
-        If there is no such padding, or no grid fits over the sensor or no window into it.
-    """
+    """Grid over a sensor; refuses unknown paddings, and a sensor over which no grid or window fits."""
     if padding not in PADDINGS:
         raise OptionError(f"--padding {padding}: unknown; choose from {', '.join(PADDINGS)}")
     grid = window_forms(grid_cells(coordinates), KERNEL)[padding]
@@ -89,20 +80,10 @@ def with_self_loops(edges: IntArray, n: int) -> FloatArray:
 
 
 def propagation_of(system: str, edges: IntArray, taxels: int, grid: Grid | None, filters: int) -> FloatArray:
-    """What the first layer sees, in the form that :func:`expand.stack_of` takes.
+    """What the first layer of a system sees, in the form that :func:`expand.stack_of` takes.
 
-    Parameters
-    ----------
-    system : str
-        One of ``SYSTEMS``.
-    edges : (edges, 2) int64
-        Of the taxel graph; unused by systems that have none.
-    taxels : int
-        Of the sensor.
-    grid : Grid, optional
-        Of a grid-based CNN.
-    filters : int
-        Of the first layer, which say how large the window of a grid-based CNN is.
+    `edges` are unused by systems without a graph, `grid` and the number of `filters`, which says how large its window
+    is, by all but the grid-based CNN.
     """
     match system:
         case "tactilesgnet":

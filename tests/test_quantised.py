@@ -349,7 +349,7 @@ def test_what_cannot_be_fine_tuned(refusal, tmp_path, capsys):
     assert refusal(net, "--weight-bits", "4") == (
         f"{net}: is a netlist, its weights are rounded already; give the checkpoint it was made from"
     )
-    assert refusal("pretrained:grasps", "--weight-bits", "four").startswith("--weight-bits four: not a number; give one")
+    assert refusal("pretrained:grasps", "--weight-bits", "four").startswith("--weight-bits four: not a number; give")
     assert refusal("pretrained:grasps", "--weight-bits", "4", "--resume") == (
         f"--resume: {tmp_path / 'out.pt.state'} does not exist, so nothing was interrupted; omit --resume"
     )

@@ -171,25 +171,13 @@ def test_repeated_edges_count_once(write, directed):
         ("0.5,1", "source 0.5, taxels are whole numbers 0..2"),
         ("0,nan", "target nan, taxels are whole numbers 0..2"),
         ("0,1e300", "target 1e+300, taxels are whole numbers 0..2"),
+        ("2,2", "joins taxel 2 to itself, allowed are two taxels"),
+        ("a,b", "source is 'a', not a number"),
     ],
 )
 def test_edges_to_nowhere(write, row, found):
     path = write("e.csv", f"source,target\n0,1\n{row}\n")
-    rest = "; count from 0 and use the layout that the edges were drawn on"
-    assert message(read_edges, path, 3) == f"e.csv: line 3: {found}{rest}"
-
-
-def test_self_loops(write):
-    assert message(read_edges, write("e.csv", "0,1\n2,2\n"), 3) == (
-        "e.csv: line 2: joins taxel 2 to itself, allowed are two taxels; remove the line "
-        "(every taxel receives its own events anyway)"
-    )
-
-
-def test_edges_with_text(write):
-    assert message(read_edges, write("e.csv", "0,1\na,b\n"), 3) == (
-        "e.csv: line 2: source is 'a', not a number; write plain numbers"
-    )
+    assert message(read_edges, path, 3).startswith(f"e.csv: line 3: {found}")
 
 
 # Graphs
@@ -266,21 +254,17 @@ def test_the_order_of_lines_does_not_matter(write):
     assert np.array_equal(normalised_adjacency(forward.edges, 4), normalised_adjacency(backward.edges, 4))
 
 
-def test_options_that_exclude_each_other(write):
-    coords, edges = write("c.csv", SQUARE), write("e.csv", "0,1\n")
-    choices = "knn:K (K 1..8) or mst:SIGMA (mm, 0 = tree only), each also as released:NAME"
-    assert message(sensor_graph, error=OptionError) == (
-        f"--graph and --edges: neither was given, allowed is one of them; --graph takes manual, {choices}"
-    )
-    assert message(sensor_graph, graph="manual", edges=edges, error=OptionError) == (
-        f"--graph and --edges: both were given, allowed is one of them; --graph takes manual, {choices}"
-    )
-    assert message(sensor_graph, graph="manual", directed=True, error=OptionError) == (
-        "--directed: only edges from a file have directions; give --edges or omit it"
-    )
-    assert message(sensor_graph, graph="knn:2", taxels="25", error=OptionError) == (
-        "--taxels 25: --graph knn:2 needs positions; give a CSV file with x,y in mm"
-    )
-    assert message(sensor_graph, graph="manual", taxels=coords, error=OptionError) == (
-        "graph 'manual': drawn by hand for the NeuTouch layout, not for this one of 25 taxels; use knn:K or mst:SIGMA"
-    )
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({}, "--graph and --edges: neither was given, allowed is one of them; --graph takes manual, knn:K"),
+        ({"graph": "manual", "edges": "e.csv"}, "--graph and --edges: both were given, allowed is one of them"),
+        ({"graph": "manual", "directed": True}, "--directed: only edges from a file have directions"),
+        ({"graph": "knn:2", "taxels": "25"}, "--taxels 25: --graph knn:2 needs positions; give a CSV file"),
+        ({"graph": "manual", "taxels": "c.csv"}, "graph 'manual': drawn by hand for the NeuTouch layout, not for"),
+    ],
+)
+def test_options_that_exclude_each_other(write, monkeypatch, options, words):
+    monkeypatch.chdir(write("c.csv", SQUARE).parent)
+    write("e.csv", "0,1\n")
+    assert message(sensor_graph, **options, error=OptionError).startswith(words)

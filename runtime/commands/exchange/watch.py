@@ -21,19 +21,18 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from decimal import Decimal, InvalidOperation
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from spikeloom.compiler.errors import DataError, ModelError, OptionError
+from spikeloom.compiler.types import IntArray
+from spikeloom.models.recordings.counts import number
 from spikeloom.models.recordings.eventlines import Event, EventLines, Mark
 from spikeloom.runtime.commands.options import add_netlist
+from spikeloom.runtime.machines.base import Step, Stream
 from spikeloom.runtime.report.encode import OPTIONAL
 from spikeloom.runtime.report.sections import Outcome, Section, Text
-
-if TYPE_CHECKING:
-    from spikeloom.compiler.types import IntArray
-from spikeloom.runtime.machines.base import Step, Stream
 
 NOTES = """\
 Lines come in the order of their times: an event whose bin is over, since a later one came, is counted as late and not
@@ -53,14 +52,9 @@ REFRESH_S = 0.05
 
 
 class Display:
-    """Where the running decision appears: lines on stdout; on a terminal also one line that changes, on stderr.
+    """Where the running decision appears: lines, or objects as JSON, on stdout.
 
-    Parameters
-    ----------
-    bin_s : Decimal
-        Length of a bin.
-    as_json : bool
-        Print objects instead of text.
+    On a terminal also one line that changes, on stderr.
     """
 
     def __init__(self, bin_s: Decimal, *, as_json: bool) -> None:
@@ -94,7 +88,7 @@ class Display:
         else:
             seconds = f"{self._bin_s * bins:f}"
             sure = ", sure" if early else ""
-            self._write(f"grasp {grasp}: {_standing(last)}{sure}, after {_number(bins, 'bin')} ({seconds} s)")
+            self._write(f"grasp {grasp}: {_standing(last)}{sure}, after {number(bins, 'bin')} ({seconds} s)")
 
     def _result(self, kind: str, grasp: int, bins: int, step: Step, more: dict[str, bool] | None = None) -> str:
         return json.dumps(
@@ -118,68 +112,40 @@ class Display:
         sys.stdout.flush()
 
 
+@dataclass(kw_only=True, eq=False)
 class Watch:
-    """Bins events and steps a stream; one pass over the lines, any number of grasps.
+    """Bins events and steps a stream; one pass over the lines, any number of grasps."""
 
-    Parameters
-    ----------
-    stream : Stream
-        At rest.
-    lines : EventLines
-        Where events come from.
-    display : Display
-        Where decisions go.
-    channels : int
-        Input channels of the network.
-    bin_s : Decimal
-        Length of a bin.
-    bins : int, optional
-        Length of every grasp in bins; by default the last event or the wall clock ends it.
-    from_first : bool
-        Begin the bins of a grasp at its first event instead of at time 0.
-    real : bool
-        Keep to the wall clock.
-    may_end : callable, optional
-        Says from a chip step and the votes after it whether the grasp is decided, see :func:`exits.live`.
-    """
-
-    def __init__(
-        self,
-        stream: Stream,
-        lines: EventLines,
-        display: Display,
-        *,
-        channels: int,
-        bin_s: Decimal,
-        bins: int | None,
-        from_first: bool,
-        real: bool,
-        may_end: Callable[[int, IntArray], bool] | None = None,
-    ) -> None:
-        self._stream = stream
-        self._lines = lines
-        self._display = display
-        self._column = np.zeros(channels, np.uint8)
-        self._bin_s = bin_s
-        self._bins = bins
-        self._from_first = from_first
-        self._real = real
-        self._may_end = may_end
-        self._origin: Decimal | None = None  # of the grasp; None between two grasps
-        self._epoch = 0.0  # wall clock at the origin
-        self._decided = False
-        self._last: tuple[Step, ...] = ()
-        self.grasps = self.bins = self.events = self.repeated = self.late = self.early = 0
-        self.step_s: list[float] = []
+    stream: Stream  # At rest
+    lines: EventLines
+    display: Display
+    bin_s: Decimal  # Length of a bin
+    bins: int | None  # Length of every grasp in bins; without it the last event or the wall clock ends it
+    from_first: bool  # Whether the bins of a grasp begin at its first event instead of at time 0
+    real: bool  # Whether to keep to the wall clock
+    # Says from a chip step and the votes after it whether the grasp is decided, see :func:`exits.live`
+    may_end: Callable[[int, IntArray], bool] | None
+    column: NDArray[np.uint8]  # Inputs of the open bin, (channels,)
+    origin: Decimal | None = None  # Of the grasp; None between two grasps
+    epoch: float = 0.0  # Wall clock at the origin
+    decided: bool = False
+    last: tuple[Step, ...] = ()
+    grasps: int = 0
+    stepped: int = 0  # Bins of all grasps
+    events: int = 0
+    repeated: int = 0
+    late: int = 0
+    early: int = 0
+    step_s: list[float] = field(default_factory=list)
 
     def run(self) -> bool:
         """Follow the lines to their end; return whether the user, or the reader of our output, ended it before."""
         try:
             while True:
-                if self._real and self._is_open() and not self._lines.arrived(self._wall(self._stream.index + 2)):
+                if self.real and self._is_open() and not self.lines.arrived(self._wall(self.stream.index + 2)):
                     self._close_bin()
                     continue
-                entry = self._lines.read()
+                entry = self.lines.read()
                 if isinstance(entry, Event):
                     self._take(entry)
                 elif entry is not Mark.NOTHING:
@@ -187,7 +153,7 @@ class Watch:
                     if entry is Mark.END_OF_STREAM:
                         return False
         except KeyboardInterrupt:
-            if self._is_open() and self._stream.index:  # what the open bin holds is not all of it
+            if self._is_open() and self.stream.index:  # what the open bin holds is not all of it
                 self._decide()
         except BrokenPipeError:
             pass
@@ -195,67 +161,67 @@ class Watch:
 
     def _is_open(self) -> bool:
         """Whether a grasp has begun and is not decided."""
-        return self._origin is not None and not self._decided
+        return self.origin is not None and not self.decided
 
     def _wall(self, bins: int) -> float:
         """Where the wall clock is after so many bins of the grasp."""
-        return self._epoch + float(self._bin_s) * bins
+        return self.epoch + float(self.bin_s) * bins
 
     def _take(self, event: Event) -> None:
         """Put an event into its bin; step the bins before it."""
         self.events += 1
-        if self._origin is None:
-            self._origin = event.time_s if self._from_first else Decimal(0)
-            self._epoch = time.monotonic() - float(event.time_s - self._origin)
-        place = (event.time_s - self._origin) / self._bin_s + EDGE
+        if self.origin is None:
+            self.origin = event.time_s if self.from_first else Decimal(0)
+            self.epoch = time.monotonic() - float(event.time_s - self.origin)
+        place = (event.time_s - self.origin) / self.bin_s + EDGE
         index = int(place) if place >= 0 else -1
-        if self._is_open() and index - self._stream.index > MAX_GAP:
-            gap = index - self._stream.index
-            raise self._lines.complain(
+        if self._is_open() and index - self.stream.index > MAX_GAP:
+            gap = index - self.stream.index
+            raise self.lines.complain(
                 f"time {event.time_s} s leaves {gap} bins without an event, allowed are {MAX_GAP}",
                 "give seconds, end a grasp with an empty line, or let it begin at its first event (--origin first)",
             )
-        while self._is_open() and self._stream.index < index:
+        while self._is_open() and self.stream.index < index:
             self._close_bin()
-        if self._decided or index < self._stream.index:
+        if self.decided or index < self.stream.index:
             self.late += 1
             return
-        self.repeated += int(self._column[event.channel])
-        self._column[event.channel] = 1
+        self.repeated += int(self.column[event.channel])
+        self.column[event.channel] = 1
 
     def _close_bin(self, *, wait: bool = True) -> None:
         """Step the open bin, not before its end by the wall clock if that counts."""
-        if self._real and wait:
-            time.sleep(max(0.0, self._wall(self._stream.index + 1) - time.monotonic()))
+        if self.real and wait:
+            time.sleep(max(0.0, self._wall(self.stream.index + 1) - time.monotonic()))
         begun = time.perf_counter()
-        step = self._stream.step(self._column)
-        self._last = (step,)
+        step = self.stream.step(self.column)
+        self.last = (step,)
         self.step_s.append(time.perf_counter() - begun)
-        self._column[:] = 0
-        self._display.bin(self.grasps + 1, step)
-        if step.index + 1 == self._bins:
+        self.column[:] = 0
+        self.display.bin(self.grasps + 1, step)
+        if step.index + 1 == self.bins:
             self._decide()
-        elif self._may_end is not None and self._may_end(step.index, step.counts):
+        elif self.may_end is not None and self.may_end(step.index, step.counts):
             self._decide(early=True)
 
     def _end_grasp(self) -> None:
         """Step the bins that are left, decide, and get ready for the next grasp."""
-        while self._is_open() and (self._column.any() or self._stream.index < (self._bins or 0)):
+        while self._is_open() and (self.column.any() or self.stream.index < (self.bins or 0)):
             self._close_bin(wait=False)
         if self._is_open():
             self._decide()
-        self._stream.reset()
-        self._origin, self._decided = None, False
+        self.stream.reset()
+        self.origin, self.decided = None, False
 
     def _decide(self, *, early: bool = False) -> None:
         """Run the steps by which the read-out lags, unless they change nothing, and show the decision."""
-        bins = self._stream.index
-        self._decided = True
-        last = self._last[-1] if early else (*self._last, *self._stream.finish())[-1]
+        bins = self.stream.index
+        self.decided = True
+        last = self.last[-1] if early else (*self.last, *self.stream.finish())[-1]
         self.grasps += 1
-        self.bins += bins
+        self.stepped += bins
         self.early += early
-        self._display.grasp(self.grasps, bins, last, early=None if self._may_end is None else early)
+        self.display.grasp(self.grasps, bins, last, early=None if self.may_end is None else early)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -318,10 +284,10 @@ def run(arguments: argparse.Namespace) -> Outcome:
     name = "standard input" if stdin else arguments.input
     with _opened(arguments.input) as file:
         session = Watch(
-            stream,
-            EventLines(file, name, netlist.taxels),
-            Display(bin_s, as_json=arguments.json),
-            channels=netlist.taxels * netlist.polarities,
+            stream=stream,
+            lines=EventLines(file, name, netlist.taxels),
+            display=Display(bin_s, as_json=arguments.json),
+            column=np.zeros(netlist.taxels * netlist.polarities, np.uint8),
             bin_s=bin_s,
             bins=arguments.bins,
             from_first=arguments.origin == "first",
@@ -333,7 +299,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
         raise DataError(f"{name}: empty stream, no event found; give lines 'time_s,taxel,polarity'")
     summary = Summary(
         grasps=session.grasps,
-        bins=session.bins,
+        bins=session.stepped,
         events=session.events,
         repeated=session.repeated,
         late=session.late,
@@ -399,16 +365,12 @@ def _duration(text: str) -> Decimal:
     return seconds
 
 
-def _number(count: int, noun: str) -> str:
-    return f"{count} {noun}{'' if count == 1 else 's'}"
-
-
 def _standing(step: Step) -> str:
     """The decision and what it rests on, for people."""
     if not step.counts.any():
         return f"class {step.decision}, no votes"
     ahead = f"{step.margin} ahead" if step.margin else "a tie"
-    return f"class {step.decision}, {_number(int(step.counts.max()), 'vote')}, {ahead}"
+    return f"class {step.decision}, {number(int(step.counts.max()), 'vote')}, {ahead}"
 
 
 def _timing(step_s: list[float], bin_s: float) -> StepTime:
@@ -418,7 +380,7 @@ def _timing(step_s: list[float], bin_s: float) -> StepTime:
 
 def sections(found: Summary) -> list[Section]:
     """The summary for people."""
-    parts = [_number(found.grasps, "grasp"), _number(found.bins, "bin"), _number(found.events, "event")]
+    parts = [number(found.grasps, "grasp"), number(found.bins, "bin"), number(found.events, "event")]
     parts += [f"{found.repeated} repeated within a bin", f"{found.late} late"]
     text = ", ".join([*parts, *([] if found.early is None else [f"{found.early} ended early"])])
     if found.step is not None:
