@@ -1,10 +1,12 @@
 """NIR and netx files with faults: bytes and content of good ones changed at random, the same for the same seed."""
 
 import copy
+import io
 import random
 from functools import cache
 from pathlib import Path
 
+import made_netx
 import numpy as np
 from fuzzed_bytes import changed_bytes
 
@@ -34,27 +36,16 @@ def sources():
 @cache
 def netx_bytes():
     """A good netx file."""
-    from spikeloom.compiler.formats.netx.writer import file_bytes
+    rng, file = np.random.default_rng(0), io.BytesIO()
 
-    rng = np.random.default_rng(0)
+    def even(*shape, **more):
+        return made_netx.dense(made_netx.even(rng, *shape), bias=made_netx.even(rng, shape[0], most=16), **more)
 
-    def neuron():
-        kinds = {"iDecay": 4096, "vDecay": 1024, "vThMant": 25, "refDelay": 1, "gradedSpike": 0}
-        return {"type": "CUBA"} | {key: np.array(value) for key, value in kinds.items()}
-
-    def block(kind, shape, weight, **more):
-        bias = 2 * rng.integers(-9, 9, len(weight))
-        return {"type": kind, "shape": np.array(shape), "weight": weight, "bias": bias, "neuron": neuron()} | more
-
-    pairs = {key: np.array([1, 1]) for key in ("stride", "dilation")} | {"padding": np.array([0, 0])}
-    layers = [
-        {"type": "input", "shape": np.array([2, 4, 4])},
-        block("conv", [3, 3, 3], 2 * rng.integers(-9, 9, (3, 2, 2, 2)), groups=np.array(1), **pairs),
-        {"type": "flatten", "shape": np.array([27])},
-        block("dense_rec", [6], 2 * rng.integers(-60, 60, (6, 27)), weight_rec=rng.integers(-60, 60, (6, 6))),
-        block("dense", [4], 2 * rng.integers(-60, 60, (4, 6))),
-    ]
-    return file_bytes({"layer": {str(number): layer for number, layer in enumerate(layers)}})
+    kernel = made_netx.even(rng, 3, 2, 2, 2, most=18)
+    recurrent = even(6, 27, type=["dense_rec"], weight_rec=rng.integers(-60, 60, (6, 6)))
+    image = made_netx.given_input(2, 4, 4), made_netx.conv(kernel, (3, 3, 3), bias=[2, 4, 6]), made_netx.flatten(27)
+    made_netx.write(file, *image, recurrent, even(4, 6))
+    return file.getvalue()
 
 
 @cache

@@ -9,30 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from spikeloom.compiler.checkpoint import Checkpoint, Dense
 from spikeloom.compiler.passes.expand import expand_graph_convolution
 from spikeloom.models.graphs import build_graph, normalised_adjacency
-from spikeloom.models.networks.layers import LifSteps, lif, spike_linear, tag_convolution
+from spikeloom.models.networks.layers import lif, spike_linear, tag_convolution
 from spikeloom.models.networks.networks import Architecture, SpikingNet
-from spikeloom.models.networks.reference import float_membranes, float_spikes
-from spikeloom.models.networks.surrogate import RECTANGLE
 
 BETA, THETA = 0.2, 0.5
-
-
-class Spike(torch.autograd.Function):
-    """Step with a rectangular surrogate, as plain autograd code has it."""
-
-    @staticmethod
-    def forward(ctx, membrane, theta):
-        ctx.save_for_backward(membrane)
-        ctx.theta = theta
-        return membrane.gt(theta).to(membrane.dtype)
-
-    @staticmethod
-    def backward(ctx, gradient):
-        (membrane,) = ctx.saved_tensors
-        return gradient * ((membrane - ctx.theta).abs() < RECTANGLE.width).to(gradient.dtype), None
 
 
 def lif_step_by_step(current, beta=BETA, theta=THETA):
@@ -40,7 +22,7 @@ def lif_step_by_step(current, beta=BETA, theta=THETA):
     spikes, membranes = [], []
     for step in current:
         membrane = membrane * beta * (1.0 - spike) + step
-        spike = Spike.apply(membrane, theta)
+        spike = membrane.gt(theta).to(membrane.dtype)
         spikes.append(spike)
         membranes.append(membrane)
     return torch.stack(spikes), torch.stack(membranes)
@@ -99,31 +81,10 @@ def test_the_threshold_is_strict_and_a_spike_resets_to_zero():
     assert_allclose(membrane[:, 0], [0.6, 0.4, 0.51], rtol=1e-6)
 
 
-@given(seed=st.integers(0, 2**31), steps=st.integers(1, 30), beta=st.sampled_from([0.0, 0.2, 0.9]))
-@settings(max_examples=40, deadline=None)
-def test_gradient_of_the_recurrence_equals_plain_autograd(seed, steps, beta):
-    generator = torch.Generator().manual_seed(seed)
-    values = torch.randn(steps, 3, 7, generator=generator, dtype=torch.float64)
-    weight = torch.randn(values.shape, generator=generator, dtype=torch.float64)
-    gradients = []
-    for function in (lif, lif_step_by_step):
-        current = values.clone().requires_grad_()
-        spikes, _ = function(current, beta, THETA)
-        (spikes * weight).sum().backward()
-        gradients.append(current.grad)
-    assert_allclose(gradients[0], gradients[1], rtol=1e-12, atol=1e-12)
-    assert gradients[0].abs().max() > 0 or ((values[-1] - THETA).abs() >= RECTANGLE.width).all()
-
-
 def test_the_surrogate_is_open_at_its_ends():
     current = torch.tensor([[0.0, 1.0, 0.25, 0.75]], dtype=torch.float64, requires_grad=True)
     lif(current, BETA, THETA)[0].sum().backward()
     assert current.grad.tolist() == [[0, 0, 1, 1]]
-
-
-def test_no_gradient_flows_from_the_membrane():
-    current = torch.ones(3, 2, requires_grad=True)
-    assert not lif(current, BETA, THETA)[1].requires_grad
 
 
 # --- the convolution -----------------------------------------------------------------------------------------------
@@ -150,23 +111,6 @@ def test_a_taxel_without_neighbours_hears_itself_only():
     hops = torch.ones(3, 1, 2)
     out = tag_convolution(torch.ones(1, 1, 3, 2), adjacency, hops, torch.zeros(1))
     assert out[0, 0].tolist() == [6, 6, 2]
-
-
-def test_gradient_of_the_convolution_equals_plain_autograd():
-    generator = torch.Generator().manual_seed(4)
-    edges = build_graph("manual").edges
-    x = random_events(1, 5, 2, 39, kind=torch.float64)
-    values = (
-        torch.randn(4, 3, 2, generator=generator, dtype=torch.float64),
-        torch.randn(3, generator=generator, dtype=torch.float64),
-    )
-    weight = torch.randn(5, 2, 39 * 3, generator=generator, dtype=torch.float64)
-    fused, plain = ([value.clone().requires_grad_() for value in values] for _ in range(2))
-    (tag_convolution(x, torch.tensor(adjacency_of()), *fused) * weight).sum().backward()
-    steps = [[convolution_step_by_step(one, edges, *plain).reshape(-1) for one in samples] for samples in x]
-    (torch.stack([torch.stack(samples) for samples in steps]) * weight).sum().backward()
-    for a, b in zip(fused, plain, strict=True):
-        assert_allclose(a.grad, b.grad, rtol=1e-10, atol=1e-10)
 
 
 # --- the dense layer -----------------------------------------------------------------------------------------------
@@ -196,15 +140,6 @@ def test_spike_linear_equals_a_dense_product_and_its_gradient(rate):
 # --- the network ---------------------------------------------------------------------------------------------------
 
 SMALL = Architecture(taxels=39, classes=4, hops=2, features=3, hidden=(8, 6, 5), beta=0.3, theta=0.4)
-
-
-def lively(seed):
-    """A network of which every layer spikes: initial weights times four."""
-    network = SpikingNet(SMALL, adjacency_of(), seed=seed)
-    with torch.no_grad():
-        for parameter in network.parameters():
-            parameter.mul_(4)
-    return network
 
 
 def test_sizes_come_from_the_architecture():
@@ -251,94 +186,4 @@ def test_weights_can_be_taken_over():
     assert (first.export_weights()["fc1.weight"] != 0).any()
 
 
-def test_all_layers_equal_the_step_by_step_network_in_spikes_and_gradient():
-    network = lively(3).double()
-    network.adjacency = torch.tensor(adjacency_of())
-    edges = build_graph("manual").edges
-    events = random_events(3, 30, 1, 39, rate=0.4, kind=torch.float64)
-    weights = {name: torch.tensor(array, requires_grad=True) for name, array in network.export_weights().items()}
-    sizes = (39 * 3, 8, 6, 5, 4)
-    membranes = [torch.zeros(size, dtype=torch.float64) for size in sizes]
-    spikes = list(membranes)
-    total = torch.zeros(4, dtype=torch.float64)
-    trace = []
-    for step in events[:, 0]:
-        current = convolution_step_by_step(step, edges, weights["conv1.hops"], weights["conv1.bias"]).reshape(-1)
-        for i in range(5):
-            if i:
-                current = weights[f"fc{i}.weight"] @ spikes[i - 1] + weights[f"fc{i}.bias"]
-            membranes[i] = membranes[i] * SMALL.beta * (1 - spikes[i]) + current
-            spikes[i] = Spike.apply(membranes[i], SMALL.theta)
-        total = total + spikes[-1]
-        trace.append([spike.detach().clone() for spike in spikes])
-    rates = network(events)
-    for i, name in enumerate(("conv1", *network.dense)):
-        found = network.layers(events)[name][0][:, 0].detach()
-        assert_array_equal(found, torch.stack([step[i] for step in trace]))
-        assert found.any()
-    target = torch.tensor([0.0, 1.0, 0.0, 0.0], dtype=torch.float64)
-    ((rates[0] - target) ** 2).mean().backward()
-    ((total / len(events) - target) ** 2).mean().backward()
-    for name, parameter in network.named_parameters():
-        expected = weights[name].grad
-        found = parameter.grad.t() if name.endswith(".weight") else parameter.grad
-        assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
-    assert network.conv1.hops.grad.abs().max() > 0
-
-
 # --- the reference -------------------------------------------------------------------------------------------------
-
-
-def checkpoint_of(network: SpikingNet) -> Checkpoint:
-    weights = network.export_weights()
-    return Checkpoint(
-        hops=weights["conv1.hops"],
-        conv_bias=weights["conv1.bias"],
-        dense=tuple(
-            Dense(name=name, weight=weights[f"{name}.weight"], bias=weights[f"{name}.bias"]) for name in network.dense
-        ),
-        beta=network.architecture.beta,
-        theta=network.architecture.theta,
-        assumed=(),
-        graph=None,
-        edges=None,
-        layout="state_dict",
-        weights="last",
-        sets=("last",),
-        runs=1,
-        training=None,
-        forms=(),
-        sha256="",
-    )
-
-
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
-def test_reference_gives_the_spikes_of_the_network(dtype):
-    network = lively(3)
-    events = random_events(5, 25, 19, 39).permute(1, 2, 3, 0).numpy().astype(np.uint8)
-    spikes = float_spikes(checkpoint_of(network), adjacency_of(), events, dtype=dtype)
-    membranes = float_membranes(checkpoint_of(network), adjacency_of(), events, dtype=dtype)
-    expected = network.layers(torch.tensor(events, dtype=torch.float32).permute(3, 0, 1, 2))
-    assert list(spikes) == list(membranes) == list(expected)
-    for name, found in spikes.items():
-        assert found.dtype == np.bool_
-        assert found.any()
-        assert_array_equal(found, expected[name][0].detach().bool().transpose(0, 1))
-        assert membranes[name].dtype == np.dtype(dtype)
-        assert_array_equal(membranes[name] > np.dtype(dtype).type(SMALL.theta), found)
-        assert_allclose(membranes[name], expected[name][1].transpose(0, 1), rtol=1e-4, atol=1e-5)
-
-
-def test_the_recurrence_in_torch_operations_equals_the_kernels_bit_for_bit():
-    generator = torch.Generator().manual_seed(3)
-    current = torch.randn(40, 3, 17, generator=generator)
-    above = torch.randn(40, 3, 17, generator=generator)
-    results = []
-    for function in (lif, LifSteps.apply):
-        x = current.clone().requires_grad_()
-        spikes, membrane = function(x, 0.2, 0.5)
-        spikes.backward(above)
-        results.append((spikes.detach(), membrane, x.grad))
-    for kernel, steps in zip(*results, strict=True):
-        assert torch.equal(kernel, steps)
-    assert 0 < results[0][0].mean() < 1

@@ -19,7 +19,7 @@ from random_netlists import large_netlist
 from test_timing import DETAILED, ENERGY_PJ, LOIHI, SANAFE, SIMPLE, six_steps
 from timed_networks import events_of, written
 
-from spikeloom.compiler import Options, compile_network
+from spikeloom.compiler import compile_network
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.formats import sanafe
@@ -27,7 +27,6 @@ from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.models.graphs import build_graph, normalised_adjacency
-from spikeloom.models.recordings.evtouch import load_recordings
 from spikeloom.runtime.machines.loihi1 import engine, timing
 from spikeloom.runtime.machines.loihi1.costs import cost
 
@@ -190,22 +189,3 @@ def without_second_lists(netlist: Netlist, kept: np.ndarray) -> Netlist:
         synapse_target=read_only(netlist.synapse_target[synapses]),
         synapse_weight=read_only(netlist.synapse_weight[synapses]),
     )
-
-
-@pytest.mark.slow
-@pytest.mark.recordings
-def test_the_real_checkpoint(interpreter, released_checkpoint, objects_zip, tmp_path):
-    graph = build_graph("manual")
-    netlist = compile_network(
-        expand(read_checkpoint(released_checkpoint), normalised_adjacency(graph.edges, graph.n_taxels)),
-        Options(training_events=load_recordings(objects_zip, "train").events),
-    ).netlist
-    recordings = load_recordings(objects_zip, "test").events[[0, 29, 58, 87, 116]]
-    for run in compare(interpreter, netlist, recordings.reshape(5, netlist.n_inputs, -1), tmp_path):
-        np.testing.assert_array_equal(run.spikes, run.expected_spikes)
-        assert run.spikes.sum() > 1000
-        np.testing.assert_allclose(run.ours_simple, run.simple, rtol=1e-9)
-        # messages of one time go in another order there
-        assert run.ours_detailed.sum() == pytest.approx(run.detailed.sum(), rel=0.002)
-        np.testing.assert_allclose(run.ours_detailed, run.detailed, rtol=0.03)
-        assert run.ours_energy == pytest.approx(run.energy, rel=1e-9)
