@@ -27,27 +27,26 @@ def members(checkpoint: Checkpoint) -> tuple[Checkpoint, ...]:
     """The networks that a checkpoint was joined from, or the one that it is."""
     if checkpoint.towers == 1:
         return (checkpoint,)
-    every = apart(arrays_of(checkpoint), checkpoint.towers)
     owners = towers_of(checkpoint)
-    return tuple(
-        replace(
-            checkpoint,
-            hops=arrays["conv1.hops"],
-            conv_bias=arrays["conv1.bias"],
-            dense=tuple(
-                replace(stage, weight=arrays[f"{stage.name}.weight"], bias=arrays[f"{stage.name}.bias"])
-                for stage in checkpoint.dense
-            ),
-            forms=None
-            if checkpoint.forms is None
-            else tuple(
+    found = []
+    for tower, arrays in enumerate(apart(arrays_of(checkpoint), checkpoint.towers)):
+        forms = None
+        if checkpoint.forms is not None:
+            forms = tuple(
                 replace(form, threshold=form.threshold[(owner == tower) | (owner == SHARED)])
                 for form, owner in zip(checkpoint.forms, owners, strict=True)
-            ),
-            towers=1,
-        )
-        for tower, arrays in enumerate(every)
+            )
+        found.append(replace(_holding(checkpoint, arrays), forms=forms, towers=1))
+    return tuple(found)
+
+
+def _holding(checkpoint: Checkpoint, arrays: Arrays) -> Checkpoint:
+    """The checkpoint with other arrays."""
+    dense = tuple(
+        replace(stage, weight=arrays[f"{stage.name}.weight"], bias=arrays[f"{stage.name}.bias"])
+        for stage in checkpoint.dense
     )
+    return replace(checkpoint, hops=arrays["conv1.hops"], conv_bias=arrays["conv1.bias"], dense=dense)
 
 
 def side_by_side(
@@ -99,17 +98,7 @@ def join(checkpoints: Sequence[Checkpoint], names: Sequence[str]) -> Checkpoint:
         )
     every = [member for checkpoint in checkpoints for member in members(checkpoint)]
     arrays = together([arrays_of(member) for member in every])
-    joined = replace(
-        every[0],
-        hops=arrays["conv1.hops"],
-        conv_bias=arrays["conv1.bias"],
-        dense=tuple(
-            replace(stage, weight=arrays[f"{stage.name}.weight"], bias=arrays[f"{stage.name}.bias"])
-            for stage in every[0].dense
-        ),
-        forms=None,
-        towers=len(every),
-    )
+    joined = replace(_holding(every[0], arrays), forms=None, towers=len(every))
     return replace(joined, forms=_joined_forms(joined, every))
 
 

@@ -65,10 +65,9 @@ def apply(node: Node, table: Table, operands: Sequence[Value | None]) -> list[Va
     if not any(isinstance(operand, Affine | Decision) for operand in operands):
         return _constant(node, table, operands)
     decisions = {operand.point for operand in operands if isinstance(operand, Decision)}
-    if node.op in POINTWISE and len(decisions) == 1 and not any(isinstance(o, Affine) for o in operands):
-        decided = _decided(node, table, operands)
-        if decided is not None:
-            return [decided]
+    alone = node.op in POINTWISE and len(decisions) == 1 and not any(isinstance(o, Affine) for o in operands)
+    if alone and (decided := _decided(node, table, operands)) is not None:
+        return [decided]
     values = [as_affine(table, operand) if isinstance(operand, Decision) else operand for operand in operands]
     varying = [place for place, operand in enumerate(values) if isinstance(operand, Affine)]
     if node.op in MOVES and not (node.op == "Where" and 0 in varying) and node.attributes.get("reduction") != "add":
@@ -204,48 +203,32 @@ def _linear(node: Node, table: Table, values: Sequence[Value | None], varying: l
 
 def _elementwise(node: Node, table: Table, values: Sequence[Value | None], varying: list[int]) -> Value:
     op = node.op
-    if op == "Cast" and varying == [0]:
-        return _cast(node, table, values[0])
     if op == "BatchNormalization" and varying == [0]:
         return _affine_map(node, table, values)
-    if op in ("Add", "Div", "Mean", "Mul", "Neg", "Not", "Sub", "Sum") and all(value is not None for value in values):
-        shape = table.room(np.broadcast_shapes(*(v.shape for v in values)))  # type: ignore[union-attr]
-        parts = [spread(as_affine(table, value), shape) for value in values]  # type: ignore[arg-type]
-        return _added(op, parts) if op in ("Add", "Mean", "Neg", "Sub", "Sum") else _scaled(op, table, parts, varying)
-    if op in STATEFUL:
-        raise ModelError(NO_LIF)
-    raise ModelError(NOT_AFFINE)
-
-
-def _cast(node: Node, table: Table, value: Value | None) -> Value:
-    assert isinstance(value, Affine)
-    to = int(node.attributes["to"])
-    if to in FLOATING or (is_binary(table, value) if to == BOOL else is_whole(table, value)):
-        return value
-    raise ModelError(f"rounds its input to whole numbers, so it {NOT_AFFINE}")
-
-
-def _added(op: str, parts: list[Affine]) -> Value:
-    weights = {"Sub": [1.0, -1.0], "Neg": [-1.0], "Mean": [1 / len(parts)] * len(parts)}.get(op, [1.0] * len(parts))
-    return added(list(zip(weights, parts, strict=True)), parts[0].shape)
-
-
-def _scaled(op: str, table: Table, parts: list[Affine], varying: list[int]) -> Value:
+    if op not in ("Add", "Cast", "Div", "Mean", "Mul", "Neg", "Not", "Sub", "Sum"):
+        raise ModelError(NO_LIF if op in STATEFUL else NOT_AFFINE)
+    shape = table.room(np.broadcast_shapes(*(present(value).shape for value in values)))
+    parts = [spread(as_affine(table, present(value)), shape) for value in values]
     value, other = parts[0], parts[-1]
-    match op:
-        case "Mul" if len(varying) == 2:
-            return multiplied(table, value, other)
-        case "Mul":
-            return scaled(parts[varying[0]], parts[1 - varying[0]].bias)
-        case "Div" if varying == [0]:
-            # Division, not a product with the reciprocal: 1 / 3 is not a number.
-            terms = {atom: own.copy() for atom, own in value.terms.items()}
-            for own in terms.values():
-                own.data = own.data / np.repeat(other.bias, np.diff(own.indptr))
-            return Affine(shape=value.shape, terms=terms, bias=value.bias / other.bias)
-        case "Not" if is_binary(table, value):
-            return scaled_by(value, np.full(len(value.bias), -1.0), np.array(1.0))
-    raise ModelError(NOT_AFFINE)
+    if op == "Cast":
+        to = int(node.attributes["to"])
+        if to not in FLOATING and not (is_binary(table, value) if to == BOOL else is_whole(table, value)):
+            raise ModelError(f"rounds its input to whole numbers, so it {NOT_AFFINE}")
+        found = value
+    elif op == "Mul":
+        both = len(varying) == 2
+        found = multiplied(table, value, other) if both else scaled(parts[varying[0]], parts[1 - varying[0]].bias)
+    elif op == "Div" and varying == [0]:
+        # not a product with the reciprocal: 1 / 3 is not a number
+        found = scaled(value, other.bias, np.divide)
+    elif op == "Not" and is_binary(table, value):
+        found = scaled_by(value, np.full(len(value.bias), -1.0), np.array(1.0))
+    elif op in ("Div", "Not"):
+        raise ModelError(NOT_AFFINE)
+    else:
+        weights = {"Sub": [1.0, -1.0], "Neg": [-1.0], "Mean": [1 / len(parts)] * len(parts)}
+        found = added(list(zip(weights.get(op, [1.0] * len(parts)), parts, strict=True)), shape)
+    return found
 
 
 def _affine_map(node: Node, table: Table, values: Sequence[Value | None]) -> Value:
@@ -260,9 +243,6 @@ def _affine_map(node: Node, table: Table, values: Sequence[Value | None]) -> Val
 
 
 def require_finite(value: Affine) -> None:
-    """Refuse coefficients that are not finite numbers.
-
-    Raises ModelError.
-    """
+    """Refuse coefficients that are not finite numbers: ModelError."""
     if not all(np.all(np.isfinite(part)) for part in (value.bias, *(own.data for own in value.terms.values()))):
         raise ModelError("has coefficients that are not finite; train it again")

@@ -183,12 +183,12 @@ def added(values: Sequence[tuple[float, Affine]], shape: tuple[int, ...]) -> Aff
     return Affine(shape=shape, terms=terms, bias=bias)
 
 
-def scaled(value: Affine, factor: FloatArray) -> Affine:
-    """Each element times a constant of its own."""
+def scaled(value: Affine, factor: FloatArray, change: np.ufunc = np.multiply) -> Affine:
+    """Each element times a constant of its own, or divided by it."""
     terms = {atom: own.copy() for atom, own in value.terms.items()}
     for own in terms.values():
-        own.data = own.data * np.repeat(factor, np.diff(own.indptr))
-    return Affine(shape=value.shape, terms=terms, bias=value.bias * factor)
+        own.data = change(own.data, np.repeat(factor, np.diff(own.indptr)))
+    return Affine(shape=value.shape, terms=terms, bias=change(value.bias, factor))
 
 
 def one_each(terms: Sparse) -> tuple[FloatArray, IntArray] | None:

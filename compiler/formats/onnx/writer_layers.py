@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy import sparse
 
 from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT
 from spikeloom.compiler.formats.names import plain_names
@@ -124,9 +125,9 @@ def plan(netlist: Netlist) -> tuple[Layer, ...]:
     def source(a: int, b: int) -> Source:
         sides = []
         for side in (weight > 0, weight < 0):
-            found, dense = (pre == a) & (post == b) & side, np.zeros((counts[a], counts[b]), np.int64)
-            np.add.at(dense, (row[found], place[target[found]]), np.abs(weight[found]))
-            sides.append(dense)
+            found = (pre == a) & (post == b) & side
+            entries = np.abs(weight[found]), (row[found], place[target[found]])
+            sides.append(sparse.coo_array(entries, shape=(counts[a], counts[b])).toarray())
         return Source(pre=a, positive=sides[0], negative=sides[1])
 
     bounds = one_step_bounds(netlist)
@@ -185,9 +186,6 @@ def _layer(
 
 def _gathered(sources: tuple[Source, ...]) -> int:
     """Bound of any partial result while products with digits are added up, membrane units."""
-    total = 0
-    for source in sources:
-        for sign in (0, 1, -1):
-            for digit, factor in digits(source.weight(sign)):
-                total += int((np.abs(digit.astype(np.int64)).sum(axis=0) * factor).max(initial=0)) << MEMBRANE_SHIFT
-    return total
+    every = [digit for source in sources for sign in (0, 1, -1) for digit in digits(source.weight(sign))]
+    sums = [(np.abs(digit.astype(np.int64)).sum(axis=0) * factor).max(initial=0) for digit, factor in every]
+    return int(sum(sums)) << MEMBRANE_SHIFT
