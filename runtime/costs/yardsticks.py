@@ -126,30 +126,21 @@ def measure(
     *,
     lengths: npt.NDArray[np.int64] | None = None,
 ) -> Yardsticks:
-    """Count a checkpoint's operations on recordings.
+    """Count a checkpoint's operations on recordings (samples, taxels, channels, steps).
 
-    Parameters
-    ----------
-    checkpoint : Checkpoint
-        Trained weights.
-    adjacency : (taxels, taxels) float64
-        Normalised propagation matrix of its graph.
-    events : (samples, taxels, channels, steps) uint8
-        Recordings.
-    spikes : mapping or sequence of (samples, steps, neurons) bool
-        Spike trains of every layer in order, of the float model or of the chip (aligned with the data).
-    lengths : (samples,) int64, optional
-        Steps of each recording where some are shorter; what comes after them is not counted.
-
-    Raises
-    ------
-    DataError
-        If spikes and recordings do not belong to this network.
+    `adjacency` (taxels, taxels) is the normalised propagation matrix of its graph; `spikes` are trains (samples, steps,
+    neurons) of every layer in order, of the float model or of the chip (aligned with the data); what comes after the
+    `lengths` (samples,) of the recordings is not counted. Raises DataError if they are not of one network.
     """
     network = expand(checkpoint, adjacency)
     samples, steps = len(events), events.shape[-1]
     given = list(spikes.values() if isinstance(spikes, Mapping) else spikes)
-    _check(network, events, given)
+    shapes = [(samples, steps, population.size) for population in network.populations]
+    if (found := [train.shape for train in given]) != shapes or samples == 0:
+        raise DataError(
+            f"yardsticks: spikes of shapes {found} found, {shapes} allowed for these {samples} recordings; "
+            "give the spikes of every layer of this network on these recordings"
+        )
     last = np.full(samples, steps) if lengths is None else lengths
     counted = np.arange(steps) < last[:, None]
     trains = [train & counted[:, :, None] for train in given]
@@ -174,17 +165,6 @@ def measure(
             for numbers in MULTIPLY_ACCUMULATE
         ),
     )
-
-
-def _check(network: Network, events: npt.NDArray[np.uint8], spikes: Sequence[SpikeTrain]) -> None:
-    samples, steps = len(events), events.shape[-1]
-    wanted = [(samples, steps, population.size) for population in network.populations]
-    found = [train.shape for train in spikes]
-    if found != wanted or samples == 0:
-        raise DataError(
-            f"yardsticks: spikes of shapes {found} found, {wanted} allowed for these {samples} recordings; "
-            "give the spikes of every layer of this network on these recordings"
-        )
 
 
 def _neurobench(

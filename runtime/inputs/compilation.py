@@ -28,17 +28,7 @@ PLACING: dict[str, object] = {"keep_all": False, "cores_for": None, "chips": 1, 
 
 
 def provenance(arguments: argparse.Namespace, asked: LoadedNetwork, *, calibrated: bool) -> Mapping[str, Any]:
-    """What a netlist remembers of its compilation.
-
-    Parameters
-    ----------
-    arguments : Namespace
-        Options of ``compile``.
-    asked : LoadedNetwork
-        The network.
-    calibrated : bool
-        Whether recordings chose its scales.
-    """
+    """What a netlist remembers of its compilation; `calibrated` if recordings chose its scales."""
     checkpoint, cores_for = asked.checkpoint, parse_cores(arguments.cores_for)
     return {
         "spikeloom": __version__,
@@ -64,13 +54,7 @@ def margin_of(arguments: argparse.Namespace) -> float:
 
 
 def whole_numbers(text: str, option: str) -> list[int]:
-    """Numbers between commas.
-
-    Raises
-    ------
-    OptionError
-        If they are none.
-    """
+    """Numbers between commas; OptionError if they are none."""
     try:
         return [int(part) for part in text.split(",")]
     except ValueError:
@@ -80,10 +64,7 @@ def whole_numbers(text: str, option: str) -> list[int]:
 def parse_recipes(arguments: argparse.Namespace) -> tuple[Recipe, ...] | None:
     """Storage that the options of ``compile`` ask for, or None where they do not.
 
-    Raises
-    ------
-    OptionError
-        If they are no numbers, or disagree about the number of layers.
+    Raises OptionError if they are no numbers, or disagree about the number of layers.
     """
     if not (arguments.weight_bits or arguments.planes or arguments.scale_groups):
         return None
@@ -124,10 +105,7 @@ def parse_cores(words: str | None) -> dict[str, int]:
     >>> parse_cores("conv1=8,fc1=6")
     {'conv1': 8, 'fc1': 6}
 
-    Raises
-    ------
-    OptionError
-        If they are none.
+    Raises OptionError if they are none.
     """
     if words is None:
         return {}

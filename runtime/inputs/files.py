@@ -15,13 +15,7 @@ PRETRAINED = "pretrained:"
 
 
 def shipped(path: str) -> str:
-    """Resolve ``pretrained:NAME`` to the file that the package ships.
-
-    Raises
-    ------
-    OptionError
-        If there is no such checkpoint.
-    """
+    """Resolve ``pretrained:NAME`` to the file that the package ships; OptionError if there is no such checkpoint."""
     if not path.startswith(PRETRAINED):
         return path
     folder = Path(str(resources.files("spikeloom.models") / "pretrained"))
@@ -37,19 +31,10 @@ INPUTS = ("checkpoint", "original", "netlist", "data", "calibrate", "source", "t
 
 
 def require_place(path: str, option: str, arguments: argparse.Namespace | None = None) -> None:
-    """Refuse, before any work is done, a place where a result could not be written.
+    """Refuse, before any work is done, a place where a result could not be written; `option` names it.
 
-    Parameters
-    ----------
-    path, option : str
-        The place, and what names it.
-    arguments : Namespace, optional
-        Whose `INPUTS` must not be overwritten.
-
-    Raises
-    ------
-    OptionError
-        If the folder does not exist, the path is a folder or a device, or it is one of the inputs.
+    Raises OptionError if the folder does not exist, the path is a folder or a device, or one of the `INPUTS` of
+    `arguments`, which must not be overwritten.
     """
     place = Path(path)
     if not place.absolute().parent.is_dir():
@@ -67,10 +52,7 @@ def require_place(path: str, option: str, arguments: argparse.Namespace | None =
 def require_inspectable(path: str) -> None:
     """Refuse what is neither a netlist nor a checkpoint, by what it is instead.
 
-    Raises
-    ------
-    OptionError
-        If it is a folder, or a zip or npz of something else.
+    Raises OptionError if it is a folder, or a zip or npz of something else.
     """
     if Path(path).is_dir():
         raise OptionError(f"{path}: is a folder, not a netlist or a checkpoint; {_RECORDINGS}")

@@ -41,16 +41,14 @@ class LoadedNetwork:
     """A float network and where it is from."""
 
     network: Network  # Float stage
-    checkpoint: Checkpoint | None  # Where it is from one
-    # (taxels, taxels) or (filters, places, taxels) float64, or None; what its first layer sees, likewise; see
-    # :func:`expand.stack_of`
-    adjacency: FloatArray | None
-    graph: str | None  # Its name, likewise
-    facts: tuple[str, ...]  # What was read from an ONNX or NIR file and what was assumed
     sha256: str  # Of the file
-    format: str = "checkpoint"  # ``checkpoint``, ``onnx`` or ``nir``
-    # How it was read, beyond what it says: the time step of a NIR file
-    read_as: Mapping[str, Any] = field(default_factory=dict)
+    checkpoint: Checkpoint | None = None  # Where it is from one
+    # (taxels, taxels) or (filters, places, taxels) float64; what its first layer sees, likewise; see `expand.stack_of`
+    adjacency: FloatArray | None = None
+    graph: str | None = None  # Its name, likewise
+    facts: tuple[str, ...] = ()  # What was read from an ONNX or NIR file and what was assumed
+    format: str = "checkpoint"  # or ``onnx``, ``nir``, ``module``
+    read_as: Mapping[str, Any] = field(default_factory=dict)  # Beyond what the file says: the time step of a NIR file
 
     def origin(self, run: int) -> JsonObject:
         """What a netlist remembers of the file; `run` is which of a released file's runs was asked for."""
@@ -88,13 +86,13 @@ def load_network(path: str | Network, arguments: argparse.Namespace, netlist: Ne
 
     Of a checkpoint that holds several epochs, the one that `netlist` was compiled from where the options name none.
 
-    Raises
-    ------
-    OptionError, ModelError
-        If it is not there, not as the options say, or an option is for the other kind of file.
+    Raises OptionError or ModelError if it is not there, not as the options say, or an option is for the other kind of
+    file.
     """
     if isinstance(path, Network):
-        return _in_memory(path)
+        # a network that Python made, as if it came from a file
+        sha256 = hashlib.sha256(text(path).encode()).hexdigest()
+        return LoadedNetwork(network=path, sha256=sha256, format="module")
     suffix = next((suffix for suffix in (ONNX, NIR) if path.endswith(suffix)), None)
     _require_fit(path, suffix, arguments)
     if suffix is None:
@@ -105,26 +103,21 @@ def load_network(path: str | Network, arguments: argparse.Namespace, netlist: Ne
         graph, adjacency = propagation(checkpoint, load_graph(arguments, checkpoint.system), path)
         return LoadedNetwork(
             network=expand(checkpoint, adjacency),
+            sha256=checkpoint.sha256,
             checkpoint=checkpoint,
             adjacency=adjacency,
             graph=graph,
-            facts=(),
-            sha256=checkpoint.sha256,
         )
     progress("reading the network")
     layout = {"polarities": arguments.polarities, "polarities_first": arguments.polarities_first}
+    found: OnnxNetwork | NirNetwork
     if suffix == ONNX:
-        onnx = read_onnx(path, **layout)
-        return _asked(onnx, "onnx", {})
-    nir = read_nir(path, dt=arguments.dt, convention=arguments.convention, **layout)
-    return _asked(nir, "nir", {"dt": nir.steps.dt, "convention": nir.steps.convention})
-
-
-def _in_memory(network: Network) -> LoadedNetwork:
-    """A network that Python made, as if it came from a file."""
-    sha256 = hashlib.sha256(text(network).encode()).hexdigest()
+        found, read_as = read_onnx(path, **layout), dict[str, Any]()
+    else:
+        found = read_nir(path, dt=arguments.dt, convention=arguments.convention, **layout)
+        read_as = {"dt": found.steps.dt, "convention": found.steps.convention}
     return LoadedNetwork(
-        network=network, checkpoint=None, adjacency=None, graph=None, facts=(), sha256=sha256, format="module"
+        network=found.network, sha256=found.sha256, facts=found.facts, format=NETWORKS[suffix].lower(), read_as=read_as
     )
 
 
@@ -134,19 +127,6 @@ def _from_file(netlist: Netlist, checkpoint: Checkpoint) -> bool:
     if made.get("checkpoint_sha256") != checkpoint.sha256:
         return False
     return made.get("weights") in checkpoint.sets and made["weights"] != checkpoint.weights
-
-
-def _asked(found: OnnxNetwork | NirNetwork, kind: str, read_as: Mapping[str, Any]) -> LoadedNetwork:
-    return LoadedNetwork(
-        network=found.network,
-        checkpoint=None,
-        adjacency=None,
-        graph=None,
-        facts=found.facts,
-        sha256=found.sha256,
-        format=kind,
-        read_as=read_as,
-    )
 
 
 def _require_fit(path: str, suffix: str | None, arguments: argparse.Namespace) -> None:
@@ -173,10 +153,7 @@ def _require_fit(path: str, suffix: str | None, arguments: argparse.Namespace) -
 def load_graph(arguments: argparse.Namespace, system: str = TACTILESGNET) -> Graph | None:
     """Graph that the options name, or None if they name none; warnings go to stderr.
 
-    Raises
-    ------
-    OptionError, ModelError
-        If there is no such graph, its files are wrong, or the system has no graph at all.
+    Raises OptionError or ModelError if there is no such graph, its files are wrong, or the system has no graph at all.
     """
     if system not in GRAPH_SYSTEMS:
         for option in ("graph", "edges", "directed"):
@@ -195,10 +172,7 @@ def load_graph(arguments: argparse.Namespace, system: str = TACTILESGNET) -> Gra
 def sensor_places(taxels: str | None) -> FloatArray:
     """Positions of the taxels in millimetres: of ``--taxels``, where a number lines them up, or of the built-in sensor.
 
-    Raises
-    ------
-    OptionError, DataError
-        If there is no such sensor.
+    Raises OptionError or DataError if there is no such sensor.
     """
     if taxels is None:
         return NEUTOUCH
@@ -217,10 +191,7 @@ def graph_words(arguments: argparse.Namespace) -> str:
 def propagation(checkpoint: Checkpoint, asked: Graph | None, where: str) -> tuple[str, FloatArray]:
     """Name of the graph that was asked for, or of the one in the checkpoint, and what the first layer sees.
 
-    Raises
-    ------
-    ModelError
-        If no graph is known, or another one than the checkpoint was trained on is asked for.
+    Raises ModelError if no graph is known, or another one than the checkpoint was trained on is asked for.
     """
 
     def seen(edges: IntArray, taxels: int) -> FloatArray:
@@ -242,13 +213,7 @@ def propagation(checkpoint: Checkpoint, asked: Graph | None, where: str) -> tupl
 
 
 def load_checkpoint(path: str, arguments: argparse.Namespace) -> Checkpoint:
-    """Read a checkpoint as the options say.
-
-    Raises
-    ------
-    OptionError, ModelError
-        If it is not there, or not as they say.
-    """
+    """Read a checkpoint as the options say; OptionError or ModelError if it is not there, or not as they say."""
     progress("reading the checkpoint")
     if (kind := stated_format(Path(shipped(path)))) == TRAINED:
         raise ModelError(f"{path}: is {FORMATS[kind]}; compile, verify, inspect and join take it, this is for others")

@@ -32,10 +32,7 @@ def recordings(
     Counts of disorder in event files go to stderr. `bins` of them make a step of the network. `labels_for` names what
     needs the label of every recording.
 
-    Raises
-    ------
-    DataError, OptionError
-        If they cannot be used, or do not suit the network.
+    Raises DataError or OptionError if they cannot be used, or do not suit the network.
     """
     if isinstance(path, Recordings):
         require_suited(path, classes=classes, taxels=taxels)
@@ -56,13 +53,7 @@ def recordings(
 
 
 def require_suited(data: Recordings, *, classes: int | None, taxels: int | None) -> None:
-    """Refuse recordings of another sensor, or of more classes than a network has.
-
-    Raises
-    ------
-    DataError
-        Naming both.
-    """
+    """Refuse recordings of another sensor, or of more classes than a network has; DataError naming both."""
     if taxels is not None and data.taxels != taxels:
         raise DataError(
             f"{data.source}: has {data.taxels} taxels, the network has {taxels}; use recordings of its sensor"
@@ -75,13 +66,7 @@ def require_suited(data: Recordings, *, classes: int | None, taxels: int | None)
 
 
 def require_bins(bins: int) -> None:
-    """Refuse a number of bins to join that is none.
-
-    Raises
-    ------
-    OptionError
-        If it is below 1, or more than a recording may have.
-    """
+    """Refuse a number of bins to join that is none; OptionError if it is below 1, or more than a recording may have."""
     if not 1 <= bins <= MAX_STEPS:
         raise OptionError(f"--join {bins}: allowed are 1 to {MAX_STEPS}; choose another")
 

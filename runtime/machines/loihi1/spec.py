@@ -75,26 +75,11 @@ def decayed(value: int, lost: int) -> int:
 
 
 def compartment_step(neuron: Compartment, positive: int, negative: int) -> tuple[int, bool, bool]:
-    """Let one neuron integrate for one chip step.
+    """Let one neuron integrate for one chip step; its current and membrane are replaced.
 
-    Parameters
-    ----------
-    neuron : Compartment
-        Its current and membrane are replaced.
-    positive, negative : int
-        Sums of the effective weights that arrived, as magnitudes.
-
-    Returns
-    -------
-    compared : int
-        The membrane before a reset.
-    spiked, saturated : bool
-        Whether it crossed the threshold; whether the register clipped it.
-
-    Raises
-    ------
-    RegisterOverflowError
-        If the synaptic sum or the current leaves its register.
+    `positive` and `negative` are sums of the effective weights that arrived, as magnitudes. Returns the membrane before
+    a reset, whether it crossed the threshold, and whether the register clipped it. Raises RegisterOverflowError if the
+    synaptic sum or the current leaves its register.
     """
     # gather input
     if UNIT * positive > ACCUMULATOR_MAX:
@@ -162,30 +147,12 @@ def read_synapses(netlist: Netlist) -> list[list[tuple[int, int]]]:
 
 
 def simulate(netlist: Netlist, events: npt.NDArray[np.uint8 | np.bool_], *, gated: bool = True) -> Trace:
-    """Run one recording through the chip.
+    """Run one recording (n_inputs, T) through the chip; the trace has spikes, membranes and updates, no leading axis.
 
-    Parameters
-    ----------
-    netlist : Netlist
-        The placed network.
-    events : (n_inputs, T) uint8 or bool
-        Input events; any value but zero is an event.
-    gated : bool
-        Whether a layer integrates in its window only. Otherwise all layers integrate in each of ``T`` chip steps,
-        biases included, as simulators do that know no windows.
-
-    Returns
-    -------
-    Trace
-        With spikes, membranes and updates, no leading axis.
-
-    Raises
-    ------
-    DataError
-        If the recording has another number of input channels than the network.
-    NumericRangeError
-        At the first register that would overflow: the lowest chip step, then the lowest compartment id, the synaptic
-        sum before the current.
+    Unless `gated`, layers know no windows: all integrate in each of ``T`` chip steps, biases included, as simulators do
+    that know none. Raises DataError if the recording has another number of input channels than the network, and
+    NumericRangeError at the first register that would overflow: the lowest chip step, then the lowest compartment id,
+    the synaptic sum before the current.
     """
     check_channels(netlist, events.shape[0])
     n_inputs, length = events.shape

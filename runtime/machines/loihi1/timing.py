@@ -118,17 +118,9 @@ def prepare(
 ) -> Latencies:
     """Lay a netlist out for the time models.
 
-    Parameters
-    ----------
-    input_tiles : tuple of int
-        Tiles of cores that hold the input channels, as many on each as it has room for; empty if no core holds them.
-    dense : (synapses,) bool, optional
-        Which synapses take the time of a dense list; by default those that are stored in one.
-
-    Raises
-    ------
-    OptionError
-        If the netlist takes several chips.
+    `input_tiles` are tiles of cores that hold the input channels, as many on each as it has room for; empty if no core
+    holds them. `dense` (synapses,) says which synapses take the time of a dense list; by default those that are stored
+    in one. Raises OptionError if the netlist takes several chips.
     """
     require_one_chip(netlist.core_tile, target, "time")
     size, n_inputs = netlist.n_compartments, netlist.n_inputs
