@@ -6,15 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from native_networks import random_network
 from random_netlists import lively
+from zoo import specimen
 
 from spikeloom.compiler import targets
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import DataError, FormatError, OptionError
-from spikeloom.compiler.targets.base import load_target, shipped
+from spikeloom.compiler.targets.base import shipped
 from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist
-from spikeloom.compiler.targets.truenorth.netlist_file import write_crossbars
 from spikeloom.runtime import machines
 from spikeloom.runtime.machines.base import machine_for, machine_of, trained_for
 from spikeloom.runtime.machines.integer import integer_machine
@@ -24,51 +23,34 @@ from spikeloom.runtime.machines.votes import class_counts
 from spikeloom.runtime.report.encode import encode
 from spikeloom.runtime.report.sections import terminal
 
-
-def crossbars():
-    return load_target("truenorth").compile(random_network(0, taxels=10, classes=3)).netlist
-
-
-WRITERS = {"loihi1": (lively, write_netlist), "truenorth": (crossbars, write_crossbars)}
+LENGTHS = np.array([14, 5, 1, 9])
+SIMULATORS = {"timed": engine, "native": crossbar_engine}
 
 
-@pytest.fixture(params=WRITERS)
-def machine(request, tmp_path):
-    make, write = WRITERS[request.param]
-    write(make(), tmp_path / "net.loom")
-    return machine_for(tmp_path / "net.loom")
+@pytest.fixture(params=SIMULATORS)
+def made(request):
+    return specimen(request.param)
 
 
-def grasps(machine, samples=5, steps=12):
-    shape = samples, machine.netlist.taxels, machine.netlist.polarities, steps
-    return (np.random.default_rng(0).random(shape) < 0.3).astype(np.uint8)
-
-
-def test_runs_and_prices_are_the_simulators(machine):
-    events, lengths = grasps(machine), np.array([12, 5, 12, 1, 9])
-    netlist = machine.netlist
-    assert machine.target.name == netlist.target
-    machine.legal()
-    channels = with_clocks(events, netlist.clocks)
-    if netlist.target == "loihi1":
-        votes = engine.simulate(netlist, channels, lengths=lengths).counts.spikes
-    else:
-        votes = crossbar_engine.simulate(netlist, channels, lengths=lengths).counts.votes
-    done = machine.run(events, lengths=lengths, spikes=True)
+def test_runs_and_prices_are_the_simulators(made):
+    machine, events = made.machine, made.events
+    netlist, channels = machine.netlist, with_clocks(events, made.machine.netlist.clocks)
+    counts = SIMULATORS[made.folder.name].simulate(netlist, channels, lengths=LENGTHS).counts
+    done = machine.run(events, lengths=LENGTHS, spikes=True)
+    votes = counts.votes if netlist.target == "truenorth" else counts.spikes
     np.testing.assert_array_equal(done.votes, class_counts(netlist, votes))
     np.testing.assert_array_equal(done.decisions, done.votes.argmax(axis=1))
     assert tuple(done.spikes) == machine.layers
     for detail in machine.details:
-        again, price = machine.price(events, lengths=lengths, bin_s=0.02, detail=detail, spikes=True)
+        again, price = machine.price(events, lengths=LENGTHS, bin_s=0.02, detail=detail, spikes=True)
         np.testing.assert_array_equal(again.votes, done.votes)
         for name, spikes in done.spikes.items():
             np.testing.assert_array_equal(again.spikes[name], spikes)
         each = [price.synaptic_operations, *price.energy_j.values(), *price.time_s.values()]
-        assert {np.shape(values) for values in each} == {(5,)}
+        assert {np.shape(values) for values in each} == {(4,)}
         assert set(price.energy_j) == {table.name for table in machine.target.energy}
         assert set(price.step_s) == set(price.time_s)
-        shown = encode(price.outcome.result)
-        assert shown["per_inference"]["energy_j"] == {
+        assert encode(price.outcome.result)["per_inference"]["energy_j"] == {
             name: pytest.approx(values.mean()) for name, values in price.energy_j.items()
         }
         assert "per inference" in terminal(price.outcome.sections(price.outcome.result))
@@ -76,15 +58,14 @@ def test_runs_and_prices_are_the_simulators(machine):
         machine.price(events, bin_s=0.02, detail="none")
 
 
-def test_simulators_are_held_against_their_specifications(machine, monkeypatch):
-    events, lengths = grasps(machine, samples=3), np.array([12, 5, 9])
+def test_simulators_are_held_against_their_specifications(made, monkeypatch):
+    machine, events, lengths = made.machine, made.events[:3], LENGTHS[:3]
     assert machine.check(events, lengths=lengths) == 0
     done = machine.run(events, lengths=lengths, spikes=True, membranes=True)
-    assert {name: held.shape for name, held in done.membranes.items()} == {
-        name: held.shape for name, held in done.spikes.items()
-    }
+    shapes = {name: held.shape for name, held in done.spikes.items()}
+    assert {name: held.shape for name, held in done.membranes.items()} == shapes
     assert any(held.any() for held in done.membranes.values())
-    simulator = engine if machine.netlist.target == "loihi1" else crossbar_engine
+    simulator = SIMULATORS[made.folder.name]
     simulate = simulator.simulate
 
     def wrong(*words, **options):
@@ -98,43 +79,28 @@ def test_simulators_are_held_against_their_specifications(machine, monkeypatch):
         machine.require_sensor(np.zeros((1, 3, 3, 12), np.uint8))
 
 
-def test_what_is_compared_with_a_float_model(machine):
-    if machine.netlist.target == "truenorth":
-        with pytest.raises(OptionError, match="TrueNorth: is not compared with a float model"):
-            integer_machine(machine)
-        with pytest.raises(OptionError, match="--engine onnx: is not for IBM TrueNorth"):
-            machine.require_engine("onnx")
-        return
-    found, events, lengths = integer_machine(machine), grasps(machine), np.array([12, 5, 12, 1, 9])
+def test_what_is_compared_with_a_float_model():
+    made = specimen("timed")
+    found, events = integer_machine(made.machine), made.events
     sizes = [layer.neurons for layer in found.netlist.layers]
     assert [len(out) for out in found.absent] == [len(out) for out in found.unused] == sizes
     assert len(found.lags) == len(sizes)
-    votes = found.votes_by_step(events, lengths)
-    ran = found.cumulative(events, lengths)
+    votes = found.votes_by_step(events, LENGTHS)
+    ran = found.cumulative(events, LENGTHS)
     np.testing.assert_array_equal(ran.votes, votes)
-    np.testing.assert_array_equal(votes[:, -1], found.run(events, lengths=lengths).votes)
-    price = found.price(events, lengths=lengths, bin_s=0.02)[1]
+    np.testing.assert_array_equal(votes[:, -1], found.run(events, lengths=LENGTHS).votes)
+    price = found.price(events, lengths=LENGTHS, bin_s=0.02)[1]
     np.testing.assert_array_equal(ran.operations[:, -1], price.synaptic_operations)
 
 
-def test_descriptions(machine):
-    found = machine.describe("some hash")
-    shown = encode(found.result)
-    assert (shown["target"], shown["sha256"]) == (machine.netlist.target, "some hash")
-    assert [layer["name"] for layer in shown["layers"]] == list(machine.layers)
-    assert terminal(found.sections(found.result)).startswith(f"{machine.netlist.target}: ")
-
-
-def test_streams(machine):
-    if machine.netlist.target == "truenorth":
-        with pytest.raises(OptionError, match="runs whole recordings"):
-            machine.stream()
-        return
-    (events,) = grasps(machine, samples=1)
-    stream = machine.stream()
-    for column in np.moveaxis(events, -1, 0):
-        stream.step(column)
-    np.testing.assert_array_equal(stream.finish()[-1].counts, machine.run(events[None]).votes[0])
+def test_what_crossbars_are_not():
+    machine = specimen("native").machine
+    with pytest.raises(OptionError, match="TrueNorth: is not compared with a float model"):
+        integer_machine(machine)
+    with pytest.raises(OptionError, match="--engine onnx: is not for IBM TrueNorth"):
+        machine.require_engine("onnx")
+    with pytest.raises(OptionError, match="runs whole recordings"):
+        machine.stream()
 
 
 def test_what_is_no_netlist(tmp_path):
@@ -172,7 +138,7 @@ def test_a_third_chip_is_a_folder(tmp_path, monkeypatch):
         write_netlist(replace(lively(), target="toy"), tmp_path / "net.loom")
         machine = machine_for(tmp_path / "net.loom")
         assert (type(machine).__name__, machine.target.name) == ("Toy", "toy")
-        events = grasps(machine)
+        events = (np.random.default_rng(0).random((4, machine.netlist.taxels, 2, 12)) < 0.3).astype(np.uint8)
         np.testing.assert_array_equal(machine.run(events).votes, machine_of(lively()).run(events).votes)
         assert integer_machine(machine).check(events[:1]) == 0
         with pytest.raises(OptionError, match="toy has no such price model; allowed: counts"):

@@ -4,6 +4,7 @@ import json
 import os
 import re
 import subprocess
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -109,28 +110,25 @@ def test_saturation_that_is_a_reset_is_written():
     assert ranc.unsupported(small(negative_saturates=True, reset=2)) == []
 
 
-def test_the_command(tmp_path, capsys):
-    write_crossbars(small(), tmp_path / "net.loom")
-    assert cli.main(["export", f"{tmp_path}/net.loom", "--to", "ranc", "-o", f"{tmp_path}/net.json"]) == 0
-    assert json.loads((tmp_path / "net.json").read_text("utf-8"))["packets"] == [[]]
-    first, second = capsys.readouterr().out.splitlines()
-    assert "3 neurons and 3 synapses for ranc" in first
-    assert second.startswith(f"run: ranc_sim {tmp_path}/net.json {tmp_path}/net.out {tmp_path}/net.json TICKS")
-
-
-def test_the_command_with_a_recording(tmp_path, capsys):
+def test_the_command(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
     draft = alone(Neuron(), channels=0)
     draft.feed(3, 0, 0)
     draft.vote((0, 0), 0, first=2)
-    write_crossbars(draft.netlist(taxels=2, polarities=2, classes=2), tmp_path / "net.loom")
+    write_crossbars(draft.netlist(taxels=2, polarities=2, classes=2), "net.loom")
     recordings = np.zeros((2, 2, 2, 5), np.uint8)
     recordings[0, 1, 1, [0, 4]] = recordings[1, 1, 1, [1, 4]] = 1
     recordings_folder(tmp_path / "data", train=recordings, test=recordings)
-    words = ["export", f"{tmp_path}/net.loom", "--to", "ranc", "-o", f"{tmp_path}/net.json"]
-    words += ["--data", f"{tmp_path}/data", "--json", "--recording"]
+    words = ["export", "net.loom", "--to", "ranc", "-o", "net.json"]
+    assert cli.main(words) == 0
+    assert json.loads(Path("net.json").read_text("utf-8"))["packets"] == [[]]
+    first, second = capsys.readouterr().out.splitlines()
+    assert "1 neurons and 1 synapses for ranc" in first
+    assert second.startswith("run: ranc_sim net.json net.out net.json TICKS")
+    words += ["--data", "data", "--json", "--recording"]
     assert cli.main([*words, "1"]) == 0
     assert json.loads(capsys.readouterr().out)["ticks"] == 5 + 2 + 1
-    packets = json.loads((tmp_path / "net.json").read_text("utf-8"))["packets"]
+    packets = json.loads(Path("net.json").read_text("utf-8"))["packets"]
     assert [len(tick) for tick in packets] == [0, 1, 0, 0, 1, 0, 0]
     assert cli.main([*words, "2"]) == 2
     assert "--recording 2: --data has recordings 0 to 1" in capsys.readouterr().err

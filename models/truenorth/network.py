@@ -77,7 +77,6 @@ class NativeArchitecture:
     voters: int = 2  # Output neurons of a class in each group
     copies: int = 3  # Axons of an input, see :mod:`truenorth.native`
     clocks: Clocks = NO_CLOCKS  # That the dense layers receive
-    floor: float = 1.0  # Lowest membrane, in thresholds below zero, at least 1
 
     @property
     def layers(self) -> tuple[str, ...]:
@@ -188,7 +187,7 @@ class NativeNet(TrainedModule):
     def _round(self, weight: Tensor, bias: Tensor, depth: int, step: Tensor) -> Rounded:
         """Whole numbers for weights (blocks, inputs, size), whose levels shall be a `step` (blocks, 1, size) apart."""
         with torch.no_grad():
-            threshold = torch.clamp(torch.round(UNIT / step), LEAST_THRESHOLD, THRESHOLD_MOST / self.architecture.floor)
+            threshold = torch.clamp(torch.round(UNIT / step), LEAST_THRESHOLD, THRESHOLD_MOST)
             most = highest_level(self.architecture.copies)
             level = torch.clamp(torch.round(weight * (threshold / UNIT)), -most, most)
             flat = threshold.reshape(-1)
@@ -198,7 +197,7 @@ class NativeNet(TrainedModule):
             weight=_past(weight * threshold, level * UNIT),
             leak=_past(bias * flat, leak),
             threshold=flat,
-            floor=torch.round(flat * self.architecture.floor),
+            floor=flat,
         )
 
     def forward(self, events: Tensor, lengths: Tensor | None = None) -> Tensor:

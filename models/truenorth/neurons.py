@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from spikeloom.models.networks.layers import events_of, rows_of
+from spikeloom.models.networks.layers import spike_linear
 from spikeloom.models.networks.surrogate import FAST_SIGMOID, Surrogate
 
 
@@ -114,57 +114,5 @@ def block_sums(spikes: Tensor, weight: Tensor) -> Tensor:
     `spikes` (steps, samples, blocks * width) are zeros and ones, the inputs of a block side by side; with `weight`
     (blocks, width, size) they give (steps, samples, blocks * size).
     """
-    found: Tensor = _BlockSums.apply(spikes, weight)  # type: ignore[no-untyped-call]
-    return found
-
-
-class _BlockSums(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, spikes: Tensor, weight: Tensor) -> Tensor:
-        blocks, width, size = weight.shape
-        steps, samples, _ = spikes.shape
-        rows = spikes.detach().reshape(steps * samples, blocks * width).contiguous()
-        source, bounds = events_of(rows.numpy())
-        out = torch.zeros((steps * samples, blocks * size))
-        _gather(source, bounds, width, weight.detach().contiguous().view(-1, size).numpy(), out.numpy())
-        ctx.events = source, bounds
-        ctx.save_for_backward(weight)
-        return out.view(steps, samples, blocks * size)
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor]:
-        (weight,) = ctx.saved_tensors
-        blocks, width, size = weight.shape
-        above = gradients[0].contiguous()
-        rows = above.view(-1, blocks * size)
-        out = torch.zeros_like(weight)
-        source, bounds = ctx.events
-        _scatter(source, bounds, width, rows.numpy(), rows_of(out.view(-1, size)))
-        if not ctx.needs_input_grad[0]:
-            return None, out
-        below = torch.bmm(rows.view(-1, blocks, size).transpose(0, 1), weight.transpose(1, 2))
-        return below.transpose(0, 1).reshape(*above.shape[:-1], blocks * width), out
-
-
-@numba.njit(cache=True)
-def _add(total: Any, term: Any) -> None:
-    for i in range(len(total)):
-        total[i] += term[i]
-
-
-@numba.njit(cache=True)
-def _gather(source: Any, bounds: Any, width: int, weight: Any, out: Any) -> None:
-    size = weight.shape[1]
-    for row in range(len(out)):
-        for event in range(bounds[row], bounds[row + 1]):
-            at = source[event] // width * size
-            _add(out[row, at : at + size], weight[source[event]])
-
-
-@numba.njit(cache=True)
-def _scatter(source: Any, bounds: Any, width: int, rows: Any, out: Any) -> None:
-    size = out.shape[1]
-    for row in range(len(rows)):
-        for event in range(bounds[row], bounds[row + 1]):
-            at = source[event] // width * size
-            _add(out[source[event]], rows[row, at : at + size])
+    blocks, nothing = spikes.chunk(len(weight), dim=2), torch.zeros(weight.shape[2])
+    return torch.cat([spike_linear(*block, nothing) for block in zip(blocks, weight, strict=True)], dim=2)
