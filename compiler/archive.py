@@ -95,26 +95,14 @@ def archive_bytes(manifest: Mapping[str, Any], arrays: Mapping[str, Array]) -> b
 
 
 def write_archive(content: bytes, path: str | os.PathLike[str]) -> str:
-    """Write a file, whole or not at all; return its sha256.
-
-    Raises
-    ------
-    OSError
-        If it cannot be written; an older file is left as it was.
-    """
+    """Write a file, whole or not at all; return its sha256."""
     with write_atomically(path) as file:
         file.write(content)
     return hashlib.sha256(content).hexdigest()
 
 
 def stored_members(content: bytes) -> dict[str, bytes]:
-    """Members of a zip that stores them plainly and claims no more bytes than it has.
-
-    Raises
-    ------
-    ValueError
-        If it is something else, in words that go on a sentence.
-    """
+    """Members of a zip that stores them plainly and claims no more bytes than it has, else ValueError."""
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             infos = archive.infolist()
@@ -127,13 +115,7 @@ def stored_members(content: bytes) -> dict[str, bytes]:
 
 
 def read_npy(content: bytes) -> Array:
-    """An array of plain numbers or text from the content of an npy file, whose size is checked against its header.
-
-    Raises
-    ------
-    ValueError
-        If it is none.
-    """
+    """An array of plain numbers or text from an npy file, whose size is checked against its header, else ValueError."""
     file = io.BytesIO(content)
     try:
         version = np.lib.format.read_magic(file)
@@ -147,15 +129,7 @@ def read_npy(content: bytes) -> Array:
 
 
 def read_members(path: Path) -> dict[str, Array]:
-    """All members of an archive by name.
-
-    Raises
-    ------
-    FormatError
-        If it is too large, truncated, compressed or no archive of arrays.
-    OSError
-        If it cannot be read.
-    """
+    """All members of an archive by name; FormatError if it is too large, truncated, compressed or no such archive."""
     if path.stat().st_size > SIZE_LIMIT:
         raise FormatError(f"{path}: {path.stat().st_size} bytes, {SIZE_LIMIT} allowed; this is no netlist of one chip")
     try:
@@ -174,11 +148,6 @@ def stated(path: Path, name: str) -> str | None:
         return None
     found = manifest.get(name) if isinstance(manifest, dict) else None
     return found if isinstance(found, str) else None
-
-
-def stated_format(path: Path) -> str | None:
-    """Format that the manifest of an archive names, None where there is no such thing."""
-    return stated(path, "format")
 
 
 def is_netlist(path: str | os.PathLike[str]) -> bool:
@@ -228,17 +197,8 @@ def read_archive(
 ) -> tuple[dict[str, Any], dict[str, Array]]:
     """Manifest and arrays of a file of a format, one of ``FORMATS``, that matches its hash.
 
-    Parameters
-    ----------
-    names : callable
-        Gives from the manifest the names of all arrays, in their order.
-
-    Raises
-    ------
-    FormatError
-        If it is missing, truncated, altered, or of another format or version.
-    OSError
-        If it cannot be read.
+    `names` gives from the manifest the names of all arrays, in their order. FormatError if the file is missing,
+    truncated, altered, or of another format or version.
     """
     if not path.is_file():
         found = "is not a file" if path.exists() else "no such file"

@@ -13,7 +13,7 @@ first dense layer they are a bias that changes with time.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -103,8 +103,7 @@ class Dynamics:
 
     def to_json(self) -> JsonObject:
         """JSON values."""
-        clocks = {"channels": self.clocks.channels, "steps": self.clocks.steps}
-        return {"betas": list(self.betas), "alphas": list(self.alphas), "clocks": clocks}
+        return {"betas": list(self.betas), "alphas": list(self.alphas), "clocks": asdict(self.clocks)}
 
 
 PLAIN = Dynamics()

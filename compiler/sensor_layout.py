@@ -19,25 +19,11 @@ _ORDER = "channel = taxel * polarities + polarity"
 def sensor_layout(
     shape: Sequence[int], *, polarities: int | None = None, polarities_first: bool | None = None
 ) -> tuple[Input, IntArray, str]:
-    """Taxels and polarities of an input of one step.
+    """Sensor of an input of one step, the position in it of each channel, and in words what was read and assumed.
 
-    Parameters
-    ----------
-    shape : sequence of int
-        ``[taxels, polarities]``, flat, or an image ``[polarities, height, width]``, whose taxels count row by row; axes
-        of length 1 in front are the batch's.
-    polarities : int, optional
-        How many there are; by default what the shape says, and 2 of a flat one.
-    polarities_first : bool, optional
-        Whether they are the outer axis; by default what the shape says, and not of a flat one.
-
-    Returns
-    -------
-    sensor : Input
-    positions : (channels,) int64
-        Position in the flat input of each channel, ``taxel * polarities + polarity``.
-    words : str
-        What the shape said and what was assumed, for people.
+    The `shape` is ``[taxels, polarities]``, flat, or an image ``[polarities, height, width]``, whose taxels count row
+    by row; axes of length 1 in front are the batch's. How many polarities there are, and whether they are the outer
+    axis, the shape says by default; of a flat one there are 2, and they are not.
 
     Raises
     ------
@@ -87,7 +73,7 @@ def _image(sizes: list[int], shown: str, polarities: int | None, first: bool | N
     axis = fits[0]
     grid = np.moveaxis(np.arange(np.prod(sizes)).reshape(sizes), axis, -1)
     words = "[polarities, height, width]" if axis == 0 else "[height, width, polarities]"
-    return _told(grid.reshape(-1, sizes[axis]), f"{words}, taxels row by row")
+    return _layout(grid.reshape(-1, sizes[axis]), f"{words}, taxels row by row")
 
 
 def _table(sizes: list[int], shown: str, polarities: int | None, first: bool | None) -> tuple[Input, IntArray, str]:
@@ -101,7 +87,7 @@ def _table(sizes: list[int], shown: str, polarities: int | None, first: bool | N
             f"the input {shown}: {which} the polarities; tell with --polarities N and --polarities-first or -last"
         )
     grid = np.arange(sizes[0] * sizes[1]).reshape(sizes)
-    return _told(grid.T if fits[0] == 0 else grid, "[polarities, taxels]" if fits[0] == 0 else "[taxels, polarities]")
+    return _layout(grid.T if fits[0] == 0 else grid, "[polarities, taxels]" if fits[0] == 0 else "[taxels, polarities]")
 
 
 def _flat(size: int, shown: str, polarities: int | None, first: bool | None) -> tuple[Input, IntArray, str]:
@@ -112,10 +98,10 @@ def _flat(size: int, shown: str, polarities: int | None, first: bool | None) -> 
         )
     grid = np.arange(size).reshape((count, -1) if first else (-1, count))
     assumed = "" if polarities else f"; {count} polarities are assumed"
-    return _told(grid.T if first else grid, f"flat, {'polarity by polarity' if first else _ORDER}{assumed}")
+    return _layout(grid.T if first else grid, f"flat, {'polarity by polarity' if first else _ORDER}{assumed}")
 
 
-def _told(grid: IntArray, words: str) -> tuple[Input, IntArray, str]:
+def _layout(grid: IntArray, words: str) -> tuple[Input, IntArray, str]:
     taxels, polarities = grid.shape
     sensor = Input(taxels=taxels, polarities=polarities)
     return sensor, np.ascontiguousarray(grid).ravel(), f"{taxels} taxels, {polarities} polarities, as {words}"

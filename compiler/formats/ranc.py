@@ -55,19 +55,9 @@ def unsupported(netlist: CrossbarNetlist) -> list[str]:
 
 
 def export(netlist: CrossbarNetlist, events: EventArray | None = None) -> Iterator[str]:
-    """Lines of the JSON file.
+    """Lines of the JSON file of a network that breaks no rule of its chip; ModelError if it uses what RANC has not.
 
-    Parameters
-    ----------
-    netlist : CrossbarNetlist
-        A network that breaks no rule of its chip.
-    events : (n_inputs, T) uint8 or bool, optional
-        Recording whose events, with the clocks, become packets; without it there are none.
-
-    Raises
-    ------
-    ModelError
-        If it uses what RANC has not.
+    Events (n_inputs, T) of a recording become packets, with the clocks; without it there are none.
     """
     missing = unsupported(netlist)
     if missing:

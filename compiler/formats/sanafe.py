@@ -64,23 +64,16 @@ def members(netlist: Netlist) -> IntArray:
     return number
 
 
-def _in_dense_list(netlist: Netlist) -> BoolArray:
-    found: BoolArray = netlist.format_index_bits[netlist.axon_format[netlist.axon_of_synapse()]] == 0
-    return found
-
-
 def dense_neurons(netlist: Netlist) -> BoolArray:
     """Which compartments name the unit of dense synapses."""
-    balance = np.where(_in_dense_list(netlist), 1.0, -1.0)
+    in_dense_list = netlist.format_index_bits[netlist.axon_format[netlist.axon_of_synapse()]] == 0
+    balance = np.where(in_dense_list, 1.0, -1.0)
     found: BoolArray = np.bincount(netlist.synapse_compartment(), balance, netlist.n_compartments) >= 0
     return found
 
 
 def input_tiles(netlist: Netlist, target: Target) -> tuple[int, ...]:
-    """Tiles for cores that hold nothing but input channels: those in use that have room, then the others.
-
-    Raises ModelError if the chip has no room for them.
-    """
+    """Tiles for cores that hold nothing but input channels: those in use that have room, then the others."""
     room = target.limit("mesh.tile_cores")
     tiles = np.arange(target.limit("mesh.width") * target.limit("mesh.height"))
     used = np.bincount(netlist.core_tile, minlength=len(tiles))
@@ -95,12 +88,7 @@ def input_tiles(netlist: Netlist, target: Target) -> tuple[int, ...]:
 
 
 def cores(netlist: Netlist, target: Target) -> tuple[str, ...]:
-    """``tile.core`` of the netlist's cores, then of those that hold the input channels.
-
-    SANA-FE counts tiles column by column.
-
-    Raises OptionError if the netlist takes several chips.
-    """
+    """``tile.core`` of the netlist's cores, then of those that hold the input channels; tiles count by columns."""
     require_one_chip(netlist.core_tile, target, "--to sanafe")
     width, height = target.limit("mesh.width"), target.limit("mesh.height")
     tiles = [*netlist.core_tile.tolist(), *input_tiles(netlist, target)]
@@ -110,13 +98,7 @@ def cores(netlist: Netlist, target: Target) -> tuple[str, ...]:
 
 
 def export(netlist: Netlist, target: Target) -> Iterator[str]:
-    """Lines of the file.
-
-    Raises
-    ------
-    OptionError
-        If the netlist takes several chips.
-    """
+    """Lines of the file; OptionError if the netlist takes several chips, ModelError if one has no room for inputs."""
     room = target.limit("core.compartments")
     names, number, places = group_names(netlist), members(netlist), cores(netlist, target)
     yield f"# spikeloom netlist for SANA-FE {VERSION} and its loihi.yaml; give the neurons of group {INPUT} 'spikes'"

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from spikeloom.compiler.archive import FORMATS, TRAINED, stated_format
+from spikeloom.compiler.archive import FORMATS, TRAINED, stated
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
@@ -215,7 +215,7 @@ def propagation(checkpoint: Checkpoint, asked: Graph | None, where: str) -> tupl
 def load_checkpoint(path: str, arguments: argparse.Namespace) -> Checkpoint:
     """Read a checkpoint as the options say; OptionError or ModelError if it is not there, or not as they say."""
     progress("reading the checkpoint")
-    if (kind := stated_format(Path(shipped(path)))) == TRAINED:
+    if (kind := stated(Path(shipped(path)), "format")) == TRAINED:
         raise ModelError(f"{path}: is {FORMATS[kind]}; compile, verify, inspect and join take it, this is for others")
     places = sensor_places(getattr(arguments, "taxels", None))
     return read_checkpoint(

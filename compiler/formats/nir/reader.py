@@ -53,16 +53,10 @@ def read_nir(
     polarities: int | None = None,
     polarities_first: bool | None = None,
 ) -> NirNetwork:
-    """Read a network.
+    """Read a network, in steps of `dt` seconds, by default those that the metadata of the file tell.
 
-    Parameters
-    ----------
-    dt : float, optional
-        Seconds of a time step; by default what the file says in its metadata, as those written here do.
-    convention : {"euler", "exponential"}, optional
-        How time constants become decays, see :mod:`nir.neurons`; by default ``euler``.
-    polarities, polarities_first : optional
-        See :func:`sensor_layout.sensor_layout`.
+    The `convention` (``euler`` by default) says how time constants become decays, see :mod:`nir.neurons`; polarities
+    are those of :func:`sensor_layout.sensor_layout`.
 
     Raises
     ------

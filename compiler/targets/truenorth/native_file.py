@@ -25,7 +25,7 @@ from spikeloom.compiler.archive import (
     archive_bytes,
     entry_faults,
     read_archive,
-    stated_format,
+    stated,
     write_archive,
 )
 from spikeloom.compiler.checkpoint import WEIGHTS
@@ -96,7 +96,7 @@ def write_trained(
 
 def is_trained(path: str | os.PathLike[str]) -> bool:
     """Whether a file is an archive that says it holds such a network."""
-    return stated_format(Path(path)) == FORMAT
+    return stated(Path(path), "format") == FORMAT
 
 
 def read_trained(path: str | os.PathLike[str], *, weights: str | None = None) -> Trained:
