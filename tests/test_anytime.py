@@ -43,6 +43,17 @@ def place(tmp_path_factory):
     return folder
 
 
+@pytest.fixture
+def report(spikeloom, place):
+    """What the command found with everything, made once."""
+    if not (place / "all.json").exists():
+        code, out, err = spikeloom(*ALL, "--differ", "0.25", "-o", "all.json", "--picture", "all.png", "--json")
+        assert (code, err) == (0, "")
+        assert json.loads((place / "all.json").read_text()) == json.loads(out)
+        assert (place / "all.png").read_bytes().startswith(b"\x89PNG")
+    return json.loads((place / "all.json").read_text())
+
+
 def test_text(spikeloom, golden):
     code, out, err = spikeloom(*ALL)
     assert (code, err) == (0, "")
@@ -52,7 +63,7 @@ def test_text(spikeloom, golden):
 def test_without_labels_checkpoint_and_calibration(spikeloom, tmp_path):
     grasp = tmp_path / "grasp.npy"
     np.save(grasp, events(5, samples=1)[0].astype(np.float32))
-    code, out, _ = spikeloom("anytime", "net.loom", "--data", grasp)
+    code, out, _ = spikeloom("anytime", "net.loom", "--data", grasp, "--picture", tmp_path / "proof.png")
     assert code == 0
     lines = out.splitlines()
     assert lines[0].split() == [
@@ -62,10 +73,8 @@ def test_without_labels_checkpoint_and_calibration(spikeloom, tmp_path):
     assert [line.split()[0] for line in lines if line] == ["stop", "all", "proven", "all", "live:"]
 
 
-def test_all_figures_of_a_stopped_chip(spikeloom, place):
-    code, out, _ = spikeloom(*ALL, "--differ", "0.25", "--json")
-    assert code == 0
-    report = json.loads(out)
+def test_all_figures_of_a_stopped_chip(report, place, monkeypatch):
+    monkeypatch.chdir(place)
     netlist, data = read_netlist("net.loom"), load_data("data", "test")[0]
     target, flat = load_target("loihi1"), with_clocks(data.events, netlist.clocks)
     stepped, meter = engine.prepare(netlist, stepwise=True), cost.prepare(netlist, target)
@@ -101,8 +110,7 @@ def test_all_figures_of_a_stopped_chip(spikeloom, place):
     assert report["rules"][report["savings"]["one_lost"]]["correct"] >= report["full"]["correct"] - 1
 
 
-def test_windows_are_those_of_shortened_recordings(spikeloom):
-    report = json.loads(spikeloom(*ALL, "--json")[1])
+def test_windows_are_those_of_shortened_recordings(report, spikeloom):
     netlist, data = read_netlist("net.loom"), load_data("data", "test")[0]
     assert [window["percent"] for window in report["windows"]] == list(range(5, 101, 5))
     for window in report["windows"]:
@@ -147,14 +155,6 @@ def test_clocks_and_lasting_currents(spikeloom, tmp_path):
     code, out, _ = spikeloom("anytime", net, "--checkpoint", checkpoint, "--data", data, "--calibrate", data, "--json")
     assert code == 0
     assert json.loads(out)["rules"][0]["differ"] == 0
-
-
-def test_files(spikeloom, tmp_path):
-    code, out, _ = spikeloom(*ALL, "-o", tmp_path / "out.json", "--picture", tmp_path / "out.png", "--json")
-    assert code == 0
-    assert json.loads((tmp_path / "out.json").read_text()) == json.loads(out)
-    assert (tmp_path / "out.png").read_bytes().startswith(b"\x89PNG")
-    assert spikeloom(*WORDS, "--picture", tmp_path / "proof.png")[0] == 0
 
 
 def test_several_chips_have_no_times(spikeloom, tmp_path):
