@@ -165,7 +165,10 @@ def test_a_report_shows_the_chart_of_its_network(spikeloom, chart, place):
     [
         (None, ["no such file", "spikeloom chart"]),
         ("other", ["grasps, grasps-knn1", "not of net.pt"]),
-        *((content, ["no chart"]) for content in ("", "[]", '{"format": 99}', '{"format": 1, "points": []}')),
+        *(
+            (content, ["is not what spikeloom chart writes"])
+            for content in ("", "[]", '{"format": 99}', '{"format": 1, "points": []}')
+        ),
     ],
 )
 def test_a_report_refuses_what_is_no_chart_of_its_network(spikeloom, chart, place, content, words):

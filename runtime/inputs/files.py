@@ -26,27 +26,39 @@ def shipped(path: str) -> str:
     return str(known[name])
 
 
-INPUTS = ("checkpoint", "original", "netlist", "data", "calibrate", "source", "taxels", "edges", "stress")
+INPUTS = (
+    "checkpoint",
+    "checkpoints",
+    "original",
+    "netlist",
+    "data",
+    "calibrate",
+    "source",
+    "taxels",
+    "edges",
+    "stress",
+)
 """Arguments that may name a file to read."""
 
 
-def require_place(path: str, option: str, arguments: argparse.Namespace | None = None) -> None:
-    """Refuse, before any work is done, a place where a result could not be written; `option` names it.
+def require_place(path: str | None, option: str, arguments: argparse.Namespace | None = None) -> None:
+    """Refuse, before any work is done, a place where a result could not be written; nothing to do without one.
 
     Raises OptionError if the folder does not exist, the path is a folder or a device, or one of the `INPUTS` of
     `arguments`, which must not be overwritten.
     """
+    if path is None:
+        return
     place = Path(path)
     if not place.absolute().parent.is_dir():
         raise OptionError(f"{option} {path}: the folder does not exist; make it first")
     if place.exists() and not place.is_file():
         raise OptionError(f"{option} {path}: is not a regular file; give the name of a file to write")
-    for name in INPUTS:
+    for name in INPUTS if place.exists() else ():
         given = getattr(arguments, name, None)
-        if isinstance(given, str) and place.exists():
-            read = Path(shipped(given))
-            if read.exists() and place.samefile(read):
-                raise OptionError(f"{option} {path}: is an input of this command ({given}); give another name")
+        for each in given if isinstance(given, list) else [given]:
+            if isinstance(each, str) and Path(shipped(each)).exists() and place.samefile(shipped(each)):
+                raise OptionError(f"{option} {path}: is an input of this command ({each}); give another name")
 
 
 def require_inspectable(path: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, fields, is_dataclass
@@ -11,6 +12,9 @@ from types import NoneType, UnionType
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
+
+from spikeloom.compiler.errors import DataError
+from spikeloom.compiler.files import write_atomically
 
 Result = TypeVar("Result")
 
@@ -92,6 +96,29 @@ def decode(kind: type[Result], value: Any) -> Result:
         elif field.default is MISSING and field.default_factory is MISSING:
             raise KeyError(name)
     return kind(**entries)
+
+
+def write_json(path: str | None, result: Any) -> None:
+    """Write a result as one JSON object, if a place is named."""
+    if path is not None:
+        with write_atomically(path) as file:
+            file.write(json.dumps(encode(result)).encode())
+
+
+def read_json(kind: type[Result], path: Path, option: str, command: str) -> Result:
+    """What :func:`write_json` wrote; `option` named it, `command` makes it.
+
+    Raises
+    ------
+    DataError
+        If it is not there, something else, or of another version.
+    """
+    if not path.is_file():
+        raise DataError(f"{option} {path}: no such file; write it with {command}")
+    try:
+        return decode(kind, json.loads(path.read_bytes()))
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise DataError(f"{option} {path}: is not what {command} writes; give such a file") from error
 
 
 def _decoded(kind: Any, value: Any) -> Any:

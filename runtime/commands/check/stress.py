@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,12 +12,12 @@ from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.files import write_atomically
 from spikeloom.runtime.commands.options import add_netlist_and_model, add_recordings
 from spikeloom.runtime.inputs.files import require_place
-from spikeloom.runtime.report.encode import encode
+from spikeloom.runtime.report.encode import write_json
 from spikeloom.runtime.report.sections import Outcome
-from spikeloom.runtime.studies.jobs import Job, add_sweep_arguments, sweep
+from spikeloom.runtime.studies.jobs import add_sweep_arguments, sweep
 from spikeloom.runtime.studies.stress.battery import NAMES, SEEDS
 from spikeloom.runtime.studies.stress.sections import picture, sections
-from spikeloom.runtime.studies.stress.study import Plan, Request, measure_task, study
+from spikeloom.runtime.studies.stress.study import Plan, Request, Task, measure_task, study
 from spikeloom.runtime.studies.stress.verdicts import parse_requirement
 
 NOTES = """\
@@ -57,7 +56,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     with tempfile.TemporaryDirectory(prefix="spikeloom-") as folder:
         store = Path(folder) / "points" if arguments.output is None else Path(f"{arguments.output}.points")
 
-        def measured(points: Sequence[Job]) -> Mapping[str, Any]:
+        def measured(points: Sequence[Task]) -> Mapping[str, Any]:
             return sweep(
                 points,
                 measure_task,
@@ -74,17 +73,14 @@ def run(arguments: argparse.Namespace) -> Outcome:
     if arguments.picture is not None:
         with write_atomically(arguments.picture) as file:
             file.write(picture(result))
-    if arguments.output is not None:
-        with write_atomically(arguments.output) as file:
-            file.write(json.dumps(encode(result)).encode())
+    write_json(arguments.output, result)
     return Outcome(result, sections, 1 if result.missed else 0)
 
 
 def _plan(arguments: argparse.Namespace) -> Plan:
     """Refuse options that cannot be meant; what is to be measured."""
-    for option, place in (("-o", arguments.output), ("--picture", arguments.picture)):
-        if place is not None:
-            require_place(place, option, arguments)
+    require_place(arguments.output, "-o", arguments)
+    require_place(arguments.picture, "--picture", arguments)
     if arguments.seeds < 1:
         raise OptionError(f"--seeds {arguments.seeds}: allowed are 1 or more; choose another")
     chosen = list(NAMES) if arguments.only is None else [name.strip() for name in arguments.only.split(",")]

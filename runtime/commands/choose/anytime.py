@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from spikeloom.runtime.inputs.recordings import recordings
 from spikeloom.runtime.machines.integer import IntegerMachine, integer_machine_for
 from spikeloom.runtime.machines.votes import votes_by_step
 from spikeloom.runtime.report.console import progress
-from spikeloom.runtime.report.encode import encode
+from spikeloom.runtime.report.encode import write_json
 from spikeloom.runtime.report.sections import Outcome
 from spikeloom.runtime.studies.anytime import exits
 from spikeloom.runtime.studies.anytime.sections import sections
@@ -61,9 +60,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> Outcome:
     """Run the command."""
-    for option, place in (("-o", arguments.output), ("--picture", arguments.picture)):
-        if place is not None:
-            require_place(place, option, arguments)
+    require_place(arguments.output, "-o", arguments)
+    require_place(arguments.picture, "--picture", arguments)
     allowed = _allowed(arguments)
     machine = integer_machine_for(arguments.netlist)
     data = _read(arguments.data, arguments.split, machine, arguments, limit=arguments.limit)
@@ -86,9 +84,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
 
         with write_atomically(arguments.picture) as file:
             file.write(picture(result).file("png"))
-    if arguments.output is not None:
-        with write_atomically(arguments.output) as file:
-            file.write(json.dumps(encode(result)).encode())
+    write_json(arguments.output, result)
     return Outcome(result, sections)
 
 

@@ -63,8 +63,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
         raise OptionError(f"--{figure} {wanted:g}: not a share; give a number from 0 to 1")
     if arguments.samples < 1:
         raise OptionError(f"--samples {arguments.samples}: give 1 or more")
-    if arguments.output is not None:
-        require_place(arguments.output, "-o", arguments)
+    require_place(arguments.output, "-o", arguments)
     target, given = load_target(arguments.target, COMPARTMENTS), whole_numbers(arguments.widths, "--widths")
     path = shipped(arguments.checkpoint)
     if Path(path).is_file() and is_netlist(path):

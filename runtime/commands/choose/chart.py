@@ -18,8 +18,8 @@ from spikeloom.runtime.report.sections import Outcome
 from spikeloom.runtime.studies.chart.choices import parse_budgets
 from spikeloom.runtime.studies.chart.grid import Grid, parse_grid
 from spikeloom.runtime.studies.chart.networks import given_networks, require_grid, require_suited
-from spikeloom.runtime.studies.chart.requests import FORMAT, Data, Facts
-from spikeloom.runtime.studies.jobs import Job, add_sweep_arguments, sweep
+from spikeloom.runtime.studies.chart.requests import FORMAT, Data, Facts, Work
+from spikeloom.runtime.studies.jobs import add_sweep_arguments, sweep
 
 STORE = "points.sqlite"
 
@@ -85,7 +85,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     require_grid(networks, grid, stores)
     folder.mkdir(exist_ok=True)
 
-    def measured(jobs: Sequence[Job], label: str) -> Mapping[str, Any]:
+    def measured(jobs: Sequence[Work], label: str) -> Mapping[str, Any]:
         return sweep(
             jobs,
             work.measure,

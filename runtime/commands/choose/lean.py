@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Mapping
 from dataclasses import replace
 
 from spikeloom.compiler import __version__, write_netlist
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.files import write_atomically
 from spikeloom.models.recordings.counts import number
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.commands.options import NETWORK_FILES, add_network, add_recordings
@@ -18,7 +16,7 @@ from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import recordings
 from spikeloom.runtime.report.console import progress
-from spikeloom.runtime.report.encode import encode
+from spikeloom.runtime.report.encode import encode, write_json
 from spikeloom.runtime.report.sections import Outcome
 from spikeloom.runtime.studies.pruning.sections import sections
 from spikeloom.runtime.studies.pruning.study import study
@@ -53,10 +51,8 @@ def run(arguments: argparse.Namespace) -> Outcome:
     """Run the command."""
     if not 0 <= arguments.differ < 1:
         raise OptionError(f"--differ {arguments.differ:g}: not a share; give a number from 0 to below 1")
-    for option, place in (("-o", arguments.output), ("--report", arguments.report)):
-        if place is not None:
-            for path in arguments.checkpoint:
-                require_place(place, option, argparse.Namespace(**vars(arguments) | {"checkpoint": path}))
+    require_place(arguments.output, "-o", arguments)
+    require_place(arguments.report, "--report", arguments)
     networks = {path: load_network(path, arguments) for path in arguments.checkpoint}
     _require_alike(networks)
     training, test = (
@@ -70,9 +66,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
         made |= storage(None, chosen.checkpoint)
         made |= {"keep_all": False, "prune_unused": True, "ranges": "proven", "calibrated": True, "lean": lean}
         write_netlist(replace(netlist, provenance=made), arguments.output)
-    if arguments.report is not None:
-        with write_atomically(arguments.report) as file:
-            file.write(json.dumps(encode(result)).encode())
+    write_json(arguments.report, result)
     return Outcome(result, sections)
 
 

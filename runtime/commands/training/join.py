@@ -42,8 +42,7 @@ def run(arguments: Namespace) -> Outcome:
     SpikeloomError
         If a network cannot be used, or they do not fit together.
     """
-    for name in arguments.checkpoints:
-        require_place(arguments.output, "-o", Namespace(checkpoint=name))
+    require_place(arguments.output, "-o", arguments)
     found = [_network(name, arguments.weights) for name in arguments.checkpoints]
     towers = [record for name, checkpoint in zip(arguments.checkpoints, found, strict=True)
               for record in _records(name, checkpoint)]  # fmt: skip

@@ -10,13 +10,10 @@ from pathlib import Path
 from spikeloom.compiler.errors import DataError, ModelError
 from spikeloom.compiler.files import write_atomically
 from spikeloom.runtime.report import html
-from spikeloom.runtime.report.encode import decode, encode
+from spikeloom.runtime.report.encode import encode, read_json
 from spikeloom.runtime.studies.chart.requests import FORMAT
 from spikeloom.runtime.studies.chart.results import Chart
 from spikeloom.runtime.studies.chart.sections import picture, sections
-
-SIZE_LIMIT = 2**28
-"""Bytes that a chart may have."""
 
 
 def write_chart(folder: Path, chart: Chart) -> None:
@@ -73,18 +70,9 @@ def read_chart(words: str, sha256: str, checkpoint: str) -> Chart:
         If there is no chart, or one of another version or of other networks.
     """
     path = Path(words) / "chart.json" if Path(words).is_dir() else Path(words)
-    if not path.is_file():
-        raise DataError(f"--chart {words}: no such file; give the chart.json that spikeloom chart wrote")
-    try:
-        if path.stat().st_size > SIZE_LIMIT:
-            raise ValueError(path)
-        chart = decode(Chart, json.loads(path.read_text("utf-8")))
-        if chart.format != FORMAT:
-            raise ValueError(chart.format)
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        raise DataError(
-            f"--chart {words}: is no chart, or one of another version; make it anew with spikeloom chart"
-        ) from None
+    chart = read_json(Chart, path, "--chart", "spikeloom chart")
+    if chart.format != FORMAT:
+        raise DataError(f"--chart {words}: is of another version; make it anew with spikeloom chart")
     if sha256 not in [network.sha256 for network in chart.networks]:
         names = ", ".join(network.name for network in chart.networks)
         raise ModelError(f"--chart {words}: is of {names}, not of {checkpoint}; give a chart that this network is in")

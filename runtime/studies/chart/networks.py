@@ -131,8 +131,9 @@ class Given:
 
     def from_anywhere(self) -> Given:
         """The same for a process that works in another folder."""
-        files = {name: from_anywhere(getattr(self.source, name)) for name in ("path", "taxels", "edges")}
-        return replace(self, source=replace(self.source, **files))
+        taxels, edges = from_anywhere(self.source.taxels), from_anywhere(self.source.edges)
+        source = replace(self.source, path=str(from_anywhere(self.source.path)), taxels=taxels, edges=edges)
+        return replace(self, source=source)
 
     def storages(self, grid: Grid) -> Iterator[Storage]:
         """Every storage that a grid asks for; of a network that was trained in one its own and no other."""

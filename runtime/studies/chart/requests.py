@@ -74,6 +74,9 @@ class Run(Job):
     window: int
 
 
+Work = Decide | Build | Run
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Facts:
     """What decides every result, beside what a single one is about."""

@@ -19,7 +19,7 @@ from spikeloom.runtime.studies.chart import choices
 from spikeloom.runtime.studies.chart.choices import Budget
 from spikeloom.runtime.studies.chart.grid import Grid
 from spikeloom.runtime.studies.chart.networks import Given
-from spikeloom.runtime.studies.chart.requests import SPLITS, Build, Built, Facts, Run, commands
+from spikeloom.runtime.studies.chart.requests import SPLITS, Build, Built, Facts, Run, Work, commands
 from spikeloom.runtime.studies.chart.results import (
     Chart,
     ChartedData,
@@ -34,9 +34,8 @@ from spikeloom.runtime.studies.chart.results import (
     share,
 )
 from spikeloom.runtime.studies.chart.work import Decisions, Ran, RanBoth
-from spikeloom.runtime.studies.jobs import Job
 
-Sweep = Callable[[Sequence[Job], str], Mapping[str, Any]]
+Sweep = Callable[[Sequence[Work], str], Mapping[str, Any]]
 """Measures jobs under a heading; their JSON by key."""
 
 

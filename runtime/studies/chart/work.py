@@ -32,7 +32,7 @@ from spikeloom.runtime.machines.base import DEFAULT, Machine, chip_chart, machin
 from spikeloom.runtime.machines.votes import readout_counts
 from spikeloom.runtime.report.encode import encode
 from spikeloom.runtime.studies.chart.networks import Given, Source
-from spikeloom.runtime.studies.chart.requests import SPLITS, Build, Built, Data, Decide, Run, layout_options
+from spikeloom.runtime.studies.chart.requests import SPLITS, Build, Built, Data, Decide, Run, Work, layout_options
 
 PART = 16
 """Recordings whose float spikes are held at a time."""
@@ -62,7 +62,7 @@ class RanBoth:
     recordings_per_s: float
 
 
-def measure(work: Decide | Build | Run) -> Any:
+def measure(work: Work) -> Any:
     """Do one piece of a chart's work; the JSON of `Decisions`, of `Built` by layout, or of `RanBoth`."""
     if isinstance(work, Decide):
         return encode(_decide(work))

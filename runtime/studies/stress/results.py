@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from spikeloom.compiler.errors import DataError
-from spikeloom.runtime.report.encode import OPTIONAL, decode, key
+from spikeloom.runtime.report.encode import OPTIONAL, key, read_json
 from spikeloom.runtime.studies.stress.battery import Level
 
 
@@ -135,13 +134,7 @@ def read_stress(path: str, netlist: str, sha256: str) -> Stress:
     DataError
         If the file is not there, something else, or about another netlist.
     """
-    place = Path(path)
-    if not place.is_file():
-        raise DataError(f"--stress {path}: no such file; write it with spikeloom stress -o")
-    try:
-        result = decode(Stress, json.loads(place.read_bytes()))
-    except (ValueError, TypeError, KeyError) as error:
-        raise DataError(f"--stress {path}: is not what spikeloom stress -o writes; give such a file") from error
+    result = read_json(Stress, Path(path), "--stress", "spikeloom stress -o")
     about = result.provenance.netlist_sha256
     if about != sha256:
         raise DataError(

@@ -34,8 +34,6 @@ CHUNK = 5
 FILES = ("netlist", "checkpoint", "data", "taxels", "edges")
 """Options that name files."""
 
-Sweep = Callable[[Sequence[Job]], Mapping[str, Any]]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Request:
@@ -82,6 +80,16 @@ class Request:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Task(Job):
+    """A perturbation at a level, and the seeds to draw it with."""
+
+    request: Request
+    name: str
+    level: Level
+    seeds: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
     """Perturbations in the battery's order, what is required of them, and how densely they are measured."""
 
@@ -89,6 +97,9 @@ class Plan:
     requirements: tuple[Requirement, ...]
     seeds: int
     full: bool
+
+
+Sweep = Callable[[Sequence[Task]], Mapping[str, Any]]
 
 
 def study(request: Request, plan: Plan, sweep: Sweep | None = None) -> Stress:
@@ -160,16 +171,6 @@ def _provenance(request: Request, loaded: LoadedNetwork, data: str) -> Provenanc
 
 
 # -- where tasks are measured ------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Task(Job):
-    """A perturbation at a level, and the seeds to draw it with."""
-
-    request: Request
-    name: str
-    level: Level
-    seeds: tuple[int, ...]
 
 
 def _task(request: Request, name: str, level: Level, seeds: tuple[int, ...], facts: Mapping[str, Any]) -> Task:
