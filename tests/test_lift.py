@@ -78,7 +78,7 @@ def test_runs_like_the_chip(data):
 
 
 @pytest.mark.parametrize("empty", [0, 1, 2])
-def test_a_layer_without_synapses_still_listens(empty):
+def test_a_layer_without_synapses_keeps_its_projection(empty):
     weights = [np.full((3, 4), 50), np.full((2, 3), 60), np.full((2, 2), 70)]
     weights[empty] = np.zeros_like(weights[empty])
     network = integer_chain(*weights)
@@ -88,15 +88,6 @@ def test_a_layer_without_synapses_still_listens(empty):
     assert [(p.pre, p.post, p.weight.nnz > 0) for p in sorted(found.projections, key=lambda p: p.post)] == [
         (post - 1 if post else INPUT, post, post != empty) for post in range(3)
     ]
-
-
-def test_zeros_in_dense_lists_are_left_out():
-    weight = np.full((64, 4), 50)
-    weight[10, :] = 0
-    netlist = lower(integer_chain(weight))
-    assert netlist.n_synapses == 64 * 4
-    (projection,) = lift(netlist).projections
-    assert projection.weight.nnz == 63 * 4
 
 
 def netlist_of(*neurons: Neuron) -> Netlist:

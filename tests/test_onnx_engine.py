@@ -146,26 +146,22 @@ def verified():
     ]
 
 
-def test_verify_tells_which_engine(verified, capsys):
-    found = {}
-    for name in ("spikeloom", "onnx"):
-        capsys.readouterr()
-        assert cli.main([*verified, "--engine", name, "--json"]) == 0
-        found[name] = json.loads(capsys.readouterr().out)
-    assert [(report["engine"], report["engine_different"]) for report in found.values()] == [
+def as_json(capsys, words, code=0):
+    capsys.readouterr()
+    assert cli.main([*words, "--json"]) == code
+    return json.loads(capsys.readouterr().out)
+
+
+def test_verify_says_which_engine(verified, capsys):
+    ours, onnx = (as_json(capsys, [*verified, "--engine", name]) for name in ("spikeloom", "onnx"))
+    assert [(found.pop("engine"), found.pop("engine_different")) for found in (ours, onnx)] == [
         ("spikeloom", None),
         ("onnx", 0),
     ]
-    assert found["onnx"]["spec_equals_engine"]
-    said = found["onnx"]["levels"][0]["text"]
-    assert said == (
-        found["spikeloom"]["levels"][0]["text"]
-        + f"; onnx beside it, 0 differing spikes on {found['onnx']['samples']} recordings"
-    )
-    for report in found.values():
-        for key in ("engine", "engine_different", "levels"):
-            del report[key]
-    assert found["onnx"] == found["spikeloom"]
+    beside = f"; onnx beside it, 0 differing spikes on {onnx['samples']} recordings"
+    assert onnx["levels"].pop(0)["text"] == ours["levels"].pop(0)["text"] + beside
+    assert onnx["spec_equals_engine"]
+    assert onnx == ours
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -179,9 +175,7 @@ def test_verify_finds_an_engine_that_strays(verified, form, monkeypatch, capsys)
         return trace
 
     monkeypatch.setattr(onnx_engine, "simulate", stray)
-    capsys.readouterr()
-    assert cli.main([*verified, "--engine", "onnx", "--json"]) == 1
-    report = json.loads(capsys.readouterr().out)
+    report = as_json(capsys, [*verified, "--engine", "onnx"], code=1)
     assert not report["spec_equals_engine"]
     assert report["engine_different"] == (form == "scan")
 
