@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from spikeloom.compiler import Options, Recipe, compile_network
+from spikeloom.compiler import Options, Packing, compile_network
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.files import write_atomically
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
@@ -38,14 +38,14 @@ Scheme = dict[str, Any]
 SCHEMES: dict[str, tuple[str, Scheme]] = {
     "8 bits, from the weights": ("", {"calibrated": False}),
     "8 bits": ("", {}),
-    "2 × 8 bits": ("", {"recipes": (Recipe(planes=2),)}),
-    "2 × 8 bits, 8 scales": ("", {"recipes": (Recipe(planes=2, groups=8),)}),
+    "2 × 8 bits": ("", {"packings": (Packing(planes=2),)}),
+    "2 × 8 bits, 8 scales": ("", {"packings": (Packing(planes=2, groups=8),)}),
     "spike-exact": ("", {"spike_exact": True}),
-    "6 bits": ("", {"recipes": (Recipe(bits=6),)}),
-    "4 bits": ("", {"recipes": (Recipe(bits=4),)}),
-    "4 bits, 8 scales": ("", {"recipes": (Recipe(bits=4, groups=8),)}),
+    "6 bits": ("", {"packings": (Packing(bits=6),)}),
+    "4 bits": ("", {"packings": (Packing(bits=4),)}),
+    "4 bits, 8 scales": ("", {"packings": (Packing(bits=4, groups=8),)}),
     "4 bits, fine-tuned": ("-4bit", {"calibrated": False}),
-    "ternary, 8 scales": ("", {"recipes": (Recipe(bits=2, groups=8),)}),
+    "ternary, 8 scales": ("", {"packings": (Packing(bits=2, groups=8),)}),
     "ternary, fine-tuned": ("-2bit", {"calibrated": False}),
 }
 

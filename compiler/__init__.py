@@ -19,11 +19,11 @@ if TYPE_CHECKING:
         MAX_PLANES,
         RANGES,
         Options,
-        Recipe,
-        check_recipes,
+        Packing,
+        check_packings,
     )
-    from spikeloom.compiler.targets.loihi1.passes import lay_out_again, store, without
-    from spikeloom.compiler.targets.loihi1.storage.quantize import round_to_forms
+    from spikeloom.compiler.targets.loihi1.passes import lay_out_again, to_integers, without
+    from spikeloom.compiler.targets.loihi1.storage.choose_storage import round_to_forms
     from spikeloom.compiler.targets.loihi1.storage.scales import layer_of, rounded
     from spikeloom.compiler.targets.loihi1.storage.width_search import (
         WidthPoint,
@@ -43,11 +43,11 @@ __all__ = [
     "Compilation",
     "Netlist",
     "Options",
-    "Recipe",
+    "Packing",
     "WidthPoint",
     "WidthSearch",
     "__version__",
-    "check_recipes",
+    "check_packings",
     "check_widths",
     "compile_network",
     "lay_out_again",
@@ -57,8 +57,8 @@ __all__ = [
     "round_to_forms",
     "rounded",
     "search_widths",
-    "store",
     "store_alike",
+    "to_integers",
     "widths_front",
     "without",
     "write_netlist",
@@ -72,9 +72,9 @@ _NAMES = {
     "lift": "lift",
     "netlist": "Netlist",
     "netlist_file": "read_netlist write_netlist",
-    "options": "GOALS MARGIN MAX_PLANES RANGES Options Recipe check_recipes",
-    "passes": "lay_out_again store without",
-    "storage.quantize": "round_to_forms",
+    "options": "GOALS MARGIN MAX_PLANES RANGES Options Packing check_packings",
+    "passes": "lay_out_again to_integers without",
+    "storage.choose_storage": "round_to_forms",
     "storage.scales": "layer_of rounded",
     "storage.width_search": "WidthPoint WidthSearch check_widths search_widths widths_front",
 }

@@ -65,7 +65,7 @@ def build(neurons: list[Neuron], axons: list[Axon], *, n_inputs: int, depths: li
             Layer(
                 name=f"layer{i}",
                 neurons=sum(neuron.layer == i for neuron in neurons),
-                unreceived=(),
+                unread=(),
                 depth=depth,
                 beta=0.2,
                 theta=0.5,

@@ -6,7 +6,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from random_netlists import KEPT, Axon, Neuron, assert_equal, build, by_engine, by_steps, recording_of
 
-from spikeloom.compiler import Options, Recipe, compile_network
+from spikeloom.compiler import Options, Packing, compile_network
 from spikeloom.compiler.errors import NumericRangeError
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.passes.expand import expand
@@ -245,15 +245,15 @@ def test_scattered_synapses_take_the_other_kernel():
 
 
 @pytest.mark.recordings
-@pytest.mark.parametrize("recipe", [Recipe(), Recipe(planes=2, groups=8), Recipe(bits=2)])
-def test_the_released_network(released_checkpoint, objects_zip, recipe):
+@pytest.mark.parametrize("packing", [Packing(), Packing(planes=2, groups=8), Packing(bits=2)])
+def test_the_released_network(released_checkpoint, objects_zip, packing):
     from spikeloom.models.graphs import build_graph, normalised_adjacency
     from spikeloom.models.recordings.evtouch import load_recordings
 
     graph = build_graph("manual")
     checkpoint = read_checkpoint(released_checkpoint)
     adjacency = normalised_adjacency(graph.edges, graph.n_taxels)
-    netlist = compile_network(expand(checkpoint, adjacency), Options(recipes=(recipe,))).netlist
+    netlist = compile_network(expand(checkpoint, adjacency), Options(packings=(packing,))).netlist
     recordings = load_recordings(objects_zip, "test")
     events = recordings.events[::24].reshape(6, -1, recordings.steps)
     prepared = engine.prepare(netlist)

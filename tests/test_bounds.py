@@ -13,10 +13,10 @@ from random_networks import (
     recordings_for,
 )
 
-from spikeloom.compiler import Recipe
+from spikeloom.compiler import Packing
 from spikeloom.compiler.interpret import run_integer
 from spikeloom.compiler.range_proof import prove_ranges
-from spikeloom.compiler.targets.loihi1.storage.quantize import quantize
+from spikeloom.compiler.targets.loihi1.storage.choose_storage import choose_storage
 
 
 def with_registers(network, **changes):
@@ -90,22 +90,22 @@ def check(network, events, proofs):
         assert np.abs(activity.membranes[post]).max() <= proof.membrane
 
 
-@settings(deadline=None, max_examples=50)
+@settings(deadline=None, max_examples=20)
 @given(st.data())
 def test_bounds_hold_on_random_registers(data):
     network = data.draw(integer_networks())
     check(network, data.draw(recordings_for(network.input.size, most=30)), prove_ranges(network))
 
 
-@settings(deadline=None, max_examples=50)
+@settings(deadline=None, max_examples=20)
 @given(st.data())
 def test_bounds_hold_on_quantised_networks(data):
-    recipe = Recipe(bits=data.draw(st.sampled_from([2, 8])))
-    network, _ = quantize(data.draw(float_networks()), LOIHI, recipes=(recipe,))
+    packing = Packing(bits=data.draw(st.sampled_from([2, 8])))
+    network, _ = choose_storage(data.draw(float_networks()), LOIHI, packings=(packing,))
     check(network, data.draw(recordings_for(network.input.size, most=30)), prove_ranges(network))
 
 
-@settings(deadline=None, max_examples=50)
+@settings(deadline=None, max_examples=20)
 @given(st.data())
 def test_a_proof_means_that_saturation_changes_nothing(data):
     network = data.draw(integer_networks())

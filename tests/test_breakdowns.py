@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from made_files import CLASSES, events, small_checkpoint, weights
 
-from spikeloom.compiler import Options, Recipe, compile_network
+from spikeloom.compiler import Options, Packing, compile_network
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.runtime import cli
 from spikeloom.runtime.equivalence.breakdowns import breakdowns
@@ -79,9 +79,9 @@ def test_nearly_empty_recordings():
 # --- networks ---------------------------------------------------------------------------------------------------------
 
 
-def verified(folder, arrays, recordings, recipe, **options):
+def verified(folder, arrays, recordings, packing, **options):
     checkpoint, adjacency = small_checkpoint(folder, last=arrays)
-    netlist = compile_network(expand(checkpoint, adjacency), Options(recipes=(recipe,), **options)).netlist
+    netlist = compile_network(expand(checkpoint, adjacency), Options(packings=(packing,), **options)).netlist
     verdict = verify(netlist, checkpoint, adjacency, recordings, LABELS, FILES)
     return {breakdown["kind"]: breakdown for breakdown in encode(verdict)["breakdowns"]}, terminal(sections(verdict))
 
@@ -92,7 +92,7 @@ def test_a_neuron_that_fires_by_a_hair_from_its_bias_alone(tmp_path, bits):
     arrays = weights()
     arrays["fc2.weight"][3], arrays["fc2.bias"][3] = 0, 0.400005
     recordings = events(2, steps=60)
-    kinds, text = verified(tmp_path, arrays, recordings, Recipe(bits=bits), keep_all=True, training_events=events(1))
+    kinds, text = verified(tmp_path, arrays, recordings, Packing(bits=bits), keep_all=True, training_events=events(1))
     line = "breakdown: fc2 neurons that fire in the float model and never on the chip: 3 (42 times)"
     assert (line in text) == ("silenced neurons" in kinds) == (bits == 4)
 
@@ -102,7 +102,7 @@ def test_a_network_that_rounding_silences(tmp_path):
     arrays = weights()
     arrays["fc3.weight"][:, 0] = 60.0
     arrays["fc2.weight"][0], arrays["fc2.bias"][0] = 0, 0
-    kinds, text = verified(tmp_path, arrays, events(2), Recipe(bits=2), keep_all=True)
+    kinds, text = verified(tmp_path, arrays, events(2), Packing(bits=2), keep_all=True)
     assert kinds["silent layer"]["layer"] == "fc3"
     assert kinds["no vote"]["count"] == 6
     assert "breakdown: fc3 never fires on the chip; it fires " in text

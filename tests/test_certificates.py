@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_files import CLASSES, FEATURES, TAXELS, events, ring, small_checkpoint, weights
 
-from spikeloom.compiler import Options, Recipe, compile_network, lift
+from spikeloom.compiler import Options, Packing, compile_network, lift
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.interpret import channels_last, run_float, vote
 from spikeloom.compiler.passes.expand import expand
@@ -208,7 +208,7 @@ def by_hand(checkpoint, adjacency, recordings, chip, kept=None, lengths=None):
 
 def test_entries_are_counted_once_each(folder):
     checkpoint, adjacency = model(folder, 3)
-    netlist = compile_network(expand(checkpoint, adjacency), Options(recipes=(Recipe(bits=4),))).netlist
+    netlist = compile_network(expand(checkpoint, adjacency), Options(packings=(Packing(bits=4),))).netlist
     recordings = events(4, samples=5, steps=12)
     chip, decisions = on_chip(netlist, recordings)
     found = certify(checkpoint, adjacency, lift(netlist), recordings, chip, decisions)
@@ -226,7 +226,7 @@ def test_entries_are_counted_once_each(folder):
 
 def test_parts_of_layers_and_of_recordings(folder):
     checkpoint, adjacency = model(folder, 3)
-    netlist = compile_network(expand(checkpoint, adjacency), Options(recipes=(Recipe(bits=4),))).netlist
+    netlist = compile_network(expand(checkpoint, adjacency), Options(packings=(Packing(bits=4),))).netlist
     recordings, lengths = events(4, samples=3, steps=12), np.array([5, 12, 9])
     for recording, length in zip(recordings, lengths, strict=True):
         recording[..., length:] = 0

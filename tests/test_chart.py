@@ -199,7 +199,7 @@ def test_what_the_chip_refuses_is_listed(spikeloom, place, monkeypatch):
     refused, store = {4}, chart_work.store
 
     def picky(network, options, target):
-        if options.recipes is not None and options.recipes[0].bits in refused:
+        if options.packings is not None and options.packings[0].bits in refused:
             raise CapacityError((VIOLATION,))
         return store(network, options, target)
 

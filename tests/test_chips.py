@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import networkx as nx
 import numpy as np
 import pytest
 from hypothesis import given
@@ -172,6 +173,23 @@ def test_what_is_refused_of_several_chips(netlist, recordings):
         "--to sanafe: the netlist": lambda: list(sanafe.export(netlist, SMALL)),
     }.items():
         refused(OptionError, f"{what}|takes 3 chips|links between chips|--detail counts", call)
+
+
+def test_the_map_of_cores_has_the_axons_that_the_limits_count_and_the_hops_of_the_placement():
+    target = small_target(core_compartments=4, mesh_tile_cores=1)
+    layout, _ = lay_out(net(), target)
+    made = emit(net(), layout.parts, layout.placement.tiles, target, {})
+    graph = core_map(made, target)
+    used = {(use.name, use.core): use.used for use in measure(made, target)}
+    for core in range(5):
+        assert graph.in_degree(core, weight="axons") == used["core.axons_in", core]
+        assert graph.out_degree(core, weight="axons") == used["core.axons_out", core]
+        assert graph.nodes[core]["compartments"] == used["core.compartments", core] == 4
+    # without rates every neuron counts as one spike a step
+    edges = [edge for _, _, edge in graph.edges(data=True) if edge["hops"] is not None]
+    assert sum(edge["axons"] * edge["hops"] for edge in edges) == layout.placement.spike_hops > 0
+    assert nx.descendants(graph, "input") == set(range(5))
+    assert [graph.nodes[core]["layers"] for core in range(5)] == [("fc1",)] * 2 + [("fc2",)] * 2 + [("fc3",)]
 
 
 def test_hops_between_chips_are_unknown_to_the_map(netlist):

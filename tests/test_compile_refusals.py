@@ -8,13 +8,13 @@ import pytest
 from oracles import refused
 from random_networks import LOIHI, chain, integer_chain, random_checkpoint, ring, small_target
 
-from spikeloom.compiler import Options, Recipe, compile_network
+from spikeloom.compiler import Options, Packing, compile_network
 from spikeloom.compiler.errors import CapacityError, DataError, ModelError, OptionError
 from spikeloom.compiler.passes.calibrate import calibrate
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.targets.loihi1.layout.choose import asked_cores, lay_out
+from spikeloom.compiler.targets.loihi1.layout.choose import lay_out, least_cores
 from spikeloom.compiler.targets.loihi1.layout.partition import partition
-from spikeloom.compiler.targets.loihi1.storage.quantize import quantize
+from spikeloom.compiler.targets.loihi1.storage.choose_storage import choose_storage
 from spikeloom.compiler.targets.loihi1.storage.width_search import check_widths
 
 EVENTS = np.ones((2, 5, 2, 8), np.uint8)
@@ -26,7 +26,7 @@ def compiling(target="loihi1", graph=5, **options):
 
 
 def rounding(weight=1.0, **options):
-    return lambda: quantize(chain([[weight]]), LOIHI, **options)
+    return lambda: choose_storage(chain([[weight]]), LOIHI, **options)
 
 
 def calibrating(shape):
@@ -63,12 +63,15 @@ OPTIONS = [
     ("--prune-unused|--keep-all", compiling(prune_unused=True, training_events=EVENTS, keep_all=True)),
     ("--spike-exact|--calibrate", compiling(spike_exact=True)),
     ("--spike-exact|--ranges", compiling(spike_exact=True, training_events=EVENTS, ranges="observed")),
-    ("--spike-exact|--planes", compiling(spike_exact=True, training_events=EVENTS, recipes=(Recipe(planes=2),))),
-    (f"--weight-bits 7|{WIDTHS}", compiling(spike_exact=True, training_events=EVENTS, recipes=(Recipe(bits=7),))),
-    *((f"--weight-bits {bits}|{WIDTHS}", rounding(recipes=(Recipe(bits=bits),))) for bits in (-1, 0, 1, 7, 9)),
-    *((f"--planes {planes}|1 to 3", rounding(recipes=(Recipe(planes=planes),))) for planes in (0, 4)),
-    *((f"--scale-groups {n}|8 thresholds|1 to 8", rounding(recipes=(Recipe(groups=n),))) for n in (0, 9)),
-    ("--weight-bits: 2 layers|the network has 1", rounding(recipes=(Recipe(), Recipe()))),
+    ("--spike-exact|--planes", compiling(spike_exact=True, training_events=EVENTS, packings=(Packing(planes=2),))),
+    (
+        f"--weight-bits 7|{WIDTHS}",
+        compiling(spike_exact=True, training_events=EVENTS, packings=(Packing(bits=7),)),
+    ),
+    *((f"--weight-bits {bits}|{WIDTHS}", rounding(packings=(Packing(bits=bits),))) for bits in (-1, 0, 1, 7, 9)),
+    *((f"--planes {planes}|1 to 3", rounding(packings=(Packing(planes=planes),))) for planes in (0, 4)),
+    *((f"--scale-groups {n}|8 thresholds|1 to 8", rounding(packings=(Packing(groups=n),))) for n in (0, 9)),
+    ("--weight-bits: 2 layers|the network has 1", rounding(packings=(Packing(), Packing()))),
     (f"--widths 7|{WIDTHS}", lambda: check_widths([7], 1, 4, LOIHI)),
     ("--scale-groups 9|1 to 8", lambda: check_widths([4], 9, 4, LOIHI)),
     ("--optimize speed|cores, energy, latency", goal("speed")),
@@ -87,12 +90,12 @@ OPTIONS = [
     ("--cores-for fc1=1|2 cores at least", laying_out((1, 4, 9), small_target(core_axons_out=7), fc1=1, fc2=3)),
     (
         "--cores-for fc1=7|3 chips|6 cores",
-        lambda: asked_cores(full(6, 8), {"fc1": 7}, small_target(chip_cores=2), 3),
+        lambda: least_cores(full(6, 8), {"fc1": 7}, small_target(chip_cores=2), 3),
     ),
 ]
 NETWORKS = [
     ("graph has 4 taxels|trained on 5", compiling(graph=4)),
-    ("fc1|6 bits|32767 units|more bits", rounding(1e6, recipes=(Recipe(bits=6),))),
+    ("fc1|6 bits|32767 units|more bits", rounding(1e6, packings=(Packing(bits=6),))),
 ]
 RECORDINGS = [
     ("calibration|split is empty", compiling(training_events=EVENTS[:0])),
@@ -135,8 +138,8 @@ def test_what_cannot_be_had_is_refused(error, words, call):
 
 
 def test_what_is_just_allowed():
-    assert asked_cores(full(2496, 128), {"fc1": 3}, LOIHI) == {0: 3}
-    assert asked_cores(full(6, 8), {"fc1": 6}, small_target(chip_cores=2), 3) == {0: 6}
+    assert least_cores(full(2496, 128), {"fc1": 3}, LOIHI) == {0: 3}
+    assert least_cores(full(6, 8), {"fc1": 6}, small_target(chip_cores=2), 3) == {0: 6}
     assert check_widths([8, 2, 8], 1, 4, LOIHI) == (2, 8)
     assert check_widths([2, 3, 4, 5, 6, 8], 1, 4, LOIHI) == (2, 3, 4, 5, 6, 8)
     assert len(partition(full(4096, 1), LOIHI).cores) == 1

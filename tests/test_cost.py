@@ -8,13 +8,13 @@ from made_files import events, small_checkpoint
 from random_netlists import Axon, Neuron, build
 from random_networks import LOIHI, small_target
 
-from spikeloom.compiler import Recipe
+from spikeloom.compiler import Packing
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.base import EnergyTable, Quantity
 from spikeloom.compiler.targets.loihi1.emit import emit
 from spikeloom.compiler.targets.loihi1.layout.partition import partition
 from spikeloom.compiler.targets.loihi1.layout.place import core_traffic, place
-from spikeloom.compiler.targets.loihi1.storage.quantize import quantize
+from spikeloom.compiler.targets.loihi1.storage.choose_storage import choose_storage
 from spikeloom.runtime.machines.loihi1 import engine, spec
 from spikeloom.runtime.machines.loihi1.costs import cost
 from spikeloom.runtime.machines.loihi1.costs.estimate import estimate
@@ -103,7 +103,7 @@ def check(netlist, recordings):
 def test_against_brute_force_on_many_cores(tmp_path):
     checkpoint, adjacency = small_checkpoint(tmp_path)
     target = small_target(core_compartments=7, mesh_tile_cores=1, mesh_width=8)
-    integer, _ = quantize(expand(checkpoint, adjacency), target, recipes=(Recipe(bits=4),))
+    integer, _ = choose_storage(expand(checkpoint, adjacency), target, packings=(Packing(bits=4),))
     parts = partition(integer, target)
     netlist = emit(integer, parts, place(core_traffic(integer, parts, None), target).tiles, target, {})
     assert netlist.n_cores >= 8
@@ -117,7 +117,7 @@ def test_against_brute_force_on_many_cores(tmp_path):
 
 def test_against_brute_force_on_one_core(tmp_path):
     checkpoint, adjacency = small_checkpoint(tmp_path, theta=0.3)
-    integer, _ = quantize(expand(checkpoint, adjacency), LOIHI)
+    integer, _ = choose_storage(expand(checkpoint, adjacency), LOIHI)
     parts = partition(integer, LOIHI)
     netlist = emit(integer, parts, place(core_traffic(integer, parts, None), LOIHI).tiles, LOIHI, {})
     costs = check(netlist, events(6, samples=2).reshape(2, netlist.n_inputs, -1))
@@ -250,7 +250,7 @@ def test_what_no_table_covers_is_always_listed(tables):
 
 def test_report_has_means_and_extremes_over_recordings(tmp_path):
     checkpoint, adjacency = small_checkpoint(tmp_path)
-    integer, _ = quantize(expand(checkpoint, adjacency), LOIHI)
+    integer, _ = choose_storage(expand(checkpoint, adjacency), LOIHI)
     parts = partition(integer, LOIHI)
     netlist = emit(integer, parts, place(core_traffic(integer, parts, None), LOIHI).tiles, LOIHI, {})
     recordings = events(7, samples=5).reshape(5, netlist.n_inputs, -1)

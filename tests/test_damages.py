@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from random_networks import chain, compiled, integer_chain, random_checkpoint
 from timed_networks import written
 
-from spikeloom.compiler import Options, Recipe, compile_network, lift
+from spikeloom.compiler import Options, Packing, compile_network, lift
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.fixedpoint import decay_registers
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
@@ -23,11 +23,11 @@ from spikeloom.runtime.studies.stress import damages, other_networks
 from spikeloom.runtime.studies.stress.pair import Pair
 
 
-def made(seed=0, recipe=None, taxels=6):
+def made(seed=0, packing=None, taxels=6):
     """A pair of a small TactileSGNet."""
     checkpoint = random_checkpoint(taxels=taxels, features=4, sizes=(9, 8, 4), seed=seed)
     network = expand(checkpoint, normalised_adjacency(ring(taxels).edges, taxels))
-    return Pair(netlist=compile_network(network, Options(recipes=recipe)).netlist, network=network)
+    return Pair(netlist=compile_network(network, Options(packings=packing)).netlist, network=network)
 
 
 def timed(folder):
@@ -71,9 +71,9 @@ def moved(before, after):
 # -- weights -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("recipe", [None, (Recipe(bits=4),), (Recipe(planes=2),)])
-def test_float_weights_move_as_the_stored_ones_do(recipe):
-    pair = made(recipe=recipe)
+@pytest.mark.parametrize("packing", [None, (Packing(bits=4),), (Packing(planes=2),)])
+def test_float_weights_move_as_the_stored_ones_do(packing):
+    pair = made(packing=packing)
     after = damages.flip_bits(pair, 0.02, drawn(1))
     assert any(m.any() for m in moved(pair, after))
     for old, new in zip(pair.network.projections, after.network.projections, strict=True):
@@ -99,7 +99,7 @@ def test_flipped_bits_are_as_many_as_asked_and_two_flips_undo_each_other():
 
 
 def test_every_bit_flips_at_a_probability_of_one_half_at_last():
-    pair = made(recipe=(Recipe(bits=3),))
+    pair = made(packing=(Packing(bits=3),))
     seen = np.zeros(pair.netlist.n_synapses, int)
     for seed in range(40):
         after = damages.flip_bits(pair, 0.5, drawn(seed)).netlist.synapse_weight.astype(int) // 64
@@ -228,9 +228,9 @@ def test_windows_that_open_late_are_those_of_the_specification():
 # -- other networks ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("recipe", [None, (Recipe(planes=2),), (Recipe(bits=4),)])
-def test_an_unplaced_netlist_spikes_as_the_placed_one(recipe):
-    pair = made(recipe=recipe)
+@pytest.mark.parametrize("packing", [None, (Packing(planes=2),), (Packing(bits=4),)])
+def test_an_unplaced_netlist_spikes_as_the_placed_one(packing):
+    pair = made(packing=packing)
     flat = unplaced(lift(pair.netlist), pair.netlist)
     events = inputs(pair)
     placed, other = (engine.simulate(netlist, events) for netlist in (pair.netlist, flat))

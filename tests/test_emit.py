@@ -15,16 +15,16 @@ from random_networks import (
     tight_targets,
 )
 
-from spikeloom.compiler import Recipe
+from spikeloom.compiler import Packing
 from spikeloom.compiler.interpret import run_integer
 from spikeloom.compiler.ir import INPUT, fan_in
 from spikeloom.compiler.targets.loihi1.legalize import require_legal
-from spikeloom.compiler.targets.loihi1.storage.quantize import quantize
+from spikeloom.compiler.targets.loihi1.storage.choose_storage import choose_storage
 from spikeloom.runtime.machines.loihi1 import spec
 from spikeloom.runtime.machines.loihi1.trace import aligned
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=25)
 @given(integer_networks(), tight_targets())
 def test_the_netlist_holds_exactly_the_network(network, target):
     parts = legal_partition(network, target)
@@ -77,7 +77,7 @@ def test_the_netlist_holds_exactly_the_network(network, target):
             np.testing.assert_array_equal(dense[pre, post], weight)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=25)
 @given(integer_networks(), tight_targets())
 def test_compartments_hold_the_registers_of_their_neurons(network, target):
     parts = legal_partition(network, target)
@@ -103,12 +103,12 @@ def test_compartments_hold_the_registers_of_their_neurons(network, target):
     assert all(not getattr(netlist, name).flags.writeable for name in ("neuron", "axon_source", "synapse_weight"))
 
 
-@settings(deadline=None, max_examples=50)
+@settings(deadline=None, max_examples=20)
 @given(st.data())
 def test_the_chip_spikes_like_the_network(data):
     """Partition and emission change no spike: the specified chip step against the integer network."""
-    recipe = Recipe(bits=data.draw(st.sampled_from([8, 6, 4, 2])), planes=data.draw(st.integers(1, 2)))
-    network, _ = quantize(data.draw(float_networks()), LOIHI, recipes=(recipe,))
+    packing = Packing(bits=data.draw(st.sampled_from([8, 6, 4, 2])), planes=data.draw(st.integers(1, 2)))
+    network, _ = choose_storage(data.draw(float_networks()), LOIHI, packings=(packing,))
     target = data.draw(tight_targets())
     parts = legal_partition(network, target)
     netlist = seated(network, parts, target)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from made_files import STEPS, events, own_file, recordings_folder, small_checkpoint, weights
 from random_netlists import Neuron, build
 
-from spikeloom.compiler import Options, Recipe, compile_network, lift
+from spikeloom.compiler import Options, Packing, compile_network, lift
 from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.interpret import channels_last, run_float
 from spikeloom.compiler.passes.expand import expand
@@ -36,7 +36,7 @@ def rungs(verdict):
 def small(tmp_path_factory):
     """A checkpoint, its propagation matrix and a coarse netlist that often strays from it."""
     checkpoint, adjacency = small_checkpoint(tmp_path_factory.mktemp("small"))
-    netlist = compile_network(expand(checkpoint, adjacency), Options(recipes=(Recipe(bits=4),))).netlist
+    netlist = compile_network(expand(checkpoint, adjacency), Options(packings=(Packing(bits=4),))).netlist
     return checkpoint, adjacency, netlist
 
 
@@ -84,7 +84,7 @@ def test_spikes_and_decisions(small, verdict):
 @pytest.mark.parametrize(("seed", "bits"), [(0, 4), (1, 6), (4, 6)])
 def test_the_first_divergence_is_the_first(tmp_path, seed, bits):
     checkpoint, adjacency = small_checkpoint(tmp_path, last=weights(seed))
-    options = Options(recipes=(Recipe(bits=bits),), keep_all=bits == 6)
+    options = Options(packings=(Packing(bits=bits),), keep_all=bits == 6)
     netlist, recordings = compile_network(expand(checkpoint, adjacency), options).netlist, events(2 + seed, samples=3)
     found = verify(netlist, checkpoint, adjacency, recordings, LABELS[:3], FILES[:3], spec_samples=1).first_divergence
     reference = list(float_spikes(checkpoint, adjacency, recordings).values())

@@ -8,7 +8,7 @@ import timing_oracle
 from made_files import events, small_checkpoint
 from random_networks import LOIHI
 
-from spikeloom.compiler import Options, Recipe, compile_network
+from spikeloom.compiler import Options, Packing, compile_network
 from spikeloom.compiler.errors import DataError
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.runtime.machines.loihi1 import engine, timing
@@ -25,7 +25,7 @@ LENGTHS = np.array([30, 7, 1, 30])
 @pytest.fixture(scope="module")
 def small(tmp_path_factory):
     checkpoint, adjacency = small_checkpoint(tmp_path_factory.mktemp("small"))
-    netlist = compile_network(expand(checkpoint, adjacency), Options(recipes=(Recipe(planes=2),))).netlist
+    netlist = compile_network(expand(checkpoint, adjacency), Options(packings=(Packing(planes=2),))).netlist
     recordings = events(5, samples=4, steps=30)
     return netlist, recordings.reshape(4, netlist.n_inputs, -1)
 

@@ -61,7 +61,7 @@ def graphs(draw):
     return normalised_adjacency(np.array(edges, np.int64).reshape(-1, 2), taxels)
 
 
-@settings(deadline=None)
+@settings(deadline=None, max_examples=40)
 @given(graphs(), st.integers(1, 5), st.integers(1, 3), st.integers(1, 3), st.integers(0, 2**32 - 1))
 def test_the_expanded_convolution_is_the_probed_one(adjacency, n_hops, features, channels, seed):
     hops = np.random.default_rng(seed).normal(size=(n_hops, features, channels))
@@ -69,12 +69,6 @@ def test_the_expanded_convolution_is_the_probed_one(adjacency, n_hops, features,
     weight, bias = probed(factored(adjacency, hops), len(adjacency) * channels)
     np.testing.assert_allclose(expanded.toarray(), weight, rtol=0, atol=1e-12)
     assert not bias.any()
-
-
-def test_the_expanded_convolution_is_the_probed_one_on_the_manual_graph():
-    adjacency, hops = adjacency_of("manual"), np.random.default_rng(1).normal(size=(4, 64, 2))
-    weight, _ = probed(factored(adjacency, hops), 78)
-    np.testing.assert_allclose(expand_graph_convolution(adjacency, hops).toarray(), weight, rtol=0, atol=1e-12)
 
 
 def test_two_taxels_by_hand():
@@ -85,7 +79,7 @@ def test_two_taxels_by_hand():
 
 
 def test_rows_gather():
-    adjacency = np.array([[0.0, 0.5], [0.0, 0.0]])  # taxel 0 hears taxel 1
+    adjacency = np.array([[0.0, 0.5], [0.0, 0.0]])  # taxel 0 gathers from taxel 1
     hops = np.array([[[1.0]], [[8.0]]])
     assert expand_graph_convolution(adjacency, hops).toarray().tolist() == [[1, 4], [0, 1]]
 
@@ -110,7 +104,7 @@ def test_structure_does_not_depend_on_the_weights():
     assert fan_in(network, 1).tolist() == [15] * 6
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_sparse_graph_expands_as_a_dense_one_does(seed):
     rng = np.random.default_rng(seed)
     adjacency = np.where(rng.random((9, 9)) < 0.2, rng.normal(size=(9, 9)), 0.0)
@@ -123,7 +117,7 @@ def test_a_sparse_graph_expands_as_a_dense_one_does(seed):
     np.testing.assert_allclose(thin.data, dense.data, rtol=1e-12, atol=1e-14)
 
 
-def test_an_isolated_taxel_hears_itself_only():
+def test_an_isolated_taxel_gathers_from_itself_only():
     adjacency = normalised_adjacency([[0, 1], [1, 0]], 3)
     weight = expand_graph_convolution(adjacency, np.ones((4, 2, 2)))
     assert np.diff(weight.indptr).tolist() == [4, 4, 4, 4, 2, 2]
@@ -134,35 +128,18 @@ def test_an_isolated_taxel_hears_itself_only():
 
 
 def test_a_checkpoint_becomes_a_chain_of_populations():
-    checkpoint = random_checkpoint(taxels=5, features=3, sizes=(6, 5, 4))
-    network = expand(checkpoint, ring(5))
+    network = expand(random_checkpoint(taxels=39, features=64, sizes=(128, 256, 36)), adjacency_of("manual"))
     verify(network)
-    assert [population.name for population in network.populations] == ["conv1", "fc1", "fc2", "fc3"]
-    assert [population.size for population in network.populations] == [15, 6, 5, 4]
+    assert [(p.name, p.size) for p in network.populations] == [("conv1", 2496), ("fc1", 128), ("fc2", 256), ("fc3", 36)]
     assert [(p.pre, p.post) for p in network.projections] == [(INPUT, 0), (0, 1), (1, 2), (2, 3)]
     assert depths(network) == (0, 1, 2, 3)
-    assert (network.input.taxels, network.input.polarities, network.classes) == (5, 2, 4)
-    assert network.readout.population == 3
-    assert network.readout.label.tolist() == [0, 1, 2, 3]
-    # every feature of a taxel has the bias of that feature
-    np.testing.assert_array_equal(network.populations[0].bias.reshape(5, 3), np.tile(checkpoint.conv_bias, (5, 1)))
-    for population, projection, dense in zip(
-        network.populations[1:], network.projections[1:], checkpoint.dense, strict=True
-    ):
-        np.testing.assert_array_equal(projection.weight.toarray(), dense.weight.astype(np.float64))
-        np.testing.assert_array_equal(population.bias, dense.bias.astype(np.float64))
-        assert projection.weight.nnz == dense.weight.size
-
-
-def test_the_released_size_has_459392_structural_synapses():
-    checkpoint = random_checkpoint(taxels=39, features=64, sizes=(128, 256, 36))
-    network = expand(checkpoint, adjacency_of("manual"))
     assert [int(fan_in(network, post).sum()) for post in range(4)] == [97_920, 319_488, 32_768, 9_216]
-    assert sum(int(fan_in(network, post).sum()) for post in range(4)) == 459_392
     assert [int(fan_in(network, post).max()) for post in range(4)] == [60, 2496, 128, 256]
+    assert network.readout.population == 3
+    assert network.readout.label.tolist() == list(range(36))
 
 
-@settings(deadline=None, max_examples=20)
+@settings(deadline=None, max_examples=10)
 @given(st.integers(0, 2**32 - 1), st.floats(0, 0.99))
 def test_the_expanded_network_spikes_like_the_checkpoint(seed, beta):
     """Against the plain order of operations: propagate, filter, integrate, step by step."""

@@ -15,7 +15,7 @@ from spikeloom.compiler.interpret import channels_last, run_float, run_integer
 from spikeloom.compiler.ir import Form
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
-from spikeloom.compiler.targets.loihi1.storage.quantize import round_to_forms
+from spikeloom.compiler.targets.loihi1.storage.choose_storage import round_to_forms
 from spikeloom.models.graphs import normalised_adjacency
 from spikeloom.runtime import cli
 from spikeloom.runtime.equivalence.explanation.causes import explain
@@ -256,7 +256,7 @@ def test_a_neuron_that_was_left_out():
     assert (silenced.cause, silenced.held, silenced.chip_membrane) == (WEIGHTS, False, None)
     (root,) = explained(network, integer, steps("x"), absent=absent, pruned=True).found
     assert (root.cause, root.layer, root.neuron, root.dragged) == (LEFT_OUT, "fc1", 1, 1)
-    assert explained(network, integer, steps("x"), absent=absent, unused=absent).layers[0].different == 0
+    assert explained(network, integer, steps("x"), absent=absent, unread=absent).layers[0].different == 0
 
 
 @pytest.mark.parametrize(

@@ -98,7 +98,7 @@ def test_neurons_that_the_chip_leaves_out_are_counted_elsewhere():
     found = float_engine.run(float_engine.prepare(network, smaller), inputs)
     assert wanted[..., gone].any()
     assert_array_equal(found.elsewhere[:, 0], wanted[..., gone].sum(axis=1))
-    quiet = replace(smaller, layers=(replace(netlist.layers[0], unreceived=(gone,)), *netlist.layers[1:]))
+    quiet = replace(smaller, layers=(replace(netlist.layers[0], unread=(gone,)), *netlist.layers[1:]))
     found = float_engine.run(float_engine.prepare(network, quiet), inputs)
     assert not found.elsewhere.any()
     assert_array_equal(found.spikes[:, 0], np.delete(wanted, gone, axis=2).sum(axis=(1, 2)))

@@ -22,7 +22,7 @@ from spikeloom.compiler.formats.towers import arrays_of, join, members, side_by_
 from spikeloom.compiler.interpret import channels_last, run_float, run_integer, vote
 from spikeloom.compiler.ir import Form
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.targets.loihi1.storage.quantize import round_to_forms
+from spikeloom.compiler.targets.loihi1.storage.choose_storage import round_to_forms
 from spikeloom.models.graphs import build_graph
 from spikeloom.models.networks.quantised import quantised_spikes
 from spikeloom.models.networks.reference import float_membranes, float_spikes

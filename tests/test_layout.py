@@ -25,8 +25,8 @@ from spikeloom.compiler.passes.calibrate import Calibration
 from spikeloom.compiler.targets.loihi1.emit import emit
 from spikeloom.compiler.targets.loihi1.layout import forecast as forecast_module
 from spikeloom.compiler.targets.loihi1.layout import place as place_module
-from spikeloom.compiler.targets.loihi1.layout.choose import lay_out
-from spikeloom.compiler.targets.loihi1.layout.core_needs import Needs
+from spikeloom.compiler.targets.loihi1.layout.choose import _cost, lay_out
+from spikeloom.compiler.targets.loihi1.layout.core_needs import Chunk, Needs
 from spikeloom.compiler.targets.loihi1.layout.forecast import Forecast, sample, tables
 from spikeloom.compiler.targets.loihi1.layout.latency_search import _useful, estimate, fastest
 from spikeloom.compiler.targets.loihi1.layout.partition import cut, partition
@@ -47,7 +47,7 @@ def quick_placement():
         yield
 
 
-def heard_by(network, events, rng, rate=0.4):
+def spikes_for(network, events, rng, rate=0.4):
     """A calibration with these events and random spikes."""
     return Calibration(
         events=events,
@@ -77,7 +77,7 @@ def netlist_of(network, layout, target=LOIHI):
 # --- what is expected is what the time model and the energy tables say
 
 
-@settings(deadline=None, max_examples=40)
+@settings(deadline=None, max_examples=20)
 @given(st.data())
 def test_expectations_are_the_simple_model_and_the_prices_of_the_same_spikes(data):
     network = data.draw(integer_networks())
@@ -85,7 +85,7 @@ def test_expectations_are_the_simple_model_and_the_prices_of_the_same_spikes(dat
     rng = np.random.default_rng(data.draw(st.integers(0, 2**32 - 1)))
     parts = legal_partition(network, target)
     events = data.draw(recordings_for(network.input.size))
-    calibration = heard_by(network, events, rng)
+    calibration = spikes_for(network, events, rng)
     layout, _ = lay_out(network, target, calibration=calibration)
     assert layout.parts.cores == parts.cores
     netlist = netlist_of(network, layout, target)
@@ -131,6 +131,16 @@ def test_a_step_by_hand():
     assert (layout.expected.packets, layout.expected.hops) == (pytest.approx(1 / 3), 0)
 
 
+def test_the_energy_of_a_chunk_by_hand():
+    """Its synapses, as its sources fire, and a packet for each of their spikes: 35.5 and 111 pJ."""
+    network = integer_chain(np.full((2, 2), 2), np.full((1, 2), 2))
+    spikes = (np.array([[[1, 0], [1, 1]]], bool), np.zeros((1, 2, 1), bool))
+    forecast = forecast_of(network, Calibration(events=np.array([[[1, 1], [0, 0]]], bool), spikes=spikes))
+    first, second = (Chunk(population=0, first=0, last=2), Chunk(population=1, first=0, last=1))
+    assert _cost(forecast, first) == pytest.approx(4 / 3 * 35.5e-12)  # three chip steps; events cost no packet
+    assert _cost(forecast, second) == pytest.approx(3 / 3 * (35.5e-12 + 111e-12))
+
+
 def test_the_mean_of_the_longest_is_not_the_longest_of_the_means():
     """Two layers that are busy in turn: each step lasts as long as the busy one."""
     network = integer_chain(np.full((8, 40), 2), np.full((40, 8), 2))
@@ -165,15 +175,15 @@ def forecast_of(network, calibration, target=LOIHI):
 
 def test_few_steps_of_many_are_looked_at(monkeypatch):
     monkeypatch.setattr(forecast_module, "SAMPLES", 10)
-    activity = forecast_of(*busy([4, 5, 3])).activity
-    assert activity.steps == 10
-    assert [spikes.shape for spikes in (activity.inputs, *activity.spikes)] == [(10, 4), (10, 5), (10, 3)]
+    forecast = forecast_of(*busy([4, 5, 3]))
+    assert forecast.steps == 10
+    assert [spikes.shape for spikes in forecast.activity] == [(10, 5), (10, 3), (10, 4)]
 
 
 # --- cores asked for
 
 
-@pytest.mark.parametrize("cores", [1, 2, 3, 5, 8, 16])
+@pytest.mark.parametrize("cores", [1, 3, 16])
 def test_a_layer_is_cut_evenly(cores):
     network = integer_chain(np.full((16, 3), 2), np.full((4, 16), 2))
     parts = partition(network, LOIHI, cores_for={0: cores})
@@ -201,7 +211,7 @@ def test_a_layer_gets_more_cores_than_asked_for_if_even_parts_do_not_fit():
     assert [core[0].size for core in parts.cores] == [6, 6, 6]
 
 
-@settings(deadline=None, max_examples=80)
+@settings(deadline=None, max_examples=30)
 @given(integer_networks(), tight_targets(), st.data())
 def test_every_partition_is_legal_and_holds_every_neuron_once(network, target, data):
     legal_partition(network, target)
@@ -259,7 +269,7 @@ def test_a_network_that_does_little_stays_on_one_tile():
     assert lay_out(network, LOIHI, goal="energy", calibration=calibration)[0].parts.cores == usual.parts.cores
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_the_search_comes_near_the_best_cut(seed):
     """All numbers of cores of two layers, each chunk on a core of its own."""
     rng = np.random.default_rng(seed)
@@ -277,7 +287,7 @@ def test_the_search_comes_near_the_best_cut(seed):
     assert estimate(forecast, found) <= 1.03 * min(every)
 
 
-@settings(deadline=None, max_examples=15, phases=WITHOUT_SHRINKING)
+@settings(deadline=None, max_examples=6, phases=WITHOUT_SHRINKING)
 @given(st.data())
 def test_spikes_are_the_same_whatever_the_layout(data):
     network = data.draw(integer_networks(exponents=(-1, 0)))
@@ -285,7 +295,7 @@ def test_spikes_are_the_same_whatever_the_layout(data):
     legal_partition(network, target)
     rng = np.random.default_rng(data.draw(st.integers(0, 2**32 - 1)))
     events = data.draw(recordings_for(network.input.size))
-    calibration = heard_by(network, events, rng)
+    calibration = spikes_for(network, events, rng)
     most = {p.name: int(rng.integers(1, p.size + 1)) for p in network.populations}
     layouts = [lay_out(network, target, goal=goal, calibration=calibration)[0] for goal in GOALS]
     with contextlib.suppress(CapacityError, OptionError):
@@ -302,14 +312,14 @@ def test_spikes_are_the_same_whatever_the_layout(data):
     assert_same_layers(*traces)
 
 
-@settings(deadline=None, max_examples=25)
+@settings(deadline=None, max_examples=10)
 @given(st.data())
 def test_a_goal_is_never_missed_by_more_than_the_usual_layout(data):
     network = data.draw(integer_networks())
     target = data.draw(tight_targets())
     legal_partition(network, target)
     events = data.draw(recordings_for(network.input.size))
-    calibration = heard_by(network, events, np.random.default_rng(0))
+    calibration = spikes_for(network, events, np.random.default_rng(0))
     for goal, key in (("latency", "step_ns"), ("energy", "step_j")):
         layout, usual = lay_out(network, target, goal=goal, calibration=calibration)
         assert getattr(layout.expected, key) <= getattr(usual.expected, key)
@@ -327,12 +337,3 @@ def test_energy_is_saved_by_fewer_visited_zeros():
     thrifty, usual = lay_out(network, target, goal="energy", calibration=calibration)
     assert (chunks_per_layer(usual, 2), chunks_per_layer(thrifty, 2)) == ([1, 1], [2, 1])
     assert thrifty.expected.step_j < 0.95 * usual.expected.step_j
-
-
-@pytest.mark.parametrize("goal", GOALS)
-def test_two_searches_are_equal(goal):
-    network, calibration = busy([40, 120, 60, 10])
-    one, two = (lay_out(network, LOIHI, goal=goal, calibration=calibration)[0] for _ in range(2))
-    assert one.parts.cores == two.parts.cores
-    assert one.placement == two.placement
-    assert one.expected == two.expected

@@ -83,7 +83,7 @@ def test_what_is_compared_with_a_float_model():
     made = specimen("timed")
     found, events = integer_machine(made.machine), made.events
     sizes = [layer.neurons for layer in found.netlist.layers]
-    assert [len(out) for out in found.absent] == [len(out) for out in found.unused] == sizes
+    assert [len(out) for out in found.absent] == [len(out) for out in found.unread] == sizes
     assert len(found.lags) == len(sizes)
     votes = found.votes_by_step(events, LENGTHS)
     ran = found.cumulative(events, LENGTHS)

@@ -29,7 +29,7 @@ from made_onnx import (
 )
 from oracles import weight_differences
 
-from spikeloom.compiler import Options, Recipe, compile_network, lift
+from spikeloom.compiler import Options, Packing, compile_network, lift
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.formats.onnx.reader import read_onnx
 from spikeloom.compiler.sensor_layout import sensor_layout
@@ -134,7 +134,7 @@ def test_modules_come_back_with_the_same_integers(read, name, opset):
     assert (step.steps, several.steps) == (1, 5)
     for found in (step.network, several.network):
         first, second = (
-            compile_network(network, Options(recipes=(Recipe(bits=6),))).integer for network in (ours, found)
+            compile_network(network, Options(packings=(Packing(bits=6),))).integer for network in (ours, found)
         )
         assert not weight_differences(first, second)
     # torch's exporter folds a batch norm into the convolution before it, in float32

@@ -13,23 +13,23 @@ from spikeloom.compiler.targets.loihi1.layout.place import core_traffic, hops, p
 
 
 def cost(traffic, tiles, width):
-    """Spikes times hops, pair by pair."""
-    return sum(
-        traffic[a, b] * sum(hops(tiles[a], tiles[b], width)) for a in range(len(tiles)) for b in range(len(tiles))
-    )
+    """Spikes times hops of a layout, or of each of several (…, cores)."""
+    x, y = np.asarray(tiles) % width, np.asarray(tiles) // width
+    ways = abs(x[..., :, None] - x[..., None, :]) + abs(y[..., :, None] - y[..., None, :])
+    return (traffic * ways).sum(axis=(-1, -2))
 
 
 def brute_force(traffic, width, height, tile_cores):
-    """Least cost of all layouts; the first core may sit in one quarter, the others are its mirror images."""
-    cores = len(traffic)
-    best = np.inf
-    quarter = [y * width + x for y in range((height + 1) // 2) for x in range((width + 1) // 2)]
-    for first in quarter:
-        for rest in itertools.product(range(width * height), repeat=cores - 1):
-            tiles = (first, *rest)
-            if max(tiles.count(tile) for tile in tiles) <= tile_cores:
-                best = min(best, cost(traffic, tiles, width))
-    return best
+    """Least cost of all layouts."""
+    layouts = np.array(list(itertools.product(range(width * height), repeat=len(traffic))))
+    held = (layouts[:, :, None] == np.arange(width * height)).sum(axis=1)
+    return cost(traffic, layouts[held.max(axis=1) <= tile_cores], width).min()
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """Few steps of the search for a proof."""
+    monkeypatch.setattr(place_module, "EXACT_STEPS", 200)
 
 
 def layered(rng, cores):
@@ -52,7 +52,7 @@ def test_hops_under_xy_routing(a, b, expected):
     assert hops(a, b, 8) == expected
 
 
-@settings(deadline=None, max_examples=40)
+@settings(deadline=None, max_examples=25)
 @given(
     st.integers(1, 5),
     st.sampled_from([(3, 2, 1), (3, 3, 2), (2, 2, 2), (5, 1, 1), (1, 5, 2)]),
@@ -97,15 +97,15 @@ def test_a_slightly_better_layout_is_not_given_up_for_cheaper_hops():
     assert placement.spike_hops == pytest.approx(3 + 3e-6 + 1.0, rel=1e-12)
 
 
-@pytest.mark.parametrize("cores", range(1, 10))
+@pytest.mark.parametrize("cores", [1, 2, 4, 9])
 @pytest.mark.parametrize("kind", ["random", "layered", "equal"])
 def test_up_to_nine_cores_are_solved_with_a_proof(cores, kind):
     placement = place(KINDS[kind](np.random.default_rng(cores), cores), LOIHI)
     assert placement.bound == placement.spike_hops
 
 
-@pytest.mark.parametrize("kind", ["random", "layered", "star"])
-@pytest.mark.parametrize("cores", [12, 128])
+@pytest.mark.usefixtures("quick")
+@pytest.mark.parametrize(("kind", "cores"), [("random", 12), ("star", 12), ("layered", 128)])
 def test_many_cores_are_placed_well_and_bounded(cores, kind):
     rng = np.random.default_rng(1)
     traffic = KINDS[kind](rng, cores)
@@ -114,9 +114,9 @@ def test_many_cores_are_placed_well_and_bounded(cores, kind):
     assert 0 < placement.bound <= placement.spike_hops
     assert placement.spike_hops == pytest.approx(cost(traffic, placement.tiles, 8))
     shuffled = [cost(traffic, rng.permutation(128)[:cores] // 4, 8) for _ in range(50)]
-    in_order = cost(traffic, np.arange(cores) // 4, 8)
     assert placement.spike_hops <= min(shuffled)
-    assert placement.spike_hops <= in_order * (1 + 1e-9)
+    assert placement.spike_hops <= cost(traffic, np.arange(cores) // 4, 8) * (1 + 1e-9)
+    assert place(traffic.copy(), LOIHI) == placement
 
 
 def test_a_search_that_is_cut_short_says_so(monkeypatch):
@@ -128,8 +128,8 @@ def test_a_search_that_is_cut_short_says_so(monkeypatch):
     assert cut.bound < full.spike_hops <= cut.spike_hops * (1 + 1e-12)
 
 
-@settings(deadline=None, max_examples=30)
-@given(st.integers(1, 8), st.integers(0, 2**32 - 1), st.integers(1, 60))
+@settings(deadline=None, max_examples=20)
+@given(st.integers(1, 7), st.integers(0, 2**32 - 1), st.integers(1, 60))
 def test_the_bound_never_exceeds_the_optimum(cores, seed, steps):
     traffic = np.random.default_rng(seed).random((cores, cores)) ** 3
     optimum = place(traffic, LOIHI).spike_hops
@@ -145,13 +145,8 @@ def test_a_full_mesh_has_a_place_for_every_core():
     assert placement.spike_hops == placement.bound == 0
 
 
-@pytest.mark.parametrize("cores", [3, 8, 12])
-def test_two_placements_are_equal(cores):
-    traffic = layered(np.random.default_rng(2), cores)
-    assert place(traffic, LOIHI) == place(traffic.copy(), LOIHI)
-
-
-@pytest.mark.parametrize(("tiles", "cores"), [(1, 4), (2, 5), (3, 9), (3, 12), (28, 60)])
+@pytest.mark.usefixtures("quick")
+@pytest.mark.parametrize(("tiles", "cores"), [(1, 4), (2, 5), (3, 9), (3, 12), (12, 28)])
 def test_a_placement_within_few_tiles(tiles, cores):
     """A ring of cores that would rather spread: each talks to the next but one."""
     traffic = np.roll(np.eye(cores), 2, axis=1) + 0.1 * np.random.default_rng(0).random((cores, cores))
@@ -159,7 +154,6 @@ def test_a_placement_within_few_tiles(tiles, cores):
     assert len(set(placement.tiles)) <= tiles
     assert max(placement.tiles.count(tile) for tile in placement.tiles) <= 4
     assert placement.spike_hops == pytest.approx(cost(traffic, placement.tiles, 8))
-    assert placement == place_within(traffic, LOIHI, tiles)
 
 
 def test_a_placement_keeps_to_few_tiles_even_where_more_cost_fewer_hops():
@@ -189,7 +183,7 @@ def test_traffic_by_hand():
     assert core_traffic(network, parts, None).tolist() == [[0, 0, 1], [0, 1, 1], [0, 0, 0]]
 
 
-@settings(deadline=None, max_examples=40)
+@settings(deadline=None, max_examples=20)
 @given(integer_networks(), st.integers(1, 8), st.integers(0, 2**32 - 1))
 def test_traffic_is_a_packet_per_listening_axon(network, compartments, seed):
     rng = np.random.default_rng(seed)

@@ -9,7 +9,7 @@ import pytest
 import torch
 from made_files import ring, small_checkpoint, weights
 
-from spikeloom.compiler import Options, Recipe, compile_network, lift
+from spikeloom.compiler import Options, Packing, compile_network, lift
 from spikeloom.compiler.errors import DataError, ModelError, OptionError
 from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
@@ -18,7 +18,7 @@ from spikeloom.compiler.interpret import channels_last, run_integer
 from spikeloom.compiler.passes.calibrate import calibrate
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.base import load_target
-from spikeloom.compiler.targets.loihi1.storage.quantize import round_to_forms
+from spikeloom.compiler.targets.loihi1.storage.choose_storage import round_to_forms
 from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.models.networks.checkpoint import save_checkpoint
 from spikeloom.models.networks.quantised import QuantisedNet, quantised_spikes, time_first
@@ -152,7 +152,7 @@ def test_a_fine_tuned_checkpoint_brings_its_own_storage(tmp_path):
     path = tmp_path / "tuned.pt"
     graph = ring(checkpoint.taxels)
     save_checkpoint(path, {"last": tuned.weights}, graph, beta=0.2, theta=0.5, training={}, forms=tuned.forms)
-    for options in ({"recipes": (Recipe(),)}, {"spike_exact": True}, {"ranges": "observed"}):
+    for options in ({"packings": (Packing(),)}, {"spike_exact": True}, {"ranges": "observed"}):
         with pytest.raises(OptionError) as caught:
             compile_network(
                 expand(read_checkpoint(path), adjacency),

@@ -25,7 +25,7 @@ from test_sanafe import compare as with_sanafe
 from test_sanafe import interpreter  # noqa: F401
 from zoo import specimen
 
-from spikeloom.compiler import Options, Recipe, compile_network, lift
+from spikeloom.compiler import Options, Packing, compile_network, lift
 from spikeloom.compiler.errors import CapacityError, NumericRangeError
 from spikeloom.compiler.formats.netx.reader import read_netx
 from spikeloom.compiler.interpret import channels_last, run_float, run_integer
@@ -35,7 +35,7 @@ from spikeloom.compiler.passes.prune import never_fires, removable
 from spikeloom.compiler.targets.loihi1.emit import emit
 from spikeloom.compiler.targets.loihi1.layout.partition import partition
 from spikeloom.compiler.targets.loihi1.legalize import require_legal
-from spikeloom.compiler.targets.loihi1.storage.quantize import quantize
+from spikeloom.compiler.targets.loihi1.storage.choose_storage import choose_storage
 from spikeloom.runtime.cli import main
 from spikeloom.runtime.equivalence.certain_spikes import certain_spikes
 from spikeloom.runtime.machines.loihi1 import engine
@@ -74,7 +74,7 @@ def test_what_is_fired_in_a_step_arrives_in_the_next():
     network = chain(np.eye(3), np.eye(3), beta=0.0)
     network = hearing_itself(network, 0, [[0, 0, 0], [0, 1, 0], [0, -1, 0]])
     events = np.array([[1, 0, 1], [0, 1, 1], [0, 0, 1], [1, 0, 1]], bool)[None]
-    for steps in (run_float(network, events), run_integer(quantize(network, LOIHI)[0], events)):
+    for steps in (run_float(network, events), run_integer(choose_storage(network, LOIHI)[0], events)):
         assert steps.spikes[0][0].astype(int).tolist() == [[1, 0, 1], [0, 1, 1], [0, 1, 0], [1, 1, 0]]
         assert_array_equal(steps.spikes[1], steps.spikes[0])
 
@@ -148,8 +148,8 @@ def test_spikes_are_judged_on_what_the_layer_itself_fired_a_step_before():
     assert_array_equal(late[:, 1:], calibration.spikes[0][:, :-1])
     assert not late[:, 0].any()
     assert calibration.source(0, 1) is calibration.spikes[0]
-    for recipe in (Recipe(), Recipe(planes=2), Recipe(groups=4)):
-        _, choices = quantize(network, LOIHI, recipes=(recipe,), calibration=calibration)
+    for packing in (Packing(), Packing(planes=2), Packing(groups=4)):
+        _, choices = choose_storage(network, LOIHI, packings=(packing,), calibration=calibration)
         assert choices[0].flips < 0.1 * choices[0].spikes
 
 
@@ -163,9 +163,9 @@ def test_neurons_that_only_excite_each_other_are_silent():
     cut = chain([[0.05, 0.05], [0.05, 0], [1, 1], [0, 0]], np.ones((1, 4)))
     cut = hearing_itself(cut, 0, own * [0.1, 0.1, 1, 0])
     assert never_fires(cut)[0].tolist() == [True, True, False, False]
-    silent, unheard = removable(compile_network(cut, Options(keep_all=True)).integer)
+    silent, unread = removable(compile_network(cut, Options(keep_all=True)).integer)
     assert silent[0].tolist() == [True, True, False, False]
-    assert not unheard[0].any()
+    assert not unread[0].any()
 
 
 def test_neurons_that_only_each_other_hear_are_left_out():
@@ -175,11 +175,11 @@ def test_neurons_that_only_each_other_hear_are_left_out():
     own[1, 0] = own[3, 2] = 1
     network = hearing_itself(network, 0, own)
     made = compile_network(network)
-    assert [removal.unreceived for removal in made.removals] == [2, 0]
-    assert made.netlist.layers[0].unreceived == (2, 3)
+    assert [removal.unread for removal in made.removals] == [2, 0]
+    assert made.netlist.layers[0].unread == (2, 3)
     own[2, 2] = 1  # what hears itself counts as heard
     made = compile_network(hearing_itself(replace(network, projections=network.projections[:2]), 0, own))
-    assert made.netlist.layers[0].unreceived == (3,)
+    assert made.netlist.layers[0].unread == (3,)
 
 
 # -- cores -------------------------------------------------------------------------------------------------------------

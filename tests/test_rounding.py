@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from made_files import TAXELS, events, own_file, recordings_folder, small_checkpoint, weights
 from random_networks import chain
 
-from spikeloom.compiler import Options, Recipe, compile_network
+from spikeloom.compiler import Options, Packing, compile_network
 from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.models.graphs import normalised_adjacency
@@ -33,21 +33,21 @@ def network(tmp_path_factory):
 
 @pytest.fixture(scope="module", params=[2, 8])
 def netlist(request, network):
-    return compiled(network, recipes=(Recipe(bits=request.param),))
+    return compiled(network, packings=(Packing(bits=request.param),))
 
 
-RECIPES = [Recipe(bits=b, planes=p, groups=g) for b, p, g in [(2, 1, 1), (3, 3, 1), (5, 2, 4), (8, 1, 8), (8, 2, 1)]]
+PACKINGS = [Packing(bits=b, planes=p, groups=g) for b, p, g in [(2, 1, 1), (3, 3, 1), (5, 2, 4), (8, 1, 8), (8, 2, 1)]]
 
 
-@pytest.mark.parametrize(("recipe", "keep_all"), [*zip(RECIPES, [True, False] * 3, strict=False)])
-def test_what_the_compiler_makes_is_the_rounding_of_what_it_got(network, recipe, keep_all):
-    netlist = compiled(network, recipes=(recipe,), keep_all=keep_all)
+@pytest.mark.parametrize(("packing", "keep_all"), [*zip(PACKINGS, [True, False] * 3, strict=False)])
+def test_what_the_compiler_makes_is_the_rounding_of_what_it_got(network, packing, keep_all):
+    netlist = compiled(network, packings=(packing,), keep_all=keep_all)
     found = checked(netlist, network)
     assert found.holds
     assert found.text == "every weight, bias, threshold and decay is the checkpoint's, rounded to the nearest"
     for layer, population in zip(found.layers.values(), network.populations, strict=True):
         assert 0 < layer.nearest == layer.weights <= population.size**2 * 20
-        assert 0 < layer.farthest_steps <= 0.5 + 1e-9 or recipe.planes > 1
+        assert 0 < layer.farthest_steps <= 0.5 + 1e-9 or packing.planes > 1
 
 
 @pytest.mark.parametrize("options", [{}, {"spike_exact": True}, {"prune_unused": True}])
@@ -93,7 +93,7 @@ def test_every_single_change_is_found(netlist, network, data):
 
 
 def test_words(network):
-    netlist = compiled(network, recipes=(Recipe(bits=8),), keep_all=True)
+    netlist = compiled(network, packings=(Packing(bits=8),), keep_all=True)
 
     def faults(changed):
         found = checked(changed, network)

@@ -130,7 +130,7 @@ def test_numpy_alone_reads_the_file(path, netlist):
         manifest = json.loads(str(members["manifest"]))
     assert manifest["format"] == "spikeloom-netlist"
     assert (manifest["version"], manifest["bins"], manifest["clocks"]) == (5, 1, {"channels": 0, "steps": 1})
-    assert manifest["layers"][0] == dataclasses.asdict(netlist.layers[0]) | {"unreceived": []}
+    assert manifest["layers"][0] == dataclasses.asdict(netlist.layers[0]) | {"unread": []}
     assert manifest["provenance"] == netlist.provenance
 
 

@@ -9,7 +9,7 @@ from made_files import CLASSES, STEPS, TAXELS, events, own_file, recordings_fold
 from numpy.testing import assert_array_equal
 from timed_networks import events_of, written
 
-from spikeloom.compiler import Options, Recipe, compile_network, write_netlist
+from spikeloom.compiler import Options, Packing, compile_network, write_netlist
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.formats.towers import join
@@ -516,7 +516,7 @@ def test_a_netlist_of_another_architecture_is_refused(spikeloom, tmp_path):
 
 
 def test_what_does_not_apply(bench):
-    netlist = compile_network(bench.pair.network, Options(recipes=(Recipe(planes=2),))).netlist
+    netlist = compile_network(bench.pair.network, Options(packings=(Packing(planes=2),))).netlist
     pair = Pair(netlist=netlist, network=bench.pair.network)
     assert why_not("fewer_bits", pair, bench.sensor) == "weights are stored in several planes"
     assert why_not("fewer_bits", bench.pair, bench.sensor) is None

@@ -13,7 +13,7 @@ from random_networks import chain, integer_population
 from timed_networks import TIMING, events_of, written
 from zoo import specimen
 
-from spikeloom.compiler import Options, Recipe, compile_network, lift
+from spikeloom.compiler import Options, Packing, compile_network, lift
 from spikeloom.compiler.dynamics import Clocks, Dynamics, with_clocks
 from spikeloom.compiler.errors import DataError, ModelError, NumericRangeError
 from spikeloom.compiler.fixedpoint import (
@@ -32,7 +32,7 @@ from spikeloom.compiler.passes.prune import never_fires
 from spikeloom.compiler.range_proof import prove_ranges
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.netlist import one_step_bounds
-from spikeloom.compiler.targets.loihi1.storage.quantize import quantize
+from spikeloom.compiler.targets.loihi1.storage.choose_storage import choose_storage
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import current_load
 from spikeloom.models.networks.reference import float_spikes
 from spikeloom.runtime.cli import main
@@ -194,11 +194,11 @@ def test_ranges_are_proven_for_any_input(compiled):
 @pytest.mark.parametrize(
     "options",
     [
-        {"recipes": (Recipe(bits=2),)},
-        {"recipes": (Recipe(planes=2, groups=8),)},
+        {"recipes": (Packing(bits=2),)},
+        {"recipes": (Packing(planes=2, groups=8),)},
         {"spike_exact": True},
         {"ranges": "observed"},
-        {"recipes": (Recipe(bits=2),), "training_events": None},
+        {"recipes": (Packing(bits=2),), "training_events": None},
     ],
 )
 def test_relays_tick_with_their_clocks_however_weights_are_stored(timed, options):
@@ -223,7 +223,7 @@ def test_all_layers_without_a_scale_are_listed(timed):
         ),
     )
     with pytest.raises(ModelError) as error:
-        quantize(tight, load_target("loihi1"))
+        choose_storage(tight, load_target("loihi1"))
     assert str(error.value).splitlines() == [
         f"{name}: no scale at 8 bits keeps its threshold of at least one unit within the accumulator (32767 units a "
         "step) and its current, of which a step keeps 0.9999, within its register; use more bits or smaller weights"

@@ -109,8 +109,8 @@ def _figures(
         **costs,
         "first_layer": {
             "neurons": first.neurons,
-            "cannot_fire": first.neurons - len(held) - len(first.unreceived),
-            "unheard": len(first.unreceived),
+            "cannot_fire": first.neurons - len(held) - len(first.unread),
+            "unheard": len(first.unread),
             "quiet_in_training": int(quiet.sum()),
             "quiet_in_both": int(np.sum(quiet & (spikes[:, held].sum(axis=0) == 0))),
         },

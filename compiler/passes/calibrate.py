@@ -44,26 +44,14 @@ def evenly_spaced(events: BoolArray, count: int = FEW) -> BoolArray:
 
 def fewer(calibration: Calibration, count: int = FEW) -> Calibration:
     """A calibration on at most `count` of its recordings, evenly spaced."""
-    return Calibration(
-        events=evenly_spaced(calibration.events, count),
-        spikes=tuple(evenly_spaced(spikes, count) for spikes in calibration.spikes),
-    )
+    spikes = tuple(evenly_spaced(spikes, count) for spikes in calibration.spikes)
+    return Calibration(events=evenly_spaced(calibration.events, count), spikes=spikes)
 
 
 def calibrate(network: Network, events: BoolArray) -> Calibration:
-    """Run the float64 model.
+    """Run the float64 model on all of these training recordings, (samples, steps, channels) bool.
 
-    Parameters
-    ----------
-    network : Network
-        Float stage.
-    events : (samples, steps, channels) bool
-        Training recordings; all of them are run.
-
-    Raises
-    ------
-    DataError
-        If there is no recording, or its channels are not the network's.
+    DataError if there is no recording, or its channels are not the network's.
     """
     if not len(events):
         raise DataError("calibration: the split is empty; give recordings with a train split")

@@ -61,28 +61,17 @@ def effective_weight(stack: FloatArray, filters: FloatArray) -> FloatArray:
     """``W = sum_k S_k ⊗ g_k`` of filters (filters, features, channels); shape (places, features, taxels, channels)."""
     _, places, taxels = stack.shape
     _, features, channels = filters.shape
-    weight = np.zeros((places * features, taxels * channels))
-    for matrix, values in zip(stack, filters, strict=True):
-        weight += np.kron(matrix, values)
-    return weight.reshape(places, features, taxels, channels)
+    weight = sum(np.kron(matrix, values) for matrix, values in zip(stack, filters, strict=True))
+    return np.asarray(weight).reshape(places, features, taxels, channels)
 
 
 def expand_graph_convolution(adjacency: FloatArray | Sparse, hops: FloatArray) -> Sparse:
-    """``W = sum_k A^k ⊗ g_k``.
+    """``W = sum_k A^k ⊗ g_k`` of filters ``g_k = W_k^T``, (K + 1, features, channels), and a propagation matrix A.
 
-    Parameters
-    ----------
-    adjacency : (taxels, taxels) float64, dense or sparse
-        Normalised propagation matrix; row i gathers into taxel i. From a sparse one nothing dense is made; sums are
-        then taken in another order, so that weights may differ in their last bits.
-    hops : (K + 1, features, channels) float64
-        Filter ``g_k = W_k^T`` of each hop.
-
-    Returns
-    -------
-    csr_array (taxels * features, taxels * channels) float64
-        Rows are taxel-major (``taxel * features + feature``), columns likewise. The stored entries are all pairs of
-        taxels that some hop connects, whatever their weight.
+    Row i of A, (taxels, taxels), gathers into taxel i. From a sparse one nothing dense is made; sums are then taken in
+    another order, so that weights may differ in their last bits. Rows of the csr_array are taxel-major (``taxel *
+    features + feature``), columns likewise. Its stored entries are all pairs of taxels that some hop connects, whatever
+    their weight.
     """
     if sparse.issparse(adjacency):
         return _expand_sparse(adjacency, hops)
@@ -155,25 +144,16 @@ def expand(checkpoint: Checkpoint, propagation: FloatArray) -> Network:
     """Lower trained weights to a network of populations and synapses, in float64.
 
     Spikes equal those of the float64 model up to the rounding of a differently ordered sum. `propagation` as of
-    :class:`Factored`.
-
-    Raises
-    ------
-    ModelError
-        If propagation and weights disagree about the number of taxels, places or filters.
+    :class:`Factored`; ModelError if it disagrees with the weights about the number of taxels, places or filters.
     """
     _require_fit(checkpoint, propagation.shape)
     dynamics = checkpoint.dynamics
     stages = [("conv1", *_with_relays(checkpoint, *expand_first_layer(checkpoint, propagation)))]
     for layer, dense in enumerate(checkpoint.dense, 1):
         stages.append((dense.name, expand_dense(checkpoint, layer), dense.bias.astype(np.float64)))
+    polarities, bins = checkpoint.hops.shape[2], checkpoint.bins
     return Network(
-        input=Input(
-            taxels=checkpoint.taxels,
-            polarities=checkpoint.hops.shape[2],
-            clocks=dynamics.clocks,
-            bins=checkpoint.bins,
-        ),
+        input=Input(taxels=checkpoint.taxels, polarities=polarities, clocks=dynamics.clocks, bins=bins),
         populations=tuple(
             Population(
                 name=name,

@@ -1,7 +1,7 @@
 """Leave out what provably does nothing: neurons that can never fire, neurons whose spikes reach no neuron.
 
 The bounds hold for any input, so every spike that is left is as before. A neuron that cannot fire in the float model
-is taken out before rounding: its weights then no longer take room in the accumulators of its listeners, whose scales
+is taken out before rounding: its weights then no longer take room in the accumulators of its targets, whose scales
 become finer. Left out on request only: neurons that did not fire on the training recordings.
 """
 
@@ -40,9 +40,8 @@ class Removal:
 
     layer: str  # Population
     silent: int  # Neurons that no input can make fire, in the float model or on the chip
-    # Neurons that fire, but without a synapse that is not zero to any that is left, and without a vote
-    unreceived: int = field(metadata={"key": "unheard"})  # its name in JSON
-    unused: int  # Neurons that did not fire on the training recordings; on request only
+    unread: int  # Neurons that fire, but without a synapse that is not zero to any that is left, and without a vote
+    never_fired: int = field(metadata={"key": "unused"})  # On the training recordings; on request only
     synapses: int  # Synapses from and to all of these that would not have been zero
 
 
@@ -131,27 +130,22 @@ def disconnect(network: Network, gone: Masks) -> Network:
 
 
 def removable(network: IntegerNetwork) -> tuple[Masks, Masks]:
-    """Neurons that the chip need not hold: those that no input can make fire, and others whose spikes reach no neuron.
+    """Neurons that the chip need not hold: silent, as no input can make them fire, or unread, as none receives them.
 
-    Neurons that vote are never among them, and every population keeps one neuron.
-
-    Returns
-    -------
-    silent, unreceived : tuple of (neurons,) bool
-        One mask per population; no neuron is in both.
+    Neurons that vote are never among them, and every population keeps one neuron; no neuron is in both.
     """
     silent: Known = {INPUT: np.zeros(network.input.size, np.bool_)}
     for post in range(len(network.populations)):
         _grow(network, post, silent, _silent)
-    unreceived: Known = {}
+    unread: Known = {}
     for pre in reversed(range(len(network.populations))):
         if pre == network.readout.population:
             silent[pre] = np.zeros(network.populations[pre].size, np.bool_)
-        _grow(network, pre, unreceived, lambda net, at, known: _unreceived(net, at, known, silent))
-        if np.all(silent[pre] | unreceived[pre]):
-            silent[pre][0] = unreceived[pre][0] = False
+        _grow(network, pre, unread, lambda net, at, known: _unread(net, at, known, silent))
+        if np.all(silent[pre] | unread[pre]):
+            silent[pre][0] = unread[pre][0] = False
     indices = range(len(network.populations))
-    return tuple(silent[i] for i in indices), tuple(unreceived[i] for i in indices)
+    return tuple(silent[i] for i in indices), tuple(unread[i] for i in indices)
 
 
 def _silent(network: IntegerNetwork, post: int, silent: Known) -> Mask:
@@ -166,16 +160,13 @@ def _silent(network: IntegerNetwork, post: int, silent: Known) -> Mask:
     return _cannot_reach(population, up * (1 << MEMBRANE_SHIFT))
 
 
-def _unreceived(network: IntegerNetwork, pre: int, unreceived: Known, silent: Known) -> Mask:
+def _unread(network: IntegerNetwork, pre: int, unread: Known, silent: Known) -> Mask:
     """Neurons of one population, not silent, without a vote or a synapse to one that is neither."""
     received = np.full(network.populations[pre].size, pre == network.readout.population)
     for p in network.projections:
         if p.pre == pre:
-            listens = ~(silent[p.post] | unreceived[p.post])
-            for rows in row_parts(p.weight):
-                weight = p.weight[rows]
-                counts = np.repeat(listens[rows], np.diff(weight.indptr)) & (weight.data != 0)
-                received[weight.indices[counts]] = True
+            counts = np.repeat(~(silent[p.post] | unread[p.post]), np.diff(p.weight.indptr)) & (p.weight.data != 0)
+            received[p.weight.indices[counts]] = True
     return ~received & ~silent[pre]
 
 
@@ -190,31 +181,18 @@ def _cannot_reach(population: IntegerPopulation, inflow: npt.NDArray[np.float64]
     return below
 
 
-def deaf_to(network: IntegerNetwork, channels: Mask) -> IntegerNetwork:
+def without_channels(network: IntegerNetwork, channels: Mask) -> IntegerNetwork:
     """Set the weights from some input channels, (channels,) bool, to zero; the structure stays."""
-    if not channels.any():
-        return network
-    return replace(
-        network,
-        projections=tuple(
-            replace(p, weight=_zeroed(p.weight, np.zeros(p.weight.shape[0], np.bool_), channels))
-            if p.pre == INPUT
-            else p
-            for p in network.projections
-        ),
+    none = none_of(network)
+    projections = (
+        replace(p, weight=_zeroed(p.weight, none[p.post], channels)) if p.pre == INPUT else p
+        for p in network.projections
     )
+    return replace(network, projections=tuple(projections))
 
 
 def compact(network: IntegerNetwork, gone: Masks) -> tuple[IntegerNetwork, tuple[IntArray, ...]]:
-    """Take neurons out.
-
-    Returns
-    -------
-    IntegerNetwork
-        The rest, renumbered.
-    tuple of (neurons left,) int64
-        Which neuron of the original each one is.
-    """
+    """Take neurons out: the rest, renumbered, and which neuron of the original each one is, by population."""
     kept = tuple(np.flatnonzero(~mask) for mask in gone)
     if not any(mask.any() for mask in gone):
         return network, kept
@@ -245,27 +223,26 @@ def compact(network: IntegerNetwork, gone: Masks) -> tuple[IntegerNetwork, tuple
     )
 
 
-def removals(network: Network, silent: Masks, unreceived: Masks, unused: Masks) -> tuple[Removal, ...]:
-    """Count what was left out of `network`, layer by layer; what no input can make fire does not count as unused."""
-    proven, gone = never_fires(network), either(silent, unreceived)
+def removals(network: Network, silent: Masks, unread: Masks, quiet: Masks) -> tuple[Removal, ...]:
+    """Count what was left out of `network`, layer by layer.
+
+    Neurons that are `quiet` on the training recordings count as such only if some input can make them fire.
+    """
+    proven, gone = never_fires(network), either(silent, unread)
     found = []
     for post, population in enumerate(network.populations):
-        by_evidence = unused[post] & ~proven[post] & gone[post]
+        by_evidence = quiet[post] & ~proven[post] & gone[post]
         synapses = 0
         for p in network.projections:
             if p.post == post:
-                deaf = _of(gone, p.pre, p.weight.shape[1])
-                for rows in row_parts(p.weight):
-                    held = slice(p.weight.indptr[rows.start], p.weight.indptr[rows.stop])
-                    own = np.repeat(gone[post][rows], np.diff(p.weight.indptr[rows.start : rows.stop + 1]))
-                    lost = own | deaf[p.weight.indices[held]]
-                    synapses += int((lost & (p.weight.data[held] != 0)).sum())
+                lost = _touched(p.weight, gone[post], _of(gone, p.pre, p.weight.shape[1]))
+                synapses += int((lost & (p.weight.data != 0)).sum())
         found.append(
             Removal(
                 layer=population.name,
                 silent=int((silent[post] & ~by_evidence).sum()),
-                unreceived=int((unreceived[post] & ~by_evidence).sum()),
-                unused=int(by_evidence.sum()),
+                unread=int((unread[post] & ~by_evidence).sum()),
+                never_fired=int(by_evidence.sum()),
                 synapses=synapses,
             )
         )
@@ -281,6 +258,10 @@ def _of(masks: Masks, pre: int, size: int) -> Mask:
     return np.zeros(size, np.bool_) if pre == INPUT else masks[pre]
 
 
+def _touched(weight: Sparse, rows: Mask, columns: Mask) -> Mask:
+    """Whether each stored synapse is in one of these rows or columns."""
+    return np.asarray(np.repeat(rows, np.diff(weight.indptr)) | columns[weight.indices])
+
+
 def _zeroed(weight: Sparse, rows: Mask, columns: Mask) -> Sparse:
-    away = np.repeat(rows, np.diff(weight.indptr)) | columns[weight.indices]
-    return with_data(weight, np.where(away, 0, weight.data))
+    return with_data(weight, np.where(_touched(weight, rows, columns), 0, weight.data))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -64,17 +64,9 @@ class Target(Numbers):
         return options
 
     def compile(self, source: Any, options: Any = None, *, after: Callable[[str, Any], object] | None = None) -> Any:
-        """Lower what is trained; `after` is called with the name of each pass and all that was made so far.
+        """Lower what is trained to a compilation of the chip, with the result as ``netlist``.
 
-        Returns
-        -------
-        Compilation of the chip
-            With the result as ``netlist``.
-
-        Raises
-        ------
-        SpikeloomError
-            As the passes say.
+        `after` is called with the name of each pass and all that was made so far. SpikeloomError as the passes say.
         """
         module = self.module
         work, passes = module.start(source, module.Options() if options is None else options, self)
@@ -82,32 +74,15 @@ class Target(Numbers):
 
 
 def read_target(path: str | os.PathLike[str]) -> Target:
-    """Read and check a target file.
-
-    Raises
-    ------
-    OptionError
-        If it cannot be read, or entries are wrong: one line for each.
-    """
-    numbers = read_numbers(path)
-    return Target(**{field.name: getattr(numbers, field.name) for field in fields(Numbers)})
+    """Read and check a target file; OptionError if it cannot be read or entries are wrong, with a line for each."""
+    return read_numbers(path, Target)
 
 
 def with_tables(target: Target, name: str) -> Target:
-    """Choose the tables that price and time a run: one of the target's by name, or those of a file.
+    """Choose the tables that price and time a run: of the target by `name`, or of a TOML file of that name.
 
-    Parameters
-    ----------
-    target : Target
-        Chip.
-    name : str
-        Of a table, or of a TOML file with ``[energy.NAME]`` or ``[time.NAME]`` sections as a target file has them.
-        What a file lacks of the two kinds stays that of the target.
-
-    Raises
-    ------
-    OptionError
-        If there is no such table, or the file is wrong: one line for each fault.
+    The file has ``[energy.NAME]`` or ``[time.NAME]`` sections as a target file has; what it lacks stays the target's.
+    OptionError if there is no such table, or with a line for each fault of the file.
     """
     energy = tuple(table for table in target.energy if table.name == name)
     time = tuple(table for table in target.time if table.name == name)

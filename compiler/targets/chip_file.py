@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.targets.price_tables import (
@@ -53,6 +54,10 @@ CHOICES = ("synapse.weight_bits", "synapse.index_bits", "synapse.exponent")
 """Of what a target of compartments must list the permitted values."""
 
 Faults = list[str]
+Entry = dict[str, Any]
+
+Rule = Callable[[str], tuple[str, float]]
+"""Unit of an entry by its name, "" if any will do, and of what its value must be a multiple, 0 of nothing."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,36 +77,36 @@ class Numbers:
     cores: str = COMPARTMENTS
 
 
-def read_numbers(path: str | os.PathLike[str]) -> Numbers:
-    """Read and check a target file.
+N = TypeVar("N", bound=Numbers)
 
-    Raises
-    ------
-    OptionError
-        If it cannot be read, or entries are wrong: one line for each.
-    """
+
+def read_numbers(path: str | os.PathLike[str], kind: type[N]) -> N:
+    """Read and check a target file; OptionError with a line for each fault."""
     raw = _toml(path, "a target file")
-    crossbars = raw.get("cores") == CROSSBARS
+    cores, crossbars = raw.get("cores", COMPARTMENTS), raw.get("cores") == CROSSBARS
     known = {"name", "title", "limits", "energy"} | (set() if crossbars else {"choices", "time"})
     faults = [f"{key}: is missing" for key in sorted(known - raw.keys())]
     faults += [f"unknown key {key!r}" for key in raw.keys() - known - {"static", "cores"}]
-    faults += [
-        f"{key}: is {raw[key]!r}, a text is needed" for key in ("name", "title") if not _is_text(raw.get(key, key))
-    ]
-    if raw.get("cores", COMPARTMENTS) not in (COMPARTMENTS, CROSSBARS):
-        faults.append(f"cores: is {raw['cores']!r}, allowed are {COMPARTMENTS}, {CROSSBARS}")
-    limits = _section(raw, "limits", "value", faults, wanted=CROSSBAR_LIMITS if crossbars else LIMITS)
-    for name, entry in limits.items():
-        _require_whole(f"limits.{name}", entry, faults)
-    choices = {} if crossbars else _section(raw, "choices", "values", faults, wanted=CHOICES)
-    static = _section(raw, "static", "value", faults)
-    _require_unit("static", static, lambda _: POWER_UNIT, faults)
-    energy, time = _cost_tables(raw, CROSSBAR_EVENTS if crossbars else EVENTS, faults)
+    for key in ("name", "title"):
+        if not _is_text(raw.get(key, key)):
+            faults.append(f"{key}: is {raw[key]!r}, a text is needed")
+    if cores not in (COMPARTMENTS, CROSSBARS):
+        faults.append(f"cores: is {cores!r}, allowed are {COMPARTMENTS}, {CROSSBARS}")
+    wanted = CROSSBAR_LIMITS if crossbars else LIMITS
+    limits = _section("limits", raw.get("limits", {}), faults, lambda _: ("", 1), required=wanted, allowed=wanted)
+    choices: dict[str, Entry] = {}
+    if not crossbars:
+        given = raw.get("choices", {})
+        choices = _section(
+            "choices", given, faults, lambda _: ("", 0), leaf="values", required=CHOICES, allowed=CHOICES
+        )
+    static = _section("static", raw.get("static", {}), faults, lambda _: (POWER_UNIT, 0))
+    energy, time = _cost_tables(raw, cores, faults)
     _refuse(path, faults)
-    return Numbers(
+    return kind(
         name=raw["name"],
         title=raw["title"],
-        cores=raw.get("cores", COMPARTMENTS),
+        cores=cores,
         limits={rule: Quantity(**entry) for rule, entry in limits.items()},
         choices={rule: tuple(entry["values"]) for rule, entry in choices.items()},
         energy=energy,
@@ -111,20 +116,14 @@ def read_numbers(path: str | os.PathLike[str]) -> Numbers:
 
 
 def read_cost_tables(path: str, cores: str) -> tuple[tuple[EnergyTable, ...], tuple[TimeTable, ...]]:
-    """Tables of a file that holds nothing but ``[energy.NAME]`` and, for compartments, ``[time.NAME]`` sections.
-
-    Raises
-    ------
-    OptionError
-        If it cannot be read, or entries are wrong: one line for each.
-    """
+    """Tables of a file that holds nothing but ``[energy.NAME]`` and, for compartments, ``[time.NAME]`` sections."""
     raw = _toml(path, "a file of tables")
     kinds = {"energy"} if cores == CROSSBARS else {"energy", "time"}
     sections = " or ".join(f"[{kind}.NAME]" for kind in sorted(kinds))
     faults = [f"unknown key {key!r}, allowed are {', '.join(sorted(kinds))}" for key in raw.keys() - kinds]
     if not kinds & raw.keys():
         faults.append(f"holds no table; give {sections} with title and entries")
-    tables = _cost_tables(raw, CROSSBAR_EVENTS if cores == CROSSBARS else EVENTS, faults)
+    tables = _cost_tables(raw, cores, faults)
     _refuse(path, faults)
     return tables
 
@@ -143,18 +142,28 @@ def _refuse(path: str | os.PathLike[str], faults: Faults) -> None:
         raise OptionError("\n".join(f"{path}: {fault}" for fault in faults))
 
 
-# -- entries -----------------------------------------------------------------------------------------------------------
-
-
 def _section(
-    raw: Mapping[str, Any], kind: str, leaf: str, faults: Faults, wanted: tuple[str, ...] | None = None
-) -> dict[str, dict[str, Any]]:
-    """Sound entries of a section by their dotted names; if some are wanted, all of these and no others."""
-    entries = dict(_entries(raw.get(kind, {}), leaf))
-    if wanted is not None:
-        faults += [f"{kind}.{name}: is missing" for name in wanted if name not in entries]
-        faults += [f"{kind}.{name}: unknown, allowed are {', '.join(wanted)}" for name in entries if name not in wanted]
-    return _sound(kind, entries, leaf, faults)
+    where: str,
+    table: Any,
+    faults: Faults,
+    rule: Rule,
+    *,
+    leaf: str = "value",
+    required: tuple[str, ...] = (),
+    allowed: tuple[str, ...] | None = None,
+) -> dict[str, Entry]:
+    """Sound entries of a section by their dotted names; the others are added to the faults."""
+    entries = dict(_entries(table, leaf))
+    faults += [f"{where}.{name}: is missing" for name in required if name not in entries]
+    sound = {}
+    for name, entry in entries.items():
+        if allowed is not None and _BARRIER.sub(f"{BARRIER}N", name) not in allowed:
+            faults.append(f"{where}.{name}: unknown, allowed are {', '.join(allowed)}")
+        elif fault := _fault(entry, leaf, *rule(name)):
+            faults.append(f"{where}.{name}: {fault}")
+        else:
+            sound[name] = entry
+    return sound
 
 
 def _entries(table: Any, leaf: str, prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -166,13 +175,7 @@ def _entries(table: Any, leaf: str, prefix: str = "") -> Iterator[tuple[str, Any
         yield from _entries(entry, leaf, f"{prefix}.{key}" if prefix else key)
 
 
-def _sound(where: str, entries: Mapping[str, Any], leaf: str, faults: Faults) -> dict[str, dict[str, Any]]:
-    wrong = {name: _fault(entry, leaf) for name, entry in entries.items()}
-    faults += [f"{where}.{name}: {fault}" for name, fault in wrong.items() if fault]
-    return {name: entry for name, entry in entries.items() if not wrong[name]}
-
-
-def _fault(entry: Any, leaf: str) -> str:
+def _fault(entry: Any, leaf: str, unit: str, step: float) -> str:
     """What is wrong with an entry: it says its amount, its unit and where it was read, and nothing else."""
     keys = {leaf, "unit", "source"}
     if not isinstance(entry, dict) or not keys <= entry.keys() <= keys | {"confidence"}:
@@ -181,11 +184,19 @@ def _fault(entry: Any, leaf: str) -> str:
         return f"unit and source are {entry['unit']!r} and {entry['source']!r}, texts are needed"
     if entry.get("confidence", CONFIDENCE[0]) not in CONFIDENCE:
         return f"confidence is {entry['confidence']!r}, allowed are {', '.join(CONFIDENCE)}"
-    amount = entry[leaf]
-    if leaf == "value" and not (type(amount) in (int, float) and math.isfinite(amount) and amount >= 0):
+    if unit and entry["unit"] != unit:
+        return f"unit is {entry['unit']!r}, allowed is {unit!r}"
+    return _amount_fault(entry[leaf], leaf, step)
+
+
+def _amount_fault(amount: Any, leaf: str, step: float) -> str:
+    if leaf == "values":
+        whole = isinstance(amount, list) and amount and all(type(value) is int for value in amount)
+        return "" if whole else f"values are {amount!r}, a list of whole numbers is needed"
+    if not (type(amount) in (int, float) and math.isfinite(amount) and amount >= 0):
         return f"value is {amount!r}, a finite number from 0 is needed"
-    if leaf == "values" and not (isinstance(amount, list) and amount and all(type(value) is int for value in amount)):
-        return f"values are {amount!r}, a list of whole numbers is needed"
+    if step and abs(amount / step - round(amount / step)) > 1e-6:
+        return f"value is {amount!r}, {'a whole number' if step == 1 else f'a multiple of {step}'} is needed"
     return ""
 
 
@@ -193,44 +204,40 @@ def _is_text(value: Any) -> bool:
     return isinstance(value, str) and bool(value.strip())
 
 
-def _require_whole(where: str, entry: Mapping[str, Any], faults: Faults) -> None:
-    if entry["value"] != int(entry["value"]):
-        faults.append(f"{where}: value is {entry['value']!r}, a whole number is needed")
-
-
-def _require_unit(
-    where: str, entries: Mapping[str, Mapping[str, Any]], unit: Callable[[str], str], faults: Faults
-) -> None:
-    faults += [
-        f"{where}.{name}: unit is {entry['unit']!r}, allowed is {unit(name)!r}"
-        for name, entry in entries.items()
-        if entry["unit"] != unit(name)
-    ]
-
-
-# -- tables ------------------------------------------------------------------------------------------------------------
+_BARRIER = re.compile(rf"^{re.escape(BARRIER)}[1-9][0-9]*$")
+"""A barrier says from how many tiles on it holds."""
 
 
 def _cost_tables(
-    raw: Mapping[str, Any], events: tuple[str, ...], faults: Faults
+    raw: Mapping[str, Any], cores: str, faults: Faults
 ) -> tuple[tuple[EnergyTable, ...], tuple[TimeTable, ...]]:
-    """Energy tables of these events and time tables, as far as they are sound."""
+    """Energy tables and time tables, as far as they are sound."""
+    events = CROSSBAR_EVENTS if cores == CROSSBARS else EVENTS
     energy, time = [], []
-    for key, title, entries in _tables(raw, "energy", faults):
-        where = f"energy.{key}"
-        faults += [
-            f"{where}.{event}: unknown event, allowed are {', '.join(events)}" for event in entries.keys() - events
-        ]
-        if events is CROSSBAR_EVENTS and events[0] not in entries:
-            faults.append(f"{where}: has no price of {events[0]}; give it")
-        _require_unit(where, entries, lambda event: POWER_UNIT if event == FLOOR else PRICE_UNIT, faults)
-        prices = {event: Quantity(**entry) for event, entry in entries.items()}
-        energy.append(EnergyTable(name=key, title=title, prices=prices))
-    for key, title, entries in _tables(raw, "time", faults):
-        missing = _latency_faults(f"time.{key}", entries, faults)
-        if not missing:
-            found = {rule: Quantity(**entry) for rule, entry in entries.items()}
-            barriers = {int(rule[len(BARRIER) :]): found[rule] for rule in found if _is_barrier(rule)}
+    for key, title, table in _tables(raw, "energy", faults):
+        prices = _section(
+            f"energy.{key}",
+            table,
+            faults,
+            lambda event: (POWER_UNIT if event == FLOOR else PRICE_UNIT, 0),
+            required=events[:1] if cores == CROSSBARS else (),
+            allowed=events,
+        )
+        found = {event: Quantity(**entry) for event, entry in prices.items()}
+        energy.append(EnergyTable(name=key, title=title, prices=found))
+    required, allowed = (*LATENCIES, LINK_BUFFER, f"{BARRIER}1"), (*LATENCIES, LINK_BUFFER, f"{BARRIER}N")
+    for key, title, table in _tables(raw, "time", faults):
+        entries = _section(
+            f"time.{key}",
+            table,
+            faults,
+            lambda event: ("", 1) if event == LINK_BUFFER else (TIME_UNIT, 1 / PICOSECONDS),
+            required=required,
+            allowed=allowed,
+        )
+        if set(required) <= entries.keys():
+            found = {event: Quantity(**entry) for event, entry in entries.items()}
+            barriers = {int(rule[len(BARRIER) :]): found[rule] for rule in found if rule.startswith(BARRIER)}
             latencies = {event: found[event] for event in LATENCIES}
             time.append(
                 TimeTable(name=key, title=title, latencies=latencies, barriers=barriers, link_buffer=found[LINK_BUFFER])
@@ -238,37 +245,10 @@ def _cost_tables(
     return tuple(energy), tuple(time)
 
 
-def _tables(raw: Mapping[str, Any], kind: str, faults: Faults) -> Iterator[tuple[str, str, dict[str, dict[str, Any]]]]:
-    """Key, title and sound entries of each table of a kind."""
+def _tables(raw: Mapping[str, Any], kind: str, faults: Faults) -> Iterator[tuple[str, str, Entry]]:
+    """Key, title and entries of each table of a kind."""
     for key, table in raw.get(kind, {}).items() if isinstance(raw.get(kind, {}), dict) else [("", None)]:
         if not isinstance(table, dict) or not isinstance(table.get("title"), str):
             faults.append(f"{kind}.{key}: lacks its title; give title and entries")
-            continue
-        entries = {name: entry for name, entry in table.items() if name != "title"}
-        yield key, table["title"], _sound(f"{kind}.{key}", dict(_entries(entries, "value")), "value", faults)
-
-
-def _is_barrier(rule: str) -> bool:
-    """Whether `rule` is a barrier and says from how many tiles on it holds."""
-    tiles = rule.removeprefix(BARRIER)
-    return rule.startswith(BARRIER) and tiles.isdecimal() and tiles.isascii() and not tiles.startswith("0")
-
-
-def _latency_faults(where: str, entries: Mapping[str, Mapping[str, Any]], faults: Faults) -> list[str]:
-    """Refuse unknown, coarse or missing latencies, of which none is zero unless it says; return those missing."""
-    wanted = (*LATENCIES, LINK_BUFFER, f"{BARRIER}1")
-    missing = [rule for rule in wanted if rule not in entries]
-    faults += [f"{where}.{rule}: is missing" for rule in missing]
-    allowed = ", ".join((*LATENCIES, LINK_BUFFER, f"{BARRIER}N with a number of tiles N"))
-    unknown = [rule for rule in entries if rule not in wanted and not _is_barrier(rule)]
-    faults += [f"{where}.{rule}: unknown, allowed are {allowed}" for rule in unknown]
-    if LINK_BUFFER in entries:
-        _require_whole(f"{where}.{LINK_BUFFER}", entries[LINK_BUFFER], faults)
-    times = {rule: entry for rule, entry in entries.items() if rule != LINK_BUFFER}
-    _require_unit(where, times, lambda _: TIME_UNIT, faults)
-    faults += [
-        f"{where}.{rule}: value is {entry['value']!r}, a multiple of {1 / PICOSECONDS} is needed"
-        for rule, entry in times.items()
-        if abs(entry["value"] * PICOSECONDS - round(entry["value"] * PICOSECONDS)) > 1e-6
-    ]
-    return missing
+        else:
+            yield key, table["title"], {name: entry for name, entry in table.items() if name != "title"}

@@ -110,7 +110,7 @@ def prepare(network: Network, netlist: Netlist) -> FloatEngine:
         seat, compared = np.full(population.size, NOWHERE), np.ones(population.size, np.bool_)
         ids = netlist.compartments_of(post)
         seat[netlist.neuron[ids]] = ids
-        compared[list(netlist.layers[post].unreceived)] = False
+        compared[list(netlist.layers[post].unread)] = False
         before = max((-1 if pre == INPUT else depth[pre] for pre in pres), default=-1)
         layers.append(
             Layer(

@@ -163,7 +163,7 @@ def verify(
         same_checkpoint=_compiled_from(netlist, checkpoint, sha256),
         quantised_different=quantised_different,
         breakdowns=breakdowns(names, reference, chip, neurons, (float_counts, ran.votes), flat, files, lengths),
-        not_compared={name: int(out.sum()) for name, out in zip(names, machine.unused, strict=True) if out.any()},
+        not_compared={name: int(out.sum()) for name, out in zip(names, machine.unread, strict=True) if out.any()},
         certificate=certificate,
         engine=engine_name,
         engine_different=None if beside is None else beside.different,

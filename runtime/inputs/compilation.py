@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Mapping
 from typing import Any
 
-from spikeloom.compiler import MARGIN, Recipe, __version__
+from spikeloom.compiler import MARGIN, Packing, __version__
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.errors import OptionError
 from spikeloom.runtime.inputs.network import LoadedNetwork
@@ -35,7 +35,7 @@ def provenance(arguments: argparse.Namespace, asked: LoadedNetwork, *, calibrate
         "checkpoint_sha256": asked.sha256,
         **asked.origin(arguments.run),
         **({"towers": checkpoint.towers} if checkpoint is not None and checkpoint.towers > 1 else {}),
-        **storage(parse_recipes(arguments), checkpoint),
+        **storage(parse_packings(arguments), checkpoint),
         "spike_exact": arguments.spike_exact,
         "keep_all": arguments.keep_all,
         "prune_unused": arguments.prune_unused,
@@ -61,8 +61,8 @@ def whole_numbers(text: str, option: str) -> list[int]:
         raise OptionError(f"{option} {text}: not a number; give one, or several as in 8,4,4,8") from None
 
 
-def parse_recipes(arguments: argparse.Namespace) -> tuple[Recipe, ...] | None:
-    """Storage that the options of ``compile`` ask for, or None where they do not.
+def parse_packings(arguments: argparse.Namespace) -> tuple[Packing, ...] | None:
+    """Packing that the options of ``compile`` ask for, or None where they do not.
 
     Raises OptionError if they are no numbers, or disagree about the number of layers.
     """
@@ -78,18 +78,18 @@ def parse_recipes(arguments: argparse.Namespace) -> tuple[Recipe, ...] | None:
         if len(values) not in (1, layers):
             raise OptionError(f"{option}: {len(values)} numbers, another option gives {layers}; give as many, or one")
     columns = [values if len(values) == layers else values * layers for values in asked.values()]
-    return tuple(Recipe(bits=b, planes=p, groups=g) for b, p, g in zip(*columns, strict=True))
+    return tuple(Packing(bits=b, planes=p, groups=g) for b, p, g in zip(*columns, strict=True))
 
 
-def storage(recipes: tuple[Recipe, ...] | None, checkpoint: Checkpoint | None) -> Mapping[str, Any]:
+def storage(packings: tuple[Packing, ...] | None, checkpoint: Checkpoint | None) -> Mapping[str, Any]:
     """The same for the provenance of a netlist."""
     if checkpoint is not None and checkpoint.forms is not None:
         return {"weight_bits": _one_or_list([form.bits for form in checkpoint.forms]), "fine_tuned": True}
-    known = recipes or (Recipe(),)
+    known = packings or (Packing(),)
     return {
-        "weight_bits": _one_or_list([recipe.bits for recipe in known]),
-        "planes": _one_or_list([recipe.planes for recipe in known]),
-        "scale_groups": _one_or_list([recipe.groups for recipe in known]),
+        "weight_bits": _one_or_list([packing.bits for packing in known]),
+        "planes": _one_or_list([packing.planes for packing in known]),
+        "scale_groups": _one_or_list([packing.groups for packing in known]),
     }
 
 

@@ -62,7 +62,7 @@ class IntegerMachine(Machine):
 
     @property
     @abstractmethod
-    def unused(self) -> tuple[BoolArray, ...]:
+    def unread(self) -> tuple[BoolArray, ...]:
         """Those of them that were left out because their spikes reach no neuron: their spikes cannot be compared."""
 
     @property
@@ -113,7 +113,7 @@ class IntegerMachine(Machine):
 
     def compared(self) -> list[slice | IntArray]:
         """Neurons of each layer whose spikes can be compared."""
-        return [np.flatnonzero(~unused) if unused.any() else slice(None) for unused in self.unused]
+        return [np.flatnonzero(~unread) if unread.any() else slice(None) for unread in self.unread]
 
 
 LONGEST = 4096

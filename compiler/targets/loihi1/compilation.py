@@ -20,7 +20,7 @@ from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import inconsistencies
 from spikeloom.compiler.targets.loihi1.netlist_text import layout_text, netlist_text
 from spikeloom.compiler.targets.loihi1.options import Options
-from spikeloom.compiler.targets.loihi1.storage.quantize import Choice
+from spikeloom.compiler.targets.loihi1.storage.choose_storage import Choice
 from spikeloom.compiler.targets.loihi1.storage.spike_exact import Exactness
 from spikeloom.compiler.text import text
 from spikeloom.compiler.types import FloatArray, IntArray
@@ -41,16 +41,16 @@ class Compilation:
     # Spikes per step by population, likewise; the placement weighs traffic by them
     rates: tuple[FloatArray, ...] | None = None
     connected: Network = LATER  # The same network without the weights of neurons that do nothing (`disconnect`)
-    unused: Masks = ()  # Neurons that never fired in training and are to go for it
+    quiet: Masks = ()  # Neurons that never fired in training and are to go for it
     integer: IntegerNetwork = LATER  # In the integers of the chip (`quantize`)
     choices: tuple[Choice, ...] = ()  # Scale of each layer and why
     exactness: tuple[Exactness, ...] = ()  # What is in the way of equal spikes, where these were asked for; else empty
     proofs: tuple[RangeProof, ...] = ()  # Worst-case register values of each layer (`prove`)
     held: IntegerNetwork = LATER  # What the chip holds of it (`remove`)
     identity: tuple[IntArray, ...] = ()  # Which neurons these are, by population
-    # silent, unreceived: Neurons that it does not hold: they cannot fire, or their spikes reach no neuron
+    # silent, unread: Neurons that it does not hold: they cannot fire, or their spikes reach no neuron
     silent: Masks = ()
-    unreceived: Masks = ()
+    unread: Masks = ()
     removals: tuple[Removal, ...] = ()  # The same in numbers, and why
     # layout, usual: Cores and tiles, and those of the layout of fewest cores; often they are one (`place`)
     layout: Layout = LATER
@@ -75,13 +75,7 @@ class Compilation:
         return next(stage for stage in stages if stage is not LATER)
 
     def verify(self) -> None:
-        """Check every rule of the newest artefact.
-
-        Raises
-        ------
-        VerifyError
-            If a pass broke one.
-        """
+        """Check every rule of the newest artefact; VerifyError if a pass broke one."""
         newest = self.newest
         if not isinstance(newest, Netlist):
             verify(newest)

@@ -58,7 +58,7 @@ class Origin:
     network: IntegerNetwork  # With all neurons
     identity: tuple[IntArray, ...]  # For each population, which of its neurons the chip holds
     # Neurons removed although they fire, because their spikes reach no neuron
-    unreceived: tuple[npt.NDArray[np.bool_], ...]
+    unread: tuple[npt.NDArray[np.bool_], ...]
 
 
 def unpruned(network: IntegerNetwork) -> Origin:
@@ -66,7 +66,7 @@ def unpruned(network: IntegerNetwork) -> Origin:
     return Origin(
         network=network,
         identity=tuple(np.arange(population.size) for population in network.populations),
-        unreceived=tuple(np.zeros(population.size, np.bool_) for population in network.populations),
+        unread=tuple(np.zeros(population.size, np.bool_) for population in network.populations),
     )
 
 
@@ -76,7 +76,7 @@ def _layers(origin: Origin) -> tuple[Layer, ...]:
         Layer(
             name=population.name,
             neurons=population.size,
-            unreceived=tuple(np.flatnonzero(origin.unreceived[post]).tolist()),
+            unread=tuple(np.flatnonzero(origin.unread[post]).tolist()),
             depth=depth,
             beta=population.beta,
             theta=population.theta,
@@ -97,22 +97,9 @@ def emit(
     provenance: Mapping[str, Any],
     origin: Origin | None = None,
 ) -> Netlist:
-    """Assemble the netlist of a partitioned network.
+    """Assemble the netlist of a partitioned network, with a tile for each core and JSON values to remember.
 
-    Parameters
-    ----------
-    network : IntegerNetwork
-        Integer stage.
-    partition : Partition
-        Chunks of each core.
-    tiles : tuple of int
-        Tile of each core.
-    target : Target
-        Chip.
-    provenance : mapping
-        JSON values to remember.
-    origin : Origin, optional
-        What `network` was before neurons were left out; itself by default.
+    `origin` is what the network was before neurons were left out; itself by default.
     """
     origin = origin or unpruned(network)
     compartment_id = [np.zeros(population.size, np.int64) for population in network.populations]

@@ -67,13 +67,7 @@ def _distinct_per_core(netlist: Netlist, *columns: IntArray) -> IntArray:
 
 
 def measure(netlist: Netlist, target: Target) -> tuple[LimitUse, ...]:
-    """Use of every limit by every core, in the order of the target file.
-
-    Returns
-    -------
-    tuple of LimitUse
-        One entry per per-core limit and core, and one for the cores of the fullest chip.
-    """
+    """Use of every limit by every core, in the order of the target file, and the cores of the fullest chip."""
     cores = netlist.n_cores
     core_of_axon = netlist.core_of_axon()
     from_compartment = netlist.axon_source >= netlist.n_inputs
@@ -106,23 +100,12 @@ def measure(netlist: Netlist, target: Target) -> tuple[LimitUse, ...]:
 
 def violation(use: LimitUse, owner: str, target: Target) -> Violation:
     """Turn a use that is too large into the line that a user reads."""
-    return Violation(
-        owner=owner,
-        rule=f"{target.name}.{use.name}",
-        used=use.used,
-        allowed=use.allowed,
-        remedy=REMEDIES[use.name],
-    )
+    rule = f"{target.name}.{use.name}"
+    return Violation(owner=owner, rule=rule, used=use.used, allowed=use.allowed, remedy=REMEDIES[use.name])
 
 
 def require_legal(netlist: Netlist, target: Target) -> tuple[LimitUse, ...]:
-    """Measure every limit and refuse a netlist that breaks one.
-
-    Raises
-    ------
-    CapacityError
-        Listing every violation.
-    """
+    """Measure every limit; CapacityError lists every one that is broken."""
     uses = measure(netlist, target)
     violations = []
     for use in uses:

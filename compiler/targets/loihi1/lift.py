@@ -1,7 +1,7 @@
 """Read a netlist back as an integer network: the inverse of :mod:`loihi1.emit`, cores forgotten.
 
 Synapses of weight zero are stored by chance (inside dense lists) and are left out. A layer whose weights all rounded
-to zero stores no synapse; it is given an empty projection from where it would listen. Neurons that the chip does not
+to zero stores no synapse; it is given an empty projection from the layer before. Neurons that the chip does not
 hold come back without synapses or bias, so that they never fire.
 """
 
@@ -32,11 +32,7 @@ def _one(netlist: Netlist, layer: int, field: str) -> int:
 def lift(netlist: Netlist) -> IntegerNetwork:
     """Collect compartments to populations and axons to projections, one per pair of layers and weight format.
 
-    Raises
-    ------
-    FormatError
-        If the compartments of a layer have different decays, or several layers vote, which the network form cannot
-        say.
+    FormatError if a layer has different decays, or several layers vote, which the network form cannot say.
     """
     populations = []
     for index, layer in enumerate(netlist.layers):

@@ -41,12 +41,12 @@ class Layer:
     name: str  # ``conv1``, ``fc1`` …
     neurons: int  # Neurons of the float model's layer; the chip may hold fewer compartments
     # Neurons left out although they fire, as their spikes reach no neuron; any other that is missing cannot fire
-    unreceived: tuple[int, ...]
+    unread: tuple[int, ...]
     depth: int  # Steps that the layer lags behind the data
     # beta, theta: Decay and threshold of the float model
     beta: float
     theta: float
-    weight_bits: int  # Storage width of the mantissas
+    weight_bits: int  # Packing width of the mantissas
     synapses: int  # Structural synapses into the layer, before zeros were dropped
     max_fan_in: int  # Largest structural fan-in of a neuron
     alpha: float = 0.0  # Current decay of the float model
@@ -146,10 +146,7 @@ class Netlist:
         return np.repeat(np.arange(self.n_cores), np.diff(self.core_axons))
 
     def synapses_of(self, core: int) -> tuple[IntArray, IntArray, IntArray]:
-        """Synapses of one core: source, compartment and effective weight of each; all (synapses of the core,) int64.
-
-        Core by core, what holds for all synapses is found without arrays of them all.
-        """
+        """Synapses of one core: source, compartment and effective weight of each; all (synapses of the core,) int64."""
         axons = slice(*self.core_axons[core : core + 2].tolist())
         ends = self.axon_synapses[axons.start : axons.stop + 1]
         held, length = slice(*ends[[0, -1]].tolist()), np.diff(ends)
@@ -179,12 +176,7 @@ def one_step_bounds(netlist: Netlist) -> tuple[IntArray, IntArray]:
     """Largest positive and negative synaptic sum that one step can bring to each compartment.
 
     No order of arrival and no input can bring a running sum outside ``-negative … positive``: it is reached when
-    every positive (negative) synapse is hit at once.
-
-    Returns
-    -------
-    positive, negative : (compartments,) int64
-        Non-negative magnitudes in weight units.
+    every positive (negative) synapse is hit at once. Both are magnitudes, (compartments,), in weight units.
     """
     positive, negative = np.zeros((2, netlist.n_compartments), np.int64)
     for core in range(netlist.n_cores):

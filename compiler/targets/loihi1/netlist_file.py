@@ -20,7 +20,7 @@ from spikeloom.compiler.targets.netlist_file import (
 
 LAYER: Kind = {
     "name": str,
-    "unreceived": [(0, 2**31)],
+    "unread": [(0, 2**31)],
     **dict.fromkeys(("neurons", "depth", "weight_bits", "synapses", "max_fan_in"), (0, 2**62)),
     **dict.fromkeys(("beta", "theta", "alpha"), float),
 }
@@ -69,7 +69,7 @@ def inconsistencies(netlist: Netlist) -> list[str]:
         found.append("synapse_target points beyond its core")
     for index, layer in enumerate(netlist.layers):
         neurons = np.sort(netlist.neuron[netlist.layer == index])
-        if np.intersect1d(neurons, layer.unreceived).size or max(layer.unreceived, default=0) >= layer.neurons:
+        if np.intersect1d(neurons, layer.unread).size or max(layer.unread, default=0) >= layer.neurons:
             found.append(f"layer {layer.name} holds neurons that it leaves out, or leaves out some that are not there")
         if is_outside(neurons, 0, layer.neurons) or len(np.unique(neurons)) != len(neurons) or not len(neurons):
             found.append(
@@ -79,7 +79,7 @@ def inconsistencies(netlist: Netlist) -> list[str]:
 
 
 def _layer(entry: dict[str, Any]) -> Layer:
-    return Layer(**(entry | {"unreceived": tuple(entry["unreceived"])}))
+    return Layer(**(entry | {"unread": tuple(entry["unread"])}))
 
 
 FILE = NetlistFile(

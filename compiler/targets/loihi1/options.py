@@ -26,10 +26,10 @@ MARGIN = 0.1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Recipe:
-    """Storage of one population."""
+class Packing:
+    """Packing of one population."""
 
-    bits: int = 8  # Storage width of a mantissa
+    bits: int = 8  # Packing width of a mantissa
     planes: int = 1  # Times that a synapse may be stored, with different exponents
     groups: int = 1  # Different thresholds, and so scales, at most
 
@@ -38,11 +38,11 @@ class Recipe:
 class Options:
     """Options of a compilation."""
 
-    forms: Sequence[Form] | None = None  # Storage that the network was fine-tuned for, by population
-    # Storage of each layer, or one for all; 8 bits by default. A fine-tuned network brings its own and takes none.
-    recipes: Sequence[Recipe] | None = None
+    forms: Sequence[Form] | None = None  # Packing that the network was fine-tuned for, by population
+    # Packing of each layer, or one for all; 8 bits by default. A fine-tuned network brings its own and takes none.
+    packings: Sequence[Packing] | None = None
     # Add planes and scales until every spike on the training recordings, all of them, is the float64 model's, see
-    # :mod:`storage.spike_exact`; takes the width from `recipes` and nothing else
+    # :mod:`storage.spike_exact`; takes the width from `packings` and nothing else
     spike_exact: bool = False
     keep_all: bool = False  # Keep neurons that provably do nothing, too
     prune_unused: bool = False  # Remove neurons that did not fire on any training recording, too
@@ -59,13 +59,7 @@ class Options:
     provenance: Mapping[str, Any] = field(default_factory=dict)  # JSON values to store with the netlist
 
     def require_consistent(self, *, calibrated: bool) -> None:
-        """Refuse options that contradict each other; `calibrated` where there are, or will be, training events.
-
-        Raises
-        ------
-        OptionError
-            Saying which, and what to change.
-        """
+        """Refuse options that contradict each other; `calibrated` where there are, or will be, training events."""
         if not 0 <= self.margin < math.inf:
             raise OptionError(f"--margin {self.margin:g}: is no share to add to a range; give a number from 0")
         fine_tuned = self.forms is not None
@@ -74,7 +68,7 @@ class Options:
                 "--prune-unused: needs --calibrate, and neither --keep-all nor a fine-tuned checkpoint; "
                 "change the options"
             )
-        if fine_tuned and (self.recipes is not None or self.spike_exact or self.ranges != "proven"):
+        if fine_tuned and (self.packings is not None or self.spike_exact or self.ranges != "proven"):
             raise OptionError(
                 "compile: the checkpoint was fine-tuned for its own storage; omit --weight-bits, --planes, "
                 "--scale-groups, --spike-exact and --ranges"
@@ -83,8 +77,8 @@ class Options:
             raise OptionError("--spike-exact: nothing to be exact on; give --calibrate")
         if self.spike_exact and self.ranges != "proven":
             raise OptionError(f"--spike-exact: needs proven ranges, --ranges says {self.ranges}; omit --ranges")
-        recipes = self.recipes or (Recipe(),)
-        if self.spike_exact and (len(recipes) > 1 or recipes[0] != Recipe(bits=recipes[0].bits)):
+        packings = self.packings or (Packing(),)
+        if self.spike_exact and (len(packings) > 1 or packings[0] != Packing(bits=packings[0].bits)):
             raise OptionError(
                 "--spike-exact: finds planes and scales itself; give one width, no --planes or --scale-groups"
             )
@@ -107,35 +101,27 @@ class Options:
             raise OptionError(f"--optimize {self.optimize}: {why}")
 
 
-def check_recipes(recipes: Sequence[Recipe], layers: int, target: Target) -> tuple[Recipe, ...]:
-    """One recipe for each layer.
-
-    Raises
-    ------
-    OptionError
-        If there are neither one nor as many as layers, or the chip has no such storage.
-    """
-    if len(recipes) not in (1, layers):
+def check_packings(packings: Sequence[Packing], layers: int, target: Target) -> tuple[Packing, ...]:
+    """One packing for each layer; OptionError unless there is one, or one a layer, and the chip has such storage."""
+    if len(packings) not in (1, layers):
         raise OptionError(
-            f"--weight-bits: {len(recipes)} layers are described, the network has {layers}; "
+            f"--weight-bits: {len(packings)} layers are described, the network has {layers}; "
             "give one number, or one for each layer"
         )
     allowed = target.choices["synapse.weight_bits"]
-    for recipe in recipes:
-        if recipe.bits not in allowed:
+    for packing in packings:
+        if packing.bits not in allowed:
             raise OptionError(
-                f"--weight-bits {recipe.bits}: {target.title} does not store that width; "
+                f"--weight-bits {packing.bits}: {target.title} does not store that width; "
                 f"allowed: {', '.join(map(str, allowed))}"
             )
-        if not 1 <= recipe.planes <= MAX_PLANES:
-            raise OptionError(f"--planes {recipe.planes}: allowed are 1 to {MAX_PLANES}; choose one of these")
+        if not 1 <= packing.planes <= MAX_PLANES:
+            raise OptionError(f"--planes {packing.planes}: allowed are 1 to {MAX_PLANES}; choose one of these")
         slots = target.limit("core.threshold_slots")
-        if not 1 <= recipe.groups <= slots:
-            raise OptionError(
-                f"--scale-groups {recipe.groups}: a core of {target.title} holds {slots} thresholds; "
-                f"give a number from 1 to {slots}"
-            )
-    return tuple(recipes) if len(recipes) == layers else tuple(recipes) * layers
+        if not 1 <= packing.groups <= slots:
+            holds = f"a core of {target.title} holds {slots} thresholds"
+            raise OptionError(f"--scale-groups {packing.groups}: {holds}; give a number from 1 to {slots}")
+    return tuple(packings) if len(packings) == layers else tuple(packings) * layers
 
 
 def require_stored(forms: Sequence[Form], names: Sequence[str], target: Target) -> None:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 
 from spikeloom.compiler.interpret import channels_last
 from spikeloom.compiler.ir import IntegerNetwork, Network
@@ -18,12 +16,12 @@ from spikeloom.compiler.targets.loihi1.emit import Origin, emit
 from spikeloom.compiler.targets.loihi1.layout.choose import lay_out
 from spikeloom.compiler.targets.loihi1.legalize import require_legal
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
-from spikeloom.compiler.targets.loihi1.options import Options, Recipe, check_recipes, require_stored
-from spikeloom.compiler.targets.loihi1.storage.quantize import quantize, round_to_forms
+from spikeloom.compiler.targets.loihi1.options import Options, Packing, check_packings, require_stored
+from spikeloom.compiler.targets.loihi1.storage.choose_storage import choose_storage, round_to_forms
 from spikeloom.compiler.targets.loihi1.storage.spike_exact import make_exact
 from spikeloom.compiler.types import FloatArray
 
-__all__ = ["INTEGERS", "LAYOUT", "PASSES", "STORAGE", "Options", "lay_out_again", "start", "store", "without"]
+__all__ = ["INTEGERS", "LAYOUT", "PASSES", "STORAGE", "Options", "lay_out_again", "start", "to_integers", "without"]
 
 
 def _expand(done: Compilation) -> Compilation:
@@ -39,37 +37,37 @@ def _calibrate(done: Compilation) -> Compilation:
         return done
     events = channels_last(options.training_events, done.network.input.clocks)
     if not (options.spike_exact or options.prune_unused):
-        several = any(recipe.planes > 1 for recipe in options.recipes or ())
+        several = any(packing.planes > 1 for packing in options.packings or ())
         events = calibration.evenly_spaced(events, calibration.MANY if several else calibration.FEW)
     found = calibration.calibrate(done.network, events)
     return replace(done, calibration=found, rates=tuple(spikes.mean(axis=(0, 1)) for spikes in found.spikes))
 
 
 def _disconnect(done: Compilation) -> Compilation:
-    unused = prune.none_of(done.network)
+    quiet = prune.none_of(done.network)
     if done.options.prune_unused and done.calibration is not None:
-        unused = prune.never_fired(done.network, done.calibration)
+        quiet = prune.never_fired(done.network, done.calibration)
     if done.options.keep_all or done.options.forms is not None:
-        return replace(done, connected=done.network, unused=unused)
-    gone = prune.either(prune.never_fires(done.network), unused)
-    return replace(done, connected=prune.disconnect(done.network, gone), unused=unused)
+        return replace(done, connected=done.network, quiet=quiet)
+    gone = prune.either(prune.never_fires(done.network), quiet)
+    return replace(done, connected=prune.disconnect(done.network, gone), quiet=quiet)
 
 
 def _quantize(done: Compilation) -> Compilation:
     options, network, target = done.options, done.connected, done.target
-    recipes = options.recipes or (Recipe(),)
+    packings = options.packings or (Packing(),)
     if options.forms is not None:
         require_stored(options.forms, [population.name for population in network.populations], target)
         integer, choices = round_to_forms(network, options.forms, done.calibration)
         return replace(done, integer=integer, choices=choices, connected=LATER)
     if options.spike_exact and done.calibration is not None:
-        check_recipes(recipes, len(network.populations), target)
-        integer, choices, exactness = make_exact(network, target, done.calibration, bits=recipes[0].bits)
+        check_packings(packings, len(network.populations), target)
+        integer, choices, exactness = make_exact(network, target, done.calibration, bits=packings[0].bits)
         return replace(done, integer=integer, choices=choices, exactness=exactness, connected=LATER)
-    integer, choices = quantize(
+    integer, choices = choose_storage(
         network,
         target,
-        recipes=recipes,
+        packings=packings,
         calibration=done.calibration,
         ranges=options.ranges,
         margin=options.margin,
@@ -84,20 +82,15 @@ def _prove(done: Compilation) -> Compilation:
 def _remove(done: Compilation) -> Compilation:
     integer, network = done.integer, done.network
     none = prune.none_of(integer)
-    silent, unreceived = (none, none) if done.options.keep_all else prune.removable(integer)
-    unused = done.unused or none
-    removals = () if network is LATER else prune.removals(network, silent, unreceived, unused)
-    held, identity = prune.compact(integer, prune.either(silent, unreceived))
-    return replace(
-        done, held=held, identity=identity, silent=silent, unreceived=unreceived, unused=unused, removals=removals
-    )
+    silent, unread = (none, none) if done.options.keep_all else prune.removable(integer)
+    removals = () if network is LATER else prune.removals(network, silent, unread, done.quiet)
+    held, identity = prune.compact(integer, prune.either(silent, unread))
+    return replace(done, held=held, identity=identity, silent=silent, unread=unread, removals=removals)
 
 
 def _place(done: Compilation) -> Compilation:
     options = done.options
-    rates = None
-    if done.rates is not None:
-        rates = tuple(rate[ids] for rate, ids in zip(done.rates, done.identity, strict=True))
+    rates = done.rates and tuple(rate[ids] for rate, ids in zip(done.rates, done.identity, strict=True))
     layout, usual = lay_out(
         done.held,
         done.target,
@@ -112,7 +105,7 @@ def _place(done: Compilation) -> Compilation:
 
 
 def _emit(done: Compilation) -> Compilation:
-    origin = Origin(network=done.integer, identity=done.identity, unreceived=done.unreceived)
+    origin = Origin(network=done.integer, identity=done.identity, unread=done.unread)
     parts, tiles = done.layout.parts, done.layout.placement.tiles
     provenance = dict(done.options.provenance)
     if done.choices:
@@ -203,10 +196,7 @@ def start(
 ) -> tuple[Compilation, tuple[Pass[Compilation], ...]]:
     """What the passes begin with, and which of them are due: integers are rounded already.
 
-    Raises
-    ------
-    OptionError
-        If the options contradict each other.
+    OptionError if the options contradict each other.
     """
     options.require_consistent(calibrated=options.training_events is not None)
     work = Compilation(source=source, options=options, target=target)
@@ -215,7 +205,7 @@ def start(
     return work, PASSES
 
 
-def store(source: expand.Factored | Network, options: Options, target: Target) -> Compilation:
+def to_integers(source: expand.Factored | Network, options: Options, target: Target) -> Compilation:
     """Round a network to the integers of the chip, without a layout: :func:`lay_out_again` makes as many as wanted."""
     return run(STORAGE, start(source, options, target)[0])
 
@@ -225,38 +215,14 @@ def lay_out_again(done: Compilation, options: Options) -> Compilation:
     return run(LAYOUT, replace(done, options=options))
 
 
-def without(done: Compilation, unused: prune.Masks, *, rates: tuple[FloatArray, ...] | None = None) -> Netlist:
-    """Remove more neurons from what was compiled, and lay out the rest on the fewest cores.
+def without(done: Compilation, gone: prune.Masks, *, rates: tuple[FloatArray, ...] | None = None) -> Netlist:
+    """Remove more neurons, (neurons,) bool by population, and lay out the rest on the fewest cores of one chip.
 
     Weights and thresholds are the same integers: on any recording on which none of these neurons fires, every other
-    spike is as before.
-
-    Parameters
-    ----------
-    done : Compilation
-        Of a network on one chip.
-    unused : tuple of (neurons,) bool
-        Neurons to remove, by population; each population keeps one.
-    rates : tuple of (neurons,) float64, optional
-        Spikes per step, for the placement.
-
-    Raises
-    ------
-    CapacityError
-        If a limit cannot be kept.
+    spike is as before. Each population must keep a neuron; `rates` are spikes per step of all, for the placement.
     """
-    silent, unreceived = prune.removable(done.integer)
-    silent = prune.either(silent, unused)
-    held, identity = prune.compact(done.integer, prune.either(silent, unreceived))
-    provenance: Mapping[str, Any] = done.netlist.provenance
-    fewer = replace(
-        done,
-        options=Options(provenance=provenance),
-        held=held,
-        identity=identity,
-        silent=silent,
-        unreceived=unreceived,
-        calibration=None,
-        rates=rates,
-    )
-    return run(LAYOUT, fewer).netlist
+    silent, unread = prune.removable(done.integer)
+    silent = prune.either(silent, gone)
+    held, identity = prune.compact(done.integer, prune.either(silent, unread))
+    removed = replace(done, held=held, identity=identity, silent=silent, unread=unread, calibration=None, rates=rates)
+    return lay_out_again(removed, Options(provenance=done.netlist.provenance)).netlist

@@ -71,7 +71,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
             model=loaded.model,
             rounding=rounding,
             absent=machine.absent,
-            unused=machine.unused,
+            unread=machine.unread,
             pruned=bool(netlist.provenance.get("prune_unused", False)),
         )
         if explanation.different:

@@ -11,7 +11,7 @@ from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.runtime.commands.main_job.integers import brings_integers, compile_integers
 from spikeloom.runtime.commands.options import NETWORK_FILES, add_bin_option, add_network, group
-from spikeloom.runtime.inputs.compilation import margin_of, parse_cores, parse_recipes, provenance
+from spikeloom.runtime.inputs.compilation import margin_of, parse_cores, parse_packings, provenance
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.inputs.recordings import recordings
@@ -91,7 +91,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
             f"--margin {arguments.margin:g}: only observed ranges have one; add --ranges observed or omit it"
         )
     options = chip.options(
-        recipes=parse_recipes(arguments),
+        packings=parse_packings(arguments),
         spike_exact=arguments.spike_exact,
         keep_all=arguments.keep_all,
         prune_unused=arguments.prune_unused,

@@ -62,21 +62,21 @@ def explain(
     model: Checkpoint | Network | None = None,
     rounding: Rounding | None = None,
     absent: Sequence[BoolArray] | None = None,
-    unused: Sequence[BoolArray] | None = None,
+    unread: Sequence[BoolArray] | None = None,
     pruned: bool = False,
 ) -> Explanation:
     """Find the roots of all differences between float64 model and chip on one recording, and their causes.
 
     `network` is the float stage of `model`, `integer` what the netlist holds, `events` (steps, channels) bool, and
     `observed` what the chip did on this recording. `rounding` is what is known of the stored weights; by default each
-    is the nearest. The chip does not hold the `absent` neurons of each population, of which the `unused` reach no
+    is the nearest. The chip does not hold the `absent` neurons of each population, of which the `unread` reach no
     neuron and are not compared; they were `pruned` on evidence, or cannot fire with their rounded weights.
     """
     ideal = run_float(network, events[None], membranes=True)
     truth, chip = ([spikes[0] for spikes in side.spikes] for side in (ideal, observed))
     none = [np.zeros(population.size, np.bool_) for population in network.populations]
-    absent, unused = absent or none, unused or none
-    differs = [(a != b) & ~mute for a, b, mute in zip(truth, chip, unused, strict=True)]
+    absent, unread = absent or none, unread or none
+    differs = [(a != b) & ~mute for a, b, mute in zip(truth, chip, unread, strict=True)]
     resets = [
         a & b if population.decay_u == 4095 else np.zeros_like(a)
         for a, b, population in zip(truth, chip, integer.populations, strict=True)

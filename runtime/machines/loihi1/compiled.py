@@ -12,7 +12,7 @@ from spikeloom.compiler.targets.loihi1.compilation import Compilation
 from spikeloom.compiler.targets.loihi1.layout import choose
 from spikeloom.compiler.targets.loihi1.layout.forecast import Expectation
 from spikeloom.compiler.targets.loihi1.layout.place import Placement
-from spikeloom.compiler.targets.loihi1.storage.quantize import Choice
+from spikeloom.compiler.targets.loihi1.storage.choose_storage import Choice
 from spikeloom.compiler.targets.loihi1.storage.spike_exact import Exactness
 from spikeloom.runtime.machines.loihi1 import description
 from spikeloom.runtime.machines.loihi1.description import LayerFacts, NetlistFacts
@@ -142,8 +142,8 @@ def _removed(facts: CompilationFacts) -> Iterator[str]:
     """What the chip does not hold, and why."""
     reasons = {
         "that no input can make fire": [layer.silent for layer in facts.removals],
-        "whose spikes reach no neuron": [layer.unreceived for layer in facts.removals],
-        "that did not fire in training (by evidence, not by proof)": [layer.unused for layer in facts.removals],
+        "whose spikes reach no neuron": [layer.unread for layer in facts.removals],
+        "that did not fire in training (by evidence, not by proof)": [layer.never_fired for layer in facts.removals],
     }
     for why, neurons in reasons.items():
         counts = [f"{layer.layer} {n:,}" for layer, n in zip(facts.removals, neurons, strict=True) if n]

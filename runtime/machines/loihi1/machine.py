@@ -139,9 +139,9 @@ class Loihi(IntegerMachine):
         )
 
     @property
-    def unused(self) -> tuple[BoolArray, ...]:
+    def unread(self) -> tuple[BoolArray, ...]:
         """As the netlist lists them."""
-        return tuple(np.isin(np.arange(layer.neurons), layer.unreceived) for layer in self.netlist.layers)
+        return tuple(np.isin(np.arange(layer.neurons), layer.unread) for layer in self.netlist.layers)
 
     @property
     def received(self) -> BoolArray:

@@ -112,8 +112,8 @@ def aligned(netlist: Netlist, array: npt.NDArray[Any], layer: int) -> npt.NDArra
 
 def comparable(netlist: Netlist, layer: int) -> slice | IntArray:
     """Neurons of a layer whose spikes can be compared: all but those left out because their spikes reach no neuron."""
-    unused = netlist.layers[layer].unreceived
-    return np.setdiff1d(np.arange(netlist.layers[layer].neurons), unused) if unused else slice(None)
+    unread = netlist.layers[layer].unread
+    return np.setdiff1d(np.arange(netlist.layers[layer].neurons), unread) if unread else slice(None)
 
 
 def differences(slow: Trace, fast: Trace) -> int:

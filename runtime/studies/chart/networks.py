@@ -10,7 +10,7 @@ from itertools import count, product
 from pathlib import Path
 from typing import Any
 
-from spikeloom.compiler import Recipe, check_recipes
+from spikeloom.compiler import Packing, check_packings
 from spikeloom.compiler.archive import arrays_digest, is_netlist
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.formats.onnx.reader import SUFFIX
@@ -270,7 +270,7 @@ def require_grid(networks: Sequence[Given], grid: Grid, target: Target) -> None:
                     f"--grid bits={'+'.join(map(str, bits))}: {len(bits)} widths, {path} has {len(layers)} "
                     f"layers ({', '.join(layers)}); give one width, or one for each layer"
                 )
-            check_recipes([Recipe(bits=width) for width in bits], len(layers), target)
+            check_packings([Packing(bits=width) for width in bits], len(layers), target)
         for layout in grid.cores:
             for part in layout.split("+") if ":" in layout else ():
                 layer = part.partition(":")[0]

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from spikeloom.compiler import Options, lay_out_again, store, write_netlist
+from spikeloom.compiler import Options, lay_out_again, to_integers, write_netlist
 from spikeloom.compiler.errors import CapacityError, DataError, FormatError, ModelError
 from spikeloom.compiler.files import sha256_of
 from spikeloom.compiler.interpret import cut, vote
@@ -25,7 +25,7 @@ from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.models.recordings.events import joined_bins
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.recordings.windows import first_part, steps_of
-from spikeloom.runtime.inputs.compilation import PLACING, ROUNDING, parse_cores, parse_recipes, provenance
+from spikeloom.runtime.inputs.compilation import PLACING, ROUNDING, parse_cores, parse_packings, provenance
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import recordings
 from spikeloom.runtime.machines.base import DEFAULT, Machine, chip_chart, machine_for
@@ -172,11 +172,11 @@ def _build(work: Build) -> dict[str, Built]:
     sensor = network.network.input
     training = _in_steps(work.data, sensor.taxels, network.network.classes, sensor.bins)["train"]
     try:
-        stored = store(
+        stored = to_integers(
             network.source,
             Options(
                 forms=None if network.checkpoint is None else network.checkpoint.forms,
-                recipes=parse_recipes(some),
+                packings=parse_packings(some),
                 prune_unused=some.prune_unused,
                 training_events=training.events,
             ),

@@ -17,7 +17,7 @@ from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.fixedpoint import DECAY_BITS, ONE_STEP_SUM_MAX, read_only
 from spikeloom.compiler.ir import Form, IntegerNetwork
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.passes.prune import deaf_to
+from spikeloom.compiler.passes.prune import without_channels
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.machines.base import machine_of
@@ -152,8 +152,8 @@ def sources_of(netlist: Netlist, taxels: IntArray) -> BoolArray:
 
 
 def without_taxels(integer: IntegerNetwork, netlist: Netlist, taxels: IntArray) -> IntegerNetwork:
-    """The integer network deaf to some taxels."""
-    return deaf_to(integer, sources_of(netlist, taxels)[: netlist.n_inputs])
+    """The integer network without the synapses from some taxels."""
+    return without_channels(integer, sources_of(netlist, taxels)[: netlist.n_inputs])
 
 
 def changed_alone(netlist: Netlist, of: Recordings, wanted: IntArray) -> IntArray:

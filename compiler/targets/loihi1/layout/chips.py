@@ -37,15 +37,8 @@ def chip_count(core_tile: IntArray, target: Target) -> int:
 
 
 def require_one_chip(core_tile: IntArray, target: Target, what: str) -> None:
-    """Refuse `what` for a netlist on several chips.
-
-    Raises
-    ------
-    OptionError
-        Saying what can be had of it.
-    """
-    chips = chip_count(core_tile, target)
-    if chips > 1:
+    """Refuse `what` for a netlist on several chips with an OptionError."""
+    if (chips := chip_count(core_tile, target)) > 1:
         raise OptionError(
             f"{what}: the netlist takes {chips} chips, and links between chips are not modelled; "
             "use estimate --detail counts, or a network that one chip holds"
@@ -55,14 +48,8 @@ def require_one_chip(core_tile: IntArray, target: Target, what: str) -> None:
 def share(traffic: FloatArray, room: int) -> IntArray:
     """Chip of each core, on as few chips as hold them.
 
-    A chip is grown from the lowest core that has none by the one that talks most to it, until it is full.
-
-    Parameters
-    ----------
-    traffic : (cores, cores) float64
-        Packets per step.
-    room : int
-        Cores of a chip.
+    A chip, of `room` cores, is grown from the lowest core that has none by the one that talks most to it, until it is
+    full.
     """
     between = traffic + traffic.T
     cores = len(between)
@@ -77,19 +64,9 @@ def share(traffic: FloatArray, room: int) -> IntArray:
 
 
 def place_on_chips(traffic: FloatArray, target: Target) -> Placement:
-    """Share cores among as few chips as hold them and place the cores of each.
+    """Share cores among as few chips as hold them and place the cores of each, by packets per step (cores, cores).
 
-    Parameters
-    ----------
-    traffic : (cores, cores) float64
-        Packets per step.
-    target : Target
-        Mesh size and cores per tile.
-
-    Returns
-    -------
-    Placement
-        Spike-hops are those within chips; their bound is for this share of the cores.
+    Spike-hops are those within chips; their bound is for this share of the cores.
     """
     room = target.limit("chip.cores")
     if len(traffic) <= room:

@@ -2,7 +2,7 @@
 
 The integer network is not changed: which neuron sits where has no influence on any spike.
 
-A layer on more cores is swept and fed in parallel, but each of its spikes, and each spike that it hears, is sent to
+A layer on more cores is swept and fed in parallel, but each of its spikes, and each spike that it receives, is sent to
 more of them. Layouts are judged by :mod:`layout.forecast`.
 """
 
@@ -36,31 +36,25 @@ class Layout:
 
     parts: Partition  # Chunks of each core
     placement: Placement  # Tiles
-    expected: Expectation | None  # Time and energy of a step, where these can be told
+    expected: Expectation | None  # Time and energy of a step, where these can be foretold
 
 
-def asked_cores(
+def least_cores(
     network: IntegerNetwork, cores_for: Mapping[str, int], target: Target, chips: int = 1
 ) -> dict[int, int]:
-    """Least number of cores by population, from names.
-
-    Raises
-    ------
-    OptionError
-        If there is no such layer, or the chip or the layer cannot be cut so often.
-    """
+    """Least number of cores by population, from names; OptionError if there is no such layer or not so many cores."""
     names = [population.name for population in network.populations]
     allowed = chips * target.limit("chip.cores")
     owner = f"{target.title} has" if chips == 1 else f"{chips} chips {target.title} have"
     for name, least in cores_for.items():
-        asked = f"--cores-for {name}={least}"
+        option = f"--cores-for {name}={least}"
         if name not in names:
-            raise OptionError(f"{asked}: no such layer; layers are {', '.join(names)}")
+            raise OptionError(f"{option}: no such layer; layers are {', '.join(names)}")
         size = network.populations[names.index(name)].size
         if least > allowed:
-            raise OptionError(f"{asked}: {owner} {allowed} cores ({target.name}.chip.cores); give {allowed} or fewer")
+            raise OptionError(f"{option}: {owner} {allowed} cores ({target.name}.chip.cores); give {allowed} or fewer")
         if least > size:
-            raise OptionError(f"{asked}: {name} has {size} neurons on the chip; give {size} or fewer")
+            raise OptionError(f"{option}: {name} has {size} neurons on the chip; give {size} or fewer")
     return {names.index(name): least for name, least in cores_for.items()}
 
 
@@ -75,40 +69,19 @@ def lay_out(
     calibration: Calibration | None = None,
     identity: tuple[IntArray, ...] | None = None,
 ) -> tuple[Layout, Layout]:
-    """Choose a layout for a goal.
+    """Choose a layout for a goal, one of ``options.GOALS``, and that of fewest cores; often they are one.
 
-    Parameters
-    ----------
-    network : IntegerNetwork
-        Integer stage, what the chip holds of it.
-    target : Target
-        Limits, latencies and prices.
-    goal : str
-        One of ``options.GOALS``: fewest cores, least expected energy of a step, shortest expected step.
-    cores_for : mapping of str to int, optional
-        Least number of cores of a layer, by name. These hold no other layer.
-    chips : int
-        Number of chips at most; as few are used as hold the cores.
-    rates : tuple of (neurons,) float64, optional
-        Spikes per step, from calibration.
-    calibration : Calibration, optional
-        Spikes of the float model, for what a step is expected to take.
-    identity : tuple of (neurons left,) int64, optional
-        Which neurons of the calibration the chip holds; all by default.
-
-    Returns
-    -------
-    chosen, usual : Layout
-        The layout, and that of fewest cores; often they are one.
+    Layers in `cores_for` get so many cores at least, which hold no other layer. `rates` are spikes per step (neurons,)
+    of each population; `identity` says which neurons of the calibration the network holds, all by default.
 
     Raises
     ------
     CapacityError
         If a limit cannot be kept.
     OptionError
-        If the goal cannot be judged, or the cores asked for do not exist.
+        If the goal cannot be judged, or there are not so many cores.
     """
-    least = asked_cores(network, cores_for or {}, target, chips)
+    least = least_cores(network, cores_for or {}, target, chips)
     priced = tables(target)
     forecast = None
     if calibration is not None and priced is not None:
@@ -119,12 +92,10 @@ def lay_out(
     def placed(parts: Partition, tiles: int | None = None) -> Layout:
         traffic = core_traffic(network, parts, rates)
         placement = place_on_chips(traffic, target) if tiles is None else place_within(traffic, target, tiles)
-        return Layout(parts=parts, placement=placement, expected=expect(parts, placement))
-
-    def expect(parts: Partition, placement: Placement) -> Expectation | None:
-        if forecast is None or len(parts.cores) > target.limit("chip.cores"):
-            return None
-        return forecast.expect(parts, placement.tiles, core_traffic(network, parts, forecast.rates))
+        expected = None
+        if forecast is not None and len(parts.cores) <= target.limit("chip.cores"):
+            expected = forecast.expect(parts, placement.tiles, core_traffic(network, parts, forecast.rates))
+        return Layout(parts=parts, placement=placement, expected=expected)
 
     usual = placed(partition(network, target, rates, chips=chips))
     if least:
@@ -148,9 +119,6 @@ def lay_out(
 def _expected(layout: Layout) -> Expectation:
     assert layout.expected is not None
     return layout.expected
-
-
-# -- energy ------------------------------------------------------------------------------------------------------------
 
 
 def _thrifty(forecast: Forecast, rates: tuple[FloatArray, ...] | None) -> list[Partition]:

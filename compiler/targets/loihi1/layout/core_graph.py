@@ -14,23 +14,9 @@ from spikeloom.compiler.targets.loihi1.netlist import Netlist
 def core_map(netlist: Netlist, target: Target) -> nx.DiGraph:
     """Cores (and ``input``) as nodes, connections between them as edges.
 
-    Parameters
-    ----------
-    netlist : Netlist
-        Placed network.
-    target : Target
-        Chip, for the width of its mesh.
-
-    Returns
-    -------
-    networkx.DiGraph
-        Node attributes ``tile`` (None for the input), ``compartments`` and ``layers`` (names). Edge attributes
-        ``axons`` (input axons of the second core that listen to the first) and ``hops`` (0 on one tile; None from
-        the input, which has no place on the mesh, and between chips).
-
-    Notes
-    -----
-    A core that no path from ``input`` reaches can only spike from its biases.
+    Node attributes are ``tile`` (None for the input), ``compartments`` and ``layers`` (names); edge attributes
+    ``axons`` (input axons of the second core that listen to the first) and ``hops`` (0 on one tile; None from the
+    input, which has no place on the mesh, and between chips).
     """
     graph = nx.DiGraph()
     chip = chip_of_core(netlist.core_tile, target)

@@ -64,13 +64,7 @@ def lists_into(network: IntegerNetwork, chunk: Chunk) -> tuple[Lists, ...]:
             first[column[::-1]] = row[::-1]
             source = np.flatnonzero(nonzero)
             found.append(
-                Lists(
-                    projection=index,
-                    source=source,
-                    nonzero=nonzero[source],
-                    first=first[source],
-                    last=last[source],
-                )
+                Lists(projection=index, source=source, nonzero=nonzero[source], first=first[source], last=last[source])
             )
     return tuple(found)
 
@@ -83,19 +77,9 @@ def index_bits(highest: int, target: Target) -> int:
 def choose_dense(
     lists: Lists, projection: IntegerProjection, base: int, size: int, *, lean: bool, target: Target
 ) -> tuple[IntArray, IntArray]:
-    """Decide the form of each list of a chunk that starts at compartment `base` of its core.
+    """Decide the form of each list of a chunk that starts at compartment `base` of its core: 1 for dense, and words.
 
-    Parameters
-    ----------
-    lean : bool
-        Prefer few visited synapses (sparse unless nearly full) to few words.
-
-    Returns
-    -------
-    dense : (lists,) bool as int64
-        1 where the list is stored dense.
-    words : (lists,) int64
-        Words that it takes.
+    A `lean` core prefers few visited synapses (sparse unless nearly full) to few words.
     """
     span = lists.last - lists.first + 1
     sparse_words = list_words(lists.nonzero, projection.bits, index_bits(base + size - 1, target), target)
@@ -115,7 +99,6 @@ class Needs:
         self.forget()
         self._lists: dict[Chunk, tuple[Lists, ...]] = {}
         self._stored: dict[tuple[Chunk, int, bool], tuple[int, frozenset[SynapseFormat]]] = {}
-        self._thresholds: dict[Chunk, frozenset[int]] = {}
         self._lean: dict[tuple[Chunk, ...], bool] = {}
 
     def lists(self, chunk: Chunk) -> tuple[Lists, ...]:
@@ -154,9 +137,7 @@ class Needs:
             formats |= used
             base += chunk.size
             population = self.network.populations[chunk.population]
-            if chunk not in self._thresholds:
-                self._thresholds[chunk] = frozenset(population.threshold[chunk.first : chunk.last].tolist())
-            thresholds |= self._thresholds[chunk]
+            thresholds |= set(np.unique(population.threshold[chunk.first : chunk.last]).tolist())
             decays.add((population.decay_u, population.decay_v))
         return {
             "core.compartments": base,
@@ -170,12 +151,9 @@ class Needs:
 
     def excess(self, chunks: tuple[Chunk, ...], *, lean: bool = False) -> list[LimitUse]:
         """Limits that such a core breaks."""
-        uses = self.uses(chunks, lean=lean)
-        return [
-            LimitUse(name=rule, used=used, allowed=self.target.limit(rule), core=None)
-            for rule, used in uses.items()
-            if used > self.target.limit(rule)
-        ]
+        uses = self.uses(chunks, lean=lean).items()
+        every = [LimitUse(name=rule, used=used, allowed=self.target.limit(rule), core=None) for rule, used in uses]
+        return [use for use in every if use.used > use.allowed]
 
     def lean(self, chunks: tuple[Chunk, ...]) -> bool:
         """Whether such a core has room for lists of few visited synapses; its output axons do not matter."""
@@ -197,7 +175,7 @@ class Needs:
                     axons.setdefault(pre, np.zeros(self.network.populations[pre].size, np.int64))[lists.source] += 1
         return axons
 
-    def listen(self, chunks: Iterable[Chunk]) -> None:
-        """Charge the sources of chunks with these."""
-        for pre, axons in self.source_axons(chunks).items():
-            self.out_axons[pre] += axons
+    def charge(self, axons: dict[int, IntArray]) -> None:
+        """Charge sources with output axons, by population."""
+        for pre, more in axons.items():
+            self.out_axons[pre] += more

@@ -30,22 +30,8 @@ SAMPLES = 1000
 
 Core = tuple[Chunk, ...]
 
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Activity:
-    """Events and spikes in some chip steps, each as 0 or 1."""
-
-    inputs: sparse.csc_array  # Input events
-    spikes: tuple[sparse.csc_array, ...]  # Spikes of each population
-
-    @property
-    def steps(self) -> int:
-        """Number of chip steps."""
-        return int(self.inputs.shape[0])
-
-    def source(self, pre: int) -> sparse.csc_array:
-        """Spikes of a population, or the input events."""
-        return self.inputs if pre == INPUT else self.spikes[pre]
+Activity = tuple[sparse.csc_array, ...]
+"""Spikes of each population in some chip steps, (steps, neurons) of 0 and 1; last, at ``INPUT``, the input events."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,14 +55,7 @@ class Expectation:
 def sample(network: IntegerNetwork, calibration: Calibration, identity: tuple[IntArray, ...]) -> Activity:
     """Spikes of the chip steps that calibration recordings take, each layer as late as it is on the chip.
 
-    Parameters
-    ----------
-    network : IntegerNetwork
-        What the chip holds.
-    calibration : Calibration
-        Spikes of all neurons of the float model.
-    identity : tuple of (neurons left,) int64
-        For each population, which of these neurons the chip holds.
+    `identity` says for each population which of the calibration's neurons the `network` holds.
     """
     calibration = fewer(calibration)
     late = depths(network)
@@ -90,13 +69,8 @@ def sample(network: IntegerNetwork, calibration: Calibration, identity: tuple[In
         runs = (0 <= at) & (at < length)
         return sparse.csc_array((values[recording, np.where(runs, at, 0)] & runs[:, None]).astype(np.float64))
 
-    return Activity(
-        inputs=seen(calibration.events, 0),
-        spikes=tuple(
-            seen(spikes[:, :, ids], depth)
-            for spikes, ids, depth in zip(calibration.spikes, identity, late, strict=True)
-        ),
-    )
+    layers = zip(calibration.spikes, identity, late, strict=True)
+    return (*(seen(spikes[:, :, ids], depth) for spikes, ids, depth in layers), seen(calibration.events, 0))
 
 
 def tables(target: Target) -> tuple[TimeTable, EnergyTable] | None:
@@ -113,30 +87,17 @@ def tables(target: Target) -> tuple[TimeTable, EnergyTable] | None:
 
 
 class Forecast:
-    """Times and energies of cores that hold given chunks; what was found for one is kept for others that hold it.
-
-    Parameters
-    ----------
-    needs : Needs
-        Of the network and its chip.
-    activity : Activity
-        What is expected to happen.
-    time, energy : TimeTable, EnergyTable
-        Latencies and prices.
-    """
+    """Times and energies of cores that hold given chunks; what was found for one is kept for others that hold it."""
 
     def __init__(self, needs: Needs, activity: Activity, time: TimeTable, energy: EnergyTable) -> None:
         self.needs = needs
         self.activity = activity
         self.time = time
         self.energy = energy
-        self.rates = tuple(self._mean(spikes) for spikes in activity.spikes)
-        self._input_rates = self._mean(activity.inputs)
+        self.steps = int(activity[INPUT].shape[0])
+        # spikes a step of each population; last, at INPUT, events a step
+        self.rates = tuple(np.asarray(spikes.sum(axis=0)).reshape(-1) / self.steps for spikes in activity)
         self._receiving: dict[tuple[Chunk, int, bool], tuple[FloatArray, float]] = {}
-
-    def _mean(self, spikes: sparse.csc_array) -> FloatArray:
-        mean: FloatArray = np.asarray(spikes.sum(axis=0)).reshape(-1) / self.activity.steps
-        return mean
 
     def joule(self, event: str) -> float:
         """Price of an event; 0 if the table has it in another (Davies: the spike is in the active neuron's)."""
@@ -148,19 +109,18 @@ class Forecast:
         """Picoseconds in which a chunk at `base` receives, shape (steps,); mean joules of its synapses a step."""
         key = (chunk, base, lean)
         if key not in self._receiving:
-            taken, spent = np.zeros(self.activity.steps), 0.0
+            taken, spent = np.zeros(self.steps), 0.0
             ps = np.array([self.time.picoseconds(f"synaptic_operation_{form}") for form in ("sparse", "dense")])
             joule = np.array([self.joule(f"synaptic_operation_{form}") for form in ("sparse", "dense")])
             for lists in self.needs.lists(chunk):
                 projection = self.needs.network.projections[lists.projection]
                 dense, _ = choose_dense(lists, projection, base, chunk.size, lean=lean, target=self.needs.target)
                 entries = np.where(dense, lists.last - lists.first + 1, lists.nonzero)
-                source = self.activity.source(projection.pre)
+                source = self.activity[projection.pre]
                 if len(lists.source) < source.shape[1]:
                     source = source[:, lists.source]
                 taken += source @ (self.time.picoseconds("axon_in") + entries * ps[dense]).astype(np.float64)
-                rates = self._input_rates if projection.pre == INPUT else self.rates[projection.pre]
-                spent += float(rates[lists.source] @ (entries * joule[dense]))
+                spent += float(self.rates[projection.pre][lists.source] @ (entries * joule[dense]))
             self._receiving[key] = taken, spent
         return self._receiving[key]
 
@@ -169,18 +129,17 @@ class Forecast:
         axons = self.needs.out_axons[chunk.population][chunk.first : chunk.last]
         neuron = self.time.picoseconds("neuron_access") + self.time.picoseconds("neuron_update")
         fires = (self.time.picoseconds("spike") + axons * self.time.picoseconds("axon_out")).astype(np.float64)
-        spikes = self.activity.spikes[chunk.population]
+        spikes = self.activity[chunk.population]
         bounds = spikes.indptr[chunk.first : chunk.last + 1]
         step = spikes.indices[bounds[0] : bounds[-1]]
-        taken = np.bincount(step, np.repeat(fires, np.diff(bounds)), self.activity.steps).astype(np.float64)
-        taken += chunk.size * neuron
-        return taken
+        sent = np.bincount(step, np.repeat(fires, np.diff(bounds)), self.steps)
+        return np.asarray(sent, np.float64) + chunk.size * neuron
 
     def core(self, chunks: Core) -> tuple[FloatArray, FloatArray, float]:
         """Sweeping and receiving of a core, each (steps,) picoseconds, and its synapses' joules a step."""
         lean = self.needs.lean(chunks)
-        sweeps, receives, spent = np.zeros(self.activity.steps), np.zeros(self.activity.steps), 0.0
-        base = 0
+        sweeps, receives = np.zeros((2, self.steps))
+        spent, base = 0.0, 0
         for chunk in chunks:
             sweeps += self.sweeping(chunk)
             taken, joule = self.listening(chunk, base, lean=lean)
@@ -192,20 +151,10 @@ class Forecast:
     def charge(self, cores: tuple[Core, ...]) -> None:
         """Charge the sources of a layout with their output axons, as the other methods take them to be."""
         self.needs.forget()
-        self.needs.listen(chunk for core in cores for chunk in core)
+        self.needs.charge(self.needs.source_axons(chunk for core in cores for chunk in core))
 
     def expect(self, parts: Partition, tiles: tuple[int, ...], traffic: FloatArray) -> Expectation:
-        """Time and energy of a placed layout.
-
-        Parameters
-        ----------
-        parts : Partition
-            Chunks of each core.
-        tiles : tuple of int
-            Tile of each core.
-        traffic : (cores, cores) float64
-            Packets per step from each core to each core at the rates of `activity`.
-        """
+        """Time and energy of a placed layout; `traffic` is packets per step, (cores, cores), at ``self.rates``."""
         self.charge(parts.cores)
         loads = [self.core(core) for core in parts.cores]
         sweeps, receives = (np.array([load[i] for load in loads]) for i in (0, 1))
@@ -213,8 +162,8 @@ class Forecast:
         often = np.bincount(longest, minlength=len(loads))
         critical = int(np.argmax(often))
         width = self.needs.target.limit("mesh.width")
-        ways = np.array([[hops(a, b, width) for b in tiles] for a in tiles])
-        crossed = np.einsum("ab,abk->k", traffic, ways)
+        at = np.array(tiles)
+        crossed = np.einsum("ab,abk->k", traffic, np.stack(hops(at[:, None], at, width), axis=-1))
         packets = float(traffic.sum())
         route = (
             packets * self.joule("packet")
@@ -222,13 +171,13 @@ class Forecast:
             + crossed[1] * self.joule("hop_north_south")
         )
         neurons = sum(chunk.size for core in parts.cores for chunk in core)
-        fired = sum(float(rates.sum()) for rates in self.rates)
+        fired = sum(float(rates.sum()) for rates in self.rates[:INPUT])
         spent = neurons * self.joule("neuron_active") + fired * self.joule("spike") + sum(load[2] for load in loads)
         duration = np.maximum(sweeps, receives).max(axis=0).mean() + self.time.barrier(len(set(tiles)))
         return Expectation(
             step_ns=float(duration) / PICOSECONDS,
             critical_core=critical,
-            critical_share=float(often[critical] / self.activity.steps),
+            critical_share=float(often[critical] / self.steps),
             receiving=bool(receives[critical].mean() > sweeps[critical].mean()),
             packets=packets,
             hops=float(crossed.sum()),

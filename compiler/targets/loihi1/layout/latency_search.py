@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from dataclasses import dataclass
-from hashlib import sha256
 
 import numpy as np
 
 from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.targets.loihi1.layout.chips import chip_tiles
 from spikeloom.compiler.targets.loihi1.layout.core_needs import Chunk
 from spikeloom.compiler.targets.loihi1.layout.forecast import Core, Forecast
 from spikeloom.compiler.targets.loihi1.layout.partition import chunks_of, cut, cut_layer, order_on_core
@@ -30,16 +30,13 @@ WORTH = 1e-3
 
 def tiles_for(forecast: Forecast, cores: int) -> int:
     """Most tiles for which the barrier is as short as for the fewest that hold so many cores."""
-    target = forecast.needs.target
-    fewest = -(-cores // target.limit("mesh.tile_cores"))
-    most = target.limit("mesh.width") * target.limit("mesh.height")
-    return max(
-        tiles for tiles in range(fewest, most + 1) if forecast.time.barrier(tiles) == forecast.time.barrier(fewest)
-    )
+    fewest = _fewest_tiles(forecast, cores)
+    shortest, most = forecast.time.barrier(fewest), chip_tiles(forecast.needs.target)
+    return max(tiles for tiles in range(fewest, most + 1) if forecast.time.barrier(tiles) == shortest)
 
 
-def _barrier(forecast: Forecast, cores: int) -> int:
-    return forecast.time.barrier(-(-cores // forecast.needs.target.limit("mesh.tile_cores")))
+def _fewest_tiles(forecast: Forecast, cores: int) -> int:
+    return -(-cores // forecast.needs.target.limit("mesh.tile_cores"))
 
 
 def _score(time: float, cores: int) -> float:
@@ -47,37 +44,30 @@ def _score(time: float, cores: int) -> float:
 
 
 def _busy(forecast: Forecast, core: Core) -> FloatArray:
-    sweeps, receives, _ = forecast.core(core)
-    longest: FloatArray = np.maximum(sweeps, receives)
+    longest: FloatArray = np.maximum(*forecast.core(core)[:2])
     return longest
 
 
 def estimate(forecast: Forecast, cores: list[Core]) -> float:
     """Expected picoseconds of a step, on as few tiles as can be."""
     forecast.charge(tuple(cores))
-    ordered = [order_on_core(forecast.needs, core) for core in cores]
-    return float(np.max([_busy(forecast, core) for core in ordered], axis=0).mean()) + _barrier(forecast, len(cores))
+    busy = [_busy(forecast, order_on_core(forecast.needs, core)) for core in cores]
+    return float(np.max(busy, axis=0).mean()) + forecast.time.barrier(_fewest_tiles(forecast, len(cores)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Trial:
     """Layers cut evenly, each chunk on a core of its own."""
 
-    counts: dict[int, int]  # Chunks of each population
-    chunks: list[Chunk]  # All of them
+    chunks: list[Chunk]
     score: float  # What is made small
-    blamed: int  # Population that takes longest in most steps
+    critical: int  # Population that takes longest in most steps
     longest: float  # Mean picoseconds of the slowest core of the slowest layer
     barrier: int  # Picoseconds
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Cut:
-    """One layer cut: its chunks, picoseconds of the slowest, shape (steps,), and output axons that its sources need."""
-
-    chunks: list[Chunk]
-    slowest: FloatArray
-    source_axons: dict[int, IntArray]
+_Cut = tuple[list[Chunk], FloatArray, dict[int, IntArray]]
+"""Chunks of a layer, picoseconds of the slowest, shape (steps,), and output axons that its sources need."""
 
 
 def _useful(size: int, most: int) -> list[int]:
@@ -95,52 +85,45 @@ class _Search:
     """Cuts that were tried, layer by layer: a layer's depends on nothing but the output axons that it needs."""
 
     def __init__(self, forecast: Forecast) -> None:
-        self.forecast = forecast
-        most = forecast.needs.target.limit("chip.cores")
-        self.useful = [_useful(population.size, most) for population in forecast.needs.network.populations]
+        self.forecast, self.needs = forecast, forecast.needs
+        self.most = self.needs.target.limit("chip.cores")
+        self.useful = [_useful(population.size, self.most) for population in self.needs.network.populations]
         self._cuts: dict[tuple[int, int, bytes], _Cut | None] = {}
 
     def _cut(self, population: int, least: int) -> _Cut | None:
         """Cut a layer into at least so many chunks; None if it needs more."""
-        needs = self.forecast.needs
-        key = population, least, sha256(needs.out_axons[population].tobytes()).digest()
+        key = population, least, self.needs.out_axons[population].tobytes()
         if key not in self._cuts:
+            self._cuts[key] = None
             try:
-                chunks, _ = cut_layer(needs, population, least)
+                chunks, _ = cut_layer(self.needs, population, least)
             except OptionError:
                 chunks = []
-            self._cuts[key] = None
             if chunks:
                 slowest = np.max([_busy(self.forecast, (chunk,)) for chunk in chunks], axis=0)
-                self._cuts[key] = _Cut(chunks=chunks, slowest=slowest, source_axons=needs.source_axons(chunks))
+                self._cuts[key] = chunks, slowest, self.needs.source_axons(chunks)
         return self._cuts[key]
-
-    def _listen(self, found: _Cut) -> None:
-        for pre, axons in found.source_axons.items():
-            self.forecast.needs.out_axons[pre] += axons
 
     def attempt(self, least: dict[int, int]) -> _Trial | None:
         """Judge the cut into so many chunks, or None if there is no such cut."""
-        needs = self.forecast.needs
-        needs.forget()
+        self.needs.forget()
         chunks: list[Chunk] = []
         times = {}
         for population in sorted(least, reverse=True):
             found = self._cut(population, least[population])
             if found is None:
                 return None
-            times[population] = found.slowest
-            chunks += found.chunks
-            self._listen(found)
-        if len(chunks) > needs.target.limit("chip.cores"):
+            chunks += found[0]
+            times[population] = found[1]
+            self.needs.charge(found[2])
+        if len(chunks) > self.most:
             return None
         every = np.array([times[population] for population in sorted(times)])
-        barrier = _barrier(self.forecast, len(chunks))
+        barrier = self.forecast.time.barrier(_fewest_tiles(self.forecast, len(chunks)))
         return _Trial(
-            counts=chunks_of(chunks),
             chunks=sorted(chunks),
             score=_score(float(every.max(axis=0).mean()) + barrier, len(chunks)),
-            blamed=sorted(times)[int(np.argmax(np.bincount(np.argmax(every, axis=0))))],
+            critical=sorted(times)[int(np.argmax(np.bincount(np.argmax(every, axis=0))))],
             longest=float(every.mean(axis=1).max()),
             barrier=barrier,
         )
@@ -153,35 +136,33 @@ class _Search:
 
     def shrink(self) -> list[_Trial]:
         """Fewest cores with which no layer takes longer than some time, for shorter and shorter times."""
-        needs = self.forecast.needs
         trials = []
-        trial = self.attempt(chunks_of(cut(needs, {})))
+        trial = self.attempt(chunks_of(cut(self.needs, {})))
         while trial is not None and trial.longest > 0:
             trials.append(trial)
             allowed = trial.longest * SHORTER
-            counts = dict(trial.counts)
-            needs.forget()
+            counts = chunks_of(trial.chunks)
+            self.needs.forget()
             for population in sorted(counts, reverse=True):
-                while (found := self._cut(population, counts[population])) is None or found.slowest.mean() > allowed:
+                while (found := self._cut(population, counts[population])) is None or found[1].mean() > allowed:
                     more = self._near(population, counts[population], 1)
                     if more is None:
                         return trials
                     counts[population] = more
-                self._listen(found)
+                self.needs.charge(found[2])
             trial = self.attempt(counts)
         return trials
 
     def polish(self, trial: _Trial) -> _Trial:
-        """Change the cores of one layer, or of the blamed one and another, as long as that helps."""
+        """Change the cores of one layer, or of the critical one and another, as long as that helps."""
         while True:
-            before = trial
-            others = sorted(trial.counts)
-            changes = [{a: i} for a in others for i in STRIDES]
-            changes += [{trial.blamed: i, a: j} for a in others if a != trial.blamed for i in STRIDES for j in STRIDES]
+            before, counts, slow = trial, chunks_of(trial.chunks), trial.critical
+            changes = [{a: i} for a in counts for i in STRIDES]
+            changes += [{slow: i, a: j} for a in counts if a != slow for i in STRIDES for j in STRIDES]
             for change in changes:
-                near = {a: self._near(a, before.counts[a], steps) for a, steps in change.items()}
-                counts = before.counts | {a: count for a, count in near.items() if count is not None}
-                other = self.attempt(counts) if len(change) == sum(map(bool, near.values())) else None
+                near = {a: self._near(a, counts[a], steps) for a, steps in change.items()}
+                moved = {a: count for a, count in near.items() if count is not None}
+                other = self.attempt(counts | moved) if len(moved) == len(change) else None
                 if other is not None and other.score < trial.score:
                     trial = other
             if trial is before:

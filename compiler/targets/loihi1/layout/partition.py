@@ -3,8 +3,8 @@
 The integer network is not changed: which neuron sits where has no influence on any spike.
 
 Synaptic memory, axons and compartments are all counted by the rules of the target; the split of a population decides
-how many output axons the populations before it need, so populations are cut from the last to the first. One that hears
-itself needs some for its own chunks, so it is cut again until they are enough.
+how many output axons the populations before it need, so populations are cut from the last to the first. A recurrent one
+needs some for its own chunks, so it is cut again until they are enough.
 """
 
 from __future__ import annotations
@@ -55,11 +55,7 @@ def cut_layer(needs: Needs, population: int, least: int | None = None) -> Cut:
     """Cut one population into full chunks, or as evenly as possible into at least `least`; or say why it cannot be.
 
     A recurrent one is cut until its neurons have output axons for its own chunks, too; finer chunks need more.
-
-    Raises
-    ------
-    OptionError
-        If it needs more than `least` chunks.
+    OptionError if it needs more than `least` chunks.
     """
 
     def once() -> Cut:
@@ -201,12 +197,7 @@ def _spread(needs: Needs, population: int, least: int) -> Cut:
 def cut(needs: Needs, least: Mapping[int, int]) -> list[Chunk]:
     """Cut every population: evenly into at least so many chunks if it is in `least`, else into full ones.
 
-    Raises
-    ------
-    CapacityError
-        If a single neuron exceeds a limit; lists every violation.
-    OptionError
-        If a population needs more chunks than `least` says.
+    CapacityError lists every limit that a single neuron exceeds; OptionError if `least` is too few.
     """
     chunks: list[Chunk] = []
     violations: list[Violation] = []
@@ -215,7 +206,7 @@ def cut(needs: Needs, least: Mapping[int, int]) -> list[Chunk]:
         found, why = cut_layer(needs, population, least.get(population))
         violations = why + violations
         chunks += found
-        needs.listen(found)
+        needs.charge(needs.source_axons(found))
     if violations:
         raise CapacityError(tuple(violations))
     return sorted(chunks)
@@ -227,13 +218,7 @@ def chunks_of(chunks: Iterable[Chunk]) -> dict[int, int]:
 
 
 def arrange(needs: Needs, groups: Iterable[tuple[Chunk, ...]], chips: int = 1) -> Partition:
-    """Put groups of chunks on cores, in order.
-
-    Raises
-    ------
-    CapacityError
-        If the chips have too few cores.
-    """
+    """Put groups of chunks on cores, in order; CapacityError if the chips have too few cores."""
     cores = sorted((order_on_core(needs, group) for group in groups), key=min)
     used = LimitUse(name="chip.cores", used=len(cores), allowed=chips * needs.target.limit("chip.cores"), core=None)
     if used.used > used.allowed:
@@ -251,28 +236,12 @@ def partition(
     shared: bool = False,
     chips: int = 1,
 ) -> Partition:
-    """Assign every neuron to a core.
+    """Assign every neuron to a core, on as few as the cut into chunks allows if the densest of a core comes first.
 
-    Parameters
-    ----------
-    network : IntegerNetwork
-        Integer stage.
-    target : Target
-        Limits of a core and of the chip.
-    rates : tuple of (neurons,) float64, optional
-        Spikes per step of each population, to prefer packings that keep traffic within a core; all equal without.
-    cores_for : mapping of int to int, optional
-        At least so many cores for a population, which is cut as evenly as possible.
-    shared : bool
-        Whether these cores may hold other populations, too.
-    chips : int
-        Number of chips at most.
-
-    Returns
-    -------
-    Partition
-        Fewest cores that the cut into chunks, full ones by default, allows if the densest chunk of a core comes
-        first, searched exhaustively up to ``EXACT_CHUNKS`` chunks.
+    Populations in `cores_for` are cut as evenly as possible into so many chunks at least, each on a core of its own
+    unless cores may be `shared`; the others into full ones. Among equal packings, searched exhaustively up to
+    ``EXACT_CHUNKS`` chunks, the one that keeps most traffic within a core is taken; `rates` are spikes per step
+    (neurons,) of each population, all equal without.
 
     Raises
     ------
@@ -285,9 +254,9 @@ def partition(
     least = cores_for or {}
     chunks = cut(needs, least)
 
-    def traffic(source: Chunk, listener: Chunk) -> float:
+    def traffic(source: Chunk, receiver: Chunk) -> float:
         total = 0.0
-        for lists in needs.lists(listener):
+        for lists in needs.lists(receiver):
             if network.projections[lists.projection].pre == source.population:
                 inside = lists.source[(lists.source >= source.first) & (lists.source < source.last)]
                 total += float(rates[source.population][inside].sum()) if rates is not None else len(inside)

@@ -31,8 +31,6 @@ STARTS = 16
 TIE = 1e-9
 """What a north-south hop costs beyond an east-west one in the search: it decides between equal layouts only."""
 
-Layout = tuple[IntArray, IntArray]
-
 Tiles = TypeVar("Tiles", int, IntArray)
 
 
@@ -47,10 +45,9 @@ class Placement:
 
 
 def core_traffic(network: IntegerNetwork, partition: Partition, rates: tuple[FloatArray, ...] | None) -> FloatArray:
-    """Packets per step from each core to each core; shape (cores, cores).
+    """Packets per step from each core to each core, one for each spike and axon that listens; shape (cores, cores).
 
-    A spike costs one packet per input axon that listens to it. Without `rates` every neuron counts as one spike a
-    step.
+    Without `rates` every neuron counts as one spike a step.
     """
     core_of = [np.zeros(population.size, np.int64) for population in network.populations]
     for core, chunks in enumerate(partition.cores):
@@ -135,7 +132,7 @@ def _improve(between: FloatArray, price: FloatArray, tile_cores: int, site: IntA
 
 def _search(
     between: FloatArray, width: int, height: int, tile_cores: int, known: float
-) -> tuple[Layout | None, float, bool]:
+) -> tuple[tuple[IntArray, IntArray] | None, float, bool]:
     """Branch and bound over the layouts that cost less than `known`, heaviest core first.
 
     Sites are counted from the first core, so layouts that differ by a shift or a reflection are visited once. An
@@ -143,14 +140,8 @@ def _search(
     there is no room left for the cheapest site of every core to come plus the optimum of the cores to come among
     themselves; that one was found before by the same search, which runs over ever longer tails of the cores.
 
-    Returns
-    -------
-    layout : (x, y), each (cores,) int64, or None
-        The best layout found below `known`.
-    bound : float
-        Optimum of the longest tail that was searched to its end: no layout costs less.
-    complete : bool
-        Whether all were searched, so that the better of `layout` and `known` is optimal.
+    Given back are columns and rows of the best layout below `known`, if there is one; the optimum of the longest tail
+    that was searched to its end, below which no layout costs; and whether all were searched.
     """
     cores = len(between)
     span_x, span_y = min(width, cores) - 1, min(height, cores) - 1
@@ -207,28 +198,21 @@ def _search(
     whole = found and first == 0
     place_of = np.empty(cores, np.int64)
     place_of[order] = layout
-    return (
-        (x[place_of] - x[place_of].min(), y[place_of] - y[place_of].min()) if whole else None,
-        float(among.max()),
-        steps <= EXACT_STEPS,
-    )
+    column, row = x[place_of], y[place_of]
+    return (column - column.min(), row - row.min()) if whole else None, float(among.max()), steps <= EXACT_STEPS
 
 
 def place(traffic: FloatArray, target: Target) -> Placement:
     """Choose tiles of least spikes times hops; among equal ones those with more of the cheaper east-west hops.
 
     A layout is grown and improved change by change, then branch and bound looks for a better one. At the size of a
-    tactile network (up to nine cores) that ends with a proof; at more it may stop after ``EXACT_STEPS``.
-
-    Parameters
-    ----------
-    traffic : (cores, cores) float64
-        Packets per step.
-    target : Target
-        Mesh size and cores per tile; there must be a place for every core.
+    tactile network (up to nine cores) that ends with a proof; at more it may stop after ``EXACT_STEPS``. `traffic` is
+    packets per step, (cores, cores).
     """
-    width, height = target.limit("mesh.width"), target.limit("mesh.height")
-    tile_cores = target.limit("mesh.tile_cores")
+    return _place(traffic, target.limit("mesh.width"), target.limit("mesh.height"), target.limit("mesh.tile_cores"))
+
+
+def _place(traffic: FloatArray, width: int, height: int, tile_cores: int) -> Placement:
     between = traffic + traffic.T
     np.fill_diagonal(between, 0)
     cores = len(between)
@@ -247,30 +231,17 @@ def place(traffic: FloatArray, target: Target) -> Placement:
 
 
 def place_within(traffic: FloatArray, target: Target, tiles: int) -> Placement:
-    """Choose tiles as :func:`place` does, but at most so many; of several that fit the best rectangle is taken.
-
-    Parameters
-    ----------
-    traffic : (cores, cores) float64
-        Packets per step.
-    target : Target
-        Mesh size and cores per tile.
-    tiles : int
-        Enough for the cores.
-    """
+    """Choose tiles as :func:`place` does, but at most so many; of several that fit the best rectangle is taken."""
     free = place(traffic, target)
     if len(set(free.tiles)) <= tiles:
         return free
     width, height = target.limit("mesh.width"), target.limit("mesh.height")
+    tile_cores = target.limit("mesh.tile_cores")
     found = []
     for columns in range(1, min(width, tiles) + 1):
         rows = min(height, tiles // columns)
-        if columns * rows * target.limit("mesh.tile_cores") >= len(traffic):
-            limits = {
-                rule: replace(target.limits[rule], value=value)
-                for rule, value in (("mesh.width", columns), ("mesh.height", rows))
-            }
-            inside = place(traffic, replace(target, limits={**target.limits, **limits}))
+        if columns * rows * tile_cores >= len(traffic):
+            inside = _place(traffic, columns, rows, tile_cores)
             moved = tuple(tile // columns * width + tile % columns for tile in inside.tiles)
             found.append(replace(inside, tiles=moved))
     return min(found, key=lambda placement: placement.spike_hops, default=free)

@@ -21,7 +21,7 @@ from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX, reach, step_units
 from spikeloom.compiler.ir import Form
 from spikeloom.compiler.passes.calibrate import Calibration
 from spikeloom.compiler.targets.loihi1.storage.scales import FloatLayer, Rounded, flips
-from spikeloom.compiler.targets.loihi1.storage.weight_storage import scales, store
+from spikeloom.compiler.targets.loihi1.storage.weight_storage import in_registers, scales
 from spikeloom.compiler.types import FloatArray, IntArray
 
 DAMPING = 1e-3
@@ -41,14 +41,14 @@ def compensated(layer: FloatLayer, form: Form, calibration: Calibration) -> Roun
     population, projections, post = layer.population, layer.projections, layer.post
     scale, step = scales(population, form), step_units(form.bits, form.exponents)
     offset, width = 0, sum(p.weight.shape[1] for p in projections)
-    wanted, stored = np.zeros((2, population.size, width))
+    wanted, connected = np.zeros((population.size, width)), np.zeros((population.size, width), np.bool_)
     places, sources = [], []
     limit = reach(form.bits, form.exponents)
     for p in projections:
         row = np.repeat(np.arange(population.size), np.diff(p.weight.indptr))
         place = row, offset + p.weight.indices
         wanted[place] = p.weight.data * scale[row] / step
-        stored[place] = 1
+        connected[place] = True
         places.append(place)
         sources.append(calibration.source(p.pre, post).reshape(-1, p.weight.shape[1]))
         offset += p.weight.shape[1]
@@ -57,14 +57,16 @@ def compensated(layer: FloatLayer, form: Form, calibration: Calibration) -> Roun
     together = (active.T @ active).toarray().astype(np.float64) / active.shape[0]
     rate = np.diag(together)
     steps = np.zeros(wanted.shape, np.int64)
-    for rows, columns in _alike(stored):
-        part = np.ix_(rows, columns)
+    kinds, kind = np.unique(connected, axis=0, return_inverse=True)
+    for index, inputs in enumerate(kinds):  # neurons with synapses from the same inputs are rounded together
+        columns = np.flatnonzero(inputs)
+        part = np.ix_(np.flatnonzero(kind == index), columns)
         steps[part] = np.clip(_round_in_turn(held[part], together[np.ix_(columns, columns)]), -limit, limit)
 
     def stored_as(steps: IntArray, errors: FloatArray) -> Rounded | None:
         try:
             bias = population.bias + errors
-            integer, planes = store(population, projections, form, [steps[place] for place in places], bias)
+            integer, planes = in_registers(population, projections, form, [steps[place] for place in places], bias)
         except ValueError:
             return None
         reached = float(np.max(layer.sums(integer, planes), initial=0))
@@ -84,23 +86,10 @@ def compensated(layer: FloatLayer, form: Form, calibration: Calibration) -> Roun
     return stored_as(steps, errors)
 
 
-def _alike(stored: FloatArray) -> list[tuple[IntArray, IntArray]]:
-    """Neurons with synapses from the same inputs, and these inputs."""
-    groups: dict[bytes, list[int]] = {}
-    for row in range(len(stored)):
-        groups.setdefault(stored[row].tobytes(), []).append(row)
-    return [(np.array(rows), np.flatnonzero(stored[rows[0]])) for rows in groups.values()]
-
-
 def _round_in_turn(weight: FloatArray, together: FloatArray) -> FloatArray:
     """Round columns one after the other, the most active first, each error passed on to the columns that follow.
 
-    Parameters
-    ----------
-    weight : (neurons, inputs) float64
-        In steps.
-    together : (inputs, inputs) float64
-        Mean of ``x x^T``.
+    Weights (neurons, inputs) are in steps; `together` (inputs, inputs) is the mean of ``x x^T``.
     """
     inputs = weight.shape[1]
     order = np.argsort(-np.diag(together), kind="stable")

@@ -1,6 +1,6 @@
 """Scales of one population: the finest that the accumulator allows, one for all neurons or one for each group.
 
-Nothing here looks at the rest of the network; :mod:`storage.quantize` chooses among what is found here.
+Nothing here looks at the rest of the network; :mod:`storage.choose_storage` chooses among what is found here.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from spikeloom.compiler.fixedpoint import (
 from spikeloom.compiler.interpret import BATCH, integer_recurrence, integer_sums, lasting_currents, product
 from spikeloom.compiler.ir import Form, IntegerPopulation, IntegerProjection, Network, Population, Projection, Sparse
 from spikeloom.compiler.passes.calibrate import Calibration
-from spikeloom.compiler.targets.loihi1.options import Recipe
+from spikeloom.compiler.targets.loihi1.options import Packing
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import loads, round_population
 from spikeloom.compiler.types import FloatArray, IntArray
 
@@ -50,8 +50,7 @@ class FloatLayer:
     projections: tuple[Projection, ...]
     post: int  # Its index in the network
     calibration: Calibration | None = None  # Spikes of the float model
-    # (neurons,) float64, optional; largest sums that were observed, membrane units, see :func:`observed_sums`; without
-    # it the proven ones count
+    # Largest sums of each neuron that were observed, see :func:`observed_sums`; without them the proven ones count
     observed: FloatArray | None = None
 
     def sums(self, integer: IntegerPopulation, planes: tuple[IntegerProjection, ...]) -> FloatArray:
@@ -99,9 +98,9 @@ def rounded(layer: FloatLayer, form: Form) -> Rounded | None:
 
 def _relays_follow(population: Population, integer: IntegerPopulation, planes: tuple[IntegerProjection, ...]) -> bool:
     """Whether the one synapse of every relay crosses its threshold."""
-    last = slice(population.size - population.relays, population.size)
-    weight = sum(np.asarray(plane.effective()[last].sum(axis=1)) for plane in planes)
-    return bool(np.all(weight > integer.threshold[last]))
+    first = population.size - population.relays
+    weight = sum(np.asarray(plane.effective()[first:].sum(axis=1)) for plane in planes)
+    return bool(np.all(weight > integer.threshold[first:]))
 
 
 def in_batches(calibration: Calibration, measure: Callable[[slice], IntArray | FloatArray]) -> list[FloatArray]:
@@ -128,8 +127,7 @@ def observed_sums(layer: FloatLayer, calibration: Calibration) -> FloatArray:
             both = np.maximum(both, np.abs(lasting).max(axis=(0, 1)) * narrower)
         return both
 
-    found: FloatArray = np.max(in_batches(calibration, largest), axis=0)
-    return found
+    return np.asarray(np.max(in_batches(calibration, largest), axis=0))
 
 
 def flips(layer: Rounded, post: int, calibration: Calibration) -> IntArray:
@@ -141,31 +139,23 @@ def flips(layer: Rounded, post: int, calibration: Calibration) -> IntArray:
     def moved(part: slice) -> IntArray:
         sums = sum(integer_sums(weight, calibration.source(pre, post)[part]) for pre, weight in merged.items())
         spikes, _ = integer_recurrence(layer.population, np.asarray(sums))
-        differ: IntArray = np.count_nonzero(spikes != calibration.spikes[post][part], axis=(0, 1))
-        return differ
+        return np.asarray(np.count_nonzero(spikes != calibration.spikes[post][part], axis=(0, 1)))
 
-    total: IntArray = np.sum(in_batches(calibration, moved), axis=0).astype(np.int64)
-    return total
+    return np.asarray(np.sum(in_batches(calibration, moved), axis=0), np.int64)
 
 
-def planes_from(exponent: int, bits: int, planes: int, exponents: tuple[int, ...]) -> tuple[int, ...]:
-    """Exponents of up to `planes` planes from a finest one, as far apart as leaves no gap.
+def planes_from(exponent: int, bits: int, planes: int, largest: int) -> tuple[int, ...]:
+    """Exponents of up to `planes` planes from a finest one, up to `largest`, as far apart as leaves no gap.
 
     Examples
     --------
-    >>> planes_from(-1, 8, 2, tuple(range(-1, 8))), planes_from(3, 8, 3, tuple(range(-1, 8)))
+    >>> planes_from(-1, 8, 2, 7), planes_from(3, 8, 3, 7)
     ((-1, 6), (3, 7))
     """
     found = [exponent]
-    while len(found) < planes and found[-1] < max(exponents):
-        found.append(min(found[-1] + plane_distance(bits), max(exponents)))
+    while len(found) < planes and found[-1] < largest:
+        found.append(min(found[-1] + plane_distance(bits), largest))
     return tuple(found)
-
-
-def full_scale(layer: FloatLayer, bits: int, planes: tuple[int, ...]) -> float:
-    """Mantissa units per membrane unit at which the planes just hold the largest weight."""
-    peak = float(layer.peaks().max(initial=0))
-    return reach(bits, planes) * weight_step(bits) / peak if peak else 1.0 / layer.population.theta
 
 
 def _largest_threshold(population: Population) -> float:
@@ -178,9 +168,10 @@ def _largest_threshold(population: Population) -> float:
 def fit(layer: FloatLayer, bits: int, exponents: tuple[int, ...], mantissa_scale: float) -> Rounded | None:
     """Population with the finest scale up to `mantissa_scale` that stays within the accumulator.
 
-    A threshold is a whole number of weight units. Only scales at which it is one exactly are tried, so it carries
-    no rounding at all; that costs at most one unit of scale in ``theta * scale``. Rounded weights, and so their sum,
-    never shrink when the scale grows: the finest scale (to one part in ``SCALE_STEPS``) is closed in from both sides.
+    Scales are in mantissa units of the finest plane per membrane unit. A threshold is a whole number of weight units.
+    Only scales at which it is one exactly are tried, so it carries no rounding at all; that costs at most one unit of
+    scale in ``theta * scale``. Rounded weights, and so their sum, never shrink when the scale grows: the finest scale
+    (to one part in ``SCALE_STEPS``) is closed in from both sides.
     """
     population = layer.population
 
@@ -217,16 +208,18 @@ def mantissa_scale(layer: Rounded) -> float:
     return float(layer.population.scale.min()) / 2.0 ** layer.form.exponents[0]
 
 
-def candidate(layer: FloatLayer, recipe: Recipe, factor: float, exponents: tuple[int, ...]) -> Rounded | None:
+def candidate(layer: FloatLayer, packing: Packing, factor: float, exponents: tuple[int, ...]) -> Rounded | None:
     """Best compromise between a fine weight scale and a fine threshold, see ``WORTHWHILE``.
 
     `factor` says how far the scale may exceed the one that just holds the largest weight; the rest is clipped.
     """
+    bits, peak = packing.bits, float(layer.peaks().max(initial=0))
     chosen: Rounded | None = None
     finest = 0.0
     for exponent in sorted(exponents):
-        stored = planes_from(exponent, recipe.bits, recipe.planes, exponents)
-        fitted = fit(layer, recipe.bits, stored, full_scale(layer, recipe.bits, stored) * factor)
+        stored = planes_from(exponent, bits, packing.planes, max(exponents))
+        held = reach(bits, stored) * weight_step(bits) / peak if peak else 1.0 / layer.population.theta
+        fitted = fit(layer, bits, stored, held * factor)
         if fitted is None and chosen is None:
             continue  # the threshold is less than a unit, a larger exponent makes it more
         if fitted is None or mantissa_scale(fitted) < WORTHWHILE * finest:
@@ -240,13 +233,7 @@ def candidate(layer: FloatLayer, recipe: Recipe, factor: float, exponents: tuple
 
 
 def finest_thresholds(layer: FloatLayer, bits: int, exponents: tuple[int, ...], factor: float = 1.0) -> IntArray:
-    """Largest threshold of each neuron that accumulator and registers allow, and `factor` beyond its largest weight.
-
-    Returns
-    -------
-    (neurons,) int64
-        0 where there is none.
-    """
+    """Largest threshold of each neuron that registers allow, and `factor` beyond its largest weight; 0 if none."""
     population = layer.population
     with np.errstate(divide="ignore"):
         held = population.theta * reach(bits, exponents) * step_units(bits, exponents) * factor / layer.peaks()
@@ -300,34 +287,32 @@ def group_by_fineness(finest: IntArray, groups: int) -> IntArray:
 def choose_levels(cost: FloatArray, groups: int) -> IntArray:
     """Pick at most `groups` columns so that the sum over rows of the cheapest picked entry is least, by exchange.
 
-    Parameters
-    ----------
-    cost : (neurons, levels) float64
-        Infinite where a level is not allowed; the first level is allowed for every row.
+    `cost` is (neurons, levels), infinite where a level is not allowed; the first is allowed for every row.
 
     Examples
     --------
     >>> choose_levels(np.array([[1.0, 0.0, np.inf], [2.0, 2.0, 0.0], [0.0, 5.0, 5.0]]), 2).tolist()
     [0, 2]
     """
-    picked = [0]
-    best = cost[:, 0]
+
+    def best_beside(others: list[int]) -> tuple[int, float]:
+        cheapest = cost[:, others].min(axis=1, initial=np.inf)
+        sums = np.minimum(cheapest[:, None], cost).sum(axis=0)
+        return int(np.argmin(sums)), float(sums.min())
+
+    picked, total = [0], float(cost[:, 0].sum())
     while len(picked) < min(groups, cost.shape[1]):
-        gains = np.minimum(best[:, None], cost).sum(axis=0)
-        level = int(np.argmin(gains))
-        if gains[level] >= best.sum():
+        level, less = best_beside(picked)
+        if less >= total:
             break
-        picked.append(level)
-        best = np.minimum(best, cost[:, level])
+        picked, total = [*picked, level], less
     improved = True
     while improved:
         improved = False
         for i in range(len(picked)):
-            others = cost[:, picked[:i] + picked[i + 1 :]].min(axis=1, initial=np.inf)
-            sums = np.minimum(others[:, None], cost).sum(axis=0)
-            level = int(np.argmin(sums))
-            if sums[level] < cost[:, picked].min(axis=1).sum():
-                picked[i], improved = level, True
+            level, less = best_beside(picked[:i] + picked[i + 1 :])
+            if less < total:
+                picked[i], total, improved = level, less, True
     return np.array(sorted(set(picked)))
 
 

@@ -6,7 +6,6 @@ moves a spike, the whole network does not. Where spikes still move, it is said w
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,8 +16,8 @@ from spikeloom.compiler.interpret import float_recurrence, product
 from spikeloom.compiler.ir import IntegerNetwork, Network
 from spikeloom.compiler.passes.calibrate import Calibration, fewer
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.targets.loihi1.options import Recipe
-from spikeloom.compiler.targets.loihi1.storage.quantize import (
+from spikeloom.compiler.targets.loihi1.options import Packing
+from spikeloom.compiler.targets.loihi1.storage.choose_storage import (
     Candidate,
     Choice,
     assemble,
@@ -44,66 +43,35 @@ class Exactness:
     layer: str  # Population
     # In order, on ``calibrate.FEW`` recordings; the best was taken, and rounded anew on ``calibrate.MANY``
     tried: tuple[tuple[int, int, int], ...]
-    # flips, spikes: Spikes that move in what was taken, and all spikes of the float64 model, on all calibration
-    # recordings
-    flips: int
-    spikes: int
+    flips: int  # Spikes that move in what was taken, on all calibration recordings
+    spikes: int  # All spikes of the float64 model
     limits: tuple[tuple[str, int], ...]  # Spikes that still move, by what keeps their neuron's scale from being finer
     decay: int  # Spikes that move if nothing but the 12-bit decay deviates
 
 
 def make_exact(
-    network: Network,
-    target: Target,
-    calibration: Calibration,
-    *,
-    bits: int = 8,
-    tell: Callable[[str], None] = lambda _what: None,
+    network: Network, target: Target, calibration: Calibration, *, bits: int = 8
 ) -> tuple[IntegerNetwork, tuple[Choice, ...], tuple[Exactness, ...]]:
-    """Choose planes and scales of every population.
+    """Choose planes and scales of every population by float64 spikes on all training recordings.
 
-    Parameters
-    ----------
-    network : Network
-        Float stage.
-    target : Target
-        Permitted widths, exponents and thresholds.
-    calibration : Calibration
-        Float64 spikes on all training recordings.
-    bits : int
-        Storage width of a mantissa.
-    tell : callable
-        Told the name of each population as it starts.
-
-    Returns
-    -------
-    IntegerNetwork
-        Integer stage.
-    tuple of Choice, tuple of Exactness
-        One per population.
-
-    Raises
-    ------
-    ModelError
-        If a population has no usable scale.
+    ModelError if a population has no usable scale at so many `bits` of a mantissa.
     """
     slots = target.limit("core.threshold_slots")
     steps = (1, 1), (2, 1), (2, slots), (3, slots)
-    ladder = [Recipe(bits=bits, planes=planes, groups=groups) for planes, groups in steps]
+    ladder = [Packing(bits=bits, planes=planes, groups=groups) for planes, groups in steps]
     exponents = target.choices["synapse.exponent"]
     few = fewer(calibration)
     chosen, found = [], []
     layers = [layer_of(network, post, few) for post in range(len(network.populations))]
     for layer in layers:
-        tell(layer.population.name)
         best: Candidate | None = None
         tried: list[tuple[int, int, int]] = []
-        for recipe in ladder:
-            if recipe.planes > 2 and best is not None and not _full_range(layer, best).any():
+        for packing in ladder:
+            if packing.planes > 2 and best is not None and not _full_range(layer, best).any():
                 break  # the planes hold every weight already
-            candidate = shortlist(layer, recipe, exponents, clip=False)[0]
+            candidate = shortlist(layer, packing, exponents, clip=False)[0]
             moved = candidate.flips or 0
-            tried.append((recipe.planes, recipe.groups, moved))
+            tried.append((packing.planes, packing.groups, moved))
             if best is None or moved <= (best.flips or 0):
                 best = candidate
             if not moved and not flips(candidate.layer, layer.post, calibration).any():
@@ -152,11 +120,12 @@ def _decay_flips(layer: FloatLayer, calibration: Calibration) -> int:
     """Spikes that move if nothing but the decays is rounded."""
     alpha, beta = kept_shares(*decay_registers(layer.population.beta, layer.population.alpha))
     realised = replace(layer.population, alpha=alpha, beta=beta)
+    wanted = calibration.spikes[layer.post]
     sources = [(p.weight, calibration.source(p.pre, layer.post)) for p in layer.projections]
 
     def moved(part: slice) -> IntArray:
         sums = sum(product(weight, spikes[part], np.float64) for weight, spikes in sources)
         spikes, _ = float_recurrence(realised, np.asarray(sums))
-        return np.asarray(np.count_nonzero(spikes != calibration.spikes[layer.post][part]))
+        return np.asarray(np.count_nonzero(spikes != wanted[part]))
 
     return int(np.sum(in_batches(calibration, moved)))

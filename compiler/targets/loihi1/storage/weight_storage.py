@@ -50,29 +50,15 @@ def scales(population: Population, form: Form) -> FloatArray:
 
 
 def store_steps(projection: Projection, steps: IntArray, form: Form) -> tuple[IntegerProjection, ...]:
-    """One integer projection for each plane in use; the finest holds every structural synapse.
-
-    Parameters
-    ----------
-    steps : (synapses,) int64
-        Weights in steps of the finest plane, in the order of the projection's synapses.
-    """
-    stored = []
-    for plane, mantissa in enumerate(split_planes(steps, form.bits, form.exponents)):
+    """One integer projection for each plane in use; the finest holds every structural synapse."""
+    pre, post, stored = projection.pre, projection.post, list[IntegerProjection]()
+    for exponent, mantissa in zip(form.exponents, split_planes(steps, form.bits, form.exponents), strict=True):
         weight = with_data(projection.weight, mantissa.astype(MANTISSA))
-        if plane:
+        if stored:
             weight = weight.copy()
             weight.eliminate_zeros()
-        if not plane or weight.nnz:
-            stored.append(
-                IntegerProjection(
-                    pre=projection.pre,
-                    post=projection.post,
-                    weight=weight,
-                    exponent=form.exponents[plane],
-                    bits=form.bits,
-                )
-            )
+        if weight.nnz or not stored:
+            stored.append(IntegerProjection(pre=pre, post=post, weight=weight, exponent=exponent, bits=form.bits))
     return tuple(stored)
 
 
@@ -87,26 +73,16 @@ def nearest_steps(population: Population, projection: Projection, form: Form) ->
     return steps
 
 
-def store(
+def in_registers(
     population: Population,
     projections: tuple[Projection, ...],
     form: Form,
     steps: Sequence[IntArray],
     bias: FloatArray | None = None,
 ) -> tuple[IntegerPopulation, tuple[IntegerProjection, ...]]:
-    """Registers of one population and its synapses, whose weights are given in steps.
+    """Registers of one population and its synapses, whose weights are given in steps, an array for each projection.
 
-    Parameters
-    ----------
-    steps : sequence of (synapses,) int64
-        One array per projection.
-    bias : (neurons,) float64, optional
-        Instead of the population's, model units.
-
-    Raises
-    ------
-    ValueError
-        If a bias has no register value at this scale.
+    A `bias` (neurons,), in model units, is taken instead of the population's. ValueError if one has no register value.
     """
     scale = scales(population, form)
     wanted = population.bias if bias is None else bias
@@ -131,8 +107,8 @@ def store(
 def round_population(
     population: Population, projections: tuple[Projection, ...], form: Form
 ) -> tuple[IntegerPopulation, tuple[IntegerProjection, ...]]:
-    """Registers of one population and its synapses, everything rounded to the nearest; raises as :func:`store`."""
-    return store(population, projections, form, [nearest_steps(population, p, form) for p in projections])
+    """The same with every weight rounded to the nearest."""
+    return in_registers(population, projections, form, [nearest_steps(population, p, form) for p in projections])
 
 
 def current_load(decay_u: int) -> float:

@@ -21,13 +21,13 @@ from spikeloom.compiler.passes.prune import compact, disconnect, either, never_f
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.layout.core_needs import Needs
 from spikeloom.compiler.targets.loihi1.layout.partition import partition
-from spikeloom.compiler.targets.loihi1.options import Recipe, check_recipes
-from spikeloom.compiler.targets.loihi1.storage.quantize import Candidate, assemble, settle, shortlist
+from spikeloom.compiler.targets.loihi1.options import Packing, check_packings
+from spikeloom.compiler.targets.loihi1.storage.choose_storage import Candidate, assemble, settle, shortlist
 from spikeloom.compiler.targets.loihi1.storage.scales import layer_of
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 
 Widths = tuple[int, ...]
-"""Storage width of each layer."""
+"""Packing width of each layer."""
 
 Offers = list[dict[int, list[Candidate]]]
 """Scales worth a closer look of each layer, best first, by width; widest width first."""
@@ -58,13 +58,7 @@ class WidthSearch:
 
 
 def check_widths(widths: Sequence[int], groups: int, layers: int, target: Target) -> Widths:
-    """Widths to search, each once, narrowest first.
-
-    Raises
-    ------
-    OptionError
-        If the chip has no such storage.
-    """
+    """Widths to search, each once, narrowest first; OptionError if the chip has no such storage."""
     allowed = target.choices["synapse.weight_bits"]
     for width in widths:
         if width not in allowed:
@@ -72,7 +66,7 @@ def check_widths(widths: Sequence[int], groups: int, layers: int, target: Target
             raise OptionError(
                 f"--widths {given}: {target.title} does not store {width} bits; allowed: {', '.join(map(str, allowed))}"
             )
-    check_recipes((Recipe(bits=widths[0], groups=groups),), layers, target)
+    check_packings((Packing(bits=widths[0], groups=groups),), layers, target)
     return tuple(sorted(set(widths)))
 
 
@@ -117,12 +111,8 @@ def search_widths(
         spaced, are decided.
     labels : (recordings,) int64
         Class of each, -1 where it is not known.
-    widths : sequence of int
-        Storage widths of a mantissa.
-    groups : int
-        Different scales in a layer, at most.
-    samples : int
-        Recordings to decide.
+    widths, groups
+        Packing widths of a mantissa; different scales in a layer, at most.
     lengths : (recordings,) int64, optional
         Steps of each recording that count.
     tell : callable, optional
@@ -130,10 +120,8 @@ def search_widths(
 
     Raises
     ------
-    DataError, OptionError
-        If the recordings or the widths cannot be used.
-    ModelError
-        If a layer has no usable scale at any width.
+    DataError, OptionError, ModelError
+        If the recordings or the widths cannot be used, or a layer has no usable scale at any width.
     """
     widths = check_widths(widths, groups, len(network.populations), target)
     tell("running the float model")
@@ -204,8 +192,8 @@ def _offers(network: Network, target: Target, widths: Widths, groups: int, calib
         faults: list[ModelError] = []
         for bits in reversed(widths):
             try:
-                recipe = Recipe(bits=bits, groups=groups)
-                offer[bits] = shortlist(layer_of(network, post, calibration), recipe, exponents)
+                packing = Packing(bits=bits, groups=groups)
+                offer[bits] = shortlist(layer_of(network, post, calibration), packing, exponents)
             except ModelError as error:
                 faults.append(error)
         if not offer:

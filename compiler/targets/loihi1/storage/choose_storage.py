@@ -19,7 +19,7 @@ from spikeloom.compiler.interpret import run_integer
 from spikeloom.compiler.ir import Form, IntegerNetwork, Network, Population, row_parts
 from spikeloom.compiler.passes.calibrate import MANY, Calibration, fewer
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.targets.loihi1.options import MARGIN, RANGES, Recipe, check_recipes
+from spikeloom.compiler.targets.loihi1.options import MARGIN, RANGES, Packing, check_packings
 from spikeloom.compiler.targets.loihi1.storage.compensate import compensated
 from spikeloom.compiler.targets.loihi1.storage.scales import (
     FloatLayer,
@@ -45,25 +45,19 @@ class Choice:
     """The storage that was chosen for one population, and why."""
 
     layer: str  # Population
-    # bits, planes, groups: Width of a mantissa, times that a synapse is stored at most, different scales
-    bits: int
-    planes: int
-    groups: int
+    bits: int  # Width of a mantissa
+    planes: int  # Times that a synapse is stored at most
+    groups: int  # Different scales
     exponent: int  # Exponent of the finest plane
-    # scale, finest_scale: Weight units (mantissa times 2**exponent) per membrane unit of the model, of the coarsest and
-    # of the finest group
-    scale: float
-    finest_scale: float
-    # clipped, zeroed, weights: Weights that the range cuts off, those that round to zero, and all that are not zero
-    clipped: int
-    zeroed: int
-    weights: int
+    scale: float  # Weight units (mantissa times 2**exponent) per membrane unit of the model, of the coarsest group
+    finest_scale: float  # The same of the finest group
+    clipped: int  # Weights that the range cuts off
+    zeroed: int  # Weights that round to zero
+    weights: int  # All that are not zero
     compensated: bool  # Whether weights were rounded so that their errors cancel, rather than each to the nearest
     candidates: int  # Scales that were compared
-    # flips, spikes: Calibration spikes that differ from float64, and how many the float64 model has; None without
-    # calibration
-    flips: int | None
-    spikes: int | None
+    flips: int | None  # Calibration spikes that differ from float64; None without calibration
+    spikes: int | None  # Calibration spikes of the float64 model
     # Share of the accumulator that the worst case (proven) or the largest observed step leaves free; of the current's
     # register where a current that outlasts its step fills that sooner
     headroom: float
@@ -89,33 +83,28 @@ def _moved(stored: Rounded, layer: FloatLayer) -> int | None:
     return None if layer.calibration is None else int(flips(stored, layer.post, layer.calibration).sum())
 
 
-def shortlist(layer: FloatLayer, recipe: Recipe, exponents: tuple[int, ...], *, clip: bool = True) -> list[Candidate]:
-    """Scales of one population worth a closer look, best first; a single one without calibration.
+def shortlist(layer: FloatLayer, packing: Packing, exponents: tuple[int, ...], *, clip: bool = True) -> list[Candidate]:
+    """Scales of one population worth a closer look, best first; a single one without calibration, else ModelError.
 
     Without `clip` every weight must fit its planes.
-
-    Raises
-    ------
-    ModelError
-        If there is none.
     """
     population = layer.population
-    factors = CLIPPING if clip and layer.calibration is not None and recipe.planes == 1 else (1.0,)
-    fitted = [candidate(layer, recipe, factor, exponents) for factor in factors]
+    factors = CLIPPING if clip and layer.calibration is not None and packing.planes == 1 else (1.0,)
+    fitted = [candidate(layer, packing, factor, exponents) for factor in factors]
     # one scale at two exponents is two candidates: mantissas and clipping differ
     found = list({(c.form.exponents, int(c.form.threshold[0])): c for c in fitted if c is not None}.values())
     if not found:
         register = _register(population)
         lasting = f" and its current, of which a step keeps {population.alpha:g}, within its register"
         raise ModelError(
-            f"{population.name}: no scale at {recipe.bits} bits keeps its threshold of at least one unit within the "
+            f"{population.name}: no scale at {packing.bits} bits keeps its threshold of at least one unit within the "
             f"accumulator ({ONE_STEP_SUM_MAX} units a step){lasting if register == 'current' else ''}; use more bits "
             "or smaller weights"
         )
     counted = [Candidate(layer=stored, flips=_moved(stored, layer), tried=len(found)) for stored in found]
     counted.sort(key=_fewest)
-    if recipe.groups > 1:
-        several = grouped(layer, counted[0].layer, recipe.groups, factors[-1])
+    if packing.groups > 1:
+        several = grouped(layer, counted[0].layer, packing.groups, factors[-1])
         if several is not None:
             several_scales = replace(counted[0], layer=several, flips=_moved(several, layer))
             counted = [min(several_scales, counted[0], key=_fewest)]
@@ -203,62 +192,42 @@ def explain_choice(layer: FloatLayer, chosen: Candidate) -> Choice:
     )
 
 
-def quantize(
+def choose_storage(
     network: Network,
     target: Target,
     *,
-    recipes: Sequence[Recipe] = (Recipe(),),
+    packings: Sequence[Packing] = (Packing(),),
     calibration: Calibration | None = None,
     ranges: str = "proven",
     margin: float = MARGIN,
 ) -> tuple[IntegerNetwork, tuple[Choice, ...]]:
     """Choose the scales of each population and round weights, thresholds, biases and decays.
 
-    Parameters
-    ----------
-    network : Network
-        Float stage.
-    target : Target
-        Permitted widths and exponents.
-    recipes : sequence of Recipe
-        Storage of each population, or one for all.
-    calibration : Calibration, optional
-        Float spikes on training recordings: ``calibrate.FEW`` of them choose, several planes use ``MANY``. Without it
-        scales come from the weights and the proven bounds alone.
-    ranges : {"proven", "observed"}
-        ``proven`` keeps the accumulator in range for any input; ``observed`` only for what the calibration
-        recordings bring, plus `margin`, and leaves the check to the simulator.
-    margin : float
-        Share added to an observed range.
-
-    Returns
-    -------
-    IntegerNetwork
-        Integer stage.
-    tuple of Choice
-        One per population.
+    ``calibrate.FEW`` recordings of the calibration choose, several planes use ``MANY``; without it scales come from the
+    weights and the proven bounds alone. Proven `ranges` keep the accumulator in range for any input, observed ones only
+    for what the calibration recordings bring, plus a share `margin`, and leave the check to the simulator.
 
     Raises
     ------
     OptionError
-        If the recipes or `ranges` do not exist, or ``observed`` lacks a calibration.
+        If the packings or `ranges` do not exist, or ``observed`` lacks a calibration.
     ModelError
-        If a population has no usable scale.
+        If populations have no usable scale; a line for each.
     """
-    recipes = check_recipes(recipes, len(network.populations), target)
+    packings = check_packings(packings, len(network.populations), target)
     if ranges not in RANGES:
         raise OptionError(f"--ranges {ranges}: unknown; allowed: {', '.join(RANGES)}")
     if ranges == "observed" and calibration is None:
         raise OptionError("--ranges observed: nothing was observed; give --calibrate, or use --ranges proven")
     exponents = target.choices["synapse.exponent"]
     few = None if calibration is None else fewer(calibration)
-    layers = [layer_of(network, post, few) for post in range(len(recipes))]
+    layers = [layer_of(network, post, few) for post in range(len(packings))]
     if ranges == "observed" and few is not None:
         layers = [replace(layer, observed=observed_sums(layer, few) * (1 + margin)) for layer in layers]
     shortlists, faults = [], []
-    for layer, recipe in zip(layers, recipes, strict=True):
+    for layer, packing in zip(layers, packings, strict=True):
         try:
-            shortlists.append(shortlist(layer, recipe, exponents))
+            shortlists.append(shortlist(layer, packing, exponents))
         except ModelError as error:
             faults.append(str(error))
     if faults:
@@ -266,8 +235,8 @@ def quantize(
     if calibration is None or few is None:
         chosen = [candidates[0] for candidates in shortlists]
     else:
-        settled = zip(layers, settle(network, shortlists, few), recipes, strict=True)
-        chosen = [c if recipe.planes == 1 else round_with_more(layer, c, calibration) for layer, c, recipe in settled]
+        settled = zip(layers, settle(network, shortlists, few), packings, strict=True)
+        chosen = [c if packing.planes == 1 else round_with_more(layer, c, calibration) for layer, c, storage in settled]
     choices = tuple(map(explain_choice, layers, chosen))
     return assemble(network, [c.layer for c in chosen]), choices
 
@@ -277,10 +246,7 @@ def round_to_forms(
 ) -> tuple[IntegerNetwork, tuple[Choice, ...]]:
     """Round a network to storage that is already decided, as a quantisation-aware training left it.
 
-    Raises
-    ------
-    ModelError
-        If a bias has no register value, or the accumulator may overflow.
+    ModelError if a bias has no register value, or the accumulator may overflow.
     """
     layers = [layer_of(network, post, calibration) for post in range(len(network.populations))]
     chosen = []
