@@ -100,6 +100,14 @@ def kept_shares(decay_u: IntArray | int, decay_v: IntArray | int) -> tuple[Any, 
     return (DECAY_ONE - 1 - decay_u) / DECAY_ONE, (DECAY_ONE - decay_v) / DECAY_ONE
 
 
+def largest_current(worst: IntArray, decay_u: IntArray | int) -> IntArray:
+    """Largest current, in register units, that sums of up to `worst` weight units a step add up to.
+
+    What loses ``lost / 4096`` a step and gains x cannot climb beyond ``x * 4096 / lost``.
+    """
+    return (worst << MEMBRANE_SHIFT + DECAY_BITS) // (decay_u + 1)
+
+
 def plane_distance(bits: int) -> int:
     """Largest difference of exponents at which two planes leave no gap between their values.
 

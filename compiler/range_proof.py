@@ -31,7 +31,7 @@ class RangeProof:
         return self.accumulator <= ACCUMULATOR_MAX and self.current <= CURRENT_MAX and self.membrane <= MEMBRANE_MAX
 
 
-def _settled(inflow: FloatArray | IntArray, kept: float) -> FloatArray:
+def settled(inflow: FloatArray | IntArray, kept: float) -> FloatArray:
     """Limit of ``x <- kept * x + inflow``: what a leaking register can add up to."""
     limit: FloatArray = inflow / (1 - kept) if kept < 1 else np.where(inflow > 0, np.inf, 0.0)
     return limit
@@ -50,9 +50,9 @@ def prove_ranges(network: IntegerNetwork) -> tuple[RangeProof, ...]:
         positive, negative = one_sided(into, population.size)
         unit = 1 << MEMBRANE_SHIFT
         kept_u = population.realised_alpha
-        up, down = _settled(positive * unit, kept_u), _settled(negative * unit, kept_u)
+        up, down = settled(positive * unit, kept_u), settled(negative * unit, kept_u)
         rise = population.realised_beta * population.threshold * unit + up + np.maximum(population.bias, 0)
-        fall = _settled(down + np.maximum(-population.bias, 0), population.realised_beta)
+        fall = settled(down + np.maximum(-population.bias, 0), population.realised_beta)
         proofs.append(
             RangeProof(
                 layer=population.name,

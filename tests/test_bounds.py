@@ -56,12 +56,6 @@ def test_without_a_leak_only_the_positive_side_is_bounded():
     assert not proof.holds
 
 
-def test_a_neuron_without_input_stays_where_its_bias_leaves_it():
-    (proof,) = prove_ranges(integer_chain([[0]], thresholds=[3]))
-    assert (proof.accumulator, proof.current) == (0, 0)
-    assert proof.holds
-
-
 @pytest.mark.parametrize(
     ("weights", "holds"), [([254] * 129, True), ([254] * 129 + [2], False), ([-254] * 129 + [254] * 129, True)]
 )

@@ -16,7 +16,6 @@ from spikeloom.compiler.targets.loihi1.emit import emit
 from spikeloom.compiler.targets.loihi1.layout.chips import chip_count, chip_of_core, place_on_chips, share
 from spikeloom.compiler.targets.loihi1.layout.choose import lay_out
 from spikeloom.compiler.targets.loihi1.layout.core_graph import core_map
-from spikeloom.compiler.targets.loihi1.layout.place import place
 from spikeloom.compiler.targets.loihi1.legalize import LimitUse, measure, require_legal
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist, write_netlist
 from spikeloom.runtime.machines.loihi1 import engine, spec, timing
@@ -63,12 +62,6 @@ def test_a_network_takes_as_few_chips_as_hold_it(netlist, tmp_path):
     assert read_netlist(tmp_path / "net.loom").core_tile.tolist() == netlist.core_tile.tolist()
 
 
-@pytest.mark.parametrize("chips", [1, 2])
-def test_too_few_chips(chips):
-    words = f"{'chip' if chips == 1 else '2 chips'}: 5 used, {2 * chips} allowed (loihi1.chip.cores)|--chips"
-    refused(CapacityError, words, lay_out, net(), SMALL, chips=chips)
-
-
 def test_the_fullest_chip_is_measured(netlist):
     assert measure(netlist, SMALL)[-1] == LimitUse(name="chip.cores", used=2, allowed=2, core=None)
     crowded = dataclasses.replace(netlist, core_tile=np.array([0, 1, 0, 2, 3]))
@@ -102,12 +95,6 @@ def test_a_placement_counts_what_stays_and_what_leaves(cores, seed):
     assert placement.between_chips == pytest.approx(traffic.sum() - stays)
     assert placement.spike_hops == pytest.approx(hops)
     assert placement.bound <= placement.spike_hops
-
-
-def test_what_one_chip_holds_is_placed_as_ever():
-    traffic = np.random.default_rng(0).random((5, 5))
-    assert place_on_chips(traffic, LOIHI) == place(traffic, LOIHI)
-    assert place(traffic, LOIHI).between_chips == 0
 
 
 @pytest.mark.parametrize("stepwise", [False, True])

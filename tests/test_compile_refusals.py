@@ -109,6 +109,10 @@ CAPACITIES = [
     ),
     ("chip: 129 used, 128 allowed (loihi1.chip.cores)", laying_out((3, 100, 100), fc1=100, fc2=29)),
     ("chip: 129 used, 128 allowed (loihi1.chip.cores)", cutting((1, 129 * 1024))),
+    (
+        "2 chips: 5 used, 4 allowed (loihi1.chip.cores)|--chips",
+        lambda: partition(full(1, 5), small_target(core_compartments=1, chip_cores=2), chips=2),
+    ),
     ("fc1 neuron 0: 4097 used, 4096 allowed (loihi1.core.axons_in)", cutting((4097, 1))),
     (
         "neuron 0: 16385 used, 4096 allowed (loihi1.core.axons_in)|\n"

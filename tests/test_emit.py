@@ -27,49 +27,34 @@ from spikeloom.runtime.machines.loihi1.trace import aligned
 @settings(deadline=None, max_examples=25)
 @given(integer_networks(), tight_targets())
 def test_the_netlist_holds_exactly_the_network(network, target):
-    parts = legal_partition(network, target)
-    netlist = seated(network, parts, target)
-    core_of_axon, core_of_compartment = [], []
-    for core in range(netlist.n_cores):
-        core_of_axon += [core] * int(np.diff(netlist.core_axons)[core])
-        core_of_compartment += [core] * int(np.diff(netlist.core_compartments)[core])
-    dense = {
-        (p.pre, p.post): np.zeros(
-            (
-                network.populations[p.post].size,
-                network.input.size if p.pre == INPUT else network.populations[p.pre].size,
-            ),
-            np.int64,
-        )
-        for p in network.projections
-    }
+    netlist = seated(network, legal_partition(network, target), target)
+    sizes = {INPUT: network.input.size} | {i: p.size for i, p in enumerate(network.populations)}
+    dense = {(p.pre, p.post): np.zeros((sizes[p.post], sizes[p.pre]), np.int64) for p in network.projections}
     nonzero = 0
-    for axon in range(netlist.n_axons):
+    for axon, core in enumerate(np.repeat(np.arange(netlist.n_cores), np.diff(netlist.core_axons))):
         source, form = int(netlist.axon_source[axon]), int(netlist.axon_format[axon])
         pre, column = INPUT, source
         if source >= netlist.n_inputs:
             compartment = source - netlist.n_inputs
             pre, column = int(netlist.layer[compartment]), int(netlist.neuron[compartment])
-        exponent = int(netlist.format_exponent[form])
-        entries = range(*netlist.axon_synapses[axon : axon + 2])
-        targets = [int(netlist.synapse_target[s]) for s in entries]
-        weights = [int(netlist.synapse_weight[s]) for s in entries]
+        held = slice(*netlist.axon_synapses[axon : axon + 2])
+        targets, weights = netlist.synapse_target[held].tolist(), netlist.synapse_weight[held].tolist()
         if netlist.format_index_bits[form] == 0:
             # A dense list has no indices: its targets are consecutive, and it begins and ends with a synapse.
             assert targets == list(range(targets[0], targets[0] + len(targets)))
-            assert weights[0] != 0
-            assert weights[-1] != 0
+            assert weights[0] * weights[-1] != 0
         else:
             assert targets == sorted(set(targets))
             assert 0 not in weights
             assert targets[-1] < 2 ** int(netlist.format_index_bits[form])
+        exponent, step = int(netlist.format_exponent[form]), 2 ** (9 - int(netlist.format_weight_bits[form]))
+        first, last = netlist.core_compartments[core : core + 2]
         for where, weight in zip(targets, weights, strict=True):
-            assert weight % 2 ** (9 - int(netlist.format_weight_bits[form])) == 0
-            target_id = int(netlist.core_compartments[core_of_axon[axon]]) + where
-            assert core_of_compartment[target_id] == core_of_axon[axon]
+            assert weight % step == 0
+            assert first + where < last
             if weight:
                 nonzero += 1
-                row, post = int(netlist.neuron[target_id]), int(netlist.layer[target_id])
+                row, post = int(netlist.neuron[first + where]), int(netlist.layer[first + where])
                 dense[pre, post][row, column] += weight * 2**exponent if exponent >= 0 else weight // 2
     assert nonzero == sum(np.count_nonzero(p.weight.data) for p in network.projections)
     for post in range(len(network.populations)):

@@ -28,7 +28,7 @@ from spikeloom.compiler.targets.loihi1.layout import place as place_module
 from spikeloom.compiler.targets.loihi1.layout.choose import _cost, lay_out
 from spikeloom.compiler.targets.loihi1.layout.core_needs import Chunk, Needs
 from spikeloom.compiler.targets.loihi1.layout.forecast import Forecast, sample, tables
-from spikeloom.compiler.targets.loihi1.layout.latency_search import _useful, estimate, fastest
+from spikeloom.compiler.targets.loihi1.layout.latency_search import estimate, fastest
 from spikeloom.compiler.targets.loihi1.layout.partition import cut, partition
 from spikeloom.compiler.targets.loihi1.legalize import require_legal
 from spikeloom.compiler.targets.loihi1.options import GOALS
@@ -183,18 +183,6 @@ def test_few_steps_of_many_are_looked_at(monkeypatch):
 # --- cores asked for
 
 
-@pytest.mark.parametrize("cores", [1, 3, 16])
-def test_a_layer_is_cut_evenly(cores):
-    network = integer_chain(np.full((16, 3), 2), np.full((4, 16), 2))
-    parts = partition(network, LOIHI, cores_for={0: cores})
-    mine = [core for core in parts.cores if core[0].population == 0]
-    assert [len(core) for core in mine] == [1] * cores
-    sizes = [core[0].size for core in mine]
-    assert sum(sizes) == 16
-    assert max(sizes) - min(sizes) <= 1
-    assert len(parts.cores) == cores + 1
-
-
 def test_cores_asked_for_hold_no_other_layer_unless_that_is_allowed():
     network = integer_chain(np.full((6, 3), 2), np.full((4, 6), 2), np.full((2, 4), 2))
     alone = partition(network, LOIHI, cores_for={0: 2, 1: 2})
@@ -240,13 +228,6 @@ def test_every_partition_is_legal_and_holds_every_neuron_once(network, target, d
 
 
 # --- goals
-
-
-def test_numbers_of_chunks_that_make_the_largest_smaller():
-    for size in range(1, 60):
-        largest = [-(-size // parts) for parts in range(1, size + 1)]
-        expected = [n for n in range(1, size + 1) if n == 1 or largest[n - 1] < largest[n - 2]]
-        assert _useful(size, 128) == expected
 
 
 def test_a_busy_layer_gets_more_cores():

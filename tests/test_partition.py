@@ -1,5 +1,3 @@
-import dataclasses
-
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, assume, given, settings
@@ -59,11 +57,6 @@ def test_a_sparse_index_is_as_narrow_as_it_can_be(highest, bits):
 # --- splitting
 
 
-def test_a_small_network_shares_one_core():
-    network = integer_chain(np.full((4, 3), 2), np.full((2, 4), 2))
-    assert sizes(partition(network, LOIHI)) == [[(0, 0, 4), (1, 0, 2)]]
-
-
 @pytest.mark.parametrize(("neurons", "cores"), [(1024, 1), (1025, 2), (2048, 2), (2496, 3)])
 def test_a_layer_is_split_at_1024_compartments(neurons, cores):
     parts = partition(integer_chain(np.full((neurons, 1), 2)), LOIHI)
@@ -99,21 +92,8 @@ def test_a_layer_is_split_by_output_axons():
     ]
 
 
-def test_different_decays_share_a_core_up_to_the_limit():
-    network = integer_chain([[2]], [[2]], [[2]])
-    decays = [3277, 3276, 3276]
-    network = dataclasses.replace(
-        network,
-        populations=tuple(
-            dataclasses.replace(p, decay_v=decay) for p, decay in zip(network.populations, decays, strict=True)
-        ),
-    )
-    assert sizes(partition(network, small_target(core_compartment_configs=2))) == [[(0, 0, 1), (1, 0, 1), (2, 0, 1)]]
-    assert sizes(partition(network, small_target(core_compartment_configs=1))) == [[(0, 0, 1)], [(1, 0, 1), (2, 0, 1)]]
-
-
 def fan_in_of_formats(exponents):
-    """One neuron that hears four inputs through projections of these exponents."""
+    """One neuron with four inputs through projections of these exponents."""
     return IntegerNetwork(
         input=Input(taxels=4, polarities=1),
         populations=(integer_population("fc1", 1),),
@@ -126,31 +106,12 @@ def fan_in_of_formats(exponents):
     )
 
 
-def test_projections_of_one_format_share_its_slot():
-    netlist = compiled(fan_in_of_formats([0] * 9))
-    assert (netlist.n_cores, len(netlist.format_exponent)) == (1, 1)
-
-
 def test_seven_formats_fit_a_core_and_eight_do_not():
-    netlist = compiled(fan_in_of_formats(range(7)))
-    assert (netlist.n_cores, len(netlist.format_exponent)) == (1, 7)
+    for exponents, formats in ((range(7), 7), ([0] * 9, 1)):  # projections of one format share its slot
+        netlist = compiled(fan_in_of_formats(exponents))
+        assert (netlist.n_cores, len(netlist.format_exponent)) == (1, formats)
     words = "fc1 neuron 0: 8 used, 7 allowed (loihi1.core.synapse_formats)"
     refused(CapacityError, words, partition, fan_in_of_formats(range(-1, 7)), LOIHI)
-
-
-def test_index_widths_count_as_formats():
-    """Three sparse layers on one core may end at compartments that need wider and wider indices."""
-    rng = np.random.default_rng(0)
-
-    def sparse_layer(outputs, inputs):
-        return np.where(rng.random((outputs, inputs)) < 0.1, 2, 0)
-
-    network = integer_chain(sparse_layer(50, 20), sparse_layer(60, 50), sparse_layer(100, 60))
-    for slots in range(1, 8):
-        target = small_target(core_synapse_formats=slots)
-        netlist = compiled(network, target)
-        require_legal(netlist, target)
-    assert netlist.n_cores == 1
 
 
 # --- every limit

@@ -9,7 +9,7 @@ from random_networks import LOIHI, integer_chain, integer_networks, seated, smal
 from spikeloom.compiler.targets.loihi1.layout import place as place_module
 from spikeloom.compiler.targets.loihi1.layout.core_needs import Chunk
 from spikeloom.compiler.targets.loihi1.layout.partition import Partition, partition
-from spikeloom.compiler.targets.loihi1.layout.place import core_traffic, hops, place, place_within
+from spikeloom.compiler.targets.loihi1.layout.place import core_traffic, place, place_within
 
 
 def cost(traffic, tiles, width):
@@ -45,11 +45,6 @@ KINDS = {
     "equal": lambda _, cores: np.ones((cores, cores)),
     "star": lambda _, cores: np.outer(np.arange(cores) == 0, np.ones(cores)),
 }
-
-
-@pytest.mark.parametrize(("a", "b", "expected"), [(0, 0, (0, 0)), (0, 17, (1, 2)), (7, 24, (7, 3)), (31, 0, (7, 3))])
-def test_hops_under_xy_routing(a, b, expected):
-    assert hops(a, b, 8) == expected
 
 
 @settings(deadline=None, max_examples=25)

@@ -1,5 +1,3 @@
-import dataclasses
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -83,20 +81,6 @@ def test_every_network_is_rounded_to_registers(network, bits, calibrated, data):
         wanted = np.clip(original.weight.data * scale, -(256 - step), 256 - step)
         error = np.abs(projection.weight.data - wanted)
         assert choices[projection.post].compensated or np.all(error <= step / 2 * (1 + 1e-9))
-
-
-@settings(deadline=None, max_examples=15)
-@given(float_networks(), st.sampled_from(BITS))
-def test_a_network_and_its_negation_have_opposite_weights(network, bits):
-    mirrored = dataclasses.replace(
-        network, projections=tuple(dataclasses.replace(p, weight=-p.weight) for p in network.projections)
-    )
-    left, right = (
-        choose_storage(network, LOIHI, packings=(Packing(bits=bits),))[0],
-        choose_storage(mirrored, LOIHI, packings=(Packing(bits=bits),))[0],
-    )
-    for p, q in zip(left.projections, right.projections, strict=True):
-        assert np.array_equal(p.weight.data, -q.weight.data)
 
 
 @settings(deadline=None, max_examples=20)
@@ -244,17 +228,6 @@ def test_observed_ranges_allow_a_finer_scale():
     assert observed.headroom >= 0
     # The proof does not hold for it, and says so.
     assert [proof.holds for proof in prove_ranges(integer)] == [False]
-
-
-def test_a_margin_makes_observed_scales_coarser():
-    network = chain(np.full((3, 2000), 0.5))
-    calibration = calibrate(network, recordings(network, 0, rate=0.2))
-    scales = [
-        choose_storage(network, LOIHI, calibration=calibration, ranges="observed", margin=margin)[1][0].scale
-        for margin in (0.0, 0.5, 2.0)
-    ]
-    assert scales == sorted(scales, reverse=True)
-    assert scales[0] > scales[2]
 
 
 @pytest.mark.parametrize(

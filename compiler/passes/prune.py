@@ -17,6 +17,7 @@ import numpy.typing as npt
 from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT
 from spikeloom.compiler.ir import INPUT, IntegerNetwork, IntegerPopulation, Network, Sparse, row_parts, with_data
 from spikeloom.compiler.passes.calibrate import Calibration
+from spikeloom.compiler.range_proof import settled
 from spikeloom.compiler.types import IntArray
 
 Mask = npt.NDArray[np.bool_]
@@ -89,11 +90,8 @@ def _never_fires(network: Network, post: int, silent: Known) -> Mask:
     slack = (inputs + 8) * FLOAT32_ROUNDING * total * gathered
     with np.errstate(invalid="ignore"):
         most = np.maximum(np.where(up > 0, up * gathered, 0.0) + population.bias + slack, 0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        kept = population.beta * (1 + 8 * FLOAT32_ROUNDING)
-        settled = most / (1 - kept) if kept < 1 else np.where(most > 0, np.inf, 0)
-    below: Mask = settled <= population.theta * (1 - 8 * FLOAT32_ROUNDING)
-    return below
+    kept = population.beta * (1 + 8 * FLOAT32_ROUNDING)
+    return settled(most, kept) <= population.theta * (1 - 8 * FLOAT32_ROUNDING)
 
 
 def never_fired(network: Network, calibration: Calibration) -> Masks:
@@ -172,13 +170,8 @@ def _unread(network: IntegerNetwork, pre: int, unread: Known, silent: Known) -> 
 
 def _cannot_reach(population: IntegerPopulation, inflow: npt.NDArray[np.float64]) -> Mask:
     """Whether the membrane stays at or below its threshold whatever arrives, register rounding included."""
-    lost_u, lost_v = (population.decay_u + 1) / 4096, population.decay_v / 4096
-    with np.errstate(divide="ignore", invalid="ignore"):
-        current = inflow / lost_u
-        step = np.maximum(current + population.bias, 0)
-        most = np.where(step > 0, step / lost_v if lost_v else np.inf, 0)
-    below: Mask = most <= population.threshold << MEMBRANE_SHIFT
-    return below
+    step = np.maximum(settled(inflow, population.realised_alpha) + population.bias, 0)
+    return settled(step, population.realised_beta) <= population.threshold << MEMBRANE_SHIFT
 
 
 def without_channels(network: IntegerNetwork, channels: Mask) -> IntegerNetwork:

@@ -14,7 +14,14 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT
+from spikeloom.compiler.fixedpoint import (
+    ACCUMULATOR_MAX,
+    CURRENT_MAX,
+    DECAY_BITS,
+    MEMBRANE_MAX,
+    MEMBRANE_SHIFT,
+    largest_current,
+)
 from spikeloom.compiler.formats.names import plain_names
 from spikeloom.compiler.formats.onnx.builder import require_room
 from spikeloom.compiler.ir import INPUT
@@ -151,8 +158,7 @@ def _layer(
     lost_u, lost_v = netlist.decay_u[ids] + 1, netlist.decay_v[ids]
     threshold = netlist.threshold[ids] << MEMBRANE_SHIFT
     bias = netlist.bias_mantissa[ids] << netlist.bias_exponent[ids]
-    # what loses lost/4096 a step and gains `worst` cannot climb beyond worst * 4096 / lost
-    lasting_up, lasting_down = (worst * ONE // lost_u for worst in (up, down))
+    lasting_up, lasting_down = (largest_current(bound[ids], netlist.decay_u[ids]) for bound in bounds)
     highest = np.maximum(lasting_up, lasting_down)
     checked = bool(np.any(np.maximum(up, down) > ACCUMULATOR_MAX) or np.any(highest > CURRENT_MAX))
     fall = lasting_down + np.maximum(-bias, 0)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.fixedpoint import CURRENT_MAX, DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT
+from spikeloom.compiler.fixedpoint import CURRENT_MAX, DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT, largest_current
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, one_step_bounds
 from spikeloom.compiler.types import BoolArray, IntArray
 from spikeloom.runtime.machines.loihi1.block_kernel import CHARGES, LANES, Blocks, ChargeRows
@@ -36,8 +36,7 @@ def _in_range(netlist: Netlist) -> bool:
     bias = netlist.bias_mantissa << netlist.bias_exponent
     keep, lost_u = 2**DECAY_BITS - netlist.decay_v, netlist.decay_u + 1
     lasts = lost_u != 2**DECAY_BITS
-    # a current that loses lost_u/4096 a step and gains x cannot climb beyond x * 4096 / lost_u
-    up, down = ((sums << MEMBRANE_SHIFT + DECAY_BITS) // lost_u for sums in (positive, negative))
+    up, down = (largest_current(sums, netlist.decay_u) for sums in (positive, negative))
     if np.any(np.maximum(up, down) > CURRENT_MAX):
         return False
     # a membrane is left at the threshold at most; below zero it loses as much as it can gain at the far end

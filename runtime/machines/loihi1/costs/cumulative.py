@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from spikeloom.compiler.fixedpoint import DECAY_BITS, MEMBRANE_SHIFT
+from spikeloom.compiler.fixedpoint import DECAY_BITS, MEMBRANE_SHIFT, largest_current
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.layout.chips import chip_count
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, one_step_bounds
@@ -27,9 +27,7 @@ def read_out_depth(netlist: Netlist) -> int:
 def least_intervals(netlist: Netlist) -> IntArray:
     """See :attr:`IntegerMachine.least_intervals`; in the order of compartments."""
     voters = np.flatnonzero(netlist.readout_class >= 0)
-    positive = one_step_bounds(netlist)[0][voters]
-    # a current that loses lost/4096 a step and gains x stays at or below x * 4096 / lost
-    current = (positive << MEMBRANE_SHIFT + DECAY_BITS) // (netlist.decay_u[voters] + 1)
+    current = largest_current(one_step_bounds(netlist)[0][voters], netlist.decay_u[voters])
     gain = current + (netlist.bias_mantissa << netlist.bias_exponent)[voters]
     threshold = netlist.threshold[voters] << MEMBRANE_SHIFT
     keep = 2**DECAY_BITS - netlist.decay_v[voters]
