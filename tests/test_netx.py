@@ -17,7 +17,7 @@ from numpy.testing import assert_array_equal
 from random_networks import chain
 from zoo import specimen
 
-from spikeloom.compiler import Options, Recipe, compile_network, lift
+from spikeloom.compiler import Options, Packing, compile_network, lift
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.netx import writer as netx_export
 from spikeloom.compiler.formats.netx.layout import blocks_of, read_blocks
@@ -376,14 +376,14 @@ def test_strict_writes_what_is_exact(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("recipe", "words"),
+    ("packing", "words"),
     [
-        (Recipe(groups=4), "fc1: has 4 thresholds, netx has one for a layer; compile with --scale-groups 1"),
-        (Recipe(planes=2), "netx holds 8 bits without an exponent; compile with --planes 1 --weight-bits 8"),
+        (Packing(groups=4), "fc1: has 4 thresholds, netx has one for a layer; compile with --scale-groups 1"),
+        (Packing(planes=2), "netx holds 8 bits without an exponent; compile with --planes 1 --weight-bits 8"),
     ],
 )
-def test_netlists_that_the_format_cannot_hold(recipe, words):
+def test_netlists_that_the_format_cannot_hold(packing, words):
     weight = np.random.default_rng(7).normal(size=(20, 6)) * np.geomspace(0.01, 1, 20)[:, None]
-    netlist = compile_network(chain(weight), Options(recipes=[recipe])).netlist
+    netlist = compile_network(chain(weight), Options(packings=[packing])).netlist
     with pytest.raises(ModelError, match=words):
         netx_export.blocks_for(lift(netlist))

@@ -166,7 +166,7 @@ def manifest(text):
     return lambda path: rewrite(path, manifest=np.array(text))
 
 
-LAYER = {"name": "fc1", "neurons": 3, "unreceived": [], "depth": 0, "weight_bits": 8, "synapses": 9, "max_fan_in": 6}
+LAYER = {"name": "fc1", "neurons": 3, "unread": [], "depth": 0, "weight_bits": 8, "synapses": 9, "max_fan_in": 6}
 LAYER |= {"beta": 0.2, "theta": 0.5, "alpha": 0.0}
 DAMAGES = [
     *((lambda path, content=content: path.write_bytes(content), "not a netlist") for content in (b"", bytes(9999))),
