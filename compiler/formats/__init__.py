@@ -1,1 +1,5 @@
-"""Readers of other people's files; each returns plain values, nothing here runs foreign code."""
+"""Every file that comes in or goes out, reader and writer of a format side by side; nothing here runs foreign code.
+
+Checkpoints: ``checkpoint_reader`` takes any, ``spikeloom_checkpoint`` and ``torch_checkpoint`` are the two kinds.
+Networks of other frameworks: ``onnx``, ``nir``, ``netx``. For other simulators: ``sanafe``, ``ranc``.
+"""

@@ -11,7 +11,7 @@ import numpy as np
 from spikeloom.compiler.formats.names import printable
 from spikeloom.compiler.formats.nir.file import Graph, Node
 from spikeloom.compiler.formats.nir.neurons import SPIKING, Neurons, Steps, decay_words, written_for
-from spikeloom.compiler.formats.nir.values import Value
+from spikeloom.compiler.formats.nir.stages import Value
 from spikeloom.compiler.ir import Input
 from spikeloom.compiler.types import FloatArray, IntArray
 

@@ -18,10 +18,9 @@ from spikeloom.compiler.formats.names import printable, unique_names
 from spikeloom.compiler.formats.nir.facts import SpikingNode, facts_of, hint, stated_step
 from spikeloom.compiler.formats.nir.file import Graph, Node, read_graph
 from spikeloom.compiler.formats.nir.neurons import CONVENTIONS, SPIKING, TOLERANCE, Steps, neurons_of, require_steps
-from spikeloom.compiler.formats.nir.nodes import KNOWN, STAGES
 from spikeloom.compiler.formats.nir.order import in_order as nodes_in_order
 from spikeloom.compiler.formats.nir.order import loops
-from spikeloom.compiler.formats.nir.values import Value, added, filtered, scaled, spikes_of
+from spikeloom.compiler.formats.nir.stages import KNOWN, STAGES, Value, added, filtered, scaled, spikes_of
 from spikeloom.compiler.ir import INPUT, Input, Network, Sparse
 from spikeloom.compiler.sensor_layout import sensor_layout
 from spikeloom.compiler.types import FloatArray, IntArray
