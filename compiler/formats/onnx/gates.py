@@ -38,11 +38,12 @@ def present(value: Value | None) -> Value:
     return value
 
 
-def as_affine(table: Table, value: Value) -> Affine:
+def as_affine(table: Table, operand: Value | None) -> Affine:
     """A value that varies as an affine one: a choice by a threshold becomes a multiple of the spikes.
 
-    Raises ModelError if it has a third value at the threshold itself.
+    Raises ModelError if it has a third value at the threshold itself, or is missing.
     """
+    value = present(operand)
     if isinstance(value, Affine):
         return value
     if isinstance(value, Decision):
@@ -101,7 +102,7 @@ def chosen(table: Table, values: Sequence[Value | None]) -> Value:
     if not is_binary(table, condition):
         raise ModelError("chooses by what is neither a spike nor a constant; only spikes can choose")
     shape = table.room(np.broadcast_shapes(*(np.shape(v) if isinstance(v, np.ndarray) else v.shape for v in values)))  # type: ignore[union-attr]
-    s, a, b = (spread(as_affine(table, value), shape) for value in values)  # type: ignore[arg-type]
+    s, a, b = (spread(as_affine(table, value), shape) for value in values)
     product = multiplied(table, s, added([(1.0, a), (-1.0, b)], shape))
     return added([(1.0, b), (1.0, product)], shape)
 

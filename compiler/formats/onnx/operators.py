@@ -89,7 +89,7 @@ def _constant(node: Node, table: Table, operands: Sequence[Value | None]) -> lis
         return list(evaluate(node, table, operands))  # type: ignore[arg-type]
     if node.op not in LINEAR:
         raise ModelError(NO_LIF if node.op in STATEFUL else CONSTANT)
-    first = as_affine(table, present(operands[0]))
+    first = as_affine(table, operands[0])
     result = _linear(node, table, [first, *operands[1:]], [0])
     return [result.bias.reshape(result.shape)]
 
@@ -108,7 +108,7 @@ def _decided(node: Node, table: Table, operands: Sequence[Value | None]) -> Valu
 
 def _scattered(node: Node, table: Table, values: Sequence[Value | None]) -> Value:
     """A scattering sum: data plus what the updates bring; a gathering of positions tells where each goes."""
-    start, more = (as_affine(table, present(values[place])) for place in (0, 2))
+    start, more = (as_affine(table, values[place]) for place in (0, 2))
     if not isinstance(values[1], np.ndarray):
         raise ModelError("takes its indices from what varies; only a fixed graph can be lowered")
     op = node.op.replace("Scatter", "Gather")
@@ -173,7 +173,7 @@ def _linear(node: Node, table: Table, values: Sequence[Value | None], varying: l
     inner = [place for place in varying if not (has_bias and place == 2)]
     matrix_of, allowed = LINEAR[node.op]
     if has_bias and not inner:  # only the bias varies
-        values, inner = [as_affine(table, present(values[0])), *values[1:]], [0]
+        values, inner = [as_affine(table, values[0]), *values[1:]], [0]
     if len(inner) != 1 or inner[0] not in allowed:
         raise ModelError(NOT_AFFINE)
     place = inner[0]
@@ -208,7 +208,7 @@ def _elementwise(node: Node, table: Table, values: Sequence[Value | None], varyi
     if op not in ("Add", "Cast", "Div", "Mean", "Mul", "Neg", "Not", "Sub", "Sum"):
         raise ModelError(NO_LIF if op in STATEFUL else NOT_AFFINE)
     shape = table.room(np.broadcast_shapes(*(present(value).shape for value in values)))
-    parts = [spread(as_affine(table, present(value)), shape) for value in values]
+    parts = [spread(as_affine(table, value), shape) for value in values]
     value, other = parts[0], parts[-1]
     if op == "Cast":
         to = int(node.attributes["to"])

@@ -69,11 +69,11 @@ class ChipModule(nn.Module):
         self._stages: list[list[tuple[int, nn.Linear]]] = []
         self.layers = nn.ModuleList()
         for post, population in enumerate(network.populations):
-            into: dict[int, np.ndarray[Any, Any]] = {}
+            into: dict[int, Any] = {}
             for projection in network.projections:
                 if projection.post == post:
                     dense = projection.effective().toarray().astype(np.float64)
-                    into[projection.pre] = into[projection.pre] + dense if projection.pre in into else dense
+                    into[projection.pre] = into.get(projection.pre, 0) + dense
             stages = []
             for pre, weight in sorted(into.items()):
                 linear = nn.Linear(weight.shape[1], weight.shape[0], bias=False, dtype=torch.float64)

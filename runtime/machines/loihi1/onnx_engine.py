@@ -27,9 +27,6 @@ PART = 64
 BATCH = {"step": 144, "scan": 16}
 """Recordings that run together: few enough for the caches."""
 
-KINDS = {f"tensor({kind})": np.dtype(kind) for kind in ("bool", "uint8", "int32", "int64")}
-"""Types of onnxruntime that the graphs use."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class OnnxEngine:
@@ -119,7 +116,7 @@ def _run_steps(prepared: OnnxEngine, events: EventArray, which: IntArray, trace:
     steps, batch, channels = events.shape
     drain = prepared.netlist.max_depth
     given = {
-        port.name: np.zeros([batch if size == "batch" else size for size in port.shape], KINDS[port.type])
+        port.name: np.zeros([batch if size == "batch" else size for size in port.shape], port.type[len("tensor(") : -1])
         for port in prepared.session.get_inputs()
     }
     given["length"][...] = steps
