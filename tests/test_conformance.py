@@ -12,7 +12,7 @@ from random_crossbars import assert_same
 from random_netlists import assert_equal, by_engine, by_steps
 from test_cost import check as check_costs
 from test_onnx_engine import assert_as_specified
-from zoo import CROSSBARS, FLOAT, LAYERED, MAKERS, over, specimen
+from zoo import CROSSBARS, FLOAT, LAYERED, MAKERS, over, specified, specimen
 
 from spikeloom.compiler import lift
 from spikeloom.compiler.dynamics import with_clocks
@@ -24,7 +24,7 @@ from spikeloom.models.networks.reference import float_spikes
 from spikeloom.runtime.cli import build_parser, main
 from spikeloom.runtime.equivalence import float_engine
 from spikeloom.runtime.inputs.network import load_network
-from spikeloom.runtime.machines.loihi1 import engine, spec
+from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.blocks import obstacle
 from spikeloom.runtime.machines.loihi1.trace import aligned, unpack
 from spikeloom.runtime.machines.truenorth import engine as crossbar_engine
@@ -72,8 +72,8 @@ def test_every_kernel_is_the_specification(name):
     netlist = made.machine.netlist
     assert (obstacle(netlist) is not None) == (name in STEP_BY_STEP)
     total = np.zeros(len(netlist.layers), int)
-    for recording in channels(made):
-        expected = spec.simulate(netlist, recording)
+    for index, recording in enumerate(channels(made)[:2]):
+        expected = specified(name, index)
         for simulate in (by_engine, by_steps):
             assert_equal(simulate(netlist, recording), expected)
         total += [expected.counts.spikes[netlist.compartments_of(layer)].sum() for layer in range(len(total))]
@@ -96,8 +96,8 @@ def test_the_engine_of_crossbars_is_the_specification(name):
 def test_onnxruntime_is_the_specification(name):
     pytest.importorskip("onnxruntime")
     made = specimen(name)
-    for recording in channels(made)[:2]:
-        assert_as_specified(made.machine.netlist, recording)
+    for index, recording in enumerate(channels(made)[:2]):
+        assert_as_specified(made.machine.netlist, recording, specified(name, index))
 
 
 @over(LAYERED)
@@ -167,7 +167,8 @@ def test_compiled_again_the_bytes_are_the_same(name, tmp_path, capsys):
 @over(LAYERED)
 def test_costs_are_those_counted_spike_by_spike(name):
     made = specimen(name)
-    assert check_costs(made.machine.netlist, channels(made)[:2]).synaptic_operations.sum() > 0
+    traces = [specified(name, index) for index in range(2)]
+    assert check_costs(made.machine.netlist, channels(made)[:2], traces).synaptic_operations.sum() > 0
 
 
 @over(CROSSBARS)

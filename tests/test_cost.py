@@ -48,9 +48,9 @@ PICOJOULES = {
 """The published prices, typed a second time."""
 
 
-def brute_force(netlist, recording):
+def brute_force(netlist, recording, trace=None):
     """Amounts per layer as plain lists, by visiting every synapse for every spike of the specification's run."""
-    trace = spec.simulate(netlist, recording)
+    trace = trace or spec.simulate(netlist, recording)
     steps = recording.shape[1]
     layers = range(len(netlist.layers))
     found = {name: [0] * len(layers) for name in (*cost.EVENTS, "zeros")}
@@ -81,12 +81,12 @@ def brute_force(netlist, recording):
     return found
 
 
-def check(netlist, recordings):
+def check(netlist, recordings, traces=None):
     """Hold the counts and energies of a batch against the brute force; returns the costs."""
     trace = engine.simulate(netlist, recordings)
     costs = cost.estimate(cost.prepare(netlist, LOIHI), trace.counts, recordings.shape[2])
     for sample, recording in enumerate(recordings):
-        expected = brute_force(netlist, recording)
+        expected = brute_force(netlist, recording, traces and traces[sample])
         for name in cost.EVENTS:
             assert costs.events[name][sample].tolist() == expected[name], name
         assert costs.zeros[sample].tolist() == expected["zeros"]

@@ -22,7 +22,7 @@ from native_networks import random_network as native_network
 from timed_networks import GRAPH, TIMING, written
 
 from spikeloom.compiler.checkpoint import Checkpoint
-from spikeloom.compiler.dynamics import PLAIN
+from spikeloom.compiler.dynamics import PLAIN, with_clocks
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.formats.towers import arrays_of, join
 from spikeloom.compiler.ir import Form
@@ -32,6 +32,8 @@ from spikeloom.models.recordings.events import joined_bins
 from spikeloom.models.recordings.evtouch import Recordings, load_recordings
 from spikeloom.runtime.cli import main
 from spikeloom.runtime.machines.base import Machine, machine_for
+from spikeloom.runtime.machines.loihi1 import spec
+from spikeloom.runtime.machines.loihi1.trace import Trace
 
 STEPS = 14
 STORAGE = ((8, (0,)), (4, (-1,)), (8, (0, 4)), (6, (1,)))
@@ -215,6 +217,14 @@ def specimen(name: str) -> Specimen:
     made = Specimen(folder, folder / file, tuple(reading.split()), (*compiling.split(), *calibrated))
     assert main([*made.compilation, "-o", str(made.netlist)]) == 0
     return made
+
+
+@cache
+def specified(name: str, index: int) -> Trace:
+    """What the specification makes of one recording."""
+    made = specimen(name)
+    netlist = made.machine.netlist
+    return spec.simulate(netlist, with_clocks(made.events, netlist.clocks)[index])
 
 
 def over(names) -> pytest.MarkDecorator:
