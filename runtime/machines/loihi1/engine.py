@@ -186,9 +186,11 @@ def _run_layers(
     words = len(events), steps, -(-n // 64)
     spikes = np.zeros(words, np.uint64) if trace.packed is None else trace.packed[part]
     updated = np.zeros(words if trace.updated is not None else nothing, np.uint64)
+    given = events.view(np.uint8)
+    given.flags.writeable = False  # or the kernel would be compiled twice, for either
     run_recordings(
         blocks,
-        events.view(np.uint8),
+        given,
         ends,
         trace.counts.inputs[part],
         trace.counts.spikes[part],
