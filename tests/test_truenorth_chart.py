@@ -7,7 +7,7 @@ import shlex
 import numpy as np
 import pytest
 from made_files import CLASSES, STEPS, TAXELS, events, own_file, recordings_folder
-from native_networks import random_network
+from random_crossbars import random_network
 
 from spikeloom.compiler.targets.truenorth.native_file import write_trained
 from spikeloom.models.recordings.evtouch import load_recordings

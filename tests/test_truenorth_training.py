@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from made_files import CLASSES, TAXELS, own_file
-from native_networks import random_network
+from random_crossbars import random_network
 from zoo import specimen
 
 from spikeloom.compiler.dynamics import clocks_over

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from made_files import CLASSES, own_file, recordings_folder
 from made_modules import TAXELS
-from native_networks import random_network as native_network
+from random_crossbars import random_network as native_network
 from timed_networks import GRAPH, TIMING, written
 
 from spikeloom.compiler.checkpoint import Checkpoint

@@ -100,13 +100,7 @@ class NativeArchitecture:
 def sized(
     *, taxels: int, classes: int, hops: int, features: int, copies: int, clocks: Clocks, channels: int = 2
 ) -> NativeArchitecture:
-    """The architecture whose groups fill the axons of a core best: as few groups as can be.
-
-    Raises
-    ------
-    OptionError
-        If the sensor is too large, or the features cannot be dealt to groups that fit.
-    """
+    """The architecture whose groups fill the axons of a core best, as few as can be; OptionError if none fit."""
     axons = load_target(CHIP).limit("core.axons")
     room = axons // copies
     if taxels * channels > room:
@@ -114,16 +108,15 @@ def sized(
             f"--copies {copies}: {taxels * channels} input channels with {copies} axons each, a core of TrueNorth has "
             f"{axons}; give fewer copies, or a smaller sensor"
         )
-    fitting = [
-        g for g in range(1, features + 1) if not features % g and taxels * features // g <= room - clocks.channels
-    ]
-    if not fitting or room - clocks.channels < fitting[0]:
+    width = room - clocks.channels
+    fitting = [g for g in range(1, features + 1) if not features % g and taxels * features // g <= width]
+    if not fitting or width < fitting[0]:
         raise OptionError(
             f"--features {features}: no number of groups deals {features} features of {taxels} taxels and "
             f"{clocks.channels} clocks to cores of {room} inputs; give other --features, or fewer --clocks or --copies"
         )
     groups = fitting[0]
-    size = (room - clocks.channels) // groups * groups
+    size = width // groups * groups
     return NativeArchitecture(
         taxels=taxels,
         classes=classes,

@@ -21,21 +21,8 @@ def integrate(current: Tensor, threshold: Tensor, floor: Tensor, surrogate: Surr
 
     ``m_t = c_{t-1} + current_t`` and ``s_t = m_t >= threshold``; then ``c_t`` is 0 after a spike, and
     ``max(m_t, -floor)`` otherwise. The gradient runs back through the membrane until a spike or the floor cuts it, and
-    not through the reset; the surrogate is taken at ``m / threshold - 1``.
-
-    Parameters
-    ----------
-    current : (steps, samples, neurons) float32
-        Whole numbers.
-    threshold, floor : (neurons,) float32
-        Whole numbers above and from zero; no gradient.
-    surrogate : Surrogate
-        Derivative of a spike, in units of the threshold.
-
-    Returns
-    -------
-    (steps, samples, neurons) float32
-        Zeros and ones.
+    not through the reset; the surrogate, whose width is in thresholds, is taken at ``m / threshold - 1``. Currents and
+    spikes are (steps, samples, neurons), thresholds and floors (neurons,), which have no gradient; all float32.
     """
     spikes: Tensor = _Integrate.apply(current, threshold, floor, surrogate)  # type: ignore[no-untyped-call]
     return spikes

@@ -24,8 +24,9 @@ from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
 from spikeloom.compiler.targets.truenorth.netlist_file import write_crossbars
 from spikeloom.compiler.targets.truenorth.passes import Compilation, Options
 from spikeloom.compiler.types import BoolArray, JsonObject
+from spikeloom.runtime.inputs.compilation import PLACING, ROUNDING
 from spikeloom.runtime.inputs.files import shipped
-from spikeloom.runtime.inputs.network import load_network
+from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import netlist_recordings
 from spikeloom.runtime.machines.truenorth import verdicts
 from spikeloom.runtime.machines.truenorth.describe import describe, describe_trained
@@ -43,9 +44,8 @@ OTHERS: Mapping[str, Any] = {
 """Options of other checkpoints, and what they are where they are not given."""
 
 STORAGE: Mapping[str, Any] = {
-    **dict.fromkeys(("weight_bits", "planes", "scale_groups", "calibrate", "margin", "cores_for", "against"), None),
-    **dict.fromkeys(("spike_exact", "prune_unused", "keep_all"), False),
-    **{"ranges": "proven", "chips": 1, "optimize": "cores"},
+    "calibrate": None,
+    **{name: usual for name, usual in (ROUNDING | PLACING).items() if name != "dump_after"},
 }
 """Options of ``compile`` for chips that store rounded weights, likewise."""
 
@@ -124,27 +124,27 @@ def verify(arguments: argparse.Namespace) -> Outcome:
     why = f"a network for {TITLE} has one model, whose every spike must be the chip's"
     _refuse_options(arguments, VERIFY, why)
     machine = load(arguments.netlist)
-    netlist = machine.netlist
-    check = _verify_in_time if "in_time" in netlist.provenance else _verify_trained
-    verdict = check(arguments, netlist, machine.target)
+    check = _verify_in_time if "in_time" in machine.netlist.provenance else _verify_trained
+    verdict = check(arguments, machine.netlist, machine.target)
     return Outcome(verdict, verdicts.sections, 0 if verdict.exact else 1)
 
 
-def _require_same(arguments: argparse.Namespace, netlist: CrossbarNetlist, sha256: str) -> None:
-    if netlist.provenance.get("checkpoint_sha256") != sha256:
+def _require_same(arguments: argparse.Namespace, netlist: CrossbarNetlist, network: Trained | LoadedNetwork) -> None:
+    """Refuse a network that the netlist was not compiled from."""
+    made = netlist.provenance
+    if made.get("checkpoint_sha256") != network.sha256:
         raise OptionError(
             f"--checkpoint {arguments.checkpoint}: {arguments.netlist} was compiled from another file; give that one"
+        )
+    if isinstance(network, Trained) and made.get("weights") != network.weights:
+        raise OptionError(
+            f"--weights {network.weights}: {arguments.netlist} was compiled from {made.get('weights')}; give the same"
         )
 
 
 def _verify_trained(arguments: argparse.Namespace, netlist: CrossbarNetlist, _: Target) -> Verdict:
     trained = read(arguments.checkpoint, arguments)
-    _require_same(arguments, netlist, trained.sha256)
-    if netlist.provenance.get("weights") != trained.weights:
-        raise OptionError(
-            f"--weights {trained.weights}: {arguments.netlist} was compiled from {netlist.provenance.get('weights')}; "
-            "give the same"
-        )
+    _require_same(arguments, netlist, trained)
     data = netlist_recordings(arguments, netlist, labels_for="verify")
     from spikeloom.models.truenorth.network import run_network  # torch, so only here
 
@@ -157,7 +157,7 @@ def _verify_trained(arguments: argparse.Namespace, netlist: CrossbarNetlist, _: 
 
 def _verify_in_time(arguments: argparse.Namespace, netlist: CrossbarNetlist, chip: Target) -> Verdict:
     loaded = load_network(arguments.checkpoint, arguments)
-    _require_same(arguments, netlist, loaded.sha256)
+    _require_same(arguments, netlist, loaded)
     levels = in_levels(loaded.network, int(netlist.provenance["in_time"]), chip)
     data = netlist_recordings(arguments, netlist, labels_for="verify")
     sums = np.zeros((3, len(levels.layers)), np.int64)

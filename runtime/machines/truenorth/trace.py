@@ -23,8 +23,8 @@ MIX_1, MIX_2 = 0xBF58476D1CE4E5B9, 0x94D049BB133111EB
 def random_bits(seed: int, neuron: int, tick: int, bits: int) -> int:
     """Random number of so many bits that a neuron draws in a tick, in plain integers.
 
-    A finaliser of splitmix64 over seed, neuron and tick: the same whoever draws first, so that an engine may leave out
-    neurons at rest. The chip's own generator is not public; no network that shall be exact should use it.
+    A finaliser of splitmix64 over seed, neuron and tick: the same whoever draws first. The chip's own generator is not
+    public; no network that shall be exact should use it.
 
     Examples
     --------

@@ -22,7 +22,7 @@ from spikeloom.runtime.report.sections import Section, Table, Text
 
 @dataclass(frozen=True, slots=True)
 class AgainstSpec:
-    """Recordings on which engine and specification ran; spikes, membranes and counts that differ."""
+    """Recordings on which both ran; spikes, membranes and counts that differ."""
 
     samples: int
     differences: int
