@@ -178,8 +178,8 @@ def _parts(edges: IntArray, n: int) -> IntArray:
 
     links = sparse.coo_array((np.ones(len(edges)), edges.T), (n, n))
     part = sparse.csgraph.connected_components(links, directed=False)[1]
-    lowest: IntArray = np.unique(part, return_index=True)[1].astype(np.int64)
-    return lowest[part]
+    lowest: IntArray = np.unique(part, return_index=True)[1][part]
+    return lowest
 
 
 def _repeats(table: Table, edges: IntArray, first: IntArray) -> tuple[str, ...]:

@@ -40,17 +40,7 @@ class Event:
 
 
 class EventLines:
-    """Lines of an unbuffered file, parsed one by one as they arrive.
-
-    Parameters
-    ----------
-    file : io.FileIO
-        Where they come from: a file, a pipe, a terminal.
-    name : str
-        What messages call it.
-    taxels : int
-        Size of the sensor.
-    """
+    """Lines of an unbuffered file of that `name`, a pipe or a terminal, parsed one by one as they arrive."""
 
     def __init__(self, file: io.FileIO, name: str, taxels: int) -> None:
         self._file = file
@@ -73,13 +63,7 @@ class EventLines:
         return True
 
     def read(self) -> Event | Mark:
-        """Read one line, whenever it comes.
-
-        Raises
-        ------
-        DataError
-            If it is neither an event of this sensor nor anything else that may stand in a line.
-        """
+        """Read one line, whenever it comes; DataError if it is nothing that may stand in one."""
         while not self._ended and b"\n" not in self._buffer:
             self._fill()
         if not self._buffer:

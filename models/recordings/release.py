@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from spikeloom.compiler.archive import ZIP_DATE
+from spikeloom.compiler.archive import ZIP_DATE, npy_bytes
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.files import beside, write_atomically
 from spikeloom.models.recordings.events import need_labels
@@ -67,9 +67,7 @@ def _members(splits: Sequence[Recordings]) -> Iterator[tuple[str, bytes]]:
     """Name and content of every file."""
     for recordings in splits:
         for index, events in enumerate(recordings.events):
-            buffer = io.BytesIO()
-            np.lib.format.write_array(buffer, events.astype(np.float32), version=(1, 0), allow_pickle=False)
-            yield f"{recordings.split}/{_name(recordings, index)}", buffer.getvalue()
+            yield f"{recordings.split}/{_name(recordings, index)}", npy_bytes(events.astype(np.float32))
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["split", "file", "source"])

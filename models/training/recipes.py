@@ -36,10 +36,8 @@ class Recipe:
     # {"mse", "cross-entropy"}; squared error of the spike rates against zeros and a one, or cross-entropy of `gain`
     # times the rates
     loss: str = MSE
-    # gain, smoothing: Of the cross-entropy: factor before the softmax, and share of the label that goes to all classes
-    # alike
-    gain: float = 1.0
-    smoothing: float = 0.0
+    gain: float = 1.0  # Of the cross-entropy: factor before the softmax
+    smoothing: float = 0.0  # Of the cross-entropy: share of the label that goes to all classes alike
     surrogate: Surrogate = RECTANGLE  # Derivative of a spike
     optimizer: str = ADAM  # {"adam", "adamw"}; both with amsgrad
     weight_decay: float = 0.0  # Of AdamW
@@ -125,11 +123,6 @@ def decays_asked(words: str, option: str, layers: tuple[str, ...]) -> Decays:
     --------
     >>> decays_asked("fc1=0.95,fc3=0.5", "--current-decay", ("conv1", "fc1", "fc2", "fc3"))
     (('fc1', 0.95), ('fc3', 0.5))
-
-    Raises
-    ------
-    OptionError
-        If they are none.
     """
     found: dict[str, float] = {}
     for word in words.split(","):
@@ -151,13 +144,7 @@ def decays_asked(words: str, option: str, layers: tuple[str, ...]) -> Decays:
 
 
 def check_recipe(recipe: Recipe) -> None:
-    """Refuse sizes that no network has.
-
-    Raises
-    ------
-    OptionError
-        Naming the option.
-    """
+    """Refuse sizes that no network has."""
     for option, value, most in (("features", recipe.features, 1024), ("batch", recipe.batch, 1024)):
         if not 1 <= value <= most:
             raise OptionError(f"--{option} {value}: allowed are 1 to {most}; choose another")

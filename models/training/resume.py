@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
-import tokenize
-import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,17 +13,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from spikeloom.compiler.archive import npy_bytes, read_npy, stored_members, zip_bytes
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.files import write_atomically
-
-SIZE_LIMIT = 2**30
-
-DAMAGES = (
-    *(zipfile.BadZipFile, zlib.error, RuntimeError),  # RuntimeError: encrypted, or packed in a way that is not known
-    *(ValueError, KeyError, EOFError, TypeError, RecursionError),
-    *(SyntaxError, tokenize.TokenError),  # of the header of an array
-)
-"""What reading a damaged state may raise."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -44,37 +32,24 @@ class TrainingState:
 def write_state(path: str | os.PathLike[str], state: TrainingState) -> None:
     """Write a state, whole or not at all."""
     header = json.dumps({"options": dict(state.options), "progress": dict(state.progress)})
+    arrays = {"header": np.array(header), **state.arrays}
+    content = zip_bytes({f"{name}.npy": npy_bytes(array) for name, array in arrays.items()})
     with write_atomically(path) as file:
-        np.savez(file, allow_pickle=False, header=np.array(header), **state.arrays)
+        file.write(content)
 
 
 def read_state(path: str | os.PathLike[str], options: Mapping[str, Any]) -> TrainingState:
-    """Read a state and check that it belongs to this training.
-
-    Raises
-    ------
-    ModelError
-        If the file is missing or damaged.
-    OptionError
-        If it was written with other options or data; names them.
-    """
+    """Read a state; ModelError if it is missing or damaged, OptionError if it is that of another training."""
     path = Path(path)
     if not path.is_file():
         raise ModelError(f"{path}: no interrupted training to resume; omit --resume")
-    if path.stat().st_size > SIZE_LIMIT:
-        raise ModelError(f"{path}: {path.stat().st_size} bytes, {SIZE_LIMIT} allowed; this is no training state")
-    damaged = f"{path}: is not a training state or is damaged; delete it and train anew"
     try:
-        content = path.read_bytes()
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            if sum(member.file_size for member in archive.infolist()) > len(content):  # states are not compressed
-                raise ModelError(damaged)
-        with np.load(io.BytesIO(content), allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
+        members = stored_members(path.read_bytes())
+        arrays = {name.removesuffix(".npy"): read_npy(content) for name, content in members.items()}
         header = json.loads(str(arrays.pop("header")))
         found, progress = dict(header["options"]), dict(header["progress"])
-    except DAMAGES as error:
-        raise ModelError(damaged) from error
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise ModelError(f"{path}: is not a training state or is damaged; delete it and train anew") from error
     differing = sorted(name for name in {*found, *options} if found.get(name) != options.get(name))
     if differing:
         raise OptionError(

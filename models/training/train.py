@@ -43,13 +43,10 @@ class Epoch:
 
     epoch: int  # Counted from 1
     learning_rate: float  # When it began
-    # training_loss, test_loss: The recipe's loss, by default the mean squared error of the spike rates against zeros
-    # and a one; mean over the recordings. A penalty on spikes counts in training only.
-    training_loss: float
+    training_loss: float  # The recipe's, mean over the recordings; a penalty on spikes counts in training only
     test_loss: float
-    # correct, tested: Test recordings classified correctly after it, and all of them
-    correct: int
-    tested: int
+    correct: int  # Test recordings classified correctly after it
+    tested: int  # All test recordings
 
     @property
     def accuracy(self) -> float:
@@ -62,10 +59,8 @@ class Trained:
     """What a training left."""
 
     architecture: Sizes  # Of the network
-    # last, best: Weights after the last epoch, and after the epoch with the most correct test recordings (the first
-    # such): the latter is chosen on test data, as the published figures are
-    last: Weights
-    best: Weights
+    last: Weights  # After the last epoch
+    best: Weights  # After the first epoch with the most correct test recordings: chosen on these, as published figures
     best_epoch: int  # Counted from 1
     kept: Weights | None  # Weights after the epoch that was asked for
     history: tuple[Epoch, ...]  # All epochs

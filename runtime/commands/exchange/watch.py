@@ -249,13 +249,7 @@ class Summary:
 
 
 def run(arguments: argparse.Namespace) -> Outcome:
-    """Run the command; its result is the summary, everything else was printed before.
-
-    Raises
-    ------
-    SpikeloomError
-        If an option, the netlist or a line cannot be used.
-    """
+    """Run the command; its result is the summary, everything else was printed before."""
     from spikeloom.runtime.machines.base import machine_for
     from spikeloom.runtime.machines.integer import integer_machine
     from spikeloom.runtime.studies.anytime import exits

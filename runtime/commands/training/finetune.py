@@ -122,15 +122,7 @@ def _state(output: Path, *, resume: bool) -> Path:
 
 
 def run(arguments: argparse.Namespace) -> Outcome:
-    """Fine-tune, write the checkpoint, report.
-
-    Raises
-    ------
-    SpikeloomError
-        If network, recordings or options cannot be used.
-    KeyboardInterrupt
-        On an interrupt; its text says what is kept.
-    """
+    """Fine-tune, write the checkpoint, report; the text of a KeyboardInterrupt says what is kept."""
     require_place(arguments.output, "-o", arguments)
     with only_one(Path(arguments.output)):
         return Outcome(_finetuned(arguments, Path(arguments.output)), finetune_sections)

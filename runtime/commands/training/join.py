@@ -35,13 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: Namespace) -> Outcome:
-    """Join, write the checkpoint, report.
-
-    Raises
-    ------
-    SpikeloomError
-        If a network cannot be used, or they do not fit together.
-    """
+    """Join, write the checkpoint, report."""
     require_place(arguments.output, "-o", arguments)
     found = [_network(name, arguments.weights) for name in arguments.checkpoints]
     towers = [record for name, checkpoint in zip(arguments.checkpoints, found, strict=True)

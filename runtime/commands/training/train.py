@@ -120,13 +120,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
 
 
 def both_splits(data: str, taxels: int, bin_s: float) -> tuple[Recordings, Recordings]:
-    """Training and test recordings of a sensor, every one with its label.
-
-    Raises
-    ------
-    DataError, OptionError
-        If they cannot be used.
-    """
+    """Training and test recordings of a sensor, every one with its label."""
     progress("reading the recordings")
     shared: dict[str, Any] = {"taxels": taxels, "bin_s": bin_s, "labels_for": "training", "classes": None}
     training, test = (recordings(data, split, **shared) for split in ("train", "test"))

@@ -20,19 +20,9 @@ Result = tuple[Finished, IntArray | None]
 
 
 def train_seeds(jobs: Sequence[Job], *, resume: bool) -> list[Result]:
-    """Train several seeds, side by side on the cores where there are several.
+    """Train several seeds, side by side on the cores where there are several; results are those of `run_job`.
 
-    Parameters
-    ----------
-    jobs : sequence of Job
-        One for each seed.
-    resume : bool
-        Leave finished seeds alone, go on with interrupted ones, and start the rest.
-
-    Returns
-    -------
-    list of (record, predictions)
-        In the order of the jobs, see :func:`training.run_job`.
+    With `resume`, finished seeds are left alone, interrupted ones go on, and the rest is started.
 
     Raises
     ------

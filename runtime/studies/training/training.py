@@ -61,15 +61,7 @@ def state_of(job: Job) -> tuple[Path, Path]:
 
 
 def run_job(job: Job) -> tuple[Finished, IntArray | None]:
-    """Train one seed by both protocols and write its checkpoint.
-
-    Returns
-    -------
-    finished : Finished
-        The training record, file and hash.
-    predictions : (test samples,) int64, or None
-        Of the last epoch, where they are drawn.
-    """
+    """Train one seed by both protocols and write its checkpoint; gives the decisions of the last epoch if drawn."""
     from spikeloom.models.training.protocols import train_both
     from spikeloom.models.training.record import training_record
 
@@ -112,10 +104,8 @@ def recall(job: Job) -> tuple[Finished, IntArray | None]:
 
     Raises
     ------
-    ModelError
-        If the file is no checkpoint.
-    OptionError
-        If it holds another training, or lacks the epoch that a picture or ``--keep`` needs.
+    ModelError, OptionError
+        If the file is no checkpoint, of another training, or lacks the epoch that a picture or ``--keep`` needs.
     """
     from spikeloom.models.training.protocols import data_digest
     from spikeloom.models.training.record import read_record
