@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from made_files import CLASSES, events, own_file, recordings_folder, weights
 from numpy.testing import assert_allclose, assert_array_equal
-from timed_networks import written
 
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.targets.base import load_target
@@ -143,18 +142,6 @@ def test_recordings_of_different_length_end_on_their_own(place, monkeypatch):
         for name, each in alone.costs.energy.items():
             assert_allclose(ran.energy[name][i, -1], each.sum())
         assert_allclose(ran.time["sanafe"][i, -1], alone.simple["sanafe"].duration_ns.sum() * 1e-9)
-
-
-def test_clocks_and_lasting_currents(spikeloom, tmp_path):
-    checkpoint, data = tmp_path / "x.pt", tmp_path / "data"
-    written(checkpoint)
-    made = (np.random.default_rng(3).random((6, 39, 2, 20)) < 0.15).astype(np.uint8)
-    recordings_folder(data, train=made[:3], test=made[3:])
-    net = tmp_path / "x.loom"
-    assert spikeloom("compile", checkpoint, "--keep-all", "-o", net)[0] == 0
-    code, out, _ = spikeloom("anytime", net, "--checkpoint", checkpoint, "--data", data, "--calibrate", data, "--json")
-    assert code == 0
-    assert json.loads(out)["rules"][0]["differ"] == 0
 
 
 def test_several_chips_have_no_times(spikeloom, tmp_path):

@@ -25,7 +25,6 @@ from spikeloom.models.recordings.evtouch import load_recordings
 from spikeloom.models.training.protocols import data_digest
 from spikeloom.runtime.studies.chart import requests as chart_requests
 from spikeloom.runtime.studies.chart import work as chart_work
-from spikeloom.runtime.studies.chart.grid import Grid
 from spikeloom.runtime.studies.chart.networks import Storage, given_networks
 
 GRID = "bits=4,8,window=50-100%:50,cores=cores/fc1:2"
@@ -187,12 +186,15 @@ def read_as(*checkpoints):
     return argparse.Namespace(checkpoints=list(checkpoints), directed=False, run=0, **options)
 
 
-def test_the_graph_of_the_grid_chooses_among_the_networks(place, monkeypatch):
+def test_files_of_one_name_have_names_of_their_own(place, monkeypatch):
     monkeypatch.chdir(place)
-    for grid, names in ((Grid(), ["ring", "chain"]), (Grid(graph=("knn1",)), ["chain"])):
-        assert [network.name for network in given_networks(read_as("ring.pt", "chain.pt"), grid)] == names
     shutil.copy("ring.pt", "other/ring.pt")
-    assert [network.name for network in given_networks(read_as("ring.pt", "other/ring.pt"), Grid())][1] == "ring-2"
+    networks = given_networks(read_as("ring.pt", "chain.pt", "other/ring.pt"))
+    assert [(network.name, network.graph) for network in networks] == [
+        ("ring", "ring"),
+        ("chain", "knn:1"),
+        ("ring-2", "ring"),
+    ]
 
 
 def test_what_the_chip_refuses_is_listed(spikeloom, place, monkeypatch):
@@ -242,10 +244,6 @@ OUT = ("-o", "bad")
             "--grid bits=9: allowed are 2, 3, 4, 5, 6, 8",
         ),
         ("ring.pt --data data --grid ''", "--grid : belongs to no axis"),
-        (
-            "ring.pt --data data --grid graph=mst:3",
-            "graph=mst:3: .* on ring; spikeloom train --graph mst:3 makes one",
-        ),
         ("ring.pt --data data --grid bits=8+4", r"bits=8\+4: 2 widths, ring.pt has 4 layers \(conv1, fc1, fc2, fc3\)"),
         (
             "ring.pt --data data --grid cores=fc9:2",
@@ -285,7 +283,7 @@ def test_a_store_of_another_version(made, spikeloom, place, monkeypatch):
 
 def test_a_worker_that_has_other_files_says_so(place, monkeypatch):
     monkeypatch.chdir(place)
-    (network,) = given_networks(read_as("ring.pt"), Grid())
+    (network,) = given_networks(read_as("ring.pt"))
     digest = data_digest(load_recordings("data", "train"), load_recordings("data", "test"))
     data = chart_requests.Data(path="data", bin_s=0.02, sha256=digest)
     facts = chart_requests.Facts(data=data, targets={"loihi1": load_target("loihi1")}, folder=place)

@@ -20,12 +20,9 @@ def parsed(text):
 
 
 def test_every_axis_of_the_whole_example():
-    found = parsed(
-        "bits=2-6,8,graph=manual/knn:1,planes=1-2,window=25-100%,cores=latency/fc1:6+conv1:4,prune=0/1,groups=2"
-    )
+    found = parsed("bits=2-6,8,planes=1-2,window=25-100%,cores=latency/fc1:6+conv1:4,prune=0/1,groups=2")
     assert found == Grid(
         bits=((2,), (3,), (4,), (5,), (6,), (8,)),
-        graph=("manual", "knn:1"),
         planes=(1, 2),
         window=(25, 50, 75, 100),
         cores=("latency", "fc1:6+conv1:4"),
@@ -68,7 +65,7 @@ def test_windows(text, windows):
         *((f"bits={value}", "or a width for each layer as in 8+4+4+8") for value in ("8+4+9", "8+", "8+2-4", "6-2")),
         ("bits=3,,4", "bits=: allowed are 2"),
         ("bits=3,", "bits=: allowed are 2"),
-        ("bits=3,bits=4", "bits: give each of bits, planes, groups, prune, cores, window, graph once"),
+        ("bits=3,bits=4", "bits: give each of bits, planes, groups, prune, cores, window once"),
         ("planes=1, colour=2", "colour: give each of bits, planes"),
         ("3,4", "3: belongs to no axis; begin with one"),
         ("", ": belongs to no axis; begin with one"),
@@ -77,7 +74,6 @@ def test_windows(text, windows):
         ("prune=2", "prune=2: allowed are 0 (keep) and 1 (leave out)"),
         *((f"window={value}", "1 to 100 per cent") for value in ("50-101%", "0", "80-20%", "20-80%:0", "50%:5")),
         *((f"cores={value}", "cores, energy, latency, or LAYER:N") for value in ("fast", "a:2+:3", "a:2+a:3", "a:0")),
-        ("graph=", "graph=: allowed are names of graphs"),
     ],
 )
 def test_a_mistake_names_the_value_and_what_is_allowed(text, telling):
@@ -119,7 +115,6 @@ GRIDS = st.builds(
         unique=True,
     ).map(tuple),
     window=st.lists(st.integers(1, 100), min_size=1, max_size=4, unique=True).map(tuple),
-    graph=st.lists(st.from_regex(r"[a-z]+(:[0-9.]+)?", fullmatch=True), max_size=3, unique=True).map(tuple),
 )
 
 
@@ -132,7 +127,6 @@ def test_what_is_written_is_read(grid, between, order):
         "prune": grid.prune,
         "cores": grid.cores,
         "window": [f"{window}%" for window in grid.window],
-        "graph": grid.graph,
     }
     text = ",".join(f"{axis}={between.join(map(str, words[axis]))}" for axis in order if words[axis])
     assert parsed(text) == grid

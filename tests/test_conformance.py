@@ -274,9 +274,9 @@ def test_explain_finds_causes(name, capsys):
 
 COMMANDS = {
     "report": ("timed", "report {net} --checkpoint {file} --data {data} -o {out}/page.html"),
-    "anytime": ("gcn", "anytime {net} --checkpoint {file} --data {data}"),
+    "anytime": ("timed", "anytime {net} --checkpoint {file} --data {data}"),
     "bits": ("joined", "bits {file} --calibrate {data} --agreement 0.1 --widths 4,8"),
-    "lean": ("recurrent", "lean {file} --dt 0.02 --data {data} -o {out}/lean.loom"),
+    "lean": ("joined-timed", "lean {file} --data {data} -o {out}/lean.loom"),
     "stress": ("recurrent", "stress {net} --checkpoint {file} --dt 0.02 --data {data} --seeds 1 --only taxels_dead"),
     "chart": ("binned", "chart {file} --data {data} --grid bits=8 --jobs 1 -o {out}/chart"),
     "yardsticks": ("joined", "yardsticks {file} --data {data}"),

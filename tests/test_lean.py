@@ -9,7 +9,6 @@ import pytest
 from made_files import CLASSES, TAXELS, events, own_file, recordings_folder, small_checkpoint, weights
 from numpy.testing import assert_array_equal
 from random_netlists import Axon, Neuron, build
-from timed_networks import written
 
 from spikeloom.compiler import Options, compile_network, lift, read_netlist
 from spikeloom.compiler.fixedpoint import read_only
@@ -229,16 +228,6 @@ def test_joined_bins():
     keep = 4096 - 1 - trials.coarse_netlist(lasting, 2, adapted=True).decay_u
     assert keep.tolist() == [round(3891**2 / 4096), round(3891**2 / 4096), 0]
     assert trials.coarse_netlist(netlist, 2, adapted=False).decay_v.tolist() == netlist.decay_v.tolist()
-
-
-def test_clocks_and_lasting_currents(spikeloom, tmp_path):
-    checkpoint, data = tmp_path / "x.pt", tmp_path / "data"
-    written(checkpoint)
-    made = (np.random.default_rng(3).random((6, 39, 2, 20)) < 0.15).astype(np.uint8)
-    recordings_folder(data, train=made[:3], test=made[3:])
-    code, out, _ = spikeloom("lean", checkpoint, "--data", data, "--json")
-    assert code == 0
-    assert json.loads(out)["rows"][0]["test"]["differ"] == 0
 
 
 def test_a_network_from_nir_remembers_how_it_was_read(spikeloom):

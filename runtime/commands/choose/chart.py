@@ -26,11 +26,10 @@ STORE = "points.sqlite"
 NOTES = """\
 Axes of the grid: bits (2-6, 8, or one a layer as in 8+4+4+8), planes (1-3), groups (1-8), prune (0, 1), cores (cores,
 energy, latency, or LAYER:N as in fc1:6+conv1:4), window (per cent of each recording, 25-100% is every quarter,
-25-100%:5 every twentieth), graph (that a network was trained on: of those given, or shipped ones beside them). Choices
-are made on the training split, the test split is reported. A chart that was interrupted goes on with the same command;
-netlists and figures are kept in FOLDER. Networks for different chips stand beside each other by the prices of their
-own: fronts and choices are among the points of the chip of the first network. The exit code is 1 if no point fits a
-budget.
+25-100%:5 every twentieth). Choices are made on the training split, the test split is reported. A chart that was
+interrupted goes on with the same command; netlists and figures are kept in FOLDER. Networks for different chips stand
+beside each other by the prices of their own: fronts and choices are among the points of the chip of the first network.
+The exit code is 1 if no point fits a budget.
 """
 
 
@@ -70,7 +69,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     grid = Grid() if arguments.grid is None else parse_grid(arguments.grid, stores)
     budgets = parse_budgets(arguments.budget)
     folder = _folder(arguments.output)
-    networks = given_networks(arguments, grid)
+    networks = given_networks(arguments)
     targets = {network.target: load_target(network.target) for network in networks}
     target = targets[networks[0].target]
     tables = [table.name for table in target.energy]

@@ -1,7 +1,7 @@
 """What ``--grid`` says: axes and their values.
 
 A grid is ``AXIS=VALUE,VALUE,AXIS=VALUE …``; values stand between commas or slashes, whole numbers may be ranges:
-``bits=2-6,8,graph=manual/knn:1,window=25-100%:25``. Axes that it does not name keep their usual value.
+``bits=2-6,8,cores=cores/latency,window=25-100%:25``. Axes that it does not name keep their usual value.
 """
 
 from __future__ import annotations
@@ -37,7 +37,6 @@ class Grid:
     # What the layout is for, as ``--optimize`` names it, or least cores as in ``fc1:6+conv1:4``
     cores: tuple[str, ...] = ("cores",)
     window: tuple[int, ...] = (25, 50, 75, WHOLE)  # Per cent of each recording
-    graph: tuple[str, ...] = ()  # Graphs that networks were trained on; empty: of all that are given
 
 
 AXES = tuple(axis.name for axis in fields(Grid))
@@ -74,7 +73,7 @@ def parse_grid(text: str, target: Target) -> Grid:
             raise OptionError(f"--grid {axis}={value}: allowed are {allowed}")
         found[axis] |= dict.fromkeys(values)
     grid = Grid(**{name: tuple(values) for name, values in found.items()})
-    points = math.prod(len(getattr(grid, axis)) for axis in AXES if axis != "graph")
+    points = math.prod(len(getattr(grid, axis)) for axis in AXES)
     if points > MOST:
         raise OptionError(f"--grid: {points:,} points a network, allowed are {MOST:,}; give fewer values")
     return grid
@@ -94,7 +93,6 @@ def _readers(target: Target) -> dict[str, tuple[Callable[[str], Sequence[Any]], 
         "prune": (lambda words: _numbers(words, range(2)), "0 (keep) and 1 (leave out)"),
         "cores": (_cores, f"{', '.join(GOALS)}, or LAYER:N as in fc1:6+conv1:4, each layer once"),
         "window": (_windows, f"1 to {WHOLE} per cent, or ranges as in 25-100%:5"),
-        "graph": (lambda words: [words] if words else [], "names of graphs"),
     }
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import count, product
@@ -157,32 +156,16 @@ class Given:
         return grid.cores if self.levels is None else Grid().cores
 
 
-def given_networks(arguments: argparse.Namespace, grid: Grid) -> tuple[Given, ...]:
-    """Networks of ``checkpoints``, those of graphs that the grid leaves out not among them.
-
-    Raises
-    ------
-    OptionError, ModelError
-        If a checkpoint cannot be used, is given twice, or a graph has none.
-    """
+def given_networks(arguments: argparse.Namespace) -> tuple[Given, ...]:
+    """Networks of ``checkpoints``; refused if one cannot be used, or is given twice."""
     paths: list[str] = arguments.checkpoints
+    named: dict[str, Given] = {}
     for path in paths:
         if paths.count(path) > 1:
             raise OptionError(f"{path}: is given twice; give each checkpoint once")
-    networks = [_read(path, arguments) for path in paths]
-    trained = {_plain(network.graph): network.graph for network in networks}
-    for graph in grid.graph:
-        if _plain(graph) not in trained:
-            raise OptionError(
-                f"--grid graph={graph}: no checkpoint was trained on that graph, those given on "
-                f"{', '.join(trained.values())}; spikeloom train --graph {graph} makes one"
-            )
-    wanted = [_plain(graph) for graph in grid.graph or trained]
-    named: dict[str, Given] = {}
-    for network in networks:
-        if _plain(network.graph) in wanted:
-            name = next(name for name in _names(network.name) if name not in named)
-            named[name] = replace(network, name=name)
+        network = _read(path, arguments)
+        name = next(name for name in _names(network.name) if name not in named)
+        named[name] = replace(network, name=name)
     return tuple(named.values())
 
 
@@ -226,11 +209,6 @@ def _read(path: str, arguments: argparse.Namespace) -> Given:
         forms=checkpoint.forms,
         bins=checkpoint.bins,
     )
-
-
-def _plain(graph: str) -> str:
-    """A graph's name as it stands in names of files: ``knn:1`` is ``knn1``."""
-    return re.sub(r"[^A-Za-z0-9.]", "", graph).strip(".")
 
 
 def require_suited(networks: Sequence[Given], splits: Mapping[str, Recordings], digest: str) -> None:

@@ -323,10 +323,7 @@ def _provenance(chart: Chart) -> list[Block]:
     files = [["recordings", chart.data.path, chart.data.sha256]]
     files += [[network.name, network.path, network.sha256] for network in chart.networks]
     trained = [[each.name, each.system, each.trained_by or "not known"] for each in chart.networks]
-    grid = [
-        [name, ", ".join(_value(value) for value in getattr(chart.grid, name)) or "all"]
-        for name in chart.grid.__slots__
-    ]
+    grid = [[name, ", ".join(_value(value) for value in getattr(chart.grid, name))] for name in chart.grid.__slots__]
     titles = [
         [f"{kind}, {name}", title]
         for kind, tables in (("energy", chart.tables.energy), ("time", chart.tables.time))
