@@ -19,7 +19,7 @@ from spikeloom.models.graphs import normalised_adjacency
 from spikeloom.runtime.equivalence import float_engine
 from spikeloom.runtime.machines.loihi1 import engine, spec
 from spikeloom.runtime.machines.loihi1.blocks import lay_out_blocks
-from spikeloom.runtime.studies.stress import damages, other_networks
+from spikeloom.runtime.studies.stress import damages
 from spikeloom.runtime.studies.stress.pair import Pair
 
 
@@ -244,7 +244,7 @@ def test_an_unplaced_netlist_spikes_as_the_placed_one(packing):
 
 def test_the_same_network_is_stored_alike_and_none_can_overflow():
     pair = made()
-    alike = other_networks.stored_alike(pair, pair.network)
+    alike = damages.stored_alike(pair, pair.network)
     integer = lift(alike.netlist)
     for ours, theirs, population, projection in zip(
         in_model_units(alike.netlist), weights(pair.network), integer.populations, integer.projections, strict=True
@@ -252,14 +252,14 @@ def test_the_same_network_is_stored_alike_and_none_can_overflow():
         half_a_step = 2.0**projection.exponent / population.scale.min()
         assert np.abs(ours - theirs).max() <= half_a_step * (1 + 1e-9)
     larger = tuple(replace(p, weight=p.weight * 40) for p in pair.network.projections)
-    shrunk = other_networks.stored_alike(pair, replace(pair.network, projections=larger))
+    shrunk = damages.stored_alike(pair, replace(pair.network, projections=larger))
     for netlist in (alike.netlist, shrunk.netlist):
         assert lay_out_blocks(netlist) is not None
 
 
 def test_outliers_leave_the_float_network_but_for_one_weight_a_layer_and_coarsen_the_chip():
     pair = made()
-    after = other_networks.add_outliers(pair, 8, drawn(5))
+    after = damages.add_outliers(pair, 8, drawn(5))
     for old, new in zip(weights(pair.network), weights(after.network), strict=True):
         place = np.argwhere(old != new)
         assert len(place) == 1
@@ -271,7 +271,7 @@ def test_outliers_leave_the_float_network_but_for_one_weight_a_layer_and_coarsen
 
 def test_rewired_edges():
     edges = ring(8).edges
-    some, more = (other_networks.rewire(edges, 8, share, drawn(6)) for share in (0.25, 0.5))
+    some, more = (damages.rewire(edges, 8, share, drawn(6)) for share in (0.25, 0.5))
     for found, count in ((some, 2), (more, 4)):
         pairs = set(map(tuple, found.tolist()))
         assert len(pairs) == len(found) == len(edges)
@@ -279,23 +279,23 @@ def test_rewired_edges():
         assert len(set(map(tuple, edges.tolist())) - pairs) == 2 * count
         assert all(a != b for a, b in pairs)
     one_way = np.array([[0, 1], [1, 2], [2, 3]])
-    found = other_networks.rewire(one_way, 4, 1.0, drawn(6))
+    found = damages.rewire(one_way, 4, 1.0, drawn(6))
     assert len(found) == 3
     assert not set(map(tuple, one_way.tolist())) & set(map(tuple, found.tolist()))
 
 
 def test_doubled_edges_change_the_propagation_and_no_reach():
     edges = ring(8).edges
-    twice = other_networks.double(edges, 0.5, drawn(7))
+    twice = damages.double(edges, 0.5, drawn(7))
     assert len(twice) == 1.5 * len(edges)
     before, after = normalised_adjacency(edges, 8), normalised_adjacency(twice, 8)
     assert_array_equal(before != 0, after != 0)
     assert not np.allclose(before, after)
-    assert_allclose(normalised_adjacency(other_networks.double(edges, 1.0, drawn(7)), 8), before)
+    assert_allclose(normalised_adjacency(damages.double(edges, 1.0, drawn(7)), 8), before)
 
 
 def test_a_bias_that_no_register_holds():
     pair = made()
     populations = tuple(replace(p, bias=p.bias + 1e9) for p in pair.network.populations)
     with pytest.raises(OptionError, match=r"^conv1: .*; omit this perturbation$"):
-        other_networks.stored_alike(pair, replace(pair.network, populations=populations))
+        damages.stored_alike(pair, replace(pair.network, populations=populations))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -28,7 +28,7 @@ from spikeloom.models.recordings.windows import first_part, steps_of
 from spikeloom.runtime.inputs.compilation import PLACING, ROUNDING, parse_cores, parse_packings, provenance
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import recordings
-from spikeloom.runtime.machines.base import DEFAULT, Machine, chip_chart, machine_for
+from spikeloom.runtime.machines.base import DEFAULT, Machine, Price, chip_chart, machine_for
 from spikeloom.runtime.machines.votes import readout_counts
 from spikeloom.runtime.report.encode import encode
 from spikeloom.runtime.studies.chart.networks import Given, Source
@@ -113,13 +113,8 @@ def _chart_of(network: Given) -> Any | None:
 
 @lru_cache(maxsize=1)
 def _machine(path: Path, sha256: str) -> Machine | None:
-    """A netlist that is kept; None if it is gone, damaged or another one."""
-    if not path.is_file() or sha256_of(path) != sha256:
-        return None
-    try:
-        return machine_for(path)
-    except FormatError:
-        return None
+    """A netlist that is kept; None if it is gone or another one."""
+    return machine_for(path) if path.is_file() and sha256_of(path) == sha256 else None
 
 
 # -- float model -------------------------------------------------------------------------------------------------------
@@ -248,27 +243,19 @@ def _run(work: Run) -> RanBoth:
 def _costs(machine: Machine, data: Recordings, bin_s: float) -> Ran:
     """Decisions, and the mean inference: operations, energy by table, time by table, the longest step."""
     steps, size = data.step_counts, machine.batch(data.steps)
-    decided: list[int] = []
-    operations: list[IntArray | FloatArray] = []
-    energy: dict[str, list[FloatArray]] = {}
-    seconds: dict[str, list[FloatArray]] = {}
-    longest: dict[str, float] = {}
-    for first in range(0, len(data), size):
-        part = slice(first, first + size)
-        ran, price = machine.price(data.events[part], bin_s=bin_s, lengths=steps[part])
-        decided += ran.decisions.tolist()
-        operations.append(price.synaptic_operations)
-        for name, joules in price.energy_j.items():
-            energy.setdefault(name, []).append(joules)
-        for name, each in price.time_s.items():
-            seconds.setdefault(name, []).append(each)
-            longest[name] = max(longest.get(name, 0.0), price.step_s[name])
+    parts = [slice(first, first + size) for first in range(0, len(data), size)]
+    priced = [machine.price(data.events[part], bin_s=bin_s, lengths=steps[part]) for part in parts]
+    prices = [price for _, price in priced]
+
+    def mean(of: Callable[[Price], Mapping[str, FloatArray]]) -> dict[str, float]:
+        return {name: float(np.concatenate([of(price)[name] for price in prices]).mean()) for name in of(prices[0])}
+
     return Ran(
-        decisions=tuple(decided),
-        synaptic_operations=float(np.concatenate(operations).mean()),
-        energy_j={name: float(np.concatenate(each).mean()) for name, each in energy.items()},
-        time_s={name: float(np.concatenate(each).mean()) for name, each in seconds.items()},
-        step_s=longest,
+        decisions=tuple(np.concatenate([ran.decisions for ran, _ in priced]).tolist()),
+        synaptic_operations=float(np.concatenate([price.synaptic_operations for price in prices]).mean()),
+        energy_j=mean(lambda price: price.energy_j),
+        time_s=mean(lambda price: price.time_s),
+        step_s={name: max(0.0, *(price.step_s[name] for price in prices)) for name in prices[0].time_s},
         steps=float(steps.mean()),
     )
 

@@ -15,7 +15,7 @@ from spikeloom.compiler.systems import GRAPH_SYSTEMS, TITLES
 from spikeloom.compiler.types import IntArray
 from spikeloom.models.graphs import build_graph
 from spikeloom.models.systems import propagation_of
-from spikeloom.runtime.studies.stress import damages, disturbances, other_networks
+from spikeloom.runtime.studies.stress import damages, disturbances
 from spikeloom.runtime.studies.stress.bench import Bench, Sensor, after_others, going_round
 from spikeloom.runtime.studies.stress.disturbances import Events
 from spikeloom.runtime.studies.stress.pair import Inputs, Pair
@@ -126,7 +126,7 @@ def _on_graph(pair: Pair, sensor: Sensor, edges: IntArray) -> Pair:
     checkpoint = sensor.checkpoint
     assert checkpoint is not None, "no obstacle"
     seen = propagation_of(checkpoint.system, edges, checkpoint.taxels, checkpoint.grid, len(checkpoint.hops))
-    return other_networks.stored_alike(pair, expand(checkpoint, seen))
+    return damages.stored_alike(pair, expand(checkpoint, seen))
 
 
 # -- the table ---------------------------------------------------------------------------------------------------------
@@ -321,14 +321,14 @@ BATTERY = (
         "edges_rewired",
         "edges of the taxel graph lead elsewhere",
         Scale("share of edges", (0.05, 0.1, 0.25, 0.5), (0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.75, 1)),
-        damage=_on_edges(other_networks.rewire),
+        damage=_on_edges(damages.rewire),
         obstacle=_no_graph,
     ),
     Perturbation(
         "edges_doubled",
         "edges of the taxel graph are listed twice",
         Scale("share of edges", (0.1, 0.25, 0.5, 1), (*TENTHS, 1)),
-        damage=_on_edges(lambda edges, _, share, rng: other_networks.double(edges, share, rng)),
+        damage=_on_edges(lambda edges, _, share, rng: damages.double(edges, share, rng)),
         obstacle=_no_graph,
     ),
     Perturbation(
@@ -343,7 +343,7 @@ BATTERY = (
         "outlier_weight",
         "one weight a layer grows beyond the largest and takes the scale with it",
         Scale("times the largest", (2, 4, 8, 16), (2, 4, 8, 16, 32, 64), least=1, most=64, whole=True),
-        damage=_drawn(other_networks.add_outliers),
+        damage=_drawn(damages.add_outliers),
     ),
     Perturbation(
         "shorter_decay",
