@@ -9,7 +9,7 @@ from fuzzed_onnx import faulty
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from made_modules import exported
-from made_onnx import CONSTANTS, STAGE, STATE_IN, body, model, neuron, node, scanned, two_layers, value
+from made_onnx import CONSTANTS, STAGE, STATE_IN, model, neuron, node, scanned, two_layers
 from onnx import ModelProto, TensorProto, helper
 
 from spikeloom.compiler.errors import SpikeloomError
@@ -63,13 +63,6 @@ def changed(change):
     proto = ModelProto.FromString(two_layers())
     change(proto.graph.initializer[0], proto)
     return proto.SerializeToString()
-
-
-def deep():
-    inside = body()
-    for _ in range(9):
-        inside = helper.make_graph([node("If", "yes", "out", then_branch=inside)], "deep", [], [value("out", None)])
-    return model([node("If", "yes", "out", then_branch=inside)], [("x", [1, 4])], ["out"], {"yes": np.array(True)})
 
 
 def one(op, inputs="current", **attributes):
@@ -203,7 +196,6 @@ REFUSED = [
     ("tensor w: has element type 16", lambda: changed(lambda w, _: setattr(w, "data_type", TensorProto.BFLOAT16))),
     ("makes 1000000000000 values or", lambda: plain(inputs=[("x", [10**6, 10**6]), *STATE_IN[:2]])),
     ("input x: has an open size 'taxels', allowed", lambda: plain(inputs=[("x", [1, "taxels"]), *STATE_IN[:2]])),
-    ("has graphs nested deeper than 8", deep),
 ]
 
 

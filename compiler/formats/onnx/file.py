@@ -30,8 +30,7 @@ OPSETS = range(9, 27)
 
 NODE_LIMIT = 200_000
 DIMENSIONS = 16
-NESTING = 8
-"""Nodes of a file, dimensions of a value, and graphs within graphs that are read."""
+"""Nodes of a file and dimensions of a value; how deep graphs lie in graphs is limited by protobuf."""
 
 BOOL, DOUBLE = 9, 11
 NUMBERS = range(1, 14)
@@ -47,11 +46,11 @@ DAMAGED = "is truncated or damaged; export it again"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Declared:
-    """An input as the file declares it; a word or None stands for a size that is not fixed."""
+    """An input as the file declares it."""
 
     name: str
     kind: int
-    shape: tuple[int | str | None, ...]
+    shape: tuple[int | str | None, ...]  # a word or None stands for a size that is not fixed
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -159,7 +158,7 @@ def _bring_data(graph: Any, folder: Path, digest: Any) -> None:
     from onnx.external_data_helper import load_external_data_for_tensor
 
     total = 0
-    for tensor in _tensors(graph, [NODE_LIMIT], NESTING):
+    for tensor in _tensors(graph, [NODE_LIMIT]):
         if tensor.data_location != tensor.EXTERNAL:
             continue
         location = next((entry.value for entry in tensor.external_data if entry.key == "location"), "")
@@ -177,19 +176,18 @@ def _bring_data(graph: Any, folder: Path, digest: Any) -> None:
         digest.update(tensor.raw_data)
 
 
-def _tensors(graph: Any, left: list[int], nesting: int) -> Iterator[Any]:
-    """Tensors of a graph and of those in it; there may be so many nodes left and so many graphs in graphs."""
+def _tensors(graph: Any, left: list[int]) -> Iterator[Any]:
+    """Tensors of a graph and of those in it, which may have so many nodes together."""
     left[0] -= len(graph.node)
-    if nesting == 0 or left[0] < 0:
-        what = f"more than {NODE_LIMIT} nodes" if left[0] < 0 else f"graphs nested deeper than {NESTING}"
-        raise ModelError(f"has {what}; export one step of the network instead of all")
+    if left[0] < 0:
+        raise ModelError(f"has more than {NODE_LIMIT} nodes; export one step of the network instead of all")
     yield from graph.initializer
     for node in graph.node:
         for attribute in node.attribute:
             if attribute.HasField("t"):
                 yield attribute.t
             if attribute.HasField("g"):
-                yield from _tensors(attribute.g, left, nesting - 1)
+                yield from _tensors(attribute.g, left)
 
 
 def _check(proto: Any) -> None:

@@ -165,4 +165,4 @@ def _pair(table: Table, first: int, second: int) -> int:
     other = second if spike == first else first
     if table.atoms[spike].kind == SPIKE and table.points[table.atoms[spike].of[0]].membrane == other:
         return table.product(first, second)
-    raise ModelError(f"multiplies {table.atoms[first].label} by {table.atoms[second].label}, so it {NOT_AFFINE}")
+    raise ModelError(f"multiplies {table.atoms[first]} by {table.atoms[second]}, so it {NOT_AFFINE}")

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.formats.names import printable
 from spikeloom.compiler.formats.onnx.values import (
     INPUT_ATOM,
     MEMBRANE,
@@ -110,24 +109,21 @@ def _carried(
     pair = table.atoms[products[0]].of
     linear = [atom for atom in pair if atom in terms and table.atoms[atom].kind in (INPUT_ATOM, MEMBRANE)]
     kept = [atom for atom in linear if _decay(terms[atom]) is not None] or linear
-    shown = table.atoms[products[0]].label
     if len(kept) != 1:
-        raise ModelError(f"holds {printable(shown)} in a way that is no reset; {RESET}")
+        raise ModelError(f"holds {table.atoms[products[0]]} in a way that is no reset; {RESET}")
     previous = kept[0]
     gate = pair[0] if pair[1] == previous else pair[1]
     beta, removed = _decay(terms.pop(previous)), _decay(terms.pop(products[0]))
     if beta is None or removed is None:
-        raise ModelError(
-            f"mixes or weighs the neurons of {printable(table.atoms[previous].label)} differently; {RESET}"
-        )
+        raise ModelError(f"mixes or weighs the neurons of {table.atoms[previous]} differently; {RESET}")
     if abs(beta + removed) > EQUAL * max(abs(beta), abs(removed)):
         raise ModelError(f"keeps {beta:g} of a membrane and {beta + removed:g} of it after a spike; {RESET}")
     if table.atoms[gate].kind == SPIKE:
         _require_same_threshold(table, previous, gate, spike)
     if table.atoms[previous].kind == INPUT_ATOM:
-        _require_output(outputs, {membrane: 1.0}, f"membrane of {printable(table.atoms[previous].label)}")
+        _require_output(outputs, {membrane: 1.0}, f"membrane of {table.atoms[previous]}")
         if table.atoms[gate].kind == INPUT_ATOM:
-            _require_output(outputs, {spike: 1.0}, f"spikes of {printable(table.atoms[gate].label)}")
+            _require_output(outputs, {spike: 1.0}, f"spikes of {table.atoms[gate]}")
     return previous, gate if table.atoms[gate].kind == INPUT_ATOM else None, beta
 
 
@@ -156,7 +152,7 @@ def _already_reset(
     if not factors or not states:
         return None, None, None
     if len(states) > 1:
-        shown = " and ".join(printable(table.atoms[atom].label) for atom in states)
+        shown = " and ".join(str(table.atoms[atom]) for atom in states)
         raise ModelError(f"could carry either of {shown}; {RESET}, say which with a product that resets it")
     beta = _decay(terms.pop(states[0]))
     assert beta is not None
@@ -187,21 +183,18 @@ def _require_same_threshold(table: Table, previous: int, gate: int, spike: int) 
     old, new = (table.atoms[atom] for atom in (gate, spike))
     same = np.array_equal(table.points[old.of[0]].theta, table.points[new.of[0]].theta) and old.strict == new.strict
     if not same:
-        raise ModelError(
-            f"resets {printable(table.atoms[previous].label)} by another threshold than it fires by; {RESET}"
-        )
+        raise ModelError(f"resets {table.atoms[previous]} by another threshold than it fires by; {RESET}")
 
 
 def _require_current(table: Table, atom: int, terms: Sparse, previous: int | None, membrane: int) -> None:
     """Whether the rest is a current: from the input or from spikes; says what it is where it is not."""
     found = table.atoms[atom]
-    label = printable(found.label)
     if found.kind == MEMBRANE:
-        raise ModelError(f"takes the membrane of {label}, not its spikes, as its input or without a reset; {RESET}")
+        raise ModelError(f"takes the membrane of {found}, not its spikes, as its input or without a reset; {RESET}")
     if found.kind == PRODUCT:
-        raise ModelError(f"holds {label} in a way that is no reset; {RESET}")
+        raise ModelError(f"holds {found} in a way that is no reset; {RESET}")
     factor = _decay(terms)
     own = found.kind == SPIKE and table.points[found.of[0]].membrane == previous
     state = found.kind == INPUT_ATOM and previous is None and found.size == table.atoms[membrane].size
     if factor is not None and factor < 0 and (own or state):
-        raise ModelError(f"loses {-factor:g} for a spike of {label}, a reset by subtraction; {RESET}")
+        raise ModelError(f"loses {-factor:g} for a spike of {found}, a reset by subtraction; {RESET}")

@@ -199,7 +199,7 @@ def _facts(
     form = "one step, state in and out from zero" if steps == 1 else f"{steps} steps unrolled"
     facts = [
         f"{model.producer or 'unknown producer'}, operators of version {model.opset}: {form}",
-        f"input {printable(table.atoms[found.data].label)}: {words}",
+        f"input {table.atoms[found.data]}: {words}",
     ]
     used = {found.data}
     for name, layer in zip(names, found.layers, strict=True):
@@ -208,7 +208,7 @@ def _facts(
         line = f"layer {name}: {len(n.bias)} neurons, decay {beta:g}, fires at u {sign} {n.theta:g}"
         if n.previous is not None:
             held = is_output(outputs, {n.membrane: 1.0}) or "after the reset"
-            line += f", membrane {printable(table.atoms[n.previous].label)} -> {printable(held)}"
+            line += f", membrane {table.atoms[n.previous]} -> {printable(held)}"
             used |= {n.previous} | ({n.gate} if n.gate is not None else set())
         if not n.strict:
             line += "; >= is read as > the next number below"

@@ -63,7 +63,7 @@ def _chains(table: Table, neurons: Sequence[Neurons]) -> list[list[Neurons]]:
         if n.previous is not None and table.atoms[n.previous].kind == MEMBRANE:
             if n.previous in after:
                 raise ModelError(
-                    f"{n.node}: carries on from {printable(table.atoms[n.previous].label)}, as another layer does; "
+                    f"{n.node}: carries on from {table.atoms[n.previous]}, as another layer does; "
                     "each membrane belongs to one layer"
                 )
             after[n.previous] = n
@@ -94,13 +94,13 @@ def _data(table: Table, neurons: Sequence[Neurons]) -> int:
     data = sorted(atom for atom in received if table.atoms[atom].kind == INPUT_ATOM)
     mixed = [atom for atom in data if atom in states]
     if mixed:
-        label = printable(table.atoms[mixed[0]].label)
+        label = str(table.atoms[mixed[0]])
         raise ModelError(
             f"{received[mixed[0]].node}: takes the state {label} of a layer as its input, a recurrent connection, "
             "which is not read from ONNX; export the network as NIR"
         )
     if len(data) != 1:
-        named = ", ".join(f"{printable(table.atoms[atom].label)} ({table.atoms[atom].size})" for atom in data)
+        named = ", ".join(f"{table.atoms[atom]} ({table.atoms[atom].size})" for atom in data)
         where = f"{received[data[-1]].node}: " if data else ""
         raise ModelError(
             f"{where}{len(data)} inputs are no state of a neuron{f': {named}' if named else ''}; one must bring the "
@@ -131,7 +131,7 @@ def _time(
             return shape[:axis] + shape[axis + 1 :], list(by_step)
     shown = f"[{', '.join(map(str, shape))}]"
     raise ModelError(
-        f"input {printable(table.atoms[data].label)} {shown}: no axis of it is the time of the {steps} steps; let each "
+        f"input {table.atoms[data]} {shown}: no axis of it is the time of the {steps} steps; let each "
         "step read its own events, in order"
     )
 
@@ -149,14 +149,12 @@ def _sources(
         if atom == data:
             found[INPUT] = weight if positions is None else weight[:, positions]
         elif atom not in step_of:
-            raise ModelError(
-                f"{n.node}: takes {printable(table.atoms[atom].label)}, which is no spike of a layer; {RESET}"
-            )
+            raise ModelError(f"{n.node}: takes {table.atoms[atom]}, which is no spike of a layer; {RESET}")
         else:
             layer, when = step_of[atom]
             if when != step:
                 raise ModelError(
-                    f"{n.node}: receives {printable(table.atoms[atom].label)} of another step; only spikes of the "
+                    f"{n.node}: receives {table.atoms[atom]} of another step; only spikes of the "
                     "same step can be lowered"
                 )
             found[layer] = weight

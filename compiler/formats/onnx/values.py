@@ -52,6 +52,9 @@ class Atom:
         """Elements."""
         return int(self.eye.shape[0])
 
+    def __str__(self) -> str:
+        return printable(self.label)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Affine:
