@@ -198,14 +198,14 @@ def test_files_of_one_name_have_names_of_their_own(place, monkeypatch):
 
 
 def test_what_the_chip_refuses_is_listed(spikeloom, place, monkeypatch):
-    refused, store = {4}, chart_work.store
+    refused, to_integers = {4}, chart_work.to_integers
 
     def picky(network, options, target):
         if options.packings is not None and options.packings[0].bits in refused:
             raise CapacityError((VIOLATION,))
-        return store(network, options, target)
+        return to_integers(network, options, target)
 
-    monkeypatch.setattr("spikeloom.runtime.studies.chart.work.store", picky)
+    monkeypatch.setattr("spikeloom.runtime.studies.chart.work.to_integers", picky)
     words = ("chart", "ring.pt", "--data", "data", "--jobs", "1", "--grid")
     code, out, _ = spikeloom(*words, "bits=4,3,window=100%", "-o", "refused")
     assert code == 0

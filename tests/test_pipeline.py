@@ -9,6 +9,7 @@ from random_networks import assert_same_layers, random_checkpoint, ring
 
 from spikeloom.compiler import Options, compile_network, targets
 from spikeloom.compiler.errors import OptionError, VerifyError
+from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.interpret import channels_last, run_integer
 from spikeloom.compiler.passes.expand import Factored, expand
 from spikeloom.compiler.pipeline import run
@@ -20,7 +21,6 @@ from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist, write_n
 from spikeloom.compiler.targets.loihi1.passes import start
 from spikeloom.compiler.text import text
 from spikeloom.models.graphs import build_graph, normalised_adjacency
-from spikeloom.models.recordings.evtouch import load_recordings
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.trace import aligned, comparable
 
@@ -164,38 +164,11 @@ def test_the_proof_covers_the_netlist():
         assert proof.accumulator == 64 * max(positive[ids].max(), negative[ids].max())
 
 
-# --- the released checkpoint
-
-
-@pytest.fixture(scope="module")
-def released(released_checkpoint):
-    pytest.importorskip("torch")
-    from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
-
-    return read_checkpoint(released_checkpoint)
-
-
-@pytest.fixture(scope="module")
-def manual():
+@pytest.mark.recordings
+def test_without_calibration_nothing_of_the_released_network_is_clipped(released_checkpoint):
     graph = build_graph("manual")
-    return normalised_adjacency(graph.edges, graph.n_taxels)
-
-
-@pytest.mark.recordings
-def test_a_step_of_the_released_network_can_take_a_seventh(released, manual, objects_zip):
-    """112 cores; the fc2 core of the usual layout and the fc1 cores keep the others waiting."""
-    events = load_recordings(objects_zip, "train").events
-    done = compile_network(expand(released, manual), Options(training_events=events, optimize="latency"))
-    usual, fast = done.usual.expected, done.layout.expected
-    assert 25_000 < usual.step_ns < 36_000
-    assert fast.step_ns < usual.step_ns / 6
-    assert usual.step_j < fast.step_j < 1.5 * usual.step_j
-    assert all(use.used <= use.allowed for use in done.uses)
-
-
-@pytest.mark.recordings
-def test_without_calibration_nothing_is_clipped(released, manual):
-    done = compile_network(expand(released, manual))
+    adjacency = normalised_adjacency(graph.edges, graph.n_taxels)
+    done = compile_network(expand(read_checkpoint(released_checkpoint), adjacency))
     assert done.placement.bound == done.placement.spike_hops
     assert done.core_bound <= done.netlist.n_cores <= 9
     assert all(choice.clipped == 0 for choice in done.choices)

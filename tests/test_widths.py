@@ -16,7 +16,7 @@ from spikeloom.compiler.targets.loihi1.storage.width_search import WidthPoint, s
 WIDTHS = (2, 4, 8)
 
 
-def drawn(seed, *, samples=40, steps=25, taxels=5, rate=0.3):
+def drawn(seed, *, samples=24, steps=16, taxels=5, rate=0.3):
     """A small network, recordings and labels that it gets right half the time."""
     checkpoint = random_checkpoint(seed=seed, taxels=taxels, sizes=(7, 6, 4))
     rng = np.random.default_rng(seed + 100)
@@ -48,7 +48,7 @@ def decisions(integer, events, lengths=None):
 def test_figures_are_those_of_the_compiler(seed, groups):
     """Every point that is built counts what the compiled netlist does, and no other built point beats it."""
     checkpoint, network, events, labels = drawn(seed)
-    samples, flat = 17, channels(events)
+    samples, flat = 9, channels(events)
     made = search_widths(network, LOIHI, flat, labels, widths=WIDTHS, groups=groups, samples=samples)
     picked = np.linspace(0, len(events) - 1, samples).round().astype(int)
     wanted = vote(run_float(network, flat[picked]).spikes[-1].sum(axis=1))
@@ -85,7 +85,7 @@ def test_recordings_count_up_to_their_own_length():
     for index, length in enumerate(lengths):
         events[index, ..., length:] = 0
     flat = channels(events)
-    made = search_widths(network, LOIHI, flat, labels, widths=WIDTHS, lengths=lengths)
+    made = search_widths(network, LOIHI, flat, labels, widths=(2, 8), lengths=lengths)
     wanted = vote(cut(run_float(network, flat).spikes[-1], lengths).sum(axis=1))
     assert made.float_right == np.count_nonzero(wanted == labels)
     for point in made.built:
@@ -96,7 +96,7 @@ def test_recordings_count_up_to_their_own_length():
 def test_without_labels_agreement_alone_counts():
     _, network, events, labels = drawn(7)
     labels[3] = -1
-    found = search_widths(network, LOIHI, channels(events), labels, widths=WIDTHS)
+    found = search_widths(network, LOIHI, channels(events), labels, widths=(4, 8))
     assert found.float_right is None
     assert {point.right for point in (*found.points, *found.built)} == {None}
     assert found.built
