@@ -6,10 +6,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from random_netlists import KEPT, Axon, Neuron, assert_equal, build, by_engine, by_steps, recording_of
 
-from spikeloom.compiler import Options, Packing, compile_network
 from spikeloom.compiler.errors import NumericRangeError
-from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
-from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.runtime.machines.loihi1 import engine, spec
 from spikeloom.runtime.machines.loihi1.blocks import lay_out_blocks
@@ -239,29 +236,6 @@ def test_scattered_synapses_take_the_other_kernel():
         for source in range(6000)
     ]
     assert lay_out_blocks(build([Neuron() for _ in range(1000)], axons, n_inputs=6000, depths=[0])) is None
-
-
-# --- real networks ----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.recordings
-@pytest.mark.parametrize("packing", [Packing(), Packing(planes=2, groups=8), Packing(bits=2)])
-def test_the_released_network(released_checkpoint, objects_zip, packing):
-    from spikeloom.models.graphs import build_graph, normalised_adjacency
-    from spikeloom.models.recordings.evtouch import load_recordings
-
-    graph = build_graph("manual")
-    checkpoint = read_checkpoint(released_checkpoint)
-    adjacency = normalised_adjacency(graph.edges, graph.n_taxels)
-    netlist = compile_network(expand(checkpoint, adjacency), Options(packings=(packing,))).netlist
-    recordings = load_recordings(objects_zip, "test")
-    events = recordings.events[::24].reshape(6, -1, recordings.steps)
-    prepared = engine.prepare(netlist)
-    assert prepared.blocks is not None
-    found = engine.simulate(prepared, events, **KEPT)
-    expected = engine.simulate(engine.prepare(netlist, stepwise=True), events, **KEPT)
-    assert_equal(found, expected)
-    assert found.counts.spikes.sum() > 0
 
 
 @pytest.mark.parametrize("layer", [0, 1, 2])

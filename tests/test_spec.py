@@ -104,41 +104,41 @@ def test_threshold_at_zero_and_at_its_largest(simulate):
     assert spikes(simulate(single(neuron, (254, 7)), events("1110"))) == [2]
 
 
-@pytest.mark.parametrize(
-    ("decay_u", "weight", "expected"),
-    [
-        (0, 32, [2048, 2047, 2046, 2045]),  # loses 1/4096
-        (0, -32, [-2048, -2047, -2046, -2045]),
-        (2047, -32, [-2048, -1024, -512, -256]),  # loses 2048/4096
-        (4094, 128, [8192, 2 + 2, 0, 0]),  # keeps 1/4096, as the membrane does
-        (4095, 128, [8192, 0 + 2, 0, 0]),  # keeps nothing
-    ],
-)
-def test_current_decay_has_an_offset_of_one(simulate, decay_u, weight, expected):
-    neuron = Neuron(decay_u=decay_u, decay_v=4095, threshold=NEVER)  # below 4096 such a membrane forgets at once
-    assert membranes(simulate(single(neuron, (weight, 0)), events("1000"))) == expected
+PLAIN = -4095 * 128
+COURSES = {
+    # a current loses one 4096th more than its register says; below 4096 such a membrane forgets at once
+    "current loses 1": ({"decay_u": 0, "decay_v": 4095}, [(32, 0)], ["1000"], [2048, 2047, 2046, 2045]),
+    "negative current": ({"decay_u": 0, "decay_v": 4095}, [(-32, 0)], ["1000"], [-2048, -2047, -2046, -2045]),
+    "current loses half": ({"decay_u": 2047, "decay_v": 4095}, [(-32, 0)], ["1000"], [-2048, -1024, -512, -256]),
+    "current keeps 1": ({"decay_u": 4094, "decay_v": 4095}, [(128, 0)], ["1000"], [8192, 2 + 2, 0, 0]),
+    "current keeps nothing": ({"decay_u": 4095, "decay_v": 4095}, [(128, 0)], ["1000"], [8192, 0 + 2, 0, 0]),
+    # a membrane loses what its register says
+    "membrane keeps all": ({"decay_v": 0}, [(64, 0)], ["100"], [4096, 4096, 4096]),
+    "membrane loses 1": ({"decay_v": 1}, [(64, 0)], ["100"], [4096, 4095, 4094]),
+    # rounding toward zero: -(1 * 2048 // 4096) is 0, where an arithmetic shift would say -1
+    "rounding": ({"decay_v": 2048, "bias": -1}, [(2, -1)], ["100"], [63, 30, 14]),
+    "rounding below zero": ({"decay_v": 2048, "bias": -1}, [], ["000"], [-1, -1, -1]),
+    # biases are not shifted, exponents scale
+    "exponents": (
+        {"decay_v": 4095, "bias": -4095, "bias_exponent": 7},
+        [(-256, -1), (254, 7)],
+        ["0100", "0010"],
+        [PLAIN, PLAIN - 127 - 128 * 64, PLAIN - 129 + 254 * 128 * 64, PLAIN + 379],
+    ),
+    "largest sums": (
+        {},
+        [(254, 7), (254, 0), (2, -1), (-254, 7), (-254, 0), (-2, -1)],
+        ["10", "10", "10", "01", "01", "01"],
+        [2097088, -2097088 + 419315],
+    ),
+}
+"""A neuron, the weights of its channels, their events, and its membranes."""
 
 
-def test_membrane_decay_has_no_offset(simulate):
-    kept = simulate(single(Neuron(decay_v=0, threshold=NEVER), (64, 0)), events("100"))
-    assert membranes(kept) == [4096, 4096, 4096]
-    lost = simulate(single(Neuron(decay_v=1, threshold=NEVER), (64, 0)), events("100"))
-    assert membranes(lost) == [4096, 4095, 4094]
-
-
-def test_decay_rounds_toward_zero(simulate):
-    trace = simulate(single(Neuron(decay_v=2048, bias=-1, threshold=NEVER), (2, -1)), events("100"))
-    assert membranes(trace) == [63, 30, 14]
-    # -(1 * 2048 // 4096) is 0, where an arithmetic shift would say -1
-    trace = simulate(single(Neuron(decay_v=2048, bias=-1, threshold=NEVER)), events("000"))
-    assert membranes(trace) == [-1, -1, -1]
-
-
-def test_bias_is_not_shifted_and_exponents_scale(simulate):
-    neuron = Neuron(decay_v=4095, bias=-4095, bias_exponent=7, threshold=NEVER)
-    trace = simulate(single(neuron, (-256, -1), (254, 7)), events("0100", "0010"))
-    plain = -4095 * 128
-    assert membranes(trace) == [plain, plain - 127 - 128 * 64, plain - 129 + 254 * 128 * 64, plain + 379]
+@pytest.mark.parametrize(("neuron", "weights", "channels", "expected"), COURSES.values(), ids=COURSES)
+def test_membranes_of_one_neuron(simulate, neuron, weights, channels, expected):
+    trace = simulate(single(Neuron(threshold=NEVER, **neuron), *weights), events(*channels))
+    assert membranes(trace) == expected
 
 
 def test_reset_takes_the_membrane_and_leaves_the_current(simulate):
@@ -245,13 +245,6 @@ def two_layers() -> Netlist:
 def test_overflows(simulate, netlist, channels, found):
     with pytest.raises(NumericRangeError, match=f"layer0 neuron 0 on {found}.*smaller scale for layer0"):
         simulate(netlist, events(*channels))
-
-
-def test_largest_sums_hold(simulate):
-    neuron = Neuron(threshold=NEVER)
-    netlist = single(neuron, (254, 7), (254, 0), (2, -1), (-254, 7), (-254, 0), (-2, -1))
-    trace = simulate(netlist, events("10", "10", "10", "01", "01", "01"))
-    assert membranes(trace) == [2097088, -2097088 + 419315]
 
 
 def test_first_overflow_is_reported(simulate):
