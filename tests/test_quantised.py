@@ -1,19 +1,18 @@
 """The torch model on chip integers, fine-tuning on it, and the checkpoints that come out."""
 
 import json
-import zipfile
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from made_files import ring, small_checkpoint, weights
+from test_checkpoint import rebuilt
 
 from spikeloom.compiler import Options, Packing, compile_network, lift
 from spikeloom.compiler.errors import DataError, ModelError, OptionError
 from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
-from spikeloom.compiler.formats.spikeloom_checkpoint import content_digest
 from spikeloom.compiler.interpret import channels_last, run_integer
 from spikeloom.compiler.passes.calibrate import calibrate
 from spikeloom.compiler.passes.expand import expand
@@ -195,21 +194,21 @@ def test_an_interrupted_fine_tuning_goes_on_to_the_same_bytes(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("options", "words"),
     [
         ({"bits": [7]}, "--weight-bits 7: Intel Loihi 1 does not store that width; allowed: 2, 3, 4, 5, 6, 8"),
-        ({"bits": [4, 4]}, "--weight-bits: 2 widths, the network has 4 layers; give one, or one for each"),
-        ({"bits": [4], "epochs": 0}, "--epochs 0: allowed are 1 or more; choose another"),
-        ({"bits": [4], "seed": -1}, "--seed -1: allowed are 0 or more; choose another"),
-        ({"bits": [4], "groups": 9}, "--scale-groups 9: allowed are 1 to 8, the thresholds of a core; choose one"),
+        ({"bits": [4, 4]}, "--weight-bits: 2 widths, the network has 4 layers"),
+        ({"bits": [4], "epochs": 0}, "--epochs 0: allowed are 1 or more"),
+        ({"bits": [4], "seed": -1}, "--seed -1: allowed are 0 or more"),
+        ({"bits": [4], "groups": 9}, "--scale-groups 9: allowed are 1 to 8, the thresholds of a core"),
     ],
 )
-def test_options_that_cannot_be(tmp_path, options, message):
+def test_options_that_cannot_be(tmp_path, options, words):
     checkpoint, adjacency = small_checkpoint(tmp_path)
     data = recordings(checkpoint, 0)
     with pytest.raises(OptionError) as caught:
         finetune(checkpoint, adjacency, data, data, LOIHI, **options)
-    assert str(caught.value) == message
+    assert str(caught.value).startswith(words)
 
 
 @pytest.mark.parametrize(
@@ -261,16 +260,7 @@ def test_forms_that_cannot_be_used(tmp_path, change):
     path = tmp_path / "tuned.pt"
     graph = ring(checkpoint.taxels)
     save_checkpoint(path, {"last": weights()}, graph, beta=0.2, theta=0.5, training={}, forms=forms)
-    with zipfile.ZipFile(path) as archive:
-        members = {name: archive.read(name) for name in archive.namelist()}
-    manifest = json.loads(members["manifest.json"])
-    change(manifest["forms"])
-    arrays = {f"last/{name}": np.asarray(array, "<f4") for name, array in weights().items()}
-    manifest["sha256"] = content_digest(manifest, arrays)
-    members["manifest.json"] = json.dumps(manifest).encode()
-    with zipfile.ZipFile(path, "w") as archive:
-        for name, content in members.items():
-            archive.writestr(name, content)
+    path.write_bytes(rebuilt(path.read_bytes(), lambda manifest, _: change(manifest["forms"])))
     with pytest.raises(ModelError) as caught:
         read_checkpoint(path)
     assert str(caught.value).startswith(f"{path}: the manifest has no usable forms")
