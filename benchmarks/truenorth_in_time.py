@@ -12,13 +12,15 @@ from __future__ import annotations
 
 import sys
 from dataclasses import replace
+from functools import reduce
+from operator import add
 
 import numpy as np
 
 from spikeloom.compiler.interpret import channels_last, run_float, vote
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.targets.base import load_target
-from spikeloom.compiler.targets.truenorth.codebook import COPIES, MOST, LevelNetwork, Run, in_levels, run_levels
+from spikeloom.compiler.targets.truenorth.codebook import COPIES, MOST, LevelNetwork, PartialSums, in_levels, run_levels
 from spikeloom.compiler.targets.truenorth.in_time import lower_in_time
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.cli import build_parser
@@ -41,15 +43,17 @@ def float_right(network: Network, data: Recordings) -> int:
     return right
 
 
-def level_right(network: LevelNetwork, data: Recordings, most: int) -> tuple[int, list[Run]]:
-    """The same for a network in levels, and its runs."""
-    runs, right = [], 0
+def level_right(network: LevelNetwork, data: Recordings, most: int) -> tuple[int, list[PartialSums]]:
+    """The same for a network in levels, and its partial sums."""
+    sums, right = [], 0
     for index in range(len(data)):
-        run = run_levels(network, data.events[index].reshape(-1, data.steps)[:, : data.steps_of(index)], most=most)
-        votes = np.bincount(network.label, weights=run.spikes[-1].sum(axis=0), minlength=network.classes)
+        events = data.events[index].reshape(-1, data.steps)[:, : data.steps_of(index)]
+        spikes, counts = run_levels(network, events, most=most)
+        last = spikes[network.layers[-1].name].sum(axis=0)
+        votes = np.bincount(network.label, weights=last, minlength=network.classes)
         right += int(votes.argmax() == data.labels[index])
-        runs.append(replace(run, spikes=()))
-    return right, runs
+        sums.append(counts)
+    return right, [reduce(add, each) for each in zip(*sums, strict=True)]
 
 
 def main() -> None:
@@ -69,11 +73,8 @@ def main() -> None:
     for copies in COPIES:
         levels = in_levels(forgetful, copies, chip)
         netlist = lower_in_time(levels, chip)
-        right, runs = level_right(levels, data, MOST)
+        right, sums = level_right(levels, data, MOST)
         endless, _ = level_right(levels, data, ENDLESS)
-        split = [index for index, layer in enumerate(levels.layers) if layer.is_split]
-        saturated = [100 * sum(r.saturated[i] for r in runs) / sum(r.partial[i] for r in runs) for i in split]
-        largest = [max(run.largest[i] for run in runs) for i in split]
         rows.append(
             [
                 str(copies),
@@ -81,8 +82,8 @@ def main() -> None:
                 f"{netlist.ticks(data.steps):,}",
                 share(right),
                 share(endless),
-                ", ".join(f"{levels.layers[i].name} {s:.2g} %" for i, s in zip(split, saturated, strict=True)),
-                ", ".join(map(str, largest)),
+                ", ".join(f"{each.layer} {100 * each.saturated / each.partial:.2g} %" for each in sums),
+                ", ".join(str(each.largest) for each in sums),
             ]
         )
     head = ["axons an input", "cores", "ticks", "saturating at 19", "not saturating", "saturated", "largest"]

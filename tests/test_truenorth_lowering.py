@@ -33,6 +33,7 @@ from spikeloom.compiler.targets.truenorth.codebook import (
     WEIGHTS,
     Layer,
     LevelNetwork,
+    PartialSums,
     codebook,
     in_levels,
     run_levels,
@@ -168,17 +169,17 @@ def assert_equal(levels, netlist, recording):
     """Every spike of every copy is the model's, in its tick, and no other tick of its data has one."""
     trace = both(netlist, recording)
     assert trace.counts.overflows.sum() == 0
-    model = run_levels(levels, recording)
+    model, sums = run_levels(levels, recording)
     steps = recording.shape[1]
-    for index, (name, first) in enumerate(first_spikes(levels).items()):
+    for name, first in first_spikes(levels).items():
         chosen = np.flatnonzero(netlist.layer == netlist.layers.index(name))
         on_chip = trace.spikes[first : first + steps * BIN_TICKS][:, chosen]
         due = np.zeros_like(on_chip)
-        due[::BIN_TICKS] = model.spikes[index][:, netlist.neuron[chosen]]
+        due[::BIN_TICKS] = model[name][:, netlist.neuron[chosen]]
         np.testing.assert_array_equal(on_chip, due, name)
-    expected = np.bincount(levels.label, weights=model.spikes[-1].sum(axis=0), minlength=levels.classes)
+    expected = np.bincount(levels.label, weights=model[levels.layers[-1].name].sum(axis=0), minlength=levels.classes)
     np.testing.assert_array_equal(class_counts(netlist, trace.counts.votes[None])[0], expected)
-    return model
+    return model, sums
 
 
 @pytest.mark.parametrize("largest", [1, 2, 3, -4])
@@ -198,10 +199,10 @@ def test_a_network_in_levels_is_the_float_network_with_rounded_weights():
         beta=0.0,
     )
     events = (np.random.default_rng(1).random((20, 30)) < 0.3).astype(np.uint8)
-    found = run_levels(levels, events)
-    for mine, expected in zip(found.spikes, run_float(rounded, events.T[None]).spikes, strict=True):
+    spikes, sums = run_levels(levels, events)
+    for mine, expected in zip(spikes.values(), run_float(rounded, events.T[None]).spikes, strict=True):
         np.testing.assert_array_equal(mine, expected[0])
-    assert found.partial == found.saturated == found.largest == (0, 0, 0)
+    assert sums == ()
 
 
 def test_partial_sums_saturate_and_are_counted():
@@ -210,12 +211,13 @@ def test_partial_sums_saturate_and_are_counted():
     events = np.zeros((60, 3), np.uint8)
     events[:25, 0] = events[:19, 1] = 1
     events[40:, :2] = 1
-    found = run_levels(network, events)
-    assert (found.partial, found.saturated, found.largest) == ((6,), (3,), (25,))
-    assert found.spikes[0][:, 0].tolist() == [False, False, False]  # 19 and 19 of 25 and 20
+    spikes, sums = run_levels(network, events)
+    assert sums == (PartialSums("fc1", 6, 3, 25),)
+    assert sums[0] + PartialSums("fc1", 4, 1, 30) == PartialSums("fc1", 10, 4, 30)
+    assert spikes["fc1"][:, 0].tolist() == [False, False, False]  # 19 and 19 of 25 and 20
     for threshold, spiked in ((39, False), (38, True)):
         other = replace(network, layers=(replace(layer, threshold=np.array([threshold])),))
-        assert run_levels(other, events).spikes[0][0, 0] == spiked
+        assert run_levels(other, events)[0]["fc1"][0, 0] == spiked
 
 
 def test_layers_that_receive_a_clock_take_three_axons_an_input():
@@ -263,9 +265,9 @@ def test_sums_that_saturate_leave_nothing_for_the_next_step(sign):
     recording = np.zeros((60, 5), np.uint8)
     recording[:, 0] = recording[:, 2] = 1
     recording[3, 3] = 1
-    model = assert_equal(network, lower_in_time(network, CHIP), recording)
-    assert model.saturated == (8,)
-    assert model.spikes[0][0].any() == (sign > 0)
+    model, (sums,) = assert_equal(network, lower_in_time(network, CHIP), recording)
+    assert sums.saturated == 8
+    assert model["fc1"][0].any() == (sign > 0)
 
 
 def test_shorter_recordings_count_for_their_own_length():

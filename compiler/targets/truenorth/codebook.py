@@ -166,29 +166,37 @@ def gate_axons(groups: int, least: int = 0) -> tuple[int, int]:
     return lifts, (2 * reach + LIFT * lifts) // -PULL + 2
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Run:
-    """Spikes (steps, neurons) by layer; its partial sums that travel in time, those that saturate, the largest."""
+@dataclass(frozen=True, slots=True)
+class PartialSums:
+    """Partial sums of a layer that travel in time, those that saturate, and the largest."""
 
-    spikes: tuple[BoolArray, ...]
-    partial: tuple[int, ...]
-    saturated: tuple[int, ...]
-    largest: tuple[int, ...]
+    layer: str
+    partial: int
+    saturated: int
+    largest: int
+
+    def __add__(self, other: PartialSums) -> PartialSums:
+        """Of two recordings."""
+        largest = max(self.largest, other.largest)
+        return PartialSums(self.layer, self.partial + other.partial, self.saturated + other.saturated, largest)
 
 
-def run_levels(network: LevelNetwork, events: npt.NDArray[np.uint8], *, most: int = MOST) -> Run:
-    """Run one recording (channels, steps) through a network in levels; partial sums count `most` at the most."""
+def run_levels(
+    network: LevelNetwork, events: npt.NDArray[np.uint8], *, most: int = MOST
+) -> tuple[dict[str, BoolArray], tuple[PartialSums, ...]]:
+    """Spikes (steps, neurons) of each layer for one recording (channels, steps), and the partial sums of split layers.
+
+    Partial sums count `most` at the most.
+    """
     active = (events > 0).T.astype(np.float64)  # whole numbers, so that the products are exact and fast
-    spikes, counts = [], []
+    spikes, counts = {}, []
     for layer in network.layers:
         sums = np.stack([active[:, group] @ layer.level[:, group].T.astype(np.float64) for group in layer.groups])
         if layer.is_split:
-            held = np.abs(sums)
-            counts.append((sums.size, int(np.count_nonzero(held > most)), int(held.max(initial=0))))
+            size = np.abs(sums)
+            beyond = int(np.count_nonzero(size > most))
+            counts.append(PartialSums(layer.name, size.size, beyond, int(size.max(initial=0))))
             sums = np.clip(sums, -most, most)
-        else:
-            counts.append((0, 0, 0))
-        spikes.append(sums.sum(axis=0) >= layer.threshold)
-        active = spikes[-1].astype(np.float64)
-    partial, saturated, largest = zip(*counts, strict=True)
-    return Run(spikes=tuple(spikes), partial=partial, saturated=saturated, largest=largest)
+        spikes[layer.name] = sums.sum(axis=0) >= layer.threshold
+        active = spikes[layer.name].astype(np.float64)
+    return spikes, tuple(counts)

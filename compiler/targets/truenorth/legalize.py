@@ -140,8 +140,8 @@ def _parameters(netlist: CrossbarNetlist, chip: Target) -> Iterator[Broken]:
 def _on_cores(netlist: CrossbarNetlist, neurons: IntArray, found: list[str]) -> list[Offender]:
     """Neurons by their core and their number on it."""
     cores = netlist.core_of_neuron()[neurons]
-    own = neurons - netlist.core_neurons[cores]
-    return [(int(c), f"neuron {n}", what) for c, n, what in zip(cores, own, found, strict=True)]
+    numbers = neurons - netlist.core_neurons[cores]
+    return [(int(c), f"neuron {n}", what) for c, n, what in zip(cores, numbers, found, strict=True)]
 
 
 def _targets(netlist: CrossbarNetlist, chip: Target) -> Iterator[Broken]:

@@ -6,17 +6,16 @@ import argparse
 import sys
 from collections.abc import Mapping
 from dataclasses import replace
+from operator import add
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from spikeloom.compiler import __version__
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.passes.expand import Factored
 from spikeloom.compiler.targets.base import Target, load_target
-from spikeloom.compiler.targets.truenorth.codebook import in_levels, run_levels
+from spikeloom.compiler.targets.truenorth.codebook import PartialSums, in_levels, run_levels
 from spikeloom.compiler.targets.truenorth.in_time import first_spikes
 from spikeloom.compiler.targets.truenorth.native import SYSTEM, NativeNetwork
 from spikeloom.compiler.targets.truenorth.native_file import Trained, is_trained, read_trained
@@ -31,7 +30,7 @@ from spikeloom.runtime.inputs.recordings import netlist_recordings
 from spikeloom.runtime.machines.truenorth import verdicts
 from spikeloom.runtime.machines.truenorth.describe import describe, describe_trained
 from spikeloom.runtime.machines.truenorth.machine import load
-from spikeloom.runtime.machines.truenorth.verdicts import PartialSums, Verdict, compare
+from spikeloom.runtime.machines.truenorth.verdicts import Verdict, compare
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.sections import Outcome
 
@@ -160,15 +159,14 @@ def _verify_in_time(arguments: argparse.Namespace, netlist: CrossbarNetlist, chi
     _require_same(arguments, netlist, loaded)
     levels = in_levels(loaded.network, int(netlist.provenance["in_time"]), chip)
     data = netlist_recordings(arguments, netlist, labels_for="verify")
-    sums = np.zeros((3, len(levels.layers)), np.int64)
+    sums = tuple(PartialSums(layer.name, 0, 0, 0) for layer in levels.layers if layer.is_split)
 
     def spikes(events: Any) -> dict[str, BoolArray]:
-        found = run_levels(levels, events.reshape(-1, events.shape[-1]))
-        sums[:2] += found.partial, found.saturated
-        np.maximum(sums[2], found.largest, out=sums[2])
-        return {layer.name: held for layer, held in zip(levels.layers, found.spikes, strict=True)}
+        nonlocal sums
+        spikes, counts = run_levels(levels, events.reshape(-1, events.shape[-1]))
+        sums = tuple(map(add, sums, counts))
+        return spikes
 
     samples = arguments.spec_samples
     verdict = compare(netlist, spikes, first_spikes(levels), data, spec_samples=samples, spec_steps=SPEC_STEPS)
-    parts = zip(levels.layers, sums.T.tolist(), strict=True)
-    return replace(verdict, sums=tuple(PartialSums(layer.name, *each) for layer, each in parts if layer.is_split))
+    return replace(verdict, sums=sums)

@@ -173,8 +173,8 @@ def joules(table: EnergyTable, events: IntArray, time_s: FloatArray) -> tuple[Fl
     >>> joules(marginal, np.array([1_000_000]), np.array([0.25]))
     (array([2.3e-06]), array([0.0161]))
     """
-    spent: FloatArray = events.astype(np.float64) * table.joule("synaptic_event")
-    return spent, None if table.floor_w is None else table.floor_w * time_s
+    events_j: FloatArray = events.astype(np.float64) * table.joule("synaptic_event")
+    return events_j, None if table.floor_w is None else table.floor_w * time_s
 
 
 def sections(found: Estimate) -> list[Section]:

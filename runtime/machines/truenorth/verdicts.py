@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from spikeloom.compiler.interpret import vote
+from spikeloom.compiler.targets.truenorth.codebook import PartialSums
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
 from spikeloom.compiler.types import BoolArray
 from spikeloom.models.recordings.evtouch import Recordings
@@ -48,16 +49,6 @@ class AgainstModel:
     def differences(self) -> int:
         """Of all layers."""
         return sum(layer.differences for layer in self.layers)
-
-
-@dataclass(frozen=True, slots=True)
-class PartialSums:
-    """Partial sums of a layer that travel in time, those that saturate, and the largest."""
-
-    layer: str
-    partial: int
-    saturated: int
-    largest: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
