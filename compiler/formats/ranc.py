@@ -23,19 +23,10 @@ import numpy.typing as npt
 
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.targets.base import load_target
-from spikeloom.compiler.targets.truenorth.legalize import require_legal
 from spikeloom.compiler.targets.truenorth.netlist import RESET_NONE, RESET_TO, CrossbarNetlist
-from spikeloom.compiler.targets.truenorth.netlist_file import read_crossbars
 from spikeloom.compiler.types import IntArray
 
 EventArray = npt.NDArray[np.uint8] | npt.NDArray[np.bool_]
-
-
-def read(path: str) -> CrossbarNetlist:
-    """Read a netlist of crossbar cores that breaks no rule of its chip."""
-    netlist = read_crossbars(path)
-    require_legal(netlist, load_target(netlist.target))
-    return netlist
 
 
 def unsupported(netlist: CrossbarNetlist) -> list[str]:

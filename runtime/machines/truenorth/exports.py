@@ -8,6 +8,7 @@ from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.formats import ranc
 from spikeloom.runtime.machines.export_format import Export, Format, Request
+from spikeloom.runtime.machines.truenorth.machine import load
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -20,7 +21,7 @@ class RancFacts:
 
 
 def _ranc(request: Request) -> Export:
-    netlist = ranc.read(request.source)
+    netlist = load(request.source).netlist
     events = None
     if request.recordings is not None:
         data, number = request.recordings(netlist.classes, netlist.taxels, 1), request.recording or 0
