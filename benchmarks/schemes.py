@@ -26,7 +26,7 @@ from spikeloom.compiler.targets.base import load_target
 from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.models.networks.reference import float_spikes
 from spikeloom.models.recordings.evtouch import Recordings, load_recordings
-from spikeloom.runtime.equivalence.levels import mcnemar
+from spikeloom.runtime.equivalence.verdict import mcnemar
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.costs import cost
 from spikeloom.runtime.machines.loihi1.trace import aligned, comparable

@@ -22,7 +22,6 @@ from spikeloom.runtime.equivalence.breakdowns import breakdowns
 from spikeloom.runtime.equivalence.certificates import certify
 from spikeloom.runtime.equivalence.divergence import first_divergence
 from spikeloom.runtime.equivalence.ladder import rungs
-from spikeloom.runtime.equivalence.levels import judged
 from spikeloom.runtime.equivalence.reference import float_network, require_match, spikes_of
 from spikeloom.runtime.equivalence.rounding import check_rounding
 from spikeloom.runtime.equivalence.verdict import LayerSpikes, Rung, Verdict
@@ -70,7 +69,7 @@ def verify(
     spec_samples, engine_name
         Recordings on which the specification runs beside the engine; which of ``ENGINES`` runs, too.
     required : mapping of level to share, optional
-        What has to be reached, see :mod:`equivalence.levels`; the weights always have to be the checkpoint's.
+        What has to be reached, see :mod:`equivalence.verdict`; the weights always have to be the checkpoint's.
     progress : callable, optional
         Called with the name of each part as it starts.
 
@@ -139,7 +138,7 @@ def verify(
     flat = with_clocks(events, netlist.clocks)
     begin("certificate")
     certificate = certify(model, adjacency, integer, events, chip, ran.decisions, kept=kept, lengths=lengths)
-    verdict = Verdict(
+    return Verdict(
         files=files,
         labels=labels,
         float_predictions=vote(float_counts),
@@ -167,5 +166,5 @@ def verify(
         certificate=certificate,
         engine=engine_name,
         engine_different=None if beside is None else beside.different,
+        required={} if required is None else required,
     )
-    return judged(verdict, {} if required is None else required)

@@ -45,6 +45,7 @@ STAGES = {
 
 def sections(report: Report) -> list[Section]:
     """Chapters of the page."""
+    chart = report.chart  # of this network and others
     chapters = [
         Section("Verdict", _verdict(report)),
         Section("Decisions", _decisions(report)),
@@ -53,7 +54,7 @@ def sections(report: Report) -> list[Section]:
         Section("One recording", _recording(report.recording)),
         Section("Energy and time", [*_of_chip(report.chip.costs), *_by_step(report.recording)]),
         Section("Stability", [] if report.stress is None else stability(report.stress)),
-        Section("Configurations", _configurations(report)),
+        Section("Configurations", [] if chart is None else [*figures(chart, "pareto"), *taken(chart), saved(chart)]),
         Section("Provenance", _provenance(report.provenance)),
     ]
     return [Section(each.title, each.blocks, chapter=True) for each in chapters if each.blocks]
@@ -349,12 +350,6 @@ def _by_step(recording: Recording) -> list[Block]:
 
 
 # -- the rest ----------------------------------------------------------------------------------------------------------
-
-
-def _configurations(report: Report) -> list[Block]:
-    """What a chart of this network and others found."""
-    chart = report.chart
-    return [] if chart is None else [*figures(chart, "pareto"), *taken(chart), saved(chart)]
 
 
 def _provenance(made: Provenance) -> list[Block]:

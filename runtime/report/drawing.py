@@ -180,6 +180,8 @@ def lines(title: str, series: Mapping[str, Sequence[float] | FloatArray], label:
 @styled
 def matrices(title: str, panels: Mapping[str, npt.NDArray[np.int64]]) -> Drawing:
     """Confusion matrices side by side: rows are labels, columns decisions; right ones are of another colour."""
+    from matplotlib.patches import Rectangle
+
     drawing = sheet(title, 4.6)
     for axes, (side, counts) in zip(np.ravel(drawing.figure.subplots(1, len(panels))), panels.items(), strict=True):
         totals = np.maximum(counts.sum(axis=1), 1)
@@ -187,7 +189,8 @@ def matrices(title: str, panels: Mapping[str, npt.NDArray[np.int64]]) -> Drawing
         for label, decided in np.argwhere(counts).tolist():
             count = int(counts[label, decided])
             colour, alpha = (CHIP if label == decided else FLOAT), 0.2 + 0.4 * count / totals[label]
-            axes.add_patch(_box(decided - 0.5, label - 0.5, 1, 1, facecolor=colour, alpha=alpha, edgecolor="none"))
+            corner = decided - 0.5, label - 0.5
+            axes.add_patch(Rectangle(corner, 1, 1, facecolor=colour, alpha=alpha, edgecolor="none"))
             axes.text(decided, label, str(count), ha="center", va="center", fontsize=size)
             tip = f"{side}: label {label} decided as {decided}, {count} of {counts[label].sum()}"
             drawing.tips.append((axes, decided, label, tip))
@@ -196,12 +199,6 @@ def matrices(title: str, panels: Mapping[str, npt.NDArray[np.int64]]) -> Drawing
         axes.locator_params(integer=True)
         axes.spines[:].set_visible(True)
     return drawing
-
-
-def _box(x: float, y: float, wide: float, high: float, **look: Any) -> Any:
-    from matplotlib.patches import Rectangle
-
-    return Rectangle((x, y), wide, high, **look)
 
 
 @styled
