@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from made_files import CLASSES, events, own_file, recordings_folder, small_checkpoint, weights
 
-from spikeloom.compiler import Options, Recipe, compile_network
+from spikeloom.compiler import Options, Packing, compile_network
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.runtime.cli import main
@@ -202,9 +202,9 @@ def test_nearly_empty_recordings():
     assert found(spikes(), spikes(), votes=votes, recordings=recordings, lengths=np.full(5, 100)) == []
 
 
-def verified(folder, arrays, recordings, recipe, **options):
+def verified(folder, arrays, recordings, packing, **options):
     checkpoint, adjacency = small_checkpoint(folder, last=arrays)
-    netlist = compile_network(expand(checkpoint, adjacency), Options(recipes=(recipe,), **options)).netlist
+    netlist = compile_network(expand(checkpoint, adjacency), Options(packings=(packing,), **options)).netlist
     made = verify(netlist, checkpoint, adjacency, recordings, LABELS, FILES)
     return {breakdown.kind: breakdown for breakdown in made.breakdowns}, terminal(sections(made))
 
@@ -215,7 +215,7 @@ def test_a_neuron_that_fires_by_a_hair_from_its_bias_alone(tmp_path, bits):
     arrays = weights()
     arrays["fc2.weight"][3], arrays["fc2.bias"][3] = 0, 0.400005
     recordings = events(2, steps=60)
-    kinds, text = verified(tmp_path, arrays, recordings, Recipe(bits=bits), keep_all=True, training_events=events(1))
+    kinds, text = verified(tmp_path, arrays, recordings, Packing(bits=bits), keep_all=True, training_events=events(1))
     line = "breakdown: fc2 neurons that fire in the float model and never on the chip: 3 (42 times)"
     assert (line in text) == ("silenced neurons" in kinds) == (bits == 4)
 
@@ -225,7 +225,7 @@ def test_a_network_that_rounding_silences(tmp_path):
     arrays = weights()
     arrays["fc3.weight"][:, 0] = 60.0
     arrays["fc2.weight"][0], arrays["fc2.bias"][0] = 0, 0
-    kinds, text = verified(tmp_path, arrays, events(2), Recipe(bits=2), keep_all=True)
+    kinds, text = verified(tmp_path, arrays, events(2), Packing(bits=2), keep_all=True)
     assert kinds["silent layer"].layer == "fc3"
     assert kinds["no vote"].count == 6
     assert "breakdown: fc3 never fires on the chip; it fires " in text
