@@ -20,7 +20,7 @@ from spikeloom.runtime import cli
 from spikeloom.runtime.machines.loihi1 import engine, onnx_engine, spec
 
 FORMS = onnx_writer.FORMS
-SETTINGS = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+SETTINGS = settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 
 def by_onnx(netlist, events, form, **options):
