@@ -3,8 +3,6 @@
 import hashlib
 import io
 import json
-import os
-import pickle
 import subprocess
 import sys
 import zipfile
@@ -174,11 +172,6 @@ def test_the_released_checkpoint(released_checkpoint):
 # --- refusals ------------------------------------------------------------------------------------------------------
 
 
-class _Command:
-    def __reduce__(self):
-        return os.system, ("touch harm",)
-
-
 def changed(*, old: bool = False, **tensors_too: object) -> bytes:
     """A state dict with other tensors; None stands for one that is missing."""
     state = tensors(old=old) | {key.replace("__", "."): value for key, value in tensors_too.items()}
@@ -187,8 +180,6 @@ def changed(*, old: bool = False, **tensors_too: object) -> bytes:
 
 NEITHER = "holds neither net_list nor weights of a TactileSGNet, but"
 REFUSED = {
-    "empty": (lambda: b"", NOT_A_CHECKPOINT),
-    "text": (lambda: b"spikeloom", NOT_A_CHECKPOINT),
     "random": (lambda: np.random.default_rng(0).bytes(3000), NOT_A_CHECKPOINT),
     "half a pickle": (lambda: b"\x80" + bytes(50), NOT_A_CHECKPOINT),
     "pickle of an empty dict": (lambda: b"\x80\x02}q\x00.", NOT_A_CHECKPOINT),
@@ -233,7 +224,6 @@ REFUSED = {
         lambda: changed(fc3__weight=torch.ones(0, 7), fc3__bias=torch.ones(0)),
         "fc3.weight is (0, 7), wanted (outputs, 7)",
     ),
-    "bomb": (lambda: zipped({"data.pkl": bytes(10**7)}, zipfile.ZIP_DEFLATED), "bytes claim to hold 10000000"),
     "packed": (
         lambda: rebuilt(own(), lambda m, _: m.update(note="a" * 9000), compression=zipfile.ZIP_DEFLATED),
         "bytes claim to hold",
@@ -254,19 +244,6 @@ def test_large_and_truncated_files(tmp_path):
     for whole in (torch_bytes(tensors()), torch_bytes(tensors(), new=False), own()):
         for share in (0.02, 0.5, 0.99):
             assert refusal(write(tmp_path / "x", whole[: int(share * len(whole))])).startswith(DAMAGED)
-
-
-@pytest.mark.parametrize("form", ["zip", "pre-1.6", "plain pickle", "protocol 4"])
-def test_code_in_a_pickle_is_refused_and_not_run(tmp_path, monkeypatch, form):
-    monkeypatch.chdir(tmp_path)
-    pickled = {"plain pickle": 2, "protocol 4": 4}
-    if form in pickled:
-        data = pickle.dumps(_Command(), protocol=pickled[form])
-    else:
-        data = torch_bytes({"net_list": [tensors()], "best_acc": _Command()}, new=form == "zip")
-    told = "is pickled with protocol 4" if form == "protocol 4" else f"calls {os.system.__module__}.system, allowed"
-    assert told in refusal(write(tmp_path / "x.t7", data))
-    assert not (tmp_path / "harm").exists()
 
 
 def test_every_fault_of_the_tensors_is_listed(tmp_path):

