@@ -9,10 +9,8 @@ from made_files import events, small_checkpoint
 from random_networks import LOIHI
 
 from spikeloom.compiler import Options, Packing, compile_network
-from spikeloom.compiler.errors import DataError
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.runtime.machines.loihi1 import engine, timing
-from spikeloom.runtime.machines.loihi1.costs import cost as cost_of
 from spikeloom.runtime.machines.loihi1.costs.estimate import estimate
 from spikeloom.runtime.machines.loihi1.costs.result import cost_report
 from spikeloom.runtime.machines.loihi1.costs.sections import sections
@@ -123,32 +121,6 @@ def test_the_range_names_both_ends(small, found):
     single = dataclasses.replace(cost, costs=dataclasses.replace(cost.costs, energy={"one": cost.costs.zeros}))
     alone = encode(priced := cost_report(netlist, LOIHI, single, bin_s=0.02))
     assert alone["energy_range_j"] is None
-
-
-def test_a_trace_that_does_not_belong_to_the_netlist(small):
-    netlist, recordings = small
-    latencies = timing.prepare(netlist, LOIHI, LOIHI.time[0])
-    trace = engine.simulate(
-        engine.prepare(netlist, charges=timing.charges(latencies)), recordings, spikes=True, updated=True
-    )
-    n, inputs, cores = netlist.n_compartments, netlist.n_inputs, netlist.n_cores
-    less = trace.spikes[..., :-1]
-    for spikes, updated, given in (
-        (less, less, recordings),
-        (trace.spikes, less, recordings),
-        (trace.spikes, trace.updated, recordings[:, :-1]),
-        (trace.spikes, trace.updated, recordings[:2]),
-    ):
-        with pytest.raises(DataError, match=f"updates .* found, the netlist has {n} compartments and {inputs} input"):
-            timing.detailed(latencies, spikes, updated, given)
-    with pytest.raises(DataError, match=rf"{2 * cores - 1}\) of 4 recordings found, the netlist has {cores} cores"):
-        timing.simple_times(latencies, trace.charged[..., :-1], LENGTHS)
-    counts = dataclasses.replace(trace.counts, spikes=trace.counts.spikes[:, 1:])
-    layers = len(netlist.layers)
-    with pytest.raises(
-        DataError, match=rf"{n - 1} compartments and {layers} layers found, the netlist has {inputs}, {n} "
-    ):
-        cost_of.estimate(cost_of.prepare(netlist, LOIHI), counts, 30)
 
 
 def test_a_chip_without_tables(small):

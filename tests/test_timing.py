@@ -286,6 +286,8 @@ def test_input_cores_go_where_there_is_room():
     wide = replace(full, taxels=3000)
     assert sanafe.input_tiles(wide, LOIHI) == (0, 0, 0)
     everywhere = replace(netlist, core_tile=read_only(list(range(32)) * 4))
+    one_left = replace(netlist, core_tile=read_only([*range(32)] * 3 + [*range(31)]))
+    assert sanafe.input_tiles(one_left, LOIHI) == (31,)
     with pytest.raises(ModelError, match="input channels: 1 cores needed, the chip has 0 left"):
         sanafe.input_tiles(everywhere, LOIHI)
 

@@ -28,7 +28,6 @@ from math import lcm
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.errors import DataError
 from spikeloom.compiler.targets.base import PICOSECONDS, Target, TimeTable
 from spikeloom.compiler.targets.loihi1.layout.chips import require_one_chip
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
@@ -188,23 +187,12 @@ def prepare(
 def _slots(
     latencies: Latencies, spikes: BoolArray, updated: BoolArray, events: EventArray
 ) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8], npt.NDArray[np.uint8]]:
-    """Firing slots, working slots and events that nobody sends, as the kernels want them; refuses another's trace."""
-    netlist = latencies.netlist
-    if (
-        spikes.ndim != 3
-        or spikes.shape[2] != netlist.n_compartments
-        or updated.shape != spikes.shape
-        or events.shape[:2] != (len(spikes), netlist.n_inputs)
-    ):
-        raise DataError(
-            f"trace: spikes {spikes.shape}, updates {updated.shape} and events {events.shape} found, the netlist has "
-            f"{netlist.n_compartments} compartments and {netlist.n_inputs} input channels; give (recordings, chip "
-            "steps, compartments) twice and (recordings, channels, steps) of one run of this netlist"
-        )
+    """Firing slots, working slots and events that nobody sends, as the kernels want them."""
     fired, worked, seen = (np.ascontiguousarray(bits).view(np.uint8) for bits in (spikes, updated, events != 0))
-    if len(latencies.core_tile) == latencies.netlist.n_cores:
+    netlist = latencies.netlist
+    if len(latencies.core_tile) == netlist.n_cores:
         return fired, worked, seen
-    sent = np.zeros((*spikes.shape[:2], latencies.netlist.n_inputs), np.uint8)
+    sent = np.zeros((*spikes.shape[:2], netlist.n_inputs), np.uint8)
     ahead = seen[:, :, 1 : spikes.shape[1] + 1]
     sent[:, : ahead.shape[2]] = ahead.transpose(0, 2, 1)
     return np.concatenate([fired, sent], 2), np.concatenate([worked, sent], 2), seen[:, :, :0]
@@ -231,14 +219,9 @@ def charges(latencies: Latencies) -> Charges:
 def simple_times(latencies: Latencies, charged: IntArray, steps: IntArray) -> SimpleTimes:
     """Times of the simple model from what :func:`charges` added up to, (samples, chip steps, 2 * cores) int64.
 
-    `steps` (samples,) are the chip steps of each recording. Raises DataError if the sums are of another netlist.
+    `steps` (samples,) are the chip steps of each recording.
     """
     cores = len(latencies.core_tile)
-    if charged.ndim != 3 or charged.shape[::2] != (len(steps), 2 * cores):
-        raise DataError(
-            f"trace: sums {charged.shape} of {len(steps)} recordings found, the netlist has {cores} "
-            "cores; give (recordings, chip steps, twice the cores), charged for this netlist"
-        )
     samples, length = charged.shape[:2]
     duration, critical = np.zeros((samples, length)), np.full((samples, length), -1)
     each, receiving = np.zeros((samples, 2 * cores), np.int64), np.zeros((samples, length), np.bool_)
@@ -259,8 +242,7 @@ def detailed(
     """Time a batch of recordings by the detailed model.
 
     `spikes` and `updated` (samples, chip steps, compartments) are a simulator's, see :class:`trace.Trace`, for `events`
-    (samples, n_inputs, T); `steps` (samples,) are the chip steps of each recording, by default all. Raises DataError if
-    the trace is of another netlist.
+    (samples, n_inputs, T); `steps` (samples,) are the chip steps of each recording, by default all.
     """
     fired, worked, events = _slots(latencies, spikes, updated, events)
     samples, length = spikes.shape[:2]

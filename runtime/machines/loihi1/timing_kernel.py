@@ -3,10 +3,8 @@
 Latencies are whole picoseconds and link loads are whole multiples of one over ``Tables.unit``, so sums neither round
 nor depend on their order. Only what congestion and blocking add is fractional.
 
-*Who is next.* Two winner trees hold the cores, one by the time of their next message, one by the time at which their
-earliest message under way arrives. Messages to one core arrive in the order in which they are sent, so each core
-needs only a queue, and a message costs a few steps of a tree whatever the number of cores. Of equal times the lower
-core comes first.
+*Who is next.* Of equal times the lower core comes first. Messages to one core arrive in the order in which they are
+sent, so each core needs only a queue.
 """
 
 from __future__ import annotations
@@ -113,23 +111,13 @@ def conclude(
 
 
 @compiled
-def _replay(tree: IntArray, key: FloatArray, leaf: int) -> None:
-    """Mend a winner tree after the key of one leaf changed; the left of two equal keys wins."""
-    node = (key.size + leaf) >> 1
-    while node:
-        left, right = tree[2 * node], tree[2 * node + 1]
-        tree[node] = right if key[right] < key[left] else left
-        node >>= 1
-
-
-@compiled
-def _fill(tree: IntArray, key: FloatArray) -> None:
-    """Build a winner tree."""
-    for leaf in range(key.size):
-        tree[key.size + leaf] = leaf
-    for node in range(key.size - 1, 0, -1):
-        left, right = tree[2 * node], tree[2 * node + 1]
-        tree[node] = right if key[right] < key[left] else left
+def _earliest(times: FloatArray) -> int:
+    """Core whose time comes first; of equal times the lowest."""
+    earliest = 0
+    for core in range(1, times.size):
+        if times[core] < times[earliest]:
+            earliest = core
+    return earliest
 
 
 @compiled
@@ -200,28 +188,24 @@ def _send_all(  # noqa: PLR0915 - one loop over local state, which numba passes 
     route_first, route_link, route_share = tables.route_first, tables.route_link, tables.route_share
     route_hops, unit = tables.route_hops, tables.unit
     cores = done.size
-    leaves = 1
-    while leaves < cores:
-        leaves *= 2
-    senders, due = np.empty(2 * leaves, np.int64), np.full(leaves, np.inf)
-    winners, arrives = np.empty(2 * leaves, np.int64), np.full(leaves, np.inf)
+    due, arrives = np.full(cores, np.inf), np.full(cores, np.inf)
     cursor, front, back = queue[:cores].copy(), np.full(cores, -1), np.empty(cores, np.int64)
     for core in range(cores):
         if queue[core] < queue[core + 1]:
             due[core] = generation[queue[core]]
-    _fill(senders, due)
-    _fill(winners, arrives)
     under_way, work_under_way = 0, 0
     blocked, peak = 0.0, 0
-    while due[senders[1]] < np.inf:
-        core = senders[1]
+    while True:
+        core = _earliest(due)
+        if due[core] == np.inf:
+            return blocked, peak / unit
         m = cursor[core]
         sent = due[core]
         a = delivery[m]
         if a >= 0:
             # what has arrived leaves the mesh
-            while arrives[winners[1]] <= sent:
-                to = winners[1]
+            to = _earliest(arrives)
+            while arrives[to] <= sent:
                 gone = front[to]
                 other = delivery[gone]
                 way = route[other]
@@ -230,7 +214,7 @@ def _send_all(  # noqa: PLR0915 - one loop over local state, which numba passes 
                 work_under_way -= processing[other]
                 front[to] = later[gone]
                 arrives[to] = np.inf if later[gone] < 0 else received[later[gone]]
-                _replay(winners, arrives, to)
+                to = _earliest(arrives)
             # what is under way slows or blocks the message
             way = route[a]
             begin, end = route_first[way], route_first[way + 1]
@@ -252,15 +236,12 @@ def _send_all(  # noqa: PLR0915 - one loop over local state, which numba passes 
             if front[to] < 0:
                 front[to] = m
                 arrives[to] = received[m]
-                _replay(winners, arrives, to)
             else:
                 later[back[to]] = m
             back[to] = m
         done[core] = sent
         cursor[core] = m + 1
         due[core] = sent + generation[m + 1] if m + 1 < queue[core + 1] else np.inf
-        _replay(senders, due, core)
-    return blocked, peak / unit
 
 
 @compiled_and_cached

@@ -20,7 +20,6 @@ from itertools import pairwise
 import numpy as np
 from scipy.sparse import csr_array
 
-from spikeloom.compiler.errors import DataError
 from spikeloom.compiler.targets.base import EnergyTable, Target
 from spikeloom.compiler.targets.loihi1.layout.chips import chip_of_core
 from spikeloom.compiler.targets.loihi1.layout.place import hops
@@ -165,16 +164,8 @@ def count(meter: Meter, counts: Counts, steps: int | IntArray) -> dict[str, Floa
     """Amount per recording and layer of everything that a meter knows and of neuron updates.
 
     `counts` are those of a batch, with one leading axis of recordings; `steps` the data steps T of all of them, or of
-    each (samples,). Raises DataError if the counts are of another netlist.
+    each (samples,).
     """
-    netlist = meter.netlist
-    wanted = netlist.n_inputs, netlist.n_compartments, len(netlist.layers)
-    found = tuple(part.shape[-1] for part in (counts.inputs, counts.spikes, counts.updates))
-    if found != wanted:
-        raise DataError(
-            "trace: counts of {} channels, {} compartments and {} layers found, ".format(*found)
-            + "the netlist has {}, {} and {}; give counts of a run of this netlist".format(*wanted)
-        )
     sources = np.concatenate([counts.inputs, counts.spikes], axis=1).astype(np.float64)
     amounts = dict(zip(meter.names, np.split(sources @ meter.caused, len(meter.names), axis=1), strict=True))
     active = counts.updates.astype(np.float64)
