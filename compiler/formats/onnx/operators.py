@@ -242,7 +242,7 @@ def _affine_map(node: Node, table: Table, values: Sequence[Value | None]) -> Val
     return scaled_by(value, (high - shift) / 2.0**20, shift)
 
 
-def require_finite(value: Affine) -> None:
+def require_finite(value: Affine, where: str = "") -> None:
     """Refuse coefficients that are not finite numbers: ModelError."""
     if not all(np.all(np.isfinite(part)) for part in (value.bias, *(own.data for own in value.terms.values()))):
-        raise ModelError("has coefficients that are not finite; train it again")
+        raise ModelError(f"{where}has coefficients that are not finite; train it again")

@@ -90,10 +90,7 @@ def _network(model: Model, polarities: int | None, polarities_first: bool | None
     results = zip(graph.outputs, run(graph, {}, given, table), strict=True)
     outputs = {name: as_affine(table, value) for name, value in results}
     for name, value in outputs.items():
-        try:
-            require_finite(value)
-        except ModelError as error:
-            raise ModelError(f"output {printable(name)}: {error}") from error
+        require_finite(value, f"output {printable(name)}: ")
     found = group(table, neurons_of(table, outputs), shapes)
     voters, label, counted = readout(table, found, outputs)
     sensor, positions, words = sensor_layout(found.shape, polarities=polarities, polarities_first=polarities_first)

@@ -41,10 +41,7 @@ def group(table: Table, neurons: Sequence[Neurons], shapes: Mapping[int, tuple[i
     shape, positions = _time(table, layers, data, shapes[data])
     sources: list[dict[int, Sparse]] = []
     for layer in layers:
-        every = [
-            _sources(table, n, step, step_of, data, positions[step] if positions is not None else None)
-            for step, n in enumerate(layer)
-        ]
+        every = [_sources(table, n, step, step_of, {data: positions[step]}) for step, n in enumerate(layer)]
         for step in range(1, len(layer)):
             _require_like(layer, step, every)
         sources.append(every[0])
@@ -111,12 +108,12 @@ def _data(table: Table, neurons: Sequence[Neurons]) -> int:
 
 def _time(
     table: Table, layers: list[list[Neurons]], data: int, shape: tuple[int, ...]
-) -> tuple[tuple[int, ...], list[IntArray] | None]:
-    """Shape of one step of the input, and the flat positions of each step; None where there is one step."""
+) -> tuple[tuple[int, ...], list[IntArray]]:
+    """Shape of one step of the input, and the flat positions of each step."""
     steps = len(layers[0])
-    if steps == 1:
-        return shape, None
     every = np.arange(table.atoms[data].size).reshape(shape)
+    if steps == 1:
+        return shape, [every.ravel()]
     for axis in range(len(shape)):
         if shape[axis] != steps:
             continue
@@ -137,17 +134,13 @@ def _time(
 
 
 def _sources(
-    table: Table,
-    n: Neurons,
-    step: int,
-    step_of: Mapping[int, tuple[int, int]],
-    data: int,
-    positions: IntArray | None,
+    table: Table, n: Neurons, step: int, step_of: Mapping[int, tuple[int, int]], inputs: Mapping[int, IntArray]
 ) -> dict[int, Sparse]:
+    """Weights from each source; of an input from its positions in this step."""
     found = {}
     for atom, weight in n.current.items():
-        if atom == data:
-            found[INPUT] = weight if positions is None else weight[:, positions]
+        if atom in inputs:
+            found[INPUT] = weight[:, inputs[atom]]
         elif atom not in step_of:
             raise ModelError(f"{n.node}: takes {table.atoms[atom]}, which is no spike of a layer; {RESET}")
         else:
