@@ -100,6 +100,12 @@ def kept_shares(decay_u: IntArray | int, decay_v: IntArray | int) -> tuple[Any, 
     return (DECAY_ONE - 1 - decay_u) / DECAY_ONE, (DECAY_ONE - decay_v) / DECAY_ONE
 
 
+def in_units(mantissa: IntArray, exponent: IntArray | int) -> IntArray:
+    """``mantissa * 2**exponent``, int64; at exponent -1 mantissas are even."""
+    wide = mantissa.astype(np.int64)
+    return np.where(np.less(exponent, 0), wide >> 1, wide << np.maximum(exponent, 0))
+
+
 def largest_current(worst: IntArray, decay_u: IntArray | int) -> IntArray:
     """Largest current, in register units, that sums of up to `worst` weight units a step add up to.
 

@@ -9,7 +9,7 @@ object can know is checked on construction, everything else in :mod:`compiler.in
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ import numpy.typing as npt
 from scipy import sparse
 
 from spikeloom.compiler.dynamics import NO_CLOCKS, Clocks
-from spikeloom.compiler.fixedpoint import kept_shares
+from spikeloom.compiler.fixedpoint import in_units, kept_shares
 from spikeloom.compiler.types import FloatArray, IntArray
 
 INPUT = -1
@@ -234,9 +234,12 @@ def one_sided(projections: Iterable[IntegerProjection], neurons: int) -> tuple[I
     positive, negative = np.zeros((2, neurons), np.int64)
     for projection in projections:
         for rows in row_parts(projection.weight):
-            part = replace(projection, weight=projection.weight[rows]).effective()
-            positive[rows] += part.maximum(0).sum(axis=1)
-            negative[rows] -= part.minimum(0).sum(axis=1)
+            ends = projection.weight.indptr[rows.start : rows.stop + 1]
+            units = in_units(projection.weight.data[ends[0] : ends[-1]], projection.exponent)
+            row = np.repeat(np.arange(rows.start, rows.stop), np.diff(ends))
+            # float64 sums of integers below 2**53 are exact, and much faster than those of sparse matrices
+            positive += np.bincount(row, np.maximum(units, 0), neurons).astype(np.int64)
+            negative -= np.bincount(row, np.minimum(units, 0), neurons).astype(np.int64)
     return positive, negative
 
 

@@ -31,6 +31,7 @@ from typing import Any
 import numpy as np
 
 from spikeloom.compiler.dynamics import NO_CLOCKS, Clocks
+from spikeloom.compiler.fixedpoint import in_units
 from spikeloom.compiler.types import FloatArray, IntArray
 
 
@@ -186,9 +187,3 @@ def one_step_bounds(netlist: Netlist) -> tuple[IntArray, IntArray]:
             # float64 sums of integers below 2**53 are exact
             sums[first:last] = np.bincount(compartment - first, np.maximum(share, 0), last - first)
     return positive, negative
-
-
-def in_units(mantissa: IntArray, exponent: IntArray) -> IntArray:
-    """``mantissa * 2**exponent``, int64; at exponent -1 mantissas are even."""
-    wide = mantissa.astype(np.int64)
-    return np.where(exponent < 0, wide >> 1, wide << np.maximum(exponent, 0))

@@ -9,6 +9,7 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -106,8 +107,13 @@ def _relays_follow(population: Population, integer: IntegerPopulation, planes: t
 def in_batches(calibration: Calibration, measure: Callable[[slice], IntArray | FloatArray]) -> list[FloatArray]:
     """Measure something on batches of calibration recordings, on all cores."""
     parts = [slice(start, start + BATCH) for start in range(0, len(calibration.events), BATCH)]
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        return [np.asarray(part, np.float64) for part in pool.map(measure, parts)]
+    return [np.asarray(part, np.float64) for part in _threads().map(measure, parts)]
+
+
+@cache
+def _threads() -> ThreadPoolExecutor:
+    """Started once: a layer is measured hundreds of times."""
+    return ThreadPoolExecutor(os.cpu_count())
 
 
 def observed_sums(layer: FloatLayer, calibration: Calibration) -> FloatArray:
