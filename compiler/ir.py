@@ -204,8 +204,7 @@ def recurrent(network: Network | IntegerNetwork) -> tuple[str, ...]:
 def fan_in(network: Network | IntegerNetwork, post: int) -> IntArray:
     """Structural synapses into each neuron of a population, planes of one synapse counted once; shape (neurons,)."""
     planes: dict[int, list[Sparse]] = {}
-    projections: tuple[Projection | IntegerProjection, ...] = network.projections
-    for projection in projections:
+    for projection in network.projections:
         if projection.post == post:
             planes.setdefault(projection.pre, []).append(projection.weight)
     total = np.zeros(network.populations[post].size, np.int64)

@@ -195,7 +195,7 @@ def test_estimate_by_one_table_or_ones_own(place, command):
     for content, said in (
         ("other = 1\n", f"{mine}: unknown key 'other', allowed are energy"),
         ("other = 1\n", f"{mine}: holds no table; give [energy.NAME]"),
-        ('[energy.mine]\ntitle = "mine"\n', f"{mine}: energy.mine: has no price of synaptic_event"),
+        ('[energy.mine]\ntitle = "mine"\n', f"{mine}: energy.mine.synaptic_event: is missing"),
     ):
         mine.write_text(content, "utf-8")
         assert said in command(f"estimate --table {mine}", code=2)
