@@ -13,7 +13,7 @@ from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.commands.options import MODEL, add_netlist_and_model, add_recordings
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import load_network
-from spikeloom.runtime.inputs.recordings import recordings
+from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.machines.integer import IntegerMachine, integer_machine_for
 from spikeloom.runtime.machines.votes import votes_by_step
 from spikeloom.runtime.report.console import progress
@@ -64,7 +64,8 @@ def run(arguments: argparse.Namespace) -> Outcome:
     require_place(arguments.picture, "--picture", arguments)
     allowed = _allowed(arguments)
     machine = integer_machine_for(arguments.netlist)
-    data = _read(arguments.data, arguments.split, machine, arguments, limit=arguments.limit)
+    data = load_recordings(arguments, machine.netlist)
+    machine.require_sensor(data.events)
     lengths = data.step_counts
     floats = _float_votes(arguments, machine, data)
     points = _races(arguments, machine)
@@ -74,10 +75,10 @@ def run(arguments: argparse.Namespace) -> Outcome:
         machine,
         data,
         ran,
-        () if points is None else [exits.calibrate(points, share) for share in allowed],
+        () if points is None else [exits.calibrate(points, share) for share in sorted(allowed)],
         model_votes=floats,
         calibrated_on=arguments.calibrate,
-        chosen=None if points is None else allowed.index(_chosen(arguments)) + 1,
+        chosen=None if points is None else sorted(allowed).index(allowed[0]) + 1,
     )
     if arguments.picture is not None:
         from spikeloom.runtime.studies.anytime.picture import picture  # Matplotlib, so only here
@@ -88,42 +89,23 @@ def run(arguments: argparse.Namespace) -> Outcome:
     return Outcome(result, sections)
 
 
-def _chosen(arguments: argparse.Namespace) -> float:
-    return DIFFER if arguments.differ is None else float(arguments.differ)
-
-
 def _allowed(arguments: argparse.Namespace) -> list[float]:
-    """Shares to calibrate for."""
+    """Shares to calibrate for, the chosen one first."""
     if arguments.differ is not None and arguments.calibrate is None:
         raise OptionError(f"--differ {arguments.differ:g}: nothing to calibrate on; add --calibrate or omit it")
-    chosen = _chosen(arguments)
+    chosen = DIFFER if arguments.differ is None else arguments.differ
     if not 0 <= chosen < 1:
         raise OptionError(f"--differ {chosen:g}: not a share; give a number from 0 to below 1")
-    return sorted({*ALLOWED, chosen})
-
-
-def _read(
-    path: str, split: str, machine: IntegerMachine, arguments: argparse.Namespace, limit: int | None = None
-) -> Recordings:
-    progress("reading the recordings")
-    data = recordings(
-        path,
-        split,
-        limit=limit,
-        classes=machine.netlist.classes,
-        taxels=machine.netlist.taxels,
-        bin_s=arguments.bin,
-        bins=machine.netlist.bins,
-    )
-    machine.require_sensor(data.events)
-    return data
+    return [chosen, *(share for share in ALLOWED if share != chosen)]
 
 
 def _races(arguments: argparse.Namespace, machine: IntegerMachine) -> FloatArray | None:
     """Turning points of the races on the training split, if there is something to calibrate on."""
     if arguments.calibrate is None:
         return None
-    training = _read(arguments.calibrate, "train", machine, arguments)
+    named = {"data": arguments.calibrate, "split": "train", "limit": None}
+    training = load_recordings(argparse.Namespace(**vars(arguments) | named), machine.netlist)
+    machine.require_sensor(training.events)
     progress("calibrating")
     lengths = training.step_counts
     return exits.turning_points(exits.races(machine.votes_by_step(training.events, lengths), lengths))

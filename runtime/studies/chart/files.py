@@ -62,13 +62,7 @@ def csv_text(chart: Chart) -> str:
 
 
 def read_chart(words: str, sha256: str, checkpoint: str) -> Chart:
-    """The chart in a file or folder that a network with this checkpoint is part of.
-
-    Raises
-    ------
-    DataError, ModelError
-        If there is no chart, or one of another version or of other networks.
-    """
+    """The chart in a file or folder that a network with this checkpoint is part of; refused if there is none."""
     path = Path(words) / "chart.json" if Path(words).is_dir() else Path(words)
     chart = read_json(Chart, path, "--chart", "spikeloom chart")
     if chart.format != FORMAT:

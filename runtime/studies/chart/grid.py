@@ -45,10 +45,7 @@ AXES = tuple(axis.name for axis in fields(Grid))
 def parse_grid(text: str, target: Target) -> Grid:
     """Read a grid; the chip says which widths it stores and how many thresholds a core holds.
 
-    Raises
-    ------
-    OptionError
-        Naming the value that cannot be understood, and what is allowed.
+    An OptionError names the value that cannot be understood, and what is allowed.
 
     Examples
     --------

@@ -367,12 +367,7 @@ def why_not(name: str, pair: Pair, sensor: Sensor) -> str | None:
 
 
 def level_of(name: str, words: str) -> Level:
-    """Read a level of a perturbation.
-
-    Raises
-    ------
-    OptionError
-        If it is none that makes sense.
+    """Read a level of a perturbation; refused if it is none that makes sense.
 
     Examples
     --------

@@ -110,13 +110,7 @@ def going_round(bench: Bench, rounds: int) -> Inputs:
 
 
 def bench_of(arguments: argparse.Namespace) -> tuple[Bench, LoadedNetwork, str]:
-    """Everything that is stressed, the float network, and a hash of the recordings.
-
-    Raises
-    ------
-    SpikeloomError
-        If a file cannot be used, or they do not belong together.
-    """
+    """Everything that is stressed, the float network, and a hash of the recordings."""
     netlist = read_netlist(arguments.netlist)
     loaded = load_network(arguments.checkpoint, arguments, netlist)
     require_match(netlist, loaded.model)

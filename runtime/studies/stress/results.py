@@ -127,13 +127,7 @@ def shown(level: Level) -> str:
 
 
 def read_stress(path: str, netlist: str, sha256: str) -> Stress:
-    """Read what ``stress -o`` wrote about a netlist of this name and hash.
-
-    Raises
-    ------
-    DataError
-        If the file is not there, something else, or about another netlist.
-    """
+    """Read what ``stress -o`` wrote about a netlist of this name and hash; refused if it is about another one."""
     result = read_json(Stress, Path(path), "--stress", "spikeloom stress -o")
     about = result.provenance.netlist_sha256
     if about != sha256:

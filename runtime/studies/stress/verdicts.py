@@ -55,12 +55,7 @@ class Requirement:
 
 
 def parse_requirement(words: str) -> Requirement:
-    """Read ``taxels_dead:3>=0.85``.
-
-    Raises
-    ------
-    OptionError
-        If it is none.
+    """Read ``taxels_dead:3>=0.85``; an OptionError says why it is none.
 
     Examples
     --------
