@@ -118,22 +118,15 @@ def body(spelling="product"):
 RESTS = {"r0": np.zeros((1, 3), np.float32), "r1": np.zeros((1, 2), np.float32), "axes": np.array([0])}
 
 
-def scanned(steps=4, *, reverse=False):
-    """All steps by a Scan over the last axis of (4, steps), then the mean."""
-    more = {"body": body(), "num_scan_inputs": 1, "scan_input_axes": [0]}
-    more |= {"scan_input_directions": [1]} if reverse else {}
-    nodes = [
-        node("Transpose", "events", "turned", perm=[1, 0]),
-        node("Unsqueeze", "turned axis", "sequence"),
-        node(
-            "Scan",
-            "r0 r0 r1 r1 sequence",
-            "end0 end1 end2 end3 spikes",
-            **more,
-        ),
-        node("ReduceMean", "spikes axes", "rate", keepdims=0),
-    ]
-    return model(nodes, [("events", [4, steps])], ["rate"], RESTS | {"axis": np.array([1])})
+MEAN = node("ReduceMean", "spikes axes", "rate", keepdims=0)
+
+
+def scanned(steps=4, last=(MEAN,), **more):
+    """All steps by a Scan over (steps, 4), then the mean of the spikes, or what the last nodes make of them."""
+    more |= {"body": body(), "num_scan_inputs": 1}
+    scan = node("Scan", "r0 r0 r1 r1 sequence", "end0 end1 end2 end3 spikes", **more)
+    nodes = [node("Unsqueeze", "events axis", "sequence"), scan, *last]
+    return model(nodes, [("events", [steps, 4])], last[-1].output, RESTS | {"axis": np.array([1])})
 
 
 def looped(steps=4):

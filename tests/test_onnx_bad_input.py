@@ -144,7 +144,7 @@ REFUSED = [
     ("layer layer1: keeps 1.5 of its membrane in a step, allowed", layer(GOOD, beta=np.array(1.5, np.float32))),
     ("layer layer1: has the threshold -0.5, allowed are", layer(GOOD, theta=np.array(-0.5, np.float32))),
     ("node u0_new (Add): has coefficients that are not finite", layer(GOOD, w=np.full((4, 3), np.nan, np.float32))),
-    ("node end0 (Scan): runs backwards in time", scanned(reverse=True)),
+    ("node end0 (Scan): runs backwards in time", scanned(scan_input_directions=[1])),
     # files
     ("holds no graph, so it is not an ONNX file", b""),
     ("is not an ONNX file, or is truncated", b"PK\x03\x04 not at all"),
