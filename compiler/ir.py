@@ -118,7 +118,7 @@ class IntegerPopulation:
     """The same neurons in the chip's registers; units as in :class:`netlist.Netlist`."""
 
     name: str  # Unique in the network
-    # beta, theta, alpha: What the float model asked for
+    # beta, theta, alpha: Of the float model
     beta: float
     theta: float
     scale: FloatArray  # (neurons,) float64; weight units per membrane unit of the float model

@@ -15,7 +15,7 @@ TAXELS, FEATURES, CLASSES, STEPS = 6, 5, 4, 24
 
 
 def ring(taxels: int = TAXELS) -> Graph:
-    """Each taxel hears its two neighbours."""
+    """Each taxel is joined to its two neighbours."""
     pairs = [(i, (i + 1) % taxels) for i in range(taxels)]
     return Graph(
         name="ring",

@@ -70,9 +70,9 @@ def simulate(graph, events, dt, convention="euler", late=()):
 
     Membranes start at their reset, currents at zero. Along the edges in `late` comes what was sent in the step before.
     """
-    heard = {name: [a for a, b in graph.edges if b == name] for name in graph.nodes}
-    order, ready = [], {name: [a for a in sources if (a, name) not in late] for name, sources in heard.items()}
-    while len(order) < len(heard):
+    received = {name: [a for a, b in graph.edges if b == name] for name in graph.nodes}
+    order, ready = [], {name: [a for a in sources if (a, name) not in late] for name, sources in received.items()}
+    while len(order) < len(received):
         order += [n for n in ready if n not in order and all(source in order for source in ready[n])]
     state, spikes = {}, {}
     before = {source: np.zeros(graph.nodes[source].output_type["output"]) for source, _ in late}
@@ -83,7 +83,7 @@ def simulate(graph, events, dt, convention="euler", late=()):
             if isinstance(node, nir.Input):
                 values[name] = now.reshape(node.input_type["input"]).astype(float)
                 continue
-            x = sum((before if (source, name) in late else values)[source] for source in heard[name])
+            x = sum((before if (source, name) in late else values)[source] for source in received[name])
             values[name] = stepped(node, x, state.setdefault(name, {}), dt, convention)
             if isinstance(node, nir.LIF | nir.IF | nir.CubaLIF | nir.Threshold):
                 spikes.setdefault(name, []).append(values[name].ravel() > 0)

@@ -209,7 +209,7 @@ def test_odd_weights_are_exact(tmp_path, most, exponents):
 
 
 @pytest.mark.parametrize("most", [60, 127, 250])
-def test_a_block_that_hears_itself(tmp_path, most):
+def test_a_recurrent_block(tmp_path, most):
     rng = np.random.default_rng(8)
     first, own, last = even(rng, 12, 6), rng.integers(-most, most + 1, (12, 12)), even(rng, 5, 12)
     block = dense(first) | {"type": ["dense_rec"], "weight_rec": own.astype(np.float32)}

@@ -244,7 +244,7 @@ def test_branches_and_nested_graphs():
 
 
 def loop(neurons, *stages):
-    """A layer of nine that hears itself through stages, one that hears it, and which edge is late."""
+    """A recurrent layer of nine, fed back through stages, one after it, and which edge is late."""
     rng = np.random.default_rng(12)
     names = [f"w{place}" for place in range(len(stages))]
     nodes = {"a": affine(rng, 9, 6, 1.5), "b": neurons, **dict(zip(names, stages, strict=True))}
@@ -255,7 +255,7 @@ def loop(neurons, *stages):
 
 @pytest.mark.parametrize("convention", ["euler", "exponential"])
 @pytest.mark.parametrize("kind", ["lif", "thresholds", "cuba", "if", "threshold"])
-def test_a_layer_that_hears_itself(kind, convention):
+def test_a_recurrent_layer(kind, convention):
     rng = np.random.default_rng(13)
     neurons = {
         "lif": lif(9, tau=0.07, r=2.0, leak=0.1, reset=-0.2),

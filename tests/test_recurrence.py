@@ -1,4 +1,4 @@
-"""Layers that hear themselves, from the float network to the chip, its commands and other programs."""
+"""Recurrent layers, from the float network to the chip, its commands and other programs."""
 
 import json
 from dataclasses import replace
@@ -45,20 +45,20 @@ from spikeloom.runtime.machines.loihi1.trace import aligned
 SETTINGS = settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 
-def hearing_itself(network, post, weight):
+def with_loop(network, post, weight):
     """A network with one more projection, from a population to itself."""
     own = Projection(pre=post, post=post, weight=stored(np.asarray(weight, float)))
     return replace(network, projections=(*network.projections, own))
 
 
 def drawn(seed, *, hidden=12, gain=1.0, alpha=0.0):
-    """Ten channels, a layer that hears itself, four classes; weights of no special values."""
+    """Ten channels, a recurrent layer, four classes; weights of no special values."""
     rng = np.random.default_rng(seed)
     first, last = rng.normal(size=(hidden, 10)) * 0.4, rng.normal(size=(4, hidden)) * 0.5
     network = chain(first, last, beta=0.6, biases=[rng.normal(size=hidden) * 0.05, np.zeros(4)], polarities=2)
-    hears = replace(network.populations[0], alpha=alpha)
-    network = replace(network, populations=(hears, network.populations[1]))
-    return hearing_itself(network, 0, rng.normal(size=(hidden, hidden)) * gain / hidden**0.5)
+    recurring = replace(network.populations[0], alpha=alpha)
+    network = replace(network, populations=(recurring, network.populations[1]))
+    return with_loop(network, 0, rng.normal(size=(hidden, hidden)) * gain / hidden**0.5)
 
 
 def events_for(seed, samples=6, steps=50):
@@ -72,7 +72,7 @@ def events_for(seed, samples=6, steps=50):
 def test_what_is_fired_in_a_step_arrives_in_the_next():
     """The second neuron keeps itself firing once it is hit; it stops the third a step after each spike."""
     network = chain(np.eye(3), np.eye(3), beta=0.0)
-    network = hearing_itself(network, 0, [[0, 0, 0], [0, 1, 0], [0, -1, 0]])
+    network = with_loop(network, 0, [[0, 0, 0], [0, 1, 0], [0, -1, 0]])
     events = np.array([[1, 0, 1], [0, 1, 1], [0, 0, 1], [1, 0, 1]], bool)[None]
     for steps in (run_float(network, events), run_integer(choose_storage(network, LOIHI)[0], events)):
         assert steps.spikes[0][0].astype(int).tolist() == [[1, 0, 1], [0, 1, 1], [0, 1, 0], [1, 1, 0]]
@@ -116,7 +116,7 @@ def test_whole_numbers_without_leak_are_exact_in_floats(seed, hidden):
         populations=tuple(replace(population, decay_v=0) for population in integer.populations),
         projections=(*integer.projections, loop),
     )
-    network = hearing_itself(chain(first, last, beta=1.0, theta=100.0), 0, own)
+    network = with_loop(chain(first, last, beta=1.0, theta=100.0), 0, own)
     events = rng.random((2, 30, 4)) < 0.4
     wanted = run_float(network, events, membranes=True)
     netlist = compiled(integer)
@@ -158,27 +158,27 @@ def test_neurons_that_only_excite_each_other_are_silent():
     network = chain([[0, 0], [0, 0], [1, 1], [0, 0]], np.ones((1, 4)))
     own = np.zeros((4, 4))
     own[0, 1] = own[1, 0] = own[3, 2] = 2
-    network = hearing_itself(network, 0, own)
+    network = with_loop(network, 0, own)
     assert never_fires(network)[0].tolist() == [False, False, False, False]  # a ring might keep itself going
     cut = chain([[0.05, 0.05], [0.05, 0], [1, 1], [0, 0]], np.ones((1, 4)))
-    cut = hearing_itself(cut, 0, own * [0.1, 0.1, 1, 0])
+    cut = with_loop(cut, 0, own * [0.1, 0.1, 1, 0])
     assert never_fires(cut)[0].tolist() == [True, True, False, False]
     silent, unread = removable(compile_network(cut, Options(keep_all=True)).integer)
     assert silent[0].tolist() == [True, True, False, False]
     assert not unread[0].any()
 
 
-def test_neurons_that_only_each_other_hear_are_left_out():
+def test_neurons_that_only_feed_each_other_are_left_out():
     """The first drives the second, which votes; the third and the fourth talk among themselves."""
     network = chain(np.ones((4, 2)), [[1, 1, 0, 0]])
     own = np.zeros((4, 4))
     own[1, 0] = own[3, 2] = 1
-    network = hearing_itself(network, 0, own)
+    network = with_loop(network, 0, own)
     made = compile_network(network)
     assert [removal.unread for removal in made.removals] == [2, 0]
     assert made.netlist.layers[0].unread == (2, 3)
-    own[2, 2] = 1  # what hears itself counts as heard
-    made = compile_network(hearing_itself(replace(network, projections=network.projections[:2]), 0, own))
+    own[2, 2] = 1  # a neuron that receives itself counts as received
+    made = compile_network(with_loop(replace(network, projections=network.projections[:2]), 0, own))
     assert made.netlist.layers[0].unread == (3,)
 
 
@@ -217,7 +217,7 @@ def test_what_is_certain_is_so_in_float32_and_in_another_order(seed, alpha, gain
     turned = np.random.default_rng(seed).permutation(12)
     first, last, own = (p.weight.toarray() for p in network.projections)
     other = chain(first[turned], last[:, turned], beta=0.6, biases=[network.populations[0].bias[turned], np.zeros(4)])
-    other = hearing_itself(replace(other, input=network.input), 0, own[np.ix_(turned, turned)])
+    other = with_loop(replace(other, input=network.input), 0, own[np.ix_(turned, turned)])
     other = replace(other, populations=(replace(other.populations[0], alpha=alpha), other.populations[1]))
     runs = [run_float(network, channels_last(events), dtype=dtype).spikes for dtype in (np.float64, np.float32)]
     hidden, votes = run_float(other, channels_last(events), dtype=np.float32).spikes
@@ -280,7 +280,7 @@ def test_commands_know_the_loop(capsys, tmp_path):
 
 
 def test_currents_biases_and_loops_together():
-    """A CubaLIF that hears itself through an Affine: its bias goes through the current, from a channel of its own."""
+    """A recurrent CubaLIF, fed back through an Affine: its bias goes through the current, from a channel of its own."""
     rng = np.random.default_rng(16)
     nodes = {
         "a": affine(rng, 9, 6, 0.5),

@@ -48,7 +48,7 @@ def read_checkpoint(
     Raises
     ------
     ModelError
-        If the file is no checkpoint, holds code, is damaged or altered, does not hold what is asked for, or its
+        If the file is no checkpoint, holds code, is damaged or altered, lacks the set or run, or its
         tensors do not make the system; every fault of the tensors is listed.
     OptionError
         If `system` is another than the file's, or `weights`, `beta` or `theta` has a value that does not exist, or a

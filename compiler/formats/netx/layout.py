@@ -37,7 +37,7 @@ LAYER_LIMIT = 1000
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Block(Part):
-    """One layer of a file, to be asked for its entries."""
+    """One layer of a file, with its entries."""
 
     number: int
     type: str

@@ -278,12 +278,12 @@ def _own(tree: Tree, inputs: int, voters: int) -> tuple[Input, IntArray] | None:
 
 
 def _fact(block: Block, population: IntegerPopulation, planes: int) -> str:
-    told = (
+    fact = (
         f"{population.name}: {population.size} neurons, decay_u {population.decay_u}, decay_v {population.decay_v}, "
         f"fires at v > 64 * {population.threshold[0]}"
     )
     if block.type == "input":
-        told += "; it turns events into currents"
+        fact += "; it turns events into currents"
     if block.type == "dense_rec":
-        told += "; it is recurrent, fed by its own spikes of the step before"
-    return told + ("; odd weights are stored twice" if planes > 1 else "")
+        fact += "; it is recurrent, fed by its own spikes of the step before"
+    return fact + ("; odd weights are stored twice" if planes > 1 else "")

@@ -54,12 +54,12 @@ def facts_of(graph: Graph, steps: Steps, spiking: Sequence[SpikingNode], sensor:
     for one in spiking:
         n = one.neurons
         decays = " or ".join(decay_words(float(n.beta[rows[0]])) for rows in one.groups[:4])
-        told = f"layer {printable(one.node.name)} ({one.node.type}): {len(n.beta)} neurons, {decays}"
-        told += f", current {one.value.alpha:.6g}" if one.value.alpha else ""
-        told += f", fires at v > {_span(n.theta + n.reset)}, then v = {_span(n.reset)}"
+        fact = f"layer {printable(one.node.name)} ({one.node.type}): {len(n.beta)} neurons, {decays}"
+        fact += f", current {one.value.alpha:.6g}" if one.value.alpha else ""
+        fact += f", fires at v > {_span(n.theta + n.reset)}, then v = {_span(n.reset)}"
         if np.any(np.abs(n.gain - 1) > 1e-4):
-            told += f"; a step adds {_span(n.gain)} of its input"
-        facts.append(told)
+            fact += f"; a step adds {_span(n.gain)} of its input"
+        facts.append(fact)
     return facts + _drifts(graph, steps, spiking, clocked)
 
 
