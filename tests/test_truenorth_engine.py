@@ -51,7 +51,6 @@ def lives(neuron: Neuron, arrivals: list[int]) -> tuple[list[int], list[int]]:
         (Neuron(threshold=9, leak=2, leak_reversal=True, negative_threshold=99), [0, 0], [0, 0], []),
         # history-free: the threshold is the leak
         (history_free((1, 0, 0, 0), 3), [2, 2, 3, 0, -9, 4], [0] * 6, [2, 5]),
-        (history_free((1, 0, 0, 0), 3, bias=1), [2, 1, 0], [0] * 3, [0]),
         # the register saturates at both ends
         (Neuron(threshold=2**18 - 1, reset_mode=RESET_NONE, initial=2**19 - 1), [5, -3], [524287, 524284], [0, 1]),
         (Neuron(negative_threshold=2**18 - 1, reset_mode=RESET_NONE, initial=-(2**19)), [-5], [-524288], []),

@@ -192,13 +192,8 @@ def test_estimate_by_one_table_or_ones_own(place, command):
     mine.write_text(f'[energy.mine]\ntitle = "mine"\n{price}', "utf-8")
     report = command(f"estimate --table {mine}")
     assert report["per_inference"]["energy_j"] == {"mine": pytest.approx(3e-12)}
-    for content, said in (
-        ("other = 1\n", f"{mine}: unknown key 'other', allowed are energy"),
-        ("other = 1\n", f"{mine}: holds no table; give [energy.NAME]"),
-        ('[energy.mine]\ntitle = "mine"\n', f"{mine}: energy.mine.synaptic_event: is missing"),
-    ):
-        mine.write_text(content, "utf-8")
-        assert said in command(f"estimate --table {mine}", code=2)
+    mine.write_text('[energy.mine]\ntitle = "mine"\n', "utf-8")
+    assert "energy.mine.synaptic_event: is missing" in command(f"estimate --table {mine}", code=2)
 
 
 def test_inspect(command):

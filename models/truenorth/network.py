@@ -36,10 +36,6 @@ from spikeloom.models.networks.surrogate import RECTANGLE, Surrogate
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.truenorth.neurons import block_sums, integrate
 
-CHIP = "truenorth"
-
-CONV = "conv1"
-
 CONV_GAIN, GAIN = 4.0, 2.7
 """Initial weights lie within this over the root of a neuron's inputs (of one taxel's channels in the convolution),
 thresholds being 1: membranes that only add reach them every ten to twenty steps."""
@@ -81,7 +77,7 @@ class NativeArchitecture:
     @property
     def layers(self) -> tuple[str, ...]:
         """Names of the layers."""
-        return (CONV, *(f"fc{i}" for i in range(1, len(self.hidden) + 2)))
+        return ("conv1", *(f"fc{i}" for i in range(1, len(self.hidden) + 2)))
 
     def inputs(self) -> list[NDArray[np.int64]]:
         """Neurons from which each group of the dense layers receives, (groups, inputs of a group) for each layer."""
@@ -101,7 +97,7 @@ def sized(
     *, taxels: int, classes: int, hops: int, features: int, copies: int, clocks: Clocks, channels: int = 2
 ) -> NativeArchitecture:
     """The architecture whose groups fill the axons of a core best, as few as can be; OptionError if none fit."""
-    axons = load_target(CHIP).limit("core.axons")
+    axons = load_target("truenorth").limit("core.axons")
     room = axons // copies
     if taxels * channels > room:
         raise OptionError(

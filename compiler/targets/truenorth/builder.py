@@ -42,13 +42,13 @@ RELAY = Neuron()
 """Spikes in every tick in which its axon of type 0 does, and remembers nothing."""
 
 
-def history_free(weights: tuple[int, ...], threshold: int, *, bias: int = 0) -> Neuron:
-    """A neuron that spikes when its sum and bias reach the threshold, and forgets everything within the tick.
+def history_free(weights: tuple[int, ...], threshold: int) -> Neuron:
+    """A neuron that spikes when its sum reaches the threshold, and forgets everything within the tick.
 
     The threshold is a leak: what is at least zero after it spikes and is reset to zero, what is below zero is reset to
     zero by the negative threshold. (The encoding of RANC's ``teaconversion.py``.)
     """
-    return Neuron(weights=weights, leak=bias - threshold, threshold=0)
+    return Neuron(weights=weights, leak=-threshold, threshold=0)
 
 
 def crossing_points(levels: IntArray, weights: Sequence[int]) -> IntArray:

@@ -37,9 +37,6 @@ MOST_COPIES = 3
 EMPTYING = 4
 """Axons by which a clock empties neurons of partial sums: more than these can hold."""
 
-LIFT, PULL = 255, -256
-"""Weights of the clocks of gated neurons."""
-
 SEARCHED = np.linspace(0.1, 1.0, 19)
 """Shares of the largest weight that are tried as the largest level of a codebook."""
 
@@ -149,21 +146,6 @@ def _layer(population: Population, weight: FloatArray, copies: int, chip: Target
         # with the axons of a clock beside: groups of 126 inputs with two axons each, 84 with three
         width=weight.shape[1] if whole else (chip.limit("core.axons") - EMPTYING) // tried,
     )
-
-
-def gate_axons(groups: int, least: int = 0) -> tuple[int, int]:
-    """Axons of the clocks that lift a gated neuron to its threshold, and that pull it down.
-
-    It adds up the partial sums of so many groups; `least` is the lowest threshold on its core.
-
-    Examples
-    --------
-    >>> gate_axons(30)
-    (3, 9)
-    """
-    reach = MOST * groups
-    lifts = (reach - least) // LIFT + 1
-    return lifts, (2 * reach + LIFT * lifts) // -PULL + 2
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,21 +27,21 @@ import numpy as np
 
 from spikeloom.compiler.errors import CapacityError
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.targets.truenorth.builder import RELAY, Draft, Neuron, Place, crossing_points
+from spikeloom.compiler.targets.truenorth.builder import RELAY, Draft, Neuron, Place, crossing_points, history_free
 from spikeloom.compiler.targets.truenorth.codebook import (
     BIN_TICKS,
     EMPTYING,
-    LIFT,
     MOST,
-    PULL,
     WEIGHTS,
     Layer,
     LevelNetwork,
-    gate_axons,
 )
 from spikeloom.compiler.targets.truenorth.lower import exceeded, place_cores
 from spikeloom.compiler.targets.truenorth.netlist import AXON_TYPES, RESET_LINEAR, RESET_TO, CrossbarNetlist
 from spikeloom.compiler.types import IntArray
+
+LIFT, PULL = 255, -256
+"""Weights of the clocks of gated neurons."""
 
 CLOCK = AXON_TYPES - 1
 """Type of axons that clocks reach on cores that add up inputs."""
@@ -115,9 +115,9 @@ class _Placing:
             core = self.draft.core()
             for n, end in part:
                 threshold = int(layer.threshold[n])
-                made = Neuron(weights=weights, leak=-threshold, threshold=0)
+                made = history_free(weights, threshold)
                 if threshold <= 0:  # it would spike without inputs and has to wait for a clock: its leak must not do
-                    made = Neuron(weights=(*_first_types(layer), 1 - threshold), leak=-1, threshold=0)
+                    made = history_free((*_first_types(layer), 1 - threshold), 1)
                 self._add(core, made, layer, n, None if end is None else [end], depth, 1)
             chosen = np.array([n for n, _ in part])
             self._inputs(core, layer, layer.level[chosen].T, range(layer.level.shape[1]), inputs)
@@ -151,7 +151,9 @@ class _Placing:
     def _gated(self, depth: int, layer: Layer, groups: int, ends: list[list[Place]] | None) -> list[list[Place]]:
         """Neurons that add up partial sums; returns for each the lines of its groups, above zero and below in turn."""
         reach = MOST * groups
-        lifts, pulls = gate_axons(groups, int(layer.threshold.min()))
+        # axons of the clocks that lift a neuron to its threshold from below all sums, and that pull it down again
+        lifts = (reach - int(layer.threshold.min())) // LIFT + 1
+        pulls = (2 * reach + LIFT * lifts) // -PULL + 2
         a_core = min((self.chip.limit("core.axons") - lifts - pulls) // (2 * groups), self.chip.limit("core.neurons"))
         if a_core < 1:
             remedy = f"partial sums of {groups} groups and the clocks beside; use fewer inputs or copies"

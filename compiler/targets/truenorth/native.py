@@ -115,11 +115,6 @@ class NativeNetwork:
     stages: tuple[Stage, ...]
     clocks: Clocks = NO_CLOCKS
 
-    @property
-    def neurons(self) -> dict[str, int]:
-        """Neurons of each layer."""
-        return {stage.name: stage.neurons for stage in self.stages}
-
 
 def faults(network: NativeNetwork) -> list[str]:
     """What in a network contradicts itself or the rules above; empty if it can be placed."""

@@ -48,7 +48,7 @@ def facts(path: str, weights: str | None) -> JsonObject:
         "system": SYSTEM,
         "taxels": network.taxels,
         "classes": network.classes,
-        "layers": tuple(network.neurons),
+        "layers": tuple(stage.name for stage in network.stages),
         "training": found.training,
         "levels": 2 * highest_level(network.copies) + 1,
     }
