@@ -11,12 +11,13 @@ from spikeloom.runtime.report.sections import Section, Table, Text
 
 def sections(verdict: Verdict) -> list[Section]:
     """Accuracies, levels and warnings; spikes; the ladder; the certificate; the first divergence."""
+    first = verdict.first_divergence
     return [
         Section("Levels", [Text("\n".join(_lines(verdict)))]),
         Section("Spikes", [spike_table(verdict)]),
         Section("Ladder", [ladder_table(verdict)]),
         Section("Certificate", [certificate_table(verdict.certificate), Text(certificate_text(verdict.certificate))]),
-        Section("First divergence", [Text(first_divergence_text(verdict.first_divergence))]),
+        Section("First divergence", [Text("no spike differs" if first is None else divergence_text(first))]),
     ]
 
 
@@ -78,18 +79,13 @@ def certificate_text(certificate: Certificate) -> str:
     return f"{certificate.decisions} of {certificate.samples} decisions certified equal; {proof}"
 
 
-def first_divergence_text(first: Divergence | None) -> str:
-    """Where the first spike differs, and how near both membranes were to their thresholds."""
-    return "no spike differs" if first is None else f"first divergence: {divergence_text(first)}"
-
-
 def divergence_text(first: Divergence) -> str:
-    """The same without its heading."""
+    """Where the first spike differs, and how near both membranes were to their thresholds."""
     where = f"neuron {first.neuron}"
     if first.taxel is not None:
         where = f"taxel {first.taxel}, feature {first.feature}"
     return (
-        f"{first.file}, step {first.step}, {first.layer} {where}: membrane {first.float_membrane:.6f} float, "
-        f"{first.chip_membrane:.6f} chip ({first.chip_register}/64 units); threshold {first.theta:g} and "
+        f"first divergence: {first.file}, step {first.step}, {first.layer} {where}: membrane "
+        f"{first.float_membrane:.6f} float, {first.chip_membrane:.6f} chip ({first.chip_register}/64 units); threshold {first.theta:g} and "
         f"{first.chip_theta:.6f}" + (" (ill-posed: float64 sides with the chip)" if first.ill_posed else "")
     )

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -92,17 +91,20 @@ def explain(
             # what the chip does not hold, it has no weights from: the float model's spikes say what it lacks
             sent = events if pre == INPUT else np.where(absent[pre], truth[pre], chip[pre])
             inputs.append(step_late(sent[None])[0] if pre == post else sent)
-        layer = _Layer(
-            network=network,
-            integer=integer,
+        named = _name_causes(
+            network,
+            integer,
+            post,
+            here,
+            np.concatenate(inputs, axis=1).astype(np.float64),
+            ideal,
+            observed,
             model=model or network,
-            post=post,
             absent=absent[post],
             pruned=pruned,
             compensated=rounding is not None and rounding.layers[population.name].compensated,
         )
-        arrived = np.concatenate(inputs, axis=1).astype(np.float64)
-        causes |= zip(here, layer.name_causes(here, arrived, ideal, observed), strict=True)
+        causes |= zip(here, named, strict=True)
     counts = Counter(root.layer for root in roots)
     return Explanation(
         layers=tuple(
@@ -119,91 +121,90 @@ def explain(
     )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Layer:
-    """One population whose roots are to be explained."""
+def _name_causes(
+    network: Network,
+    integer: IntegerNetwork,
+    post: int,
+    roots: list[Root],
+    arrived: FloatArray,
+    ideal: Activity,
+    observed: Activity,
+    *,
+    model: Checkpoint | Network,
+    absent: BoolArray,
+    pruned: bool,
+    compensated: bool,
+) -> list[RootCause]:
+    """Causes of roots of one population, which are sorted by the length of what they remember."""
+    assert ideal.membranes is not None, "membranes were wanted"
+    assert observed.membranes is not None, "membranes were wanted"
+    population, chip = network.populations[post], integer.populations[post]
+    rows = np.array([root.neuron for root in roots])
+    steps = np.array([root.step for root in roots])
+    begins = np.array([root.begin for root in roots])
+    variants = variants_of(network, integer, post, rows, compensated=compensated)
+    weights = weights_into(network, integer, post, rows)
+    inflows = np.stack([arrived @ weight.T for weight in weights])
+    fires, fired = ideal.spikes[post][0], observed.spikes[post][0]
+    threshold = chip.threshold[rows].astype(np.float64) * (1 << MEMBRANE_SHIFT)
+    margins, early = run_variants(variants, threshold, inflows, begins, steps, (fires & fired)[:, rows])
 
-    network: Network
-    integer: IntegerNetwork
-    model: Checkpoint | Network
-    post: int
-    absent: BoolArray
-    pruned: bool
-    compensated: bool
+    unit = chip.scale[rows] * (1 << MEMBRANE_SHIFT)
+    register = np.asarray(observed.membranes[post][0], np.int64)[steps, rows]
+    truth = fires[steps, rows]
+    membrane = ideal.membranes[post][0, steps, rows]
 
-    def name_causes(
-        self, roots: list[Root], arrived: FloatArray, ideal: Activity, observed: Activity
-    ) -> list[RootCause]:
-        """Causes of roots of this population, which are sorted by the length of what they remember."""
-        assert ideal.membranes is not None, "membranes were wanted"
-        assert observed.membranes is not None, "membranes were wanted"
-        post, population, chip = self.post, self.network.populations[self.post], self.integer.populations[self.post]
-        rows = np.array([root.neuron for root in roots])
-        steps = np.array([root.step for root in roots])
-        begins = np.array([root.begin for root in roots])
-        variants = variants_of(self.network, self.integer, post, rows, compensated=self.compensated)
-        weights = weights_into(self.network, self.integer, post, rows)
-        inflows = np.stack([arrived @ weight.T for weight in weights])
-        fires, fired = ideal.spikes[post][0], observed.spikes[post][0]
-        threshold = chip.threshold[rows].astype(np.float64) * (1 << MEMBRANE_SHIFT)
-        margins, early = run_variants(variants, threshold, inflows, begins, steps, (fires & fired)[:, rows])
+    # what the margin would be without each deviation; the first variant is the netlist itself
+    margin = register - threshold
+    without = margin + (margins - margins[0])
+    moved = np.abs(without - margin) / unit
+    mended = ((without > 0) == truth) & ~early & (moved > 0)
 
-        unit = chip.scale[rows] * (1 << MEMBRANE_SHIFT)
-        register = np.asarray(observed.membranes[post][0], np.int64)[steps, rows]
-        truth = fires[steps, rows]
-        membrane = ideal.membranes[post][0, steps, rows]
-
-        # what the margin would be without each deviation; the first variant is the netlist itself
-        margin = register - threshold
-        without = margin + (margins - margins[0])
-        moved = np.abs(without - margin) / unit
-        mended = ((without > 0) == truth) & ~early & (moved > 0)
-
-        sums = np.abs(weights[UNROUNDED] / unit[:, None]).sum(axis=1)
-        magnitude = population.theta + sums + np.abs(population.bias[rows])
-        undecided = np.abs(membrane - population.theta) <= UNDECIDED * magnitude
-        stored = [p for p in self.integer.projections if p.post == post]
-        bits, planes = max(p.bits for p in stored), len({p.exponent for p in stored})
-        found = []
-        for i, root in enumerate(roots):
-            held = not self.absent[root.neuron]
-            order = sorted(range(len(variants)), key=lambda k: -moved[k, i])
-            enough = [k for k in order if mended[k, i]]
-            first = next(iter(enough), order[0] if moved[order[0], i] > 0 else None)
-            cause = TIE if undecided[i] else UNKNOWN if first is None else variants[first].cause
-            if not held:
-                cause = LEFT_OUT if self.pruned else WEIGHTS
-            amounts: dict[str, float] = {}  # the largest of each cause
-            for k in order:
-                if moved[k, i] > 0:
-                    amounts.setdefault(variants[k].cause, float(moved[k, i]))
-            clipped = any(variants[k].weights == UNCLIPPED for k in enough)
-            taxel, feature = taxel_and_feature(self.model, post, root.neuron)
-            found.append(
-                RootCause(
-                    layer=population.name,
-                    neuron=root.neuron,
-                    taxel=taxel,
-                    feature=feature,
-                    step=root.step,
-                    remembers_from_step=root.begin,
-                    float_fires=bool(truth[i]),
-                    float_membrane=float(membrane[i]),
-                    float_distance=float(membrane[i]) - population.theta,
-                    theta=population.theta,
-                    chip_membrane=float(register[i] / unit[i]) if held else None,
-                    chip_distance=float(register[i] / unit[i]) - float(threshold[i] / unit[i]) if held else None,
-                    chip_theta=float(threshold[i] / unit[i]) if held else None,
-                    chip_register=int(register[i]) if held else None,
-                    chip_threshold_register=int(threshold[i]) if held else None,
-                    cause=cause,
-                    held=held,
-                    clipped_weights=clipped,
-                    sufficient=tuple(dict.fromkeys(variants[k].cause for k in enough)) if held else (),
-                    moved=amounts if held else {},
-                    change=remedy(cause, population.name, bits=bits, planes=planes, clipped=clipped, held=held),
-                    dragged=root.dragged,
-                    dragged_alone=root.alone,
-                )
+    sums = np.abs(weights[UNROUNDED] / unit[:, None]).sum(axis=1)
+    magnitude = population.theta + sums + np.abs(population.bias[rows])
+    undecided = np.abs(membrane - population.theta) <= UNDECIDED * magnitude
+    stored = [p for p in integer.projections if p.post == post]
+    bits, planes = max(p.bits for p in stored), len({p.exponent for p in stored})
+    found = []
+    for i, root in enumerate(roots):
+        held = not absent[root.neuron]
+        order = sorted(range(len(variants)), key=lambda k: -moved[k, i])
+        enough = [k for k in order if mended[k, i]]
+        first = next(iter(enough), order[0] if moved[order[0], i] > 0 else None)
+        cause = TIE if undecided[i] else UNKNOWN if first is None else variants[first].cause
+        if not held:
+            cause = LEFT_OUT if pruned else WEIGHTS
+        amounts: dict[str, float] = {}  # the largest of each cause
+        for k in order:
+            if moved[k, i] > 0:
+                amounts.setdefault(variants[k].cause, float(moved[k, i]))
+        clipped = any(variants[k].weights == UNCLIPPED for k in enough)
+        taxel, feature = taxel_and_feature(model, post, root.neuron)
+        found.append(
+            RootCause(
+                layer=population.name,
+                neuron=root.neuron,
+                taxel=taxel,
+                feature=feature,
+                step=root.step,
+                remembers_from_step=root.begin,
+                float_fires=bool(truth[i]),
+                float_membrane=float(membrane[i]),
+                float_distance=float(membrane[i]) - population.theta,
+                theta=population.theta,
+                chip_membrane=float(register[i] / unit[i]) if held else None,
+                chip_distance=float(register[i] / unit[i]) - float(threshold[i] / unit[i]) if held else None,
+                chip_theta=float(threshold[i] / unit[i]) if held else None,
+                chip_register=int(register[i]) if held else None,
+                chip_threshold_register=int(threshold[i]) if held else None,
+                cause=cause,
+                held=held,
+                clipped_weights=clipped,
+                sufficient=tuple(dict.fromkeys(variants[k].cause for k in enough)) if held else (),
+                moved=amounts if held else {},
+                change=remedy(cause, population.name, bits=bits, planes=planes, clipped=clipped, held=held),
+                dragged=root.dragged,
+                dragged_alone=root.alone,
             )
-        return found
+        )
+    return found
