@@ -86,6 +86,7 @@ def divergence_text(first: Divergence) -> str:
         where = f"taxel {first.taxel}, feature {first.feature}"
     return (
         f"first divergence: {first.file}, step {first.step}, {first.layer} {where}: membrane "
-        f"{first.float_membrane:.6f} float, {first.chip_membrane:.6f} chip ({first.chip_register}/64 units); threshold {first.theta:g} and "
-        f"{first.chip_theta:.6f}" + (" (ill-posed: float64 sides with the chip)" if first.ill_posed else "")
+        f"{first.float_membrane:.6f} float, {first.chip_membrane:.6f} chip ({first.chip_register}/64 units); "
+        f"threshold {first.theta:g} and {first.chip_theta:.6f}"
+        + (" (ill-posed: float64 sides with the chip)" if first.ill_posed else "")
     )
