@@ -20,7 +20,8 @@ from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.storage.choose_storage import round_to_forms
 from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.models.networks.checkpoint import save_checkpoint
-from spikeloom.models.networks.quantised import QuantisedNet, quantised_spikes, time_first
+from spikeloom.models.networks.layers import time_first
+from spikeloom.models.networks.quantised import QuantisedNet, quantised_spikes
 from spikeloom.models.recordings.evtouch import Recordings, load_recordings
 from spikeloom.models.recordings.release import write_released
 from spikeloom.models.training.finetune import finetune

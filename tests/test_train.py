@@ -19,9 +19,8 @@ from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.recordings.grasps import synthetic_grasps
 from spikeloom.models.training.evaluate import evaluate
 from spikeloom.models.training.protocols import state_files, train_both, validation_split
-from spikeloom.models.training.recipes import RELEASED, Recipe
+from spikeloom.models.training.recipes import DECAY_EPOCHS, RELEASED, Recipe
 from spikeloom.models.training.record import training_record
-from spikeloom.models.training.schedule import DECAY_EPOCHS
 from spikeloom.models.training.train import Epoch, train
 
 GRAPH = build_graph("manual")

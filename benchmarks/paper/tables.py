@@ -12,7 +12,7 @@ from pictures import pictures
 from spreads import MARGIN, PROTOCOLS, READINGS, Line, Spread, lines_of, rank_correlation, variance
 
 from spikeloom.compiler.files import write_atomically
-from spikeloom.models.training.schedule import DECAY_EPOCHS
+from spikeloom.models.training.recipes import DECAY_EPOCHS
 from spikeloom.runtime.report.numbers import si
 from spikeloom.runtime.report.sections import Section, Table, markdown
 

@@ -20,6 +20,7 @@ from typing import Any
 
 import numba
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -187,6 +188,11 @@ class _SpikeLinear(torch.autograd.Function):
         source, bounds = ctx.events
         scatter(source, bounds, rows.numpy(), out.numpy())
         return above @ weight.t(), out, rows.sum(0)
+
+
+def time_first(events: npt.NDArray[np.uint8]) -> Tensor:
+    """(samples, taxels, channels, steps) uint8 to (steps, samples, taxels, channels) float32."""
+    return torch.from_numpy(events.transpose(3, 0, 1, 2).astype(np.float32, order="C"))
 
 
 def rates_of(spikes: Tensor, lengths: Tensor | None) -> Tensor:

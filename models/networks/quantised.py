@@ -35,7 +35,7 @@ from spikeloom.compiler.formats.towers import members, side_by_side
 from spikeloom.compiler.ir import Form
 from spikeloom.compiler.passes.expand import effective_weight, stack_of
 from spikeloom.compiler.systems import in_order
-from spikeloom.models.networks.layers import differentiate, events_of, gather, rates_of, scatter
+from spikeloom.models.networks.layers import differentiate, events_of, gather, rates_of, scatter, time_first
 from spikeloom.models.networks.surrogate import RECTANGLE
 
 SHRINK = 0.98
@@ -143,13 +143,13 @@ class QuantisedNet(nn.Module):
                         self.hops[:, torch.tensor(np.unique(feature[wrong]))] *= SHRINK
 
     def spikes_of(self, events: Tensor) -> list[Tensor]:
-        """Spikes of every layer, (steps, samples, neurons), for events (steps, samples, channels) of zeros and ones."""
+        """Spikes of every layer, (steps, samples, neurons), for events (steps, samples, taxels, channels)."""
         stack = torch.tensor(self.stack, dtype=torch.float32)
         places, features = stack.shape[1], self.hops.shape[1]
         # for the gradient only; the integers come from float64
         conv = in_order(self.system, torch.einsum("kij,kfc->ifjc", stack, self.hops))
         bias = in_order(self.system, self.conv_bias.repeat(places).view(places, features))
-        found, spikes = [], events
+        found, spikes = [], events.flatten(2)
         pairs = [(conv.reshape(len(conv), -1), bias), *zip(self.weights, self.biases, strict=True)]
         for (weight, bias), integers in zip(pairs, self.integers, strict=True):
             spikes = _ChipLayer.apply(spikes, weight, bias, integers, self.theta)  # type: ignore[no-untyped-call]
@@ -157,7 +157,7 @@ class QuantisedNet(nn.Module):
         return found
 
     def forward(self, events: Tensor, lengths: Tensor | None = None) -> Tensor:
-        """Spikes per step of each output neuron, (samples, classes), for events (steps, samples, channels).
+        """Spikes per step of each output neuron, (samples, classes), for events (steps, samples, taxels, channels).
 
         `lengths` (samples,) has the steps of each recording, where some were filled up with silence.
         """
@@ -228,9 +228,3 @@ def quantised_spikes(
             for name, spikes in zip(network.names, layers, strict=True):
                 found[name].append(spikes[:, 0].bool().numpy())
     return {name: np.stack(parts) for name, parts in found.items()}
-
-
-def time_first(events: NDArray[np.uint8]) -> Tensor:
-    """(samples, taxels, channels, steps) uint8 to (steps, samples, taxels * channels) float32."""
-    flat = events.reshape(len(events), -1, events.shape[3])
-    return torch.from_numpy((flat != 0).transpose(2, 0, 1).astype(np.float32, order="C"))

@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from spikeloom.models.networks.layers import time_first
 from spikeloom.models.networks.networks import TrainedModule
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.training.recipes import CROSS_ENTROPY, RELEASED, Recipe
@@ -68,11 +69,6 @@ def _rates(network: TrainedModule, events: NDArray[np.uint8]) -> Tensor:
     """Spike rates on the CPU, computed where the network is."""
     rates: Tensor = network(time_first(events).to(network.adjacency.device)).cpu()
     return rates
-
-
-def time_first(events: NDArray[np.uint8]) -> Tensor:
-    """(samples, taxels, channels, steps) uint8 to (steps, samples, taxels, channels) float32."""
-    return torch.from_numpy(events.transpose(3, 0, 1, 2).astype(np.float32, order="C"))
 
 
 @contextmanager

@@ -33,13 +33,14 @@ from spikeloom.compiler.ir import Form
 from spikeloom.compiler.passes.calibrate import calibrate, evenly_spaced
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.base import Target
+from spikeloom.models.networks.layers import time_first
 from spikeloom.models.networks.networks import Weights
-from spikeloom.models.networks.quantised import QuantisedNet, time_first
+from spikeloom.models.networks.quantised import QuantisedNet
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.training.checks import require_finite
 from spikeloom.models.training.evaluate import one_thread, rate_loss
 from spikeloom.models.training.initial_storage import initial_forms
-from spikeloom.models.training.resume import TrainingState, pack, read_state, unpack, write_state
+from spikeloom.models.training.resume import TrainingState, pack, read_state, set_rate, unpack, write_state
 
 BATCH = 4
 """Recordings per step of the optimizer: the weights are rounded anew for each."""
@@ -185,8 +186,7 @@ def _epoch(
     steps = math.ceil(len(order) / BATCH)
     total, correct = 0.0, 0
     for step in range(steps):
-        for group in optimizer.param_groups:
-            group["lr"] = LEARNING_RATE * 0.5 * (1 + math.cos(math.pi * (index * steps + step) / (epochs * steps)))
+        set_rate(optimizer, LEARNING_RATE * 0.5 * (1 + math.cos(math.pi * (index * steps + step) / (epochs * steps))))
         chosen = order[step * BATCH : (step + 1) * BATCH]
         optimizer.zero_grad()
         labels = training.labels[chosen]

@@ -16,7 +16,9 @@ from spikeloom.compiler.fixedpoint import decay_registers, kept_shares
 from spikeloom.compiler.types import JsonObject
 from spikeloom.models.networks.surrogate import FAST_SIGMOID, RECTANGLE, Surrogate
 from spikeloom.models.systems import HOPS
-from spikeloom.models.training.schedule import DECAY_EPOCHS
+
+DECAY_EPOCHS = 40
+"""There the learning rate falls to a tenth after so many epochs; the first of each such block still has the old one."""
 
 MSE, CROSS_ENTROPY = LOSSES = ("mse", "cross-entropy")
 ADAM, ADAMW = OPTIMIZERS = ("adam", "adamw")

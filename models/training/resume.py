@@ -83,5 +83,10 @@ def unpack(
     state = optimizer.state_dict()
     state["state"] = moments
     optimizer.load_state_dict(state)
+    set_rate(optimizer, rate)
+
+
+def set_rate(optimizer: torch.optim.Optimizer, rate: float) -> None:
+    """Set the learning rate of all parameters."""
     for group in optimizer.param_groups:
         group["lr"] = rate

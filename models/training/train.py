@@ -16,6 +16,7 @@ References
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -27,14 +28,13 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from spikeloom.compiler.archive import arrays_digest
+from spikeloom.models.networks.layers import time_first
 from spikeloom.models.networks.networks import SpikingNet, TrainedModule, Weights
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.training.checks import Sizes, require_finite, require_options, require_suited
-from spikeloom.models.training.evaluate import evaluate, loss_of, one_thread, time_first
-from spikeloom.models.training.optimizers import course_of, optimizer_of, set_rate
-from spikeloom.models.training.recipes import RELEASED, Recipe
-from spikeloom.models.training.resume import TrainingState, pack, read_state, unpack, write_state
-from spikeloom.models.training.schedule import EPOCHS
+from spikeloom.models.training.evaluate import evaluate, loss_of, one_thread
+from spikeloom.models.training.recipes import ADAMW, COSINE, RELEASED, Recipe
+from spikeloom.models.training.resume import TrainingState, pack, read_state, set_rate, unpack, write_state
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,7 +72,7 @@ def train(
     propagation: NDArray[np.float64],
     architecture: Sizes,
     *,
-    epochs: int = EPOCHS,
+    epochs: int = RELEASED.epochs,
     seed: int = 0,
     recipe: Recipe = RELEASED,
     device: str = "cpu",
@@ -133,14 +133,14 @@ def train(
     weights: dict[str, Weights] = {}
     with one_thread():
         network = architecture.network(propagation, seed=seed, surrogate=recipe.surrogate).to(device)
-        optimizer = optimizer_of(recipe, network, device)
+        optimizer = _optimizer_of(recipe, network, device)
         if resume and state is not None and state.exists():
             found = read_state(state, options)
             history, weights = _restore(found, network, optimizer, order)
         bar = tqdm(total=epochs, initial=len(history), desc=label, unit="epoch", position=position, disable=None)
         with bar as progress:
             for index in range(len(history), epochs):
-                course = course_of(recipe, index, epochs)
+                course = _course_of(recipe, index, epochs)
                 if course is not None:
                     set_rate(optimizer, course(0.0))
                 rate = float(optimizer.param_groups[0]["lr"])
@@ -179,6 +179,23 @@ def train(
         kept=weights.get("kept"),
         history=tuple(history),
     )
+
+
+def _optimizer_of(recipe: Recipe, network: torch.nn.Module, device: str) -> torch.optim.Optimizer:
+    """Optimizer of a recipe on the parameters of a network."""
+    rate, fused = recipe.learning_rate, device == "cpu"
+    if recipe.optimizer == ADAMW:
+        return torch.optim.AdamW(
+            network.parameters(), lr=rate, weight_decay=recipe.weight_decay, amsgrad=True, fused=fused
+        )
+    return torch.optim.Adam(network.parameters(), lr=rate, amsgrad=True, fused=fused)
+
+
+def _course_of(recipe: Recipe, epoch: int, epochs: int) -> Callable[[float], float] | None:
+    """Learning rate within an epoch by the share of it that is done, counted from 0; None where it is constant."""
+    if recipe.schedule != COSINE:
+        return None
+    return lambda share: recipe.learning_rate * 0.5 * (1 + math.cos(math.pi * (epoch + share) / epochs))
 
 
 def _restore(

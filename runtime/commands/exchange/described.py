@@ -84,7 +84,7 @@ def describe(
     alive = total > 0
     middle = float(np.median(total[alive])) if alive.any() else 0.0
     rate = per_taxel / (lengths.sum() * bin_s)
-    falling, rising = rate.sum(axis=0).tolist()
+    falling, rising = (float(rate[:, polarity].sum()) for polarity in (0, 1))
     labels = dict(zip(*(found.tolist() for found in np.unique(recordings.labels, return_counts=True)), strict=True))
     shortest, median, longest = (float(of(lengths) * bin_s) for of in (np.min, np.median, np.max))
     return Described(

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 from argparse import Namespace
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from spikeloom.compiler.files import remove_leftovers, sha256_of
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.formats.towers import arrays_of
 from spikeloom.compiler.formats.towers import join as join_networks
-from spikeloom.models.training.joined import Joined, joined_layers
+from spikeloom.models.networks.checkpoint import save_checkpoint
 from spikeloom.runtime.commands.main_job.inspect import tower_line
 from spikeloom.runtime.commands.training.finetune import stored_graph
 from spikeloom.runtime.inputs.files import require_place, shipped
@@ -23,6 +24,28 @@ from spikeloom.runtime.report.sections import Outcome, Section, Text
 
 KEPT = ("command", "seed", "epochs", "recipe", "data", "data_sha256", "test_samples", "fine_tuned_from")
 """Parts of a network's training record that the joined one keeps, beside what the chosen weights reached."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JoinedLayer:
+    """A layer, towers side by side."""
+
+    name: str
+    neurons: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Joined:
+    """Networks that were put side by side; `towers` has of each its file, hash and training record."""
+
+    command: str
+    towers: Sequence[Mapping[str, Any]]
+    system: str
+    graph: str | None
+    classes: int
+    layers: Sequence[JoinedLayer]
+    file: str
+    sha256: str
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -46,8 +69,6 @@ def run(arguments: Namespace) -> Outcome:
     words = [_shown(name) for name in arguments.checkpoints]
     words += [f"--weights {arguments.weights}"] if arguments.weights else []
     record: dict[str, Any] = {"command": f"spikeloom join {' '.join(words)}", "towers": towers}
-    from spikeloom.models.networks.checkpoint import save_checkpoint  # torch, so only here
-
     output = Path(arguments.output)
     remove_leftovers(output)
     save_checkpoint(
@@ -70,7 +91,7 @@ def run(arguments: Namespace) -> Outcome:
         system=joined.system,
         graph=joined.graph,
         classes=joined.classes,
-        layers=joined_layers(joined.neurons),
+        layers=[JoinedLayer(name=name, neurons=count) for name, count in joined.neurons.items()],
         file=output.name,
         sha256=sha256_of(output),
     )

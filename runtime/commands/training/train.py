@@ -18,8 +18,16 @@ from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.recordings.grasps import SYNTHETIC
 from spikeloom.models.systems import PADDINGS, sensor_grid, taxels_alone
 from spikeloom.models.training.kinds import Plan
-from spikeloom.models.training.recipes import LAYERS, RECIPES, RELEASED, STEPS, Recipe, check_recipe, decays_asked
-from spikeloom.models.training.schedule import DECAY_EPOCHS
+from spikeloom.models.training.recipes import (
+    DECAY_EPOCHS,
+    LAYERS,
+    RECIPES,
+    RELEASED,
+    STEPS,
+    Recipe,
+    check_recipe,
+    decays_asked,
+)
 from spikeloom.runtime.commands.options import DATA_HELP, add_bin_option, add_graph_options, add_system
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import graph_words, load_graph, sensor_places
