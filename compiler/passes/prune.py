@@ -54,10 +54,16 @@ def never_fires(network: Network) -> Masks:
     A neuron that has not fired holds at most ``sum(positive weights) + bias``, added up by the leak, where a current
     that outlasts its step has added up the weights already.
     """
+    silent = _spread(network, _never_fires)
+    return _without_voters(network, tuple(silent[post] for post in range(len(network.populations))))
+
+
+def _spread(network: Net, judge: Callable[[Net, int, Known], Mask]) -> Known:
+    """Neurons of all populations that `judge` finds silent, first population first: silence spreads."""
     silent: Known = {INPUT: np.zeros(network.input.size, np.bool_)}
     for post in range(len(network.populations)):
-        _grow(network, post, silent, _never_fires)
-    return _without_voters(network, tuple(silent[post] for post in range(len(network.populations))))
+        _grow(network, post, silent, judge)
+    return silent
 
 
 def _grow(network: Net, post: int, known: Known, judge: Callable[[Net, int, Known], Mask]) -> None:
@@ -132,9 +138,7 @@ def removable(network: IntegerNetwork) -> tuple[Masks, Masks]:
 
     Neurons that vote are never among them, and every population keeps one neuron; no neuron is in both.
     """
-    silent: Known = {INPUT: np.zeros(network.input.size, np.bool_)}
-    for post in range(len(network.populations)):
-        _grow(network, post, silent, _silent)
+    silent = _spread(network, _silent)
     unread: Known = {}
     for pre in reversed(range(len(network.populations))):
         if pre == network.readout.population:

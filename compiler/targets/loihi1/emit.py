@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from spikeloom.compiler.fixedpoint import frozen, read_only, read_only_float
 from spikeloom.compiler.ir import INPUT, MANTISSA, IntegerNetwork, depths, fan_in
+from spikeloom.compiler.passes.prune import none_of
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.layout.core_needs import (
     Chunk,
@@ -61,15 +62,6 @@ class Origin:
     unread: tuple[npt.NDArray[np.bool_], ...]
 
 
-def unpruned(network: IntegerNetwork) -> Origin:
-    """A network of which nothing was left out."""
-    return Origin(
-        network=network,
-        identity=tuple(np.arange(population.size) for population in network.populations),
-        unread=tuple(np.zeros(population.size, np.bool_) for population in network.populations),
-    )
-
-
 def _layers(origin: Origin) -> tuple[Layer, ...]:
     network = origin.network
     return tuple(
@@ -101,7 +93,9 @@ def emit(
 
     `origin` is what the network was before neurons were left out; itself by default.
     """
-    origin = origin or unpruned(network)
+    if origin is None:
+        identity = tuple(np.arange(population.size) for population in network.populations)
+        origin = Origin(network=network, identity=identity, unread=none_of(network))
     compartment_id = [np.zeros(population.size, np.int64) for population in network.populations]
     placed: list[tuple[Chunk, int, int]] = []  # chunk, core, base on it
     counts: list[int] = []
