@@ -108,7 +108,7 @@ CAPACITIES = [
         laying_out((1, 1, 8), small_target(core_axons_out=7), fc2=8),
     ),
     ("chip: 129 used, 128 allowed (loihi1.chip.cores)", laying_out((3, 100, 100), fc1=100, fc2=29)),
-    ("chip: 129 used, 128 allowed (loihi1.chip.cores)", cutting((1, 129 * 1024))),
+    ("chip: 129 used, 128 allowed (loihi1.chip.cores)", cutting((1, 129 * 8), core_compartments=8)),
     (
         "2 chips: 5 used, 4 allowed (loihi1.chip.cores)|--chips",
         lambda: partition(full(1, 5), small_target(core_compartments=1, chip_cores=2), chips=2),
@@ -147,6 +147,6 @@ def test_what_is_just_allowed():
     assert check_widths([8, 2, 8], 1, 4, LOIHI) == (2, 8)
     assert check_widths([2, 3, 4, 5, 6, 8], 1, 4, LOIHI) == (2, 3, 4, 5, 6, 8)
     assert len(partition(full(4096, 1), LOIHI).cores) == 1
-    assert len(partition(full(1, 128 * 1024), LOIHI).cores) == 128
+    assert len(partition(full(1, 128 * 8), small_target(core_compartments=8)).cores) == 128
     assert len(cutting((1, 1, 5), core_axons_out=5, core_compartments=1)().cores) == 6
     assert len(partition(full(1, 4, 9), small_target(core_axons_out=7), cores_for={1: 3}).cores) == 5
