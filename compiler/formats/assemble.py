@@ -98,6 +98,7 @@ def assemble(layers: Sequence[Layer], sensor: Input, voters: int, label: IntArra
             )
         )
         for source, weight in sorted(layer.sources.items(), key=lambda entry: place[entry[0]]):
+            weight.sort_indices()
             projections.append(Projection(pre=place[source], post=post, weight=weight))
     network = Network(
         input=sensor,

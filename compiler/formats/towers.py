@@ -73,18 +73,10 @@ def arrays_of(checkpoint: Checkpoint) -> Arrays:
 def join(checkpoints: Sequence[Checkpoint], names: Sequence[str]) -> Checkpoint:
     """One network of all towers; where it is from, its training record and hash, are those of the first.
 
-    Parameters
-    ----------
-    checkpoints : sequence of Checkpoint
-        Of one system, sensor, graph, sizes, neurons and clocks, and of one storage where they were fine-tuned; joined
-        ones give all their towers.
-    names : sequence of str
-        For messages.
+    They are of one system, sensor, graph, sizes, neurons and clocks, and of one storage where they were fine-tuned;
+    joined ones give all their towers. `names` are for messages.
 
-    Raises
-    ------
-    ModelError
-        If they disagree in any of these; all of them are listed.
+    Raises ModelError if they disagree in any of these; all of them are listed.
     """
     facts = [_facts(checkpoint) for checkpoint in checkpoints]
     others = {

@@ -212,7 +212,6 @@ def module_network(
         sources = {source - 1: part for source, part in enumerate(weights[index]) if part.nnz}
         if INPUT in sources:
             sources[INPUT] = sources[INPUT][:, positions]
-            sources[INPUT].sort_indices()
         layers.append(
             Layer(name=name, beta=float(layer.beta), theta=float(layer.theta), bias=bias[index], sources=sources)
         )

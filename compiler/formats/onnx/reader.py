@@ -25,9 +25,8 @@ from spikeloom.compiler.formats.onnx.operators import require_finite
 from spikeloom.compiler.formats.onnx.run import inner, run
 from spikeloom.compiler.formats.onnx.steps import Unrolled, group, readout
 from spikeloom.compiler.formats.onnx.values import INPUT_ATOM, Affine, Table
-from spikeloom.compiler.ir import INPUT, Network, Sparse
+from spikeloom.compiler.ir import INPUT, Network
 from spikeloom.compiler.sensor_layout import sensor_layout
-from spikeloom.compiler.types import IntArray
 
 SUFFIX = ".onnx"
 
@@ -102,9 +101,7 @@ def _network(model: Model, polarities: int | None, polarities_first: bool | None
             beta=layer[-1].beta or 0.0,
             theta=_threshold(layer[0], double=double),
             bias=layer[0].bias,
-            sources={
-                source: _columns(weight, positions) if source == INPUT else weight for source, weight in sources.items()
-            },
+            sources={source: weight[:, positions] if source == INPUT else weight for source, weight in sources.items()},
         )
         for name, layer, sources in zip(names, found.layers, found.sources, strict=True)
     ]
@@ -145,12 +142,6 @@ def _undecided(graph: Graph, facts: list[str]) -> Graph:
             name = node.inputs[0]
         outputs += [] if name in outputs else [name]
     return replace(graph, outputs=tuple(outputs))
-
-
-def _columns(weight: Sparse, positions: IntArray) -> Sparse:
-    taken = weight[:, positions]
-    taken.sort_indices()
-    return taken
 
 
 def _threshold(neurons: Neurons, *, double: bool) -> float:

@@ -51,12 +51,8 @@ FORMS = ("step", "scan")
 def export(netlist: Netlist, form: str) -> bytes:
     """Content of the ONNX file of a netlist in a form, see the module; equal netlists give equal bytes.
 
-    Raises
-    ------
-    ModelError
-        If its weights as dense matrices are more than a file holds.
-    OptionError
-        If the package ``onnx`` is not installed.
+    Raises ModelError if its weights as dense matrices are more than a file holds, OptionError if the package ``onnx``
+    is not installed.
     """
     layers = plan(netlist)
     model = _chip_step(netlist, layers)

@@ -43,23 +43,13 @@ from spikeloom.compiler.types import FloatArray
 
 
 def export_float(checkpoint: Checkpoint, adjacency: FloatArray, form: str, *, graph_name: str) -> bytes:
-    """Content of the ONNX file of a checkpoint; equal checkpoints give equal bytes.
+    """Content of the ONNX file of a checkpoint in a form, see the module; equal checkpoints give equal bytes.
 
-    Parameters
-    ----------
-    adjacency : (taxels, taxels) float64
-        Normalised propagation matrix; rounded to float32.
-    form : {"step", "scan"}
-        See the module.
-    graph_name : str
-        Of the taxel graph, for the metadata.
+    adjacency: (taxels, taxels) float64; normalised propagation matrix, rounded to float32.
+    graph_name: of the taxel graph, for the metadata.
 
-    Raises
-    ------
-    ModelError
-        If its weights are more than a file holds, or it has clocks or decays of single layers.
-    OptionError
-        If the package ``onnx`` is not installed.
+    Raises ModelError if its weights are more than a file holds, or it has clocks or decays of single layers;
+    OptionError if the package ``onnx`` is not installed.
     """
     if not checkpoint.dynamics.is_plain:
         raise ModelError(

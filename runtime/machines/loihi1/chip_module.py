@@ -118,10 +118,7 @@ def vote(votes: Tensor) -> Tensor:
 def neurobench_model(netlist: Netlist) -> Any:
     """The netlist as a ``neurobench.models.TorchModel``, to be given to ``neurobench.benchmarks.Benchmark``.
 
-    Raises
-    ------
-    OptionError
-        If the package neurobench is not installed.
+    Raises OptionError if the package neurobench is not installed.
     """
     try:
         from neurobench.models import TorchModel  # type: ignore[import-not-found]
