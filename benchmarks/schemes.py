@@ -27,9 +27,10 @@ from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.models.networks.reference import float_spikes
 from spikeloom.models.recordings.evtouch import Recordings, load_recordings
 from spikeloom.runtime.equivalence.verdict import mcnemar
+from spikeloom.runtime.machines.integer import integer_machine_of
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.costs import cost
-from spikeloom.runtime.machines.loihi1.trace import aligned, comparable
+from spikeloom.runtime.machines.loihi1.trace import aligned
 from spikeloom.runtime.machines.votes import predictions
 from spikeloom.runtime.report.intervals import wilson
 
@@ -62,10 +63,9 @@ def measure(
     trace = engine.simulate(netlist, test.events.reshape(len(test), -1, test.steps), spikes=True)
     assert trace.spikes is not None
     costs = cost.estimate(cost.prepare(netlist, load_target(netlist.target)), trace.counts, test.steps)
+    kept = integer_machine_of(netlist).compared()
     different = {
-        layer.name: int(
-            np.count_nonzero((aligned(netlist, trace.spikes, i) != reference[layer.name])[..., comparable(netlist, i)])
-        )
+        layer.name: int(np.count_nonzero((aligned(netlist, trace.spikes, i) != reference[layer.name])[..., kept[i]]))
         for i, layer in enumerate(netlist.layers)
     }
     return {

@@ -139,7 +139,7 @@ def test_synapses_are_laid_out_source_by_source():
     tables = kernel.tables_of(build([Neuron()] * 4, axons, n_inputs=3, depths=[2]), gated=True)
     assert tables.first.tolist() == [0, 2, 5, 5, 5, 5, 5, 5]
     assert tables.sum_of.tolist() == [4, 4, 0, 2, 7]
-    assert (tables.entry >> kernel.ARRIVAL_BITS).tolist() == [8, 0, 2, 4, 6]
+    assert tables.magnitude.tolist() == [8, 0, 2, 4, 6]
     assert tables.depth.tolist() == [2] * 4
 
 

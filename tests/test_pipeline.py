@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from oracles import refused
+from oracles import comparable, refused
 from random_networks import assert_same_layers, random_checkpoint, ring
 
 from spikeloom.compiler import Options, compile_network, targets
@@ -22,7 +22,7 @@ from spikeloom.compiler.targets.loihi1.passes import start
 from spikeloom.compiler.text import text
 from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.runtime.machines.loihi1 import engine
-from spikeloom.runtime.machines.loihi1.trace import aligned, comparable
+from spikeloom.runtime.machines.loihi1.trace import aligned
 
 
 def grasps(samples=6, *, taxels=5, steps=40, seed=0):

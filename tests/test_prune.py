@@ -23,7 +23,7 @@ from spikeloom.compiler.passes.prune import compact, disconnect, either, never_f
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist, write_netlist
 from spikeloom.runtime.equivalence.verify import verify
 from spikeloom.runtime.machines.loihi1 import engine, spec
-from spikeloom.runtime.machines.loihi1.trace import aligned, comparable
+from spikeloom.runtime.machines.loihi1.trace import aligned
 
 
 @settings(deadline=None, max_examples=40)
@@ -114,7 +114,6 @@ def test_unread_neurons_are_not_compared(tmp_path):
     compilation = compile_network(expand(changed, adjacency))
     netlist, labels = compilation.netlist, np.zeros(6, np.int64)
     assert netlist.layers[0].unread == (0, 1, 2)
-    assert isinstance(comparable(netlist, 0), np.ndarray)
     verdict = verify(netlist, changed, adjacency, events(2), labels, tuple("abcdef"))
     reference = run_float(compilation.network, channels_last(events(2))).spikes[0]
     assert reference[..., :3].any()

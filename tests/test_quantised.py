@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from made_files import ring, small_checkpoint, weights
+from oracles import comparable
 from test_checkpoint import rebuilt
 
 from spikeloom.compiler import Options, Packing, compile_network, lift
@@ -28,7 +29,7 @@ from spikeloom.models.training.finetune import finetune
 from spikeloom.models.training.initial_storage import initial_forms
 from spikeloom.runtime.cli import main
 from spikeloom.runtime.machines.loihi1 import engine
-from spikeloom.runtime.machines.loihi1.trace import aligned, comparable
+from spikeloom.runtime.machines.loihi1.trace import aligned
 
 LOIHI = load_target("loihi1")
 EXPONENTS = LOIHI.choices["synapse.exponent"]

@@ -35,10 +35,10 @@ class Tables(NamedTuple):
     """A netlist as the kernel reads it; nothing in here changes."""
 
     first: IntArray  # (sources + 1,) int64; bounds of each source, channels before compartments, in the synapses
-    # sum_of, entry: (synapses,) uint32, int64; the sum that a synapse adds to, and what: that of the positive weights
-    # of compartment c is 2 * c, that of the negative ones follows
+    # sum_of, magnitude: (synapses,) uint32, uint16; the sum that a synapse adds to, and what: that of the positive
+    # weights of compartment c is 2 * c, that of the negative ones follows
     sum_of: AnyArray
-    entry: IntArray
+    magnitude: AnyArray
     depth: AnyArray  # (compartments,) int32; of the layer of each, or zero where no window holds it at rest
     # keep_u, keep_v, threshold, bias: (compartments,) int32; decays in 1/4096, the others in membrane units
     keep_u: AnyArray
@@ -77,7 +77,7 @@ def tables_of(netlist: Netlist, *, gated: bool) -> Tables:
     return Tables(
         first=np.searchsorted(source[order], np.arange(netlist.n_inputs + netlist.n_compartments + 1)),
         sum_of=(2 * netlist.synapse_compartment()[order] + (weight < 0)).astype(np.uint32),
-        entry=(np.abs(weight) << ARRIVAL_BITS) + 1,
+        magnitude=np.abs(weight).astype(np.uint16),
         depth=depth[netlist.layer],
         keep_u=(2**DECAY_BITS - 1 - netlist.decay_u).astype(np.int32),
         keep_v=(2**DECAY_BITS - netlist.decay_v).astype(np.int32),
@@ -150,11 +150,11 @@ def _list_sources(state: State, events: AnyArray, t: int, length: int) -> Any:
 def _deliver(tables: Tables, state: State, sources: IntArray) -> None:
     """Let the synapses of the sources arrive."""
     # an array taken out of a tuple costs as much as some synapses: take them out once
-    first, sum_of, entry, sums = tables.first, tables.sum_of, tables.entry, state.sums
+    first, sum_of, magnitude, sums = tables.first, tables.sum_of, tables.magnitude, state.sums
     sums[:] = 0
     for source in sources:
         for synapse in range(first[source], first[source + 1]):
-            sums[sum_of[synapse]] += entry[synapse]
+            sums[sum_of[synapse]] += (np.int64(magnitude[synapse]) << ARRIVAL_BITS) + 1
 
 
 @compiled

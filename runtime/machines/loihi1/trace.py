@@ -58,19 +58,13 @@ class Trace:
     """Result of a simulation."""
 
     counts: Counts  # What happened, summed over chip steps
-    # (…, chip steps, compartments) bool, or None; whether a compartment spiked in a chip step; None unless wanted
+    # the others are None unless wanted; (…, chip steps, compartments) bool, int32 and bool are the first three
     spikes: BoolArray | None
-    # (…, chip steps, compartments) int32, or None; the saturated membrane that was compared with the threshold, before
-    # a spike resets it, in 1/64 of a weight unit; zero outside the layer's window. None unless wanted.
+    # what was compared with the threshold, before a spike resets it, in 1/64 of a weight unit; zero outside the window
     membranes: MembraneArray | None
-    # (…, chip steps, compartments) bool, or None; whether a compartment had work to do in a chip step, as
-    # ``Counts.updates`` counts it; None unless wanted
-    updated: BoolArray | None = None
-    # (…, chip steps, sums) int64, or None; what the events of each chip step add up to under the charges that the
-    # engine was prepared with
-    charged: IntArray | None = None
-    # (…, chip steps, ceil(compartments / 64)) uint64, or None; the spikes at a bit each: that of compartment c is bit
-    # ``c % 64`` of word ``c // 64``; see :func:`unpack`. None unless wanted.
+    updated: BoolArray | None = None  # Whether a compartment had work to do, as ``Counts.updates`` counts it
+    charged: IntArray | None = None  # (…, chip steps, sums) int64; what events add up to under the engine's charges
+    # (…, chip steps, ceil(compartments / 64)) uint64; spike of compartment c at bit ``c % 64`` of word ``c // 64``
     packed: npt.NDArray[np.uint64] | None = None
 
 
@@ -108,12 +102,6 @@ def aligned(netlist: Netlist, array: npt.NDArray[Any], layer: int) -> npt.NDArra
     whole = np.zeros((*held.shape[:-1], netlist.layers[layer].neurons), held.dtype)
     whole[..., netlist.neuron[ids]] = held
     return whole
-
-
-def comparable(netlist: Netlist, layer: int) -> slice | IntArray:
-    """Neurons of a layer whose spikes can be compared: all but those left out because their spikes reach no neuron."""
-    unread = netlist.layers[layer].unread
-    return np.setdiff1d(np.arange(netlist.layers[layer].neurons), unread) if unread else slice(None)
 
 
 def differences(slow: Trace, fast: Trace) -> int:
