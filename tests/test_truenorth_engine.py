@@ -98,7 +98,7 @@ def test_spikes_that_meet_on_an_axon_are_one():
 # -- engine = specification --------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=120, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(crossbars(), st.integers(0, 2**31))
 def test_engine_equals_specification(netlist, seed):
     assert faults(netlist, CHIP) == ()

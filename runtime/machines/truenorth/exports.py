@@ -8,7 +8,6 @@ from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.formats import ranc
 from spikeloom.runtime.machines.export_format import Export, Format, Request
-from spikeloom.runtime.machines.truenorth.machine import load
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -21,6 +20,8 @@ class RancFacts:
 
 
 def _ranc(request: Request) -> Export:
+    from spikeloom.runtime.machines.truenorth.machine import load  # numba, so only here
+
     netlist = load(request.source).netlist
     events = None
     if request.recordings is not None:
