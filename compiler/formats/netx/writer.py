@@ -28,7 +28,7 @@ MOST_SHIFT = 8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Block:
+class DenseLayer:
     """One dense layer of the file, ``dense_rec`` if it is recurrent; weights and biases in whole weight steps."""
 
     name: str  # Layer of the netlist
@@ -49,7 +49,7 @@ class Block:
         return int(np.count_nonzero(self.weight)) + (0 if self.own is None else int(np.count_nonzero(self.own)))
 
 
-def blocks_for(network: IntegerNetwork) -> tuple[Block, ...]:
+def blocks_for(network: IntegerNetwork) -> tuple[DenseLayer, ...]:
     """Layers of the file; ModelError if the format cannot hold the network."""
     found = []
     for post, population in enumerate(network.populations):
@@ -80,7 +80,7 @@ def blocks_for(network: IntegerNetwork) -> tuple[Block, ...]:
     return tuple(found)
 
 
-def _block(population: IntegerPopulation, weight: IntArray, inputs: int, threshold: int) -> Block:
+def _block(population: IntegerPopulation, weight: IntArray, inputs: int, threshold: int) -> DenseLayer:
     """A layer with these weights, those of its `inputs` first, then its own."""
     name = population.name
     shift = _shift(name, weight, threshold)
@@ -93,7 +93,7 @@ def _block(population: IntegerPopulation, weight: IntArray, inputs: int, thresho
             f"{name}: has a bias of {np.abs(whole).max()} weight steps, netx holds {BIAS_MANTISSA_MAX}; train with "
             "smaller biases"
         )
-    return Block(
+    return DenseLayer(
         name=name,
         weight=shifted[:, :inputs],
         own=shifted[:, inputs:] if weight.shape[1] > inputs else None,
@@ -122,7 +122,7 @@ def _shift(name: str, weight: IntArray, threshold: int) -> int:
     )
 
 
-def tree_of(network: IntegerNetwork, blocks: Sequence[Block]) -> Tree:
+def tree_of(network: IntegerNetwork, blocks: Sequence[DenseLayer]) -> Tree:
     """Content of the file."""
     layers: Tree = {"0": {"type": "input", "shape": np.array([network.input.size])}}
     for number, block in enumerate(blocks, 1):
@@ -172,7 +172,7 @@ def _texts_of_ten(tree: Tree) -> Tree:
     }
 
 
-def moved_spikes(network: IntegerNetwork, blocks: Sequence[Block], events: BoolArray) -> dict[str, tuple[int, int]]:
+def moved_spikes(network: IntegerNetwork, blocks: Sequence[DenseLayer], events: BoolArray) -> dict[str, tuple[int, int]]:
     """Spikes of each layer that the rounding moves, and how many the netlist has; events (samples, steps, channels)."""
     tree = tree_of(network, blocks)
     written, _ = integers_of(blocks_of(tree), tree)
