@@ -172,7 +172,9 @@ def _texts_of_ten(tree: Tree) -> Tree:
     }
 
 
-def moved_spikes(network: IntegerNetwork, blocks: Sequence[DenseLayer], events: BoolArray) -> dict[str, tuple[int, int]]:
+def moved_spikes(
+    network: IntegerNetwork, blocks: Sequence[DenseLayer], events: BoolArray
+) -> dict[str, tuple[int, int]]:
     """Spikes of each layer that the rounding moves, and how many the netlist has; events (samples, steps, channels)."""
     tree = tree_of(network, blocks)
     written, _ = integers_of(blocks_of(tree), tree)
