@@ -4,14 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_networks import (
-    LOIHI,
-    dense_weights,
-    float_networks,
-    integer_chain,
-    integer_networks,
-    recordings_for,
-)
+from random_networks import LOIHI, dense_weights, float_networks, integer_chain, integer_networks, recordings_for
 
 from spikeloom.compiler import Packing
 from spikeloom.compiler.interpret import run_integer

@@ -64,10 +64,7 @@ OPTIONS = [
     ("--spike-exact|--calibrate", compiling(spike_exact=True)),
     ("--spike-exact|--ranges", compiling(spike_exact=True, training_events=EVENTS, ranges="observed")),
     ("--spike-exact|--planes", compiling(spike_exact=True, training_events=EVENTS, packings=(Packing(planes=2),))),
-    (
-        f"--weight-bits 7|{WIDTHS}",
-        compiling(spike_exact=True, training_events=EVENTS, packings=(Packing(bits=7),)),
-    ),
+    (f"--weight-bits 7|{WIDTHS}", compiling(spike_exact=True, training_events=EVENTS, packings=(Packing(bits=7),))),
     *((f"--weight-bits {bits}|{WIDTHS}", rounding(packings=(Packing(bits=bits),))) for bits in (-1, 0, 1, 7, 9)),
     *((f"--planes {planes}|1 to 3", rounding(packings=(Packing(planes=planes),))) for planes in (0, 4)),
     *((f"--scale-groups {n}|8 thresholds|1 to 8", rounding(packings=(Packing(groups=n),))) for n in (0, 9)),
@@ -88,10 +85,7 @@ OPTIONS = [
     ("--cores-for fc1=2|3 cores at least", laying_out((2496, 128), fc1=2)),
     # four neurons of seven output axons a core: three listening cores each let two of them sit together
     ("--cores-for fc1=1|2 cores at least", laying_out((1, 4, 9), small_target(core_axons_out=7), fc1=1, fc2=3)),
-    (
-        "--cores-for fc1=7|3 chips|6 cores",
-        lambda: least_cores(full(6, 8), {"fc1": 7}, small_target(chip_cores=2), 3),
-    ),
+    ("--cores-for fc1=7|3 chips|6 cores", lambda: least_cores(full(6, 8), {"fc1": 7}, small_target(chip_cores=2), 3)),
 ]
 NETWORKS = [
     ("graph has 4 taxels|trained on 5", compiling(graph=4)),

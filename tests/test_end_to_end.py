@@ -228,10 +228,7 @@ def small(tmp_path_factory) -> Path:
 
 @pytest.mark.parametrize(
     "words",
-    [
-        ["run", "net.loom", "--data", "data", "--spikes", "out.npz"],
-        ["estimate", "net.loom", "--data", "data"],
-    ],
+    [["run", "net.loom", "--data", "data", "--spikes", "out.npz"], ["estimate", "net.loom", "--data", "data"]],
     ids=["run", "estimate"],
 )
 def test_run_and_estimate_never_import_torch(small, words):

@@ -50,8 +50,7 @@ def quick_placement():
 def spikes_for(network, events, rng, rate=0.4):
     """A calibration with these events and random spikes."""
     return Calibration(
-        events=events,
-        spikes=tuple(rng.random((*events.shape[:2], p.size)) < rate for p in network.populations),
+        events=events, spikes=tuple(rng.random((*events.shape[:2], p.size)) < rate for p in network.populations)
     )
 
 

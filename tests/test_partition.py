@@ -83,13 +83,7 @@ def test_a_layer_is_split_by_output_axons():
     """Each neuron feeds three cores, a core may have seven output axons."""
     network = integer_chain(np.full((4, 1), 2), np.full((9, 4), 2))
     target = small_target(core_axons_out=7, core_compartments=3)
-    assert sizes(partition(network, target)) == [
-        [(0, 0, 2)],
-        [(0, 2, 4)],
-        [(1, 0, 3)],
-        [(1, 3, 6)],
-        [(1, 6, 9)],
-    ]
+    assert sizes(partition(network, target)) == [[(0, 0, 2)], [(0, 2, 4)], [(1, 0, 3)], [(1, 3, 6)], [(1, 6, 9)]]
 
 
 def fan_in_of_formats(exponents):

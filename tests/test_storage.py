@@ -180,12 +180,7 @@ def test_every_recipe_gives_a_proven_legal_network(network, bits, planes, groups
 
 def test_planes_and_groups_keep_more_spikes_and_layers_may_differ():
     network, calibration = uneven_layer()
-    steps = [
-        Packing(bits=4),
-        Packing(bits=4, groups=8),
-        Packing(bits=4, planes=2),
-        Packing(bits=4, planes=2, groups=8),
-    ]
+    steps = [Packing(bits=4), Packing(bits=4, groups=8), Packing(bits=4, planes=2), Packing(bits=4, planes=2, groups=8)]
     one, grouped, two, both = (
         moved(choose_storage(network, LOIHI, packings=(packing,), calibration=calibration)[0], calibration)
         for packing in steps

@@ -20,15 +20,7 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from spikeloom.compiler.archive import (
-    CLOCKS,
-    Array,
-    Kind,
-    archive_bytes,
-    entry_faults,
-    read_archive,
-    write_archive,
-)
+from spikeloom.compiler.archive import CLOCKS, Array, Kind, archive_bytes, entry_faults, read_archive, write_archive
 from spikeloom.compiler.dynamics import Clocks
 from spikeloom.compiler.errors import FormatError
 from spikeloom.compiler.fixedpoint import frozen, read_only, read_only_float

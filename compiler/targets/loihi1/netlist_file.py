@@ -10,13 +10,7 @@ from spikeloom.compiler.archive import Kind
 from spikeloom.compiler.dynamics import MOST_STEPS
 from spikeloom.compiler.targets.base import COMPARTMENTS
 from spikeloom.compiler.targets.loihi1.netlist import Layer, Netlist
-from spikeloom.compiler.targets.netlist_file import (
-    NetlistFile,
-    bounds_faults,
-    is_outside,
-    length_faults,
-    range_faults,
-)
+from spikeloom.compiler.targets.netlist_file import NetlistFile, bounds_faults, is_outside, length_faults, range_faults
 
 LAYER: Kind = {
     "name": str,

@@ -65,12 +65,7 @@ def _quantize(done: Compilation) -> Compilation:
         integer, choices, exactness = make_exact(network, target, done.calibration, bits=packings[0].bits)
         return replace(done, integer=integer, choices=choices, exactness=exactness, connected=LATER)
     integer, choices = choose_storage(
-        network,
-        target,
-        packings=packings,
-        calibration=done.calibration,
-        ranges=options.ranges,
-        margin=options.margin,
+        network, target, packings=packings, calibration=done.calibration, ranges=options.ranges, margin=options.margin
     )
     return replace(done, integer=integer, choices=choices, connected=LATER)  # large, and no pass needs it again
 
@@ -147,12 +142,7 @@ FLOATS = (
 """From floats to integers."""
 
 INTEGERS = (
-    Pass(
-        name="prove",
-        does="bounds every register by the weights alone",
-        keeps="the network",
-        apply=_prove,
-    ),
+    Pass(name="prove", does="bounds every register by the weights alone", keeps="the network", apply=_prove),
     Pass(
         name="remove",
         does="takes out the neurons that no input can make fire and those whose spikes reach no neuron",
