@@ -113,8 +113,8 @@ def add_detail(parser: argparse.ArgumentParser, choices: tuple[str, ...], defaul
         "counts": "events, energy, simple time model",
         "cycle": "the time of every message too",
     }
-    told = "; ".join(f"{choice}: {what[choice]}" for choice in choices)
-    options.add_argument("--detail", choices=choices, default=default, help=f"{told} (default: {default})")
+    depths = "; ".join(f"{choice}: {what[choice]}" for choice in choices)
+    options.add_argument("--detail", choices=choices, default=default, help=f"{depths} (default: {default})")
     options.add_argument("--table", metavar="NAME|FILE.toml", help="price and time by this table only, or by your own")
     add_explain_cost(parser)
 

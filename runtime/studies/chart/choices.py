@@ -180,7 +180,7 @@ class Budget:
     words: str
 
 
-def parse_budgets(asked: Sequence[str]) -> tuple[Budget, ...]:
+def parse_budgets(given: Sequence[str]) -> tuple[Budget, ...]:
     """Read the words of every ``--budget``; an OptionError says which is none.
 
     Examples
@@ -189,7 +189,7 @@ def parse_budgets(asked: Sequence[str]) -> tuple[Budget, ...]:
     [('latency', 0.005), ('accuracy', 0.88)]
     """
     budgets: dict[str, Budget] = {}
-    for words in asked:
+    for words in given:
         what, equals, value = (part.strip() for part in words.partition("="))
         if not equals or what not in UNITS:
             raise OptionError(

@@ -228,8 +228,8 @@ def _fronts(chart: Chart) -> list[Block]:
     blocks: list[Block] = []
     for name in ("energy", "latency"):
         on = sorted((p for p in chart.points if p.front.get(name)), key=lambda point: point.test.accuracy)
-        told, caption = "(a description, no choice)", f"Front of test accuracy and {name}"
-        blocks += _listed(f"front of test accuracy and {name} {told}:", on, chart.chosen_by, caption) if on else []
+        note, caption = "(a description, no choice)", f"Front of test accuracy and {name}"
+        blocks += _listed(f"front of test accuracy and {name} {note}:", on, chart.chosen_by, caption) if on else []
     return blocks
 
 
