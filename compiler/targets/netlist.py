@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any, Protocol
 
 from spikeloom.compiler.dynamics import Clocks
+from spikeloom.compiler.types import IntArray
 
 
 class Netlist(Protocol):
@@ -30,6 +31,10 @@ class Netlist(Protocol):
     @property
     def classes(self) -> int:
         """What it tells apart."""
+
+    @property
+    def readout_class(self) -> IntArray:
+        """Class that each neuron of the chip votes for, -1 for none."""
 
     @property
     def clocks(self) -> Clocks:

@@ -2,28 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import numpy as np
 
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.ir import Readout
+from spikeloom.compiler.targets.netlist import Netlist
 from spikeloom.compiler.types import BoolArray, IntArray
 
 
-class Voting(Protocol):
-    """A netlist of any chip, some of whose neurons vote."""
-
-    @property
-    def classes(self) -> int:
-        """How many."""
-
-    @property
-    def readout_class(self) -> IntArray:
-        """Class that each neuron votes for, -1 for none."""
-
-
-def class_counts(netlist: Voting, spikes: IntArray) -> IntArray:
+def class_counts(netlist: Netlist, spikes: IntArray) -> IntArray:
     """Votes per class from spike counts per compartment (samples, compartments); shape (samples, classes)."""
     voters = np.flatnonzero(netlist.readout_class >= 0)
     counts = np.zeros((len(spikes), netlist.classes), np.int64)
@@ -38,7 +25,7 @@ def readout_counts(readout: Readout, classes: int, spikes: BoolArray) -> IntArra
     return counts
 
 
-def predictions(netlist: Voting, spikes: IntArray) -> IntArray:
+def predictions(netlist: Netlist, spikes: IntArray) -> IntArray:
     """Class of each recording from spike counts per compartment; ties go to the lowest class."""
     return vote(class_counts(netlist, spikes))
 

@@ -107,6 +107,16 @@ def _way(start: int, end: int, port: int, width: int, tile_links: int) -> list[i
     return links
 
 
+def entries_by_form(netlist: Netlist, dense: BoolArray | None = None) -> tuple[IntArray, IntArray]:
+    """Synapses of each axon in dense and in sparse lists, as stored or as `dense` (synapses,) says."""
+    entries = np.diff(netlist.axon_synapses)
+    if dense is None:
+        in_dense = np.where(netlist.format_index_bits[netlist.axon_format] == 0, entries, 0)
+    else:
+        in_dense = np.bincount(netlist.axon_of_synapse()[dense], minlength=netlist.n_axons)
+    return in_dense, entries - in_dense
+
+
 def prepare(
     netlist: Netlist,
     target: Target,
@@ -128,13 +138,9 @@ def prepare(
     inner = np.arange(len(core_tile)) < netlist.n_cores
     latency = {event: table.picoseconds(event) for event in table.latencies}
 
-    entries = np.diff(netlist.axon_synapses)
-    if dense is None:
-        in_dense = np.where(netlist.format_index_bits[netlist.axon_format] == 0, entries, 0)
-    else:
-        in_dense = np.bincount(netlist.axon_of_synapse()[dense], minlength=netlist.n_axons)
+    in_dense, in_sparse = entries_by_form(netlist, dense)
     processing = latency["axon_in"] + in_dense * latency["synaptic_operation_dense"]
-    processing += (entries - in_dense) * latency["synaptic_operation_sparse"]
+    processing += in_sparse * latency["synaptic_operation_sparse"]
     destination = netlist.core_of_axon()
     width, tile_cores = target.limit("mesh.width"), target.limit("mesh.tile_cores")
     port = np.array([np.sum(core_tile[:core] == tile) for core, tile in enumerate(core_tile)])

@@ -25,6 +25,7 @@ from spikeloom.compiler.targets.loihi1.layout.chips import chip_of_core
 from spikeloom.compiler.targets.loihi1.layout.place import hops
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
+from spikeloom.runtime.machines.loihi1.timing import entries_by_form
 from spikeloom.runtime.machines.loihi1.trace import Counts
 
 EVENTS = (
@@ -250,11 +251,7 @@ def count_by_core(
     fired = np.concatenate([counts.inputs, counts.spikes], axis=1).astype(np.float64)
     source, receiver = netlist.axon_source, netlist.core_of_axon()
 
-    entries = np.diff(netlist.axon_synapses)
-    if dense is None:
-        in_dense = np.where(netlist.format_index_bits[netlist.axon_format] == 0, entries, 0)
-    else:
-        in_dense = np.bincount(netlist.axon_of_synapse()[dense], minlength=netlist.n_axons)
+    in_dense, in_sparse = entries_by_form(netlist, dense)
 
     def sums(amount: IntArray, axons: IntArray, at: IntArray) -> FloatArray:
         """What the spikes of the axons' sources cause on the cores `at`; (samples, cores)."""
@@ -277,7 +274,7 @@ def count_by_core(
     spikes = [np.bincount(home[netlist.n_inputs :], row, netlist.n_cores) for row in counts.spikes]
     amounts = {
         "synaptic_operation_dense": sums(in_dense, every, receiver),
-        "synaptic_operation_sparse": sums(entries - in_dense, every, receiver),
+        "synaptic_operation_sparse": sums(in_sparse, every, receiver),
         "neuron_idle": on_cores(neurons * np.reshape(chip_steps, (-1, 1)) - updates),
         "neuron_active": on_cores(updates),
         "spike": on_cores(np.array(spikes).reshape(-1, netlist.n_cores)),
