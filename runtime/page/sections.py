@@ -16,8 +16,7 @@ from spikeloom.runtime.page.provenance import Provenance
 from spikeloom.runtime.page.recording import LayerRaster, Recording, Trace
 from spikeloom.runtime.page.results import Report
 from spikeloom.runtime.report import drawing
-from spikeloom.runtime.report.drawing import Drawing
-from spikeloom.runtime.report.figures import bar_figure
+from spikeloom.runtime.report.drawing import Drawing, bar_figure
 from spikeloom.runtime.report.numbers import percent, si
 from spikeloom.runtime.report.sections import Block, Code, Details, Facts, Figure, Outcome, Section, Table, Text
 from spikeloom.runtime.studies.chart.sections import figures, saved, taken

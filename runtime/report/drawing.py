@@ -11,13 +11,14 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import wraps
+from functools import partial, wraps
 from typing import TYPE_CHECKING, Any, Literal, ParamSpec
 
 import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler.types import FloatArray, JsonObject
+from spikeloom.runtime.report import sections
 from spikeloom.runtime.report.numbers import counted, si
 
 if TYPE_CHECKING:
@@ -154,6 +155,15 @@ def bars(title: str, rows: Mapping[str, Sequence[float]], series: Sequence[str],
     if len(series) > 1:
         drawing.figure.legend(loc="outside upper left", ncols=len(series))
     return drawing
+
+
+def bar_figure(
+    name: str, title: str, rows: Mapping[str, Sequence[float]], series: Sequence[str], unit: str, caption: str
+) -> sections.Figure:
+    """Bars for a page, with their numbers as a table."""
+    cells = [[label, *(si(value, unit) for value in values)] for label, values in rows.items()]
+    numbers = [sections.Table(["", *series], cells, title, most=0)]
+    return sections.Figure(name, partial(bars, title, rows, series, unit), f"{title}. {caption}", numbers)
 
 
 @styled

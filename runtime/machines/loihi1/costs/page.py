@@ -21,7 +21,7 @@ from spikeloom.runtime.machines.loihi1.costs.sections import sections
 from spikeloom.runtime.machines.loihi1.timing import DetailedTimes, SimpleTimes
 from spikeloom.runtime.machines.loihi1.trace import Counts, Trace
 from spikeloom.runtime.machines.page_parts import BatchParts, Core, Cores, Fill, Mesh, RecordingParts, Way
-from spikeloom.runtime.report.figures import bar_figure
+from spikeloom.runtime.report.drawing import bar_figure
 from spikeloom.runtime.report.sections import Block, Outcome, Section
 
 FILLS = ("core.compartments", "core.synapse_words", "core.axons_in", "core.axons_out")
