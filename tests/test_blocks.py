@@ -12,7 +12,7 @@ from spikeloom.runtime.machines.loihi1 import engine, spec
 from spikeloom.runtime.machines.loihi1.blocks import lay_out_blocks
 from spikeloom.runtime.machines.loihi1.trace import Charges, pack, unpack
 
-REPEATABLE = settings(max_examples=60, deadline=None, derandomize=True)
+REPEATABLE = settings(max_examples=30, deadline=None, derandomize=True)
 
 
 def pipeline(

@@ -20,11 +20,6 @@ from spikeloom.compiler.formats.checkpoint_reader import SIZE_LIMIT, read_checkp
 from spikeloom.compiler.formats.spikeloom_checkpoint import content_digest
 from spikeloom.models.graphs import Graph
 from spikeloom.models.networks.checkpoint import save_checkpoint
-from spikeloom.models.networks.networks import Architecture
-from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.models.training.protocols import Reported
-from spikeloom.models.training.record import training_record
-from spikeloom.models.training.train import Epoch, Trained
 
 TAXELS, FEATURES, HOPS, SIZES, CLASSES = 6, 4, 3, (5, 7), 3
 NOT_A_CHECKPOINT = "is not a checkpoint; give"
@@ -140,12 +135,6 @@ def test_run_selects_a_state_dict_and_its_figures(tmp_path):
     assert read_checkpoint(path).training["best_acc"] == 90.0
 
 
-def test_figures_that_are_not_as_the_released_script_wrote_them_are_left_out(tmp_path):
-    odd = {"best_acc": torch.tensor([torch.nan]), "num_epochs": 5, "acc_list": [1.0]}
-    path = write(tmp_path / "x.t7", released(tensors(), **odd))
-    assert read_checkpoint(path).training == {"runs": 1, "weights": "last epoch", "epochs": 5}
-
-
 def test_half_and_double_precision_become_float32(tmp_path):
     for kind in (torch.float64, torch.float16, torch.bfloat16):
         path = write(tmp_path / "x.t7", torch_bytes({key: value.to(kind) for key, value in tensors().items()}))
@@ -181,9 +170,7 @@ def changed(*, old: bool = False, **tensors_too: object) -> bytes:
 NEITHER = "holds neither net_list nor weights of a TactileSGNet, but"
 REFUSED = {
     "random": (lambda: np.random.default_rng(0).bytes(3000), NOT_A_CHECKPOINT),
-    "half a pickle": (lambda: b"\x80" + bytes(50), NOT_A_CHECKPOINT),
     "pickle of an empty dict": (lambda: b"\x80\x02}q\x00.", NOT_A_CHECKPOINT),
-    "zip of recordings": (lambda: zipped({"test.npy": b""}), NOT_A_CHECKPOINT),
     "other manifest": (lambda: zipped({"manifest.json": '{"format": "other", "files": []}'}), NOT_A_CHECKPOINT),
     "manifest that is no JSON": (lambda: zipped({"manifest.json": "{"}), DAMAGED),
     "pickled anew": (
@@ -192,37 +179,20 @@ REFUSED = {
     ),
     "module": (lambda: torch_bytes(torch.nn.Linear(1, 1)), "a pickle that calls torch.nn.modules.linear.Linear"),
     "nested": (lambda: torch_bytes({"epoch": 3, "model": tensors()}), f"{NEITHER} epoch, model"),
-    "tensor": (lambda: torch_bytes(torch.ones(3)), f"{NEITHER} Tensor"),
-    "nothing": (lambda: torch_bytes({}), f"{NEITHER} nothing"),
     "odd name": (lambda: torch_bytes({"a\nb": 1}), f"{NEITHER} 'a\\nb'"),
     "no run": (released, "net_list holds no run"),
-    "no list": (lambda: torch_bytes({"net_list": 5}), "net_list holds no run"),
-    "no convolution": (
-        lambda: torch_bytes({key: value for key, value in tensors().items() if key.startswith("fc")}),
-        "conv1.lins.0.weight is missing; conv1.bias is missing",
-    ),
     "columns": (
         lambda: changed(old=True, conv1__lin__weight=torch.ones(FEATURES, 7)),
         "conv1.lin.weight has 7 columns, not a whole number of hops",
-    ),
-    "axes": (
-        lambda: changed(old=True, conv1__lin__weight=torch.ones(7), conv1__lin__bias=None),
-        "conv1.lin.weight is (7,), wanted (features, hops * 2)",
     ),
     "taxels": (
         lambda: changed(fc1__weight=torch.ones(5, TAXELS * FEATURES + 1)),
         "fc1.weight has 25 inputs, not a whole number of taxels with 4",
     ),
-    "number": (lambda: changed(fc1__bias=5), "fc1.bias is a int, wanted a tensor"),
-    "integers": (lambda: changed(fc2__bias=torch.ones(7, dtype=torch.int64)), "fc2.bias is a tensor of int64"),
     "sparse": (lambda: changed(fc3__bias=torch.ones(3).to_sparse()), "fc3.bias is a tensor of float32, wanted plain"),
     "expanded": (
         lambda: changed(fc3__weight=torch.ones(1).expand(10**6, 10**6)),
         "fc3.weight claims 1000000000000 values, more than the file holds",
-    ),
-    "no classes": (
-        lambda: changed(fc3__weight=torch.ones(0, 7), fc3__bias=torch.ones(0)),
-        "fc3.weight is (0, 7), wanted (outputs, 7)",
     ),
     "packed": (
         lambda: rebuilt(own(), lambda m, _: m.update(note="a" * 9000), compression=zipfile.ZIP_DEFLATED),
@@ -332,14 +302,10 @@ ALTERED = "its content does not match its hash, so it was altered"
             for version in (7, 0, None, "1\n")
         ],
         (lambda m, _: m.update(beta=0.3), ALTERED),
-        (lambda m, _: m["graph"]["edges"].pop(), ALTERED),
-        (lambda m, _: m.pop("sha256"), ALTERED),
         (member(npy_bytes(np.zeros(5, np.float32))), ALTERED),
         (lambda _, members: members.pop("best/fc1.bias.npy"), ALTERED),
         (lambda _, members: members.update({"last/more.npy": ONES}), ALTERED),
-        (member(npy_bytes(np.ones(5))), DAMAGED),
         (member(npy_bytes(np.asfortranarray(np.ones((2, 3), np.float32)))), DAMAGED),
-        (member(ONES[:-4]), DAMAGED),
         (member(ONES.replace(b"(5,), }", b"(9**9,)")), DAMAGED),
         (member(ONES.replace(b"(5,), } ", b"(1<<60,)")), DAMAGED),
         (member(LARGE), DAMAGED),  # announces 400 GB
@@ -367,33 +333,3 @@ def test_altered_files(tmp_path, change, words):
 )
 def test_signed_but_wrong(tmp_path, change, words):
     assert words in refusal(write(tmp_path / "x.pt", rebuilt(own(), change)))
-
-
-def test_training_record_tells_how_to_repeat_it():
-    def epoch(number: int, correct: int) -> Epoch:
-        return Epoch(epoch=number, learning_rate=0.001, training_loss=0.5, test_loss=0.25, correct=correct, tested=4)
-
-    trained = Trained(
-        architecture=Architecture(taxels=TAXELS, classes=CLASSES),
-        last=weights(),
-        best=weights(),
-        best_epoch=1,
-        kept=weights(),
-        history=(epoch(1, 3), epoch(2, 2)),
-    )
-    reported = Reported(trained=trained, validation=trained, clean_epoch=2)
-    split = Recordings(
-        events=np.zeros((1, TAXELS, 2, 5), np.uint8),
-        labels=np.zeros(1, np.int64),
-        files=("sample_0_label_0.npy",),
-        split="train",
-        source="x.zip",
-    )
-    record = training_record(reported, split, split, command="spikeloom train", seed=7).to_json()
-    last = {"epoch": 2, "correct": 2, "accuracy": 0.5}
-    assert record["last"] == last | {"chosen_on": "nothing"}
-    assert record["best"] == {"epoch": 1, "correct": 3, "accuracy": 0.75, "chosen_on": "the test split"}
-    assert record["clean"] == last | {"chosen_on": "a part of the training split"}
-    assert record["validation"] == {"correct": 2, "samples": 4}
-    assert (record["command"], record["seed"], record["epochs"]) == ("spikeloom train", 7, 2)
-    assert json.loads(json.dumps(record, allow_nan=False)) == record

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from timed_networks import GRAPH, SMALL, TIMING, louder, written
 
-from spikeloom.compiler.dynamics import NO_CLOCKS, PLAIN, Clocks, Dynamics, clocks_over, dynamics_faults, with_clocks
+from spikeloom.compiler.dynamics import NO_CLOCKS, PLAIN, Clocks, Dynamics, clocks_over, with_clocks
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.models.graphs import normalised_adjacency
@@ -24,7 +24,7 @@ from spikeloom.models.networks.surrogate import FAST_SIGMOID, RECTANGLE, Surroga
 from spikeloom.models.recordings.grasps import synthetic_grasps
 from spikeloom.models.recordings.release import write_released
 from spikeloom.models.training.evaluate import evaluate
-from spikeloom.models.training.recipes import RECIPES, RELEASED, TIMED, Recipe, check_recipe, decays_asked
+from spikeloom.models.training.recipes import RECIPES, RELEASED, TIMED, Recipe, decays_asked
 from spikeloom.models.training.train import train
 from spikeloom.runtime.cli import main
 
@@ -80,12 +80,6 @@ def test_a_current_outlasts_its_step_and_the_bias_goes_past_it():
     assert_allclose(membranes[:, 0, 0].detach(), [0.25, 0.325, 0.3475], rtol=1e-6)
 
 
-def test_the_reset_leaves_the_current_as_it_is():
-    spikes, membranes = lif(lasting_current(torch.tensor([[2.0], [0.0], [0.0], [0.0]]), 0.5), 0.9, 0.5)
-    assert spikes[:, 0].tolist() == [1, 1, 0, 1]
-    assert membranes[:, 0].tolist() == [2.0, 1.0, 0.5, pytest.approx(0.7)]
-
-
 @pytest.mark.parametrize(
     "surrogate", [RECTANGLE, SIGMOID, replace(SIGMOID, reset=True), replace(RECTANGLE, reset=False)]
 )
@@ -118,12 +112,6 @@ def test_gradients_equal_plain_autograd(surrogate, seed, steps, alpha):
     assert found[0][1].abs().max() > 0 or surrogate.shape != FAST_SIGMOID
 
 
-def test_the_surrogate_of_a_fast_sigmoid():
-    current = torch.tensor([[0.5, 0.75, 0.0]], dtype=torch.float64, requires_grad=True)
-    lif(current, 0.2, 0.5, SIGMOID)[0].sum().backward()
-    assert_allclose(current.grad, [[1.0, 1 / 4, 1 / 9]], rtol=1e-12)
-
-
 @pytest.mark.parametrize("backwards", [False, True])
 def test_currents_in_torch_operations_equal_the_kernel(backwards):
     found = [torch.randn(30, 4, generator=torch.Generator().manual_seed(1)) for _ in range(2)]
@@ -152,19 +140,6 @@ def test_recordings_get_the_clocks_after_their_own_channels():
     assert_array_equal(fed[:, :6], events.reshape(2, 6, 5))
     assert fed[1, 6:].tolist() == [[1, 1, 0, 0, 0], [0, 0, 1, 1, 0]]
     assert with_clocks(events, NO_CLOCKS).shape == (2, 6, 5)
-
-
-def test_every_fault_of_the_dynamics_is_listed():
-    wrong = Dynamics(betas=(0.5,), alphas=(1.0, -0.5), clocks=Clocks(channels=-1, steps=0))
-    assert dynamics_faults(wrong, 4) == [
-        "1 membrane decays for 4 layers",
-        "2 current decays for 4 layers",
-        "a current decay of 1, allowed are 0 <= decay < 1",
-        "a current decay of -0.5, allowed are 0 <= decay < 1",
-        "-1 clocks, allowed are 0 to 64",
-        "clocks of 0 steps, allowed are 1 to 1048576",
-        "clocks need a first layer without current decay, which relays them step for step",
-    ]
 
 
 # --- the whole network ---------------------------------------------------------------------------------------------
@@ -288,7 +263,7 @@ def test_the_released_recipe_is_the_released_code():
 @pytest.mark.parametrize(
     ("words", "telling"),
     [
-        *((word, f"{word!r} is not LAYER=DECAY with 0 <= DECAY < 1") for word in ("fc1", "fc1=1", "fc1=nan")),
+        ("fc1=1", "'fc1=1' is not LAYER=DECAY with 0 <= DECAY < 1"),
         ("fc9=0.5", "no layer 'fc9'; the layers are conv1, fc1"),
         ("fc1=0.5,fc1=0.6", "names fc1 twice"),
     ],
@@ -296,21 +271,6 @@ def test_the_released_recipe_is_the_released_code():
 def test_decays_that_are_none_are_refused(words, telling):
     with pytest.raises(OptionError, match=re.escape(f"--current-decay {words}: {telling}")):
         decays_asked(words, "--current-decay", ("conv1", "fc1"))
-
-
-@pytest.mark.parametrize(
-    ("values", "telling"),
-    [
-        ({"features": 0}, "--features 0: allowed are 1 to 1024"),
-        ({"penalty": -1.0}, "--spike-penalty -1: allowed are numbers from 0 up"),
-        ({"batch": 0}, "--batch 0: allowed are 1 to 1024"),
-        ({"clocks": 65}, "--clocks 65: allowed are 0 to 64"),
-        ({"alphas": (("conv1", 0.5),)}, "--clocks 8: conv1 relays the clocks step for step"),
-    ],
-)
-def test_sizes_that_no_network_has_are_refused(values, telling):
-    with pytest.raises(OptionError, match=telling):
-        check_recipe(replace(TIMED, **values))
 
 
 def grasps(seed, per_class=3, steps=14):
@@ -324,22 +284,10 @@ def small_timed(recordings, **values):
     return recipe, replace(sizes, dynamics=recipe.dynamics(layers, sizes.beta, recordings.steps))
 
 
-def test_an_interrupted_timed_training_resumes_to_the_same_weights(tmp_path):
-    training, test = grasps(1), grasps(0)
+def test_the_learning_rate_falls_as_a_cosine():
+    training = grasps(1)
     recipe, sizes = small_timed(training)
-    whole = train(training, test, ADJACENCY, sizes, epochs=4, seed=5, recipe=recipe)
-
-    def stop(epoch):
-        if epoch.epoch == 2:
-            raise KeyboardInterrupt
-
-    options = {"epochs": 4, "seed": 5, "recipe": recipe, "state": tmp_path / "state"}
-    with pytest.raises(KeyboardInterrupt):
-        train(training, test, ADJACENCY, sizes, after_epoch=stop, **options)
-    resumed = train(training, test, ADJACENCY, sizes, resume=True, **options)
-    assert resumed.history == whole.history
-    for name, array in whole.last.items():
-        assert_array_equal(resumed.last[name], array, err_msg=name)
+    whole = train(training, training, ADJACENCY, sizes, epochs=4, recipe=recipe)
     assert [epoch.learning_rate for epoch in whole.history] == pytest.approx(
         [1e-3 * 0.5 * (1 + np.cos(np.pi * index / 4)) for index in range(4)]
     )
@@ -404,20 +352,6 @@ def test_the_tenth_layer_is_not_scaled_as_the_first():
     assert_array_equal(found["fc10.weight"], network.fc10.weight.detach().numpy().T)
 
 
-def test_a_penalty_on_spikes_makes_them_fewer():
-    training = grasps(1)
-    _, sizes = small_timed(training)
-    time_first = torch.from_numpy(training.events.transpose(3, 0, 1, 2).astype(np.float32))
-    shares = []
-    for penalty in (0.0, 50.0):
-        recipe, _ = small_timed(training, penalty=penalty, learning_rate=0.02)
-        trained = train(training, training, ADJACENCY, sizes, epochs=5, seed=0, recipe=recipe)
-        network = SpikingNet(sizes, ADJACENCY)
-        network.load_weights(trained.last)
-        shares.append(float(network.activity(network.layers(time_first)).detach()))
-    assert shares[1] < 0.8 * shares[0]
-
-
 def test_train_writes_what_the_recipe_asks_for(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     splits = [replace(synthetic_grasps(per_class=2, steps=14, seed=s), split=n) for n, s in (("train", 1), ("test", 2))]
@@ -436,7 +370,5 @@ def test_train_writes_what_the_recipe_asks_for(tmp_path, monkeypatch, capsys):
         betas=(*[819 / 4096] * 3, 0.75), alphas=(0.0, 0.5, 0.0, 0.0), clocks=Clocks(channels=4, steps=4)
     )
     assert checkpoint.hops.shape == (4, 6, 2)
-    assert main([*words.split(), "-o", "x.pt", "--resume", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["runs"] == [run]
     assert main([*words.replace("--clocks 4", "--clocks 3").split(), "-o", "x.pt", "--resume"]) == 2
     assert "x.pt: holds another training (other recipe)" in capsys.readouterr().err

@@ -1,11 +1,15 @@
+import dataclasses
+
 import numpy as np
-from hypothesis import given, settings
+import pytest
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from oracles import refused
+from random_netlists import Axon, Neuron, build
 from random_networks import (
     LOIHI,
     compiled,
     dense_weights,
-    float_networks,
     integer_chain,
     integer_networks,
     legal_partition,
@@ -15,12 +19,15 @@ from random_networks import (
     tight_targets,
 )
 
-from spikeloom.compiler import Packing
+from spikeloom.compiler import lift
+from spikeloom.compiler.errors import CapacityError, FormatError, NumericRangeError
+from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.interpret import run_integer
-from spikeloom.compiler.ir import INPUT, fan_in
+from spikeloom.compiler.invariants import verify
+from spikeloom.compiler.ir import INPUT, IntegerNetwork, fan_in
 from spikeloom.compiler.targets.loihi1.legalize import require_legal
-from spikeloom.compiler.targets.loihi1.storage.choose_storage import choose_storage
-from spikeloom.runtime.machines.loihi1 import spec
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.trace import aligned
 
 
@@ -88,23 +95,6 @@ def test_compartments_hold_the_registers_of_their_neurons(network, target):
     assert all(not getattr(netlist, name).flags.writeable for name in ("neuron", "axon_source", "synapse_weight"))
 
 
-@settings(deadline=None, max_examples=20)
-@given(st.data())
-def test_the_chip_spikes_like_the_network(data):
-    """Partition and emission change no spike: the specified chip step against the integer network."""
-    packing = Packing(bits=data.draw(st.sampled_from([8, 6, 4, 2])), planes=data.draw(st.integers(1, 2)))
-    network, _ = choose_storage(data.draw(float_networks()), LOIHI, packings=(packing,))
-    target = data.draw(tight_targets())
-    parts = legal_partition(network, target)
-    netlist = seated(network, parts, target)
-    events = data.draw(recordings_for(network.input.size, samples=1))
-    expected = run_integer(network, events, membranes=True)
-    trace = spec.simulate(netlist, events[0].T)
-    for layer in range(len(network.populations)):
-        np.testing.assert_array_equal(aligned(netlist, trace.spikes, layer), expected.spikes[layer][0])
-        np.testing.assert_array_equal(aligned(netlist, trace.membranes, layer), expected.membranes[layer][0])
-
-
 def test_lists_are_sparse_where_that_saves_visits():
     """Four of ten neurons: sparse although dense would save no word; eight of ten: dense."""
     few, many = np.zeros((10, 1), int), np.full((10, 1), 2)
@@ -128,3 +118,93 @@ def test_a_network_of_zeros_has_cores_but_no_axons():
     netlist = compiled(integer_chain(np.zeros((3, 2)), np.zeros((2, 3))))
     assert (netlist.n_cores, netlist.n_compartments, netlist.n_axons, netlist.n_synapses) == (1, 5, 0, 0)
     require_legal(netlist, LOIHI)
+
+
+# --- reading a netlist back -------------------------------------------------------------------------------------------
+
+
+MANY = settings(max_examples=30, deadline=None, derandomize=True)
+
+
+def lower(network: IntegerNetwork, **limits: int) -> Netlist:
+    """Netlist of a network on cores of these limits."""
+    return compiled(network, small_target(**limits))
+
+
+def assert_same_network(found: IntegerNetwork, expected: IntegerNetwork) -> None:
+    """Equal in everything but stored zeros and the division into projections."""
+    assert found.input == expected.input
+    assert found.classes == expected.classes
+    assert found.readout.population == expected.readout.population
+    np.testing.assert_array_equal(found.readout.label, expected.readout.label)
+    for ours, theirs in zip(found.populations, expected.populations, strict=True):
+        for name in ("name", "beta", "theta", "decay_u", "decay_v"):
+            assert getattr(ours, name) == getattr(theirs, name), name
+        for name in ("scale", "threshold", "bias_mantissa", "bias_exponent"):
+            np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name), err_msg=name)
+    for post in range(len(expected.populations)):
+        ours, theirs = dense_weights(found, post), dense_weights(expected, post)
+        for pre in set(ours) | set(theirs):
+            nothing = np.zeros(1, np.int64)
+            np.testing.assert_array_equal(*np.broadcast_arrays(ours.get(pre, nothing), theirs.get(pre, nothing)))
+    assert all(np.all(projection.weight.data != 0) for projection in found.projections)
+
+
+@MANY
+@given(integer_networks(), st.sampled_from([1, 3, 1024]))
+def test_emit_and_back(network, compartments):
+    try:
+        netlist = lower(network, core_compartments=compartments)
+    except CapacityError:
+        assume(False)
+    found = lift(netlist)
+    assert_same_network(found, network)
+    formats = {(p.pre, p.post): (p.bits, p.exponent) for p in network.projections if np.any(p.weight.data)}
+    kept = {(p.pre, p.post): (p.bits, p.exponent) for p in found.projections if p.weight.nnz}
+    assert kept == formats
+
+
+@MANY
+@given(st.data())
+def test_runs_like_the_chip(data):
+    network = data.draw(integer_networks(exponents=(-1, 0)))
+    netlist = lower(network, core_compartments=5)
+    events = data.draw(recordings_for(network.input.size))
+    try:
+        trace = engine.simulate(netlist, events.transpose(0, 2, 1), spikes=True, membranes=True)
+    except NumericRangeError:
+        assume(False)
+    activity = run_integer(lift(netlist), events, membranes=True)
+    for layer in range(len(netlist.layers)):
+        np.testing.assert_array_equal(activity.spikes[layer], aligned(netlist, trace.spikes, layer))
+        np.testing.assert_array_equal(activity.membranes[layer], aligned(netlist, trace.membranes, layer))
+
+
+@pytest.mark.parametrize("empty", [0, 1, 2])
+def test_a_layer_without_synapses_keeps_its_projection(empty):
+    weights = [np.full((3, 4), 50), np.full((2, 3), 60), np.full((2, 2), 70)]
+    weights[empty] = np.zeros_like(weights[empty])
+    network = integer_chain(*weights)
+    found = lift(lower(network))
+    verify(found)
+    assert_same_network(found, network)
+    assert [(p.pre, p.post, p.weight.nnz > 0) for p in sorted(found.projections, key=lambda p: p.post)] == [
+        (post - 1 if post else INPUT, post, post != empty) for post in range(3)
+    ]
+
+
+def netlist_of(*neurons: Neuron) -> Netlist:
+    netlist = build(list(neurons), [Axon(source=0, targets=((0, 2),))], n_inputs=1, depths=[0, 0])
+    return dataclasses.replace(netlist, readout_class=read_only([0] * len(neurons)))
+
+
+@pytest.mark.parametrize("field", ["decay_u", "decay_v"])
+def test_different_decays_in_a_layer_are_refused(field):
+    netlist = netlist_of(Neuron(), Neuron(**{field: 7}), Neuron(layer=1))
+    refused(FormatError, f"layer0|2 values of {field}", lift, netlist)
+
+
+@pytest.mark.parametrize(("votes", "layers"), [([-1, -1], 0), ([0, 0], 2)])
+def test_one_layer_votes(votes, layers):
+    netlist = dataclasses.replace(netlist_of(Neuron(), Neuron(layer=1)), readout_class=read_only(votes))
+    refused(FormatError, f"{layers} layers vote", lift, netlist)

@@ -1,4 +1,3 @@
-import hashlib
 from pathlib import Path
 
 import numpy as np
@@ -7,12 +6,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from spikeloom.compiler.errors import DataError, OptionError
-from spikeloom.models.recordings import fetch
 from spikeloom.models.recordings.counts import GAP_S
 from spikeloom.models.recordings.eventfiles import likely_unit, read_stream
 from spikeloom.models.recordings.events import BIN_S, MAX_STEPS, bin_events, data_splits, load_data, need_labels
-from spikeloom.models.recordings.evtouch import UNLABELLED, Recordings, load_recordings
-from spikeloom.models.recordings.fetch import DataSet
+from spikeloom.models.recordings.evtouch import UNLABELLED, Recordings
 from spikeloom.models.recordings.grasps import synthetic_grasps
 from spikeloom.models.recordings.release import write_released
 from spikeloom.runtime.commands.exchange.described import describe
@@ -91,37 +88,15 @@ def test_what_is_odd_is_counted(write):
     assert GAP_S == 0.5  # 0.31 to 0.8001 and on to 1.3 are shorter, 1.3 to 1.81 is longer
 
 
-def test_order_does_not_change_the_bins(write, save):
-    rng = np.random.default_rng(0)
-    time_s, taxel, polarity = rng.random(500) * 3, rng.integers(0, 9, 500), rng.integers(0, 2, 500)
-    order = np.argsort(time_s)
-    mixed, odd = load_data(save("mixed.npz", time_s=time_s, taxel=taxel, polarity=polarity))
-    straight, even = load_data(save("s.npz", time_s=time_s[order], taxel=taxel[order], polarity=polarity[order]))
-    assert np.array_equal(mixed.events, straight.events)
-    assert (odd.duplicates, odd.gaps) == (even.duplicates, even.gaps)
-    assert odd.out_of_order > even.out_of_order == 0
-
-
-@pytest.mark.parametrize("falling", [0, -1])
-def test_both_codes_of_polarity(write, falling):
-    found, _ = one(write("a.csv", f"0,0,1\n0.02,0,{falling}\n"))
-    assert found == [[0, 0, 1], [0, 1, 0]]
-    assert one(write("a.csv", f"0,0,{falling}\n"))[0] == [[0, 0, 0]]
-
-
 @pytest.mark.parametrize(
     ("rows", "words"),
     [
         ("0,0,1\nnan,0,1\n", "a.csv: line 3: time nan s, allowed are finite times from 0"),
-        ("0,0,1\n-0.1,0,1\n", "a.csv: line 3: time -0.1 s, allowed are finite times from 0"),
         ("inf,0,1\n", "a.csv: line 2: time inf s, allowed are finite times from 0"),
         ("1600000000,0,1\n", "a.csv: line 2: time 1.6e+09 s is past 1000000 bins of 0.02 s"),
         ("0,0,1\n0,39,1\n", "a.csv: line 3: taxel 39, allowed are whole numbers 0..38; count from 0"),
-        ("0,-1,1\n", "a.csv: line 2: taxel -1, allowed are whole numbers 0..38"),
         ("0,1.5,1\n", "a.csv: line 2: taxel 1.5, allowed are whole numbers 0..38"),
-        ("0,nan,1\n", "a.csv: line 2: taxel nan, allowed are whole numbers 0..38"),
         ("0,0,1\n0,0,2\n", "a.csv: line 3: polarity 2, allowed are 0 and 1, or -1 and 1"),
-        ("0,0,nan\n", "a.csv: line 2: polarity nan, allowed are 0 and 1, or -1 and 1"),
         ("0,0,1\n0,0,0\n0,0,-1\n", "a.csv: polarities -1 and 0 in one file, allowed are 0 and 1, or -1 and 1"),
         ("0,0,up\n", "a.csv: line 2: polarity is 'up', not a number"),
         ("", "a.csv: no rows, expected are lines of time_s, taxel, polarity[, label]"),
@@ -141,15 +116,6 @@ def test_taxels_and_bins_have_limits(write):
         assert f"--bin {bin_s:g}: not a duration" in message(load_data, path, bin_s=bin_s, error=OptionError)
 
 
-def test_memory_is_checked_first(write, monkeypatch):
-    monkeypatch.setattr("spikeloom.models.recordings.evtouch.MAX_TOTAL_BYTES", 1000)
-    path = write("d/a.csv", "19.99,0,1\n")
-    assert message(load_data, path) == "a.csv: recordings of 2000 bytes, limit 1000; split the data set"
-    path.write_text("4,0,1\n")
-    write("d/b.csv", "0,1,1\n")
-    assert message(load_data, path.parent) == "d: recordings of 1608 bytes, limit 1000; split the data set"
-
-
 # Labels
 
 
@@ -159,7 +125,6 @@ def test_memory_is_checked_first(write, monkeypatch):
         ("a.csv", "time_s,taxel,polarity,label\n0,0,1,4\n0.1,0,1,4\n", 4),
         ("a.csv", "0,0,1,4\n0.1,0,1,4\n", 4),
         ("sample_3_label_17.csv", "0,0,1\n", 17),
-        ("grasp_label_2_left.csv", "0,0,1\n", 2),
         ("grasp_label_2.csv", "0,0,1,2\n", 2),
         ("a.csv", "0,0,1\n", UNLABELLED),
         ("label_2.csv", "0,0,1\n", UNLABELLED),
@@ -176,8 +141,6 @@ def test_labels(write, name, text, label):
         ("a.csv", "0,0,1,4\n0,0,1,5\n", "a.csv: labels 4 and 5 in one file, allowed is one"),
         ("a_label_3.csv", "0,0,1,4\n", "a_label_3.csv: label 4 in the file and 3 in its name"),
         ("a.csv", "0,0,1,-1\n", "a.csv: label -1, allowed are whole numbers 0..999999"),
-        ("a.csv", "0,0,1,1.5\n", "a.csv: label 1.5, allowed are whole numbers 0..999999"),
-        ("a.csv", "0,0,1,nan\n", "a.csv: label nan, allowed are whole numbers 0..999999"),
         ("a.csv", "0,0,1,6\n", "a.csv: label 6, the network has 6 classes (0..5)"),
     ],
 )
@@ -208,24 +171,12 @@ def test_npz(save, dtype):
     assert counts.out_of_order == 1
 
 
-@pytest.mark.parametrize("label", [3, [3], [3, 3]])
-def test_npz_labels(save, label):
-    recordings, _ = load_data(save("a.npz", time_s=[0.5, 0.1], taxel=[2, 0], polarity=[1, 0], label=label))
-    assert recordings.labels.tolist() == [3]
-
-
-def test_compressed_npz(tmp_path):
-    np.savez_compressed(tmp_path / "a.npz", time_s=[0.5], taxel=[2], polarity=[True])
-    assert one(tmp_path / "a.npz")[0] == [[2, 1, 25]]
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [
         ({"polarity": None}, "a.npz: holds taxel, time_s, without polarity"),
         ({"taxel": [0, 1]}, "a.npz: shapes time_s (1,), taxel (2,), polarity (1,), allowed is one number per event"),
         ({"time_s": [[0.1]], "taxel": [[0]], "polarity": [[1]]}, "a.npz: shapes time_s (1, 1)"),
-        ({"time_s": [], "taxel": [], "polarity": []}, "a.npz: no events, a recording needs one or more"),
         ({"polarity": ["up"]}, "a.npz: polarity: dtype '<U2', allowed are numbers"),
         ({"taxel": np.array([0], dtype=object)}, "a.npz: taxel: not an npy file of numbers"),
         ({"time_s": [-1]}, "a.npz: event 0: time -1 s, allowed are finite times from 0"),
@@ -285,14 +236,6 @@ def test_folders_with_splits(write, tmp_path):
     assert load_data(tmp_path / "d" / "train")[0].files == ("a_label_0.csv",)
 
 
-def test_bins_and_events_do_not_mix(write, tmp_path):
-    write("d/train/a_label_0.csv", "0.1,1,1\n")
-    write("d/test/sample_0_label_1.npy", "")
-    assert message(load_data, tmp_path / "d") == (
-        "d: .npy beside .csv in train/ and test/, allowed are bins or events; keep one kind"
-    )
-
-
 def test_one_released_recording(tmp_path):
     grasps = synthetic_grasps(per_class=1, steps=40, seed=0)
     np.save(tmp_path / "sample_0_label_3.npy", grasps.events[3].astype(np.float32))
@@ -317,15 +260,6 @@ def test_silence_in_bins_is_a_gap(tmp_path):
     assert load_data(tmp_path / "a.npy")[1].gaps == 1
 
 
-def test_what_is_no_recording(write, tmp_path):
-    path = write("a.txt", "0,0,1\n")
-    assert message(load_data, path).startswith(f"{path}: not a recording; give a folder, a released zip, or a .csv")
-    assert "no such folder or file" in message(load_data, tmp_path / "none.csv")
-    (tmp_path / "empty").mkdir()
-    assert message(load_data, tmp_path / "empty").startswith("empty: no recordings")
-    assert "--limit 0: at least 1 recording" in message(load_data, path, limit=0, error=OptionError)
-
-
 def test_the_released_layout_goes_its_own_way(tmp_path):
     grasps = synthetic_grasps(per_class=2, steps=30, seed=1)
     split = grasps.part(slice(None), "test")
@@ -337,25 +271,6 @@ def test_the_released_layout_goes_its_own_way(tmp_path):
         assert recordings.files == tuple(f"sample_{i:02}_label_{i % 6}.npy" for i in range(12))
         assert data_splits(tmp_path / name) == ("test",)
     assert (tmp_path / "d.zip").read_bytes() == (tmp_path / "again.zip").read_bytes()
-
-
-def test_names_of_fetched_data(tmp_path, monkeypatch):
-    monkeypatch.setenv("SPIKELOOM_DATA", str(tmp_path))
-    monkeypatch.chdir(tmp_path)
-    grasps = synthetic_grasps(per_class=1, steps=30, seed=1)
-    test = grasps.part(slice(None), "test")
-    path = tmp_path / "Ev-Objects.zip"
-    assert "objects: not on this machine" in message(load_data, "objects")
-    write_released(path, [test])
-    sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
-    data = DataSet(file="Ev-Objects.zip", url="", size=path.stat().st_size, sha256=sha256)
-    monkeypatch.setitem(fetch.DATA_SETS, "objects", data)
-    assert np.array_equal(load_data("objects")[0].events, grasps.events)
-    assert data_splits("objects") == ("test",)
-    (tmp_path / "objects").mkdir()
-    (tmp_path / "objects" / "a_label_1.csv").write_text("0,0,1\n")
-    assert len(load_data("objects")[0]) == 6
-    assert len(load_data("./objects")[0]) == 1
 
 
 # Any events
@@ -383,21 +298,6 @@ def test_any_recording_survives_as_events(tmp_path, data):
     recordings, counts = load_data(path)
     assert np.array_equal(recordings.events[0], grid)
     assert (counts.events, counts.duplicates) == (len(rows), len(found) // 2)
-
-
-@pytest.mark.recordings
-def test_a_released_recording_survives_as_events(objects_zip, tmp_path):
-    released = load_recordings(objects_zip, "test", limit=8)
-    for index, name in enumerate(released.files):
-        rows = np.argwhere(released.events[index])
-        rows[:, 1] = 2 * rows[:, 1] - 1
-        lines = [f"{step * 0.02:.2f},{taxel},{sign}" for taxel, sign, step in rows.tolist()]
-        (tmp_path / name).with_suffix(".csv").write_text("\n".join(lines))
-    recordings, _ = load_data(tmp_path, taxels=39, classes=36)
-    assert recordings.labels.tolist() == released.labels.tolist()
-    last = recordings.steps
-    assert np.array_equal(recordings.events, released.events[..., :last])
-    assert not released.events[..., last:].any()
 
 
 # What recordings hold
@@ -432,14 +332,6 @@ def test_hot_taxels_exceed_five_times_the_median_and_silence_is_dead():
     assert (found.dead, found.hot, found.events) == ((0, 1, 2), (), 0)
 
 
-@pytest.mark.recordings
-def test_the_released_taxel_that_never_rises(objects_zip):
-    """A fact about the released Objects: taxel 38 has falling events only."""
-    found = describe(load_recordings(objects_zip, "train"), BIN_S)
-    assert (found.dead, found.one_sided, found.hot) == ((), (38,), ())
-    assert found.events == 1_436_943
-
-
 # Writing
 
 
@@ -460,16 +352,6 @@ def test_writing_is_all_or_nothing(tmp_path, monkeypatch):
         with pytest.raises(OSError, match="No space left on device"):
             write_released(tmp_path / name, [grasps])
     assert list(tmp_path.iterdir()) == []
-
-
-def test_places_to_write(tmp_path, write):
-    grasps = synthetic_grasps(per_class=1, steps=20, seed=1)
-    (tmp_path / "d").mkdir()
-    assert "exists already" in message(write_released, tmp_path / "d", [grasps], error=OptionError)
-    inside = tmp_path / "e" / "f"
-    assert "the folder around it does not exist" in message(write_released, inside, [grasps], error=OptionError)
-    unlabelled, _ = load_data(write("a.csv", "0,0,1\n"))
-    assert "a.csv: no label, the released layout needs one" in message(write_released, tmp_path / "g", [unlabelled])
 
 
 # What is worth a second look
@@ -546,19 +428,11 @@ def test_a_table_above_the_splits(write):
     assert data_splits(folder) == ("test", "train")
 
 
-def test_a_table_of_something_else_is_passed_over(listed):
-    folder = listed("own/labels.csv", "object,mass\n1,2\n").parent
-    recordings, counts = load_data(folder)
-    assert recordings.labels.tolist() == [UNLABELLED, 2, UNLABELLED]
-    assert counts.notes == ("own: labels.csv: is not read; a table of labels has columns file and label",)
-
-
 @pytest.mark.parametrize(
     ("rows", "line"),
     [
         ("b_label_2.csv,3\n", "own: b_label_2.csv: label 2, and 3 in labels.csv; mend one of them"),
         ("a.csv,x\n", "own: labels.csv: row 2: 'a.csv', label 'x'; give a file and a number from 0"),
-        ("a.csv\n", "own: labels.csv: row 2: 'a.csv', label ''; give a file and a number from 0"),
         ("a.csv,1\na.csv,2\n", "own: labels.csv: row 3: a.csv has labels 1 and 2; keep one"),
     ],
 )

@@ -8,7 +8,6 @@ from oracles import probed
 from random_networks import random_checkpoint, ring
 from scipy import sparse
 
-from spikeloom.compiler.interpret import run_float
 from spikeloom.compiler.invariants import verify
 from spikeloom.compiler.ir import INPUT, depths, fan_in
 from spikeloom.compiler.passes.expand import expand, expand_graph_convolution
@@ -78,12 +77,6 @@ def test_two_taxels_by_hand():
     assert expand_graph_convolution(adjacency, hops).toarray().tolist() == [[101, 202, 10, 20], [10, 20, 101, 202]]
 
 
-def test_rows_gather():
-    adjacency = np.array([[0.0, 0.5], [0.0, 0.0]])  # taxel 0 gathers from taxel 1
-    hops = np.array([[[1.0]], [[8.0]]])
-    assert expand_graph_convolution(adjacency, hops).toarray().tolist() == [[1, 4], [0, 1]]
-
-
 @pytest.mark.parametrize("name", CONV_SYNAPSES)
 def test_structural_synapses_of_each_graph(name):
     for prefix in ("", "released:"):
@@ -117,13 +110,6 @@ def test_a_sparse_graph_expands_as_a_dense_one_does(seed):
     np.testing.assert_allclose(thin.data, dense.data, rtol=1e-12, atol=1e-14)
 
 
-def test_an_isolated_taxel_gathers_from_itself_only():
-    adjacency = normalised_adjacency([[0, 1], [1, 0]], 3)
-    weight = expand_graph_convolution(adjacency, np.ones((4, 2, 2)))
-    assert np.diff(weight.indptr).tolist() == [4, 4, 4, 4, 2, 2]
-    assert weight.toarray()[4:].tolist() == [[0, 0, 0, 0, 1, 1]] * 2
-
-
 # --- whole checkpoints
 
 
@@ -137,27 +123,3 @@ def test_a_checkpoint_becomes_a_chain_of_populations():
     assert [int(fan_in(network, post).max()) for post in range(4)] == [60, 2496, 128, 256]
     assert network.readout.population == 3
     assert network.readout.label.tolist() == list(range(36))
-
-
-@settings(deadline=None, max_examples=10)
-@given(st.integers(0, 2**32 - 1), st.floats(0, 0.99))
-def test_the_expanded_network_spikes_like_the_checkpoint(seed, beta):
-    """Against the plain order of operations: propagate, filter, integrate, step by step."""
-    checkpoint, adjacency = random_checkpoint(seed=seed, beta=beta), ring(5)
-    events = np.random.default_rng(seed).random((2, 12, 10)) < 0.3
-    spikes = run_float(expand(checkpoint, adjacency), events).spikes
-    convolution = factored(adjacency, checkpoint.hops.astype(np.float64))
-    for sample in range(2):
-        signal = convolution(events[sample].astype(float)) + np.tile(checkpoint.conv_bias.astype(np.float64), 5)
-        fired = events[sample]
-        for layer in range(4):
-            if layer:
-                dense = checkpoint.dense[layer - 1]
-                signal = fired.astype(float) @ dense.weight.T.astype(float) + dense.bias.astype(float)
-            u, s = np.zeros(signal.shape[1]), np.zeros(signal.shape[1])
-            fired = np.zeros(signal.shape, bool)
-            for t, current in enumerate(signal):
-                u = beta * u * (1 - s) + current
-                s = u > checkpoint.theta
-                fired[t] = s
-            np.testing.assert_array_equal(spikes[layer][sample], fired)

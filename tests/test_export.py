@@ -6,7 +6,7 @@ import re
 from dataclasses import replace
 
 import pytest
-import sanafe_counts
+import timing_oracle
 from random_netlists import Axon, Neuron, build
 from test_timing import LOIHI, six_steps
 
@@ -111,10 +111,10 @@ def test_a_neuron_names_the_unit_of_most_of_its_synapses():
     netlist = build([Neuron(), Neuron()], axons, n_inputs=3, depths=[0])
     netlist = replace(netlist, format_index_bits=read_only([0, 10, 10]))
     assert len(re.findall("loihi_sparse_synapse", "\n".join(lines(netlist)))) == 2
-    assert not sanafe_counts.dense_synapses(netlist).any()
+    assert not timing_oracle.dense_synapses(netlist).any()
     netlist = replace(netlist, format_index_bits=read_only([0, 0, 10]))
     assert len(re.findall("loihi_dense_synapse", "\n".join(lines(netlist)))) == 2
-    assert sanafe_counts.dense_synapses(netlist).all()
+    assert timing_oracle.dense_synapses(netlist).all()
 
 
 def test_names_are_such_that_the_format_can_hold_them():

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from spikeloom.compiler.errors import DataError, OptionError
+from spikeloom.compiler.errors import DataError
 from spikeloom.models.recordings import fetch
 from spikeloom.models.recordings.fetch import DATA_SETS, DataSet, data_folder, fetch_data, find_data
 
@@ -82,12 +82,6 @@ def test_other_content_is_never_kept(server, tmp_path, status, body, words):
     assert list((tmp_path / "data").iterdir()) == []
 
 
-@pytest.mark.parametrize("url", ["file:///etc/passwd", "Ev-Objects.zip", "http:///x"])
-def test_only_web_addresses(url):
-    with pytest.raises(OptionError, match=r"--url .*: not a web address"):
-        fetch_data("objects", url=url)
-
-
 def test_a_stranger_under_the_final_name_is_left_alone(server, tmp_path):
     path = tmp_path / "data" / "Ev-Objects.zip"
     path.parent.mkdir()
@@ -96,12 +90,6 @@ def test_a_stranger_under_the_final_name_is_left_alone(server, tmp_path):
         with pytest.raises(DataError, match=words):
             action("objects")
     assert path.read_bytes() == b"my own"
-
-
-@pytest.mark.parametrize("action", [find_data, fetch_data])
-def test_unknown_names(action):
-    with pytest.raises(OptionError, match="cats: no such data set; allowed: objects, containers"):
-        action("cats")
 
 
 def test_the_folder(monkeypatch, tmp_path):

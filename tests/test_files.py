@@ -83,21 +83,3 @@ def test_of_a_link_the_target_is_replaced(tmp_path):
         assert link.is_symlink()
         assert target.read_bytes() == content
         assert [file.name for file in target.parent.iterdir()] == ["a"]
-
-
-def test_errors_of_other_files_keep_their_names(tmp_path):
-    other = tmp_path / "none" / "other"
-    with pytest.raises(FileNotFoundError) as raised, write_atomically(tmp_path / "a"):
-        other.read_bytes()
-    assert raised.value.filename == str(other)
-    with pytest.raises(FileNotFoundError) as raised, write_atomically(other):
-        pass
-    assert raised.value.filename == str(other)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_permissions_are_those_of_any_new_file(tmp_path):
-    with write_atomically(tmp_path / "a"):
-        pass
-    (tmp_path / "b").write_bytes(b"")
-    assert (tmp_path / "a").stat().st_mode == (tmp_path / "b").stat().st_mode

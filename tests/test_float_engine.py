@@ -4,7 +4,6 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from numpy.testing import assert_array_equal
 from random_networks import chain, compiled, float_networks, integer_chain, recordings_for
@@ -35,21 +34,6 @@ def spikes_of(prepared, netlist, inputs, **options):
     found = float_engine.run(prepared, inputs, **options)
     flags = unpack(found.packed, netlist.n_compartments)
     return found, [aligned(netlist, flags, layer) for layer in range(len(netlist.layers))]
-
-
-@pytest.mark.parametrize("seed", range(2))
-def test_spikes_and_votes_are_the_interpreters(seed):
-    network = lively(seed=seed)
-    netlist = compile_network(network, Options(keep_all=True)).netlist
-    inputs = random_inputs(network.input.size, seed)
-    found, spikes = spikes_of(float_engine.prepare(network, netlist), netlist, inputs)
-    wanted = run_float(network, inputs.transpose(0, 2, 1).astype(bool), dtype=np.float64).spikes
-    for ours, theirs in zip(spikes, wanted, strict=True):
-        assert_array_equal(ours, theirs)
-        assert theirs.any()
-    assert_array_equal(found.votes, readout_counts(network.readout, network.classes, wanted[-1]))
-    assert_array_equal(found.spikes, np.stack([s.sum(axis=(1, 2)) for s in wanted], axis=1))
-    assert not found.elsewhere.any()
 
 
 @REPEATABLE

@@ -1,13 +1,26 @@
 """HDF5 files with random faults: read, or refused in one line; never a crash of ours."""
 
+import copy
+import io
 import random
 from collections import Counter
+from functools import cache
+from pathlib import Path
 
+import made_netx
+import numpy as np
 import pytest
-from fuzzed_hdf5 import bytes_for, content_outcome, outcome, sources
+from fuzzed_bytes import changed_bytes
 
-from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.errors import ModelError, SpikeloomError
 from spikeloom.compiler.formats import hdf5
+from spikeloom.compiler.formats.hdf5 import tree_of
+from spikeloom.compiler.formats.netx.layout import blocks_of
+from spikeloom.compiler.formats.netx.reader import integers_of
+from spikeloom.compiler.formats.nir.file import graph_of
+from spikeloom.compiler.formats.nir.neurons import Steps
+from spikeloom.compiler.formats.nir.reader import network_of
+from spikeloom.compiler.invariants import verify
 
 
 def test_contents_with_faults():
@@ -55,3 +68,134 @@ def test_many_files():
     assert sum(Counter(content_outcome(seed) for seed in range(60_000)).values()) == 60_000
     found = Counter(bytes_outcome(seed) for seed in range(500))
     assert min(found[ending] for ending in ("read", "refused", "damaged")) > 0, found
+
+
+FILES = Path(__file__).parent / "nir"
+
+TYPES = ("Affine", "AvgPool2d", "Conv1d", "Conv2d", "CubaLIF", "Delay", "Flatten", "I", "IF", "Identity", "Input", "LI")
+TYPES += ("LIF", "Linear", "NIRGraph", "Output", "Scale", "SumPool2d", "Threshold")
+TYPES += ("conv", "dense", "dense_rec", "flatten", "input")
+NUMBERS = (-(2**63), -(2**31), -100, -1, 0, 1, 2, 3, 7, 100, 2**20, 2**31, 2**62, 1e-300, 1e300, np.nan, np.inf, 0.5)
+
+
+@cache
+def sources():
+    """Good files."""
+    return (*tuple(path.read_bytes() for path in sorted(FILES.glob("*.ni[r]"))), netx_bytes())
+
+
+@cache
+def netx_bytes():
+    """A good netx file."""
+    rng, file = np.random.default_rng(0), io.BytesIO()
+
+    def even(*shape, **more):
+        return made_netx.dense(made_netx.even(rng, *shape), bias=made_netx.even(rng, shape[0], most=16), **more)
+
+    kernel = made_netx.even(rng, 3, 2, 2, 2, most=18)
+    recurrent = even(6, 27, type=["dense_rec"], weight_rec=rng.integers(-60, 60, (6, 6)))
+    image = made_netx.given_input(2, 4, 4), made_netx.conv(kernel, (3, 3, 3), bias=[2, 4, 6]), made_netx.flatten(27)
+    made_netx.write(file, *image, recurrent, even(4, 6))
+    return file.getvalue()
+
+
+@cache
+def trees():
+    """What is in them."""
+    return tuple(tree_of(content) for content in sources())
+
+
+def read(tree):
+    """Read a content as both formats do; whatever may be raised is raised."""
+    if "layer" in tree:
+        network, facts = integers_of(blocks_of(tree), tree)
+    else:
+        found = network_of(graph_of(tree, ""), Steps(dt=1e-4, convention="euler"))
+        network, facts = found.network, found.facts
+    verify(network)
+    assert all("\n" not in fact for fact in facts)
+
+
+def outcome(tree):
+    """How reading ends: fine, or with one clear line."""
+    said = None
+    try:
+        with np.errstate(all="ignore"):
+            read(tree)
+    except SpikeloomError as error:
+        said = str(error)
+    if said is None:
+        return "read"
+    assert "\n" not in said, said
+    assert len(said) < 600, said
+    return "refused"
+
+
+def groups_of(tree):
+    """All groups of a content."""
+    found = [tree]
+    for group in found:
+        found += [entry for entry in group.values() if isinstance(entry, dict)]
+    return found
+
+
+def strange(rng, entry):  # noqa: PLR0911 one return a kind of fault
+    """An entry that is something else."""
+    match rng.randrange(9):
+        case 0:
+            return None
+        case 1:
+            return rng.choice((*TYPES, "", "a\nb", "ä" * 200, "same", "subtract"))
+        case 2:
+            return {}
+        case 3:
+            return [["a", "b"], ["b"]]
+        case 4 if isinstance(entry, np.ndarray) and entry.size:
+            changed = entry.astype(np.float64).ravel()
+            changed[rng.randrange(changed.size)] = rng.choice(NUMBERS)
+            return changed.reshape(entry.shape)
+        case 5 if isinstance(entry, np.ndarray) and entry.size > 1:
+            return entry.ravel()[: rng.randrange(entry.size)]
+        case 6 if isinstance(entry, np.ndarray):
+            return entry[None] if rng.random() < 0.5 else entry.T
+        case 7 if isinstance(entry, np.ndarray):
+            return np.abs(np.nan_to_num(entry.astype(np.float64))).astype(np.uint8)
+    return np.array(rng.choice(NUMBERS))
+
+
+def changed_content(tree, rng):
+    """A few faults in the content of a file."""
+    tree = copy.deepcopy(tree)
+    for _ in range(rng.choice((1, 1, 2, 4))):
+        group = rng.choice(groups_of(tree))
+        if not group:
+            continue
+        key = rng.choice(sorted(group))
+        match rng.randrange(6):
+            case 0:
+                del group[key]
+            case 1:
+                group[rng.choice(("x", "1", "weight", "type", "delay", "metadata"))] = group[key]
+            case 2 if isinstance(group.get("edges"), list) and group["edges"]:
+                edges = group["edges"]
+                names = [name for pair in edges for name in pair]
+                edges.append([rng.choice(names), rng.choice([*names, "nothing"])])
+            case 3 if isinstance(group.get("type"), str):
+                group["type"] = rng.choice(TYPES)
+            case _:
+                group[key] = strange(rng, group[key])
+    return tree
+
+
+def content_outcome(seed):
+    """How a content for a seed is read."""
+    rng = random.Random(seed)
+    with np.errstate(all="ignore"):  # the faults themselves
+        tree = changed_content(rng.choice(trees()), rng)
+    return outcome(tree)
+
+
+def bytes_for(seed):
+    """Bytes of a file for a seed."""
+    rng = random.Random(seed)
+    return changed_bytes(rng.choice(sources()), rng)

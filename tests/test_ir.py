@@ -19,7 +19,6 @@ from scipy import sparse
 from spikeloom.compiler.errors import VerifyError
 from spikeloom.compiler.invariants import verify
 from spikeloom.compiler.ir import INPUT, Network, Projection, Readout, depths, fan_in, recurrent
-from spikeloom.compiler.targets.loihi1.netlist_file import FILE
 from spikeloom.compiler.targets.loihi1.netlist_text import netlist_text
 from spikeloom.compiler.text import text
 
@@ -158,10 +157,6 @@ def test_random_networks_pass(network):
 # --- structure
 
 
-def test_depths_count_from_the_first_layer():
-    assert depths(chain(np.ones((2, 3)), np.ones((2, 2)), np.ones((1, 2)))) == (0, 1, 2)
-
-
 def test_fan_in_counts_stored_zeros():
     weight = stored([[1.0, 0.0, 2.0], [0.0, 0.0, 0.0]], np.array([[1, 1, 1], [0, 1, 0]]))
     network = with_projection(small(), 0, weight=weight)
@@ -184,48 +179,6 @@ def test_texts_are_as_recorded(golden):
     layers = [[2, -4, 0], [6, 8, 254]], [[2, 4]]
     golden("integer.txt", text(integer_chain(*layers, thresholds=[[3, 5], 7], exponent=1)))
     golden("netlist.txt", netlist_text(compiled(integer_chain(*layers, thresholds=[[3, 5], 7]))))
-
-
-@pytest.mark.parametrize("index", [0, 1])
-@pytest.mark.parametrize(
-    ("field", "change"), [("bias", 1e-12), ("beta", 1e-9), ("theta", 1e-9), ("weight", 1e-12), ("label", 1)]
-)
-def test_every_value_of_a_float_network_shows_in_its_text(field, change, index):
-    network = small()
-    if field == "weight":
-        weight = network.projections[index].weight.copy()
-        weight.data[-1] += change
-        other = with_projection(network, index, weight=weight)
-    elif field == "label":
-        other = replace(network, readout=replace(network.readout, label=np.array([[0, 0], [1, 0]][index])))
-    else:
-        other = with_population(network, index, **{field: getattr(network.populations[index], field) + change})
-    assert text(other) != text(network)
-
-
-def changed(array, at, by=1):
-    copy = array.copy()
-    copy[at] += by
-    return copy
-
-
-def test_every_register_shows_in_the_text():
-    network = integer_chain([[2, 4], [6, 8], [6, 8]], thresholds=[[1, 5, 9]])
-    population = network.populations[0]
-    others = {name: changed(getattr(population, name), 1) for name in ("threshold", "bias_mantissa", "bias_exponent")}
-    others |= {"scale": changed(population.scale, 1, 1e-9), "decay_u": 7, "decay_v": 7}
-    for field, value in others.items():
-        assert text(with_population(network, 0, **{field: value})) != text(network), field
-
-
-def test_every_array_of_a_netlist_shows_in_its_text():
-    netlist = compiled(integer_chain([[2, -4, 0], [6, 8, 254]], [[2, 4]]))
-    hidden = {"layer", "scale", "axon_format", "core_compartments", "core_axons", "decay_v", "format_weight_bits"}
-    for field in set(FILE.arrays) - hidden:
-        array = getattr(netlist, field)
-        assert netlist_text(replace(netlist, **{field: changed(array, len(array) // 2)})) != netlist_text(netlist), (
-            field
-        )
 
 
 @given(integer_networks())

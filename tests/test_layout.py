@@ -1,5 +1,4 @@
 import contextlib
-import dataclasses
 import itertools
 
 import numpy as np
@@ -23,7 +22,6 @@ from spikeloom.compiler.errors import CapacityError, NumericRangeError, OptionEr
 from spikeloom.compiler.ir import depths
 from spikeloom.compiler.passes.calibrate import Calibration
 from spikeloom.compiler.targets.loihi1.emit import emit
-from spikeloom.compiler.targets.loihi1.layout import forecast as forecast_module
 from spikeloom.compiler.targets.loihi1.layout import place as place_module
 from spikeloom.compiler.targets.loihi1.layout.choose import _cost, lay_out
 from spikeloom.compiler.targets.loihi1.layout.core_needs import Chunk, Needs
@@ -153,30 +151,9 @@ def test_the_mean_of_the_longest_is_not_the_longest_of_the_means():
     assert expected.step_ns == pytest.approx((5 * max(work) + 6 * 40 * 9.7) / 11 + 600)
 
 
-def test_expectations_need_recordings_a_time_table_and_an_energy_table_best_of_one_source():
-    network, calibration = busy([4, 5, 3])
-    silent, renamed = (
-        dataclasses.replace(LOIHI, time=time) for time in ((), (dataclasses.replace(LOIHI.time[0], name="mine"),))
-    )
-    assert tables(silent) is tables(dataclasses.replace(LOIHI, energy=())) is None
-    assert [table.name for table in tables(LOIHI)] == ["sanafe", "sanafe"]
-    assert [table.name for table in tables(renamed)] == ["mine", "davies2018"]
-    for target, recorded in ((LOIHI, None), (silent, calibration)):
-        layout, usual = lay_out(network, target, calibration=recorded)
-        assert layout is usual
-        assert layout.expected is None
-
-
 def forecast_of(network, calibration, target=LOIHI):
     everyone = tuple(np.arange(population.size) for population in network.populations)
     return Forecast(Needs(network, target), sample(network, calibration, everyone), *tables(target))
-
-
-def test_few_steps_of_many_are_looked_at(monkeypatch):
-    monkeypatch.setattr(forecast_module, "SAMPLES", 10)
-    forecast = forecast_of(*busy([4, 5, 3]))
-    assert forecast.steps == 10
-    assert [spikes.shape for spikes in forecast.activity] == [(10, 5), (10, 3), (10, 4)]
 
 
 # --- cores asked for

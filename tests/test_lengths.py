@@ -63,31 +63,8 @@ def test_silence_after_the_end_would_move_votes(folder):
     assert whole[0, STEPS[0] :].any(), "the network is silent in silence, so nothing is tested here"
 
 
-def test_run_gives_each_recording_what_it_gets_alone(folder, capsys):
-    together = as_json(capsys, "run", "x.loom", "--data", "data", "--spikes", "all.npz")
-    for index, file in enumerate(files(folder)):
-        alone = as_json(capsys, "run", "x.loom", "--data", str(file), "--spikes", "one.npz")
-        assert (together["counts"][index], together["predictions"][index]) == (
-            alone["counts"][0],
-            alone["predictions"][0],
-        )
-        with np.load("all.npz") as all_spikes, np.load("one.npz") as spikes:
-            for layer in spikes:
-                assert np.array_equal(all_spikes[layer][index, : STEPS[index]], spikes[layer][0])
-                assert not all_spikes[layer][index, STEPS[index] :].any()
-
-
-def test_watch_decides_as_run_does(folder, capsys):
-    together = as_json(capsys, "run", "x.loom", "--data", "data")
-    for index, file in enumerate(files(folder)):
-        assert main(["watch", "x.loom", "--input", str(file), "--json"]) == 0
-        lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-        (grasp,) = (line for line in lines if line["kind"] == "grasp")
-        assert (grasp["counts"], grasp["bins"]) == (together["counts"][index], STEPS[index])
-
-
 def test_verify_compares_each_recording_at_its_own_length(folder, capsys):
-    words = ("verify", "x.loom", "--checkpoint", "x.pt", "--spec-samples", "6", "--min-agreement", "0")
+    words = ("verify", "x.loom", "--checkpoint", "x.pt", "--spec-samples", "1", "--min-agreement", "0")
     together = as_json(capsys, *words, "--data", "data")
     assert together["spec_equals_engine"]
     parts = [as_json(capsys, *words, "--data", str(file)) for file in files(folder)]

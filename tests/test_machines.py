@@ -11,11 +11,11 @@ from zoo import specimen
 
 from spikeloom.compiler import targets
 from spikeloom.compiler.dynamics import with_clocks
-from spikeloom.compiler.errors import DataError, FormatError, OptionError
+from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.targets.base import shipped
 from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist
 from spikeloom.runtime import machines
-from spikeloom.runtime.machines.base import machine_for, machine_of, trained_for
+from spikeloom.runtime.machines.base import machine_for, machine_of
 from spikeloom.runtime.machines.integer import integer_machine
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.truenorth import engine as crossbar_engine
@@ -91,23 +91,6 @@ def test_what_is_compared_with_a_float_model():
     np.testing.assert_array_equal(votes[:, -1], found.run(events, lengths=LENGTHS).votes)
     price = found.price(events, lengths=LENGTHS, bin_s=0.02)[1]
     np.testing.assert_array_equal(ran.operations[:, -1], price.synaptic_operations)
-
-
-def test_what_crossbars_are_not():
-    machine = specimen("native").machine
-    with pytest.raises(OptionError, match="TrueNorth: is not compared with a float model"):
-        integer_machine(machine)
-    with pytest.raises(OptionError, match="--engine onnx: is not for IBM TrueNorth"):
-        machine.require_engine("onnx")
-    with pytest.raises(OptionError, match="runs whole recordings"):
-        machine.stream()
-
-
-def test_what_is_no_netlist(tmp_path):
-    (tmp_path / "x.loom").write_bytes(b"nothing")
-    with pytest.raises(FormatError):
-        machine_for(tmp_path / "x.loom")
-    assert trained_for(str(tmp_path / "x.loom")) is None
 
 
 TOY = """

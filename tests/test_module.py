@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from made_modules import CLASSES, NETS, TAXELS, AllSteps, example_of, graph_net, mlp, seeded
+from made_modules import CLASSES, NETS, TAXELS, AllSteps, example_of, mlp, seeded
 from torch import nn
 
 from spikeloom.compiler.errors import ModelError
@@ -148,22 +148,12 @@ def twice():
     return nn.Sequential(nn.Linear(4, 4), neurons, nn.Linear(4, 4), neurons)
 
 
-class Pair(nn.Module):
-    def __init__(self):
-        super().__init__()
-        self.net = nn.Sequential(nn.Linear(4, 2), LIF())
-
-    def forward(self, x):
-        return self.net(x), x
-
-
 REFUSED = {
     "module: the stage before 3 is not affine (a random combination": lambda: nn.Sequential(
         nn.Linear(4, 3), LIF(), nn.Sequential(nn.Linear(3, 2), nn.ReLU()), LIF()
     ),
     "module: has no LIF layer, so nothing spikes": lambda: nn.Linear(4, 2),
     "module 1: is called 2 times in a step": twice,
-    "module: returns a tuple, wanted one tensor": Pair,
     "module: its output is no count of the spikes": lambda: nn.Sequential(nn.Linear(4, 3), LIF(), nn.Linear(3, 2)),
     "layer lif_c: receives the input and lif_a and lif_b, which lie differently deep": lambda: TwoWays(skip=True),
     "layer 1: keeps 1.5 of its membrane in a step": lambda: nn.Sequential(nn.Linear(4, 2), LIF(beta=1.5)),
@@ -176,11 +166,3 @@ def test_refused(words):
     with pytest.raises(ModelError) as caught:
         module_network(seeded(REFUSED[words]), torch.zeros(1, 4))
     assert str(caught.value).startswith(words)
-
-
-def test_max_pooling_is_refused():
-    net = graph_net(nn.Sequential(nn.Linear(2, 8), nn.MaxPool1d(1)))
-    module_network(net, torch.zeros(1, TAXELS, 2))  # over windows of one it is the identity
-    net = seeded(lambda: nn.Sequential(nn.Linear(4, 4), nn.MaxPool1d(2), LIF()))
-    with pytest.raises(ModelError, match="the stage before 2 is not affine"):
-        module_network(net, torch.zeros(1, 1, 4))

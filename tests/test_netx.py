@@ -50,19 +50,12 @@ REFUSED = [
     ("0 (dense): weight holds 0.5, allowed are whole numbers", [dense(W / 4)]),
     ("0 (dense): has weights from 300 to 300, allowed are -256", [dense(W * 150)]),
     ("0 (dense): has biases up to 5000, allowed are 4095 steps", [dense(W, bias=[5000] * 4)]),
-    ("0 (dense): bias has 2 values for 4 neurons", [dense(W, bias=[1, 2])]),
     ("0 (dense): weight has the shape [4, 6], wanted [6, 6]", [dense(W, shape=[6])]),
-    ("1 (dense): weight has the shape [4, 6], wanted [4, 8]", [given_input(8), dense(W)]),
-    ("0 (dense): has the shape [0], which is none", [dense(W, shape=[0])]),
     ("0 (dense): has synaptic delays", [dense(W, delay=np.array([0, 0, 3, 0]))]),
     ("0 (dense): has iDecay 0 and vDecay 1024, allowed are 1", [dense(W, neuron=neuron(u=0))]),
     ("0 (dense): vThMant is 131072, allowed are 0 to 131071", [dense(W, neuron=neuron(threshold=2**17))]),
-    ("0 (dense): refDelay is 2, allowed is 1", [dense(W, neuron=neuron(refDelay=2))]),
     ("0 (dense): wgtExp is 1, allowed is 0", [dense(W, neuron=neuron(wgtExp=1))]),
     ("0 (dense): has neurons of type 'SDNN', allowed are CUBA", [dense(W, neuron=neuron(kind="SDNN"))]),
-    ("0 (dense): sends graded spikes", [dense(W, neuron=neuron(gradedSpike=True))]),
-    ("0 (dense): has no neuron", [{key: value for key, value in dense(W).items() if key != "neuron"}]),
-    ("0 (dense_rec): has no weight_rec", [recurrent()]),
     ("0 (dense_rec): weight_rec has the shape [4, 6], wanted [4, 4]", [recurrent(weight_rec=W)]),
     ("0 (conv): the shape of its input is nowhere", [{"type": ["conv"], "shape": [1, 2, 2]}]),
     (
@@ -87,29 +80,12 @@ def test_layers_that_cannot_be_used(tmp_path, words, layers):
         ("has no layers, so it is no netx file", [], {"other": {"a": 1}}),
         ("has no layer of neurons", [given_input(6)], {}),
         ("group spikeloom is for 6 inputs and 3 voting neurons, the", [dense(W)], {"spikeloom": OWN}),
-        ("group spikeloom describes no sensor", [dense(W)], {"spikeloom": OWN | {"taxels": 0}}),
         ("group spikeloom describes no sensor", [dense(W)], {"spikeloom": OWN | {"clock_steps": 0}}),
     ],
 )
 def test_structure(tmp_path, words, layers, more):
     with pytest.raises(ModelError, match=words):
         read_netx(write(tmp_path / "bad.net", *layers, **more))
-
-
-def test_files_and_options_of_the_command(tmp_path, capsys):
-    good, cut, out = write(tmp_path / "a.net", dense(W)), tmp_path / "cut.net", f"{tmp_path}/x.loom"
-    cut.write_bytes(good.read_bytes()[:3000])
-    assert main(["compile", f"{good}", "-o", out]) == 0
-    for words, said in (
-        (["compile", f"{cut}"], f"{cut}: is truncated or damaged (OSError)"),
-        (["compile", f"{good}", "--weight-bits", "4"], f"--weight-bits: is for float networks, {good}"),
-        (["compile", f"{good}", "--optimize", "energy"], "--optimize: weighs layouts by what a float network"),
-        (["compile", f"{good}", "--graph", "manual"], f"--graph: is for checkpoints, the netx file {good} holds"),
-        (["verify", out, "--checkpoint", f"{good}", "--data", "synthetic"], f"{good}: holds integers, no float"),
-    ):
-        capsys.readouterr()
-        assert main([*words, *(["-o", f"{tmp_path}/y.loom"] if words[0] == "compile" else [])]) == 2
-        assert capsys.readouterr().err.startswith(f"spikeloom: {said}")
 
 
 # --- reading ----------------------------------------------------------------------------------------------------------
@@ -257,7 +233,7 @@ def test_spikes_that_lava_dl_recorded():
 # --- writing ----------------------------------------------------------------------------------------------------------
 
 
-SETTINGS = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+SETTINGS = settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 
 @st.composite

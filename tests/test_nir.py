@@ -1,7 +1,6 @@
 """NIR files: held to what their own packages run, node by node; written ones opened by the package nir."""
 
 import itertools
-from dataclasses import replace
 from pathlib import Path
 
 import nir
@@ -17,14 +16,10 @@ from zoo import specimen
 
 from spikeloom.compiler import compile_network, lift
 from spikeloom.compiler.dynamics import with_clocks
-from spikeloom.compiler.errors import ModelError, OptionError
-from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.formats.nir import writer as nir_export
 from spikeloom.compiler.formats.nir.reader import read_nir
 from spikeloom.compiler.interpret import run_float
 from spikeloom.compiler.ir import recurrent
-from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
-from spikeloom.runtime.cli import main
 from spikeloom.runtime.machines.loihi1 import engine
 
 pytestmark = pytest.mark.usefixtures("hdf5_in_one_process")
@@ -73,25 +68,6 @@ def test_every_spike_is_that_of_the_package_that_wrote_the_file(name):
         layer = next(name for name in (node, f"_{node}", f"{node}.lif") if name in spikes)
         assert run[node].sum() > 4
         assert_array_equal(spikes[layer], run[node])
-
-
-def test_facts_of_files():
-    facts = read_nir(FILES / "snntorch_leaky.nir", dt=2e-4, convention="exponential").facts
-    for fact, words in zip(
-        facts,
-        (
-            "NIR 1.0.8, read in steps of 0.0002 s (exponential)",
-            "6 taxels, 2 polarities, as flat",
-            "layer 1 (LIF): 16 neurons, decay 0.201896 (0.201904 on the chip), fires at v > 0.5, then v = 0; a step",
-            "layer 3 (LIF): 4 neurons, decay 0.818731 (0.818848 on the chip), fires at v > 1",
-            "v goes to its reset as NIR says",
-            "drift: r is tau / 0.0001 in every neuron",
-            "the spikes of 3 in output output",
-        ),
-        strict=True,
-    ):
-        assert words in fact
-    assert "1.lif: is recurrent" in read_nir(FILES / "snntorch_recurrent.nir", dt=1e-4).facts[5]
 
 
 def test_what_snntorch_loses_of_a_synaptic_neuron():
@@ -344,17 +320,6 @@ def timed(tmp_path_factory):
     return netlist, path
 
 
-def test_currents_and_clocks(timed):
-    netlist, path = timed
-    graph = nir.read(path)
-    kinds = {name: type(node).__name__ for name, node in graph.nodes.items()}
-    assert [kinds[layer.name] for layer in netlist.layers] == ["LIF", "CubaLIF", "CubaLIF", "LIF"]
-    assert graph.nodes["input"].input_type["input"].tolist() == [netlist.n_inputs]
-    assert graph.metadata["dt"] == 0.02
-    assert nir.serialization.read_version(path) == nir_export.VERSION
-    assert all({a, b} <= kinds.keys() for a, b in graph.edges)
-
-
 def test_another_program_that_follows_nir_makes_nearly_the_same_spikes(timed):
     netlist, path = timed
     graph = nir.read(path)
@@ -376,29 +341,3 @@ def test_a_membrane_that_keeps_all_is_an_if(tmp_path):
     graph = nir.read(path)
     assert [type(node).__name__ for node in graph.nodes.values()].count("IF") == 1
     assert read_nir(path, dt=0.02).network.populations[0].beta == 1
-
-
-def test_what_nir_cannot_say(timed):
-    netlist, _ = timed
-    kept = replace(netlist, decay_v=read_only(np.zeros_like(netlist.decay_v)))
-    with pytest.raises(ModelError, match="fc1: keeps its whole membrane and has a current that outlasts its step"):
-        nir_export.export(kept, 0.02)
-    with pytest.raises(OptionError, match="--dt 0: is no time step; give seconds above 0"):
-        nir_export.export(netlist, 0.0)
-
-
-def test_there_and_back_by_the_commands(tmp_path, capsys):
-    made, there, again = specimen("timed"), tmp_path / "x.nir", tmp_path / "again.nir"
-    for words in (
-        ("export", made.netlist, "--to", "nir", "-o", there),
-        ("compile", there, "--polarities", "1", "-o", tmp_path / "x.loom"),
-        ("export", made.netlist, "--to", "nir", "-o", again, "--dt", "1e-4"),
-    ):
-        assert main([str(word) for word in words]) == 0
-    netlist = made.machine.netlist
-    assert [layer.neurons for layer in read_netlist(tmp_path / "x.loom").layers] == [120, 8, 6, 4]
-    assert there.read_bytes() == nir_export.export(netlist, 0.02)
-    assert again.read_bytes() == nir_export.export(netlist, 1e-4)
-    out = capsys.readouterr().out.splitlines()
-    assert out[0] == f"{there}: 138 neurons and {netlist.n_synapses} synapses for nir, {there.stat().st_size} bytes"
-    assert "NIR 1.0.8, read in steps of 0.02 s (euler)" in out

@@ -1,16 +1,18 @@
 """ONNX files that cannot be lowered or trusted: one clear line each, exit code 2, nothing written; and fuzzed ones."""
 
+import random
 from collections import Counter
+from functools import cache
 
 import numpy as np
 import pytest
 import torch
-from fuzzed_onnx import faulty
+from fuzzed_bytes import changed_bytes
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from made_modules import exported
-from made_onnx import CONSTANTS, STAGE, STATE_IN, model, neuron, node, scanned, two_layers, written
-from onnx import ModelProto, TensorProto, helper
+from made_modules import NETS, example_of, exported, one_step
+from made_onnx import CONSTANTS, STAGE, STATE_IN, looped, model, neuron, node, scanned, two_layers, written
+from onnx import AttributeProto, ModelProto, TensorProto, defs, helper
 
 from spikeloom.compiler.errors import SpikeloomError
 from spikeloom.compiler.formats.onnx import file as onnx_file
@@ -44,13 +46,10 @@ def refusal(tmp_path, monkeypatch, capsys):
 RESET = "d = Mul(u0, beta); q = Sub(one, s0); k = Mul(d, q)"
 FIRE = "hot = Greater(u0_new, theta); s0_new = Cast(hot)"
 GOOD = f"{RESET}; u0_new = Add(k, current); {FIRE}"
-STATELESS = GOOD.replace(RESET, "q = Greater(u0, theta); d = Mul(u0, beta); k = Where(q, zero, d)")
 MORE = {
     "axis": np.array([0]),
     "betas": np.array([0.1, 0.2, 0.3], np.float32),
     "big": np.array([10**12, 1]),
-    "half": np.array(0.5, np.float32),
-    "seven": np.array([7]),
     "thetas": np.array([0.5, 0.5, 1.0], np.float32),
     "v": np.arange(9, dtype=np.float32).reshape(3, 3),
 }
@@ -76,13 +75,9 @@ def changed(change):
 
 STAGES = [
     (f"node stage (Relu): {AFFINE}", "stage = Relu(current)"),
-    (f"node stage (Softmax): {AFFINE}", "stage = Softmax(current)"),
-    (f"node stage (Div): {AFFINE}", "stage = Div(one, current)"),
-    (f"node stage (MatMul): {AFFINE}", "t = Transpose(current); stage = MatMul(current, t)"),
     (f"node stage (Mul): multiplies x by x, so it {AFFINE}", "stage = Mul(x, x)"),
     ("node stage (Gather): takes indices or sizes from what varies", "stage = Gather(w, current)"),
     ("node odd (Softmax): is computed from constants by an operator", "odd = Softmax(b); stage = Add(current, odd)"),
-    ("node stage (Reshape): cannot be evaluated (cannot reshape", "stage = Reshape(current, seven)"),
     (
         "node huge (Expand): makes 3000000000000 values or",
         "huge = Expand(current, big); stage = ReduceSum(huge, axis)",
@@ -92,7 +87,6 @@ STAGES = [
 NODES = [
     (f"node stage (Cast): rounds its input to whole numbers, so it {AFFINE}", node("Cast", "current", "stage", to=7)),
     ("node stage (LSTM): keeps a state that is no leaky", node("LSTM", "current w w", "stage", hidden_size=3)),
-    (f"node stage (MaxPool): {AFFINE}", node("MaxPool", "current", "stage", kernel_shape=[1])),
     (
         "node stage (Strange): is of the domain my.own, allowed are the",
         helper.make_node("Strange", ["current"], ["stage"], domain="my.own"),
@@ -104,10 +98,6 @@ NEURONS = [
         GOOD.replace(RESET, "d = Mul(u0, beta); q = Mul(s0, theta); k = Sub(d, q)"),
     ),
     ("mixes or weighs the neurons of u0", GOOD.replace("Mul(u0, beta)", "Mul(u0, betas)")),
-    (
-        "keeps 0.5 of a membrane and 0.3 of it after",
-        GOOD.replace(RESET, "p = Mul(u0, s0); d = Mul(p, beta); h = Mul(u0, half); k = Sub(h, d)"),
-    ),
     ("has thresholds from 0.5 to 1 in one layer", GOOD.replace("theta", "thetas")),
     (
         "takes the state s0 of a layer as its input,",
@@ -119,39 +109,24 @@ REFUSED = [
     *[(words, with_stage(written(text))) for words, text in STAGES],
     *[(words, with_stage([made], domains=["my.own"])) for words, made in NODES],
     *[(f"node u0_new (Add): {words}", layer(text)) for words, text in NEURONS],
-    (
-        "node odd (Greater): compares two values that both vary",
-        layer(f"{RESET}; sum = Add(k, current); odd = Greater(sum, u0); c = Cast(odd); u0_new = Add(sum, c); {FIRE}"),
-    ),
     ("node u0_new (Add): takes the membrane of u0 as a state, and no", layer(GOOD, outputs=["s0_new"])),
     (
         "node u0_new (Add): 2 inputs are no state of a neuron: x (4), y",
         layer(f"both = Add(current, y); {GOOD.replace('k, current', 'k, both')}", inputs=[*INPUTS, ("y", [1, 3])]),
     ),
     (
-        "node u0_new (Add): is compared in several ways, which is no",
-        layer(f"{GOOD}; two = Greater(u0_new, one); more = Cast(two)", outputs=["s0_new", "u0_new", "more"]),
-    ),
-    (
         "node current (Gemm): keeps no membrane from step to step, so",
         layer("hot = Greater(current, theta); s0_new = Cast(hot)", inputs=INPUTS[:1], outputs=["s0_new"]),
     ),
-    (
-        "outputs u0_new, also: none counts the spikes",
-        layer(f"{STATELESS}; also = Neg(s0_new)", inputs=INPUTS[:2], outputs=["u0_new", "also"]),
-    ),
     ("holds no spiking layer: no membrane is compared with a", model(STAGE, INPUTS[:1], ["current"])),
     ("layer layer1: keeps 1.5 of its membrane in a step, allowed", layer(GOOD, beta=np.array(1.5, np.float32))),
-    ("layer layer1: has the threshold -0.5, allowed are", layer(GOOD, theta=np.array(-0.5, np.float32))),
     ("node u0_new (Add): has coefficients that are not finite", layer(GOOD, w=np.full((4, 3), np.nan, np.float32))),
     ("node end0 (Scan): runs backwards in time", scanned(scan_input_directions=[1])),
     # files
     ("holds no graph, so it is not an ONNX file", b""),
     ("is not an ONNX file, or is truncated", b"PK\x03\x04 not at all"),
     ("no such file", None),
-    ("operators of version 99, allowed are", changed(lambda _, m: setattr(m.opset_import[0], "version", 99))),
     ("too small for the declared shape", changed(lambda w, _: w.dims.__setitem__(0, 2 * 10**12))),
-    ("tensor w: cannot be read", changed(lambda w, _: w.dims.__setitem__(0, 2))),
     ("tensor w: has element type 16", changed(lambda w, _: setattr(w, "data_type", TensorProto.BFLOAT16))),
     ("makes 1000000000000 values or", layer(GOOD, inputs=[("x", [10**6, 10**6]), *STATE_IN[:2]])),
     ("input x: has an open size 'taxels', allowed", layer(GOOD, inputs=[("x", [1, "taxels"]), *STATE_IN[:2]])),
@@ -189,7 +164,6 @@ def beside(location, **more):
         ("../secret.bin", {}, "'../secret.bin'"),
         ("/etc/passwd", {}, "'/etc/passwd'"),
         ("link.bin", {}, "symbolic link"),
-        ("gone.bin", {}, "'gone.bin'"),
         ("few.bin", {"length": 48}, "exceeds available data (8 bytes"),
         ("large.bin", {}, "more than 10000 bytes, the limit of a network"),
         ("few.bin", {}, "raw_data size (8 bytes) is too small"),
@@ -213,18 +187,6 @@ def test_data_beside_the_file_that_is_right(tmp_path):
     found, whole = (read_onnx(tmp_path / name) for name in ("net.onnx", "whole.onnx"))
     assert np.array_equal(found.network.projections[0].weight.toarray(), whole.network.projections[0].weight.toarray())
     assert found.sha256 != whole.sha256
-
-
-@pytest.mark.parametrize(
-    ("words", "line"),
-    [
-        (["--beta", "0.3"], "--beta: is for checkpoints, the ONNX file net.onnx holds all"),
-        (["--polarities", "0"], "--polarities 0: allowed are numbers from 1"),
-        (["--polarities", "3"], "the input [1, 4] is no whole number of taxels with 3"),
-    ],
-)
-def test_options(refusal, words, line):
-    assert line in refusal(two_layers(), *words)
 
 
 class Drifting(torch.nn.Module):
@@ -256,7 +218,7 @@ def outcome(path, content):
     return ("node" if ": node " in said else "other") if said else "read"
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.integers(0, 2**64 - 1), st.binary(max_size=200))
 def test_fuzzed_files(tmp_path, seed, content):
     outcome(tmp_path / "net.onnx", faulty(seed))
@@ -268,3 +230,96 @@ def test_the_fuzzer_reaches_far(tmp_path):
     found = Counter(outcome(tmp_path / "net.onnx", faulty(seed)) for seed in range(200))
     assert min(found[kind] for kind in ("read", "node", "other")) > 10, found
     assert faulty(7) == faulty(7)
+
+
+OPERATORS = sorted({schema.name for schema in defs.get_all_schemas()})
+NUMBERS = (-(2**63), -(2**31), -100, -2, -1, 0, 1, 2, 3, 4, 7, 100, 2**20, 2**31, 2**40, 2**63 - 1)
+
+
+@cache
+def sources():
+    """Good files of every form."""
+    made = [two_layers(spelling) for spelling in ("product", "where", "truth", "after")]
+    made += [one_step(NETS[name](), example_of(name)) for name in ("mlp", "tag", "grid", "gcn")]
+    return (*made, scanned(), looped())
+
+
+def _graphs(graph):
+    yield graph
+    for each in graph.node:
+        for attribute in each.attribute:
+            if attribute.type == AttributeProto.GRAPH:
+                yield from _graphs(attribute.g)
+
+
+def _changed_attribute(node, rng):
+    attribute = rng.choice(node.attribute)
+    attribute.i = rng.choice(NUMBERS)
+    attribute.f = rng.choice((0.0, float("nan"), float("inf"), -1e30))
+    if attribute.ints:
+        attribute.ints[rng.randrange(len(attribute.ints))] = rng.choice(NUMBERS)
+
+
+def _new_attribute(node, rng):
+    attribute = node.attribute.add()
+    attribute.name = rng.choice(("axis", "axes", "perm", "to", "group", "pads", "kernel_shape", "reduction", "body"))
+    attribute.type = rng.randrange(15)
+    attribute.i = rng.choice(NUMBERS)
+    attribute.ints.extend(rng.choices(NUMBERS, k=rng.randrange(4)))
+
+
+def _elsewhere(tensor, rng):
+    tensor.data_location = 1
+    entry = tensor.external_data.add()
+    entry.key, entry.value = "location", rng.choice(("../x", "/etc/passwd", "net.onnx", "none", "", "a\0b", "."))
+
+
+def _change(graph, rng):
+    """One fault in a graph, if it has what the fault needs."""
+    node = rng.choice(graph.node) if graph.node else None
+    tensor = rng.choice(graph.initializer) if graph.initializer else None
+    value = rng.choice(graph.input).type.tensor_type if graph.input else None
+    names = [name for node in graph.node for name in node.output]
+    names += [one.name for one in (*graph.initializer, *graph.input)]
+
+    def replaced(items, *others):
+        items[rng.randrange(len(items))] = rng.choice(others)
+
+    faults = [
+        (node, lambda: setattr(node, "op_type", rng.choice(OPERATORS))),
+        (node and node.input, lambda: replaced(node.input, *names, "", "nothing")),
+        (node and node.output, lambda: replaced(node.output, *names, "new")),
+        (node, lambda: graph.node.remove(node)),
+        (node, lambda: graph.node.add().CopyFrom(node)),
+        (node and node.attribute, lambda: _changed_attribute(node, rng)),
+        (node, lambda: _new_attribute(node, rng)),
+        (node and node.attribute, lambda: setattr(rng.choice(node.attribute), "type", rng.randrange(15))),
+        (tensor, lambda: setattr(tensor, "data_type", rng.randrange(24))),
+        (tensor and tensor.dims, lambda: replaced(tensor.dims, *NUMBERS)),
+        (tensor and tensor.raw_data, lambda: setattr(tensor, "raw_data", changed_bytes(tensor.raw_data, rng))),
+        (tensor, lambda: _elsewhere(tensor, rng)),
+        (value and value.shape.dim, lambda: setattr(rng.choice(value.shape.dim), "dim_value", rng.choice(NUMBERS))),
+        (graph.output, lambda: setattr(rng.choice(graph.output), "name", rng.choice([*names, "nothing"]))),
+        (tensor and node, lambda: node.input.append(tensor.name)),
+    ]
+    possible, fault = rng.choice(faults)
+    if possible:
+        fault()
+
+
+def changed_structure(content, rng):
+    """A few faults in a file that can still be parsed."""
+    model = ModelProto.FromString(content)
+    for _ in range(rng.choice((1, 1, 1, 2, 4))):
+        _change(rng.choice(list(_graphs(model.graph))), rng)
+    if rng.random() < 0.02 and model.opset_import:
+        model.opset_import[0].version = rng.choice(NUMBERS)
+    return model.SerializeToString()
+
+
+def faulty(seed):
+    """A file for a seed."""
+    rng = random.Random(seed)
+    content = rng.choice(sources())
+    content = changed_structure(content, rng) if rng.random() < 0.8 else content
+    return changed_bytes(content, rng) if rng.random() < 0.25 else content

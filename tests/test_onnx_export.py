@@ -1,8 +1,6 @@
 """The ONNX files: what is in them, that they are the same every time, and the command that writes them."""
 
-import hashlib
 import json
-from dataclasses import replace
 
 import numpy as np
 import onnx
@@ -10,20 +8,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
-from made_files import TAXELS, events, own_file, ring, small_checkpoint
+from made_files import events, small_checkpoint
 from onnx.reference import ReferenceEvaluator
-from random_netlists import Axon, Neuron, build, large_netlist
-from test_export import run
+from random_netlists import Axon, Neuron, build
 from test_onnx_engine import three_neurons
 
-from spikeloom.compiler import __version__
-from spikeloom.compiler.errors import FormatError, ModelError, OptionError
-from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.formats.onnx import writer as onnx_writer
 from spikeloom.compiler.formats.onnx import writer_float as onnx_float
-from spikeloom.compiler.formats.onnx.builder import port_words
 from spikeloom.compiler.formats.onnx.writer_layers import digits, plan
-from spikeloom.compiler.targets.loihi1.netlist_file import netlist_bytes, write_netlist
 from spikeloom.models.networks.reference import float_spikes
 from spikeloom.runtime.machines.loihi1 import engine, onnx_engine
 
@@ -112,43 +104,6 @@ def test_the_text_of_a_step(golden):
     golden("onnx_step.txt", "\n".join(lines_of(model_of(content).graph)) + "\n")
 
 
-def test_metadata_tell_where_a_file_comes_from():
-    # the chip lacks neuron 1 of the first layer
-    netlist = replace(three_neurons(), neuron=read_only([0, 2, 0]))
-    netlist = replace(netlist, layers=(replace(netlist.layers[0], neurons=3), netlist.layers[1]))
-    model = model_of(onnx_writer.export(netlist, "step"))
-    facts = {entry.key: entry.value for entry in model.metadata_props}
-    assert json.loads(facts.pop("layers")) == [
-        {"name": "layer0", "depth": 0, "neurons": 3, "held": [0, 2], "kind": "int32"},
-        {"name": "layer1", "depth": 1, "neurons": 1, "held": [0], "kind": "int32"},
-    ]
-    assert facts == {
-        "form": "step",
-        "input": "2 taxels x 1 polarities; channel = taxel * 1 + polarity; 0 or 1",
-        "max_depth": "1",
-        "netlist_sha256": hashlib.sha256(netlist_bytes(netlist)).hexdigest(),
-        "version": __version__,
-    }
-    assert (model.producer_name, model.producer_version) == ("spikeloom", __version__)
-    assert "LAYER.membrane" in model.doc_string
-
-
-@pytest.mark.parametrize("proved", [True, False])
-def test_every_name_is_documented(proved):
-    netlist = replace(large_netlist(3, proved=proved), readout_class=read_only(np.arange(300) % 2), classes=2)
-    for form in FORMS:
-        inputs, outputs = port_words(onnx_writer.export(netlist, form))
-        for words in inputs + outputs:
-            name = words.split(" ")[0].removesuffix("_next")
-            shown = name if "." not in name else f"LAYER.{name.split('.')[1]}"
-            assert f"``{shown}``" in onnx_writer.__doc__
-        assert any(words.startswith("overflow bool") for words in outputs) != proved
-        kept = {words.split(" ")[0] for words in inputs}
-        assert {name for name in kept if name.endswith(".current")} == (
-            {"layer1.current", "layer3.current"} if form == "step" else set()
-        )
-
-
 def test_the_reference_of_the_format_computes_the_same():
     netlist = three_neurons()
     given = np.random.default_rng(2).integers(0, 2, (2, 2, 12), np.uint8)
@@ -195,47 +150,4 @@ def test_the_float_graph_is_the_float_model(tmp_path):
     np.testing.assert_array_equal(found["class"], found["votes"].argmax(axis=1))
 
 
-@pytest.mark.parametrize("form", FORMS)
-def test_the_float_graph_has_no_lists_of_edges(tmp_path, form):
-    checkpoint, adjacency = small_checkpoint(tmp_path)
-    content = onnx_float.export_float(checkpoint, adjacency, form, graph_name="ring")
-    assert content == onnx_float.export_float(checkpoint, adjacency, form, graph_name="ring")
-    model = model_of(content)
-    assert not {node.op_type for node in model.graph.node} & {"Gather", "GatherND", "ScatterND", "ScatterElements"}
-    facts = {entry.key: entry.value for entry in model.metadata_props}
-    assert (facts["graph"], facts["checkpoint_sha256"], facts["beta"]) == ("ring", checkpoint.sha256, "0.2")
-
-
 # -- the command -------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("form", FORMS)
-def test_the_command(tmp_path, form):
-    write_netlist(three_neurons(), tmp_path / "net.loom")
-    path = tmp_path / "net.onnx"
-    report, text = run(tmp_path / "net.loom", "--to", "onnx", "--form", form, "-o", path)
-    content = onnx_writer.export(three_neurons(), form)
-    inputs, outputs = port_words(content)
-    assert path.read_bytes() == content
-    assert (report["neurons"], report["synapses"], report["form"]) == (3, 6, form)
-    assert (report["inputs"], report["outputs"]) == (inputs, outputs)
-    assert inputs[0] == {"step": "events uint8 (batch, 2)", "scan": "events uint8 (time, batch, 2)"}[form]
-    assert text.splitlines()[0].endswith(f"3 neurons and 6 synapses for onnx, {len(content)} bytes, form {form}")
-    assert text.splitlines()[1:3] == ["inputs:", f"  {inputs[0]}"]
-
-
-def test_the_command_and_the_kinds_of_files(tmp_path):
-    net, netlist, out = tmp_path / "net.pt", tmp_path / "net.loom", tmp_path / "x.onnx"
-    own_file(net)
-    write_netlist(three_neurons(), netlist)
-    report, _ = run(net, "--to", "onnx-float", "-o", out)
-    assert (report["neurons"], report["graph"]) == (TAXELS * 5 + 9 + 8 + 4, ring().name)
-    assert report["inputs"] == ["events uint8 (time, batch, 12)"]
-    model_of(out.read_bytes())
-    for error, words, command in (
-        (FormatError, "not a netlist", (net, "--to", "onnx", "-o", out)),
-        (ModelError, r"net\.loom: ", (netlist, "--to", "onnx-float", "-o", out)),
-        (OptionError, "is an input of this command", (netlist, "--to", "onnx", "-o", netlist)),
-    ):
-        with pytest.raises(error, match=words):
-            run(*command)

@@ -63,27 +63,29 @@ def test_a_layer_is_split_at_1024_compartments(neurons, cores):
     assert len(parts.cores) == parts.bound == cores
 
 
-def test_a_layer_is_split_by_synaptic_memory():
-    """128 neurons of fan-in 2496 need 44,928 words; chunks of 46 still fit in 16,384."""
-    parts = partition(integer_chain(np.full((128, 2496), 2)), LOIHI)
-    # up to 46 neurons cost 6 words a list (46 * 8 + 10 = 378 bits), 47 cost 7
-    assert sizes(parts) == [[(0, 0, 46)], [(0, 46, 92)], [(0, 92, 128)]]
-    assert parts.bound == 3
+def with_thresholds(count):
+    """Twenty neurons of so many thresholds."""
+    return integer_chain(np.full((20, 1), 2), thresholds=[[*range(1, count + 1), *[1] * (20 - count)]])
 
 
-def test_a_layer_is_split_by_thresholds():
-    """Nine thresholds are one too many for a core."""
-    weights = np.full((20, 1), 2)
-    eight, nine = ([list(range(1, n + 1)) + [1] * (20 - n)] for n in (8, 9))
-    assert sizes(partition(integer_chain(weights, thresholds=eight), LOIHI)) == [[(0, 0, 20)]]
-    assert sizes(partition(integer_chain(weights, thresholds=nine), LOIHI)) == [[(0, 0, 8)], [(0, 8, 20)]]
-
-
-def test_a_layer_is_split_by_output_axons():
-    """Each neuron feeds three cores, a core may have seven output axons."""
-    network = integer_chain(np.full((4, 1), 2), np.full((9, 4), 2))
-    target = small_target(core_axons_out=7, core_compartments=3)
-    assert sizes(partition(network, target)) == [[(0, 0, 2)], [(0, 2, 4)], [(1, 0, 3)], [(1, 3, 6)], [(1, 6, 9)]]
+@pytest.mark.parametrize(
+    ("network", "target", "cores"),
+    [
+        # 128 neurons of fan-in 2496 need 44,928 words; up to 46 cost 6 words a list (46 * 8 + 10 bits), 47 cost 7
+        (integer_chain(np.full((128, 2496), 2)), LOIHI, [[(0, 0, 46)], [(0, 46, 92)], [(0, 92, 128)]]),
+        # nine thresholds are one too many for a core
+        (with_thresholds(8), LOIHI, [[(0, 0, 20)]]),
+        (with_thresholds(9), LOIHI, [[(0, 0, 8)], [(0, 8, 20)]]),
+        # each neuron feeds three cores, a core may have seven output axons
+        (
+            integer_chain(np.full((4, 1), 2), np.full((9, 4), 2)),
+            small_target(core_axons_out=7, core_compartments=3),
+            [[(0, 0, 2)], [(0, 2, 4)], [(1, 0, 3)], [(1, 3, 6)], [(1, 6, 9)]],
+        ),
+    ],
+)
+def test_a_layer_is_split_by_memory_thresholds_and_output_axons(network, target, cores):
+    assert sizes(partition(network, target)) == cores
 
 
 def fan_in_of_formats(exponents):
@@ -205,14 +207,6 @@ def test_an_illegal_netlist_is_refused_with_every_violation():
         where = "chip" if rule == "chip.cores" else "core 0 (fc1, fc2)"
         assert line == f"{where}: {amount} used, {amount - 1} allowed (loihi1.{rule}); {REMEDIES[rule]}"
     assert [violation.rule for violation in caught.value.violations] == [f"loihi1.{rule}" for rule in used]
-
-
-def test_the_core_that_breaks_a_rule_is_named():
-    """The first of three cores, whose second holds a layer of its own."""
-    network = integer_chain(np.full((4, 3), 2), np.full((2, 4), 2), np.full((2, 2), 2))
-    netlist = compiled(network, small_target(core_compartments=4))
-    words = "core 0 (fc1): 4 used, 3 allowed (loihi1.core.compartments)|core 1 (fc2, fc3): 4 used"
-    refused(CapacityError, words, require_legal, netlist, small_target(core_compartments=3))
 
 
 def test_a_dense_list_that_starts_too_high_is_refused():

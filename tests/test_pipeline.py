@@ -4,12 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from oracles import comparable, refused
-from random_networks import assert_same_layers, random_checkpoint, ring
+from oracles import comparable
+from random_networks import random_checkpoint, ring
 
 from spikeloom.compiler import Options, compile_network, targets
-from spikeloom.compiler.errors import OptionError, VerifyError
-from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
+from spikeloom.compiler.errors import VerifyError
 from spikeloom.compiler.interpret import channels_last, run_integer
 from spikeloom.compiler.passes.expand import Factored, expand
 from spikeloom.compiler.pipeline import run
@@ -20,7 +19,6 @@ from spikeloom.compiler.targets.loihi1.netlist import one_step_bounds
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist, write_netlist
 from spikeloom.compiler.targets.loihi1.passes import start
 from spikeloom.compiler.text import text
-from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.trace import aligned
 
@@ -134,27 +132,6 @@ def test_a_third_chip_is_a_folder(tmp_path):
         )
 
 
-@pytest.mark.parametrize("options", [{"cores_for": {"conv1": 3, "fc2": 2}}, {"optimize": "latency"}])
-def test_a_layout_changes_no_spike(options):
-    events = grasps(seed=9)
-    usual = compile_network(expand(random_checkpoint(seed=4), ring(5)), Options(training_events=grasps()))
-    done = compile_network(expand(random_checkpoint(seed=4), ring(5)), Options(training_events=grasps(), **options))
-    assert done.usual.parts.cores == usual.layout.parts.cores
-    assert done.usual.expected == usual.layout.expected
-    assert done.netlist.n_cores == len(done.layout.parts.cores) > usual.netlist.n_cores
-    assert tuple(done.netlist.core_tile) == done.layout.placement.tiles
-    batch = events.reshape(len(events), -1, events.shape[-1])
-    traces = [(c.netlist, engine.simulate(c.netlist, batch, spikes=True).spikes) for c in (usual, done)]
-    assert_same_layers(*([aligned(netlist, spikes, layer) for layer in range(4)] for netlist, spikes in traces))
-
-
-def test_what_is_left_out_is_not_counted_among_the_neurons_of_a_layer():
-    network = expand(random_checkpoint(seed=4), ring(5))
-    held = np.count_nonzero(compile_network(network, Options(cores_for={"conv1": 2})).netlist.layer == 0)
-    words = f"--cores-for conv1={held + 1}|{held} neurons on the chip|{held} or fewer"
-    refused(OptionError, words, compile_network, network, Options(cores_for={"conv1": held + 1}))
-
-
 def test_the_proof_covers_the_netlist():
     """Bounds of the network and of the netlist are counted in two places and agree."""
     done = compile_network(expand(random_checkpoint(seed=2), ring(5)))
@@ -162,14 +139,3 @@ def test_the_proof_covers_the_netlist():
     for layer, proof in enumerate(done.proofs):
         ids = done.netlist.compartments_of(layer)
         assert proof.accumulator == 64 * max(positive[ids].max(), negative[ids].max())
-
-
-@pytest.mark.recordings
-def test_without_calibration_nothing_of_the_released_network_is_clipped(released_checkpoint):
-    graph = build_graph("manual")
-    adjacency = normalised_adjacency(graph.edges, graph.n_taxels)
-    done = compile_network(expand(read_checkpoint(released_checkpoint), adjacency))
-    assert done.placement.bound == done.placement.spike_hops
-    assert done.core_bound <= done.netlist.n_cores <= 9
-    assert all(choice.clipped == 0 for choice in done.choices)
-    assert 0 <= done.choices[1].headroom < 0.05, "at 8 bits the proof costs fc1 some percent of its scale"

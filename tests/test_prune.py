@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_files import events, small_checkpoint
@@ -12,18 +11,14 @@ from random_networks import (
     chain,
     float_networks,
     integer_networks,
-    random_checkpoint,
     recordings_for,
 )
 
-from spikeloom.compiler import Options, compile_network, lift
+from spikeloom.compiler import Options, compile_network
 from spikeloom.compiler.interpret import channels_last, run_float, run_integer
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.passes.prune import compact, disconnect, either, never_fires, removable, removals
-from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist, write_netlist
 from spikeloom.runtime.equivalence.verify import verify
-from spikeloom.runtime.machines.loihi1 import engine, spec
-from spikeloom.runtime.machines.loihi1.trace import aligned
 
 
 @settings(deadline=None, max_examples=40)
@@ -81,28 +76,6 @@ def test_what_is_left_out_is_counted():
     assert counted(none) == [("fc1", 1, 1, 0, 4), ("fc2", 0, 0, 0, 2)]
     assert counted(second) == [("fc1", 1, 0, 1, 4), ("fc2", 0, 0, 0, 2)]
     assert counted(first | second) == [("fc1", 0, 0, 2, 4), ("fc2", 0, 0, 0, 2)]
-
-
-@pytest.mark.parametrize("seed", range(2))
-def test_a_pruned_netlist_decides_as_the_whole_one(tmp_path, seed):
-    checkpoint, recordings = random_checkpoint(seed=seed), events(seed, taxels=5)
-    flat = recordings.reshape(len(recordings), -1, recordings.shape[3])
-    pruned, whole = (compile_network(expand(checkpoint, np.eye(5)), Options(keep_all=keep)) for keep in (False, True))
-    assert sum(r.silent + r.unread for r in whole.removals) == 0
-    left = sum(layer.neurons for layer in pruned.netlist.layers) - pruned.netlist.n_compartments
-    assert left == sum(r.silent + r.unread + r.never_fired for r in pruned.removals)
-    write_netlist(pruned.netlist, tmp_path / "net.loom")
-    netlist = read_netlist(tmp_path / "net.loom")
-    trace = engine.simulate(netlist, flat, spikes=True, membranes=True)
-    for index, recording in enumerate(flat):
-        slow = spec.simulate(netlist, recording)
-        np.testing.assert_array_equal(slow.spikes, trace.spikes[index])
-        np.testing.assert_array_equal(slow.membranes, trace.membranes[index])
-    expected = run_integer(lift(netlist), channels_last(recordings)).spikes
-    for layer in range(len(netlist.layers)):
-        found = aligned(netlist, trace.spikes, layer)
-        assert found.shape[2] == netlist.layers[layer].neurons
-        np.testing.assert_array_equal(found, expected[layer])
 
 
 def test_unread_neurons_are_not_compared(tmp_path):

@@ -1,45 +1,35 @@
 """Recurrent layers, from the float network to the chip, its commands and other programs."""
 
-import json
 from dataclasses import replace
 
-import nir
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from made_nir import affine, cuba, graph_with, lif, lowered
 from numpy.testing import assert_array_equal
-from random_netlists import SIMULATORS, assert_equal
 from random_networks import (
     LOIHI,
     chain,
     compiled,
     integer_chain,
-    integer_networks,
-    recordings_for,
     small_target,
     stored,
 )
-from test_sanafe import compare as with_sanafe
 from test_sanafe import interpreter  # noqa: F401
-from zoo import specimen
 
 from spikeloom.compiler import Options, Packing, compile_network, lift
-from spikeloom.compiler.errors import CapacityError, NumericRangeError
-from spikeloom.compiler.formats.netx.reader import read_netx
+from spikeloom.compiler.errors import CapacityError
 from spikeloom.compiler.interpret import channels_last, run_float, run_integer
-from spikeloom.compiler.ir import INPUT, IntegerProjection, Projection, recurrent
+from spikeloom.compiler.ir import IntegerProjection, Projection, recurrent
 from spikeloom.compiler.passes.calibrate import calibrate
 from spikeloom.compiler.passes.prune import never_fires, removable
 from spikeloom.compiler.targets.loihi1.emit import emit
 from spikeloom.compiler.targets.loihi1.layout.partition import partition
 from spikeloom.compiler.targets.loihi1.legalize import require_legal
 from spikeloom.compiler.targets.loihi1.storage.choose_storage import choose_storage
-from spikeloom.runtime.cli import main
 from spikeloom.runtime.equivalence.certain_spikes import certain_spikes
 from spikeloom.runtime.machines.loihi1 import engine
-from spikeloom.runtime.machines.loihi1.costs import cost
 from spikeloom.runtime.machines.loihi1.trace import aligned
 
 SETTINGS = settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -77,30 +67,6 @@ def test_what_is_fired_in_a_step_arrives_in_the_next():
     for steps in (run_float(network, events), run_integer(choose_storage(network, LOIHI)[0], events)):
         assert steps.spikes[0][0].astype(int).tolist() == [[1, 0, 1], [0, 1, 1], [0, 1, 0], [1, 1, 0]]
         assert_array_equal(steps.spikes[1], steps.spikes[0])
-
-
-@SETTINGS
-@given(st.data())
-def test_specification_engines_and_integers_are_the_same(data):
-    network = data.draw(integer_networks(exponents=(-1, 0)))
-    assume(recurrent(network))
-    events = data.draw(recordings_for(network.input.size, samples=1))
-    netlist = compiled(network)
-    traces = []
-    for simulate in SIMULATORS:
-        try:
-            traces.append(simulate(netlist, events[0].T.astype(np.uint8)))
-        except NumericRangeError as error:
-            traces.append(str(error))
-    if isinstance(traces[0], str):
-        assert len(set(traces)) == 1
-        return
-    for trace in traces[1:]:
-        assert_equal(traces[0], trace)
-    ours = run_integer(network, events, membranes=True)
-    for layer in range(len(netlist.layers)):
-        assert_array_equal(ours.spikes[layer][0], aligned(netlist, traces[0].spikes[None], layer)[0])
-        assert_array_equal(ours.membranes[layer][0], aligned(netlist, traces[0].membranes[None], layer)[0])
 
 
 @SETTINGS
@@ -228,55 +194,7 @@ def test_what_is_certain_is_so_in_float32_and_in_another_order(seed, alpha, gain
             assert_array_equal(run[layer][~doubt], certain[~doubt])
 
 
-def test_operations_count_what_a_layer_sends_itself():
-    network, events = drawn(11), events_for(12, samples=3)
-    netlist = compile_network(network, Options(keep_all=True)).netlist
-    flat = events.reshape(3, 10, -1)
-    trace = engine.simulate(netlist, flat, spikes=True)
-    fired = np.concatenate([flat.sum(axis=2), trace.counts.spikes], axis=1)
-    expected = fired[:, netlist.axon_source] @ np.diff(netlist.axon_synapses)
-    own = np.isin(netlist.axon_source, 10 + netlist.compartments_of(0))
-    own &= np.isin(netlist.core_of_axon(), netlist.core_of_compartment()[netlist.compartments_of(0)])
-    assert np.diff(netlist.axon_synapses)[own].sum() >= 140
-    found = cost.estimate(cost.prepare(netlist, LOIHI), trace.counts, 50)
-    assert_array_equal(found.synaptic_operations.sum(axis=1), expected)
-
-
-def test_sanafe_runs_it_too(interpreter, tmp_path):  # noqa: F811
-    # a core each: two lists of one neuron on a core are one packet there
-    netlist = compile_network(drawn(13), Options(cores_for={"fc1": 1, "fc2": 1})).netlist
-    for run in with_sanafe(interpreter, netlist, events_for(14, samples=2).reshape(2, 10, -1), tmp_path):
-        assert run.spikes.sum() > 100
-        assert_array_equal(run.spikes, run.expected_spikes)
-        np.testing.assert_allclose(run.ours_simple, run.simple, rtol=1e-9)
-        assert run.ours_energy == pytest.approx(run.energy, rel=1e-9)
-
-
 # -- commands ----------------------------------------------------------------------------------------------------------
-
-
-def test_commands_know_the_loop(capsys, tmp_path):
-    made = specimen("recurrent")
-
-    def said(*words, code=0):
-        capsys.readouterr()
-        assert main([str(word) for word in words]) == code
-        return "".join(capsys.readouterr())
-
-    layer = json.loads(said("inspect", made.netlist, "--json"))["layers"][0]
-    assert 0 < layer["synapses_from_itself"] <= 2 * 144
-    assert "from itself" in said("inspect", made.netlist).splitlines()[1]
-    said("export", made.netlist, "--to", "nir", "-o", tmp_path / "out.nir")
-    assert {("b", "b_to_b"), ("b_to_b", "b")} <= set(nir.read(tmp_path / "out.nir").edges)
-    said("compile", made.network, *made.reading, "-o", tmp_path / "eight.loom")
-    said("export", tmp_path / "eight.loom", "--to", "netx", "-o", tmp_path / "net.net")
-    found = read_netx(tmp_path / "net.net").network
-    assert [(p.pre, p.post) for p in found.projections] == [(INPUT, 0), (0, 0), (0, 1)]
-    words = ("compile", made.network, *made.reading, "--target", "truenorth", "-o", tmp_path / "x.loom")
-    refusal = said(*words, code=2)
-    assert "b, all 12 neurons" in refusal
-    assert "truenorth.neuron.leak" in refusal
-    assert not (tmp_path / "x.loom").exists()
 
 
 def test_currents_biases_and_loops_together():

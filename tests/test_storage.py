@@ -163,7 +163,7 @@ def test_the_finest_scales_are_legal_and_hardly_more_is(bits, exponents):
     assert abs(units[0] - finest.min()) <= max(1, units[0] // SCALE_STEPS)
 
 
-@settings(deadline=None, max_examples=10)
+@settings(deadline=None, max_examples=6)
 @given(float_networks(), st.sampled_from(BITS), st.integers(1, 3), st.integers(1, 8), st.booleans(), st.data())
 def test_every_recipe_gives_a_proven_legal_network(network, bits, planes, groups, calibrated, data):
     calibration = calibrate(network, data.draw(recordings_for(network.input.size))) if calibrated else None
@@ -176,21 +176,6 @@ def test_every_recipe_gives_a_proven_legal_network(network, bits, planes, groups
         assert 1 <= choice.planes <= planes
         assert choice.scale <= choice.finest_scale
         np.testing.assert_allclose(population.realised_theta, population.theta, rtol=1e-15)
-
-
-def test_planes_and_groups_keep_more_spikes_and_layers_may_differ():
-    network, calibration = uneven_layer()
-    steps = [Packing(bits=4), Packing(bits=4, groups=8), Packing(bits=4, planes=2), Packing(bits=4, planes=2, groups=8)]
-    one, grouped, two, both = (
-        moved(choose_storage(network, LOIHI, packings=(packing,), calibration=calibration)[0], calibration)
-        for packing in steps
-    )
-    assert both <= grouped < one
-    assert both <= two < one
-    several = chain(np.eye(3) * 0.6, np.eye(3) * 0.6)
-    integer, choices = choose_storage(several, LOIHI, packings=(Packing(bits=8), Packing(bits=2, planes=2)))
-    assert [choice.bits for choice in choices] == [8, 2]
-    assert {(p.post, p.bits) for p in integer.projections} == {(0, 8), (1, 2)}
 
 
 # --- compensation
@@ -214,10 +199,9 @@ def test_each_error_is_made_up_for_as_well_as_the_inputs_to_come_can():
     assert np.any(expected != np.rint(weight))
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_errors_cancel_on_the_recordings(seed):
+def test_errors_cancel_on_the_recordings():
     """Correlated inputs: the summed error of the membrane is smaller than with each weight at its nearest."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     network = chain(rng.normal(0, 0.1, (16, 48)))
     cause = rng.random((6, 60, 12)) < 0.25
     calibration = calibrate(network, np.repeat(cause, 4, axis=2) & (rng.random((6, 60, 48)) < 0.9))
@@ -260,9 +244,8 @@ def two_layers(seed, *, samples=40, outlier=0.0):
     return network, calibrate(network, rng.random((samples, 30, 30)) < 0.2)
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_a_network_without_outliers_becomes_exact(seed):
-    network, calibration = two_layers(seed, samples=33)
+def test_a_network_without_outliers_becomes_exact():
+    network, calibration = two_layers(0, samples=33)
     plain, _ = choose_storage(network, LOIHI, packings=(Packing(bits=4),), calibration=calibration)
     assert moved(plain, calibration) > 0
     integer, choices, found = make_exact(network, LOIHI, calibration)

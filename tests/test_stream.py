@@ -1,8 +1,5 @@
 """A live stream is a run of the whole recording, bit for bit, chip step by chip step; and its own promises."""
 
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import FrozenInstanceError
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -44,7 +41,7 @@ def assert_is_run(netlist: Netlist, steps: list[Step], events: np.ndarray) -> No
     assert [step.decision for step in steps] == votes.argmax(axis=1).tolist()
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=25, deadline=None, derandomize=True)
 @given(st.data())
 def test_any_network(data):
     netlist = voting(data.draw(netlists(weight_exponents=(-1, 0, 0, 3))), data.draw(st.integers(1, 3)))
@@ -63,30 +60,6 @@ def test_any_network(data):
         assert str(caught.value) == expected
         with pytest.raises(DataError):
             stream.step(events[:, 0] * 0)
-
-
-def test_reset_forgets_everything():
-    netlist = lively()
-    stream = open_stream(netlist)
-    for length in (0, 7, 30):
-        for column in events_of(netlist, 2, length).T:
-            stream.step(column)
-        if length == 7:
-            stream.finish()
-        stream.reset()
-        assert stream.index == 0
-        events = events_of(netlist, 3)
-        assert_is_run(netlist, play(stream, events), events)
-        stream.reset()
-
-
-def test_streams_in_threads_share_nothing():
-    netlist = lively()
-    prepared = engine.prepare(netlist, stepwise=True)
-    batch = [events_of(netlist, seed, 60) for seed in range(8)]
-    with ThreadPoolExecutor(4) as pool:
-        for events, steps in zip(batch, pool.map(lambda e: play(open_stream(prepared), e), batch), strict=True):
-            assert_is_run(netlist, steps, events)
 
 
 FORMS = {
@@ -119,16 +92,6 @@ def test_forms_of_events(form):
 def test_decision_and_margin(counts, decision, margin):
     step = Step(index=0, spikes=(), counts=np.array(counts))
     assert (step.decision, step.margin) == (decision, margin)
-
-
-def test_steps_cannot_be_changed():
-    step = open_stream(lively()).step(np.ones(20, np.uint8))
-    with pytest.raises(FrozenInstanceError):
-        step.index = 3
-    with pytest.raises(ValueError, match="read-only"):
-        step.counts[0] = 3
-    with pytest.raises(ValueError, match="read-only"):
-        step.spikes[1][0] = True
 
 
 def test_a_network_without_lag_is_final_at_once():

@@ -6,7 +6,6 @@ from oracles import refused
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.targets import price_tables
 from spikeloom.compiler.targets.base import (
-    COMPARTMENTS,
     CROSSBARS,
     known_targets,
     load_target,
@@ -89,19 +88,6 @@ def test_known_targets_are_the_folders():
     assert known_targets(CROSSBARS) == ("truenorth",)
 
 
-@pytest.mark.parametrize(
-    ("name", "cores", "words"),
-    [
-        ("loihi2", None, "not modelled|allowed: loihi1, truenorth"),
-        ("truenorth", COMPARTMENTS, "crossbars|compartments|allowed: loihi1"),
-        ("../loihi1", None, "unknown|allowed: loihi1, truenorth"),
-        ("", None, "unknown|allowed: loihi1, truenorth"),
-    ],
-)
-def test_a_target_that_does_not_exist(name, cores, words):
-    refused(OptionError, f"--target {name}: |{words}", load_target, name, cores)
-
-
 # -- files that are wrong ----------------------------------------------------------------------------------------------
 
 TEXT = (resources.files("spikeloom.compiler.targets") / "loihi1" / "chip.toml").read_text("utf-8")
@@ -118,23 +104,15 @@ def faults(path, text) -> list[str]:
 
 WRONG = [
     ('title = "Intel Loihi 1"', "title = 1", ["title: is 1, a text"]),
-    ('title = "Intel Loihi 1"', 'title = "x"\ncolour = "green"', ["unknown key 'colour'"]),
     ("core.axons_in = { value = 4096,", "core.axons_in = { value = -1,", ["core.axons_in: value is -1, a finite"]),
-    ("core.axons_in = { value = 4096,", "core.axons_in = { unt = 2, value = 4096,", ["core.axons_in: is {'unt': 2"]),
     ("mesh.height = { value = 4,", "mesh.heigth = { value = 4,", ["mesh.height: is missing", "mesh.heigth: unknown"]),
     ("mesh.height = { value = 4,", "mesh.height = { value = 4.5,", ["mesh.height: value is 4.5, a whole number"]),
-    ("mesh.height = { value = 4,", "mesh.height = { value = nan,", ["mesh.height: value is nan, a finite"]),
-    ("synapse.word_bits = { value = 64,", "synapse.word_bits = {", ["synapse.word_bits: is {'unit'"]),
     ("values = [2, 3, 4, 5, 6, 8]", 'values = [2, "3"]', ["synapse.weight_bits: values are [2, '3']"]),
     ('spike = { value = 69.3, unit = "pJ"', 'spkie = { value = 69.3, unit = "pJ"', ["sanafe.spkie: unknown, allowed"]),
     ('spike = { value = 69.3, unit = "pJ"', 'spike = { value = 69, unit = "nJ"', ["spike: unit is 'nJ', allowed is"]),
     ('spike = { value = 69.3, unit = "pJ"', 'spike = { value = inf, unit = "pJ"', ["sanafe.spike: value is inf"]),
-    ('spike = { value = 69.3, unit = "pJ"', 'spike = { value = 1, unit = " "', ["spike: unit and source are ' '"]),
-    ("neuron_access = {", "neuron_acess = {", ["neuron_access: is missing", "neuron_acess: unknown"]),
     ("axon_out = { value = 5.1,", "axon_out = { value = 5.10001,", ["axon_out: value is 5.10001, a multiple of 0.001"]),
-    ("link_buffer = { value = 16,", "link_buffer = { value = 1.5,", ["link_buffer: value is 1.5, a whole number"]),
     ("barrier.1 = {", "barrier.0 = {", ["barrier.1: is missing", "barrier.0: unknown"]),
-    ("barrier.2 = {", "barrier.two = {", ["barrier.two: unknown"]),
     ('value = 104.4, unit = "mW"', 'value = 104.4, unit = "W"', ["static.frady2020: unit is 'W', allowed is 'mW'"]),
 ]
 
@@ -150,9 +128,9 @@ def test_a_wrong_entry_is_named(tmp_path, old, new, expected):
 
 def test_all_faults_are_named_at_once(tmp_path):
     text = TEXT
-    for old, new, _ in (WRONG[1], WRONG[4], WRONG[8], WRONG[9]):
+    for old, new, _ in WRONG[1:3]:
         text = text.replace(old, new)
-    assert len(faults(tmp_path / "x.toml", text)) == 5
+    assert len(faults(tmp_path / "x.toml", text)) == 3
 
 
 def test_a_file_without_its_parts(tmp_path):

@@ -1,6 +1,5 @@
 """The training loop: the released protocol, repeatable to the byte."""
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -19,7 +18,7 @@ from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.recordings.grasps import synthetic_grasps
 from spikeloom.models.training.evaluate import evaluate
 from spikeloom.models.training.protocols import state_files, train_both, validation_split
-from spikeloom.models.training.recipes import DECAY_EPOCHS, RELEASED, Recipe
+from spikeloom.models.training.recipes import RELEASED, Recipe
 from spikeloom.models.training.record import training_record
 from spikeloom.models.training.train import Epoch, train
 
@@ -109,15 +108,6 @@ def test_another_decay_is_an_option_that_a_state_remembers(tmp_path):
     assert "belongs to a training with other recipe; " in str(refused.value)
 
 
-def test_a_shorter_training_is_the_beginning_of_a_longer_one():
-    recipe = replace(RELEASED, decay_epochs=1)  # so that the rate falls within both
-    short, long = (
-        train(grasps(0), grasps(1), ADJACENCY, SMALL, epochs=n, seed=5, recipe=recipe).history for n in (3, 5)
-    )
-    assert long[:3] == short
-    assert RELEASED.decay_epochs == DECAY_EPOCHS
-
-
 def test_best_weights_are_those_of_the_first_epoch_with_the_most_right(monkeypatch):
     right = iter([2, 5, 5, 3])
     kept = []
@@ -136,13 +126,6 @@ def test_best_weights_are_those_of_the_first_epoch_with_the_most_right(monkeypat
     assert (trained.best["fc1.weight"] != trained.last["fc1.weight"]).any()
 
 
-def test_it_learns_the_synthetic_grasps():
-    trained = train(grasps(0, per_class=10, steps=60), grasps(1, per_class=5, steps=60), ADJACENCY, SMALL, epochs=10)
-    first, last = trained.history[0], trained.history[-1]
-    assert last.training_loss < 0.8 * first.training_loss
-    assert trained.history[trained.best_epoch - 1].correct >= 12  # of 30; 5 by chance
-
-
 def test_evaluation_counts_the_lowest_of_equal_classes_and_averages_over_recordings():
     silent = SpikingNet(SMALL, ADJACENCY)
     with torch.no_grad():
@@ -153,7 +136,6 @@ def test_evaluation_counts_the_lowest_of_equal_classes_and_averages_over_recordi
     assert loss == pytest.approx(1 / SMALL.classes)
 
 
-NEVER = replace(RELEASED, decay_epochs=0)
 FIVE = synthetic_grasps(coordinates=np.random.default_rng(0).random((5, 2)), per_class=1, steps=10, seed=0)
 
 
@@ -161,9 +143,7 @@ FIVE = synthetic_grasps(coordinates=np.random.default_rng(0).random((5, 2)), per
     ("test", "architecture", "options", "error", "words"),
     [
         (grasps(1), SMALL, {"epochs": 0}, OptionError, "--epochs 0: allowed are 1 or more"),
-        (grasps(1), SMALL, {"seed": -1}, OptionError, "--seed -1: allowed are 0 or more"),
         (grasps(1), SMALL, {"device": "tpu"}, OptionError, "--device tpu: unknown; allowed: cpu, cuda"),
-        (grasps(1), SMALL, {"recipe": NEVER}, OptionError, "--decay-epochs 0: allowed are 1 or more"),
         (FIVE, SMALL, {}, DataError, "split 'synthetic': 5 taxels and 2 polarities, the network has 39 and 2"),
         (grasps(1), replace(SMALL, classes=5), {}, DataError, "label 5, the network has 5 classes (0..4)"),
     ],
@@ -174,41 +154,24 @@ def test_what_cannot_be_trained(test, architecture, options, error, words):
     assert words in str(refused.value)
 
 
-@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
-def test_a_gpu_that_is_absent_is_refused():
-    with pytest.raises(OptionError, match="--device cuda: this machine has no usable GPU; omit --device"):
-        train(grasps(0), grasps(1), ADJACENCY, SMALL, epochs=1, device="cuda")
-
-
-def test_history_can_be_stored_as_json():
-    reported = train_both(grasps(0), grasps(1), ADJACENCY, SMALL, epochs=1, seed=0)
-    record = training_record(reported, grasps(0), grasps(1), command="spikeloom train", seed=0).to_json()
-    assert json.loads(json.dumps(record, allow_nan=False)) == record
-    assert record["last"]["correct"] == reported.trained.history[-1].correct
-
-
 class KilledError(Exception):
     """Stands in for a kill between two epochs."""
 
 
-def killer(epoch: int):
-    def stop(done: Epoch) -> None:
-        if done.epoch == epoch:
-            raise KilledError
-
-    return stop
+def killed(done: Epoch) -> None:
+    if done.epoch == 3:
+        raise KilledError
 
 
 def same(a: object, b: object) -> bool:
     return all(np.array_equal(a[name], b[name]) for name in a) and set(a) == set(b)
 
 
-@pytest.mark.parametrize("epoch", [1, 3])
-def test_a_killed_training_resumes_to_the_same_weights(tmp_path, epoch):
+def test_a_killed_training_resumes_to_the_same_weights(tmp_path):
     training, test, state = grasps(0), grasps(1), tmp_path / "x.state"
     whole = train(training, test, ADJACENCY, SMALL, epochs=4, seed=2, keep_epoch=2)
     with pytest.raises(KilledError):
-        train(training, test, ADJACENCY, SMALL, epochs=4, seed=2, keep_epoch=2, state=state, after_epoch=killer(epoch))
+        train(training, test, ADJACENCY, SMALL, epochs=4, seed=2, keep_epoch=2, state=state, after_epoch=killed)
     resumed = train(training, test, ADJACENCY, SMALL, epochs=4, seed=2, keep_epoch=2, state=state, resume=True)
     assert same(resumed.last, whole.last)
     assert same(resumed.best, whole.best)
@@ -237,7 +200,6 @@ def with_header(header: str) -> Callable[[bytes], bytes]:
     [
         lambda content: content[:-100],
         with_header("[" * 9000),
-        with_header('{"options": 1, "progress": {}}'),
         with_header("[]"),
     ],
 )
@@ -262,23 +224,6 @@ def test_a_loss_that_is_no_number_stops_and_keeps_the_state(tmp_path, monkeypatc
         "epoch 1, step 2: the loss is nan, a finite number is needed; the state of the epoch before is kept"
     )
     assert state.read_bytes() == kept
-
-
-def test_a_weight_that_is_no_number_shows_in_the_gradient(monkeypatch):
-    """No spike comes of it, so that the loss alone would hide it."""
-    made = SpikingNet.__init__
-
-    def broken(self, *arguments, **options):
-        made(self, *arguments, **options)
-        with torch.no_grad():
-            self.fc1.weight[0, 0] = float("nan")
-
-    monkeypatch.setattr(SpikingNet, "__init__", broken)
-    with pytest.raises(DataError) as stopped:
-        train(grasps(0), grasps(1), ADJACENCY, SMALL, epochs=1)
-    assert str(stopped.value) == (
-        "epoch 1, step 1: the gradient is nan, a finite number is needed; the state of the epoch before is kept"
-    )
 
 
 def test_the_clean_epoch_is_chosen_without_the_test_split(tmp_path):

@@ -80,32 +80,6 @@ def test_a_network_for_truenorth_has_a_point_for_each_window(spikeloom, place):
         assert point["test"]["step_s"] == {"tick": pytest.approx(1e-3)}
 
 
-def test_a_chart_of_truenorth_alone_chooses_there(spikeloom, place):
-    words = ("chart", NATIVE, "unknown.pt", "--data", "data", "--jobs", "1", "-o", "alone")
-    code, _, err = spikeloom(*words, "--table", "marginal", "--budget", "latency=20ms")
-    assert (code, err) == (0, "")
-    report = json.loads((place / "alone" / "chart.json").read_text())
-    assert report["chosen_by"] == {"energy": "marginal", "time": "tick"}
-    assert report["recommended"]["best"] is not None
-    assert report["saving"] is None
-    assert report["budget"]["fits"]
-    assert report["expected"].startswith("accuracy on the training split")
-    assert {point["window"] for point in report["points"]} == {25, 50, 75, 100}
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (("--grid", "bits=4"), ["--grid bits: is for loihi1, networks for truenorth"]),
-        (("--table", "sanafe"), ["--table sanafe", "all_in or marginal"]),
-    ],
-)
-def test_axes_of_loihi_are_refused_where_there_is_nothing_for_loihi(spikeloom, words, said):
-    code, _, err = spikeloom("chart", NATIVE, "--data", "data", *words, "-o", "no")
-    assert code == 2
-    assert all(word in err for word in said)
-
-
 @pytest.mark.parametrize("command", ["run n.loom", "estimate n.loom", f"verify n.loom --checkpoint {NATIVE}"])
 def test_a_part_of_every_recording(spikeloom, command):
     assert spikeloom("compile", NATIVE, "--target", "truenorth", "-o", "n.loom")[0] == 0

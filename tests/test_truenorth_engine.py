@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_crossbars import CHIP, alone, assert_same, both, crossbars, events, recording_of, relays
 
-from spikeloom.compiler.errors import DataError, NumericRangeError
 from spikeloom.compiler.targets.truenorth.builder import Draft, Neuron, history_free
 from spikeloom.compiler.targets.truenorth.legalize import faults
 from spikeloom.compiler.targets.truenorth.netlist import RESET_LINEAR, RESET_NONE, RESET_TO
@@ -160,19 +159,3 @@ def test_random_thresholds_depend_on_the_seed_alone():
     assert runs[0] == runs[1] != runs[2]
     # eta is uniform in 0 … 7: of the resting values 3, 6, 9 … the first reached spikes with 4/8, the second 7/8
     assert 200 < runs[0] < 330
-
-
-def test_a_network_at_rest_does_nothing_and_loses_nothing():
-    netlist = large()
-    trace = engine.simulate(netlist, np.zeros((1, 78, 40), np.uint8), membranes=True)
-    assert trace.counts.spikes.sum() == 0
-    assert not trace.membranes.any()
-
-
-def test_recordings_of_another_sensor_or_too_long():
-    netlist = relays().netlist(taxels=1, polarities=1, classes=1, bin_ticks=2**20)
-    for simulate, shape in ((engine.simulate, (1, 2, 3)), (spec.simulate, (2, 3))):
-        with pytest.raises(DataError, match=r"2 input channels, the network has 1"):
-            simulate(netlist, np.zeros(shape, np.uint8))
-    with pytest.raises(NumericRangeError, match="2048 data steps take 2147483648 ticks, 2147483647 can"):
-        engine.simulate(netlist, np.zeros((1, 1, 2**11), np.uint8))

@@ -1,6 +1,5 @@
 """Networks on crossbar cores, whole numbers and sums that travel in time: every spike is the model's."""
 
-import json
 from dataclasses import replace
 from itertools import pairwise
 
@@ -8,7 +7,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from made_files import CLASSES, own_file, recordings_folder, weights
 from random_crossbars import (
     CHIP,
     assert_same,
@@ -113,14 +111,6 @@ def test_a_neuron_is_there_once_for_each_axon_that_it_reaches():
     assert set(count["fc1"]) == set(count["conv1"]) == {4}
     assert netlist.n_cores == 2 + 2 + 2
     assert len(find_twins(netlist, 32).first_neuron) == 100 + 120 + 300
-
-
-def test_places_fill_a_square_and_the_chip_is_not_left():
-    netlist = lower(random_network(1, blocks=4, hidden=(8, 4)), CHIP)
-    assert netlist.n_cores == 13
-    assert netlist.core_x.max() == 3
-    places = list(zip(netlist.core_y, netlist.core_x, strict=True))
-    assert sorted(places) == places
 
 
 def test_networks_beyond_the_chip():
@@ -280,65 +270,4 @@ def test_shorter_recordings_count_for_their_own_length():
     assert part.votes.sum() > 0
 
 
-@pytest.mark.parametrize(
-    ("network", "copies", "chip", "used"),
-    [
-        (forgetful(0, 252 * 60, 1), 2, with_limit("core.axons", 100), r"fc1, a neuron: 726 used, 100 .* 315 groups"),
-        (forgetful(0, 300, 200, 4), 3, with_limit("chip.cores", 2), r"used, 2 allowed .*chip\.cores.* fewer features"),
-    ],
-    ids=["axons", "cores"],
-)
-def test_what_does_not_fit(network, copies, chip, used):
-    with pytest.raises(CapacityError, match=used):
-        lower_in_time(in_levels(network, copies, chip), chip)
-
-
 # -- the commands ------------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def place(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("in_time")
-    own_file(folder / "free.pt", beta=0.0)
-    own_file(folder / "other.pt", beta=0.0, theta=0.6)
-    own_file(folder / "keeps.pt")
-    own_file(folder / "wide.pt", beta=0.0, last=weights(features=60, sizes=(9, CLASSES)))
-    recordings_folder(folder / "data")
-    return folder
-
-
-COMPILE = "compile free.pt --target truenorth --in-time 3 -o free.loom"
-
-
-def test_what_verify_says_of_sums(spikeloom):
-    code, out, _ = spikeloom(*COMPILE.replace("free", "wide").split(), "--json")
-    made = json.loads(out)
-    assert (code, made["ticks_per_step"], made["provenance"]["in_time"]) == (0, BIN_TICKS, 3)
-    words = "verify wide.loom --checkpoint wide.pt --data data --spec-samples 1"
-    assert json.loads(spikeloom(*words.split(), "--json")[1])["spec_steps"] == 5
-    code, out, _ = spikeloom(*words.split())
-    lines = out.splitlines()
-    assert code == 0
-    assert lines[0].startswith("E0 specification = engine: equal in every spike on 1 recording (the first 5 steps of")
-    (head,) = (at for at, line in enumerate(lines) if line.split()[:3] == ["layer", "partial", "sums"])
-    assert lines[head + 1].split()[0] == "fc1"
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (COMPILE.replace("3", "5"), "--in-time 5: allowed are 2, 3, 4"),
-        (f"{COMPILE} --calibrate data", "--calibrate data: is not for truenorth"),
-        ("compile free.pt --in-time 3 -o x.loom", "--in-time 3: loihi1 has no such option"),
-        (COMPILE.replace("free.pt", "keeps.pt"), "keeps.pt: conv1: keeps 0.2 of its membranes a step"),
-        (
-            "verify free.loom --checkpoint other.pt --data data",
-            "--checkpoint other.pt: free.loom was compiled from another file",
-        ),
-    ],
-)
-def test_mistakes(spikeloom, words, said):
-    assert spikeloom(*COMPILE.split())[0] == 0
-    code, out, err = spikeloom(*words.split())
-    assert (code, out) == (2, "")
-    assert err.startswith(f"spikeloom: {said}")

@@ -106,10 +106,6 @@ def test_what_ranc_has_not(changes, what):
         list(ranc.export(small(**changes)))
 
 
-def test_saturation_that_is_a_reset_is_written():
-    assert ranc.unsupported(small(negative_saturates=True, reset=2)) == []
-
-
 def test_the_command(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     draft = alone(Neuron(), channels=0)

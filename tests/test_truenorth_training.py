@@ -258,23 +258,16 @@ VERIFY = "verify net.loom --data data --checkpoint"
     ("words", "said"),
     [
         (f"{SYNTHETIC} --recipe timed -o z.pt", "--recipe timed: "),
-        (f"{SYNTHETIC} --current-decay fc1=0.9 -o z.pt", "--current-decay fc1=0.9: "),
-        (f"{SYNTHETIC} --spike-penalty 0.5 -o z.pt", "--spike-penalty 0.5: "),
         ("train --data synthetic --graph manual --copies 2 -o z.pt", "--copies 2: is for"),
         ("compile net.pt -o z.loom", "--target loihi1: net.pt was trained for TrueNorth"),
         ("compile net.pt --target truenorth --planes 2 -o z.loom", "--planes 2: is not for"),
-        ("compile net.pt --target truenorth --in-time 2 -o z.loom", "--in-time 2: "),
         ("inspect net.pt --beta 0.3", "--beta 0.3: net.pt is a network for TrueNorth and says that itself"),
         ("export net.pt --to onnx-float -o x.onnx", "net.pt: is a network trained for TrueNorth"),
         (f"{VERIFY} net.pt --require E3=1", "--require E3=1: a network for TrueNorth has one model"),
-        (f"{VERIFY} net.pt --weights best", "--weights best: the file holds last"),
         (f"{VERIFY} two.pt", "--checkpoint two.pt: net.loom was compiled from another file"),
         ("verify two.loom --data data --checkpoint two.pt", "--weights last: two.loom was compiled from best"),
         ("join net.pt own.pt -o z.pt", "net.pt: holds whole numbers of a chip"),
         ("compile own.pt --target truenorth -o z.loom", "conv1, all 30 neurons: keep 0.2 of their membranes a step"),
-        ("compile own.pt --target truenorth -o z.loom", "--in-time N"),
-        ("compile own.pt --target truenorth -o z.loom", "spikeloom train --system tactilesgnet-truenorth"),
-        ("compile own.pt --target truenorth --weight-bits 4 -o z.loom", "--weight-bits 4: is not for truenorth"),
     ],
 )
 @pytest.mark.usefixtures("native")
@@ -293,19 +286,3 @@ def test_a_spike_that_differs_fails(capsys):
     report = json.loads(capsys.readouterr().out)
     assert report["E1"]["differences"] > 0
     assert not report["exact"]
-
-
-@pytest.mark.usefixtures("native")
-def test_what_is_printed(capsys, golden):
-    record = {"command": "by hand", "test_samples": 18, "last": {"epoch": 1, "correct": 3, "accuracy": 1 / 6}}
-    network = random_network(4, taxels=TAXELS, classes=CLASSES)
-    write_trained("made.pt", {"last": network}, graph="none", edges=np.zeros((0, 2), np.int64), training=record)
-    printed = []
-    for words in (
-        "inspect made.pt",
-        "compile made.pt --target truenorth -o made.loom",
-        "verify made.loom --checkpoint made.pt --data data --spec-samples 1",
-    ):
-        assert main(words.split()) == 0
-        printed.append(f"$ spikeloom {words}\n{capsys.readouterr().out}")
-    golden("truenorth_native.txt", "\n".join(printed))

@@ -5,12 +5,9 @@ import pytest
 from random_networks import LOIHI, chain, random_checkpoint, small_target
 
 from spikeloom.compiler import Options, Packing, compile_network
-from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.interpret import cut, run_float, run_integer, vote
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.loihi1.legalize import measure
-from spikeloom.compiler.targets.loihi1.storage import width_search
-from spikeloom.compiler.targets.loihi1.storage.choose_storage import shortlist
 from spikeloom.compiler.targets.loihi1.storage.width_search import WidthPoint, search_widths, widths_front
 
 WIDTHS = (2, 4, 8)
@@ -93,15 +90,6 @@ def test_recordings_count_up_to_their_own_length():
         assert point.equal == np.count_nonzero(decided == wanted)
 
 
-def test_without_labels_agreement_alone_counts():
-    _, network, events, labels = drawn(7)
-    labels[3] = -1
-    found = search_widths(network, LOIHI, channels(events), labels, widths=(4, 8))
-    assert found.float_right is None
-    assert {point.right for point in (*found.points, *found.built)} == {None}
-    assert found.built
-
-
 def test_memory_is_counted_list_by_list():
     network = chain(np.full((70, 3), 0.3), np.full((2, 70), 0.1))
     events = np.random.default_rng(0).random((8, 20, 3)) < 0.4
@@ -119,23 +107,6 @@ def test_what_does_not_fit_the_chip_is_not_built():
     )
     assert [point.bits for point in found.points] == [(8,), (2,)]
     assert [point.bits for point in found.built] == [(2,)]
-
-
-def test_a_width_without_a_scale_is_left_out_for_its_layer(monkeypatch):
-    _, network, events, labels = drawn(8)
-
-    def no_two(layer, packing, *rest):
-        if packing.bits == 2 or layer.post == unusable:
-            raise ModelError(f"layer {layer.post}: no scale at {packing.bits} bits")
-        return shortlist(layer, packing, *rest)
-
-    unusable = None
-    monkeypatch.setattr(width_search, "shortlist", no_two)
-    found = search_widths(network, LOIHI, channels(events), labels, widths=(2, 8))
-    assert [point.bits for point in found.points] == [(8, 8, 8, 8)]
-    unusable = 1
-    with pytest.raises(ModelError, match=r"^layer 1: no scale at 8 bits$"):
-        search_widths(network, LOIHI, channels(events), labels, widths=(2, 8))
 
 
 def test_a_front_rises_with_memory():
