@@ -115,8 +115,6 @@ def assert_same(one, other) -> None:
 
 
 # -- networks of whole numbers, before they are placed -----------------------------------------------------------------
-
-
 def random_stage(rng, name, inputs, size, depth, *, copies, clocks) -> Stage:
     blocks, width = inputs.shape
     most = highest_level(copies)

@@ -83,12 +83,7 @@ def assert_kernels_agree(netlist: Netlist, events: np.ndarray) -> None:
         np.testing.assert_array_equal(unpack(found.packed[0], netlist.n_compartments), expected.spikes, strict=True)
 
 
-SHAPES = (
-    ((3,),),
-    ((64,), (65,)),
-    ((70, 5), (1,), (130,)),
-    ((20,), (2, 3, 4), (6,)),
-)
+SHAPES = (((3,),), ((64,), (65,)), ((70, 5), (1,), (130,)), ((20,), (2, 3, 4), (6,)))
 
 
 @REPEATABLE
@@ -163,8 +158,6 @@ def test_events_of_any_type_and_layout(stepwise):
 
 
 # --- the ends of the ranges -------------------------------------------------------------------------------------------
-
-
 def one_neuron(weights: list[int], **neuron) -> Netlist:
     axons = [Axon(source=i, targets=((0, weight),), exponent=0) for i, weight in enumerate(weights)]
     return build([Neuron(**neuron)], axons, n_inputs=len(weights), depths=[0])

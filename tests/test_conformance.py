@@ -64,8 +64,6 @@ def require_keys(what, found):
 
 
 # --- the chip -------------------------------------------------------------------------------------------------------
-
-
 @over(LAYERED)
 def test_every_kernel_is_the_specification(name):
     made = specimen(name)
@@ -139,8 +137,6 @@ def test_streams_give_the_votes_of_whole_recordings(name):
 
 
 # --- files ----------------------------------------------------------------------------------------------------------
-
-
 @over(MAKERS)
 def test_a_file_holds_the_netlist_to_the_byte(name):
     made = specimen(name)
@@ -162,8 +158,6 @@ def test_compiled_again_the_bytes_are_the_same(name, tmp_path, capsys):
 
 
 # --- costs ----------------------------------------------------------------------------------------------------------
-
-
 @over(LAYERED)
 def test_costs_are_those_counted_spike_by_spike(name):
     made = specimen(name)
@@ -189,8 +183,6 @@ def test_costs_of_crossbars_are_those_counted_tick_by_tick(name):
 
 
 # --- the float side -------------------------------------------------------------------------------------------------
-
-
 @over(CHECKPOINTS)
 def test_the_expanded_network_is_the_float_model(name):
     made = specimen(name)
@@ -220,8 +212,6 @@ def test_the_float_engine_is_the_float_model(name):
 
 
 # --- commands -------------------------------------------------------------------------------------------------------
-
-
 @over((*FLOAT, *CROSSBARS))
 def test_verify_holds_every_network_to_its_file(name, capsys):
     made = specimen(name)

@@ -68,18 +68,6 @@ def neurons_step_by_step(drive, bias, alpha, beta, theta, surrogate):
 # --- one layer -----------------------------------------------------------------------------------------------------
 
 
-def test_a_current_outlasts_its_step_and_the_bias_goes_past_it():
-    drive = torch.tensor([1.0, 0.0, 0.0, 2.0], dtype=torch.float64)
-    assert lasting_current(drive, 0.5).tolist() == [1.0, 0.5, 0.25, 2.125]
-    network = SpikingNet(SMALL, ADJACENCY)
-    with torch.no_grad():
-        network.fc1.weight.zero_()
-        network.fc1.bias.fill_(0.25)
-    _, membranes = network.layers(torch.zeros(3, 1, 39, 2))["fc1"]
-    # 0.25, 0.25 * 0.3 + 0.25 …: were the bias part of the current, the second would be far above
-    assert_allclose(membranes[:, 0, 0].detach(), [0.25, 0.325, 0.3475], rtol=1e-6)
-
-
 @pytest.mark.parametrize(
     "surrogate", [RECTANGLE, SIGMOID, replace(SIGMOID, reset=True), replace(RECTANGLE, reset=False)]
 )
@@ -122,8 +110,6 @@ def test_currents_in_torch_operations_equal_the_kernel(backwards):
 
 
 # --- clocks --------------------------------------------------------------------------------------------------------
-
-
 def test_a_clock_ticks_in_every_step_of_its_part_and_none_after_the_last():
     assert clocks_over(8, 250) == Clocks(channels=8, steps=32)
     assert clocks_over(0, 250) == NO_CLOCKS
@@ -143,8 +129,6 @@ def test_recordings_get_the_clocks_after_their_own_channels():
 
 
 # --- the whole network ---------------------------------------------------------------------------------------------
-
-
 def network_step_by_step(network, events, surrogate):
     """The network of the docs in plain autograd code; spikes of the last layer."""
     sizes = network.architecture
@@ -203,8 +187,6 @@ def test_recordings_that_were_filled_up_count_as_long_as_they_are():
 
 
 # --- files ---------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("system", ["tactilesgnet", "gcn", "mlp", "grid-cnn"])
 def test_a_checkpoint_holds_the_dynamics_and_its_float_model_is_the_network(tmp_path, system):
     network, seen = written(tmp_path / "x.pt", system)
@@ -243,8 +225,6 @@ def test_what_a_file_cannot_have_is_refused(tmp_path):
 
 
 # --- recipes -------------------------------------------------------------------------------------------------------
-
-
 def test_the_released_recipe_is_the_released_code():
     assert RECIPES == {"released": RELEASED, "timed": TIMED}
     assert RELEASED == Recipe(

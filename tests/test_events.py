@@ -57,17 +57,6 @@ def one(path, **options):
     return np.argwhere(recordings.events[0]).tolist(), counts
 
 
-# One recording
-
-
-def test_events_fall_into_bins(write):
-    found, counts = one(write("a.csv", f"{HEADER}0,0,0\n0.0199,1,1\n0.02,1,0\n0.0999,0,1\n"))
-    assert found == [[0, 0, 0], [0, 1, 4], [1, 0, 1], [1, 1, 0]]
-    assert counts.steps == (5,)
-    found, counts = one(write("a.csv", f"{HEADER}0,0,0\n0.0199,1,1\n0.02,1,0\n0.0999,0,1\n"), bin_s=0.05)
-    assert found == [[0, 0, 0], [0, 1, 1], [1, 0, 0], [1, 1, 0]]
-
-
 @pytest.mark.parametrize("bin_s", ["0.02", "0.001", "0.1", "0.03", "0.7", "1"])
 def test_decimal_times_on_an_edge_begin_their_bin(write, bin_s):
     from decimal import Decimal
@@ -117,8 +106,6 @@ def test_taxels_and_bins_have_limits(write):
 
 
 # Labels
-
-
 @pytest.mark.parametrize(
     ("name", "text", "label"),
     [
@@ -199,8 +186,6 @@ def test_damaged_npz(save, tmp_path):
 
 
 # Folders
-
-
 def test_flat_folders_stand_for_any_split(write, save, tmp_path):
     write("d/b_label_1.csv", "0.1,1,1\n")
     write("d/a_label_0.CSV", "0.5,0,0\n")
@@ -274,8 +259,6 @@ def test_the_released_layout_goes_its_own_way(tmp_path):
 
 
 # Any events
-
-
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_any_recording_survives_as_events(tmp_path, data):
@@ -301,8 +284,6 @@ def test_any_recording_survives_as_events(tmp_path, data):
 
 
 # What recordings hold
-
-
 def test_description():
     grid = np.zeros((2, 5, 2, 10), dtype=np.uint8)
     grid[:, :4, :, ::5] = 1
@@ -333,8 +314,6 @@ def test_hot_taxels_exceed_five_times_the_median_and_silence_is_dead():
 
 
 # Writing
-
-
 def test_writing_is_all_or_nothing(tmp_path, monkeypatch):
     grasps = synthetic_grasps(per_class=1, steps=20, seed=1)
     calls = []
@@ -355,8 +334,6 @@ def test_writing_is_all_or_nothing(tmp_path, monkeypatch):
 
 
 # What is worth a second look
-
-
 def warned(path, **options) -> tuple[str, ...]:
     return load_data(path, **options)[1].notes
 
@@ -401,8 +378,6 @@ def test_taxels_that_count_from_one(write):
 
 
 # A table of labels
-
-
 @pytest.fixture
 def listed(write):
     write("own/a.csv", HEADER + "0,0,1\n")

@@ -111,8 +111,6 @@ def test_a_sparse_graph_expands_as_a_dense_one_does(seed):
 
 
 # --- whole checkpoints
-
-
 def test_a_checkpoint_becomes_a_chain_of_populations():
     network = expand(random_checkpoint(taxels=39, features=64, sizes=(128, 256, 36)), adjacency_of("manual"))
     verify(network)

@@ -109,10 +109,7 @@ def test_a_window_that_opens_late_misses_the_first_steps():
     late = replace(netlist, layers=(netlist.layers[0], replace(netlist.layers[1], depth=netlist.layers[1].depth + 3)))
     inputs = random_inputs(network.input.size, 6)
     first = run_float(network, inputs.transpose(0, 2, 1).astype(bool)).spikes[0]
-    alone = chain(
-        network.projections[1].weight.toarray(),
-        biases=[network.populations[1].bias],
-    )
+    alone = chain(network.projections[1].weight.toarray(), biases=[network.populations[1].bias])
     heard_late = np.zeros_like(first)
     heard_late[:, :-3] = first[:, 3:]
     wanted = run_float(alone, heard_late).spikes[0]

@@ -9,13 +9,7 @@ from oracles import refused
 
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.models import graphs
-from spikeloom.models.graphs import (
-    NEUTOUCH,
-    build_graph,
-    check_coordinates,
-    check_edges,
-    normalised_adjacency,
-)
+from spikeloom.models.graphs import NEUTOUCH, build_graph, check_coordinates, check_edges, normalised_adjacency
 
 NAMES = [
     "manual",
@@ -30,8 +24,6 @@ NAMES = [
 ]
 # A square and its centre: every kind of tie in five taxels.
 SQUARE = np.array([[0, 0], [2, 0], [0, 2], [2, 2], [1, 1]], dtype=float)
-# Decimals whose distances, 0.3 both, differ in the last bit.
-DECIMALS = np.array([[0.4], [0.1], [0.7]])
 
 layouts = st.lists(st.tuples(st.integers(-3, 3), st.integers(-3, 3)), min_size=2, max_size=12, unique=True).map(
     lambda points: np.array(points) * 0.1
@@ -97,33 +89,6 @@ def test_stored_choices_are_between_equal_distances():
     assert {frozenset(pair) for pair in chosen.tolist()} != {frozenset(pair) for pair in by_rule.tolist()}
 
 
-@pytest.mark.parametrize(
-    ("name", "edges"),
-    [
-        ("knn:1", [[0, 4], [1, 4], [2, 4], [3, 4], [4, 0], [4, 1], [4, 2], [4, 3]]),
-        (
-            "released:knn:1",
-            [[0, 4], [1, 4], [2, 4], [3, 4], [4, 0], [4, 0], [4, 1], [4, 2], [4, 3], [0, 4]],
-        ),
-        ("mst:0", [[0, 4], [4, 0], [4, 1], [1, 4], [4, 2], [2, 4], [4, 3], [3, 4]]),
-        ("mst:1.42", [[0, 4], [4, 0], [4, 1], [1, 4], [4, 2], [2, 4], [4, 3], [3, 4]]),
-    ],
-)
-def test_ties_go_to_the_lower_index_on_other_layouts(name, edges):
-    assert build_graph(name, SQUARE).edges.tolist() == edges
-
-
-def test_ties_in_decimals_are_ties():
-    assert abs(0.4 - 0.1) != abs(0.4 - 0.7)
-    assert build_graph("released:knn:1", DECIMALS).edges.tolist() == [[0, 1], [1, 0], [2, 0], [1, 0], [0, 1], [0, 2]]
-
-
-def test_sigma_is_exclusive():
-    assert len(build_graph("mst:2", SQUARE).edges) == 8
-    assert len(build_graph("mst:2.01", SQUARE).edges) == 16
-    assert len(build_graph("released:mst:2.01", SQUARE).edges) == 24
-
-
 @given(layout=layouts, k=st.integers(1, 8))
 def test_neighbours_agree_with_a_plain_search(layout, k):
     n = len(layout)
@@ -159,10 +124,7 @@ def test_trees_agree_with_kruskal(layout, sigma):
     assert edges[1::2] == [row[::-1] for row in edges[::2]]
 
 
-@given(
-    edges=st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), max_size=30),
-    spare=st.integers(0, 3),
-)
+@given(edges=st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), max_size=30), spare=st.integers(0, 3))
 def test_normalisation_agrees_with_its_formula(edges, spare):
     n = 7 + spare
     rows = np.array(edges, dtype=np.int64).reshape(-1, 2)
@@ -178,12 +140,7 @@ def test_normalisation_agrees_with_its_formula(edges, spare):
 
 @pytest.mark.parametrize(
     ("given_name", "canonical"),
-    [
-        ("mst:2.0", "mst:2"),
-        ("mst:-0", "mst:0"),
-        ("knn:03", "knn:3"),
-        ("released:manual", "released:manual"),
-    ],
+    [("mst:2.0", "mst:2"), ("mst:-0", "mst:0"), ("knn:03", "knn:3"), ("released:manual", "released:manual")],
 )
 def test_names_are_canonical(given_name, canonical):
     assert build_graph(given_name).name == canonical

@@ -1,11 +1,9 @@
 import hashlib
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from spikeloom.compiler.errors import OptionError
 from spikeloom.models.graphs import NEUTOUCH
 from spikeloom.models.recordings.grasps import SHAPES, synthetic_grasps
 
@@ -76,21 +74,3 @@ def test_pressing_rises_and_lifting_falls():
     assert falling[75:95].mean() > 5 * rising[75:95].mean()
     assert min(rising[45:60].mean(), falling[45:60].mean()) > 0.05
     assert max(rising[0], falling[0], rising[-1], falling[:10].mean()) < 0.03
-
-
-NAMES = "sphere, cylinder, edge, ring, cone, box"
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"per_class": 0}, "grasps: per_class is 0, allowed are 1 or more; choose another"),
-        ({"seed": -1}, "grasps: seed is -1, allowed are 0 or more; choose another"),
-        ({"classes": ("cube",)}, f"grasps: classes cube; choose from {NAMES}, each once"),
-        ({"classes": ("box", "box")}, f"grasps: classes box, box; choose from {NAMES}, each once"),
-    ],
-)
-def test_bad_options(options, message):
-    with pytest.raises(OptionError) as caught:
-        synthetic_grasps(**{"per_class": 1, "steps": 20, "seed": 0} | options)
-    assert str(caught.value) == message

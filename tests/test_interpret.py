@@ -85,6 +85,17 @@ def test_a_run_is_the_step_by_step_loop(networks, run, slowly, data):
             np.testing.assert_array_equal(activity.membranes[post][sample], membranes[post])
 
 
+@settings(deadline=None, max_examples=5)
+@given(st.data())
+def test_a_recording_runs_the_same_alone_and_in_another_batch(data):
+    network = data.draw(integer_networks())
+    events = data.draw(recordings_for(network.input.size, samples=20, most=4))
+    together = run_integer(network, events).spikes
+    for sample in range(len(events)):
+        alone = run_integer(network, events[sample : sample + 1]).spikes
+        assert all(np.array_equal(a[0], b[sample]) for a, b in zip(alone, together, strict=True))
+
+
 def test_a_tie_at_the_threshold_does_not_spike():
     events = np.ones((1, 1, 2), bool)
     assert run_float(chain([[0.25, 0.25], [0.25, 0.25 + 1e-15]]), events).spikes[0].tolist() == [[[False, True]]]

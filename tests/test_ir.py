@@ -6,14 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from oracles import refused
-from random_networks import (
-    chain,
-    compiled,
-    float_networks,
-    integer_chain,
-    integer_networks,
-    stored,
-)
+from random_networks import chain, compiled, float_networks, integer_chain, integer_networks, stored
 from scipy import sparse
 
 from spikeloom.compiler.errors import VerifyError
@@ -43,8 +36,6 @@ def with_projection(network, index, **changes):
 
 
 # --- rules of both stages
-
-
 @pytest.mark.parametrize("make", [chain, integer_chain])
 def test_a_sound_network_passes(make):
     verify(make([[2, 4, 6], [8, 10, 12]], [[2, 0], [0, 2]]))
@@ -111,8 +102,6 @@ def test_a_float_network_that_breaks_a_rule(change, words):
 
 
 # --- rules of the integer stage
-
-
 @pytest.mark.parametrize(
     ("field", "good", "bad", "words"),
     [
@@ -155,8 +144,6 @@ def test_random_networks_pass(network):
 
 
 # --- structure
-
-
 def test_fan_in_counts_stored_zeros():
     weight = stored([[1.0, 0.0, 2.0], [0.0, 0.0, 0.0]], np.array([[1, 1, 1], [0, 1, 0]]))
     network = with_projection(small(), 0, weight=weight)
@@ -172,8 +159,6 @@ def test_fan_in_counts_a_synapse_once_whatever_its_planes():
 
 
 # --- printed form
-
-
 def test_texts_are_as_recorded(golden):
     golden("float.txt", text(chain([[0.5, -0.25, 0.0]], [[1.0], [-1.0]], biases=[[0.125], [0.0, 0.5]])))
     layers = [[2, -4, 0], [6, 8, 254]], [[2, 4]]

@@ -72,8 +72,6 @@ def netlist_of(network, layout, target=LOIHI):
 
 
 # --- what is expected is what the time model and the energy tables say
-
-
 @settings(deadline=None, max_examples=20)
 @given(st.data())
 def test_expectations_are_the_simple_model_and_the_prices_of_the_same_spikes(data):
@@ -157,8 +155,6 @@ def forecast_of(network, calibration, target=LOIHI):
 
 
 # --- cores asked for
-
-
 def test_cores_asked_for_hold_no_other_layer_unless_that_is_allowed():
     network = integer_chain(np.full((6, 3), 2), np.full((4, 6), 2), np.full((2, 4), 2))
     alone = partition(network, LOIHI, cores_for={0: 2, 1: 2})
@@ -204,8 +200,6 @@ def test_every_partition_is_legal_and_holds_every_neuron_once(network, target, d
 
 
 # --- goals
-
-
 def test_a_busy_layer_gets_more_cores():
     network, calibration = busy([60, 200, 100, 10], rates=[0.5, 0.4, 0.3, 0.1])
     fast, usual = lay_out(network, LOIHI, goal="latency", calibration=calibration)

@@ -56,8 +56,6 @@ def adjacency_of(name="manual"):
 
 
 # --- the recurrence ------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("kind", [torch.float32, torch.float64])
 @given(
     seed=st.integers(0, 2**31),
@@ -78,17 +76,7 @@ def test_spikes_and_membranes_equal_a_step_by_step_loop(kind, seed, steps, neuro
     assert spikes.dtype == membrane.dtype == kind
 
 
-def test_the_threshold_is_strict_and_a_spike_resets_to_zero():
-    spikes, _ = lif(torch.tensor([[0.5], [0.400001]]), 0.2, 0.5)
-    assert spikes[:, 0].tolist() == [0, 1]  # 0.5 is not above 0.5, and goes on as 0.1
-    spikes, membrane = lif(torch.tensor([[0.6], [0.4], [0.43]]), 0.2, 0.5)
-    assert spikes[:, 0].tolist() == [1, 0, 1]
-    assert_allclose(membrane[:, 0], [0.6, 0.4, 0.51], rtol=1e-6)
-
-
 # --- the convolution -----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("graph", ["manual", "released:knn:3", "mst:2"])
 def test_convolution_equals_scattered_edges_and_the_expanded_matrix(graph):
     generator = torch.Generator().manual_seed(3)
@@ -106,8 +94,6 @@ def test_convolution_equals_scattered_edges_and_the_expanded_matrix(graph):
 
 
 # --- the dense layer -----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("rate", [0.0, 0.2, 1.0])
 def test_spike_linear_equals_a_dense_product_and_its_gradient(rate):
     generator = torch.Generator().manual_seed(5)
@@ -150,8 +136,6 @@ def test_initial_weights_follow_the_seed_and_leave_the_global_random_state_alone
 
 
 # --- the reference of a checkpoint ------------------------------------------------------------------------------------
-
-
 def reference_step_by_step(checkpoint, adjacency, recording, dtype):
     """Spikes and membranes of one recording, (steps, neurons) per layer, in plain loops as the equations say."""
     a, theta, beta = adjacency.astype(dtype), dtype(checkpoint.theta), dtype(checkpoint.beta)
@@ -209,8 +193,6 @@ def test_recordings_do_not_influence_each_other(tmp_path):
 
 
 # -- the released checkpoint -------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def released_run(released_checkpoint, objects_zip, shared_dir):
     """Checkpoint, propagation matrix, recordings, float32 spikes and the published outputs."""

@@ -89,8 +89,6 @@ def test_structure(tmp_path, words, layers, more):
 
 
 # --- reading ----------------------------------------------------------------------------------------------------------
-
-
 def lif(weight, bias, spikes, *, u, v, threshold, own=None):
     """A second reading of a block: spikes of (steps, inputs) integers, in plain Python arithmetic."""
     rows = [np.zeros(len(weight), bool)]

@@ -78,10 +78,7 @@ STAGES = [
     (f"node stage (Mul): multiplies x by x, so it {AFFINE}", "stage = Mul(x, x)"),
     ("node stage (Gather): takes indices or sizes from what varies", "stage = Gather(w, current)"),
     ("node odd (Softmax): is computed from constants by an operator", "odd = Softmax(b); stage = Add(current, odd)"),
-    (
-        "node huge (Expand): makes 3000000000000 values or",
-        "huge = Expand(current, big); stage = ReduceSum(huge, axis)",
-    ),
+    ("node huge (Expand): makes 3000000000000 values or", "huge = Expand(current, big); stage = ReduceSum(huge, axis)"),
     ("sorted, however input 'nobody'", "stage = Add(current, nobody)"),
 ]
 NODES = [

@@ -94,16 +94,6 @@ def test_a_run_by_hand():
             assert found.membranes[0, 3].tolist() == [0, 0, 4480]
 
 
-def test_votes_of_several_layers_add_up():
-    netlist = three_neurons()
-    netlist = replace(netlist, readout_class=read_only([1, 0, 1]))
-    events = np.array([[[1, 0, 1, 0], [1, 1, 1, 1]]], np.uint8)
-    expected = engine.simulate(netlist, events).counts.spikes[0]
-    assert expected.min() > 0
-    for form in FORMS:
-        assert by_onnx(netlist, events, form).votes.tolist() == [[expected[1], expected[0] + expected[2]]]
-
-
 @pytest.mark.parametrize(("form", "where"), [("step", "recording 1, chip step 2"), ("scan", "recording 1")])
 def test_a_register_that_overflows(form, where):
     axons = [Axon(source=0, targets=((0, 254),), exponent=7), Axon(source=1, targets=((0, 254),), exponent=7)]
@@ -118,8 +108,6 @@ def test_a_register_that_overflows(form, where):
 
 
 # -- verify ------------------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def verified():
     """Words of a verify command on a small network."""

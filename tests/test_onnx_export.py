@@ -1,7 +1,5 @@
 """The ONNX files: what is in them, that they are the same every time, and the command that writes them."""
 
-import json
-
 import numpy as np
 import onnx
 import pytest
@@ -29,8 +27,6 @@ def model_of(content):
 
 
 # -- digits and widths -------------------------------------------------------------------------------------------------
-
-
 @given(
     arrays.arrays(np.int64, st.tuples(st.integers(1, 4), st.integers(1, 4)), elements=st.integers(-(2**22), 2**22)),
     st.integers(0, 6),
@@ -86,24 +82,6 @@ def test_ranges_that_are_proven_are_not_checked():
 # -- files -------------------------------------------------------------------------------------------------------------
 
 
-def lines_of(graph):
-    """A graph as text; constants as they are."""
-    for side in ("input", "output"):
-        yield f"{side} " + ", ".join(port.name for port in getattr(graph, side))
-    for constant in graph.initializer:
-        array = onnx.numpy_helper.to_array(constant)
-        yield f"{constant.name} = {array.dtype} {json.dumps(array.tolist())}"
-    for node in graph.node:
-        options = sorted(f"{a.name}={onnx.helper.get_attribute_value(a)}" for a in node.attribute)
-        yield f"{', '.join(node.output)} = {node.op_type}({', '.join([*node.input, *options])})"
-
-
-def test_the_text_of_a_step(golden):
-    content = onnx_writer.export(three_neurons(), "step")
-    assert content == onnx_writer.export(three_neurons(), "step")
-    golden("onnx_step.txt", "\n".join(lines_of(model_of(content).graph)) + "\n")
-
-
 def test_the_reference_of_the_format_computes_the_same():
     netlist = three_neurons()
     given = np.random.default_rng(2).integers(0, 2, (2, 2, 12), np.uint8)
@@ -117,8 +95,6 @@ def test_the_reference_of_the_format_computes_the_same():
 
 
 # -- the float network -------------------------------------------------------------------------------------------------
-
-
 def by_name(session, given):
     names = [port.name for port in session.get_outputs()]
     return dict(zip(names, session.run(names, given), strict=True))

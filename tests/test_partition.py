@@ -31,8 +31,6 @@ def sizes(parts):
 
 
 # --- words
-
-
 def test_the_published_size_of_fc1():
     assert 2496 * int(list_words(np.array(128), 8, 0, LOIHI)) == 44_928
     assert 2496 * int(list_words(np.array(43), 8, 0, LOIHI)) == 14_976
@@ -55,8 +53,6 @@ def test_a_sparse_index_is_as_narrow_as_it_can_be(highest, bits):
 
 
 # --- splitting
-
-
 @pytest.mark.parametrize(("neurons", "cores"), [(1024, 1), (1025, 2), (2048, 2), (2496, 3)])
 def test_a_layer_is_split_at_1024_compartments(neurons, cores):
     parts = partition(integer_chain(np.full((neurons, 1), 2)), LOIHI)
@@ -111,8 +107,6 @@ def test_seven_formats_fit_a_core_and_eight_do_not():
 
 
 # --- every limit
-
-
 @settings(deadline=None, max_examples=30)
 @given(integer_networks(), tight_targets())
 def test_every_limit_is_kept(network, target):
@@ -178,8 +172,6 @@ def test_among_equal_packings_the_one_with_least_traffic_is_taken():
 
 
 # --- what does not fit
-
-
 def test_the_neuron_that_breaks_a_rule_most_is_named():
     weights = np.full((4, 9), 2)
     weights[0, 5:] = weights[1, 2:] = weights[3, 7:] = 0

@@ -28,8 +28,6 @@ def grasps(samples=6, *, taxels=5, steps=40, seed=0):
 
 
 # --- a toy
-
-
 def test_the_passes_run_in_order_and_hand_on_what_they_make():
     seen = {}
     source = Factored(checkpoint=random_checkpoint(), propagation=ring(5))

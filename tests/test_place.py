@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_networks import LOIHI, integer_chain, integer_networks, seated, small_target
+from random_networks import LOIHI, integer_networks, seated, small_target
 
 from spikeloom.compiler.targets.loihi1.layout import place as place_module
-from spikeloom.compiler.targets.loihi1.layout.core_needs import Chunk
-from spikeloom.compiler.targets.loihi1.layout.partition import Partition, partition
+from spikeloom.compiler.targets.loihi1.layout.partition import partition
 from spikeloom.compiler.targets.loihi1.layout.place import core_traffic, place, place_within
 
 
@@ -65,16 +64,6 @@ def test_the_optimum_of_small_cases(cores, mesh, seed, kind):
     assert placement.spike_hops == pytest.approx(cost(traffic, placement.tiles, width), abs=1e-12)
     assert max(placement.tiles.count(tile) for tile in placement.tiles) <= tile_cores
     assert set(placement.tiles) <= set(range(width * height))
-
-
-def test_cores_that_talk_share_a_tile():
-    traffic = np.zeros((8, 8))
-    traffic[[0, 1, 2], [5, 5, 6]] = traffic[3, 7] = 1.0
-    placement = place(traffic, LOIHI)
-    assert placement.spike_hops == placement.bound == 0
-    assert placement.tiles[0] == placement.tiles[1] == placement.tiles[5]
-    assert placement.tiles[3] == placement.tiles[7]
-    assert place(np.diag([5.0, 7.0]), LOIHI).spike_hops == 0
 
 
 def test_of_equal_layouts_the_one_with_more_east_west_hops_is_taken():
@@ -158,18 +147,6 @@ def test_a_placement_keeps_to_few_tiles_even_where_more_cost_fewer_hops():
 
 
 # --- traffic
-
-
-def test_traffic_by_hand():
-    """fc1 is split; each half of fc2 hears what has a weight into it."""
-    second = np.array([[2, 0, 2, 0], [0, 0, 4, 0]])
-    network = integer_chain(np.full((4, 3), 2), second)
-    chunks = [Chunk(population=0, first=0, last=2), Chunk(population=0, first=2, last=4)]
-    listeners = [Chunk(population=1, first=0, last=1), Chunk(population=1, first=1, last=2)]
-    parts = Partition(cores=((chunks[0],), (chunks[1], listeners[1]), (listeners[0],)), bound=1)
-    rates = (np.array([0.5, 9.0, 0.25, 9.0]), np.zeros(2))
-    assert core_traffic(network, parts, rates).tolist() == [[0, 0, 0.5], [0, 0.25, 0.25], [0, 0, 0]]
-    assert core_traffic(network, parts, None).tolist() == [[0, 0, 1], [0, 1, 1], [0, 0, 0]]
 
 
 @settings(deadline=None, max_examples=20)

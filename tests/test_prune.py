@@ -6,13 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_files import events, small_checkpoint
-from random_networks import (
-    assert_same_layers,
-    chain,
-    float_networks,
-    integer_networks,
-    recordings_for,
-)
+from random_networks import assert_same_layers, chain, float_networks, integer_networks, recordings_for
 
 from spikeloom.compiler import Options, compile_network
 from spikeloom.compiler.interpret import channels_last, run_float, run_integer

@@ -45,8 +45,6 @@ def one_sided_sums(network, post):
 
 
 # --- registers
-
-
 def test_decays_are_the_nearest_registers():
     assert [decay_registers(beta)[1] for beta in (0.0, 1.0, 0.5, 0.9, 819 / 4096)] == [4095, 0, 2048, 410, 3277]
     population = choose_storage(noisy_layer(), LOIHI)[0].populations[0]
@@ -188,8 +186,6 @@ def test_a_large_bias_takes_the_finest_scale_that_its_register_holds():
 
 
 # --- calibration
-
-
 def candidates(network, calibration, monkeypatch, **options):
     """Integer network of each candidate, by scale and exponent."""
     found = {}
@@ -251,8 +247,6 @@ def test_recordings_are_evenly_spaced(samples, picked):
 
 
 # --- proofs of ranges -------------------------------------------------------------------------------------------------
-
-
 def with_registers(network, **changes):
     return dataclasses.replace(
         network, populations=tuple(dataclasses.replace(p, **changes) for p in network.populations)

@@ -8,14 +8,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from made_nir import affine, cuba, graph_with, lif, lowered
 from numpy.testing import assert_array_equal
-from random_networks import (
-    LOIHI,
-    chain,
-    compiled,
-    integer_chain,
-    small_target,
-    stored,
-)
+from random_networks import LOIHI, chain, compiled, integer_chain, small_target, stored
 from test_sanafe import interpreter  # noqa: F401
 
 from spikeloom.compiler import Options, Packing, compile_network, lift
@@ -28,7 +21,6 @@ from spikeloom.compiler.targets.loihi1.emit import emit
 from spikeloom.compiler.targets.loihi1.layout.partition import partition
 from spikeloom.compiler.targets.loihi1.legalize import require_legal
 from spikeloom.compiler.targets.loihi1.storage.choose_storage import choose_storage
-from spikeloom.runtime.equivalence.certain_spikes import certain_spikes
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.trace import aligned
 
@@ -57,8 +49,6 @@ def events_for(seed, samples=6, steps=50):
 
 
 # -- what it means -----------------------------------------------------------------------------------------------------
-
-
 def test_what_is_fired_in_a_step_arrives_in_the_next():
     """The second neuron keeps itself firing once it is hit; it stops the third a step after each spike."""
     network = chain(np.eye(3), np.eye(3), beta=0.0)
@@ -93,8 +83,6 @@ def test_whole_numbers_without_leak_are_exact_in_floats(seed, hidden):
 
 
 # -- rounding and pruning ----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("alpha", [0.0, 0.5])
 def test_every_spike_of_the_calibration_is_kept_if_asked(alpha):
     network, events = drawn(1, gain=1.5, alpha=alpha), events_for(2)
@@ -149,8 +137,6 @@ def test_neurons_that_only_feed_each_other_are_left_out():
 
 
 # -- cores -------------------------------------------------------------------------------------------------------------
-
-
 def in_pairs(own):
     """Four neurons with one input."""
     integer = integer_chain(np.full((4, 1), 2))
@@ -175,28 +161,7 @@ def test_a_layer_is_cut_so_that_its_axons_to_itself_are_enough():
 # -- proofs and verdicts -----------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=6, deadline=None)
-@given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.5]), st.sampled_from([0.5, 1.5]))
-def test_what_is_certain_is_so_in_float32_and_in_another_order(seed, alpha, gain):
-    network, events = drawn(seed, gain=gain, alpha=alpha), events_for(seed, samples=2)
-    certainty = certain_spikes(network, None, events)
-    turned = np.random.default_rng(seed).permutation(12)
-    first, last, own = (p.weight.toarray() for p in network.projections)
-    other = chain(first[turned], last[:, turned], beta=0.6, biases=[network.populations[0].bias[turned], np.zeros(4)])
-    other = with_loop(replace(other, input=network.input), 0, own[np.ix_(turned, turned)])
-    other = replace(other, populations=(replace(other.populations[0], alpha=alpha), other.populations[1]))
-    runs = [run_float(network, channels_last(events), dtype=dtype).spikes for dtype in (np.float64, np.float32)]
-    hidden, votes = run_float(other, channels_last(events), dtype=np.float32).spikes
-    runs.append((hidden[..., np.argsort(turned)], votes))
-    for layer, (certain, doubt) in enumerate(certainty):
-        assert np.mean(doubt) < 0.5  # some draws rest at their threshold
-        for run in runs:
-            assert_array_equal(run[layer][~doubt], certain[~doubt])
-
-
 # -- commands ----------------------------------------------------------------------------------------------------------
-
-
 def test_currents_biases_and_loops_together():
     """A recurrent CubaLIF, fed back through an Affine: its bias goes through the current, from a channel of its own."""
     rng = np.random.default_rng(16)

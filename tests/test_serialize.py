@@ -85,8 +85,6 @@ def rewrite_manifest(path, **changes):
 
 
 # --- round trip
-
-
 @settings(deadline=None, max_examples=25)
 @given(integer_networks())
 def test_every_netlist_comes_back_whole(tmp_path_factory, network):
@@ -136,8 +134,6 @@ def test_a_netlist_is_told_from_other_files(path, tmp_path):
 
 
 # --- files that are no netlist
-
-
 def unsigned(name, changed):
     def change(path):
         members = archive.read_members(path)
@@ -244,8 +240,6 @@ def test_members_of_another_type(path, change):
 
 
 # --- files that match their hash and are nonsense all the same
-
-
 def lengthened(name):
     return lambda netlist: {name: np.append(getattr(netlist, name), 0)}
 

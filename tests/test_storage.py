@@ -54,8 +54,6 @@ def uneven_layer(seed=0):
 
 
 # --- planes
-
-
 @settings(max_examples=30)
 @given(storages())
 def test_planes_hold_every_step_and_the_coarser_only_what_the_finer_do_not_reach(storage):
@@ -113,8 +111,6 @@ def test_planes_are_stored_where_they_are_used():
 
 
 # --- scales
-
-
 @given(st.lists(st.integers(1, 40), min_size=1, max_size=7), st.integers(1, 4))
 def test_grouping_by_fineness_is_optimal(finest, groups):
     shared = group_by_fineness(np.array(finest), groups)
@@ -179,8 +175,6 @@ def test_every_recipe_gives_a_proven_legal_network(network, bits, planes, groups
 
 
 # --- compensation
-
-
 def test_each_error_is_made_up_for_as_well_as_the_inputs_to_come_can():
     """Input after input, with the least squares of those to come solved anew each time; more than a block of them."""
     rng = np.random.default_rng(3)
@@ -197,22 +191,6 @@ def test_each_error_is_made_up_for_as_well_as_the_inputs_to_come_can():
         left[:, rest] += np.outer(error, np.linalg.solve(damped[np.ix_(rest, rest)], damped[rest, j]))
     np.testing.assert_array_equal(_round_in_turn(weight, together), expected)
     assert np.any(expected != np.rint(weight))
-
-
-def test_errors_cancel_on_the_recordings():
-    """Correlated inputs: the summed error of the membrane is smaller than with each weight at its nearest."""
-    rng = np.random.default_rng(0)
-    network = chain(rng.normal(0, 0.1, (16, 48)))
-    cause = rng.random((6, 60, 12)) < 0.25
-    calibration = calibrate(network, np.repeat(cause, 4, axis=2) & (rng.random((6, 60, 48)) < 0.9))
-    layer, form = layer_of(network, 0), Form(bits=4, exponents=(0,), threshold=np.full(16, 200))
-
-    def error(stored):
-        weight = sum(p.effective().toarray() for p in stored.projections) - network.projections[0].weight * 400
-        bias = stored.population.bias / 64 - network.populations[0].bias * 400
-        return float(np.square(calibration.events.reshape(-1, 48) @ weight.T + bias).mean())
-
-    assert error(compensated(layer, form, calibration)) < 0.6 * error(rounded(layer, form))
 
 
 def test_compensation_is_kept_only_where_it_keeps_spikes():
@@ -234,8 +212,6 @@ def test_a_neuron_that_would_overflow_is_rounded_to_nearest():
 
 
 # --- planes and scales until the spikes are equal, or the limit that is in the way
-
-
 def two_layers(seed, *, samples=40, outlier=0.0):
     rng = np.random.default_rng(seed)
     weight = rng.normal(0, 0.1, (20, 30))

@@ -9,6 +9,7 @@ from made_files import released
 from numpy.testing import assert_allclose, assert_array_equal
 from oracles import probed
 from scipy import sparse
+from test_dynamics import surrogate_spike
 
 from spikeloom.compiler import Options, compile_network
 from spikeloom.compiler.errors import ModelError
@@ -24,13 +25,7 @@ from spikeloom.models.networks.networks import Architecture, SpikingNet
 from spikeloom.models.networks.reference import float_spikes
 from spikeloom.models.networks.surrogate import RECTANGLE
 from spikeloom.models.recordings.grasps import synthetic_grasps
-from spikeloom.models.systems import (
-    filters_of,
-    grid_cells,
-    propagation_of,
-    sensor_grid,
-    taxels_alone,
-)
+from spikeloom.models.systems import filters_of, grid_cells, propagation_of, sensor_grid, taxels_alone
 from spikeloom.models.training.finetune import finetune
 from spikeloom.runtime.equivalence.verify import verify
 
@@ -74,8 +69,6 @@ def saved(tmp_path, network, *, padding="none", name="x.pt"):
 
 
 # --- plain code, as a script with torch's own layers would have it ---------------------------------------------------
-
-
 def plain_first(system, state, *, padding="none"):
     """Current of the first layer of one step, a function of (taxels, channels), from a released-style state dict."""
     if system == MLP:
@@ -119,38 +112,24 @@ def state_of(network) -> dict[str, torch.Tensor]:
     return first | weights
 
 
-class Spike(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, membrane):
-        ctx.save_for_backward(membrane)
-        return (membrane > 0.5).to(membrane.dtype)
-
-    @staticmethod
-    def backward(ctx, gradient):
-        (membrane,) = ctx.saved_tensors
-        return gradient * ((membrane - 0.5).abs() < RECTANGLE.width).to(gradient.dtype)
-
-
 def plain_spikes(system, state, events, *, padding="none"):
     """Spikes of every layer, step by step, of one recording (taxels, channels, steps)."""
     stages = [plain_first(system, state, padding=padding)]
     stages += [
         lambda x, k=k: torch.nn.functional.linear(x, state[f"fc{k}.weight"], state[f"fc{k}.bias"]) for k in (1, 2, 3)
     ]
-    kind = state["fc1.weight"].dtype
+    kind, fire = state["fc1.weight"].dtype, surrogate_spike(RECTANGLE)
     membranes, spikes, trace = [0.0] * 4, [torch.zeros(())] * 4, []
     for t in range(events.shape[-1]):
         x = torch.tensor(events[..., t], dtype=kind)
         for layer, stage in enumerate(stages):
             membranes[layer] = membranes[layer] * 0.2 * (1 - spikes[layer]) + stage(x)
-            spikes[layer] = x = Spike.apply(membranes[layer])
+            spikes[layer] = x = fire(membranes[layer], 0.5)
         trace.append(list(spikes))
     return [torch.stack([step[layer] for step in trace]) for layer in range(4)]
 
 
 # --- the first layer -------------------------------------------------------------------------------------------------
-
-
 @given(
     kernel=st.integers(1, 4),
     stride=st.integers(1, 3),
@@ -219,8 +198,6 @@ def test_initial_weights_are_those_of_the_usual_layers(system, bound):
 
 
 # --- files -----------------------------------------------------------------------------------------------------------
-
-
 def torch_file(path, content):
     torch.save(content, path)
     return path
@@ -274,8 +251,6 @@ def test_faults_of_released_style_files(tmp_path, system, change, words):
 
 
 # --- to the chip -----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("system", NEW)
 def test_expansion_equals_probing_the_layer(tmp_path, system):
     """The general way: any affine stage, here plain torch code, by its responses to unit vectors."""

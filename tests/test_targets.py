@@ -5,13 +5,7 @@ from oracles import refused
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.targets import price_tables
-from spikeloom.compiler.targets.base import (
-    CROSSBARS,
-    known_targets,
-    load_target,
-    read_target,
-    with_tables,
-)
+from spikeloom.compiler.targets.base import CROSSBARS, known_targets, load_target, read_target, with_tables
 from spikeloom.compiler.targets.loihi1.legalize import REMEDIES
 
 

@@ -40,8 +40,6 @@ from spikeloom.runtime.machines.loihi1.trace import aligned
 
 REPEATABLE = settings(max_examples=4, deadline=None, derandomize=True)
 
-LAYERS = ("conv1", "fc1", "fc2", "fc3")
-
 
 def float_network(path, system="tactilesgnet", dynamics=TIMING, **options):
     """Checkpoint, what its first layer sees, and its float stage."""
@@ -66,8 +64,6 @@ def compiled(timed):
 
 
 # --- registers -----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("alpha", "register", "realised"),
     [(0.0, 4095, 0.0), (0.5, 2047, 0.5), (0.95, 204, 3891 / 4096), (0.9999, 0, 4095 / 4096), (0.0001, 4095, 0.0)],
@@ -112,23 +108,6 @@ def test_the_largest_current_stays_and_one_unit_more_overflows():
 
 
 # --- the float stage -----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("system", ["tactilesgnet", "gcn", "mlp", "grid-cnn"])
-def test_the_expanded_network_spikes_as_the_checkpoint(tmp_path, system):
-    checkpoint, seen, network = float_network(tmp_path, system, hidden=(32, 24))
-    assert network.input == Input(taxels=39, polarities=2, clocks=TIMING.clocks)
-    assert [p.alpha for p in network.populations] == list(TIMING.alphas)
-    assert [p.beta for p in network.populations] == list(TIMING.betas)
-    assert [p.relays for p in network.populations] == [3, 0, 0, 0]
-    events = events_of(3)
-    wanted = float_spikes(checkpoint, seen, events, dtype="float64")
-    found = run_float(network, channels_last(events, TIMING.clocks)).spikes
-    for name, spikes in zip(LAYERS, found, strict=True):
-        assert_array_equal(spikes, wanted[name], err_msg=name)
-        assert spikes.any(), name
-
-
 def test_relays_hear_their_clock_and_nothing_else(timed):
     _, _, network = timed
     weight = network.projections[0].weight.toarray()
@@ -154,8 +133,6 @@ def test_a_neuron_that_only_fires_from_its_gathered_current_is_kept():
 
 
 # --- rounding ------------------------------------------------------------------------------------------------------
-
-
 def test_ranges_are_proven_for_any_input(compiled):
     assert all(proof.holds for proof in compiled.proofs)
     lasting = compiled.proofs[1]
@@ -194,8 +171,6 @@ def test_relays_tick_with_their_clocks_however_weights_are_stored(timed, options
 
 
 # --- what judges the chip ------------------------------------------------------------------------------------------
-
-
 @REPEATABLE
 @given(seed=st.integers(0, 10**6), alpha=st.sampled_from([0.3, 0.95, 0.999]), beta=st.sampled_from([0.0, 0.2, 0.9]))
 def test_what_is_certain_is_so_in_both_precisions(folder, seed, alpha, beta):

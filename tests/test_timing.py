@@ -66,8 +66,6 @@ def assert_as_defined(netlist, trace, events, *, times=SANAFE, input_tiles=()):
 
 
 # -- a published run ---------------------------------------------------------------------------------------------------
-
-
 def six_steps():
     """Two inputs, h0 and h1 one tile north of them, o one tile east of these; what SANA-FE 2.2.9 was run on."""
     neurons = [Neuron(threshold=80), Neuron(threshold=80), Neuron(threshold=80, core=1, layer=1)]
@@ -120,23 +118,6 @@ def test_the_published_energies_to_the_decimal():
     assert {part: (1e12 * joules.sum(axis=1)).round(1).tolist() for part, joules in parts.items()} == ENERGY_PJ
 
 
-@settings(deadline=None, max_examples=20)
-@given(st.data())
-def test_updates_of_the_reference_by_hand(data):
-    netlist = data.draw(netlists(weight_exponents=(0,)))
-    events = data.draw(recordings(netlist))
-    trace = by_engine(netlist, events, gated=False)
-    seen = timing_oracle.updates(netlist, events[None], trace.spikes[None], trace.membranes[None])[0]
-    axon = netlist.axon_of_synapse()
-    for t, c in np.ndindex(*trace.spikes.shape):
-        active = set(np.flatnonzero(events[:, t]).tolist())
-        active |= {netlist.n_inputs + int(other) for other in np.flatnonzero(trace.spikes[t - 1])} if t else set()
-        sources = set(netlist.axon_source[axon[netlist.synapse_compartment() == c]].tolist())
-        rests = t == 0 or trace.spikes[t - 1, c] or trace.membranes[t - 1, c] == 0
-        assert seen[t, c] == bool(netlist.bias_mantissa[c] or not rests or active & sources)
-        assert trace.updated[t, c] >= seen[t, c]
-
-
 def test_inputs_on_no_core_are_processed_at_once_and_from_the_start():
     netlist, events, trace = six_steps()
     simple, detailed = both(netlist, trace, events)
@@ -153,8 +134,6 @@ def test_inputs_on_no_core_are_processed_at_once_and_from_the_start():
 
 
 # -- the definition ----------------------------------------------------------------------------------------------------
-
-
 @st.composite
 def cases(draw):
     """A network on any tiles, a recording, a table with large and small latencies, tiles of inputs or none."""
@@ -163,9 +142,7 @@ def cases(draw):
     tiles = draw(st.lists(tile, min_size=netlist.n_cores, max_size=netlist.n_cores))
     index_bits = draw(st.sampled_from([0, 10]))
     netlist = replace(
-        netlist,
-        core_tile=read_only(tiles),
-        format_index_bits=read_only([index_bits] * len(netlist.format_index_bits)),
+        netlist, core_tile=read_only(tiles), format_index_bits=read_only([index_bits] * len(netlist.format_index_bits))
     )
     latency = st.sampled_from([0.0, 0.001, 1.0, 3.7, 500.0])
     chosen = {event: draw(latency) for event in LATENCIES}
@@ -198,8 +175,6 @@ def test_kernels_and_definition_agree_on_a_crowded_mesh(link_buffer, input_tiles
 
 
 # -- by hand -----------------------------------------------------------------------------------------------------------
-
-
 def pipe(tiles, targets=1, senders=1):
     """Neurons of a first core that each feed `targets` of a second one."""
     neurons = [Neuron() for _ in range(senders)] + [Neuron(core=1, layer=1) for _ in range(targets)]
@@ -295,8 +270,6 @@ def test_input_channels_spread_over_their_cores():
 
 
 # -- energy by part and core -------------------------------------------------------------------------------------------
-
-
 def test_parts_and_cores_add_up_to_the_estimate():
     netlist = replace(large_netlist(3, proved=True), core_tile=read_only([0, 0, 3, 17, 30]))
     form = np.arange(len(netlist.format_index_bits)) % 2 * 10

@@ -195,14 +195,7 @@ def with_header(header: str) -> Callable[[bytes], bytes]:
     return lambda content: zip_bytes(stored_members(content) | {"header.npy": npy_bytes(np.array(header))})
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda content: content[:-100],
-        with_header("[" * 9000),
-        with_header("[]"),
-    ],
-)
+@pytest.mark.parametrize("change", [lambda content: content[:-100], with_header("[" * 9000), with_header("[]")])
 def test_a_damaged_state_is_refused(tmp_path, change):
     state = tmp_path / "x.state"
     train(grasps(0), grasps(1), ADJACENCY, SMALL, epochs=1, state=state)

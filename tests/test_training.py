@@ -241,14 +241,6 @@ def test_no_worker_outlives_the_command(data, capsys, sent):
     assert not list(data.glob(".*")), "half-written files are left"
 
 
-def test_what_a_killed_training_left_half_written_goes(data, capsys):
-    for name in (".x.pt.abcd_123.part", ".x.pt.state.whole.zzzzzzzz.part"):
-        Path(name).write_bytes(b"half")
-    Path(".xy.pt.abcd_123.part").write_bytes(b"of somebody else")
-    as_json(capsys, *WORDS, "--epochs", "1", "-o", "x.pt")
-    assert [file.name for file in data.glob(".*")] == [".xy.pt.abcd_123.part"]
-
-
 @dataclass(frozen=True)
 class Named:
     output: Path

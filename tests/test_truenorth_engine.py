@@ -13,9 +13,8 @@ from spikeloom.compiler.targets.truenorth.legalize import faults
 from spikeloom.compiler.targets.truenorth.netlist import RESET_LINEAR, RESET_NONE, RESET_TO
 from spikeloom.runtime.machines.truenorth import engine, spec
 
+
 # -- one neuron --------------------------------------------------------------------------------------------------------
-
-
 def lives(neuron: Neuron, arrivals: list[int]) -> tuple[list[int], list[int]]:
     """Membranes at the ends of ticks and ticks with spikes of a neuron to which weights of type 0 arrive."""
     state = spec.Neuron(**{each.name: getattr(neuron, each.name, neuron.initial) for each in fields(spec.Neuron)})
@@ -67,8 +66,6 @@ def test_a_register_that_some_order_would_leave_is_counted():
 
 
 # -- ticks, delays, clocks ---------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("delay", [1, 2, 15])
 def test_when_spikes_arrive(delay):
     netlist = relays(delay=delay, tick=2, first=20).netlist(taxels=1, polarities=1, classes=1, bin_ticks=3)
@@ -95,8 +92,6 @@ def test_spikes_that_meet_on_an_axon_are_one():
 
 
 # -- engine = specification --------------------------------------------------------------------------------------------
-
-
 @settings(max_examples=80, deadline=None)
 @given(crossbars(), st.integers(0, 2**31))
 def test_engine_equals_specification(netlist, seed):

@@ -120,8 +120,6 @@ def test_any_numbers_are_refused_or_run(tmp_path_factory, netlist, name, random)
 
 
 # -- commands ----------------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def place(path, tmp_path):
     """A folder with the network and four recordings of its sensor: touches of taxel 0, 1, 1 and 2."""

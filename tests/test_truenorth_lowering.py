@@ -260,14 +260,4 @@ def test_sums_that_saturate_leave_nothing_for_the_next_step(sign):
     assert model["fc1"][0].any() == (sign > 0)
 
 
-def test_shorter_recordings_count_for_their_own_length():
-    levels = in_levels(forgetful(5, 24, 30, 4), 3, NARROW)
-    netlist = lower_in_time(levels, NARROW)
-    recording = (np.random.default_rng(5).random((1, 24, 9)) < 0.5).astype(np.uint8)
-    whole = engine.simulate(netlist, recording, lengths=np.array([6])).counts
-    part = engine.simulate(netlist, recording[..., :6]).counts
-    np.testing.assert_array_equal(whole.votes, part.votes)
-    assert part.votes.sum() > 0
-
-
 # -- the commands ------------------------------------------------------------------------------------------------------

@@ -108,8 +108,6 @@ def test_limits_are_parameters():
 
 
 # -- needs of float networks -------------------------------------------------------------------------------------------
-
-
 def wide(inputs: int, *sizes: int, beta=0.0):
     """A chain of full layers of equal weights."""
     return chain(*(np.ones((after, before)) for before, after in pairwise((inputs, *sizes))), beta=beta)

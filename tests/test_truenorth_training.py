@@ -140,8 +140,6 @@ def test_groups_fill_the_axons_of_a_core():
 
 
 # -- files -------------------------------------------------------------------------------------------------------------
-
-
 def written(path, networks=None):
     networks = networks or {"last": random_network(0), "best": random_network(1)}
     record = {"command": "spikeloom train", "seed": 0}
