@@ -1,4 +1,4 @@
-"""What shows a chart: terminal, pictures, page, and the page of a report."""
+"""What shows a chart: terminal, pictures and page."""
 
 import json
 import re
@@ -7,10 +7,7 @@ from dataclasses import replace
 import pytest
 from browser import browsed
 from made_chart import made_chart
-from made_files import own_file, recordings_folder
 
-from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
-from spikeloom.runtime import cli
 from spikeloom.runtime.report.encode import decode, encode
 from spikeloom.runtime.report.sections import terminal
 from spikeloom.runtime.studies.chart.files import csv_text, page
@@ -128,57 +125,3 @@ def test_the_page_fits_any_width_and_scheme(page_file, width, scheme):
     wide, colour = browsed(page_file, script, width=width, scheme=scheme)
     assert wide <= width
     assert colour == ("rgb(255, 255, 255)" if scheme == "light" else "rgb(20, 23, 27)")
-
-
-# -- in a report -------------------------------------------------------------------------------------------------------
-
-REPORT = ("report", "net.loom", "--checkpoint", "net.pt", "--data", "data", "-o", "out.html")
-
-
-@pytest.fixture(scope="module")
-def place(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("report")
-    recordings_folder(folder / "data")
-    own_file(folder / "net.pt")
-    assert cli.main(["compile", str(folder / "net.pt"), "-o", str(folder / "net.loom"), "--json"]) == 0
-    return folder
-
-
-def write(path, chart):
-    path.parent.mkdir(exist_ok=True)
-    path.write_text(json.dumps(encode(chart)))
-
-
-def test_a_report_shows_the_chart_of_its_network(spikeloom, chart, place):
-    network = replace(chart.networks[0], sha256=read_checkpoint(place / "net.pt").sha256)
-    write(place / "charted" / "chart.json", replace(chart, networks=(network, *chart.networks[1:])))
-    code, out, err = spikeloom(*REPORT, "--chart", "charted", "--json")
-    assert (code, err) == (0, "")
-    assert json.loads(out)["chart"] == json.loads((place / "charted" / "chart.json").read_text())
-    text = (place / "out.html").read_text("utf-8")
-    drawn = [name for name in re.findall(r'<div class="drawing" id="([^"]+)"', text) if name.startswith("pareto")]
-    assert drawn == ["pareto-energy", "pareto-latency", "pareto-operations", "pareto-cores"]
-
-
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        (None, ["no such file", "spikeloom chart"]),
-        ("other", ["grasps, grasps-knn1", "not of net.pt"]),
-        *(
-            (content, ["is not what spikeloom chart writes"])
-            for content in ("", "[]", '{"format": 99}', '{"format": 1, "points": []}')
-        ),
-    ],
-)
-def test_a_report_refuses_what_is_no_chart_of_its_network(spikeloom, chart, place, content, words):
-    path = place / "bad.json"
-    path.unlink(missing_ok=True)
-    if content == "other":
-        write(path, chart)
-    elif content is not None:
-        path.write_text(content)
-    code, out, err = spikeloom(*REPORT, "--chart", "bad.json")
-    assert (code, out) == (2, "")
-    assert err.startswith("spikeloom: --chart bad.json: ")
-    assert all(word in err for word in words)

@@ -17,14 +17,12 @@ from zoo import specimen
 
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
-from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist, write_netlist
 from spikeloom.models.graphs import normalised_adjacency
 from spikeloom.models.networks.reference import float_membranes, float_spikes
 from spikeloom.models.recordings.events import load_data
 from spikeloom.runtime import cli
 from spikeloom.runtime.machines.loihi1 import engine
-from spikeloom.runtime.machines.loihi1.costs import cost
 from spikeloom.runtime.machines.loihi1.trace import aligned
 from spikeloom.runtime.page.recording import LayerRaster
 from spikeloom.runtime.page.sections import ROWS, _raster
@@ -33,7 +31,6 @@ REPORT = ("report", "net.loom", "--checkpoint", "net.pt", "--data", "data", "-o"
 HEADINGS = ["Verdict", "Decisions", "Cores", "Taxels", "One recording", "Energy and time", "Provenance"]
 LAYERS = ("conv1", "fc1", "fc2", "fc3")
 FIGURES = {
-    "ladder",
     "confusion",
     "cores-map",
     "taxels-map",
@@ -43,9 +40,6 @@ FIGURES = {
     "energy-layers",
     "energy-parts",
     "time-cores",
-    "energy-cores",
-    "energy-steps",
-    "time-steps",
 }
 MOST_BYTES = 5_000_000
 
@@ -216,24 +210,6 @@ def test_spikes_and_membranes_are_those_of_both_sides(made, place):
     assert (first["file"], first["layer"], first["neuron"]) == (recording["file"], shown["layer"], shown["neuron"])
 
 
-def test_energy_by_step_adds_up(made, place):
-    recording = made[1]["recording"]
-    netlist, target = read_netlist(place / "net.loom"), load_target("loihi1")
-    data = load_data(str(place / "data"), "test")[0]
-    events = data.events[recording["index"]].reshape(1, -1, STEPS)
-    costs = cost.estimate(cost.prepare(netlist, target), engine.simulate(netlist, events).counts, STEPS)
-    assert set(recording["by_step"]["energy_j"]) == set(costs.energy)
-    for name, steps in recording["by_step"]["energy_j"].items():
-        assert len(steps) == STEPS + netlist.max_depth
-        assert_allclose(sum(steps), costs.energy[name].sum())
-    for name, steps in recording["by_step"]["time_s"].items():
-        entry = next(t for t in recording["costs"]["time"] if f"{t['table']}, {t['model']} model" == name)
-        assert_allclose(sum(steps), entry["inference_s"]["mean"])
-    for name, steps in recording["by_step"]["mean_time_s"].items():
-        entry = next(t for t in made[1]["costs"]["time"] if f"{t['table']}, {t['model']} model" == name)
-        assert_allclose(sum(steps), entry["inference_s"]["mean"])
-
-
 def test_decisions_cores_and_taxels_agree_with_the_rest(made, place):
     report = made[1]
     netlist, data = read_netlist(place / "net.loom"), load_data(str(place / "data"), "test")[0]
@@ -335,10 +311,6 @@ def test_clocks_and_lasting_currents_have_their_page(tmp_path, capsys):
     received = (netlist.layer == 0) & (netlist.neuron < 39 * read_checkpoint(made.network).hops.shape[1])
     assert len(found["taxels"]["spikes"]) == 39
     assert_allclose(sum(found["taxels"]["spikes"]), counts.spikes[:, received].sum(axis=1).mean())
-    recording = found["recording"]
-    costs = cost.estimate(cost.prepare(netlist, load_target("loihi1")), counts, made.events.shape[-1])
-    for name, steps in recording["by_step"]["energy_j"].items():
-        assert_allclose(sum(steps), costs.energy[name][recording["index"]].sum())
 
 
 def test_recordings_of_different_length(spikeloom, place, tmp_path):
@@ -354,13 +326,10 @@ def test_recordings_of_different_length(spikeloom, place, tmp_path):
     assert code == 0
     recording = json.loads(out)["recording"]
     assert (recording["file"], recording["steps"]) == ("a_label_0.csv", 7)
-    netlist = read_netlist(place / "net.loom")
-    assert {len(steps) for steps in recording["by_step"]["time_s"].values()} == {7 + netlist.max_depth}
-    assert {len(steps) for steps in recording["by_step"]["mean_time_s"].values()} == {30 + netlist.max_depth}
 
 
 def test_several_chips_are_drawn_one_below_the_other(spikeloom, place):
-    """Links between chips are not timed, so the page has no times and no energy by core."""
+    """Links between chips are not timed, so the page has no times."""
     assert spikeloom("compile", "net.pt", "--cores-for", "conv1=3,fc1=2", "-o", "wide.loom")[0] == 0
     netlist = read_netlist(place / "wide.loom")
     tiles = np.arange(netlist.n_cores) * 20
@@ -371,14 +340,13 @@ def test_several_chips_are_drawn_one_below_the_other(spikeloom, place):
     found = json.loads(out)
     assert [core["chip"] for core in found["cores"]["cores"]] == (tiles // 32).tolist()
     figures = drawings(Tags((place / "wide.html").read_text("utf-8")))
-    assert figures.keys() == FIGURES - {"time-cores", "energy-cores", "time-steps"}
+    assert figures.keys() == FIGURES - {"time-cores"}
 
 
 def test_large_layers_are_thinned_out():
     active = np.arange(0, 20_000, 2)
     pairs = {"both": np.stack([0 * active, active], axis=1), "float_only": np.zeros((0, 2), int)}
-    counts = {"neurons": 20_000, "float_spikes": 0, "chip_spikes": 0, "different": 2}
-    layer = LayerRaster(name="conv1", active=active, chip_only=np.array([[1, 0], [1, 2]]), **pairs, **counts)
+    layer = LayerRaster(name="conv1", neurons=20_000, chip_only=np.array([[1, 0], [1, 2]]), **pairs)
     rows = _raster(layer, 5).draw().cells[1]
     assert len(rows) == len(set(rows)) == ROWS
     assert set(rows) <= {f"neuron {neuron}" for neuron in active}

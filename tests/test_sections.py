@@ -59,9 +59,9 @@ def test_a_page_is_whole_escaped_and_the_same_each_time():
 
 
 def test_values_of_a_drawing_lie_on_its_marks():
-    drawn = drawing.lines("a line", {"a": [0.0, 1.0, 2.0]}, "step")
+    drawn = drawing.bars("bars", {"a": [1.0], "b": [2.0], "c": [3.0]}, ["n"])
     drawn.svg("x")
-    (left, low), (middle, _), (right, high) = (tip[:2] for tip in drawn.values()["tips"])
+    (left, high), (middle, _), (right, low) = (tip[:2] for tip in drawn.values()["tips"])
     assert left < middle < right <= 72 * drawing.WIDTH
     assert 0 <= high < low
     assert middle == pytest.approx((left + right) / 2, abs=0.2)

@@ -65,7 +65,7 @@ CHECKS = {
 
 PAGE = {
     "costs": RUNS["counts"],
-    "the recording": Kind(CHIP, "one", "spikes, membranes and every message of the recording that is drawn"),
+    "the recording": Kind(CHIP, "one", "spikes and membranes of the recording that is drawn"),
 }
 """What ``report`` adds to ``verify``."""
 

@@ -16,7 +16,7 @@ from spikeloom.compiler.ir import IntegerNetwork
 from spikeloom.compiler.targets.netlist import Netlist
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.runtime.machines.base import EventArray, Machine, machine_for, machine_of
-from spikeloom.runtime.machines.page_parts import BatchParts, RecordingParts
+from spikeloom.runtime.machines.page_parts import BatchParts
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -106,10 +106,6 @@ class IntegerMachine(Machine):
     @abstractmethod
     def page_parts(self, events: EventArray, *, lengths: IntArray | None, bin_s: float) -> BatchParts:
         """Run recordings for the page of the netlist; events, lengths and `bin_s` as for `price`."""
-
-    @abstractmethod
-    def page_recording(self, events: EventArray, *, bin_s: float) -> RecordingParts:
-        """Run the one recording that the page draws, (1, taxels, polarities, steps), as closely as the chip can."""
 
     def compared(self) -> list[slice | IntArray]:
         """Neurons of each layer whose spikes can be compared."""

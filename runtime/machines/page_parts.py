@@ -97,8 +97,8 @@ class Cores:
 class BatchParts:
     """Of all recordings.
 
-    Costs with the chip's layout; mean joules and seconds of an inference by table; mean spikes of each neuron, by
-    layer; and seconds of each chip step by table, the mean of the recordings that still run.
+    Costs with the chip's layout; mean joules and seconds of an inference by table; and mean spikes of each neuron, by
+    layer.
     """
 
     costs: Outcome
@@ -106,14 +106,3 @@ class BatchParts:
     time_s: Mapping[str, float]
     cores: Cores
     spikes: Mapping[str, FloatArray]
-    step_s: Mapping[str, FloatArray]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class RecordingParts:
-    """Of one recording: its costs, joules of each core by table, and joules and seconds of each chip step by table."""
-
-    costs: object
-    core_energy_j: Mapping[str, Mapping[str, float]]
-    energy_j: Mapping[str, FloatArray]
-    time_s: Mapping[str, FloatArray]

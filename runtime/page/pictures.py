@@ -5,17 +5,14 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from spikeloom.compiler.types import FloatArray
 from spikeloom.runtime.machines.page_parts import Core, Cores, Way
-from spikeloom.runtime.page.facts import Taxels
 from spikeloom.runtime.page.recording import Trace
+from spikeloom.runtime.page.results import Taxels
 from spikeloom.runtime.report.drawing import CHIP, COLOURS, DASHES, FLOAT, GREY, Drawing, sheet, styled
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 DRAWN = 80
 """Connections that are drawn, the busiest first; the table has all."""
@@ -124,6 +121,8 @@ def _way_tip(way: Way) -> str:
 @styled
 def fingertip(taxels: Taxels) -> Drawing:
     """Taxels where they lie, joined as the graph joins them; discs grow with events, and with first-layer spikes."""
+    from matplotlib.patches import Circle
+
     n = len(taxels.events)
     turn = 2 * math.pi * np.arange(n) / n - math.pi / 2
     points = np.stack([np.cos(turn), np.sin(turn)], axis=1) if taxels.positions_mm is None else taxels.positions_mm
@@ -136,8 +135,9 @@ def fingertip(taxels: Taxels) -> Drawing:
         if n <= DETAILED:
             for a, b in sorted({(min(pair), max(pair)) for pair in taxels.edges.tolist()}):
                 axes.plot(points[[a, b], 0], points[[a, b], 1], color=GREY, lw=0.8, alpha=0.6, zorder=1)
-        _discs(axes, points, reach * (0.25 + 0.75 * np.sqrt(values / (values.max() or 1.0))))
-        for taxel, ((x, y), value) in enumerate(zip(points.tolist(), values.tolist(), strict=True)):
+        radii = reach * (0.25 + 0.75 * np.sqrt(values / (values.max() or 1.0)))
+        for taxel, ((x, y), radius, value) in enumerate(zip(points.tolist(), radii, values.tolist(), strict=True)):
+            axes.add_patch(Circle((x, y), radius, facecolor=COLOURS[1], edgecolor=GREY, alpha=0.7, lw=0.6, zorder=2))
             if n <= DETAILED:
                 drawing.tips.append((axes, x, y, f"taxel {taxel}: {value:,.1f} {name} in a mean recording"))
             if n <= 100:
@@ -149,15 +149,7 @@ def fingertip(taxels: Taxels) -> Drawing:
     return drawing
 
 
-def _discs(axes: Axes, points: np.ndarray, radii: np.ndarray) -> None:
-    from matplotlib.collections import PatchCollection
-    from matplotlib.patches import Circle
-
-    discs = [Circle(tuple(point), radius) for point, radius in zip(points.tolist(), radii.tolist(), strict=True)]
-    axes.add_collection(PatchCollection(discs, facecolor=COLOURS[1], edgecolor=GREY, alpha=0.7, lw=0.6, zorder=2))
-
-
-def _reach(points: np.ndarray) -> float:
+def _reach(points: FloatArray) -> float:
     """Largest radius of discs that keep apart."""
     from scipy.spatial import KDTree  # a tenth of a second that other commands need not wait
 

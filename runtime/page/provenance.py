@@ -21,53 +21,19 @@ from spikeloom.compiler.types import JsonObject
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.network import LoadedNetwork
-from spikeloom.runtime.report.encode import key
+from spikeloom.runtime.report.encode import INLINE, key
 
 PACKAGES = ("numpy", "scipy", "torch", "numba", "networkx")
 """Packages whose versions may move a float spike."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class NetlistOrigin:
-    """The netlist's file, and how it was compiled."""
+class Origin:
+    """A file, or recordings with a hash over their events and labels, and what is known of it."""
 
     file: str
     sha256: str
-    compiled: Mapping[str, Any]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CheckpointOrigin:
-    """The float network's file, and what is known of its training."""
-
-    file: str
-    sha256: str
-    system: str | None
-    weights: str | None
-    graph: str | None
-    dynamics: Mapping[str, Any] | None
-    bins: int
-    training: Mapping[str, Any] | None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DataOrigin:
-    """The recordings, with a hash over their events and labels."""
-
-    name: str
-    split: str
-    samples: int
-    bin_s: float
-    sha256: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ChipOrigin:
-    """The chip, and titles of its tables by name."""
-
-    name: str
-    energy_tables: Mapping[str, str]
-    time_tables: Mapping[str, str]
+    facts: Mapping[str, Any] = field(metadata=INLINE)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,12 +46,12 @@ class Command:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Provenance:
-    """Files and their hashes, versions, and the commands that repeat the page."""
+    """Files and their hashes, titles of the chip's tables, versions, and the commands that repeat the page."""
 
-    netlist: NetlistOrigin
-    checkpoint: CheckpointOrigin
-    data: DataOrigin
-    chip: ChipOrigin
+    netlist: Origin
+    checkpoint: Origin
+    data: Origin
+    tables: Mapping[str, str]
     versions: Mapping[str, str]
     commands: tuple[Command, ...]
 
@@ -107,34 +73,22 @@ def provenance(
     for name, array in data.identity().items():
         digest.update(f"{name} {array.shape} {array.dtype.str}".encode())
         digest.update(np.ascontiguousarray(array).tobytes())
+    facts: JsonObject = dict.fromkeys(("system", "weights", "dynamics", "training"))
+    if checkpoint is not None:
+        facts |= {"system": checkpoint.system, "weights": checkpoint.weights, "training": checkpoint.training}
+        facts |= {"dynamics": None if checkpoint.dynamics.is_plain else checkpoint.dynamics.to_json()}
+    facts |= {"graph": loaded.graph, "bins": netlist.bins}
+    recorded = {"split": data.split, "samples": len(data), "bin_s": arguments.bin}
     return Provenance(
-        netlist=NetlistOrigin(
+        netlist=Origin(
             file=Path(arguments.netlist).name,
             sha256=sha256_of(arguments.netlist),
-            compiled=dict(netlist.provenance),
+            facts={"compiled": dict(netlist.provenance)},
         ),
-        checkpoint=CheckpointOrigin(
-            file=Path(arguments.checkpoint).name,
-            sha256=loaded.sha256,
-            system=None if checkpoint is None else checkpoint.system,
-            weights=None if checkpoint is None else checkpoint.weights,
-            graph=loaded.graph,
-            dynamics=None if checkpoint is None or checkpoint.dynamics.is_plain else checkpoint.dynamics.to_json(),
-            bins=netlist.bins,
-            training=None if checkpoint is None or checkpoint.training is None else dict(checkpoint.training),
-        ),
-        data=DataOrigin(
-            name=Path(data.source).name,
-            split=data.split,
-            samples=len(data),
-            bin_s=arguments.bin,
-            sha256=digest.hexdigest(),
-        ),
-        chip=ChipOrigin(
-            name=target.name,
-            energy_tables={table.name: table.title for table in target.energy},
-            time_tables={table.name: table.title for table in target.time},
-        ),
+        checkpoint=Origin(file=Path(arguments.checkpoint).name, sha256=loaded.sha256, facts=facts),
+        data=Origin(file=Path(data.source).name, sha256=digest.hexdigest(), facts=recorded),
+        tables={f"energy, {table.name}": table.title for table in target.energy}
+        | {f"time, {table.name}": table.title for table in target.time},
         versions={"spikeloom": __version__, "python": platform.python_version()}
         | {name: metadata.version(name) for name in PACKAGES},
         commands=_commands(arguments, netlist, recording),

@@ -1,30 +1,30 @@
-"""One recording for the page: spikes of float model and chip, membranes where they part, energy and time by step."""
+"""One recording for the page: spikes of float model and chip, and membranes where they part."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.fixedpoint import MEMBRANE_SHIFT
-from spikeloom.compiler.ir import IntegerPopulation, Network
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.equivalence.reference import membranes_of, spikes_of, taxel_and_feature
 from spikeloom.runtime.inputs.network import LoadedNetwork
 from spikeloom.runtime.machines.integer import IntegerMachine
 from spikeloom.runtime.machines.votes import readout_counts
-from spikeloom.runtime.page.facts import Sides
-from spikeloom.runtime.report.encode import HIDDEN, key
+from spikeloom.runtime.report.encode import key
 
 Floats = npt.NDArray[np.floating]
 
 AROUND = 25
 """Steps of membrane that are shown on either side of a divergence."""
+
+FIRES = {(True, True): "both", (True, False): "float only", (False, True): "chip only", (False, False): ""}
+"""Who fires, by whether float model and chip do."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -33,13 +33,31 @@ class LayerRaster:
 
     name: str
     neurons: int
-    active: IntArray
-    float_spikes: int
-    chip_spikes: int
-    different: int
     both: IntArray
     float_only: IntArray
     chip_only: IntArray
+
+    json_properties = ("active", "float_spikes", "chip_spikes", "different")
+
+    @property
+    def active(self) -> IntArray:
+        """Neurons that fire on either side."""
+        return np.unique(np.concatenate([self.both, self.float_only, self.chip_only])[:, 1])
+
+    @property
+    def float_spikes(self) -> int:
+        """Of the float model."""
+        return len(self.both) + len(self.float_only)
+
+    @property
+    def chip_spikes(self) -> int:
+        """Of the chip."""
+        return len(self.both) + len(self.chip_only)
+
+    @property
+    def different(self) -> int:
+        """Of one side only."""
+        return len(self.float_only) + len(self.chip_only)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -74,175 +92,113 @@ class Trace:
 
     def fires(self, step: int) -> str:
         """Who fires in a step."""
-        sides = step in self.float_spikes, step in self.chip_spikes
-        return {(True, True): "both", (True, False): "float only", (False, True): "chip only", (False, False): ""}[
-            sides
-        ]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class BySteps:
-    """Joules and seconds of each chip step of one recording, and mean seconds of all, by table."""
-
-    energy_j: Mapping[str, FloatArray]
-    time_s: Mapping[str, FloatArray]
-    mean_time_s: Mapping[str, FloatArray]
+        return FIRES[step in self.float_spikes, step in self.chip_spikes]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Recording:
-    """One recording on both sides; `input` holds pairs of step and channel, `costs` what estimate says of it."""
+    """One recording on both sides, ``float`` and ``chip``; `input` holds pairs of step and channel."""
 
     file: str
     index: int
     steps: int
     label: int
-    decision: Sides[int]
-    votes: Sides[IntArray]
+    decision: Mapping[str, int]
+    votes: Mapping[str, IntArray]
     input: IntArray
     layers: tuple[LayerRaster, ...]
     membranes: tuple[Trace, ...]
-    costs: object
-    by_step: BySteps
-    core_energy_j: Mapping[str, Mapping[str, float]] = field(metadata=HIDDEN)
 
 
-def recording(
-    machine: IntegerMachine,
-    loaded: LoadedNetwork,
-    data: Recordings,
-    index: int,
-    mean_step_s: Mapping[str, FloatArray],
-    *,
-    bin_s: float,
-) -> Recording:
-    """Everything that the page shows of one recording; `mean_step_s` is of all, `bin_s` the seconds of a bin."""
-    steps, netlist = data.steps_of(index), machine.netlist
-    events = data.events[index : index + 1, ..., :steps]
+def recording(machine: IntegerMachine, loaded: LoadedNetwork, data: Recordings, index: int) -> Recording:
+    """Everything that the page shows of one recording.
+
+    Neurons whose spikes reach no neuron are silent on both sides.
+    """
+    events = data.events[index : index + 1, ..., : data.steps_of(index)]
     run = machine.run(events, spikes=True, membranes=True)
     assert run.spikes is not None, "spikes were wanted"
     assert run.membranes is not None, "membranes were wanted"
-    sides = tuple(
-        _layer(machine, layer, ours[0], chip[0], membranes[0], registers[0])
-        for layer, (ours, chip, membranes, registers) in enumerate(
-            zip(
-                spikes_of(loaded.model, loaded.adjacency, events, "float32"),
-                run.spikes.values(),
-                membranes_of(loaded.model, loaded.adjacency, events),
-                run.membranes.values(),
-                strict=True,
-            )
-        )
-    )
-    costs, readout = machine.page_recording(events, bin_s=bin_s), loaded.network.readout
-    votes = readout_counts(readout, netlist.classes, sides[readout.population].float_spikes[None])[0]
+    sent = spikes_of(loaded.model, loaded.adjacency, events, "float32")
+    ours = [spikes[0] & ~unread for spikes, unread in zip(sent, machine.unread, strict=True)]
+    chip = [spikes[0] & ~unread for spikes, unread in zip(run.spikes.values(), machine.unread, strict=True)]
+    readout = loaded.network.readout
+    votes = readout_counts(readout, machine.netlist.classes, ours[readout.population][None])[0]
     return Recording(
         file=data.files[index],
         index=index,
-        steps=steps,
+        steps=data.steps_of(index),
         label=int(data.labels[index]),
-        decision=Sides(model=int(votes.argmax()), chip=int(run.decisions[0])),
-        votes=Sides(model=votes, chip=run.votes[0]),
-        input=np.argwhere(with_clocks(events, netlist.clocks)[0].T),
-        layers=tuple(_raster(layer) for layer in sides),
-        membranes=_traces(loaded.model, sides),
-        costs=costs.costs,
-        by_step=BySteps(energy_j=costs.energy_j, time_s=costs.time_s, mean_time_s=mean_step_s),
-        core_energy_j=costs.core_energy_j,
+        decision={"float": int(votes.argmax()), "chip": int(run.decisions[0])},
+        votes={"float": votes, "chip": run.votes[0]},
+        input=np.argwhere(with_clocks(events, machine.netlist.clocks)[0].T),
+        layers=tuple(
+            LayerRaster(
+                name=name,
+                neurons=a.shape[1],
+                both=np.argwhere(a & b),
+                float_only=np.argwhere(a & ~b),
+                chip_only=np.argwhere(b & ~a),
+            )
+            for name, a, b in zip(machine.layers, ours, chip, strict=True)
+        ),
+        membranes=_traces(
+            machine,
+            loaded,
+            (ours, chip),
+            [membranes[0] for membranes in membranes_of(loaded.model, loaded.adjacency, events)],
+            [
+                registers[0] / (population.scale * (1 << MEMBRANE_SHIFT))
+                for population, registers in zip(machine.integer.populations, run.membranes.values(), strict=True)
+            ],
+        ),
     )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Layer:
-    """What float32 model and chip do in one layer, aligned with the data, (steps, neurons).
-
-    Spikes are silent where neurons are left out because their spikes reach no neuron; membranes, in the float model's
-    units, are those before the comparison, zero where the chip holds no neuron.
-    """
-
-    number: int
-    population: IntegerPopulation
-    absent: BoolArray
-    float_spikes: BoolArray
-    chip_spikes: BoolArray
-    float_membranes: Floats
-    chip_membranes: FloatArray
-
-
-def _layer(
-    machine: IntegerMachine, layer: int, ours: BoolArray, chip: BoolArray, membranes: Floats, registers: IntArray
-) -> _Layer:
-    population, shown = machine.integer.populations[layer], np.zeros(ours.shape[1], np.bool_)
-    shown[machine.compared()[layer]] = True
-    return _Layer(
-        number=layer,
-        population=population,
-        absent=machine.absent[layer],
-        float_spikes=ours & shown,
-        chip_spikes=chip & shown,
-        float_membranes=membranes,
-        chip_membranes=registers / (population.scale * (1 << MEMBRANE_SHIFT)),
-    )
-
-
-def _raster(layer: _Layer) -> LayerRaster:
-    ours, chip = layer.float_spikes, layer.chip_spikes
-    return LayerRaster(
-        name=layer.population.name,
-        neurons=ours.shape[1],
-        active=np.flatnonzero((ours | chip).any(axis=0)),
-        float_spikes=int(ours.sum()),
-        chip_spikes=int(chip.sum()),
-        different=int((ours != chip).sum()),
-        both=np.argwhere(ours & chip),
-        float_only=np.argwhere(ours & ~chip),
-        chip_only=np.argwhere(chip & ~ours),
-    )
-
-
-def _traces(model: Checkpoint | Network, layers: tuple[_Layer, ...]) -> tuple[Trace, ...]:
+def _traces(
+    machine: IntegerMachine,
+    loaded: LoadedNetwork,
+    spikes: tuple[Sequence[BoolArray], Sequence[BoolArray]],
+    ours: Sequence[Floats],
+    chip: Sequence[FloatArray],
+) -> tuple[Trace, ...]:
     """Membranes around the first divergence of each layer, the first of all first.
 
-    Where no spike differs, those of the neuron whose membranes lie furthest apart.
+    Where no spike differs, those of the neuron whose membranes lie furthest apart. `spikes` are of both sides, those of
+    each layer (steps, neurons), as are the membranes.
     """
     places = [
-        (int(step), layer.number, int(neuron))
-        for layer in layers
-        for step, neuron in np.argwhere(layer.float_spikes != layer.chip_spikes)[:1]
+        (int(step), layer, int(neuron))
+        for layer, (a, b) in enumerate(zip(*spikes, strict=True))
+        for step, neuron in np.argwhere(a != b)[:1]
     ]
     diverges = bool(places)
     if not diverges:
-        gaps = [abs(layer.float_membranes - layer.chip_membranes) * ~layer.absent for layer in layers]
+        gaps = [abs(a - b) * ~absent for a, b, absent in zip(ours, chip, machine.absent, strict=True)]
         widest = int(np.argmax([gap.max(initial=0.0) for gap in gaps]))
-        step, neuron = np.unravel_index(int(gaps[widest].argmax()), gaps[widest].shape)
-        places = [(int(step), widest, int(neuron))]
-    return tuple(
-        _trace(model, layers[index], step, neuron, diverges=diverges) for step, index, neuron in sorted(places)
-    )
-
-
-def _trace(model: Checkpoint | Network, layer: _Layer, step: int, neuron: int, *, diverges: bool) -> Trace:
-    population, held = layer.population, not layer.absent[neuron]
-    first = max(0, step - AROUND)
-    window = slice(first, step + AROUND + 1)
-    return Trace(
-        layer=population.name,
-        neuron=neuron,
-        of=_name(model, layer, neuron),
-        step=step,
-        held=held,
-        first_step=first,
-        theta=population.theta,
-        chip_theta=float(population.threshold[neuron] / population.scale[neuron]) if held else population.theta,
-        model=layer.float_membranes[window, neuron],
-        chip=layer.chip_membranes[window, neuron],
-        float_spikes=np.flatnonzero(layer.float_spikes[window, neuron]) + first,
-        chip_spikes=np.flatnonzero(layer.chip_spikes[window, neuron]) + first,
-        diverges=diverges,
-    )
-
-
-def _name(model: Checkpoint | Network, layer: _Layer, neuron: int) -> str:
-    """A neuron in the terms of its layer: taxel and feature in a graph convolution, its number elsewhere."""
-    taxel, feature = taxel_and_feature(model, layer.number, neuron)
-    return f"neuron {neuron}" if taxel is None else f"taxel {taxel}, feature {feature}"
+        most = np.unravel_index(int(gaps[widest].argmax()), gaps[widest].shape)
+        places = [(int(most[0]), widest, int(most[1]))]
+    traces = []
+    for step, layer, neuron in sorted(places):
+        population, held = machine.integer.populations[layer], not machine.absent[layer][neuron]
+        first = max(0, step - AROUND)
+        window = slice(first, step + AROUND + 1), neuron
+        taxel, feature = taxel_and_feature(loaded.model, layer, neuron)
+        traces.append(
+            Trace(
+                layer=population.name,
+                neuron=neuron,
+                of=f"neuron {neuron}" if taxel is None else f"taxel {taxel}, feature {feature}",
+                step=step,
+                held=held,
+                first_step=first,
+                theta=population.theta,
+                chip_theta=float(population.threshold[neuron] / population.scale[neuron]) if held else population.theta,
+                model=ours[layer][window],
+                chip=chip[layer][window],
+                float_spikes=np.flatnonzero(spikes[0][layer][window]) + first,
+                chip_spikes=np.flatnonzero(spikes[1][layer][window]) + first,
+                diverges=diverges,
+            )
+        )
+    return tuple(traces)

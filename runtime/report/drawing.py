@@ -7,7 +7,6 @@ tell apart; on pages the style sheet chooses them for light and dark.
 from __future__ import annotations
 
 import io
-import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -17,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal, ParamSpec
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.types import FloatArray, JsonObject
+from spikeloom.compiler.types import JsonObject
 from spikeloom.runtime.report import sections
 from spikeloom.runtime.report.numbers import counted, si
 
@@ -167,27 +166,6 @@ def bar_figure(
 
 
 @styled
-def lines(title: str, series: Mapping[str, Sequence[float] | FloatArray], label: str, unit: str = "") -> Drawing:
-    """Lines over steps, each in a colour and a dash of its own."""
-    drawing = sheet(title, 2.8)
-    drawing.along = "x"
-    axes = drawing.figure.subplots()
-    for index, (name, values) in enumerate(series.items()):
-        axes.plot(values, color=COLOURS[index % len(COLOURS)], ls=DASHES[index % len(DASHES)], lw=1.3, label=name)
-    most = max((float(np.max(values, initial=0.0)) for values in series.values()), default=0.0) or 1.0
-    for step in range(max(map(len, series.values()))):
-        there = {name: values[step] for name, values in series.items() if step < len(values)}
-        told = ", ".join(f"{si(value, unit)} {name}" for name, value in there.items())
-        drawing.tips.append((axes, step, max(there.values()), f"step {step}: {told}"))
-    axes.set(xlabel=label, ylim=(0, 1.05 * most))
-    axes.margins(x=0.01)
-    axes.grid(axis="y")
-    _scale(axes.yaxis, unit)
-    drawing.figure.legend(loc="outside upper left", ncols=4)
-    return drawing
-
-
-@styled
 def matrices(title: str, panels: Mapping[str, npt.NDArray[np.int64]]) -> Drawing:
     """Confusion matrices side by side: rows are labels, columns decisions; right ones are of another colour."""
     from matplotlib.patches import Rectangle
@@ -301,7 +279,7 @@ def scatters(title: str, panels: Sequence[Scatter], label: str, *, across: int =
 
 
 def _scatter(drawing: Drawing, axes: Axes, panel: Scatter) -> None:
-    from matplotlib.ticker import FixedLocator, NullFormatter
+    from matplotlib.ticker import LogLocator, NullFormatter
 
     for index, series in enumerate(dict.fromkeys(mark.series for mark in panel.marks)):
         own = [mark for mark in panel.marks if mark.series == series]
@@ -333,27 +311,11 @@ def _scatter(drawing: Drawing, axes: Axes, panel: Scatter) -> None:
     drawing.tips += [(axes, m.x, m.y, m.tip) for m in sorted(panel.marks, key=lambda mark: mark.x)]
     axes.set_xscale("log")
     axes.set_xlabel(panel.axis)
-    reach = [math.log10(mark.x) for mark in panel.marks] or [0.0]
-    axes.xaxis.set_major_locator(FixedLocator(log_ticks(min(reach) - 0.1, max(reach) + 0.1)))
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axes.xaxis.set_minor_formatter(NullFormatter())
     _scale(axes.xaxis, panel.unit)
     axes.grid(True)
     axes.margins(0.06, 0.08)
-
-
-def log_ticks(low: float, high: float) -> list[float]:
-    """Numbers 1, 2, 5 times a power of ten between two logarithms, or more or fewer of them as the room is.
-
-    Examples
-    --------
-    >>> log_ticks(-4.1, -3.2), log_ticks(0.5, 0.9)
-    ([0.0001, 0.0002, 0.0005], [4.0, 5.0, 6.0])
-    """
-    digits = (1, 2, 3, 4, 5, 6, 8) if high - low < 0.8 else (1, 2, 5) if high - low < 3 else (1,)
-    powers = range(math.floor(low), math.ceil(high) + 1)
-    found = [float(f"{digit}e{power}") for power in powers for digit in digits]
-    inside = [value for value in found if low <= math.log10(value) <= high]
-    return inside if len(inside) > 1 else [10**low, 10**high]
 
 
 # -- curves with intervals ---------------------------------------------------------------------------------------------

@@ -16,14 +16,12 @@ from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import find_recording, load_recordings
 from spikeloom.runtime.machines.integer import IntegerMachine, integer_machine_for
-from spikeloom.runtime.page import facts
 from spikeloom.runtime.page.provenance import provenance
 from spikeloom.runtime.page.recording import recording
-from spikeloom.runtime.page.results import Report
+from spikeloom.runtime.page.results import Report, decisions, taxels
 from spikeloom.runtime.page.sections import about, sections
 from spikeloom.runtime.report import html
 from spikeloom.runtime.report.sections import Outcome, Section, Text
-from spikeloom.runtime.studies.chart.files import read_chart
 from spikeloom.runtime.studies.stress.results import read_stress
 
 NOTES = """\
@@ -44,7 +42,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--spec-samples", type=int, default=3, metavar="N", help="recordings for spec = engine (default: 3)"
     )
     parser.add_argument("--stress", metavar="STRESS.json", help="show what stress -o wrote about this netlist")
-    parser.add_argument("--chart", metavar="FOLDER", help="show what spikeloom chart found of this network, too")
     parser.add_argument("-o", "--output", required=True, metavar="OUT.html")
     add_explain_cost(parser)
     parser.epilog = NOTES
@@ -63,13 +60,12 @@ def run(arguments: argparse.Namespace) -> Outcome:
     require_match(netlist, loaded.model)
     if (difference := loaded.differs_from(netlist.provenance, arguments.run)) is not None:
         raise ModelError(f"{arguments.netlist}: {difference}")  # the page would blame the chip for it
-    chart = None if arguments.chart is None else read_chart(arguments.chart, loaded.sha256, arguments.checkpoint)
     data = load_recordings(arguments, netlist, labels_for="report")
     machine.require_sensor(data.events)
     chosen = None if arguments.recording is None else find_recording(data, arguments.recording, "--recording")
-    report = replace(_report(arguments, machine, loaded, data, chosen), stress=battery, chart=chart)
+    report = replace(_report(arguments, machine, loaded, data, chosen), stress=battery)
     made = report.provenance
-    title = f"{made.netlist.file} on {made.data.name}"
+    title = f"{made.netlist.file} on {made.data.file}"
     with write_atomically(arguments.output) as file:
         file.write(html.page(title, about(report), sections(report)).encode())
 
@@ -107,11 +103,11 @@ def _report(
     described = machine.describe(origin.netlist.sha256)
     report = Report(
         verify=verdict,
-        decisions=facts.decisions(verdict, netlist.classes),
+        decisions=decisions(verdict, netlist.classes),
         netlist=described.result,
         cores=chip.cores,
-        taxels=facts.taxels(netlist, loaded, data, chip.spikes, arguments.taxels),
-        recording=recording(machine, loaded, data, chosen, chip.step_s, bin_s=arguments.bin),
+        taxels=taxels(netlist, loaded, data, chip.spikes, arguments.taxels),
+        recording=recording(machine, loaded, data, chosen),
         costs=chip.costs.result,
         provenance=origin,
         output=arguments.output,

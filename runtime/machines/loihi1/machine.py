@@ -30,7 +30,7 @@ from spikeloom.runtime.machines.loihi1.costs.result import cost_report
 from spikeloom.runtime.machines.loihi1.costs.sections import sections
 from spikeloom.runtime.machines.loihi1.stream import Stream, open_stream
 from spikeloom.runtime.machines.loihi1.trace import MembraneArray, aligned, differences
-from spikeloom.runtime.machines.page_parts import BatchParts, RecordingParts
+from spikeloom.runtime.machines.page_parts import BatchParts
 from spikeloom.runtime.machines.votes import class_counts
 from spikeloom.runtime.report.sections import Outcome
 
@@ -184,13 +184,6 @@ class Loihi(IntegerMachine):
 
         channels, step_s = with_clocks(events, self.netlist.clocks), bin_s * self.netlist.bins
         return page.batch_parts(self.netlist, self.target, channels, lengths=lengths, bin_s=step_s)
-
-    def page_recording(self, events: EventArray, *, bin_s: float) -> RecordingParts:
-        """The same of one, with the time of every message."""
-        from spikeloom.runtime.machines.loihi1.costs import page
-
-        channels, step_s = with_clocks(events, self.netlist.clocks), bin_s * self.netlist.bins
-        return page.recording_parts(self.netlist, self.target, channels, bin_s=step_s)
 
     def price(
         self,

@@ -1,4 +1,4 @@
-"""Files of a chart: data, a line for every point, pictures, and a page; the data read back."""
+"""Files of a chart: data, a line for every point, pictures, and a page."""
 
 from __future__ import annotations
 
@@ -7,11 +7,9 @@ import io
 import json
 from pathlib import Path
 
-from spikeloom.compiler.errors import DataError, ModelError
 from spikeloom.compiler.files import write_atomically
 from spikeloom.runtime.report import html
-from spikeloom.runtime.report.encode import encode, read_json
-from spikeloom.runtime.studies.chart.requests import FORMAT
+from spikeloom.runtime.report.encode import encode
 from spikeloom.runtime.studies.chart.results import Chart
 from spikeloom.runtime.studies.chart.sections import picture, sections
 
@@ -59,15 +57,3 @@ def csv_text(chart: Chart) -> str:
     out.writeheader()
     out.writerows(rows)
     return file.getvalue()
-
-
-def read_chart(words: str, sha256: str, checkpoint: str) -> Chart:
-    """The chart in a file or folder that a network with this checkpoint is part of; refused if there is none."""
-    path = Path(words) / "chart.json" if Path(words).is_dir() else Path(words)
-    chart = read_json(Chart, path, "--chart", "spikeloom chart")
-    if chart.format != FORMAT:
-        raise DataError(f"--chart {words}: is of another version; make it anew with spikeloom chart")
-    if sha256 not in [network.sha256 for network in chart.networks]:
-        names = ", ".join(network.name for network in chart.networks)
-        raise ModelError(f"--chart {words}: is of {names}, not of {checkpoint}; give a chart that this network is in")
-    return chart

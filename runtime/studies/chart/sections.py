@@ -70,7 +70,7 @@ def printed(chart: Chart, folder: str) -> list[Section]:
 
 
 def taken(chart: Chart) -> list[Block]:
-    """Recommended points, and the commands that make them; for the page of a network, too."""
+    """Recommended points, and the commands that make them."""
     named = [(name, number) for name, number in chart.recommended.items() if number is not None]
     rows = [[NAMES[name], *_cells(chart.chosen_by, chart.point(number))] for name, number in named]
     missing = [f"  {NAMES[name]}: no point" for name, number in chart.recommended.items() if number is None]
@@ -79,15 +79,6 @@ def taken(chart: Chart) -> list[Block]:
         Table(["", *_head(chart.chosen_by)], rows, "Recommended points; test figures beside"),
         *(Text(line) for line in missing),
         *_commands(chart.point(number) for number in dict.fromkeys(number for _, number in named)),
-    ]
-
-
-def figures(chart: Chart, prefix: str = "chart", *, measured: bool = False) -> list[Figure]:
-    """Test accuracy over each cost."""
-    titles = {name: f"Test accuracy over {axis.title}" for name, axis in axes(chart, measured=measured).items()}
-    return [
-        Figure(f"{prefix}-{name}", partial(panels, chart, [name], title, measured=measured), f"{title}.")
-        for name, title in titles.items()
     ]
 
 
@@ -154,11 +145,13 @@ def _tip(chart: Chart, point: Point) -> str:
 
 
 def _figures(chart: Chart) -> list[Block]:
-    """One figure at a time, energy first."""
-    return [
-        Details(f"over {axis.title}", [figure], "cost", unfolded=name == "energy")
-        for (name, axis), figure in zip(axes(chart, measured=True).items(), figures(chart, measured=True), strict=True)
-    ]
+    """Test accuracy over each cost, one figure at a time, energy first."""
+    figures = []
+    for name, axis in axes(chart, measured=True).items():
+        title = f"Test accuracy over {axis.title}"
+        figure = Figure(f"chart-{name}", partial(panels, chart, [name], title, measured=True), f"{title}.")
+        figures.append(Details(f"over {axis.title}", [figure], "cost", unfolded=name == "energy"))
+    return [*figures]
 
 
 # -- tables ------------------------------------------------------------------------------------------------------------

@@ -2,25 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.targets.loihi1.layout.chips import chip_count, chip_of_core, chip_tiles
+from spikeloom.compiler.targets.loihi1.layout.chips import chip_of_core, chip_tiles
 from spikeloom.compiler.targets.loihi1.layout.core_graph import core_map
 from spikeloom.compiler.targets.loihi1.legalize import measure
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.runtime.machines.base import EventArray
-from spikeloom.runtime.machines.loihi1 import engine
-from spikeloom.runtime.machines.loihi1.costs import cost
 from spikeloom.runtime.machines.loihi1.costs.estimate import estimate
 from spikeloom.runtime.machines.loihi1.costs.result import CostReport, cost_report
 from spikeloom.runtime.machines.loihi1.costs.sections import sections
-from spikeloom.runtime.machines.loihi1.timing import DetailedTimes, SimpleTimes
-from spikeloom.runtime.machines.loihi1.trace import Counts, Trace
-from spikeloom.runtime.machines.page_parts import BatchParts, Core, Cores, Fill, Mesh, RecordingParts, Way
+from spikeloom.runtime.machines.loihi1.trace import Counts
+from spikeloom.runtime.machines.page_parts import BatchParts, Core, Cores, Fill, Mesh, Way
 from spikeloom.runtime.report.drawing import bar_figure
 from spikeloom.runtime.report.sections import Block, Outcome, Section
 
@@ -34,7 +29,6 @@ def batch_parts(
     """Run recordings (samples, channels, steps), clocks among their channels; `bin_s` is the seconds of a data step."""
     counts, found = estimate(netlist, target, events, lengths=lengths)
     report = cost_report(netlist, target, found, bin_s=bin_s)
-    running = {name: times.critical_core >= 0 for name, times in found.simple.items()}
     fired, spikes = counts.spikes.mean(axis=0), dict[str, FloatArray]()
     for index, layer in enumerate(netlist.layers):
         ids = netlist.compartments_of(index)
@@ -46,47 +40,7 @@ def batch_parts(
         time_s={each.table: each.inference_s["mean"] for each in report.time if each.model == "simple"},
         cores=_cores(netlist, target, counts),
         spikes=spikes,
-        step_s={
-            f"{name}, simple model": np.where(running[name], times.duration_ns, 0).sum(axis=0)
-            / np.maximum(running[name].sum(axis=0), 1)
-            * 1e-9
-            for name, times in found.simple.items()
-        },
     )
-
-
-def recording_parts(netlist: Netlist, target: Target, events: EventArray, *, bin_s: float) -> RecordingParts:
-    """Run one recording (1, channels, steps), message by message where it is on one chip."""
-    detail = "cycle" if chip_count(netlist.core_tile, target) == 1 else "counts"
-    _, found = estimate(netlist, target, events, detail=detail)
-    trace = engine.simulate(netlist, events, spikes=True, updated=True)
-    report = cost_report(netlist, target, found, bin_s=bin_s)
-    models: dict[str, Mapping[str, SimpleTimes | DetailedTimes]] = {"simple": found.simple, "detailed": found.detailed}
-    return RecordingParts(
-        costs=report,
-        core_energy_j={f"core {each.core}": each.energy_j for each in report.cores},
-        energy_j=_energy_by_step(netlist, target, events[0], trace),
-        time_s={
-            f"{name}, {model} model": times.duration_ns[0] * 1e-9
-            for model, each in models.items()
-            for name, times in each.items()
-        },
-    )
-
-
-def _energy_by_step(netlist: Netlist, target: Target, events: EventArray, trace: Trace) -> dict[str, FloatArray]:
-    """Joules of each chip step of one recording (channels, steps) by table; they add up to :func:`cost.estimate`'s."""
-    assert trace.spikes is not None, "spikes were asked for"
-    assert trace.updated is not None, "updates were asked for"
-    spikes: IntArray = trace.spikes[0].astype(np.int64)
-    inputs = np.zeros((len(spikes), netlist.n_inputs), np.int64)
-    inputs[: events.shape[1]] = events.T
-    of_layer = np.eye(len(netlist.layers), dtype=np.int64)[netlist.layer]
-    updates = trace.updated[0].astype(np.int64) @ of_layer
-    counts = Counts(inputs=inputs, spikes=spikes, updates=updates, saturations=np.zeros_like(updates))
-    # each chip step is priced as a run of its own: one that ends after `max_depth + (1 - max_depth)` steps
-    costs = cost.estimate(cost.prepare(netlist, target), counts, 1 - netlist.max_depth)
-    return {name: each.sum(axis=1) for name, each in costs.energy.items()}
 
 
 def _cores(netlist: Netlist, target: Target, counts: Counts) -> Cores:
