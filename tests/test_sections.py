@@ -9,7 +9,7 @@ import pytest
 
 from spikeloom.runtime.report import drawing, html
 from spikeloom.runtime.report.encode import OPTIONAL, decode, encode, key
-from spikeloom.runtime.report.sections import Code, Details, Facts, Figure, Section, Table, Text, markdown, terminal
+from spikeloom.runtime.report.sections import Code, Details, Facts, Figure, Section, Table, Text, terminal
 
 NUMBERS = Table(["layer", "spikes"], [["conv1", "12"], ["fc1", "3 < 4"]], "Spikes by layer")
 CHAPTER = Section(
@@ -34,16 +34,6 @@ def test_text_shows_all_but_what_is_folded_or_for_the_eye():
         "$ spikeloom run 'a b'\n\n"
         "  layer  spikes\n  conv1      12\n  fc1     3 < 4"
     )
-
-
-def test_markdown_has_headings_tables_and_code():
-    text = markdown([CHAPTER])
-    assert text.startswith(
-        "## What was found\n\n- accuracy: 90 % (9 of 10)\n\nfirst\nsecond\n\n### Spikes\n\nBy layer."
-    )
-    assert "| conv1 | 12 |" in text
-    assert "```\nspikeloom run 'a b'\n```" in text
-    assert "### More\n\nfolded" in text
 
 
 def test_a_page_is_whole_escaped_and_the_same_each_time():

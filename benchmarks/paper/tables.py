@@ -14,7 +14,7 @@ from spreads import MARGIN, PROTOCOLS, READINGS, Line, Spread, lines_of, rank_co
 from spikeloom.compiler.files import write_atomically
 from spikeloom.models.training.recipes import DECAY_EPOCHS
 from spikeloom.runtime.report.numbers import si
-from spikeloom.runtime.report.sections import Section, Table, markdown
+from spikeloom.runtime.report.sections import Table
 
 ENERGIES = ("davies2018", "sanafe")
 FIRST_LAYER = ("neurons", "cannot_fire", "unheard", "quiet_in_training", "quiet_in_both")
@@ -115,7 +115,9 @@ def _markdown(table: str, lines: Sequence[Line], cells: Mapping[str, Cell]) -> s
 
 
 def _marked(table: Table) -> str:
-    return markdown([Section("", [table])])
+    ruler = "|".join(["---", *(["---" if table.words else "---:"] * (len(table.head) - 1))])
+    lines = [f"| {' | '.join(row)} |" for row in (table.head, *table.rows)]
+    return "\n".join([lines[0], f"|{ruler}|", *lines[1:]])
 
 
 def _accuracies(lines: Sequence[Line]) -> Table:

@@ -13,19 +13,6 @@ from spikeloom.models.recordings.events import BIN_S
 MIN_AGREEMENT = 0.95
 """Share of equal decisions that ``verify`` wants."""
 
-MODEL: dict[str, object] = {
-    "system": None,
-    "graph": None,
-    "taxels": None,
-    "edges": None,
-    "directed": False,
-    "weights": None,
-    "beta": None,
-    "theta": None,
-    "run": 0,
-}
-"""Options of :func:`add_model`, and what they are where they are not given."""
-
 NETWORK_FILES = "CKPT|NET.onnx|NET.nir"
 """What a float network is read from."""
 

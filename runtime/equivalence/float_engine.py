@@ -75,13 +75,9 @@ class Layer:
 class FloatEngine:
     """A float network prepared by :func:`prepare`; holds no state."""
 
+    network: Network
+    netlist: Netlist
     layers: tuple[Layer, ...]
-    voters: int
-    label: IntArray
-    classes: int
-    inputs: int
-    compartments: int
-    drain: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -127,15 +123,7 @@ def prepare(network: Network, netlist: Netlist) -> FloatEngine:
                 compared=compared,
             )
         )
-    return FloatEngine(
-        layers=tuple(layers),
-        voters=network.readout.population,
-        label=network.readout.label,
-        classes=network.classes,
-        inputs=network.input.size,
-        compartments=netlist.n_compartments,
-        drain=netlist.max_depth,
-    )
+    return FloatEngine(network=network, netlist=netlist, layers=tuple(layers))
 
 
 def _runs(into: list[Projection], sizes: dict[int, int]) -> Runs:
@@ -170,16 +158,17 @@ def run(
     n, _, steps = inputs.shape
     ends = np.full(n, steps) if lengths is None else lengths
     begins = np.zeros(n, np.int64) if begin is None else begin
-    layers = len(engine.layers)
-    sizes = {INPUT: engine.inputs} | {number: len(layer.bias) for number, layer in enumerate(engine.layers)}
+    layers, netlist, readout = len(engine.layers), engine.netlist, engine.network.readout
+    sizes = {INPUT: engine.network.input.size} | {i: len(layer.bias) for i, layer in enumerate(engine.layers)}
     found = FloatRun(
-        votes=np.zeros((n, engine.classes), np.int64),
+        votes=np.zeros((n, engine.network.classes), np.int64),
         spikes=np.zeros((n, layers), np.int64),
         elsewhere=np.zeros((n, layers), np.int64),
-        packed=np.zeros((n, steps + engine.drain, -(-engine.compartments // 64)), np.uint64),
+        packed=np.zeros((n, steps + netlist.max_depth, -(-netlist.n_compartments // 64)), np.uint64),
     )
     for index in range(n):
-        sent = {INPUT: _events(inputs[index, :, : ends[index]])}
+        step, channel = np.nonzero(inputs[index, :, : ends[index]].T)
+        sent = {INPUT: (channel.astype(np.int32), np.searchsorted(step, np.arange(ends[index] + 1)))}
         for number, layer in enumerate(engine.layers):
             source, bounds = _arrivals(layer.pres, sent, sizes)
             counts = np.zeros(sizes[number], np.int64)
@@ -200,8 +189,8 @@ def run(
             )
             found.spikes[index, number] = counts[layer.compared].sum()
             found.elsewhere[index, number] = counts[layer.compared & (layer.seat == NOWHERE)].sum()
-            if number == engine.voters:
-                np.add.at(found.votes[index], engine.label, counts)
+            if number == readout.population:
+                np.add.at(found.votes[index], readout.label, counts)
     return found
 
 
@@ -219,26 +208,6 @@ def _arrivals(
 
 
 # Each step is a function of its own on one-dimensional arrays: only so does the compiler vectorise the loops.
-
-
-@numba.njit(cache=True, nogil=True)
-def _events(inputs: Any) -> Any:
-    """Channels (channels, steps) with an event, step after step: int32 (events,), int64 (steps + 1,)."""
-    channels, steps = inputs.shape
-    bounds = np.zeros(steps + 1, np.int64)
-    for channel in range(channels):
-        for t in range(steps):
-            bounds[t + 1] += inputs[channel, t] != 0
-    for t in range(steps):
-        bounds[t + 1] += bounds[t]
-    place = bounds[:steps].copy()
-    source = np.empty(bounds[steps], np.int32)
-    for channel in range(channels):
-        for t in range(steps):
-            if inputs[channel, t] != 0:
-                source[place[t]] = channel
-                place[t] += 1
-    return source, bounds
 
 
 @numba.njit(cache=True, nogil=True)

@@ -6,18 +6,23 @@ from spikeloom.runtime.equivalence.certificates import Certificate
 from spikeloom.runtime.equivalence.divergence import Divergence
 from spikeloom.runtime.equivalence.verdict import Verdict
 from spikeloom.runtime.report.numbers import percent
-from spikeloom.runtime.report.sections import Section, Table, Text
+from spikeloom.runtime.report.sections import Block, Section, Table, Text
 
 
 def sections(verdict: Verdict) -> list[Section]:
     """Accuracies, levels and warnings; spikes; the ladder; the certificate; the first divergence."""
+    spikes = [
+        [name, *(f"{count:,}" for count in (layer.float, layer.chip, layer.different, layer.ill_posed))]
+        for name, layer in verdict.spikes.items()
+    ]
+    ladder = [[rung.stage, *(f"{rung.different[name]:,}" for name in verdict.spikes)] for rung in verdict.ladder]
     first = verdict.first_divergence
     return [
         Section("Levels", [Text("\n".join(_lines(verdict)))]),
-        Section("Spikes", [spike_table(verdict)]),
-        Section("Ladder", [ladder_table(verdict)]),
-        Section("Certificate", [certificate_table(verdict.certificate), Text(certificate_text(verdict.certificate))]),
-        Section("First divergence", [Text("no spike differs" if first is None else divergence_text(first))]),
+        Section("Spikes", [Table(["spikes", "float", "chip", "different", "ill-posed"], spikes)]),
+        Section("Ladder", [Table(["different, adding", *verdict.spikes], ladder)]),
+        Section("Certificate", _certificate(verdict.certificate)),
+        Section("First divergence", [Text("no spike differs" if first is None else _divergence(first))]),
     ]
 
 
@@ -41,23 +46,8 @@ def _lines(verdict: Verdict) -> list[str]:
     return lines
 
 
-def spike_table(verdict: Verdict) -> Table:
-    """Spikes of each layer on both sides."""
-    rows = [
-        [name, *(f"{count:,}" for count in (layer.float, layer.chip, layer.different, layer.ill_posed))]
-        for name, layer in verdict.spikes.items()
-    ]
-    return Table(["spikes", "float", "chip", "different", "ill-posed"], rows)
-
-
-def ladder_table(verdict: Verdict) -> Table:
-    """Entries that differ, rung by rung."""
-    rows = [[rung.stage, *(f"{rung.different[name]:,}" for name in verdict.spikes)] for rung in verdict.ladder]
-    return Table(["different, adding", *verdict.spikes], rows)
-
-
-def certificate_table(certificate: Certificate) -> Table:
-    """Entries that no order of summation changes, layer by layer."""
+def _certificate(certificate: Certificate) -> list[Block]:
+    """Entries that no order of summation changes, certified decisions, and whether registers stay in range."""
     rows = [
         [
             name,
@@ -68,18 +58,16 @@ def certificate_table(certificate: Certificate) -> Table:
         ]
         for name, layer in certificate.layers.items()
     ]
-    return Table(["certified in any order of sums", "entries", "equal", "different", "undecided"], rows)
-
-
-def certificate_text(certificate: Certificate) -> str:
-    """Certified decisions, and whether registers stay in range."""
     proof = "no register overflows for any input"
     if certificate.unproven:
         proof = f"some input may overflow a register of {', '.join(certificate.unproven)}: no proof of range"
-    return f"{certificate.decisions} of {certificate.samples} decisions certified equal; {proof}"
+    return [
+        Table(["certified in any order of sums", "entries", "equal", "different", "undecided"], rows),
+        Text(f"{certificate.decisions} of {certificate.samples} decisions certified equal; {proof}"),
+    ]
 
 
-def divergence_text(first: Divergence) -> str:
+def _divergence(first: Divergence) -> str:
     """Where the first spike differs, and how near both membranes were to their thresholds."""
     where = f"neuron {first.neuron}"
     if first.taxel is not None:

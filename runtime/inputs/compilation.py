@@ -11,21 +11,6 @@ from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.errors import OptionError
 from spikeloom.runtime.inputs.network import LoadedNetwork
 
-ROUNDING: dict[str, object] = {
-    "weight_bits": None,
-    "planes": None,
-    "scale_groups": None,
-    "spike_exact": False,
-    "prune_unused": False,
-    "ranges": "proven",
-    "margin": None,
-    "dump_after": [],
-}
-"""Options of ``compile`` that say how a float network is stored, likewise."""
-
-PLACING: dict[str, object] = {"keep_all": False, "cores_for": None, "chips": 1, "optimize": "cores"}
-"""Options of ``compile`` that say where integers go, likewise."""
-
 
 def provenance(arguments: argparse.Namespace, asked: LoadedNetwork, *, calibrated: bool) -> Mapping[str, Any]:
     """What a netlist remembers of its compilation; `calibrated` if recordings chose its scales."""

@@ -31,6 +31,7 @@ from spikeloom.models.graphs import CHOICES, NEUTOUCH, Graph
 from spikeloom.models.sensors import read_layout, sensor_graph
 from spikeloom.models.systems import NO_GRAPH, grid_cells, propagation_of
 from spikeloom.runtime.inputs.files import shipped
+from spikeloom.runtime.inputs.repeat import NETWORK, refuse
 from spikeloom.runtime.report.console import progress
 
 NETWORKS = {ONNX: "ONNX", NIR: "NIR"}
@@ -134,20 +135,14 @@ def _require_fit(path: str, suffix: str | None, arguments: argparse.Namespace) -
     if path.endswith(NETX):
         raise OptionError(f"{path}: holds integers, no float network to compare with; compile, inspect and run it")
     if suffix is None:
-        layout = {"--polarities": arguments.polarities, "--polarities-first or -last": arguments.polarities_first}
-        for option, value in layout.items():
-            if value is not None:
-                raise OptionError(f"{option}: is for ONNX and NIR files, {path} is none; omit it")
+        why = f"is for ONNX and NIR files, {path} is none"
+        refuse(arguments, ("polarities",), why)
+        if arguments.polarities_first is not None:
+            raise OptionError(f"--polarities-first or -last: {why}; omit it")
     else:
-        for name in ("system", "graph", "taxels", "edges", "directed", "weights", "beta", "theta", "run"):
-            if getattr(arguments, name) not in (None, False, 0):
-                raise OptionError(
-                    f"--{name}: is for checkpoints, the {NETWORKS[suffix]} file {path} holds all it needs; omit it"
-                )
+        refuse(arguments, NETWORK, f"is for checkpoints, the {NETWORKS[suffix]} file {path} holds all it needs")
     if suffix != NIR:
-        for name in ("dt", "convention"):
-            if getattr(arguments, name) is not None:
-                raise OptionError(f"--{name}: is for NIR files, {path} is none; omit it")
+        refuse(arguments, ("dt", "convention"), f"is for NIR files, {path} is none")
 
 
 def load_graph(arguments: argparse.Namespace, system: str = TACTILESGNET) -> Graph | None:
@@ -156,9 +151,7 @@ def load_graph(arguments: argparse.Namespace, system: str = TACTILESGNET) -> Gra
     Raises OptionError or ModelError if there is no such graph, its files are wrong, or the system has no graph at all.
     """
     if system not in GRAPH_SYSTEMS:
-        for option in ("graph", "edges", "directed"):
-            if getattr(arguments, option):
-                raise OptionError(f"--{option}: is for taxel graphs, {TITLES[system]} has none; omit it")
+        refuse(arguments, ("graph", "edges", "directed"), f"is for taxel graphs, {TITLES[system]} has none")
         return None
     if not (arguments.graph or arguments.taxels or arguments.edges or arguments.directed):
         return None
@@ -178,14 +171,6 @@ def sensor_places(taxels: str | None) -> FloatArray:
         return NEUTOUCH
     count, places = read_layout(taxels)
     return np.arange(float(count))[:, None] if places is None else places
-
-
-def graph_words(arguments: argparse.Namespace) -> str:
-    """Options that name the graph, as they would be typed beside the files."""
-    files = {"--taxels": arguments.taxels, "--edges": arguments.edges}
-    words = [f"--graph {arguments.graph}"] if arguments.graph else []
-    words += [f"{option} {Path(name).name}" for option, name in files.items() if name]
-    return " ".join([*words, *(["--directed"] if arguments.directed else [])])
 
 
 def propagation(checkpoint: Checkpoint, asked: Graph | None, where: str) -> tuple[str, FloatArray]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 from difflib import get_close_matches
 
 from spikeloom.compiler.errors import DataError, OptionError
@@ -114,8 +113,3 @@ def find_recording(data: Recordings, wanted: str, option: str) -> int:
         f"{option} {wanted}: no such recording among {len(data)} of split {data.split}; near are {', '.join(near)}; "
         "'spikeloom run --json' lists the names"
     )
-
-
-def bin_words(bin_s: float) -> list[str]:
-    """Words that ask for a width of a time bin; none for the usual one."""
-    return [] if math.isclose(bin_s, BIN_S) else ["--bin", f"{bin_s:g}"]

@@ -1,19 +1,37 @@
-"""What to type to get the same again."""
+"""Options as they are typed: to get the same again, or to refuse what does not apply."""
 
 from __future__ import annotations
 
 import argparse
-import math
 import shlex
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from spikeloom.compiler import DEFAULT_TARGET
+from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.types import JsonObject
 from spikeloom.models.recordings.events import BIN_S
 
 NETWORK = ("graph", "taxels", "edges", "directed", "system", "run", "weights", "beta", "theta")
 """Options that say how a checkpoint is read."""
+
+ROUNDING = ("weight_bits", "planes", "scale_groups", "spike_exact", "prune_unused", "ranges", "margin")
+"""Options of ``compile`` that say how a float network is stored."""
+
+PLACING = ("keep_all", "cores_for", "chips", "optimize")
+"""Options of ``compile`` that say where integers go."""
+
+USUAL: Mapping[str, object] = {
+    "run": 0,
+    "target": DEFAULT_TARGET,
+    "bin": BIN_S,
+    "ranges": "proven",
+    "chips": 1,
+    "optimize": "cores",
+    "engine": "spikeloom",
+    **dict.fromkeys(("directed", "spike_exact", "prune_unused", "keep_all"), False),
+}
+"""What options are where they are not given; others are None."""
 
 
 def words(options: Mapping[str, Any]) -> list[str]:
@@ -26,19 +44,24 @@ def words(options: Mapping[str, Any]) -> list[str]:
     """
     typed: list[str] = []
     for name, value in options.items():
-        usual = (name == "run" and value == 0) or (name == "bin" and math.isclose(value, BIN_S))
-        usual |= name == "target" and value == DEFAULT_TARGET
-        if value is None or value is False or usual:
+        if value is None or value is False or value == USUAL.get(name, []):
             continue
         typed.append(f"--{name.replace('_', '-')}")
         if value is not True:
-            typed.append(f"{value:g}" if name == "bin" else str(value))
+            typed.append(f"{value:g}" if name == "bin" else str(getattr(value, "source", value)))
     return typed
 
 
 def given(arguments: argparse.Namespace, names: Sequence[str]) -> JsonObject:
     """Some options of a command, by name."""
     return {name: getattr(arguments, name) for name in names}
+
+
+def refuse(arguments: argparse.Namespace, names: Sequence[str], why: str) -> None:
+    """Refuse options that are given although they do not apply; OptionError naming the first of them."""
+    for name in names:
+        if typed := words({name: getattr(arguments, name, None)}):
+            raise OptionError(f"{' '.join(typed)}: {why}; omit it")
 
 
 def command(*typed: str) -> str:

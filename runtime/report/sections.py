@@ -1,7 +1,7 @@
 """What a result has to say, laid out once: sections of text, tables, figures and commands; and these as text.
 
-A study returns a frozen dataclass; a function beside it turns that into sections. :func:`terminal` and :func:`markdown`
-print them as text, :mod:`report.html` as a page. The first heading of a table is its name.
+A study returns a frozen dataclass; a function beside it turns that into sections. :func:`terminal` prints them,
+:mod:`report.html` makes a page of them. The first heading of a table is its name.
 """
 
 from __future__ import annotations
@@ -162,38 +162,3 @@ def _aligned(table: Table) -> str:
         ).rstrip()
         for line in lines
     )
-
-
-def markdown(sections: Iterable[Section], level: int = 2) -> str:
-    """Markdown with a heading for each titled section.
-
-    Examples
-    --------
-    >>> print(markdown([Section("", [Table(["layer", "spikes"], [["fc1", "3"]])])]))
-    | layer | spikes |
-    |---|---:|
-    | fc1 | 3 |
-    """
-    parts = []
-    for section in sections:
-        parts += [f"{'#' * level} {section.title}"] if section.title else []
-        parts += [_marked(block, level) for block in section.blocks]
-    return "\n\n".join(filter(None, parts))
-
-
-def _marked(block: Block, level: int) -> str:
-    match block:
-        case Text(text):
-            return text
-        case Table(head, rows, words=words):
-            ruler = "|".join(["---", *(["---" if words else "---:"] * (len(head) - 1))])
-            lines = [f"| {' | '.join(head)} |", f"|{ruler}|", *(f"| {' | '.join(row)} |" for row in rows)]
-            return "\n".join(lines)
-        case Figure(caption=caption, numbers=numbers):
-            return "\n\n".join([caption, *(_marked(table, level) for table in numbers)])
-        case Facts(values):
-            return "\n".join(f"- {name}: {value} ({note})" for name, (value, note) in values.items())
-        case Code(lines):
-            return "\n".join(["```", *lines, "```"])
-        case Section() | Details():
-            return markdown([Section(block.title, block.blocks)], level + 1)

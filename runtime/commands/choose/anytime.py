@@ -10,10 +10,11 @@ from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.files import write_atomically
 from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.runtime.commands.options import MODEL, add_netlist_and_model, add_recordings
+from spikeloom.runtime.commands.options import add_netlist_and_model, add_recordings
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.inputs.recordings import load_recordings
+from spikeloom.runtime.inputs.repeat import NETWORK, refuse
 from spikeloom.runtime.machines.integer import IntegerMachine, integer_machine_for
 from spikeloom.runtime.machines.votes import votes_by_step
 from spikeloom.runtime.report.console import progress
@@ -34,9 +35,6 @@ ALLOWED = (0.0, 0.005, 0.01, 0.02, 0.05)
 
 DIFFER = 0.0
 """By default no calibration race may end otherwise; of real votes a little more do than of races."""
-
-BESIDE = ("graph", "taxels", "edges", "directed", "system", "run", "weights", "beta", "theta", "dt", "convention")
-"""Options that say how a checkpoint is read, and are nothing without one."""
 
 PART = 16
 """Recordings whose float spikes are held at a time."""
@@ -114,9 +112,7 @@ def _races(arguments: argparse.Namespace, machine: IntegerMachine) -> FloatArray
 def _float_votes(arguments: argparse.Namespace, machine: IntegerMachine, data: Recordings) -> IntArray | None:
     """Votes of the float model so far after each step, (samples, steps, classes), if a checkpoint was given."""
     if arguments.checkpoint is None:
-        given = [name for name in BESIDE if getattr(arguments, name) != MODEL.get(name)]
-        if given:
-            raise OptionError(f"--{given[0]}: is for --checkpoint, which is not given; add it or omit this")
+        refuse(arguments, (*NETWORK, "dt", "convention"), "is for --checkpoint, which is not given; add it")
         return None
     from spikeloom.compiler.interpret import cut
     from spikeloom.runtime.equivalence.reference import require_match, spikes_of

@@ -15,10 +15,11 @@ from spikeloom.compiler.formats.onnx.builder import port_words
 from spikeloom.compiler.formats.onnx.writer import FORMS
 from spikeloom.models.recordings.events import BIN_S
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.runtime.commands.options import DATA_HELP, MODEL, add_bin_option, add_model
+from spikeloom.runtime.commands.options import DATA_HELP, add_bin_option, add_model
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import load_checkpoint, load_graph, propagation
 from spikeloom.runtime.inputs.recordings import recordings
+from spikeloom.runtime.inputs.repeat import NETWORK, refuse
 from spikeloom.runtime.machines.export_format import Export, Format, Request, port_lines
 from spikeloom.runtime.machines.exports import FORMATS
 from spikeloom.runtime.report.encode import INLINE
@@ -132,11 +133,8 @@ def _require_fit(arguments: argparse.Namespace, chosen: Format | None) -> None:
             raise OptionError(f"{shown}: is for {' and '.join(formats)}, --to says {arguments.to}; omit it")
         if name in OF_RECORDINGS and arguments.data is None:
             raise OptionError(f"{shown}: says which recording of --data, which is not given; add it")
-    for name, absent in {} if chosen is None else MODEL.items():
-        value = getattr(arguments, name)
-        if value != absent:
-            shown = f"--{name}" if value is True else f"--{name} {value}"
-            raise OptionError(f"{shown}: is for checkpoints, --to {arguments.to} takes a netlist; omit it")
+    if chosen is not None:
+        refuse(arguments, NETWORK, f"is for checkpoints, --to {arguments.to} takes a netlist")
 
 
 def run(arguments: argparse.Namespace) -> Outcome:

@@ -15,6 +15,7 @@ from spikeloom.runtime.inputs.compilation import margin_of, parse_cores, parse_p
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.inputs.recordings import recordings
+from spikeloom.runtime.inputs.repeat import refuse
 from spikeloom.runtime.machines.base import chip_commands, compiled, trained_for
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.sections import Outcome
@@ -84,8 +85,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     own = trained_for(arguments.checkpoint) or chip_commands(arguments.target)
     if own is not None:
         return own.compile_network(arguments)  # type: ignore[no-any-return]
-    if arguments.in_time is not None:
-        raise OptionError(f"--in-time {arguments.in_time}: {arguments.target} has no such option; omit it")
+    refuse(arguments, ("in_time",), f"{arguments.target} has no such option")
     if arguments.margin is not None and arguments.ranges != "observed":
         raise OptionError(
             f"--margin {arguments.margin:g}: only observed ranges have one; add --ranges observed or omit it"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,15 +13,12 @@ from spikeloom.compiler.formats.netx.layout import SUFFIX
 from spikeloom.compiler.formats.netx.reader import read_netx
 from spikeloom.compiler.invariants import verify
 from spikeloom.compiler.targets.base import load_target
-from spikeloom.runtime.commands.options import MODEL
-from spikeloom.runtime.inputs.compilation import ROUNDING, parse_cores
+from spikeloom.runtime.inputs.compilation import parse_cores
+from spikeloom.runtime.inputs.repeat import NETWORK, ROUNDING, refuse
 from spikeloom.runtime.machines.base import machine_of
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.encode import INLINE
 from spikeloom.runtime.report.sections import Outcome, Section, Text
-
-FLOATS: Mapping[str, object] = {"dt": None, "convention": None, **ROUNDING, "calibrate": None}
-"""Options that say how a float network is read and rounded, and what they are where they are not given."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,12 +40,9 @@ def compile_integers(arguments: argparse.Namespace) -> Outcome:
     path = arguments.checkpoint
     if load_target(arguments.target).options is not Options:
         raise OptionError(f"--target {arguments.target}: {path} holds integers of another chip; omit it")
-    if arguments.in_time is not None:
-        raise OptionError(f"--in-time {arguments.in_time}: is for float networks, {path} holds integers; omit it")
-    _refuse(arguments, FLOATS, f"is for float networks, {path} holds integers; omit it")
-    _refuse(arguments, MODEL, f"is for checkpoints, the netx file {path} holds all it needs; omit it")
-    why = f"weighs layouts by what a float network does on recordings, {path} holds integers; omit it"
-    _refuse(arguments, {"optimize": "cores"}, f"{why}, or give --cores-for")
+    floats = ("in_time", "dt", "convention", *ROUNDING, "dump_after", "calibrate", "optimize")
+    refuse(arguments, floats, f"is for float networks, {path} holds integers")
+    refuse(arguments, NETWORK, f"is for checkpoints, the netx file {path} holds all it needs")
     progress("reading the network")
     read = read_netx(path, polarities=arguments.polarities, polarities_first=arguments.polarities_first)
     verify(read.network)
@@ -74,9 +68,3 @@ def compile_integers(arguments: argparse.Namespace) -> Outcome:
         yield Section("", [*last.blocks, Text(f"sha256 {sha256}")])
 
     return Outcome(LaidOut(netlist=described.result, path=arguments.output, facts=read.facts), sections)
-
-
-def _refuse(arguments: argparse.Namespace, options: Mapping[str, object], why: str) -> None:
-    for name, absent in options.items():
-        if getattr(arguments, name) != absent:
-            raise OptionError(f"--{name.replace('_', '-')}: {why}")

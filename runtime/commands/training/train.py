@@ -29,9 +29,10 @@ from spikeloom.models.training.recipes import (
     decays_asked,
 )
 from spikeloom.runtime.commands.options import DATA_HELP, add_bin_option, add_graph_options, add_system
+from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.files import require_place
-from spikeloom.runtime.inputs.network import graph_words, load_graph, sensor_places
-from spikeloom.runtime.inputs.recordings import bin_words, recordings, require_bins
+from spikeloom.runtime.inputs.network import load_graph, sensor_places
+from spikeloom.runtime.inputs.recordings import recordings, require_bins
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.sections import Outcome
 from spikeloom.runtime.studies.training.training import Job, output_of
@@ -151,10 +152,12 @@ def plan_jobs(arguments: argparse.Namespace, training: Recordings, test: Recordi
     data = arguments.data if arguments.data == SYNTHETIC else training.source
     words = [
         f"spikeloom train --data {data}",
-        " ".join(bin_words(arguments.bin)),
+        *repeat.words({"bin": arguments.bin}),
         f"--join {arguments.join}" if arguments.join > 1 else "",
     ]
-    words += [_system_words(arguments, system), graph_words(arguments)]
+    sensor = repeat.given(arguments, ("graph", "taxels", "edges", "directed"))
+    sensor |= {name: Path(sensor[name]).name for name in ("taxels", "edges") if sensor[name]}
+    words += [_system_words(arguments, system), *repeat.words(sensor)]
     recipe = _recipe(arguments)
     epochs = recipe.epochs if arguments.epochs is None else arguments.epochs
     command = " ".join(filter(None, [*words, _recipe_words(arguments), f"--epochs {epochs}"]))

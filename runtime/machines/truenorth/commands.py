@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Mapping
 from dataclasses import replace
 from operator import add
 from pathlib import Path
@@ -23,10 +22,10 @@ from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
 from spikeloom.compiler.targets.truenorth.netlist_file import write_crossbars
 from spikeloom.compiler.targets.truenorth.passes import Compilation, Options
 from spikeloom.compiler.types import BoolArray, JsonObject
-from spikeloom.runtime.inputs.compilation import PLACING, ROUNDING
 from spikeloom.runtime.inputs.files import shipped
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import netlist_recordings
+from spikeloom.runtime.inputs.repeat import NETWORK, PLACING, ROUNDING, refuse
 from spikeloom.runtime.machines.truenorth import verdicts
 from spikeloom.runtime.machines.truenorth.describe import describe, describe_trained
 from spikeloom.runtime.machines.truenorth.machine import load
@@ -36,30 +35,11 @@ from spikeloom.runtime.report.sections import Outcome
 
 TITLE = "TrueNorth"
 
-OTHERS: Mapping[str, Any] = {
-    **dict.fromkeys(("graph", "taxels", "edges", "beta", "theta", "system"), None),
-    **{"run": 0, "directed": False},
-}
-"""Options of other checkpoints, and what they are where they are not given."""
-
-STORAGE: Mapping[str, Any] = {
-    "calibrate": None,
-    **{name: usual for name, usual in (ROUNDING | PLACING).items() if name != "dump_after"},
-}
-"""Options of ``compile`` for chips that store rounded weights, likewise."""
-
-VERIFY: Mapping[str, Any] = {"original": None, "min_agreement": None, "require": None, "engine": "spikeloom"}
-"""Options of ``verify`` where chip and model may differ, likewise."""
+VERIFY = ("original", "min_agreement", "require", "engine")
+"""Options of ``verify`` where chip and model may differ."""
 
 SPEC_STEPS = 5
 """Data steps of a recording on which the specification runs, too: it takes a second for two hundred ticks."""
-
-
-def _refuse_options(arguments: argparse.Namespace, absent: Mapping[str, Any], why: str) -> None:
-    for name, value in absent.items():
-        given = getattr(arguments, name, value)
-        if given != value and (name, given) != ("system", SYSTEM):
-            raise OptionError(f"--{name.replace('_', '-')} {given}: {why}; omit it")
 
 
 def takes(path: str) -> bool:
@@ -69,7 +49,8 @@ def takes(path: str) -> bool:
 
 def read(path: str, arguments: argparse.Namespace) -> Trained:
     """Read a trained network as the options say; OptionError or ModelError if it is not as they say."""
-    _refuse_options(arguments, OTHERS, f"{path} is a network for {TITLE} and says that itself")
+    others = [name for name in NETWORK if name != "weights" and getattr(arguments, name, None) != SYSTEM]
+    refuse(arguments, others, f"{path} is a network for {TITLE} and says that itself")
     return read_trained(shipped(path), weights=arguments.weights)
 
 
@@ -84,7 +65,7 @@ def compile_network(arguments: argparse.Namespace) -> Outcome:
     chip = load_target("truenorth")
     if arguments.target != chip.name:
         raise OptionError(f"--target {arguments.target}: {path} was trained for {TITLE}; give --target {chip.name}")
-    _refuse_options(arguments, STORAGE, f"is not for {chip.name}")
+    refuse(arguments, ("calibrate", *ROUNDING, *PLACING), f"is not for {chip.name}")
     source: NativeNetwork | Factored | Network
     if trained:
         network = read(path, arguments)
@@ -121,7 +102,7 @@ def provenance(trained: Trained) -> JsonObject:
 def verify(arguments: argparse.Namespace) -> Outcome:
     """Compare chip, specification and model; exit code 1 where one spike differs."""
     why = f"a network for {TITLE} has one model, whose every spike must be the chip's"
-    _refuse_options(arguments, VERIFY, why)
+    refuse(arguments, VERIFY, why)
     machine = load(arguments.netlist)
     check = _verify_in_time if "in_time" in machine.netlist.provenance else _verify_trained
     verdict = check(arguments, machine.netlist, machine.target)

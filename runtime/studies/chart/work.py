@@ -25,7 +25,8 @@ from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.models.recordings.events import joined_bins
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.recordings.windows import first_part, steps_of
-from spikeloom.runtime.inputs.compilation import PLACING, ROUNDING, parse_cores, parse_packings, provenance
+from spikeloom.runtime.inputs import repeat
+from spikeloom.runtime.inputs.compilation import parse_cores, parse_packings, provenance
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import recordings
 from spikeloom.runtime.machines.base import DEFAULT, Machine, Price, chip_chart, machine_for
@@ -202,8 +203,7 @@ def _compile_options(work: Build, layout: str) -> argparse.Namespace:
     return argparse.Namespace(
         **{name: value for name, value in vars(work.network.source.arguments()).items() if name != "target"}
         | {"target": DEFAULT}
-        | ROUNDING
-        | PLACING
+        | {name: repeat.USUAL.get(name) for name in (*repeat.ROUNDING, *repeat.PLACING)}
         | {name: value for name, value in work.storage.options().items() if value is not None}
         | layout_options(layout)
     )
