@@ -3,6 +3,7 @@
 import hashlib
 import json
 from dataclasses import fields
+from functools import cache
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from test_cost import check as check_costs
 from test_onnx_engine import assert_as_specified
 from zoo import CROSSBARS, FLOAT, LAYERED, MAKERS, over, specified, specimen
 
+import spikeloom
 from spikeloom.compiler import lift
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.interpret import channels_last, run_float, run_integer
@@ -24,6 +26,7 @@ from spikeloom.models.networks.reference import float_spikes
 from spikeloom.runtime.cli import build_parser, main
 from spikeloom.runtime.equivalence import float_engine
 from spikeloom.runtime.inputs.network import load_network
+from spikeloom.runtime.machines.base import machine_for
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.blocks import obstacle
 from spikeloom.runtime.machines.loihi1.trace import aligned, unpack
@@ -31,6 +34,7 @@ from spikeloom.runtime.machines.truenorth import engine as crossbar_engine
 from spikeloom.runtime.machines.truenorth import spec as crossbar_spec
 from spikeloom.runtime.machines.truenorth.trace import Counts, Trace
 from spikeloom.runtime.machines.votes import readout_counts
+from spikeloom.runtime.report.encode import encode
 
 CHECKPOINTS = tuple(name for name in FLOAT if name not in ("recurrent", "onnx"))
 STEP_BY_STEP = ("recurrent", "gcn", "onnx")
@@ -63,7 +67,7 @@ def require_keys(what, found):
     assert always <= set(found) <= always | sometimes
 
 
-# --- the chip -------------------------------------------------------------------------------------------------------
+# --- the chip ------------------------------------------------------------------------------------------------------
 @over(LAYERED)
 def test_every_kernel_is_the_specification(name):
     made = specimen(name)
@@ -136,7 +140,7 @@ def test_streams_give_the_votes_of_whole_recordings(name):
         stream.reset()
 
 
-# --- files ----------------------------------------------------------------------------------------------------------
+# --- files ---------------------------------------------------------------------------------------------------------
 @over(MAKERS)
 def test_a_file_holds_the_netlist_to_the_byte(name):
     made = specimen(name)
@@ -157,7 +161,7 @@ def test_compiled_again_the_bytes_are_the_same(name, tmp_path, capsys):
     assert (tmp_path / "again.loom").read_bytes() == made.netlist.read_bytes()
 
 
-# --- costs ----------------------------------------------------------------------------------------------------------
+# --- costs ---------------------------------------------------------------------------------------------------------
 @over(LAYERED)
 def test_costs_are_those_counted_spike_by_spike(name):
     made = specimen(name)
@@ -182,7 +186,7 @@ def test_costs_of_crossbars_are_those_counted_tick_by_tick(name):
         assert price.energy_j[marginal.name][sample] == pytest.approx(joules)
 
 
-# --- the float side -------------------------------------------------------------------------------------------------
+# --- the float side ------------------------------------------------------------------------------------------------
 @over(CHECKPOINTS)
 def test_the_expanded_network_is_the_float_model(name):
     made = specimen(name)
@@ -211,7 +215,7 @@ def test_the_float_engine_is_the_float_model(name):
     assert_array_equal(found.votes, readout_counts(loaded.network.readout, loaded.network.classes, wanted[-1]))
 
 
-# --- commands -------------------------------------------------------------------------------------------------------
+# --- commands ------------------------------------------------------------------------------------------------------
 @over((*FLOAT, *CROSSBARS))
 def test_verify_holds_every_network_to_its_file(name, capsys):
     made = specimen(name)
@@ -313,3 +317,41 @@ def test_watch_decides_as_run(name, tmp_path, capsys):
         require_keys(f"watch {entry['kind']}", entry)
     counts = [entry["counts"] for entry in shown if entry["kind"] == "grasp"]
     assert counts == made.machine.run(made.events).votes.tolist()
+
+
+# --- shipped networks, held against what was recorded -----------------------------------------------------------------
+
+
+NETWORKS = {
+    "grasps": {},
+    "objects": {"planes": "2", "scale_groups": "4"},
+    "containers": {"weight_bits": "8,4,4,8", "chips": 2},
+    "objects-200ms": {"weight_bits": "3"},
+    "containers-100ms": {"chips": 4},
+    "objects-truenorth": {"target": "truenorth"},
+    "containers-truenorth": {"target": "truenorth"},
+}
+"""Name of a shipped network, and how it is stored."""
+
+
+@cache
+def grasps():
+    return spikeloom.recordings("synthetic").test
+
+
+def digest(values):
+    array = np.ascontiguousarray(values)
+    whole = array.astype(np.int64 if array.dtype.kind in "iub" else np.float64)
+    return hashlib.sha256(f"{array.shape}".encode() + whole.tobytes()).hexdigest()[:16]
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_integers_votes_and_costs_are_as_recorded(name, golden):
+    net = spikeloom.compile(f"pretrained:{name}", **NETWORKS[name])
+    netlist = machine_for(net.path).netlist
+    arrays = {each.name: getattr(netlist, each.name) for each in fields(netlist)}
+    found = {key: digest(value) for key, value in arrays.items() if isinstance(value, np.ndarray)}
+    done, price = machine_for(net.path).price(grasps().events[:12], bin_s=0.02)
+    found["votes"] = done.votes.tolist()
+    found["costs"] = encode([price.synaptic_operations, price.energy_j, price.time_s])
+    golden(f"{name}.json", json.dumps(found, indent=1) + "\n")

@@ -1,10 +1,10 @@
-"""The fast simulator is the plain one, bit for bit, on networks of any kind; and its own promises."""
+"""The fast simulator, step by step and layer by layer, is the plain one, bit for bit, on networks of any kind."""
 
 import itertools
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from random_netlists import (
     KEPT,
@@ -21,8 +21,10 @@ from random_netlists import (
 )
 
 from spikeloom.compiler.errors import NumericRangeError
+from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.runtime.machines.loihi1 import engine, kernel, spec
-from spikeloom.runtime.machines.loihi1.trace import Trace
+from spikeloom.runtime.machines.loihi1.blocks import lay_out_blocks
+from spikeloom.runtime.machines.loihi1.trace import Charges, Trace, pack, unpack
 
 REPEATABLE = settings(max_examples=40, deadline=None, derandomize=True)
 
@@ -166,3 +168,241 @@ def test_the_kernel_compiles_where_nothing_can_be_cached(monkeypatch):
 
     monkeypatch.setattr(kernel, "njit", njit)
     assert kernel.compiled_and_cached(len) == (len, {"nogil": True})
+
+
+# --- the kernel of layers ---------------------------------------------------------------------------------------------
+
+
+def pipeline(
+    seed: int,
+    *,
+    inputs: int,
+    sizes: tuple[tuple[int, ...], ...],
+    density: float,
+    largest: int = 6,
+    biases: float = 0.7,
+    lasting: float = 0.0,
+) -> Netlist:
+    """Layers of `sizes`, some at each depth, on random cores; each neuron receives the depth before."""
+    rng = np.random.default_rng(seed)
+    neurons, depths, axons = [], [], []
+    cores = int(rng.integers(1, 4))
+    placed: list[tuple[int, int]] = []  # layer, core
+    for depth, layers in enumerate(sizes):
+        for size in layers:
+            placed += [(len(depths), int(core)) for core in np.sort(rng.integers(0, cores, size))]
+            depths.append(depth)
+    for layer, core in placed:
+        drawn = {
+            "decay_u": int(rng.choice([0, 204, 2047, 4094])) if rng.random() < lasting else 4095,
+            "decay_v": int(rng.choice([3277, 3277, 3277, 4096, 2048])),
+            "threshold": int(rng.integers(0, 12 * largest)),
+            "bias": int(rng.integers(-300, 300)) if rng.random() < biases else 0,
+        }
+        neurons.append(Neuron(layer=layer, core=core, **drawn))
+    order = sorted(range(len(neurons)), key=lambda i: neurons[i].core)
+    compartment = {index: c for c, index in enumerate(order)}
+    first_of_core = {core: sum(n.core < core for n in neurons) for core in range(cores)}
+    for depth in range(len(sizes)):
+        sources = range(inputs) if depth == 0 else [i for i, n in enumerate(neurons) if depths[n.layer] == depth - 1]
+        for source in sources:
+            for core in range(cores):
+                targets = [
+                    (compartment[i] - first_of_core[core], int(rng.integers(-largest, largest + 1)))
+                    for i, n in enumerate(neurons)
+                    if n.core == core and depths[n.layer] == depth and rng.random() < density
+                ]
+                if targets:
+                    axon = source if depth == 0 else inputs + compartment[source]
+                    exponent = int(rng.integers(0, 2))
+                    axons.append(Axon(source=axon, targets=tuple(targets), core=core, exponent=exponent))
+    return build(neurons, axons, n_inputs=inputs, depths=depths)
+
+
+def assert_kernels_agree(netlist: Netlist, events: np.ndarray) -> None:
+    assert lay_out_blocks(netlist) is not None
+    expected = spec.simulate(netlist, events)
+    assert_equal(by_engine(netlist, events), expected)
+    assert_equal(by_steps(netlist, events), expected)
+    rng = np.random.default_rng(events.size)
+    rows = {"channels": netlist.n_inputs, "spikes": netlist.n_compartments, "updates": netlist.n_compartments}
+    sums = int(rng.choice([1, 16, 17]))
+    largest = int(rng.choice([2**31, 2**20]))  # sums of the first leave 32 bits, those of the second never do
+    charges = Charges(**{name: rng.integers(-largest, largest, (size, sums)) for name, size in rows.items()})
+    if rng.random() < 0.5:
+        charges.updates[:] = charges.updates[rng.integers(0, min(3, len(charges.updates)), len(charges.updates))]
+    wanted = expected.spikes.astype(np.int64) @ charges.spikes + expected.updated.astype(np.int64) @ charges.updates
+    wanted[: events.shape[1]] += events.T.astype(np.int64) @ charges.channels
+    for stepwise in (False, True):
+        prepared = engine.prepare(netlist, stepwise=stepwise, charges=charges)
+        found = engine.simulate(prepared, events[None], packed=True)
+        np.testing.assert_array_equal(found.charged[0], wanted, strict=True)
+        np.testing.assert_array_equal(found.packed[0], pack(expected.spikes), strict=True)
+        np.testing.assert_array_equal(unpack(found.packed[0], netlist.n_compartments), expected.spikes, strict=True)
+
+
+SHAPES = (((3,),), ((64,), (65,)), ((70, 5), (1,), (130,)), ((20,), (2, 3, 4), (6,)))
+
+
+@REPEATABLE
+@given(
+    st.integers(0, 10**6),
+    st.sampled_from([1, 3, 64, 65, 130]),
+    st.sampled_from(SHAPES),
+    st.sampled_from([0.03, 0.3, 1.0]),
+    st.sampled_from([0.0, 0.7, 1.0]),
+    st.sampled_from([0.0, 0.02, 0.3, 1.0]),
+    st.sampled_from([0.0, 0.3, 1.0]),
+)
+def test_any_pipeline(seed, inputs, sizes, density, biases, rate, lasting):
+    netlist = pipeline(seed, inputs=inputs, sizes=sizes, density=density, biases=biases, lasting=lasting)
+    assume(lay_out_blocks(netlist) is not None)  # currents that last for ever may leave their registers
+    rng = np.random.default_rng(seed)
+    assert_kernels_agree(netlist, (rng.random((inputs, 12)) < rate).astype(np.uint8))
+
+
+def test_the_random_pipelines_reach_every_way_of_storage():
+    found = [
+        lay_out_blocks(pipeline(seed, inputs=130, sizes=SHAPES[2], density=density, largest=largest))
+        for seed, (density, largest) in enumerate([(0.03, 6), (1.0, 6), (1.0, 80)])
+    ]
+    assert [blocks.weight.dtype for blocks in found] == [np.int8, np.int8, np.int16]
+    assert [blocks.dense.tolist() for blocks in found[:2]] == [[False, False, True], [True] * 3]
+    assert any(blocks.restful.any() for blocks in found)
+    whole = lay_out_blocks(build([Neuron()] * 70, [Axon(source=0, targets=((0, 1),))], n_inputs=1, depths=[0])).whole
+    assert whole.tolist() == [0, -1]
+
+
+@pytest.mark.parametrize("rate", [0.0, 0.3])
+def test_whole_blocks_beside_others(rate):
+    """Neurons 0 to 69 of each layer on one core: 64 that follow each other, and six."""
+    rng = np.random.default_rng(1)
+    neurons = [Neuron(layer=i // 70, threshold=20, bias=int(rng.integers(-9, 9))) for i in range(140)]
+    axons = [
+        Axon(source=source, targets=tuple((c, int(rng.integers(-9, 9))) for c in range(70 * layer, 70 * layer + 70)))
+        for layer, sources in ((0, range(5)), (1, range(5, 75)))
+        for source in sources
+    ]
+    netlist = build(neurons, axons, n_inputs=5, depths=[0, 1])
+    assert lay_out_blocks(netlist).whole.tolist() == [0, -1, 70, -1]
+    assert_kernels_agree(netlist, (rng.random((5, 20)) < rate).astype(np.uint8))
+
+
+def test_recordings_of_any_length_together():
+    netlist = pipeline(3, inputs=20, sizes=SHAPES[3], density=0.5)
+    events = (np.random.default_rng(4).random((9, 20, 16)) < 0.2).astype(np.uint8)
+    lengths = np.array([16, 0, 1, 5, 16, 3, 2, 15, 8])
+    together = engine.simulate(netlist, events, lengths=lengths, **KEPT)
+    for index, length in enumerate(lengths):
+        expected = spec.simulate(netlist, events[index, :, :length])
+        found = recording_of(together, index)
+        window = len(expected.spikes)
+        for name in KEPT:
+            np.testing.assert_array_equal(getattr(found, name)[:window], getattr(expected, name), strict=True)
+            assert not getattr(found, name)[window:].any()
+        np.testing.assert_array_equal(found.counts.updates, expected.counts.updates)
+        np.testing.assert_array_equal(found.counts.spikes, expected.counts.spikes)
+
+
+@pytest.mark.parametrize("stepwise", [False, True])
+def test_events_of_any_type_and_layout(stepwise):
+    prepared = engine.prepare(pipeline(5, inputs=20, sizes=SHAPES[3], density=0.5), stepwise=stepwise)
+    events = (np.random.default_rng(6).random((3, 20, 16)) < 0.2).astype(np.uint8)
+    events.flags.writeable = False
+    expected = engine.simulate(prepared, events, **KEPT)
+    transposed = np.ascontiguousarray(events.transpose(2, 1, 0)).transpose(2, 1, 0)
+    for same in (events * 7, events.astype(bool), np.asfortranarray(events), transposed):
+        assert_equal(engine.simulate(prepared, same, **KEPT), expected)
+
+
+# --- the ends of the ranges ------------------------------------------------------------------------------------------
+def one_neuron(weights: list[int], **neuron) -> Netlist:
+    axons = [Axon(source=i, targets=((0, weight),), exponent=0) for i, weight in enumerate(weights)]
+    return build([Neuron(**neuron)], axons, n_inputs=len(weights), depths=[0])
+
+
+FULL = [254] * 129 + [1]  # 32,767
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("threshold", [0, 32766, 32767, 40000])
+def test_sums_at_the_end_of_sixteen_bits(sign, threshold):
+    netlist = one_neuron([sign * w for w in FULL] + [-sign * w for w in FULL], threshold=threshold)
+    rng = np.random.default_rng(0)
+    events = np.zeros((260, 12), np.uint8)
+    events[:130, 0] = events[130:, 2] = events[:, 4] = events[:130, 6:9] = 1
+    events[:, 9:] = rng.random((260, 3)) < 0.5
+    assert_kernels_agree(netlist, events)
+    assert np.abs(spec.simulate(netlist, events).membranes).max() >= 32767 * 64
+
+
+def test_a_sum_beyond_sixteen_bits_takes_the_other_kernel():
+    netlist = one_neuron([*FULL, 1])
+    assert lay_out_blocks(netlist) is None
+    events = np.ones((131, 2), np.uint8)
+    for simulate in (spec.simulate, by_engine):
+        with pytest.raises(NumericRangeError, match="synaptic sum"):
+            simulate(netlist, events)
+
+
+@pytest.mark.parametrize(
+    ("neuron", "fits"),
+    [
+        ({"threshold": 81940, "decay_v": 3277}, True),  # 81,940 * 64 * 819 is just below 2**32
+        ({"threshold": 81941, "decay_v": 3277}, False),
+        ({"threshold": 16000, "decay_v": 0}, True),  # keeps everything, and never goes down
+        ({"threshold": 16384, "decay_v": 0}, False),
+        ({"threshold": 100, "decay_v": 0, "bias": -1}, False),  # without a limit from below
+        ({"threshold": 100, "decay_u": 4094}, True),  # a current with a memory
+        # 380 weight units a step, 24,320 membrane units, that add up to 24,320 * 4096 / 12 = 8,301,226 of 8,388,607
+        ({"threshold": 1, "decay_u": 11, "decay_v": 4096}, True),
+        ({"threshold": 1, "decay_u": 10, "decay_v": 4096}, False),  # to 9,055,884: beyond the current's register
+        ({"threshold": 2000, "decay_u": 11, "decay_v": 2048}, True),  # and 64,000 that the membrane keeps
+        ({"threshold": 3000, "decay_u": 11, "decay_v": 2048}, False),  # and 96,000: it may saturate
+    ],
+)
+def test_membranes_at_the_end_of_32_bits(neuron, fits):
+    netlist = one_neuron([127, 127, 126], **neuron)
+    assert (lay_out_blocks(netlist) is not None) == fits
+    events = np.ones((3, 400), np.uint8)
+    events[:, 300:] = 0
+    assert_equal(by_engine(netlist, events), spec.simulate(netlist, events))
+
+
+def test_what_receives_more_than_the_depth_before_takes_the_other_kernel():
+    neurons = [Neuron(layer=0), Neuron(layer=1)]
+    for source, depths in ((1, [0, 0]), (0, [0, 1]), (2, [0, 1]), (1, [0, 2])):  # same depth, input, itself, skipped
+        axons = [Axon(source=0, targets=((0, 10),)), Axon(source=source, targets=((1, 10),))]
+        netlist = build(neurons, axons, n_inputs=1, depths=depths)
+        assert lay_out_blocks(netlist) is None
+        events = np.ones((1, 9), np.uint8)
+        assert_equal(by_engine(netlist, events), spec.simulate(netlist, events))
+
+
+def test_scattered_synapses_take_the_other_kernel():
+    """One synapse in each of a hundred thousand rows of 64."""
+    rng = np.random.default_rng(0)
+    axons = [
+        Axon(source=source, targets=tuple((int(c), 1) for c in np.unique(rng.integers(0, 1000, 200) // 64 * 64 % 1000)))
+        for source in range(6000)
+    ]
+    assert lay_out_blocks(build([Neuron() for _ in range(1000)], axons, n_inputs=6000, depths=[0])) is None
+
+
+@pytest.mark.parametrize("layer", [0, 1, 2])
+def test_layers_without_neurons_are_charged_nothing(layer):
+    netlist = build(
+        [Neuron(layer=layer, bias=10), Neuron(layer=layer)],
+        [Axon(source=0, targets=((0, 50),))] if layer == 0 else [],
+        n_inputs=1,
+        depths=[0, 1, 2],
+    )
+    charges = Charges(channels=np.array([[1]]), spikes=np.array([[10], [20]]), updates=np.array([[300], [400]]))
+    events = np.ones((1, 1, 6), np.uint8)
+    traces = [
+        engine.simulate(engine.prepare(netlist, stepwise=stepwise, charges=charges), events, threads=1)
+        for stepwise in (False, True)
+    ]
+    assert lay_out_blocks(netlist) is not None
+    assert traces[1].charged.sum() == 6 + 10 * traces[1].counts.spikes[0, 0] + 6 * 300
+    np.testing.assert_array_equal(traces[0].charged, traces[1].charged)

@@ -1,16 +1,33 @@
+"""The passes, one after the other: expansion of the graph convolution, pruning; and a third chip."""
+
+import dataclasses
 import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from oracles import comparable
-from random_networks import random_checkpoint, ring
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from made_files import events, small_checkpoint
+from oracles import comparable, probed
+from random_networks import (
+    assert_same_layers,
+    chain,
+    float_networks,
+    integer_networks,
+    random_checkpoint,
+    recordings_for,
+    ring,
+)
+from scipy import sparse
 
-from spikeloom.compiler import Options, compile_network, targets
+from spikeloom.compiler import Options, compile_network, invariants, targets
 from spikeloom.compiler.errors import VerifyError
-from spikeloom.compiler.interpret import channels_last, run_integer
-from spikeloom.compiler.passes.expand import Factored, expand
+from spikeloom.compiler.interpret import channels_last, run_float, run_integer
+from spikeloom.compiler.ir import INPUT, depths, fan_in
+from spikeloom.compiler.passes.expand import Factored, expand, expand_graph_convolution
+from spikeloom.compiler.passes.prune import compact, disconnect, either, never_fires, removable, removals
 from spikeloom.compiler.pipeline import run
 from spikeloom.compiler.range_proof import prove_ranges
 from spikeloom.compiler.targets import base
@@ -19,6 +36,8 @@ from spikeloom.compiler.targets.loihi1.netlist import one_step_bounds
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist, write_netlist
 from spikeloom.compiler.targets.loihi1.passes import start
 from spikeloom.compiler.text import text
+from spikeloom.models.graphs import build_graph, normalised_adjacency
+from spikeloom.runtime.equivalence.verify import verify
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.trace import aligned
 
@@ -137,3 +156,201 @@ def test_the_proof_covers_the_netlist():
     for layer, proof in enumerate(done.proofs):
         ids = done.netlist.compartments_of(layer)
         assert proof.accumulator == 64 * max(positive[ids].max(), negative[ids].max())
+
+
+# --- expand -----------------------------------------------------------------------------------------------------------
+
+
+# Pairs of taxels within three hops times 64 features and 2 polarities. The hand-drawn graph, the tree and 1, 3 and 4
+# neighbours are also published counts.
+CONV_SYNAPSES = {
+    "manual": (97_920, 60),
+    "mst:0": (45_440, 36),
+    "knn:1": (27_776, 16),
+    "knn:2": (49_792, 28),
+    "knn:3": (104_576, 62),
+    "knn:4": (117_888, 62),
+    "knn:5": (138_368, 78),
+    "knn:6": (155_520, 78),
+    "knn:7": (167_040, 78),
+    "knn:8": (181_120, 78),
+}
+"""Structural synapses and largest fan-in."""
+
+
+def adjacency_of(name):
+    graph = build_graph(name)
+    return normalised_adjacency(graph.edges, graph.n_taxels)
+
+
+def factored(adjacency, hops):
+    """The graph convolution as models compute it: propagate, then filter, hop by hop."""
+    taxels, channels = len(adjacency), hops.shape[2]
+
+    def stage(x):
+        signal = x.reshape(len(x), taxels, channels)
+        total = np.zeros((len(x), taxels, hops.shape[1]))
+        for k, filters in enumerate(hops):
+            if k:
+                signal = np.einsum("ij,bjc->bic", adjacency, signal)
+            total = total + np.einsum("bic,fc->bif", signal, filters)
+        return total.reshape(len(x), -1)
+
+    return stage
+
+
+@st.composite
+def graphs(draw):
+    """Adjacency of up to seven taxels, directed, with repeated edges and isolated taxels."""
+    taxels = draw(st.integers(1, 7))
+    node = st.integers(0, taxels - 1)
+    edges = draw(st.lists(st.tuples(node, node), max_size=14))
+    return normalised_adjacency(np.array(edges, np.int64).reshape(-1, 2), taxels)
+
+
+@settings(deadline=None, max_examples=40)
+@given(graphs(), st.integers(1, 5), st.integers(1, 3), st.integers(1, 3), st.integers(0, 2**32 - 1))
+def test_the_expanded_convolution_is_the_probed_one(adjacency, n_hops, features, channels, seed):
+    hops = np.random.default_rng(seed).normal(size=(n_hops, features, channels))
+    expanded = expand_graph_convolution(adjacency, hops)
+    weight, bias = probed(factored(adjacency, hops), len(adjacency) * channels)
+    np.testing.assert_allclose(expanded.toarray(), weight, rtol=0, atol=1e-12)
+    assert not bias.any()
+
+
+def test_two_taxels_by_hand():
+    adjacency = np.array([[0.0, 1.0], [1.0, 0.0]])
+    hops = np.array([[[1.0, 2.0]], [[10.0, 20.0]], [[100.0, 200.0]]])
+    # even hops come back to the taxel, odd ones end on the other
+    assert expand_graph_convolution(adjacency, hops).toarray().tolist() == [[101, 202, 10, 20], [10, 20, 101, 202]]
+
+
+@pytest.mark.parametrize("name", CONV_SYNAPSES)
+def test_structural_synapses_of_each_graph(name):
+    for prefix in ("", "released:"):
+        weight = expand_graph_convolution(adjacency_of(prefix + name), np.ones((4, 64, 2)))
+        assert (weight.nnz, np.diff(weight.indptr).max()) == CONV_SYNAPSES[name]
+
+
+def test_structure_does_not_depend_on_the_weights():
+    zero = expand_graph_convolution(adjacency_of("manual"), np.zeros((4, 64, 2)))
+    assert zero.nnz == 97_920
+    cancelled = expand_graph_convolution(np.array([[0.0, 1.0], [1.0, 0.0]]), np.array([[[1.0]], [[0.0]], [[-1.0]]]))
+    assert cancelled.nnz == 4
+    assert not zero.data.any()
+    assert not cancelled.toarray().any()
+    checkpoint = random_checkpoint()
+    zeroed = dataclasses.replace(checkpoint.dense[0], weight=np.zeros_like(checkpoint.dense[0].weight))
+    network = expand(dataclasses.replace(checkpoint, dense=(zeroed, *checkpoint.dense[1:])), ring(5))
+    assert fan_in(network, 1).tolist() == [15] * 6
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_sparse_graph_expands_as_a_dense_one_does(seed):
+    rng = np.random.default_rng(seed)
+    adjacency = np.where(rng.random((9, 9)) < 0.2, rng.normal(size=(9, 9)), 0.0)
+    hops = rng.normal(size=(4, 3, 2))
+    dense = expand_graph_convolution(adjacency, hops)
+    thin = expand_graph_convolution(sparse.csr_array(adjacency), hops)
+    assert thin.has_canonical_format
+    np.testing.assert_array_equal(thin.indptr, dense.indptr)
+    np.testing.assert_array_equal(thin.indices, dense.indices)
+    np.testing.assert_allclose(thin.data, dense.data, rtol=1e-12, atol=1e-14)
+
+
+# --- whole checkpoints
+def test_a_checkpoint_becomes_a_chain_of_populations():
+    network = expand(random_checkpoint(taxels=39, features=64, sizes=(128, 256, 36)), adjacency_of("manual"))
+    invariants.verify(network)
+    assert [(p.name, p.size) for p in network.populations] == [("conv1", 2496), ("fc1", 128), ("fc2", 256), ("fc3", 36)]
+    assert [(p.pre, p.post) for p in network.projections] == [(INPUT, 0), (0, 1), (1, 2), (2, 3)]
+    assert depths(network) == (0, 1, 2, 3)
+    assert [int(fan_in(network, post).sum()) for post in range(4)] == [97_920, 319_488, 32_768, 9_216]
+    assert [int(fan_in(network, post).max()) for post in range(4)] == [60, 2496, 128, 256]
+    assert network.readout.population == 3
+    assert network.readout.label.tolist() == list(range(36))
+
+
+# --- prune ------------------------------------------------------------------------------------------------------------
+
+
+@settings(deadline=None, max_examples=40)
+@given(float_networks(), st.data())
+def test_what_never_fires_never_fires(network, data):
+    recordings = data.draw(recordings_for(network.input.size))
+    silent = never_fires(network)
+    for dtype in (np.float32, np.float64):
+        for mask, spikes in zip(silent, run_float(network, recordings, dtype=dtype).spikes, strict=True):
+            assert not spikes[..., mask].any()
+    assert not silent[network.readout.population].any()
+    assert_same_layers(*(run_float(each, recordings).spikes for each in (disconnect(network, silent), network)))
+
+
+@settings(deadline=None, max_examples=40)
+@given(integer_networks(), st.data())
+def test_leaving_out_moves_no_spike_that_is_left(network, data):
+    recordings = data.draw(recordings_for(network.input.size))
+    silent, unread = removable(network)
+    laid, kept = compact(network, either(silent, unread))
+    whole, rest = run_integer(network, recordings).spikes, run_integer(laid, recordings).spikes
+    for post, ids in enumerate(kept):
+        assert len(ids) >= 1
+        assert not whole[post][..., silent[post]].any()
+        np.testing.assert_array_equal(rest[post], whole[post][..., ids])
+    voting = network.readout.population
+    assert len(kept[voting]) == network.populations[voting].size
+
+
+def test_a_bound_that_is_met_just_so():
+    """Two inputs of 0.2 and a leak of one half add up to 0.8: silent at a threshold of 0.81, not at 0.79."""
+    for theta, silent in ((0.81, True), (0.79, False)):
+        network = chain([[0.2, 0.2]], [[1.0]], beta=0.5, theta=theta)
+        assert never_fires(network)[0].tolist() == [silent]
+    spikes = run_float(chain([[0.2, 0.2]], [[1.0]], beta=0.5, theta=0.79), np.ones((1, 40, 2), bool)).spikes[0]
+    assert spikes.any()
+
+
+def test_silence_spreads():
+    """The second layer has a synapse only from a neuron that cannot fire, and no bias."""
+    network = chain([[0.1], [5.0]], [[9.0, 0.0], [0.0, 9.0]], np.eye(2))
+    silent = never_fires(network)
+    assert [mask.tolist() for mask in silent] == [[True, False], [True, False], [False, False]]
+
+
+def test_what_is_left_out_is_counted():
+    """Of fc1 the first two go: four synapses that are not zero into them, two from them."""
+    network = chain([[1, 0, 2], [3, 4, 0], [5, 6, 7]], [[1, 0, 2], [0, 3, 4]])
+    first, second, none = (np.array(mask, bool) for mask in ([1, 0, 0], [0, 1, 0], [0, 0, 0]))
+
+    def counted(quiet):
+        found = removals(network, (first, none[:2]), (second, none[:2]), (quiet, none[:2]))
+        return [(r.layer, r.silent, r.unread, r.never_fired, r.synapses) for r in found]
+
+    assert counted(none) == [("fc1", 1, 1, 0, 4), ("fc2", 0, 0, 0, 2)]
+    assert counted(second) == [("fc1", 1, 0, 1, 4), ("fc2", 0, 0, 0, 2)]
+    assert counted(first | second) == [("fc1", 0, 0, 2, 4), ("fc2", 0, 0, 0, 2)]
+
+
+def test_unread_neurons_are_not_compared(tmp_path):
+    """The weights from them round to zero at two bits: they fire in the float model and are not on the chip."""
+    checkpoint, adjacency = small_checkpoint(tmp_path)
+    weak = checkpoint.dense[0].weight.copy()
+    weak[:, :3] *= 1e-6
+    changed = replace(checkpoint, dense=(replace(checkpoint.dense[0], weight=weak), *checkpoint.dense[1:]))
+    compilation = compile_network(expand(changed, adjacency))
+    netlist, labels = compilation.netlist, np.zeros(6, np.int64)
+    assert netlist.layers[0].unread == (0, 1, 2)
+    verdict = verify(netlist, changed, adjacency, events(2), labels, tuple("abcdef"))
+    reference = run_float(compilation.network, channels_last(events(2))).spikes[0]
+    assert reference[..., :3].any()
+    assert verdict.spikes["conv1"].float == int(reference[..., 3:].sum())
+
+
+def test_pruning_by_evidence_is_optional(tmp_path):
+    checkpoint, adjacency = small_checkpoint(tmp_path)
+    quiet = events(1, rate=0.002)
+    plain = compile_network(expand(checkpoint, adjacency), Options(training_events=quiet))
+    fewer = compile_network(expand(checkpoint, adjacency), Options(training_events=quiet, prune_unused=True))
+    assert sum(r.never_fired for r in plain.removals) == 0
+    assert sum(r.never_fired for r in fewer.removals) > 0
+    assert fewer.netlist.n_compartments < plain.netlist.n_compartments

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from made_files import ring, small_checkpoint, weights
-from oracles import comparable
+from oracles import comparable, refused
 from test_checkpoint import rebuilt
 
 from spikeloom.compiler import Options, compile_network, lift
@@ -163,9 +163,8 @@ def test_an_interrupted_fine_tuning_goes_on_to_the_same_bytes(tmp_path):
         np.testing.assert_array_equal(rest.weights[name], array)
     moved = replace(checkpoint, conv_bias=checkpoint.conv_bias + 1)  # as other epochs of the same file are
     for other, what in ((moved, "network"), (replace(checkpoint, beta=0.6), "beta")):
-        with pytest.raises(OptionError) as caught:
-            finetune(other, adjacency, train, test, LOIHI, resume=True, **options)
-        assert f"belongs to a training with other {what}" in str(caught.value)
+        words = f"belongs to a training with other {what}"
+        refused(OptionError, words, finetune, other, adjacency, train, test, LOIHI, resume=True, **options)
 
 
 @pytest.mark.parametrize(
@@ -181,11 +180,8 @@ def test_a_loss_that_is_no_number(tmp_path, monkeypatch, loss, name, found):
     checkpoint, adjacency = small_checkpoint(tmp_path)
     data = recordings(checkpoint, 0)
     monkeypatch.setattr("spikeloom.models.training.finetune.rate_loss", loss)
-    with pytest.raises(DataError) as caught:
-        finetune(checkpoint, adjacency, data, data, LOIHI, bits=[4], epochs=2)
-    assert str(caught.value) == (
-        f"epoch 1, step 1: the {name} is {found}, a finite number is needed; the state of the epoch before is kept"
-    )
+    words = f"epoch 1, step 1: the {name} is {found}|state of the epoch before is kept"
+    refused(DataError, words, finetune, checkpoint, adjacency, data, data, LOIHI, bits=[4], epochs=2)
 
 
 # --- files
@@ -211,9 +207,7 @@ def test_forms_that_cannot_be_used(tmp_path, change):
     graph = ring(checkpoint.taxels)
     save_checkpoint(path, {"last": weights()}, graph, beta=0.2, theta=0.5, training={}, forms=forms)
     path.write_bytes(rebuilt(path.read_bytes(), lambda manifest, _: change(manifest["forms"])))
-    with pytest.raises(ModelError) as caught:
-        read_checkpoint(path)
-    assert str(caught.value).startswith(f"{path}: the manifest has no usable forms")
+    refused(ModelError, f"{path}: the manifest has no usable forms", read_checkpoint, path)
 
 
 # --- the command

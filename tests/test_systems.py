@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_files import released
 from numpy.testing import assert_allclose, assert_array_equal
-from oracles import probed
+from oracles import probed, refused
 from scipy import sparse
 from test_dynamics import surrogate_spike
 
@@ -244,10 +244,7 @@ def without(state, *names):
 )
 def test_faults_of_released_style_files(tmp_path, system, change, words):
     path = torch_file(tmp_path / "x.t7", change(state_of(network_of(system))))
-    with pytest.raises(ModelError) as refused:
-        read_checkpoint(path, cells=grid_cells())
-    assert str(refused.value).startswith(f"{path}: ")
-    assert words in str(refused.value)
+    refused(ModelError, f"{path}: |{words}", read_checkpoint, path, cells=grid_cells())
 
 
 # --- to the chip -----------------------------------------------------------------------------------------------------

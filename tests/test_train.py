@@ -8,6 +8,7 @@ import pytest
 import torch
 from made_files import checkpoint_bytes
 from numpy.testing import assert_allclose, assert_array_equal
+from oracles import refused
 
 import spikeloom.models.training.train
 from spikeloom.compiler.archive import npy_bytes, stored_members, zip_bytes
@@ -103,9 +104,8 @@ def test_another_decay_is_an_option_that_a_state_remembers(tmp_path):
     trained = train(one, one, ADJACENCY, tiny, epochs=7, recipe=replace(RELEASED, decay_epochs=2), state=tmp_path / "s")
     rates = [epoch.learning_rate for epoch in trained.history]
     assert_allclose(rates, [1e-3] * 3 + [1e-4] * 2 + [1e-5] * 2, rtol=1e-12)
-    with pytest.raises(OptionError) as refused:
-        train(one, one, ADJACENCY, tiny, epochs=7, state=tmp_path / "s", resume=True)
-    assert "belongs to a training with other recipe; " in str(refused.value)
+    options = {"epochs": 7, "state": tmp_path / "s", "resume": True}
+    refused(OptionError, "belongs to a training with other recipe; ", train, one, one, ADJACENCY, tiny, **options)
 
 
 def test_best_weights_are_those_of_the_first_epoch_with_the_most_right(monkeypatch):
@@ -149,9 +149,7 @@ FIVE = synthetic_grasps(coordinates=np.random.default_rng(0).random((5, 2)), per
     ],
 )
 def test_what_cannot_be_trained(test, architecture, options, error, words):
-    with pytest.raises(error) as refused:
-        train(grasps(0), test, ADJACENCY, architecture, **options)
-    assert words in str(refused.value)
+    refused(error, words, train, grasps(0), test, ADJACENCY, architecture, **options)
 
 
 class KilledError(Exception):
@@ -183,12 +181,8 @@ def test_a_killed_training_resumes_to_the_same_weights(tmp_path):
 def test_resuming_with_other_options_or_data_is_refused(tmp_path):
     state = tmp_path / "x.state"
     train(grasps(0), grasps(1), ADJACENCY, SMALL, epochs=1, state=state)
-    with pytest.raises(OptionError) as refused:
-        train(grasps(2), grasps(1), ADJACENCY, SMALL, epochs=2, state=state, resume=True)
-    assert str(refused.value) == (
-        f"{state}: belongs to a training with other epochs, training data; give the same options and data, "
-        "or delete it to train anew"
-    )
+    words = f"{state}: belongs to a training with other epochs, training data; "
+    refused(OptionError, words, train, grasps(2), grasps(1), ADJACENCY, SMALL, epochs=2, state=state, resume=True)
 
 
 def with_header(header: str) -> Callable[[bytes], bytes]:
@@ -200,9 +194,8 @@ def test_a_damaged_state_is_refused(tmp_path, change):
     state = tmp_path / "x.state"
     train(grasps(0), grasps(1), ADJACENCY, SMALL, epochs=1, state=state)
     state.write_bytes(change(state.read_bytes()))
-    with pytest.raises(ModelError) as refused:
-        train(grasps(0), grasps(1), ADJACENCY, SMALL, epochs=1, state=state, resume=True)
-    assert str(refused.value) == f"{state}: is not a training state or is damaged; delete it and train anew"
+    words = f"{state}: is not a training state or is damaged; "
+    refused(ModelError, words, train, grasps(0), grasps(1), ADJACENCY, SMALL, epochs=1, state=state, resume=True)
 
 
 def test_a_loss_that_is_no_number_stops_and_keeps_the_state(tmp_path, monkeypatch):
@@ -211,11 +204,8 @@ def test_a_loss_that_is_no_number_stops_and_keeps_the_state(tmp_path, monkeypatc
     kept = state.read_bytes()
     steps = iter((1.0, float("nan")))
     monkeypatch.setattr("spikeloom.models.training.evaluate.rate_loss", lambda rates, _: rates.sum() * next(steps))
-    with pytest.raises(DataError) as stopped:
-        train(grasps(0), grasps(1), ADJACENCY, SMALL, epochs=1, seed=1, state=state)
-    assert str(stopped.value) == (
-        "epoch 1, step 2: the loss is nan, a finite number is needed; the state of the epoch before is kept"
-    )
+    words = "epoch 1, step 2: the loss is nan|state of the epoch before is kept"
+    refused(DataError, words, train, grasps(0), grasps(1), ADJACENCY, SMALL, epochs=1, seed=1, state=state)
     assert state.read_bytes() == kept
 
 
@@ -235,9 +225,4 @@ def test_the_validation_part_is_a_fifth_of_every_class_and_disjoint():
     assert np.bincount(held.labels).tolist() == [2] * 6
     assert np.bincount(fitted.labels).tolist() == [8] * 6
     assert not set(fitted.files) & set(held.files)
-    with pytest.raises(DataError) as refused:
-        validation_split(grasps(0, per_class=1))
-    assert str(refused.value) == (
-        "synthetic grasps, seed 0: class 0 has one training recording, the clean protocol needs 2 of each; "
-        "record more or drop the class"
-    )
+    refused(DataError, "class 0 has one training recording|needs 2 of each", validation_split, grasps(0, per_class=1))
