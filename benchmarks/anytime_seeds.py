@@ -16,7 +16,7 @@ from spikeloom.compiler import compile_network
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.models.recordings.evtouch import load_recordings
+from spikeloom.models.recordings.events import load_data
 from spikeloom.runtime.commands.choose.anytime import ALLOWED
 from spikeloom.runtime.inputs.network import propagation
 from spikeloom.runtime.machines.integer import integer_machine_of
@@ -30,7 +30,7 @@ def main() -> None:
     parser.add_argument("data")
     parser.add_argument("checkpoint", nargs="+")
     arguments = parser.parse_args()
-    splits = [load_recordings(arguments.data, split) for split in ("train", "test")]
+    splits = [load_data(arguments.data, split) for split in ("train", "test")]
     lengths = [np.full(len(data), data.steps) for data in splits]
     found: dict[tuple[str, float], list[tuple[float, int, int]]] = {}
     for path in arguments.checkpoint:

@@ -19,8 +19,8 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC
 
-from spikeloom.models.recordings.events import joined_bins
-from spikeloom.models.recordings.evtouch import Recordings, load_recordings
+from spikeloom.models.recordings.events import joined_bins, load_data
+from spikeloom.models.recordings.evtouch import Recordings
 
 KERNELS = {"linear": SVC(kernel="linear", C=0.1), "rbf": SVC(C=10.0)}
 
@@ -39,7 +39,7 @@ def main() -> None:
     parser.add_argument("recordings")
     parser.add_argument("output", nargs="?", type=Path)
     arguments = parser.parse_args()
-    training, test = (load_recordings(arguments.recordings, split) for split in ("train", "test"))
+    training, test = (load_data(arguments.recordings, split) for split in ("train", "test"))
     folds = StratifiedKFold(5, shuffle=True, random_state=0)
     print("features             kernel   cross-validation   test")
     features = {}

@@ -25,8 +25,8 @@ from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.formats.towers import join
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.base import load_target
-from spikeloom.models.recordings.events import joined_bins
-from spikeloom.models.recordings.evtouch import Recordings, load_recordings
+from spikeloom.models.recordings.events import joined_bins, load_data
+from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs.network import propagation
 from spikeloom.runtime.machines.loihi1.costs.estimate import estimate
 from spikeloom.runtime.machines.votes import predictions
@@ -47,7 +47,7 @@ def main() -> None:
     parser.add_argument("--weights", choices=WEIGHTS, action="append", help="epochs to take (default: all three)")
     parser.add_argument("--float-only", action="store_true", help="leave the chip away")
     arguments = parser.parse_args()
-    training, test = (load_recordings(arguments.recordings, split) for split in ("train", "test"))
+    training, test = (load_data(arguments.recordings, split) for split in ("train", "test"))
     found: Json = {"data": Path(arguments.recordings).name, "test_samples": len(test)}
     for weights in arguments.weights or WEIGHTS:
         members = [read_checkpoint(path, weights=weights) for path in arguments.members]

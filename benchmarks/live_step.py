@@ -14,7 +14,7 @@ import time
 
 import numpy as np
 
-from spikeloom.models.recordings.evtouch import load_recordings
+from spikeloom.models.recordings.events import load_data
 from spikeloom.runtime.machines.base import Stream, machine_for
 from spikeloom.runtime.machines.loihi1.engine import simulate
 from spikeloom.runtime.machines.votes import class_counts
@@ -57,7 +57,7 @@ def main() -> None:
     arguments = parser.parse_args()
 
     live = machine_for(arguments.netlist)
-    events = load_recordings(arguments.recordings, arguments.split, limit=arguments.limit).events
+    events = load_data(arguments.recordings, arguments.split, limit=arguments.limit).events
     begun = time.perf_counter()
     stream = live.stream()
     opened_s = time.perf_counter() - begun

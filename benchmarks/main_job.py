@@ -19,7 +19,7 @@ from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.models.networks.reference import float_spikes
-from spikeloom.models.recordings.evtouch import load_recordings
+from spikeloom.models.recordings.events import load_data
 from spikeloom.runtime.machines.loihi1 import engine
 
 
@@ -42,8 +42,8 @@ def main() -> None:
     checkpoint = read_checkpoint(arguments.checkpoint)
     graph = build_graph(arguments.graph)
     adjacency = normalised_adjacency(graph.edges, graph.n_taxels)
-    train = load_recordings(arguments.recordings, "train").events
-    test = load_recordings(arguments.recordings, "test").events
+    train = load_data(arguments.recordings, "train").events
+    test = load_data(arguments.recordings, "test").events
     netlist = compile_network(expand(checkpoint, adjacency), Options(training_events=train)).netlist
     flat = test.reshape(len(test), netlist.n_inputs, -1)
     prepared = engine.prepare(netlist)

@@ -14,7 +14,7 @@ from spikeloom.models.recordings.events import BIN_S, load_data
 def main() -> None:
     """Convert one split."""
     source, split, target = sys.argv[1:]
-    data, _ = load_data(source, split, bin_s=BIN_S)
+    data = load_data(source, split, bin_s=BIN_S)
     samples, taxels, polarities, steps = data.events.shape
     events = data.events.reshape(samples, taxels * polarities, steps).astype(np.uint8)
     np.savez_compressed(target, events=events, labels=data.labels)

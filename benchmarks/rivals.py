@@ -33,7 +33,7 @@ from rivals_chart import digits, draw
 from spikeloom.compiler.files import write_atomically
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist, write_netlist
-from spikeloom.models.recordings.evtouch import load_recordings
+from spikeloom.models.recordings.events import load_data
 from spikeloom.runtime.report.sections import Table
 
 HERE = Path(__file__).parent
@@ -356,7 +356,7 @@ def main() -> None:
     if unknown := {*pythons, *only} - set(rivals()):
         raise SystemExit(f"rivals: {', '.join(sorted(unknown))}: no such rival; there are {', '.join(rivals())}")
     os.sched_setaffinity(0, {asked.processor})  # every worker inherits it
-    data = load_recordings(asked.recordings, "test", taxels=39)
+    data = load_data(asked.recordings, "test", taxels=39)
     # by number, as the busy network was defined, not by letter
     order = sorted(range(len(data)), key=lambda i: [int(digits) for digits in re.findall(r"\d+", data.files[i])])
     events = data.events[order].reshape(len(data), -1, data.steps).transpose(0, 2, 1).astype(np.bool_)

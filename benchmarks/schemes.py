@@ -25,7 +25,8 @@ from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.models.networks.reference import float_spikes
-from spikeloom.models.recordings.evtouch import Recordings, load_recordings
+from spikeloom.models.recordings.events import load_data
+from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.equivalence.verdict import mcnemar
 from spikeloom.runtime.machines.integer import integer_machine_of
 from spikeloom.runtime.machines.loihi1 import engine
@@ -84,7 +85,7 @@ def fill(arguments: argparse.Namespace) -> tuple[Options, Recordings]:
     results: Options = json.loads(place.read_text("utf-8")) if place.exists() else {}
     graph = build_graph(arguments.graph)
     adjacency = normalised_adjacency(graph.edges, graph.n_taxels)
-    training, test = (load_recordings(arguments.recordings, split) for split in ("train", "test"))
+    training, test = (load_data(arguments.recordings, split) for split in ("train", "test"))
     for path in map(Path, arguments.checkpoints):
         original = read_checkpoint(path)
         found = results.setdefault(path.stem, {"sha256": original.sha256, "schemes": {}})

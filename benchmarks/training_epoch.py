@@ -26,7 +26,8 @@ import torch
 from spikeloom.compiler.systems import SYSTEMS, TACTILESGNET
 from spikeloom.models.graphs import Graph, build_graph, normalised_adjacency
 from spikeloom.models.networks.networks import Architecture, SpikingNet
-from spikeloom.models.recordings.evtouch import Recordings, load_recordings
+from spikeloom.models.recordings.events import load_data
+from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.systems import HOPS, PADDINGS, filters_of, propagation_of, sensor_grid
 from spikeloom.models.training.evaluate import rate_loss
 from spikeloom.models.training.train import Epoch, train
@@ -46,8 +47,8 @@ def main() -> None:
     arguments = parser.parse_args()
 
     graph = build_graph(arguments.graph)
-    training = load_recordings(arguments.recordings, "train")
-    test = load_recordings(arguments.recordings, "test")
+    training = load_data(arguments.recordings, "train")
+    test = load_data(arguments.recordings, "test")
     found = {"system": arguments.system, "training_samples": len(training), "test_samples": len(test)}
     found |= _epochs(arguments.system, arguments.epochs, training, test, graph)
     if arguments.released:

@@ -19,7 +19,8 @@ from spikeloom.compiler.dynamics import Clocks, with_clocks
 from spikeloom.compiler.targets.truenorth.codebook import BIN_TICKS
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
 from spikeloom.compiler.targets.truenorth.netlist_file import read_crossbars
-from spikeloom.models.recordings.evtouch import Recordings, load_recordings
+from spikeloom.models.recordings.events import load_data
+from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.machines.truenorth import engine
 from spikeloom.runtime.report.sections import Table
 
@@ -52,7 +53,7 @@ def main() -> None:
     parser.add_argument("--limit", type=int, default=20)
     parser.add_argument("--rounds", type=int, default=5)
     arguments = parser.parse_args()
-    data = load_recordings(arguments.data, "test", limit=arguments.limit)
+    data = load_data(arguments.data, "test", limit=arguments.limit)
     rows = []
     for name in arguments.netlists:
         netlist = read_crossbars(name)

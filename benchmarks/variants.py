@@ -21,7 +21,7 @@ import matplotlib.pyplot as plt
 from joined import measured
 
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
-from spikeloom.models.recordings.evtouch import load_recordings
+from spikeloom.models.recordings.events import load_data
 from spikeloom.runtime.report.intervals import of_mean
 
 Json = dict[str, Any]
@@ -38,7 +38,7 @@ def main() -> None:
     parser.add_argument("--spike-exact", action="store_true")
     parser.add_argument("--picture", type=Path)
     arguments = parser.parse_args()
-    training, test = (load_recordings(arguments.recordings, split) for split in ("train", "test"))
+    training, test = (load_data(arguments.recordings, split) for split in ("train", "test"))
     found: Json = {"data": Path(arguments.recordings).name, "test_samples": len(test), "variants": {}}
     for variant in arguments.variants:
         name, _, files = variant.rpartition("=")

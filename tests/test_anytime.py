@@ -74,7 +74,7 @@ def test_without_labels_checkpoint_and_calibration(spikeloom, tmp_path):
 
 def test_all_figures_of_a_stopped_chip(report, place, monkeypatch):
     monkeypatch.chdir(place)
-    netlist, data = read_netlist("net.loom"), load_data("data", "test")[0]
+    netlist, data = read_netlist("net.loom"), load_data("data", "test")
     target, flat = load_target("loihi1"), with_clocks(data.events, netlist.clocks)
     stepped, meter = engine.prepare(netlist, stepwise=True), cost.prepare(netlist, target)
     assert [rule["allowed"] for rule in report["rules"]] == [None, 0.0, 0.005, 0.01, 0.02, 0.05, 0.25]
@@ -110,7 +110,7 @@ def test_all_figures_of_a_stopped_chip(report, place, monkeypatch):
 
 
 def test_windows_are_those_of_shortened_recordings(report, spikeloom):
-    netlist, data = read_netlist("net.loom"), load_data("data", "test")[0]
+    netlist, data = read_netlist("net.loom"), load_data("data", "test")
     assert [window["percent"] for window in report["windows"]] == list(range(5, 101, 5))
     for window in report["windows"]:
         steps = max(STEPS * window["percent"] // 100, 1)
@@ -126,7 +126,7 @@ def test_windows_are_those_of_shortened_recordings(report, spikeloom):
 
 def test_recordings_of_different_length_end_on_their_own(place, monkeypatch):
     monkeypatch.chdir(place)
-    netlist, data = read_netlist("net.loom"), load_data("data", "test")[0]
+    netlist, data = read_netlist("net.loom"), load_data("data", "test")
     lengths = np.array([60, 1, 7, 24, 33, 2, 50, 59, 60, 60, 3, 40])
     ran = cumulative.run(netlist, load_target("loihi1"), with_clocks(data.events, netlist.clocks), lengths)
     at = exits.standing(ran.votes, lengths)

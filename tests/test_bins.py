@@ -235,7 +235,7 @@ def test_sums_in_time_are_for_networks_that_hear_each_bin(report, refusal):
 
 
 def test_a_stream_of_events(report, place):
-    recording = load_data(place / "fine", "test", limit=1)[0]
+    recording = load_data(place / "fine", "test", limit=1)
     write_event_lines(place / "events.csv", [recording], BIN_S)
     seen = [
         report_lines(place, "watch", f"{name}.loom", "--input", "events.csv", "--bin", bin_, "--bins", "7")

@@ -21,7 +21,7 @@ from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.models.graphs import Graph
 from spikeloom.models.networks.checkpoint import save_checkpoint
-from spikeloom.models.recordings.evtouch import load_recordings
+from spikeloom.models.recordings.events import load_data
 from spikeloom.models.training.protocols import data_digest
 from spikeloom.runtime.studies.chart import requests as chart_requests
 from spikeloom.runtime.studies.chart import work as chart_work
@@ -45,7 +45,7 @@ def place(tmp_path_factory):
     train = np.concatenate([events(1, samples=12), events(3, samples=4, rate=0.05)])
     recordings_folder(folder / "data", train=train, test=events(2, samples=8))
     recordings_folder(folder / "other", test=events(5, samples=8))
-    digest = data_digest(load_recordings(folder / "data", "train"), load_recordings(folder / "data", "test"))
+    digest = data_digest(load_data(folder / "data", "train"), load_data(folder / "data", "test"))
     known = {"data_sha256": digest, "validation": {"correct": 3, "samples": 4}, "command": "spikeloom train …"}
     own_file(folder / "ring.pt", training=known)
     own_file(folder / "chain.pt", last=weights(3), graph=chain(), training=known)
@@ -284,7 +284,7 @@ def test_a_store_of_another_version(made, spikeloom, place, monkeypatch):
 def test_a_worker_that_has_other_files_says_so(place, monkeypatch):
     monkeypatch.chdir(place)
     (network,) = given_networks(read_as("ring.pt"))
-    digest = data_digest(load_recordings("data", "train"), load_recordings("data", "test"))
+    digest = data_digest(load_data("data", "train"), load_data("data", "test"))
     data = chart_requests.Data(path="data", bin_s=0.02, sha256=digest)
     facts = chart_requests.Facts(data=data, targets={"loihi1": load_target("loihi1")}, folder=place)
     work = facts.build(network, Storage(bits=(6,), planes=1, groups=1, prune=False), ("cores",))

@@ -169,8 +169,9 @@ def test_convert(own, output):
     )
     assert report["splits"]["test"]["found"]["padded"] == 1
     for split in ("train", "test"):
-        made, counts = load_data(own / output, split)
-        before, _ = load_data(own / "own", split, taxels=3)
+        made = load_data(own / output, split)
+        counts = made.counts
+        before = load_data(own / "own", split, taxels=3)
         assert counts is None
         assert made.events.shape[1:] == (3, 2, 36)
         assert np.array_equal(made.events[..., : before.steps], before.events)
@@ -196,7 +197,7 @@ def test_convert_to_more_taxels_and_other_bins(own):
 def test_convert_to_joined_bins(own, split):
     start("convert", "own", "-o", "fine.zip")
     report, _, _ = start("convert", "fine.zip", "-o", "coarse.zip", "--join", "10")
-    fine, coarse = (load_data(own / f"{name}.zip", split)[0].events for name in ("fine", "coarse"))
+    fine, coarse = (load_data(own / f"{name}.zip", split).events for name in ("fine", "coarse"))
     assert (fine.shape[3], coarse.shape[3], report["steps"]) == (36, 4, 4)
     for bin_ in range(4):
         np.testing.assert_array_equal(coarse[..., bin_], fine[..., 10 * bin_ : 10 * bin_ + 10].any(axis=3))
@@ -224,7 +225,7 @@ def test_convert_synthetic_grasps_on_the_sensor_that_is_given(own):
     report, _, _ = start("convert", "synthetic", "--taxels", "coords.csv", "-o", "grasps")
     assert report["taxels"] == 9
     assert {split: made["recordings"] for split, made in report["splits"].items()} == {"train": 360, "test": 144}
-    assert load_data(own / "grasps", "test")[0].events.shape == (144, 9, 2, 100)
+    assert load_data(own / "grasps", "test").events.shape == (144, 9, 2, 100)
 
 
 @pytest.mark.parametrize(
@@ -267,7 +268,8 @@ def test_fetch(monkeypatch, tmp_path):
 
 def test_counts_on_stderr(own, capsys):
     for path in ("own", "out"):
-        recordings, counts = load_data(own / path, "train")
+        recordings = load_data(own / path, "train")
+        counts = recordings.counts
         show_counts(recordings.source, counts)
         if path == "own":
             start("convert", "own", "-o", "out")
@@ -301,7 +303,7 @@ def test_one_recording_becomes_event_lines_that_read_back_the_same(tmp_path, mon
     lines = (tmp_path / "one.csv").read_text().splitlines()
     assert lines[0] == "time_s,taxel,polarity"
     assert len(lines) - 1 == int(grasps.events[1].sum())
-    back, _ = load_data(tmp_path / "one.csv", taxels=39)
+    back = load_data(tmp_path / "one.csv", taxels=39)
     steps = back.steps
     assert np.array_equal(back.events[0], grasps.events[1][:, :, :steps])
     assert not grasps.events[1][:, :, steps:].any()

@@ -17,7 +17,7 @@ from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
 from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.models.networks.reference import float_spikes
-from spikeloom.models.recordings.evtouch import load_recordings
+from spikeloom.models.recordings.events import load_data
 from spikeloom.runtime import cli
 from spikeloom.runtime.machines.loihi1 import spec
 
@@ -47,13 +47,13 @@ def compiled(tmp_path_factory, released_checkpoint, objects_zip) -> tuple[Path, 
 @pytest.fixture(scope="module")
 def objects(objects_zip) -> np.ndarray:
     """Objects test recordings, (144, 39, 2, 250)."""
-    return load_recordings(objects_zip, "test").events
+    return load_data(objects_zip, "test").events
 
 
 @pytest.fixture(scope="module")
 def containers(containers_zip) -> np.ndarray:
     """Containers test recordings, (60, 39, 2, 325)."""
-    return load_recordings(containers_zip, "test").events
+    return load_data(containers_zip, "test").events
 
 
 def assert_twins_agree(netlist: Netlist, events: np.ndarray) -> np.ndarray:

@@ -53,7 +53,8 @@ def made(events, **changes) -> Recordings:
 
 def one(path, **options):
     """Events of one recording as (taxel, polarity, bin), and the counts."""
-    recordings, counts = load_data(path, **options)
+    recordings = load_data(path, **options)
+    counts = recordings.counts
     return np.argwhere(recordings.events[0]).tolist(), counts
 
 
@@ -118,7 +119,7 @@ def test_taxels_and_bins_have_limits(write):
     ],
 )
 def test_labels(write, name, text, label):
-    recordings, _ = load_data(write(name, text))
+    recordings = load_data(write(name, text))
     assert recordings.labels.tolist() == [label]
 
 
@@ -137,13 +138,13 @@ def test_labels_that_cannot_be(write, name, text, words):
 
 def test_who_needs_labels_says_so(write):
     write("d/a_label_1.csv", "0,0,1\n")
-    recordings, _ = load_data(write("d/b.csv", "0,0,1\n").parent)
+    recordings = load_data(write("d/b.csv", "0,0,1\n").parent)
     assert recordings.labels.tolist() == [1, UNLABELLED]
     assert message(need_labels, recordings, "training") == (
         "d: b.csv: no label, training needs one for every recording; "
         "add a label column or name the file like grasp_7_label_3.csv"
     )
-    recordings, _ = load_data(write("d/b.csv", "0,0,1,1\n").parent)
+    recordings = load_data(write("d/b.csv", "0,0,1,1\n").parent)
     assert need_labels(recordings, "training") is recordings
 
 
@@ -194,31 +195,33 @@ def test_flat_folders_stand_for_any_split(write, save, tmp_path):
     save("d/c.npz", time_s=[0.0], taxel=[0], polarity=[0], label=2)
     np.save(tmp_path / "d" / "sample_4_label_5.npy", np.ones((2, 2, 3), dtype=np.float32))
     for split in ("train", "test", "third"):
-        recordings, counts = load_data(tmp_path / "d", split)
+        recordings = load_data(tmp_path / "d", split)
+        counts = recordings.counts
         assert recordings.files == ("a_label_0.CSV", "b_label_1.csv", "c.npz", "sample_4_label_5.npy")
         assert recordings.labels.tolist() == [0, 1, 2, 5]
         assert recordings.split == split
         assert recordings.events.shape == (4, 2, 2, 26)
-        assert counts.steps == (26, 6, 1, 3)
-        assert counts.events == 3 + 12
+        assert recordings.step_counts.tolist() == [26, 6, 1, 3]
+        assert (counts.events, counts.shorter) == (3 + 12, 3)
         assert recordings.events[3].sum(axis=(0, 1)).tolist() == [4] * 3 + [0] * 23  # padded at the end
     assert data_splits(tmp_path / "d") == ()
-    first, counts = load_data(tmp_path / "d", limit=2, taxels=7)
+    first = load_data(tmp_path / "d", limit=2, taxels=7)
+    counts = first.counts
     assert first.events.shape == (2, 7, 2, 26)
-    assert len(counts.steps) == 2
+    assert counts.shorter == 1
 
 
 def test_folders_with_splits(write, tmp_path):
     write("d/train/a_label_0.csv", "0.1,1,1\n")
     write("d/test/b_label_1.csv", "0.3,0,1\n")
     write("d/coords.csv", "0,0\n1,1\n")  # beside the splits anything may lie
-    assert load_data(tmp_path / "d", "train")[0].files == ("a_label_0.csv",)
-    assert load_data(tmp_path / "d", "test")[0].labels.tolist() == [1]
+    assert load_data(tmp_path / "d", "train").files == ("a_label_0.csv",)
+    assert load_data(tmp_path / "d", "test").labels.tolist() == [1]
     assert data_splits(tmp_path / "d") == ("test", "train")
     assert message(load_data, tmp_path / "d", "dev") == (
         "d: split 'dev' is missing or empty; splits with recordings: test, train"
     )
-    assert load_data(tmp_path / "d" / "train")[0].files == ("a_label_0.csv",)
+    assert load_data(tmp_path / "d" / "train").files == ("a_label_0.csv",)
 
 
 def test_one_released_recording(tmp_path):
@@ -226,10 +229,11 @@ def test_one_released_recording(tmp_path):
     np.save(tmp_path / "sample_0_label_3.npy", grasps.events[3].astype(np.float32))
     np.save(tmp_path / "grasp.npy", grasps.events[3])
     for name, label in (("sample_0_label_3.npy", 3), ("grasp.npy", UNLABELLED)):
-        recordings, counts = load_data(tmp_path / name, taxels=39, classes=6)
+        recordings = load_data(tmp_path / name, taxels=39, classes=6)
+        counts = recordings.counts
         assert np.array_equal(recordings.events, grasps.events[3:4])
         assert recordings.labels.tolist() == [label]
-        assert (counts.events, counts.duplicates, counts.steps) == (grasps.events[3].sum(), 0, (40,))
+        assert (counts.events, counts.duplicates, recordings.steps) == (grasps.events[3].sum(), 0, 40)
     refused = message(load_data, tmp_path / "grasp.npy", bin_s=0.05, error=OptionError)
     assert refused == "--bin 0.05: grasp.npy holds bins, not times; omit --bin"
     np.save(tmp_path / "bad.npy", np.full((3, 2, 4), 0.5))
@@ -242,7 +246,7 @@ def test_silence_in_bins_is_a_gap(tmp_path):
     grid = np.zeros((1, 2, 100), dtype=np.uint8)
     grid[0, 0, [0, 26, 53]] = 1  # 25 empty bins are half a second, 26 are more
     np.save(tmp_path / "a.npy", grid)
-    assert load_data(tmp_path / "a.npy")[1].gaps == 1
+    assert load_data(tmp_path / "a.npy").counts.gaps == 1
 
 
 def test_the_released_layout_goes_its_own_way(tmp_path):
@@ -250,7 +254,8 @@ def test_the_released_layout_goes_its_own_way(tmp_path):
     split = grasps.part(slice(None), "test")
     for name in ("d", "d.zip", "again.zip"):
         write_released(tmp_path / name, [split])
-        recordings, counts = load_data(tmp_path / name, classes=6, taxels=39)
+        recordings = load_data(tmp_path / name, classes=6, taxels=39)
+        counts = recordings.counts
         assert counts is None
         assert np.array_equal(recordings.events, grasps.events)
         assert recordings.files == tuple(f"sample_{i:02}_label_{i % 6}.npy" for i in range(12))
@@ -278,7 +283,8 @@ def test_any_recording_survives_as_events(tmp_path, data):
     )
     path = tmp_path / "a.csv"
     path.write_text(text)
-    recordings, counts = load_data(path)
+    recordings = load_data(path)
+    counts = recordings.counts
     assert np.array_equal(recordings.events[0], grid)
     assert (counts.events, counts.duplicates) == (len(rows), len(found) // 2)
 
@@ -335,7 +341,7 @@ def test_writing_is_all_or_nothing(tmp_path, monkeypatch):
 
 # What is worth a second look
 def warned(path, **options) -> tuple[str, ...]:
-    return load_data(path, **options)[1].notes
+    return load_data(path, **options).counts.notes
 
 
 @pytest.mark.parametrize(
@@ -388,7 +394,8 @@ def listed(write):
 
 def test_a_table_gives_labels(listed):
     folder = listed("own/labels.csv", "File, weight ,LABEL\na.csv,3.5,7\n\nb_label_2.csv,,2\nother.csv,,1\n").parent
-    recordings, counts = load_data(folder)
+    recordings = load_data(folder)
+    counts = recordings.counts
     assert recordings.files == ("a.csv", "b_label_2.csv", "c.csv")
     assert recordings.labels.tolist() == [7, 2, UNLABELLED]
     assert counts.notes == ("own: labels.csv: gives the labels of 2 of 3 recordings",)
@@ -398,8 +405,8 @@ def test_a_table_above_the_splits(write):
     for split in ("train", "test"):
         write(f"own/{split}/a.csv", HEADER + "0,0,1\n")
     folder = write("own/Labels.csv", "name,class\ntrain/a.csv,1\ntest/a.csv,0\n").parent
-    assert load_data(folder, "train")[0].labels.tolist() == [1]
-    assert load_data(folder, "test")[0].labels.tolist() == [0]
+    assert load_data(folder, "train").labels.tolist() == [1]
+    assert load_data(folder, "test").labels.tolist() == [0]
     assert data_splits(folder) == ("test", "train")
 
 

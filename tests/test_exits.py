@@ -17,7 +17,7 @@ from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.models.graphs import normalised_adjacency
-from spikeloom.models.recordings.evtouch import load_recordings
+from spikeloom.models.recordings.events import load_data
 from spikeloom.runtime.inputs.files import shipped
 from spikeloom.runtime.machines.integer import LONGEST, integer_machine_of
 from spikeloom.runtime.machines.loihi1 import engine
@@ -197,7 +197,7 @@ def test_live_and_recorded_votes_end_alike():
 @pytest.mark.parametrize("which", ["objects", "containers"])
 def test_no_recording_is_decided_otherwise_by_proof(which, split, shipped_netlists, request):
     netlist = shipped_netlists[which]
-    data = load_recordings(request.getfixturevalue(f"{which}_zip"), split)
+    data = load_data(request.getfixturevalue(f"{which}_zip"), split)
     lengths = np.full(len(data), data.steps)
     votes = cumulative.votes_of(netlist, with_clocks(data.events, netlist.clocks), lengths)
     at = exits.standing(votes, lengths)

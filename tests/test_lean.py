@@ -82,7 +82,7 @@ def test_what_is_written_decides_and_costs_as_reported(spikeloom, golden):
     assert spikeloom("compile", "net.pt", "--calibrate", "data", "-o", "whole.loom")[0] == 0
     whole = read_netlist("whole.loom")
     for split, key in (("train", "training"), ("test", "test")):
-        data = load_data("data", split)[0]
+        data = load_data("data", split)
         flat = data.events.reshape(len(data), -1, STEPS)
         before, after = (predictions(each, engine.simulate(each, flat).counts.spikes) for each in (whole, netlist))
         assert row[key]["differ"] == np.count_nonzero(before != after)
@@ -98,7 +98,7 @@ def test_what_is_written_decides_and_costs_as_reported(spikeloom, golden):
     assert {other["training"]["differ"] for other in strict} == {0}
     (taxels,) = (other["removed"]["taxels"] for other in strict if "taxels" in other["removed"])
     assert 3 in taxels
-    sent = load_data("data", "train")[0].events.sum(axis=(0, 2, 3), dtype=int)
+    sent = load_data("data", "train").events.sum(axis=(0, 2, 3), dtype=int)
     assert [taxel["events"] for taxel in report["taxels"]] == sent.tolist()
     assert report["taxels"][3] == {"events": 0, "training_differ": 0, "test_differ": 0}
     assert [layer["neurons"] for layer in report["layers"]] == [30, 9, 8, CLASSES]

@@ -52,10 +52,10 @@ def files(folder):
 
 
 def test_silence_after_the_end_would_move_votes(folder):
-    together, counts = load_data(folder, "test")
-    assert together.lengths.tolist() == list(STEPS) == list(counts.steps)
-    assert load_data(files(folder)[1])[0].lengths is None
-    fitted, held = validation_split(load_data(folder, "train")[0])
+    together = load_data(folder, "test")
+    assert together.lengths.tolist() == list(STEPS)
+    assert load_data(files(folder)[1]).lengths is None
+    fitted, held = validation_split(load_data(folder, "train"))
     assert sorted([*fitted.lengths, *held.lengths]) == sorted(STEPS * 2)
     network = lift(read_netlist("x.loom"))
     flat = together.events.reshape(len(together), -1, together.steps).transpose(0, 2, 1).astype(bool)
@@ -90,8 +90,8 @@ def test_estimate_prices_each_recording_at_its_own_length(folder, capsys):
 def test_training_sees_each_recording_at_its_own_length(folder):
     adjacency = np.eye(TAXELS)
     network = SpikingNet(Architecture(taxels=TAXELS, classes=CLASSES), adjacency, seed=2)
-    together, _ = load_data(folder, "test")
-    alone = [load_data(file, taxels=TAXELS)[0] for file in files(folder)]
+    together = load_data(folder, "test")
+    alone = [load_data(file, taxels=TAXELS) for file in files(folder)]
     assert predict(network, together).tolist() == [int(predict(network, one)[0]) for one in alone]
     loss, correct = evaluate(network, together)
     parts = [evaluate(network, one) for one in alone]
@@ -100,7 +100,7 @@ def test_training_sees_each_recording_at_its_own_length(folder):
 
 def test_a_training_does_not_depend_on_the_longest_recording(folder):
     """The file of 90 steps decides how long the array is; without it the same recordings train the same weights."""
-    chosen, _ = load_data(folder, "train")
+    chosen = load_data(folder, "train")
     short = np.flatnonzero(chosen.lengths < 90)
     options = {"epochs": 1, "seed": 1}
     fit = []

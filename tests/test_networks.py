@@ -17,7 +17,7 @@ from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.models.networks.layers import lif, spike_linear, tag_convolution
 from spikeloom.models.networks.networks import Architecture, SpikingNet
 from spikeloom.models.networks.reference import BATCH, float_membranes, float_spikes
-from spikeloom.models.recordings.evtouch import load_recordings
+from spikeloom.models.recordings.events import load_data
 
 BETA, THETA = 0.2, 0.5
 
@@ -200,7 +200,7 @@ def released_run(released_checkpoint, objects_zip, shared_dir):
 
     checkpoint, graph = read_checkpoint(released_checkpoint), build_graph("manual")
     adjacency = normalised_adjacency(graph.edges, graph.n_taxels)
-    data = load_recordings(objects_zip, "test", classes=checkpoint.classes, taxels=checkpoint.taxels)
+    data = load_data(objects_zip, "test", classes=checkpoint.classes, taxels=checkpoint.taxels)
     expected = json.loads((shared_dir / "checkpoints" / "objects_manual.expected.json").read_text())
     return checkpoint, adjacency, data, float_spikes(checkpoint, adjacency, data.events), expected
 

@@ -16,7 +16,7 @@ from spikeloom.compiler.errors import NumericRangeError
 from spikeloom.compiler.fixedpoint import read_only
 from spikeloom.compiler.formats.onnx import writer as onnx_writer
 from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist
-from spikeloom.models.recordings.evtouch import load_recordings
+from spikeloom.models.recordings.events import load_data
 from spikeloom.runtime import cli
 from spikeloom.runtime.machines.loihi1 import engine, onnx_engine, spec
 
@@ -175,7 +175,7 @@ def test_all_recordings(fixture, bits, request, tmp_path):
     name, sizes = SETS[fixture]
     archive = request.getfixturevalue(fixture)
     for split, size in zip(("train", "test"), sizes, strict=True):
-        events = load_recordings(archive, split).events
+        events = load_data(archive, split).events
         assert len(events) == size
         words = (f"pretrained:{name}", "--calibrate", archive, "--weight-bits", bits)
         assert spikes_of(tmp_path, events, *words) > 1_000_000

@@ -22,7 +22,8 @@ from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.models.networks.checkpoint import save_checkpoint
 from spikeloom.models.networks.layers import time_first
 from spikeloom.models.networks.quantised import QuantisedNet, quantised_spikes
-from spikeloom.models.recordings.evtouch import Recordings, load_recordings
+from spikeloom.models.recordings.events import load_data
+from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.training.finetune import finetune
 from spikeloom.models.training.initial_storage import initial_forms
 from spikeloom.runtime.cli import main
@@ -222,7 +223,7 @@ def test_the_model_is_the_chip_on_every_recording(tmp_path, objects_zip, contain
         checkpoint = read_checkpoint(output)
         netlist = compile_network(expand(checkpoint, adjacency), Options(forms=checkpoint.forms)).netlist
         for split in ("train", "test"):
-            data = load_recordings(place, split)
+            data = load_data(place, split)
             model = quantised_spikes(checkpoint, adjacency, data.events)
             trace = engine.simulate(netlist, data.events.reshape(len(data), -1, data.steps), spikes=True)
             for index, layer in enumerate(netlist.layers):

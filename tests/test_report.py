@@ -181,7 +181,7 @@ def test_the_raster_marks_every_difference(made):
 def test_spikes_and_membranes_are_those_of_both_sides(made, place):
     recording = made[1]["recording"]
     netlist, checkpoint = read_netlist(place / "net.loom"), read_checkpoint(place / "net.pt")
-    data = load_data(str(place / "data"), "test")[0]
+    data = load_data(str(place / "data"), "test")
     one = data.events[recording["index"]][None]
     seen = normalised_adjacency(checkpoint.edges, TAXELS)
     ours = float_spikes(checkpoint, seen, one)
@@ -212,7 +212,7 @@ def test_spikes_and_membranes_are_those_of_both_sides(made, place):
 
 def test_decisions_cores_and_taxels_agree_with_the_rest(made, place):
     report = made[1]
-    netlist, data = read_netlist(place / "net.loom"), load_data(str(place / "data"), "test")[0]
+    netlist, data = read_netlist(place / "net.loom"), load_data(str(place / "data"), "test")
     for side in ("float", "chip"):
         matrix = np.array(report["decisions"]["matrices"][side])
         assert_array_equal(matrix.sum(axis=1), np.bincount(data.labels, minlength=CLASSES))

@@ -10,7 +10,7 @@ from made_files import CLASSES, STEPS, TAXELS, events, own_file, recordings_fold
 from random_crossbars import random_network
 
 from spikeloom.compiler.targets.truenorth.native_file import write_trained
-from spikeloom.models.recordings.evtouch import load_recordings
+from spikeloom.models.recordings.events import load_data
 from spikeloom.models.training.protocols import data_digest
 from spikeloom.runtime.studies.chart import work as chart_work
 
@@ -24,7 +24,7 @@ def place(tmp_path_factory):
     folder = tmp_path_factory.mktemp("chart")
     train = np.concatenate([events(1, samples=12), events(3, samples=4, rate=0.05)])
     recordings_folder(folder / "data", train=train, test=events(2, samples=8))
-    digest = data_digest(load_recordings(folder / "data", "train"), load_recordings(folder / "data", "test"))
+    digest = data_digest(load_data(folder / "data", "train"), load_data(folder / "data", "test"))
     known = {"data_sha256": digest, "validation": {"correct": 3, "samples": 4}, "command": "spikeloom train …"}
     own_file(folder / LOIHI, training=known)
     for name, seed, training in ((NATIVE, 4, known), ("unknown.pt", 5, {})):

@@ -27,7 +27,6 @@ from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist
 from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.models.recordings.events import load_data
-from spikeloom.models.recordings.evtouch import load_recordings
 from spikeloom.runtime.commands.exchange import watch
 from spikeloom.runtime.machines.integer import integer_machine_of
 from spikeloom.runtime.machines.loihi1 import engine
@@ -173,7 +172,7 @@ def test_the_released_network_on_its_recordings(released_checkpoint, objects_zip
     adjacency = normalised_adjacency(graph.edges, graph.n_taxels)
     netlist = compile_network(expand(read_checkpoint(str(released_checkpoint)), adjacency)).netlist
     write_netlist(netlist, tmp_path / "net.loom")
-    data = load_recordings(objects_zip, "test", limit=3).events
+    data = load_data(objects_zip, "test", limit=3).events
     path = lines("\n".join(as_lines(recording, inside=19_999) for recording in data))
     found = objects(tmp_path / "net.loom", path, "--bins", data.shape[-1])
     assert [grasp["counts"] for grasp in found["grasp"]] == [votes_of_run(netlist, recording) for recording in data]
@@ -195,7 +194,7 @@ def test_a_file_is_read_as_recordings_are(lively, lively_file, lines, objects):
     rng = np.random.default_rng(0)
     rows = sorted((k * 0.01 * (1 - e), *rng.integers([10, 2])) for k in range(200) for e in (0, 1e-15, 1e-10, 1e-7))
     path = lines("taxel,time_s,label,polarity\n" + "".join(f"{x},{t!r},4,{p}  # {p}\n" for t, x, p in rows))
-    read, _ = load_data(path.removeprefix("--input="), taxels=10)
+    read = load_data(path.removeprefix("--input="), taxels=10)
     found = objects(lively_file, path)
     assert found["grasp"][0]["bins"] == read.steps == 100
     assert found["grasp"][0]["counts"] == votes_of_run(lively, read.events[0])

@@ -19,7 +19,7 @@ from spikeloom.compiler.interpret import channels_last, run_float
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.loihi1.netlist_file import write_netlist
 from spikeloom.models.graphs import build_graph, normalised_adjacency
-from spikeloom.models.recordings.evtouch import load_recordings
+from spikeloom.models.recordings.events import load_data
 from spikeloom.runtime import cli
 from spikeloom.runtime.costs.yardsticks import HOROWITZ, measure, sections
 from spikeloom.runtime.report.encode import encode
@@ -224,7 +224,7 @@ def test_the_released_network_in_round_figures(released_checkpoint, objects_zip)
     checkpoint = read_checkpoint(released_checkpoint)
     graph = build_graph("manual")
     adjacency = normalised_adjacency(graph.edges, graph.n_taxels)
-    events = load_recordings(objects_zip, "test", limit=2).events
+    events = load_data(objects_zip, "test", limit=2).events
     spikes = run_float(expand(checkpoint, adjacency), channels_last(events), dtype=np.float32).spikes
     result = measure(checkpoint, adjacency, events, spikes)
     found = encode(result)

@@ -28,8 +28,8 @@ from spikeloom.compiler.formats.towers import arrays_of, join
 from spikeloom.compiler.ir import Form
 from spikeloom.compiler.targets.truenorth.native_file import write_trained
 from spikeloom.models.networks.checkpoint import save_checkpoint
-from spikeloom.models.recordings.events import joined_bins
-from spikeloom.models.recordings.evtouch import Recordings, load_recordings
+from spikeloom.models.recordings.events import joined_bins, load_data
+from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.cli import main
 from spikeloom.runtime.machines.base import Machine, machine_for
 from spikeloom.runtime.machines.loihi1 import spec
@@ -74,7 +74,7 @@ class Specimen:
     def recordings(self) -> Recordings:
         """The test split, of bins that the network takes."""
 
-        return joined_bins(load_recordings(self.data, "test"), self.machine.netlist.bins)
+        return joined_bins(load_data(self.data, "test"), self.machine.netlist.bins)
 
     @property
     def events(self) -> np.ndarray:

@@ -29,7 +29,7 @@ def make(row: Row, seed: int, data: str, network: Path) -> tuple[str, Cell]:
         environment = os.environ | {"OMP_NUM_THREADS": "1"}
         subprocess.run([sys.executable, "-m", "spikeloom", *words], check=True, env=environment)
     record = read_checkpoint(network).training or {}
-    splits = (load_data(data, split)[0] for split in ("train", "test"))
+    splits = (load_data(data, split) for split in ("train", "test"))
     found = {"data": row.data, "system": row.system, "form": row.form, "epochs": row.epochs, "seed": seed}
     found |= {key: record[key] for key in KEPT}
     found["checkpoint_sha256"] = sha256_of(network)

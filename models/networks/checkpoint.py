@@ -11,9 +11,11 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler.archive import npy_bytes, zip_bytes
+from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.dynamics import PLAIN, Dynamics
 from spikeloom.compiler.files import write_atomically
 from spikeloom.compiler.formats.spikeloom_checkpoint import FORMAT, VERSION, content_digest
+from spikeloom.compiler.formats.towers import arrays_of
 from spikeloom.compiler.ir import Form
 from spikeloom.compiler.systems import TACTILESGNET, Grid
 from spikeloom.models.graphs import Graph
@@ -101,3 +103,23 @@ def save_checkpoint(
     content = zip_bytes(members | {f"{name}.npy": npy_bytes(array) for name, array in arrays.items()})
     with write_atomically(path) as file:
         file.write(content)
+
+
+def save_again(path: str | os.PathLike[str], checkpoint: Checkpoint, *, training: Mapping[str, Any]) -> None:
+    """Write a checkpoint that was read and changed, as its epoch ``last``; see `save_checkpoint`."""
+    edges = np.zeros((0, 2), np.int64) if checkpoint.edges is None else checkpoint.edges
+    coordinates = np.arange(float(checkpoint.taxels))[:, None]  # only edges are stored
+    save_checkpoint(
+        path,
+        {"last": arrays_of(checkpoint)},
+        Graph(name=str(checkpoint.graph), coordinates=coordinates, edges=edges),
+        beta=checkpoint.beta,
+        theta=checkpoint.theta,
+        training=training,
+        forms=checkpoint.forms,
+        system=checkpoint.system,
+        grid=checkpoint.grid,
+        dynamics=checkpoint.dynamics,
+        towers=checkpoint.towers,
+        bins=checkpoint.bins,
+    )

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -87,6 +88,25 @@ class TrainedModule(nn.Module):
     def export_weights(self) -> Weights:
         """Weights as they are stored."""
         raise NotImplementedError
+
+
+class Sizes(Protocol):
+    """Sizes of a network that can be trained."""
+
+    @property
+    def taxels(self) -> int:
+        """Sensor points."""
+
+    @property
+    def channels(self) -> int:
+        """Inputs per taxel."""
+
+    @property
+    def classes(self) -> int:
+        """Outputs."""
+
+    def network(self, propagation: NDArray[np.float64], *, seed: int, surrogate: Surrogate) -> TrainedModule:
+        """An untrained network."""
 
 
 class SpikingNet(TrainedModule):

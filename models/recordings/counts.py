@@ -11,29 +11,21 @@ GAP_S = 0.5
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EventCounts:
-    """What was counted while recordings were put into bins."""
+    """What was counted while recordings were put into bins; the fields are keys in JSON.
+
+    Recordings are either `shorter` than the longest, or were `padded` to one length.
+    """
 
     events: int  # Events read, duplicates included
     out_of_order: int  # Events with a time before that of an event that came earlier
     duplicates: int  # Events whose taxel already had one of the same polarity in the same bin; they count once
-    gaps: int  # Silences longer than `GAP_S` between two events of a recording
-    steps: tuple[int, ...]  # Bins of each recording
-    # What is worth a second look: times that look like another unit, taxels that seem to count from 1, a table of
-    # labels
-    notes: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Oddities:
-    """Counts as scripts read them; recordings are either `shorter` than the longest, or were `padded` to one length."""
-
-    events: int
-    out_of_order: int
-    duplicates: int
-    gaps: int
+    gaps: int  # Silences longer than `gap_s` between two events of a recording
     gap_s: float = GAP_S
     shorter: int | None = field(default=None, metadata={"optional": True})
     padded: int | None = field(default=None, metadata={"optional": True})
+    # What is worth a second look: times that look like another unit, taxels that seem to count from 1, a table of
+    # labels
+    notes: tuple[str, ...] = field(default=(), metadata={"hidden": True})
 
     def __str__(self) -> str:
         """Counts for people."""
@@ -48,24 +40,10 @@ class Oddities:
         )
 
 
-def oddities(counts: EventCounts, padded_to: int | None = None) -> Oddities:
-    """Counts as scripts read them; `padded_to` where all recordings were filled up to one length."""
-    longest = max(counts.steps) if padded_to is None else padded_to
-    less = sum(steps < longest for steps in counts.steps)
-    return Oddities(
-        events=counts.events,
-        out_of_order=counts.out_of_order,
-        duplicates=counts.duplicates,
-        gaps=counts.gaps,
-        shorter=less if padded_to is None else None,
-        padded=None if padded_to is None else less,
-    )
-
-
 def show_counts(source: str, counts: EventCounts | None) -> None:
     """Say on stderr what was counted and is worth a second look; the released layout has nothing to say."""
     if counts is not None:
-        sys.stderr.write(f"{source}: {oddities(counts)}\n")
+        sys.stderr.write(f"{source}: {counts}\n")
         show_notes(counts)
 
 

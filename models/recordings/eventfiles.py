@@ -21,7 +21,6 @@ from spikeloom.models.graphs import MAX_TAXELS
 from spikeloom.models.recordings.csvtable import read_table
 from spikeloom.models.recordings.evtouch import UNLABELLED, label_in_name, opened, parse_npy
 
-SUFFIXES = (".csv", ".npz")
 MAX_LABEL = 999_999
 
 UNITS = (("nanoseconds", 5e5), ("microseconds", 5e2), ("milliseconds", 0.5))

@@ -8,23 +8,26 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.models.recordings.counts import GAP_S, EventCounts
-from spikeloom.models.recordings.eventfiles import SUFFIXES, EventStream, likely_unit, read_stream
+from spikeloom.models.recordings.csvtable import LABELS, is_table, labels_beside
+from spikeloom.models.recordings.eventfiles import EventStream, likely_unit, read_stream
 from spikeloom.models.recordings.evtouch import (
+    SUFFIXES,
     UNLABELLED,
+    Members,
     Recordings,
     label_in_name,
-    load_recordings,
     opened,
     parse_bins,
     require_class,
@@ -32,8 +35,6 @@ from spikeloom.models.recordings.evtouch import (
     splits_of,
 )
 from spikeloom.models.recordings.fetch import DATA_SETS, find_data
-from spikeloom.models.recordings.labels import NAME as TABLE
-from spikeloom.models.recordings.labels import is_table, labels_beside
 
 BIN_S = 0.02
 """Width of a time bin in the released recordings, seconds."""
@@ -63,7 +64,7 @@ def load_data(
     taxels: int | None = None,
     classes: int | None = None,
     limit: int | None = None,
-) -> tuple[Recordings, EventCounts | None]:
+) -> Recordings:
     """Read the first `limit` recordings of a split, files in plain string order.
 
     Parameters
@@ -79,10 +80,9 @@ def load_data(
 
     Returns
     -------
-    recordings : Recordings
-        Labels are `UNLABELLED` where nothing says them; see `need_labels`.
-    counts : EventCounts or None
-        None for the released layout.
+    Recordings
+        Labels are `UNLABELLED` where nothing says them; see `need_labels`. In the released layout all have labels, the
+        same steps and taxels, and no counts.
 
     Raises
     ------
@@ -96,47 +96,63 @@ def load_data(
     if limit is not None and limit < 1:
         raise OptionError(f"--limit {limit}: at least 1 recording is needed; give a positive number")
     path = find_data(str(path)) if str(path) in DATA_SETS else Path(path)
-    found = _event_files(path)
-    if found is None:
-        require_events(path.name or str(path), bin_s)
-        return load_recordings(path, split, limit=limit, classes=classes, taxels=taxels), None
     source = path.name or str(path)
-    if split not in found and "" not in found:
-        raise DataError(
-            f"{source}: split {split!r} is missing or empty; splits with recordings: {', '.join(sorted(found))}"
-        )
-    files = sorted(found[split if split in found else ""], key=lambda file: file.name)[:limit]
-    table, notes = labels_beside(path, files, source)
-    read: list[_Recording] = []
-    held = 0
-    for file in files:
-        where = source if file == path else f"{source}: {file.relative_to(path).as_posix()}"
-        read.append(_read(file, where, bin_s, taxels, table.get(file)))
-        require_class(where, read[-1].label, classes)
-        held += read[-1].grid.size
-        require_memory(source, held)
-    steps = tuple(each.grid.shape[2] for each in read)
-    shape = max(each.grid.shape[0] for each in read), 2, max(steps)
+    with _data_set(path, split) as (members, found):
+        if split not in found and "" not in found:
+            present = ", ".join(sorted(found))
+            raise DataError(f"{source}: split {split!r} is missing or empty; splits with recordings: {present}")
+        folder = f"{split}/" if split in found else ""
+        chosen = sorted(found[split if split in found else ""].items())[:limit]
+        released = bool(folder) and all(name.lower().endswith(".npy") for name in found[split])
+        if released:
+            require_events(source, bin_s)
+        files = [(path.parent if path.is_file() else path) / member for _, member in chosen]
+        table, notes = labels_beside(path, files, source)
+        read: list[_Recording] = []
+        held = 0
+        for file, (name, member) in zip(files, chosen, strict=True):
+            where = source if path == file else f"{source}: {folder}{name}"
+            read.append(_read(file, members[member], where, bin_s, taxels, table.get(file)))
+            _require_alike(read[-1], read[0] if released else None)
+            require_class(where, read[-1].label, classes)
+            held += read[-1].grid.size
+            require_memory(source, held)
+    steps = np.array([each.grid.shape[2] for each in read], np.int64)
+    shape = max(each.grid.shape[0] for each in read), 2, int(steps.max())
     require_memory(source, len(read) * math.prod(shape))
     events = np.zeros((len(read), *shape), dtype=np.uint8)
     for index, each in enumerate(read):
         events[index, : each.grid.shape[0], :, : each.grid.shape[2]] = each.grid
-    recordings = Recordings(
-        events=events,
-        labels=np.array([each.label for each in read], dtype=np.int64),
-        files=tuple(file.name for file in files),
-        split=split,
-        source=source,
-        lengths=None if len(set(steps)) == 1 else np.array(steps, dtype=np.int64),
-    )
-    return recordings, EventCounts(
+    counts = EventCounts(
         events=sum(each.counts.events for each in read),
         out_of_order=sum(each.counts.out_of_order for each in read),
         duplicates=sum(each.counts.duplicates for each in read),
         gaps=sum(each.counts.gaps for each in read),
-        steps=steps,
+        shorter=int(np.count_nonzero(steps < steps.max())),
         notes=(*notes, *_unit_notes(read), *(_taxel_notes(source, events) if taxels is None else ())),
     )
+    return Recordings(
+        events=events,
+        labels=np.array([each.label for each in read], dtype=np.int64),
+        files=tuple(name for name, _ in chosen),
+        split=split,
+        source=source,
+        lengths=None if steps.min() == steps.max() else steps,
+        counts=None if released else counts,
+    )
+
+
+def _require_alike(read: _Recording, first: _Recording | None) -> None:
+    """Refuse a recording of the released layout that has no label, or another shape than the `first` one."""
+    if first is not None and read.label == UNLABELLED:
+        raise DataError(
+            f"{read.where}: no label in the name, allowed is sample_N_label_L.npy; rename or remove the file"
+        )
+    if first is not None and read.grid.shape != first.grid.shape:
+        raise DataError(
+            f"{read.where}: shape {read.grid.shape}, the recordings before it have {first.grid.shape}; "
+            "all of a split must agree"
+        )
 
 
 def require_events(where: str, bin_s: float) -> None:
@@ -147,12 +163,8 @@ def require_events(where: str, bin_s: float) -> None:
 
 def data_splits(path: str | os.PathLike[str]) -> tuple[str, ...]:
     """Splits that a data set has; none if it is flat or one recording, DataError if there are no recordings."""
-    path = find_data(str(path)) if str(path) in DATA_SETS else Path(path)
-    found = _event_files(path)
-    if found is not None:
+    with _data_set(find_data(str(path)) if str(path) in DATA_SETS else Path(path)) as (_, found):
         return tuple(sorted(filter(None, found)))
-    with opened(path) as members:
-        return tuple(sorted(splits_of(path.name or str(path), members, {"train", "test"})))
 
 
 def need_labels(recordings: Recordings, what: str) -> Recordings:
@@ -209,7 +221,6 @@ def bin_events(
         out_of_order=int(np.count_nonzero(stream.time_s < np.maximum.accumulate(stream.time_s))),
         duplicates=sent - int(np.count_nonzero(grid)),
         gaps=int(np.count_nonzero(np.diff(np.sort(stream.time_s)) > GAP_S)),
-        steps=(steps,),
         notes=(f"times up to {stream.time_s[latest]:g} look like {unit}; write seconds",) if unit else (),
     )
 
@@ -237,41 +248,29 @@ def join_bins(events: NDArray[Any], bins: int) -> NDArray[Any]:
     return joined
 
 
-def _event_files(path: Path) -> dict[str, list[Path]] | None:
-    """Files by split, ``""`` for any, or None where `load_recordings` reads the data set."""
-    readable = (*SUFFIXES, ".npy")
+@contextmanager
+def _data_set(path: Path, split: str = "test") -> Iterator[tuple[Members, dict[str, dict[str, str]]]]:
+    """What opens each file, and their names and members by split, ``""`` for any; DataError if there are none."""
+    source = path.name or str(path)
     if path.is_file():
-        if path.suffix.lower() in readable:
-            return {"": [path]}
+        if path.suffix.lower() in SUFFIXES:
+            yield {path.name: partial(path.open, "rb")}, {"": {path.name: path.name}}
+            return
         with path.open("rb") as file:
-            if file.read(2) == b"PK":
-                return None
-        raise DataError(f"{path}: not a recording; give a folder, a released zip, or a .csv, .npz or .npy file")
-    if not path.is_dir():
-        return None
-    found = {
-        split: [file for file in (path / split).iterdir() if _counts(file, readable)]
-        for split in ("train", "test")
-        if (path / split).is_dir()
-    }
-    found = {split: files for split, files in found.items() if files}
-    if not found:
-        flat = [file for file in path.iterdir() if _counts(file, readable)]
-        return {"": flat} if flat else None
-    suffixes = {file.suffix.lower() for files in found.values() for file in files}
-    if suffixes == {".npy"}:
-        return None
-    if ".npy" in suffixes:
-        raise DataError(
-            f"{path.name or path}: .npy beside {' and '.join(sorted(suffixes - {'.npy'}))} in train/ and test/, "
-            "allowed are bins or events; keep one kind"
-        )
-    return found
-
-
-def _counts(file: Path, suffixes: tuple[str, ...]) -> bool:
-    plain = not (file.name.startswith(".") or is_table(file))
-    return file.suffix.lower() in suffixes and plain and file.is_file()
+            if file.read(2) != b"PK":
+                raise DataError(f"{path}: not a recording; give a folder, a released zip, or a .csv, .npz or .npy file")
+    with opened(path) as members:
+        plain = {name: member for name, member in members.items() if not is_table(Path(name))}
+        found = splits_of(source, plain, {"train", "test", split})
+        flat = {name: name for name in plain if "/" not in name and not name.startswith(".")}
+        if not found and flat and path.is_dir():
+            found = {"": flat}
+        if not found:
+            raise DataError(
+                f"{source}: no recordings (train/ or test/ with sample_N_label_L.npy); "
+                "give the folder or zip that holds train/ and test/"
+            )
+        yield members, found
 
 
 def _unit_notes(read: Sequence[_Recording]) -> list[str]:
@@ -289,20 +288,22 @@ def _taxel_notes(source: str, events: NDArray[np.uint8]) -> list[str]:
     return [f"{source}: no event at taxel 0, some at each of 1..{len(alive) - 1}: if these count from 1, count from 0"]
 
 
-def _read(file: Path, where: str, bin_s: float, taxels: int | None, listed: int | None) -> _Recording:
+def _read(
+    file: Path, opener: Callable[[], IO[Any]], where: str, bin_s: float, taxels: int | None, listed: int | None
+) -> _Recording:
     """One recording; `listed` is its class in a table of labels."""
     if file.suffix.lower() == ".npy":
         require_events(where, bin_s)
-        grid = parse_bins(where, partial(file.open, "rb"), taxels)
+        grid = parse_bins(where, opener, taxels)
         busy = np.flatnonzero(grid.any(axis=(0, 1)))
         gaps = int(np.count_nonzero((np.diff(busy) - 1) * bin_s > GAP_S))
         sent = int(np.count_nonzero(grid))
-        counts = EventCounts(events=sent, out_of_order=0, duplicates=0, gaps=gaps, steps=(grid.shape[2],))
+        counts = EventCounts(events=sent, out_of_order=0, duplicates=0, gaps=gaps)
         label = label_in_name(file.name)
     else:
         stream = read_stream(file, taxels=taxels, where=where)
         grid, counts = bin_events(stream, bin_s, taxels=taxels)
         label = stream.label
     if listed is not None and label not in (UNLABELLED, listed):
-        raise DataError(f"{where}: label {label}, and {listed} in {TABLE}; mend one of them")
+        raise DataError(f"{where}: label {label}, and {listed} in {LABELS}; mend one of them")
     return _Recording(where, grid, label if listed is None else listed, counts)

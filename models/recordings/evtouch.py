@@ -1,4 +1,4 @@
-"""The EvTouch recordings: read a folder or a zip in the released layout, check everything, return one array.
+"""Recordings in one array, and the layout of the released ones: folders, zips and npy files, checked.
 
 The layout is ``train/`` and ``test/`` with files ``sample_N_label_L.npy``, possibly inside one top folder. A
 recording is (taxels, 2, steps), values 0 and 1; polarity 1 is the rising one (it leads at first contact).
@@ -7,12 +7,11 @@ recording is (taxels, 2, steps), values 0 and 1; polarity 1 is the rising one (i
 from __future__ import annotations
 
 import io
-import os
 import re
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import IO, Any
@@ -21,11 +20,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spikeloom.compiler.errors import DataError
+from spikeloom.models.recordings.counts import EventCounts
 
 MAX_TOTAL_BYTES = 4 << 30
 MAX_FILE_BYTES = 64 << 20  # the released recordings have 0.1 MB
 
 UNLABELLED = -1
+
+SUFFIXES = (".npy", ".npz", ".csv")
+"""Of files that hold a recording: bins, events, events."""
 
 _LABEL = re.compile(r"_label_([0-9]{1,6})(?![0-9])")
 _GIVE = "give the folder or zip that holds train/ and test/"
@@ -47,6 +50,7 @@ class Recordings:
     # (samples,) int64, or None; steps of each recording; read-only. None where all have as many as the array, as in the
     # released layout.
     lengths: NDArray[np.int64] | None = None
+    counts: EventCounts | None = None  # What was odd about their events; None where they had bins already
 
     def __post_init__(self) -> None:
         for name in ("events", "labels", "lengths"):
@@ -82,12 +86,12 @@ class Recordings:
     def part(self, chosen: slice | NDArray[Any], split: str | None = None) -> Recordings:
         """Some of the recordings, by indices, truth values or a slice; of another `split` if it has a name."""
         indices = np.arange(len(self))[chosen]
-        return Recordings(
+        return replace(
+            self,
             events=self.events[chosen],
             labels=self.labels[chosen],
             files=tuple(self.files[index] for index in indices),
             split=split or self.split,
-            source=self.source,
             lengths=None if self.lengths is None else self.lengths[chosen],
         )
 
@@ -97,58 +101,9 @@ class Recordings:
         return arrays if self.lengths is None else arrays | {"lengths": self.lengths}
 
 
-def load_recordings(
-    path: str | os.PathLike[str],
-    split: str = "test",
-    *,
-    limit: int | None = None,
-    classes: int | None = None,
-    taxels: int | None = None,
-) -> Recordings:
-    """Read one split of a folder or zip in the released layout, the first `limit` files in plain string order.
-
-    Raises
-    ------
-    DataError
-        If the data set or any recording in it cannot be used, or a network of so many `classes` and `taxels` cannot
-        take it; the message names the file.
-    """
-    if limit is not None and limit < 1:
-        raise DataError(f"limit: {limit} recordings, allowed are 1 or more; omit it to read all")
-    path = Path(path)
-    source = path.name or str(path)
-    with opened(path) as members:
-        found = splits_of(source, members, {"train", "test", split})
-        if split not in found:
-            present = ", ".join(sorted(found))
-            raise DataError(f"{source}: split {split!r} is missing or empty; splits with recordings: {present}")
-        files = sorted(found[split].items())[:limit]
-        labels, events = [], np.zeros((0, 0, 0, 0), np.uint8)
-        for index, (name, member) in enumerate(files):
-            where = f"{source}: {split}/{name}"
-            labels.append(label_in_name(name))
-            if labels[-1] == UNLABELLED:
-                raise DataError(
-                    f"{where}: no label in the name, allowed is sample_N_label_L.npy; rename or remove the file"
-                )
-            require_class(where, labels[-1], classes)
-            recording = parse_bins(where, members[member], taxels)
-            if not index:
-                require_memory(source, len(files) * recording.size)
-                events = np.empty((len(files), *recording.shape), np.uint8)
-            if recording.shape != events.shape[1:]:
-                raise DataError(
-                    f"{where}: shape {recording.shape}, the recordings before it have {events.shape[1:]}; "
-                    "all of a split must agree"
-                )
-            events[index] = recording
-    names = tuple(name for name, _ in files)
-    return Recordings(events=events, labels=np.array(labels, np.int64), files=names, split=split, source=source)
-
-
 @contextmanager
 def opened(path: Path) -> Iterator[Members]:
-    """What opens each npy file of a folder or zip, by its name with slashes; folders are searched two levels deep.
+    """What opens each recording of a folder, or npy file of a zip, by its name with slashes; folders two levels deep.
 
     Raises
     ------
@@ -156,8 +111,9 @@ def opened(path: Path) -> Iterator[Members]:
         If there is no such folder or zip, or the zip announces more than `MAX_TOTAL_BYTES`.
     """
     if path.is_dir():
-        files = [*path.glob("*.npy"), *path.glob("*/*.npy"), *path.glob("*/*/*.npy")]
-        yield {file.relative_to(path).as_posix(): partial(file.open, "rb") for file in files if file.is_file()}
+        files = [file for depth in ("*", "*/*", "*/*/*") for file in path.glob(depth) if file.is_file()]
+        names = {file.relative_to(path).as_posix(): file for file in files if file.suffix.lower() in SUFFIXES}
+        yield {name: partial(file.open, "rb") for name, file in names.items()}
         return
     if not path.is_file():
         raise DataError(f"{path}: no such folder or file; {_GIVE}")
@@ -172,7 +128,7 @@ def opened(path: Path) -> Iterator[Members]:
 
 
 def splits_of(source: str, members: Members, splits: set[str]) -> dict[str, dict[str, str]]:
-    """Map split to file name to member name, for the one data set among `members`; DataError if there is not one."""
+    """Map split to file name to member name, for the one data set among `members`; DataError if there are several."""
     found: dict[str, dict[str, str]] = {}
     roots: set[str] = set()
     for member in members:
@@ -183,8 +139,6 @@ def splits_of(source: str, members: Members, splits: set[str]) -> dict[str, dict
         found.setdefault(split, {})[name] = member
     if len(roots) > 1:
         raise DataError(f"{source}: several data sets ({', '.join(sorted(roots))}); give one of them")
-    if not found:
-        raise DataError(f"{source}: no recordings (train/ or test/ with sample_N_label_L.npy); {_GIVE}")
     return found
 
 

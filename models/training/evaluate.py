@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -10,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from spikeloom.compiler.errors import DataError
 from spikeloom.models.networks.layers import time_first
 from spikeloom.models.networks.networks import TrainedModule
 from spikeloom.models.recordings.evtouch import Recordings
@@ -85,3 +87,18 @@ def one_thread() -> Iterator[None]:
     finally:
         torch.set_flush_denormal(False)
         torch.set_num_threads(threads)
+
+
+def require_finite(network: torch.nn.Module, loss: float, epoch: int, step: int) -> None:
+    """Stop before the weights are touched.
+
+    Spikes hide a weight that is no number, since it exceeds no threshold and leaves the loss finite; the gradients of
+    the layers before it show it.
+    """
+    gradients = [parameter.grad for parameter in network.parameters() if parameter.grad is not None]
+    for name, found in (("loss", loss), ("gradient", sum(float(each.sum()) for each in gradients))):
+        if not math.isfinite(found):
+            raise DataError(
+                f"epoch {epoch}, step {step}: the {name} is {found}, a finite number is needed; the state of the epoch "
+                "before is kept"
+            )

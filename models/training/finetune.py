@@ -14,10 +14,9 @@ References
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -37,10 +36,9 @@ from spikeloom.models.networks.layers import time_first
 from spikeloom.models.networks.networks import Weights
 from spikeloom.models.networks.quantised import QuantisedNet
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.models.training.checks import require_finite
-from spikeloom.models.training.evaluate import one_thread, rate_loss
+from spikeloom.models.training.evaluate import one_thread, rate_loss, require_finite
 from spikeloom.models.training.initial_storage import initial_forms
-from spikeloom.models.training.resume import TrainingState, pack, read_state, set_rate, unpack, write_state
+from spikeloom.models.training.resume import restore, set_rate, write_state
 
 BATCH = 4
 """Recordings per step of the optimizer: the weights are rounded anew for each."""
@@ -157,16 +155,14 @@ def finetune(
         optimizer = torch.optim.Adam(model.parameters(), lr=LEARNING_RATE, amsgrad=True)
         before = count_right(model, test)
         if resume and state is not None and state.exists():
-            found = read_state(state, options)
-            unpack(found.arrays, model, optimizer, LEARNING_RATE)
-            order.bit_generator.state = found.progress["order"]
-            history = [TunedEpoch(**epoch) for epoch in found.progress["history"]]
+            epochs_before, _ = restore(state, options, model, optimizer, order)
+            history = [TunedEpoch(**epoch) for epoch in epochs_before]
             model.round()
         with tqdm(total=epochs, initial=len(history), desc="finetune", unit="epoch", disable=None) as bar:
             for index in range(len(history), epochs):
                 history.append(_epoch(model, optimizer, training, order.permutation(len(training)), index, epochs))
                 if state is not None:
-                    write_state(state, _state(options, model, optimizer, order, history))
+                    write_state(state, options, model, optimizer, order, history)
                 bar.set_postfix(loss=f"{history[-1].loss:.4f}", training=f"{history[-1].correct}/{len(training)}")
                 bar.update()
                 if after_epoch is not None:
@@ -211,17 +207,6 @@ def count_right(model: QuantisedNet, recordings: Recordings) -> int:
             events = recordings.events[index : index + 1, ..., : recordings.steps_of(index)]
             right += int(model(time_first(events)).numpy()[0].argmax() == label)
     return right
-
-
-def _state(
-    options: Mapping[str, Any],
-    model: QuantisedNet,
-    optimizer: torch.optim.Optimizer,
-    order: np.random.Generator,
-    history: list[TunedEpoch],
-) -> TrainingState:
-    progress = {"history": [asdict(epoch) for epoch in history], "order": order.bit_generator.state}
-    return TrainingState(options=options, progress=progress, arrays=pack(model, optimizer))
 
 
 def _weights(model: QuantisedNet) -> Weights:

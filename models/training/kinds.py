@@ -22,7 +22,7 @@ from spikeloom.models.systems import HOPS, filters_of, propagation_of
 from spikeloom.models.training.recipes import Recipe
 
 if TYPE_CHECKING:
-    from spikeloom.models.training.checks import Sizes
+    from spikeloom.models.networks.networks import Sizes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

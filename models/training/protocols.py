@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from spikeloom.compiler.archive import arrays_digest
 from spikeloom.compiler.errors import DataError
+from spikeloom.models.networks.networks import Sizes
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.models.training.checks import Sizes
 from spikeloom.models.training.recipes import RELEASED, Recipe
 from spikeloom.models.training.train import Trained, train
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -17,29 +17,50 @@ from spikeloom.compiler.archive import npy_bytes, read_npy, stored_members, zip_
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.files import write_atomically
 
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class TrainingState:
-    """What an epoch hands to the next."""
-
-    # JSON values that must be equal to go on: digests of data and graph, architecture, epochs, seed, rates
-    options: Mapping[str, Any]
-    # JSON values, as the training sees fit: history, state of the order's generator, learning rate
-    progress: Mapping[str, Any]
-    arrays: Mapping[str, NDArray[Any]]  # Parameters, optimizer moments, weights of epochs that are kept
+Weights = Mapping[str, NDArray[np.float32]]
 
 
-def write_state(path: str | os.PathLike[str], state: TrainingState) -> None:
-    """Write a state, whole or not at all."""
-    header = json.dumps({"options": dict(state.options), "progress": dict(state.progress)})
-    arrays = {"header": np.array(header), **state.arrays}
+def write_state(
+    path: str | os.PathLike[str],
+    options: Mapping[str, Any],
+    network: torch.nn.Module,
+    optimizer: torch.optim.Optimizer,
+    order: np.random.Generator,
+    history: Sequence[Any],
+    weights: Mapping[str, Weights] | None = None,
+) -> None:
+    """Write what an epoch hands to the next, whole or not at all.
+
+    `options` are the JSON values that must be equal to go on: digests of data and graph, architecture, epochs, seed,
+    rates. `history` has a dataclass of figures for each epoch, `weights` are those of epochs that are kept.
+    """
+    progress = {
+        "history": [asdict(epoch) for epoch in history],
+        "order": order.bit_generator.state,
+        "rate": float(optimizer.param_groups[0]["lr"]),
+    }
+    arrays: dict[str, Any] = {"header": np.array(json.dumps({"options": dict(options), "progress": progress}))}
+    arrays |= {f"network/{name}": parameter.detach().cpu().numpy() for name, parameter in network.named_parameters()}
+    for index, moments in optimizer.state_dict()["state"].items():
+        arrays |= {f"optimizer/{index}/{name}": value.detach().cpu().numpy() for name, value in moments.items()}
+    for which, held in (weights or {}).items():
+        arrays |= {f"kept/{which}/{name}": array for name, array in held.items()}
     content = zip_bytes({f"{name}.npy": npy_bytes(array) for name, array in arrays.items()})
     with write_atomically(path) as file:
         file.write(content)
 
 
-def read_state(path: str | os.PathLike[str], options: Mapping[str, Any]) -> TrainingState:
-    """Read a state; ModelError if it is missing or damaged, OptionError if it is that of another training."""
+def restore(
+    path: str | os.PathLike[str],
+    options: Mapping[str, Any],
+    network: torch.nn.Module,
+    optimizer: torch.optim.Optimizer,
+    order: np.random.Generator,
+) -> tuple[list[dict[str, Any]], dict[str, dict[str, NDArray[np.float32]]]]:
+    """Put parameters, optimizer and order of recordings back; returns the figures of the epochs and the kept weights.
+
+    ModelError if the state is missing or damaged, OptionError if it is that of another training.
+    """
     path = Path(path)
     if not path.is_file():
         raise ModelError(f"{path}: no interrupted training to resume; omit --resume")
@@ -56,34 +77,23 @@ def read_state(path: str | os.PathLike[str], options: Mapping[str, Any]) -> Trai
             f"{path}: belongs to a training with other {', '.join(differing)}; give the same options and data, "
             "or delete it to train anew"
         )
-    return TrainingState(options=found, progress=progress, arrays=arrays)
-
-
-def pack(network: torch.nn.Module, optimizer: torch.optim.Optimizer) -> dict[str, NDArray[Any]]:
-    """Copy parameters and optimizer moments."""
-    arrays = {f"network/{name}": p.detach().cpu().numpy().copy() for name, p in network.named_parameters()}
-    for index, moments in optimizer.state_dict()["state"].items():
-        for name, value in moments.items():
-            arrays[f"optimizer/{index}/{name}"] = value.detach().cpu().numpy().copy()
-    return arrays
-
-
-def unpack(
-    arrays: Mapping[str, NDArray[Any]], network: torch.nn.Module, optimizer: torch.optim.Optimizer, rate: float
-) -> None:
-    """Put parameters, optimizer moments and learning rate back."""
-    with torch.no_grad():
-        for name, parameter in network.named_parameters():
-            parameter.copy_(torch.tensor(arrays[f"network/{name}"]))
+    parameters = dict(network.named_parameters())
     moments: dict[int, dict[str, torch.Tensor]] = {}
+    weights: dict[str, dict[str, NDArray[np.float32]]] = {}
     for key, array in arrays.items():
-        if key.startswith("optimizer/"):
-            _, index, name = key.split("/")
-            moments.setdefault(int(index), {})[name] = torch.tensor(array)
-    state = optimizer.state_dict()
-    state["state"] = moments
-    optimizer.load_state_dict(state)
-    set_rate(optimizer, rate)
+        kind, _, name = key.partition("/")
+        which, _, part = name.partition("/")
+        if kind == "network":
+            with torch.no_grad():
+                parameters[name].copy_(torch.tensor(array))
+        elif kind == "optimizer":
+            moments.setdefault(int(which), {})[part] = torch.tensor(array)
+        else:
+            weights.setdefault(which, {})[part] = array
+    optimizer.load_state_dict(optimizer.state_dict() | {"state": moments})
+    set_rate(optimizer, progress["rate"])
+    order.bit_generator.state = progress["order"]
+    return progress["history"], weights
 
 
 def set_rate(optimizer: torch.optim.Optimizer, rate: float) -> None:

@@ -17,10 +17,9 @@ References
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -28,13 +27,18 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from spikeloom.compiler.archive import arrays_digest
+from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.models.networks.layers import time_first
-from spikeloom.models.networks.networks import SpikingNet, TrainedModule, Weights
+from spikeloom.models.networks.networks import Sizes, SpikingNet, TrainedModule, Weights
 from spikeloom.models.recordings.evtouch import Recordings
-from spikeloom.models.training.checks import Sizes, require_finite, require_options, require_suited
-from spikeloom.models.training.evaluate import evaluate, loss_of, one_thread
+from spikeloom.models.training.evaluate import evaluate, loss_of, one_thread, require_finite
 from spikeloom.models.training.recipes import ADAMW, COSINE, RELEASED, Recipe
-from spikeloom.models.training.resume import TrainingState, pack, read_state, set_rate, unpack, write_state
+from spikeloom.models.training.resume import restore, set_rate, write_state
+
+DEVICES = ("cpu", "cuda")
+
+MOST_SEED = 2**63 - 1
+"""What a torch generator takes."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -114,9 +118,9 @@ def train(
     DataError
         If recordings and architecture disagree, or the loss is no longer a number.
     """
-    require_options(epochs, recipe.decay_epochs, seed, device)
+    _require_options(epochs, recipe.decay_epochs, seed, device)
     for recordings in (training, test):
-        require_suited(recordings, architecture)
+        _require_suited(recordings, architecture)
     options = {
         "architecture": repr(architecture),
         "graph": arrays_digest({"adjacency": propagation}),
@@ -135,8 +139,8 @@ def train(
         network = architecture.network(propagation, seed=seed, surrogate=recipe.surrogate).to(device)
         optimizer = _optimizer_of(recipe, network, device)
         if resume and state is not None and state.exists():
-            found = read_state(state, options)
-            history, weights = _restore(found, network, optimizer, order)
+            epochs_before, weights = restore(state, options, network, optimizer, order)
+            history = [Epoch(**epoch) for epoch in epochs_before]
         bar = tqdm(total=epochs, initial=len(history), desc=label, unit="epoch", position=position, disable=None)
         with bar as progress:
             for index in range(len(history), epochs):
@@ -164,7 +168,7 @@ def train(
                     )
                 )
                 if state is not None:
-                    write_state(state, _state(options, network, optimizer, order, history, weights))
+                    write_state(state, options, network, optimizer, order, history, weights)
                 progress.set_postfix(loss=f"{training_loss:.4f}", test=f"{correct}/{len(test)}")
                 progress.update()
                 if after_epoch is not None:
@@ -196,38 +200,6 @@ def _course_of(recipe: Recipe, epoch: int, epochs: int) -> Callable[[float], flo
     if recipe.schedule != COSINE:
         return None
     return lambda share: recipe.learning_rate * 0.5 * (1 + math.cos(math.pi * (epoch + share) / epochs))
-
-
-def _restore(
-    found: TrainingState, network: TrainedModule, optimizer: torch.optim.Optimizer, order: np.random.Generator
-) -> tuple[list[Epoch], dict[str, Weights]]:
-    """Put a state back; return its history and the weights that it kept."""
-    unpack(found.arrays, network, optimizer, found.progress["rate"])
-    order.bit_generator.state = found.progress["order"]
-    weights: dict[str, Weights] = {}
-    for key, array in found.arrays.items():
-        which, _, name = key.partition("/")
-        if which in ("best", "kept"):
-            weights.setdefault(which, {})[name] = array
-    return [Epoch(**epoch) for epoch in found.progress["history"]], weights
-
-
-def _state(
-    options: Mapping[str, Any],
-    network: TrainedModule,
-    optimizer: torch.optim.Optimizer,
-    order: np.random.Generator,
-    history: list[Epoch],
-    weights: Mapping[str, Weights],
-) -> TrainingState:
-    arrays = pack(network, optimizer)
-    arrays |= {f"{which}/{name}": array for which, held in weights.items() for name, array in held.items()}
-    progress = {
-        "history": [asdict(epoch) for epoch in history],
-        "order": order.bit_generator.state,
-        "rate": float(optimizer.param_groups[0]["lr"]),
-    }
-    return TrainingState(options=options, progress=progress, arrays=arrays)
 
 
 def _train_epoch(
@@ -263,3 +235,33 @@ def _train_epoch(
         optimizer.step()
         total += found * len(chosen)
     return total / len(order)
+
+
+def _require_options(epochs: int, decay_epochs: int, seed: int, device: str) -> None:
+    """Refuse numbers that are too small, and a device that is unknown or not there."""
+    for name, value, least in (("epochs", epochs, 1), ("decay-epochs", decay_epochs, 1), ("seed", seed, 0)):
+        if value < least:
+            raise OptionError(f"--{name} {value}: allowed are {least} or more; choose another")
+    if seed > MOST_SEED:
+        raise OptionError(f"--seed {seed}: allowed are 0 to {MOST_SEED}; choose another")
+    if device not in DEVICES:
+        raise OptionError(f"--device {device}: unknown; allowed: {', '.join(DEVICES)}")
+    if device == "cuda" and not torch.cuda.is_available():
+        raise OptionError("--device cuda: this machine has no usable GPU; omit --device")
+
+
+def _require_suited(recordings: Recordings, architecture: Sizes) -> None:
+    """Refuse recordings of another sensor, or of more classes than a network has."""
+    where = f"{recordings.source}: split {recordings.split!r}"
+    found, wanted = recordings.events.shape[1:3], (architecture.taxels, architecture.channels)
+    if found != wanted:
+        raise DataError(
+            f"{where}: {found[0]} taxels and {found[1]} polarities, the network has {wanted[0]} and {wanted[1]}; "
+            "use the graph of this sensor"
+        )
+    highest = int(recordings.labels.max())
+    if highest >= architecture.classes:
+        raise DataError(
+            f"{where}: label {highest}, the network has {architecture.classes} classes "
+            f"(0..{architecture.classes - 1}); train it with more classes"
+        )

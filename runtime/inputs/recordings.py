@@ -40,8 +40,8 @@ def recordings(
         data = path.part(slice(limit))
         return joined_bins(data if labels_for is None else need_labels(data, labels_for), bins)
     if path != SYNTHETIC:
-        data, counts = load_data(path, split, bin_s=bin_s, limit=limit, classes=classes, taxels=taxels)
-        show_counts(data.source, counts)
+        data = load_data(path, split, bin_s=bin_s, limit=limit, classes=classes, taxels=taxels)
+        show_counts(data.source, data.counts)
         if labels_for is not None:
             need_labels(data, labels_for)
         return joined_bins(data, bins)

@@ -13,7 +13,7 @@ from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.files import write_atomically
 from spikeloom.compiler.types import FloatArray
 from spikeloom.models.graphs import NEUTOUCH
-from spikeloom.models.recordings.counts import EventCounts, Oddities, number, oddities, show_notes
+from spikeloom.models.recordings.counts import EventCounts, number, show_notes
 from spikeloom.models.recordings.events import data_splits, joined_bins, load_data, require_events
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.recordings.fetch import DATA_SETS, data_folder, fetch_data
@@ -46,7 +46,7 @@ class ConvertedSplit:
     """A split that was written, and what was odd about its events."""
 
     recordings: int
-    found: Oddities | None
+    found: EventCounts | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -136,9 +136,9 @@ def _describe(arguments: Arguments) -> Outcome:
             raise OptionError(f"--picture {arguments.picture}: allowed is a PNG; give a name that ends in .png")
         require_place(arguments.picture, "--picture", arguments)
     count, places = _layout(arguments.taxels)
-    recordings, counts = _load(arguments.source, arguments.split, arguments.bin, count)
-    show_notes(counts)
-    result = describe(recordings, arguments.bin, counts, arguments.picture)
+    recordings = _load(arguments.source, arguments.split, arguments.bin, count)
+    show_notes(recordings.counts)
+    result = describe(recordings, arguments.bin, arguments.picture)
     if places is None and recordings.taxels == len(NEUTOUCH):
         places = NEUTOUCH
     if arguments.picture is not None:
@@ -158,20 +158,18 @@ def _convert(arguments: Arguments) -> Outcome:
     count, places = _layout(arguments.taxels)
     present = tuple(SPLITS) if arguments.source == SYNTHETIC else data_splits(arguments.source)
     loaded = [_load(arguments.source, split, arguments.bin, count, places) for split in present or (arguments.split,)]
-    for _, counts in loaded:
-        show_notes(counts)
-    loaded = [(joined_bins(recordings, bins), counts) for recordings, counts in loaded]
-    taxels = max(recordings.taxels for recordings, _ in loaded)
-    steps = max(recordings.steps for recordings, _ in loaded)
+    for recordings in loaded:
+        show_notes(recordings.counts)
+    loaded = [joined_bins(recordings, bins) for recordings in loaded]
+    taxels = max(recordings.taxels for recordings in loaded)
+    steps = max(recordings.steps for recordings in loaded)
     if lines:
-        write_event_lines(arguments.output, [recordings for recordings, _ in loaded], bins * arguments.bin)
+        write_event_lines(arguments.output, loaded, bins * arguments.bin)
     else:
-        write_released(arguments.output, [_grown(recordings, taxels, steps) for recordings, _ in loaded])
+        write_released(arguments.output, [_grown(recordings, taxels, steps) for recordings in loaded])
     splits = {
-        recordings.split: ConvertedSplit(
-            recordings=len(recordings), found=None if counts is None else oddities(counts, padded_to=steps)
-        )
-        for recordings, counts in loaded
+        recordings.split: ConvertedSplit(recordings=len(recordings), found=_padded(recordings, steps))
+        for recordings in loaded
     }
     result = Converted(
         source=arguments.source,
@@ -194,6 +192,14 @@ def _convert_sections(result: Converted) -> Iterable[Section]:
     yield Section("Converted", [Text("\n".join(lines))])
 
 
+def _padded(recordings: Recordings, steps: int) -> EventCounts | None:
+    """What was odd, and how many recordings are filled up to so many steps."""
+    if recordings.counts is None:
+        return None
+    padded = int(np.count_nonzero(recordings.step_counts < steps))
+    return replace(recordings.counts, shorter=None, padded=padded)
+
+
 def _grown(recordings: Recordings, taxels: int, steps: int) -> Recordings:
     """Silence for the taxels and the time that only another split has."""
     events = np.zeros((len(recordings), taxels, 2, steps), dtype=np.uint8)
@@ -201,12 +207,10 @@ def _grown(recordings: Recordings, taxels: int, steps: int) -> Recordings:
     return replace(recordings, events=events, lengths=None)
 
 
-def _load(
-    source: str, split: str, bin_s: float, taxels: int | None, places: FloatArray | None = None
-) -> tuple[Recordings, EventCounts | None]:
+def _load(source: str, split: str, bin_s: float, taxels: int | None, places: FloatArray | None = None) -> Recordings:
     if source == SYNTHETIC:
         require_events(SYNTHETIC, bin_s)
-        return (synthetic_split(split) if places is None else synthetic_split(split, coordinates=places)), None
+        return synthetic_split(split) if places is None else synthetic_split(split, coordinates=places)
     return load_data(source, split, bin_s=bin_s, taxels=taxels)
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from spikeloom.compiler.types import FloatArray
-from spikeloom.models.recordings.counts import EventCounts, Oddities, number, oddities
+from spikeloom.models.recordings.counts import EventCounts, number
 from spikeloom.models.recordings.evtouch import UNLABELLED, Recordings
 from spikeloom.runtime.report.encode import HIDDEN
 from spikeloom.runtime.report.sections import Section, Table, Text
@@ -59,7 +59,7 @@ class Described:
     steps: int
     duration_s: Duration
     events: int  # Those that share taxel, polarity and bin count once
-    found: Oddities | None
+    found: EventCounts | None
     labels: Mapping[int, int]
     unlabelled: int
     rate: SensorRate
@@ -72,9 +72,7 @@ class Described:
     course: FloatArray = field(metadata=HIDDEN)
 
 
-def describe(
-    recordings: Recordings, bin_s: float, counts: EventCounts | None = None, picture: str | None = None
-) -> Described:
+def describe(recordings: Recordings, bin_s: float, picture: str | None = None) -> Described:
     """Count the events of one split, whose bins are so many seconds wide."""
     lengths = np.array([recordings.steps_of(index) for index in range(len(recordings))])
     per_taxel = recordings.events.sum(axis=(0, 3), dtype=np.int64)
@@ -96,7 +94,7 @@ def describe(
         steps=recordings.steps,
         duration_s=Duration(shortest=shortest, median=median, longest=longest),
         events=int(total.sum()),
-        found=None if counts is None else oddities(counts),
+        found=recordings.counts,
         unlabelled=labels.pop(UNLABELLED, 0),
         labels=labels,
         rate=SensorRate(

@@ -4,21 +4,17 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-
-import numpy as np
 
 from spikeloom.compiler import DEFAULT_TARGET, round_to_forms
 from spikeloom.compiler.archive import is_netlist
-from spikeloom.compiler.checkpoint import Checkpoint
+from spikeloom.compiler.checkpoint import layers_of
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.files import remove_leftovers, sha256_of
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.passes.expand import expand
-from spikeloom.compiler.systems import GRAPH_SYSTEMS
 from spikeloom.compiler.targets.base import COMPARTMENTS, load_target
-from spikeloom.models.graphs import Graph
 from spikeloom.models.recordings.events import joined_bins
 from spikeloom.models.recordings.grasps import SYNTHETIC
 from spikeloom.runtime.commands.options import DATA_HELP, add_bin_option, add_checkpoint
@@ -97,16 +93,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", required=True, metavar="OUT.pt")
 
 
-def stored_graph(checkpoint: Checkpoint, asked: Graph | None, name: str) -> Graph:
-    """Graph to store: the one in the checkpoint, or the one that was asked for; `propagation` has compared them."""
-    if checkpoint.edges is None and checkpoint.system in GRAPH_SYSTEMS:
-        assert asked is not None, "propagation needs a graph"
-        return asked
-    edges = np.zeros((0, 2), np.int64) if checkpoint.edges is None else checkpoint.edges
-    coordinates = [[float(taxel), 0.0] for taxel in range(checkpoint.taxels)]  # only edges are stored
-    return Graph(name=name, coordinates=coordinates, edges=edges)  # type: ignore[arg-type]
-
-
 def _state(output: Path, *, resume: bool) -> Path:
     """File of the epochs so far, of which neither an old one may be lost nor a missing one begun anew in silence."""
     state = output.with_name(f"{output.name}.state")
@@ -162,7 +148,7 @@ def _finetuned(arguments: argparse.Namespace, output: Path) -> Finetuned:
         for split in ("train", "test")
     ]
     training, test = (joined_bins(each, checkpoint.bins) for each in found)
-    from spikeloom.models.networks.checkpoint import save_checkpoint
+    from spikeloom.models.networks.checkpoint import save_again
     from spikeloom.models.training.finetune import finetune as tune
     from spikeloom.models.training.protocols import data_digest
     from spikeloom.models.training.record import CHOSEN_ON
@@ -198,18 +184,9 @@ def _finetuned(arguments: argparse.Namespace, output: Path) -> Finetuned:
         last=Tuned(correct=tuned.after, accuracy=tuned.after / len(test), chosen_on=CHOSEN_ON[checkpoint.weights]),
         history=[[epoch.loss, epoch.correct] for epoch in tuned.history],
     )
-    save_checkpoint(
-        output,
-        {"last": tuned.weights},
-        stored_graph(checkpoint, asked, name),
-        beta=checkpoint.beta,
-        theta=checkpoint.theta,
-        training=asdict(record),
-        forms=tuned.forms,
-        system=checkpoint.system,
-        grid=checkpoint.grid,
-        bins=checkpoint.bins,
-    )
+    edges = asked.edges if checkpoint.edges is None and asked is not None else checkpoint.edges
+    changed = replace(checkpoint, graph=name, edges=edges, forms=tuned.forms, **layers_of(tuned.weights))
+    save_again(output, changed, training=asdict(record))
     round_to_forms(expand(read_checkpoint(output), adjacency), tuned.forms)  # it compiles, or says why not
     state.unlink(missing_ok=True)
     sha256 = sha256_of(output)

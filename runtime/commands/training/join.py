@@ -14,11 +14,9 @@ from spikeloom.compiler.checkpoint import WEIGHTS, Checkpoint
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.files import remove_leftovers, sha256_of
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
-from spikeloom.compiler.formats.towers import arrays_of
 from spikeloom.compiler.formats.towers import join as join_networks
-from spikeloom.models.networks.checkpoint import save_checkpoint
+from spikeloom.models.networks.checkpoint import save_again
 from spikeloom.runtime.commands.main_job.inspect import tower_line
-from spikeloom.runtime.commands.training.finetune import stored_graph
 from spikeloom.runtime.inputs.files import require_place, shipped
 from spikeloom.runtime.report.sections import Outcome, Section, Text
 
@@ -71,20 +69,7 @@ def run(arguments: Namespace) -> Outcome:
     record: dict[str, Any] = {"command": f"spikeloom join {' '.join(words)}", "towers": towers}
     output = Path(arguments.output)
     remove_leftovers(output)
-    save_checkpoint(
-        output,
-        {"last": arrays_of(joined)},
-        stored_graph(joined, None, str(joined.graph)),
-        beta=joined.beta,
-        theta=joined.theta,
-        training=record,
-        forms=joined.forms,
-        system=joined.system,
-        grid=joined.grid,
-        dynamics=joined.dynamics,
-        towers=joined.towers,
-        bins=joined.bins,
-    )
+    save_again(output, joined, training=record)
     result = Joined(
         command=record["command"],
         towers=towers,
