@@ -27,7 +27,6 @@ from scipy import sparse
 from spikeloom.compiler import Options, compile_network
 from spikeloom.compiler.files import write_atomically
 from spikeloom.compiler.ir import INPUT, Input, Network, Population, Projection, Readout
-from spikeloom.compiler.passes.expand import expand_graph_convolution
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.layout.chips import chip_count
 from spikeloom.runtime.machines.loihi1 import engine
@@ -53,10 +52,20 @@ def lattice(taxels: int) -> sparse.csr_array:
     return sparse.csr_array(scale @ joined @ scale)
 
 
+def convolution(adjacency: sparse.csr_array, hops: np.ndarray) -> sparse.csr_array:
+    """The synapses of a graph convolution, ``sum_k A^k ⊗ W_k^T``, of which nothing dense is made."""
+    power, total = sparse.eye_array(adjacency.shape[0], format="csr"), 0
+    for hop in hops:
+        total = total + sparse.kron(power, hop, format="csr")
+        power = adjacency @ power
+    total.sort_indices()
+    return sparse.csr_array(total)
+
+
 def skin(taxels: int, seed: int = 0) -> Network:
     """The network of a skin, in float64."""
     rng = np.random.default_rng(seed)
-    conv = expand_graph_convolution(lattice(taxels), rng.normal(0, 0.7, (HOPS, FEATURES, 2)))
+    conv = convolution(lattice(taxels), rng.normal(0, 0.7, (HOPS, FEATURES, 2)))
     sizes = [min(SIDE * SIDE, taxels - first) * FEATURES for first in range(0, taxels, SIDE * SIDE)]
     hidden = sparse.block_diag([rng.normal(0, 3 / size**0.5, (HIDDEN, size)) for size in sizes], format="csr")
     votes = sparse.block_diag([rng.normal(0, 0.3, (CLASSES, HIDDEN)) for _ in sizes], format="csr")

@@ -17,7 +17,7 @@ from scipy import sparse
 
 from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX, decay_registers, encode_bias
 from spikeloom.compiler.ir import INPUT, Input, IntegerNetwork, IntegerPopulation, IntegerProjection, Readout
-from spikeloom.compiler.passes.expand import expand_graph_convolution
+from spikeloom.compiler.passes.expand import hop_powers, synapses
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.targets.loihi1.emit import emit
 from spikeloom.compiler.targets.loihi1.layout.partition import partition
@@ -161,7 +161,7 @@ def random_weights(seed: int = 0) -> list[IntArray]:
     graph = build_graph("manual")
     bound = np.sqrt(6 / (2 + FEATURES))
     filters = rng.uniform(-bound, bound, (HOPS + 1, FEATURES, 2))
-    convolution = expand_graph_convolution(normalised_adjacency(graph.edges, graph.n_taxels), filters)
+    convolution = synapses(hop_powers(normalised_adjacency(graph.edges, graph.n_taxels), HOPS + 1), filters)
     weights = [convolution.toarray()]
     for size in (*HIDDEN, CLASSES):
         before = len(weights[-1])

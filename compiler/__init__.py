@@ -15,9 +15,7 @@ if TYPE_CHECKING:
     from spikeloom.compiler.targets.loihi1.netlist_file import read_netlist, write_netlist
     from spikeloom.compiler.targets.loihi1.options import (
         GOALS,
-        MARGIN,
         MAX_PLANES,
-        RANGES,
         Options,
         Packing,
         check_packings,
@@ -37,9 +35,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "GOALS",
-    "MARGIN",
     "MAX_PLANES",
-    "RANGES",
     "Compilation",
     "Netlist",
     "Options",
@@ -72,7 +68,7 @@ _NAMES = {
     "lift": "lift",
     "netlist": "Netlist",
     "netlist_file": "read_netlist write_netlist",
-    "options": "GOALS MARGIN MAX_PLANES RANGES Options Packing check_packings",
+    "options": "GOALS MAX_PLANES Options Packing check_packings",
     "passes": "lay_out_again to_integers without",
     "storage.choose_storage": "round_to_forms",
     "storage.scales": "layer_of rounded",

@@ -51,18 +51,10 @@ def cutting(sizes, **limits):
 
 
 OPTIONS = [
-    ("--ranges observed|--calibrate|proven", compiling(ranges="observed")),
-    ("--ranges observed|--calibrate|proven", rounding(ranges="observed")),
-    ("--ranges guessed|proven, observed", rounding(ranges="guessed")),
-    *(
-        (f"--margin {margin:g}|from 0", compiling(ranges="observed", margin=margin))
-        for margin in (-0.1, np.inf, np.nan)
-    ),
     ("--target loihi2: not modelled|loihi1, truenorth", compiling("loihi2")),
     ("--prune-unused|--calibrate|--keep-all", compiling(prune_unused=True)),
     ("--prune-unused|--keep-all", compiling(prune_unused=True, training_events=EVENTS, keep_all=True)),
     ("--spike-exact|--calibrate", compiling(spike_exact=True)),
-    ("--spike-exact|--ranges", compiling(spike_exact=True, training_events=EVENTS, ranges="observed")),
     ("--spike-exact|--planes", compiling(spike_exact=True, training_events=EVENTS, packings=(Packing(planes=2),))),
     (f"--weight-bits 7|{WIDTHS}", compiling(spike_exact=True, training_events=EVENTS, packings=(Packing(bits=7),))),
     *((f"--weight-bits {bits}|{WIDTHS}", rounding(packings=(Packing(bits=bits),))) for bits in (-1, 0, 1, 7, 9)),
@@ -71,13 +63,11 @@ OPTIONS = [
     ("--weight-bits: 2 layers|the network has 1", rounding(packings=(Packing(), Packing()))),
     (f"--widths 7|{WIDTHS}", lambda: check_widths([7], 1, 4, LOIHI)),
     ("--scale-groups 9|1 to 8", lambda: check_widths([4], 9, 4, LOIHI)),
-    ("--optimize speed|cores, energy, latency", goal("speed")),
-    ("--optimize energy|--calibrate", goal("energy", calibrated=False)),
+    ("--optimize speed|cores, latency", goal("speed")),
     ("--optimize latency|--calibrate", goal("latency", calibrated=False)),
     ("--optimize latency|--cores-for", goal("latency", {"fc1": 2})),
     ("--optimize latency|no time", lambda: lay_out(full(2, 2), dataclasses.replace(LOIHI, time=()), goal="latency")),
     ("--optimize latency|links between chips|--chips", goal("latency", chips=2)),
-    ("--optimize energy|links between chips|--chips", goal("energy", chips=2)),
     ("--chips 0|1 or more", goal("cores", chips=0)),
     ("--cores-for fc9=2|fc1, fc2", laying_out((3, 200, 4), fc9=2)),
     ("--cores-for fc1=129|128 cores|128 or fewer", laying_out((3, 200, 4), fc1=129)),

@@ -12,7 +12,7 @@ from made_files import events as made_events
 from made_files import small_checkpoint
 from numpy.testing import assert_allclose, assert_array_equal
 
-from spikeloom.compiler.passes.expand import expand_graph_convolution
+from spikeloom.compiler.passes.expand import hop_powers, synapses
 from spikeloom.models.graphs import build_graph, normalised_adjacency
 from spikeloom.models.networks.layers import lif, spike_linear, tag_convolution
 from spikeloom.models.networks.networks import Architecture, SpikingNet
@@ -89,7 +89,7 @@ def test_convolution_equals_scattered_edges_and_the_expanded_matrix(graph):
     assert found.shape == (6, 3, 39 * 5)
     one = convolution_step_by_step(x[2, 1], edges, hops, bias)
     assert_allclose(found[2, 1], one.reshape(-1), rtol=1e-12, atol=1e-12)
-    matrix = expand_graph_convolution(adjacency, hops.numpy()).toarray()
+    matrix = synapses(hop_powers(adjacency, len(hops)), hops.numpy()).toarray()
     assert_allclose(found, x.reshape(6, 3, 78).numpy() @ matrix.T + np.tile(bias.numpy(), 39), rtol=1e-10, atol=1e-12)
 
 

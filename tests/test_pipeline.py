@@ -20,13 +20,12 @@ from random_networks import (
     recordings_for,
     ring,
 )
-from scipy import sparse
 
 from spikeloom.compiler import Options, compile_network, invariants, targets
 from spikeloom.compiler.errors import VerifyError
 from spikeloom.compiler.interpret import channels_last, run_float, run_integer
 from spikeloom.compiler.ir import INPUT, depths, fan_in
-from spikeloom.compiler.passes.expand import Factored, expand, expand_graph_convolution
+from spikeloom.compiler.passes.expand import Factored, expand, hop_powers, synapses
 from spikeloom.compiler.passes.prune import compact, disconnect, either, never_fires, removable, removals
 from spikeloom.compiler.pipeline import run
 from spikeloom.compiler.range_proof import prove_ranges
@@ -178,6 +177,10 @@ CONV_SYNAPSES = {
 """Structural synapses and largest fan-in."""
 
 
+def convolution(adjacency, hops):
+    return synapses(hop_powers(adjacency, len(hops)), hops)
+
+
 def adjacency_of(name):
     graph = build_graph(name)
     return normalised_adjacency(graph.edges, graph.n_taxels)
@@ -212,7 +215,7 @@ def graphs(draw):
 @given(graphs(), st.integers(1, 5), st.integers(1, 3), st.integers(1, 3), st.integers(0, 2**32 - 1))
 def test_the_expanded_convolution_is_the_probed_one(adjacency, n_hops, features, channels, seed):
     hops = np.random.default_rng(seed).normal(size=(n_hops, features, channels))
-    expanded = expand_graph_convolution(adjacency, hops)
+    expanded = convolution(adjacency, hops)
     weight, bias = probed(factored(adjacency, hops), len(adjacency) * channels)
     np.testing.assert_allclose(expanded.toarray(), weight, rtol=0, atol=1e-12)
     assert not bias.any()
@@ -222,20 +225,20 @@ def test_two_taxels_by_hand():
     adjacency = np.array([[0.0, 1.0], [1.0, 0.0]])
     hops = np.array([[[1.0, 2.0]], [[10.0, 20.0]], [[100.0, 200.0]]])
     # even hops come back to the taxel, odd ones end on the other
-    assert expand_graph_convolution(adjacency, hops).toarray().tolist() == [[101, 202, 10, 20], [10, 20, 101, 202]]
+    assert convolution(adjacency, hops).toarray().tolist() == [[101, 202, 10, 20], [10, 20, 101, 202]]
 
 
 @pytest.mark.parametrize("name", CONV_SYNAPSES)
 def test_structural_synapses_of_each_graph(name):
     for prefix in ("", "released:"):
-        weight = expand_graph_convolution(adjacency_of(prefix + name), np.ones((4, 64, 2)))
+        weight = convolution(adjacency_of(prefix + name), np.ones((4, 64, 2)))
         assert (weight.nnz, np.diff(weight.indptr).max()) == CONV_SYNAPSES[name]
 
 
 def test_structure_does_not_depend_on_the_weights():
-    zero = expand_graph_convolution(adjacency_of("manual"), np.zeros((4, 64, 2)))
+    zero = convolution(adjacency_of("manual"), np.zeros((4, 64, 2)))
     assert zero.nnz == 97_920
-    cancelled = expand_graph_convolution(np.array([[0.0, 1.0], [1.0, 0.0]]), np.array([[[1.0]], [[0.0]], [[-1.0]]]))
+    cancelled = convolution(np.array([[0.0, 1.0], [1.0, 0.0]]), np.array([[[1.0]], [[0.0]], [[-1.0]]]))
     assert cancelled.nnz == 4
     assert not zero.data.any()
     assert not cancelled.toarray().any()
@@ -243,19 +246,6 @@ def test_structure_does_not_depend_on_the_weights():
     zeroed = dataclasses.replace(checkpoint.dense[0], weight=np.zeros_like(checkpoint.dense[0].weight))
     network = expand(dataclasses.replace(checkpoint, dense=(zeroed, *checkpoint.dense[1:])), ring(5))
     assert fan_in(network, 1).tolist() == [15] * 6
-
-
-@pytest.mark.parametrize("seed", range(2))
-def test_a_sparse_graph_expands_as_a_dense_one_does(seed):
-    rng = np.random.default_rng(seed)
-    adjacency = np.where(rng.random((9, 9)) < 0.2, rng.normal(size=(9, 9)), 0.0)
-    hops = rng.normal(size=(4, 3, 2))
-    dense = expand_graph_convolution(adjacency, hops)
-    thin = expand_graph_convolution(sparse.csr_array(adjacency), hops)
-    assert thin.has_canonical_format
-    np.testing.assert_array_equal(thin.indptr, dense.indptr)
-    np.testing.assert_array_equal(thin.indices, dense.indices)
-    np.testing.assert_allclose(thin.data, dense.data, rtol=1e-12, atol=1e-14)
 
 
 # --- whole checkpoints

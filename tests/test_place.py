@@ -6,7 +6,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_networks import LOIHI, integer_networks, seated, small_target
 
-from spikeloom.compiler.targets.loihi1.layout import place as place_module
 from spikeloom.compiler.targets.loihi1.layout.partition import partition
 from spikeloom.compiler.targets.loihi1.layout.place import core_traffic, place, place_within
 
@@ -23,12 +22,6 @@ def brute_force(traffic, width, height, tile_cores):
     layouts = np.array(list(itertools.product(range(width * height), repeat=len(traffic))))
     held = (layouts[:, :, None] == np.arange(width * height)).sum(axis=1)
     return cost(traffic, layouts[held.max(axis=1) <= tile_cores], width).min()
-
-
-@pytest.fixture
-def quick(monkeypatch):
-    """Few steps of the search for a proof."""
-    monkeypatch.setattr(place_module, "EXACT_STEPS", 200)
 
 
 def layered(rng, cores):
@@ -60,7 +53,6 @@ def test_the_optimum_of_small_cases(cores, mesh, seed, kind):
     target = small_target(mesh_width=width, mesh_height=height, mesh_tile_cores=tile_cores)
     placement = place(traffic, target)
     assert placement.spike_hops == pytest.approx(brute_force(traffic, width, height, tile_cores), rel=1e-9, abs=1e-12)
-    assert placement.bound == placement.spike_hops
     assert placement.spike_hops == pytest.approx(cost(traffic, placement.tiles, width), abs=1e-12)
     assert max(placement.tiles.count(tile) for tile in placement.tiles) <= tile_cores
     assert set(placement.tiles) <= set(range(width * height))
@@ -81,49 +73,19 @@ def test_a_slightly_better_layout_is_not_given_up_for_cheaper_hops():
     assert placement.spike_hops == pytest.approx(3 + 3e-6 + 1.0, rel=1e-12)
 
 
-@pytest.mark.parametrize("cores", [1, 2, 4, 9])
-@pytest.mark.parametrize("kind", ["random", "layered", "equal"])
-def test_up_to_nine_cores_are_solved_with_a_proof(cores, kind):
-    placement = place(KINDS[kind](np.random.default_rng(cores), cores), LOIHI)
-    assert placement.bound == placement.spike_hops
-
-
-@pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize(("kind", "cores"), [("random", 12), ("star", 12), ("layered", 64)])
-def test_many_cores_are_placed_well_and_bounded(cores, kind):
+def test_many_cores_are_placed_well(cores, kind):
     rng = np.random.default_rng(1)
     traffic = KINDS[kind](rng, cores)
     placement = place(traffic, LOIHI)
     assert cores > 12 or place(traffic.copy(), LOIHI) == placement
     assert max(placement.tiles.count(tile) for tile in placement.tiles) <= 4
-    assert 0 < placement.bound <= placement.spike_hops
     assert placement.spike_hops == pytest.approx(cost(traffic, placement.tiles, 8))
     shuffled = [cost(traffic, rng.permutation(128)[:cores] // 4, 8) for _ in range(50)]
     assert placement.spike_hops <= min(shuffled)
     assert placement.spike_hops <= cost(traffic, np.arange(cores) // 4, 8) * (1 + 1e-9)
 
 
-def test_a_search_that_is_cut_short_says_so(monkeypatch):
-    traffic = np.random.default_rng(3).random((8, 8))
-    full = place(traffic, LOIHI)
-    monkeypatch.setattr(place_module, "EXACT_STEPS", 20)
-    cut = place(traffic, LOIHI)
-    assert full.bound == full.spike_hops
-    assert cut.bound < full.spike_hops <= cut.spike_hops * (1 + 1e-12)
-
-
-@settings(deadline=None, max_examples=10)
-@given(st.integers(1, 7), st.integers(0, 2**32 - 1), st.integers(1, 60))
-def test_the_bound_never_exceeds_the_optimum(cores, seed, steps):
-    traffic = np.random.default_rng(seed).random((cores, cores)) ** 3
-    optimum = place(traffic, LOIHI).spike_hops
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(place_module, "EXACT_STEPS", steps)
-        cut = place(traffic, LOIHI)
-    assert cut.bound <= optimum * (1 + 1e-9) <= cut.spike_hops * (1 + 2e-9)
-
-
-@pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize(("tiles", "cores"), [(1, 4), (2, 5), (3, 9), (3, 12), (12, 28)])
 def test_a_placement_within_few_tiles(tiles, cores):
     """A ring of cores that would rather spread: each talks to the next but one."""
@@ -134,19 +96,12 @@ def test_a_placement_within_few_tiles(tiles, cores):
     assert placement.spike_hops == pytest.approx(cost(traffic, placement.tiles, 8))
 
 
-def test_a_placement_keeps_to_few_tiles_even_where_more_cost_fewer_hops():
-    """Three pairs on tiles for four cores: three tiles cost no hop, two tiles tear one pair apart."""
-    traffic = np.zeros((6, 6))
-    traffic[[0, 1, 2, 3, 4, 5], [1, 2, 0, 4, 5, 3]] = 1.0
-    target = small_target(mesh_tile_cores=3)
-    assert place_within(traffic, target, 2).spike_hops == 0
-    assert len(set(place(np.kron(np.eye(3), np.ones((2, 2))), target).tiles)) == 3
-    squeezed = place_within(np.kron(np.eye(3), np.ones((2, 2))), target, 2)
-    assert len(set(squeezed.tiles)) == 2
-    assert squeezed.spike_hops == 2
-
-
-# --- traffic
+def test_a_placement_keeps_to_few_tiles():
+    """Three pairs on tiles for four cores, or for three, where two tiles tear one pair apart."""
+    traffic = np.kron(np.eye(3), np.ones((2, 2)))
+    assert place_within(traffic, LOIHI, 2).spike_hops == 0
+    squeezed = place_within(traffic, small_target(mesh_tile_cores=3), 2)
+    assert (len(set(squeezed.tiles)), squeezed.spike_hops) == (2, 2)
 
 
 @settings(deadline=None, max_examples=20)

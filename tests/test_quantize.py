@@ -240,22 +240,6 @@ def test_calibration_prefers_scales_that_keep_spikes_then_those_that_keep_class_
     assert distance == min(distance for flips, distance in best if flips <= 1.25 * fewest)
 
 
-def test_observed_ranges_allow_a_finer_scale():
-    """2000 equal inputs of which a recording hits few at once."""
-    network = chain(np.full((3, 2000), 0.5))
-    events = recordings(network, 0, rate=0.01)
-    calibration = calibrate(network, events)
-    _, (proven,) = choose_storage(network, LOIHI, calibration=calibration)
-    integer, (observed,) = choose_storage(network, LOIHI, calibration=calibration, ranges="observed", margin=0.5)
-    assert observed.scale > proven.scale
-    assert np.abs(integer.projections[0].weight.data).max() == 254
-    most = int(events.sum(axis=2).max())
-    assert observed.headroom == pytest.approx(1 - 0.5 * most * 1.5 * observed.scale / ONE_STEP_SUM_MAX)
-    assert observed.headroom >= 0
-    # The proof does not hold for it, and says so.
-    assert [proof.holds for proof in prove_ranges(integer)] == [False]
-
-
 @pytest.mark.parametrize(
     ("samples", "picked"), [(1, [0]), (4, [0, 1, 2, 3]), (5, [0, 1, 3, 4]), (100, [0, 33, 66, 99])]
 )

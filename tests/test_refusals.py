@@ -4,6 +4,7 @@ One table: what is typed, and the words that the line must hold: the option or f
 """
 
 import contextlib
+import dataclasses
 import errno
 import io
 import json
@@ -19,6 +20,7 @@ import torch
 from made_files import CLASSES, TAXELS, events, own_file, recordings_folder, released, state_dict
 from made_files import weights as made_weights
 
+from spikeloom.compiler import read_netlist, write_netlist
 from spikeloom.compiler.archive import digest, read_members
 from spikeloom.compiler.errors import FormatError
 from spikeloom.compiler.targets.loihi1 import netlist_file
@@ -171,7 +173,6 @@ TABLE = [
     (COMPILE.format("net.pt more"), "unrecognized arguments: more"),
     ("inspect net.loom --beta 0.3", "--beta 0.3: is for checkpoints|net.loom is a netlist"),
     ("inspect net.loom --weights best", "--weights best|net.loom is a netlist"),
-    (COMPILE.format("net.pt --margin 0.2"), "--margin 0.2|--ranges observed"),
     (COMPILE.format("net.pt --dump-after nope"), "--dump-after nope|expand, calibrate"),
     (VERIFY.format("--require E0 --min-agreement 0.9"), "--min-agreement 0.9|E3=0.9"),
     (RUN.format("data --bin 0.05"), "--bin 0.05: data holds bins"),
@@ -215,9 +216,6 @@ TABLE = [
     (COMPILE.format("net.pt --target ../loihi1"), "--target ../loihi1: unknown|loihi1, truenorth"),
     *((COMPILE.format(f"net.pt --weight-bits {n}"), f"--weight-bits {n}|2, 3, 4, 5, 6, 8") for n in (7, 1, 9, 0, -8)),
     (COMPILE.format("net.pt --weight-bits 8.0"), "--weight-bits 8.0: not a number|8,4,4,8"),
-    (COMPILE.format("net.pt --ranges observed"), "--ranges observed: nothing was observed; give --calibrate"),
-    (COMPILE.format("net.pt --ranges nope"), "--ranges nope: unknown|proven, observed"),
-    *((COMPILE.format(f"net.pt --ranges observed --margin {x}"), f"--margin {x}|from 0") for x in ("-0.1", "nan")),
     (COMPILE.format("net.pt --calibrate nowhere"), "nowhere: no such folder or file|train/ and test/"),
     ("compile net.pt --chips 0 -o out.loom", "--chips 0: not a number of chips; give 1 or more"),
     # layouts
@@ -234,8 +232,8 @@ TABLE = [
             ("conv1=200", "Intel Loihi 1 has 128 cores (loihi1.chip.cores); give 128 or fewer"),
         )
     ),
-    (COMPILE.format("net.pt --optimize speed"), "--optimize speed: no such goal; give one of cores, energy, latency"),
-    (COMPILE.format("net.pt --optimize energy"), "--optimize energy: needs firing rates; give --calibrate"),
+    (COMPILE.format("net.pt --optimize speed"), "--optimize speed: no such goal; give one of cores, latency"),
+    (COMPILE.format("net.pt --optimize latency"), "--optimize latency: needs firing rates; give --calibrate"),
     (COMPILE.format("net.pt --optimize latency --calibrate data --cores-for fc1=2"), "latency|omit --cores-for"),
     # prices
     ("estimate net.loom --data data --detail spikes", "argument --detail: invalid choice|counts|cycle"),
@@ -394,8 +392,10 @@ def test_recordings_of_another_number_of_channels(refusal, tmp_path):
 
 def test_overflow_on_the_chip_names_neuron_step_and_recording(refusal, tmp_path):
     recordings_folder(tmp_path / "quiet", train=events(rate=0.01), test=events(3, rate=1.0))
-    words = ["--calibrate", tmp_path / "quiet", "--ranges", "observed", "--margin", "0", "-o", tmp_path / "net.loom"]
-    assert cli.main(["compile", "net.pt", *map(str, words)]) == 0
+    netlist = read_netlist("net.loom")
+    write_netlist(
+        dataclasses.replace(netlist, format_exponent=np.full_like(netlist.format_exponent, 7)), tmp_path / "net.loom"
+    )
     line = refusal("run", tmp_path / "net.loom", "--data", tmp_path / "quiet")
     for part in ("conv1 neuron ", "on core 0, chip step 0", "2097151 allowed", "recording 0 of 6"):
         assert part in line

@@ -151,7 +151,6 @@ def test_ranges_are_proven_for_any_input(compiled):
     [
         {"packings": (Packing(bits=2),)},
         {"packings": (Packing(planes=2, groups=8),)},
-        {"ranges": "observed"},
         {"packings": (Packing(bits=2),), "training_events": None},
     ],
 )

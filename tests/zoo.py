@@ -174,7 +174,7 @@ def in_time(folder: Path) -> Made:
 MAKERS: dict[str, Callable[[Path], Made]] = {
     "tactilesgnet": of_system("tactilesgnet", PLAIN, "--planes 2 --scale-groups 4"),
     "mlp": of_system("mlp", PLAIN, "--weight-bits 4"),
-    "gcn": of_system("gcn", PLAIN, "--weight-bits 8,6,3,2 --ranges observed"),
+    "gcn": of_system("gcn", PLAIN, "--weight-bits 8,6,3,2"),
     "grid-cnn": of_system("grid-cnn", PLAIN, "--cores-for conv1=3,fc1=2"),
     "timed": of_system("tactilesgnet", TIMING),
     "binned": binned,

@@ -65,40 +65,12 @@ def effective_weight(stack: FloatArray, filters: FloatArray) -> FloatArray:
     return np.asarray(weight).reshape(places, features, taxels, channels)
 
 
-def expand_graph_convolution(adjacency: FloatArray | Sparse, hops: FloatArray) -> Sparse:
-    """``W = sum_k A^k ⊗ g_k`` of filters ``g_k = W_k^T``, (K + 1, features, channels), and a propagation matrix A.
+def synapses(stack: FloatArray, filters: FloatArray, system: str = TACTILESGNET) -> Sparse:
+    """Weights of a first layer, of a stack (filters, places, taxels) and filters (filters, features, channels).
 
-    Row i of A, (taxels, taxels), gathers into taxel i. From a sparse one nothing dense is made; sums are then taken in
-    another order, so that weights may differ in their last bits. Rows of the csr_array are taxel-major (``taxel *
-    features + feature``), columns likewise. Its stored entries are all pairs of taxels that some hop connects, whatever
-    their weight.
+    The stored entries are all pairs of a place and a taxel that some matrix of the stack connects, whatever their
+    weight; rows are in the order of the system's neurons, columns taxel-major.
     """
-    if sparse.issparse(adjacency):
-        return _expand_sparse(adjacency, hops)
-    return _synapses(hop_powers(adjacency, len(hops)), hops, TACTILESGNET)
-
-
-def _expand_sparse(adjacency: Sparse, hops: FloatArray) -> Sparse:
-    """The same of a sparse matrix: the pairs of taxels that some hop connects, then a block of weights for each."""
-    taxels = adjacency.shape[0]
-    n_hops, features, channels = hops.shape
-    power, powers = sparse.eye_array(taxels, format="csr"), []
-    for _ in range(n_hops):
-        powers.append(sparse.coo_array(power))
-        power = sparse.csr_array(adjacency @ power)
-    pair = np.concatenate([p.coords[0].astype(np.int64) * taxels + p.coords[1] for p in powers])
-    pairs, index = np.unique(pair, return_inverse=True)
-    weight = np.zeros((len(pairs), features, channels))
-    for p, own, hop in zip(powers, np.split(index, np.cumsum([p.nnz for p in powers])[:-1]), hops, strict=True):
-        weight[own] += p.data[:, None, None] * hop
-    row, column = np.divmod(pairs, taxels)
-    first = np.searchsorted(row, np.arange(taxels + 1)).astype(np.int32)
-    blocks = sparse.bsr_array((weight, column.astype(np.int32), first), shape=(taxels * features, taxels * channels))
-    return sparse.csr_array(blocks)
-
-
-def _synapses(stack: FloatArray, filters: FloatArray, system: str) -> Sparse:
-    """Weights of a first layer, stored for all pairs of a place and a taxel that some filter connects."""
     weight = effective_weight(stack, filters)
     connected: npt.NDArray[np.bool_] = (stack != 0).any(axis=0)
     connected = np.broadcast_to(connected[:, None, :, None], weight.shape)
@@ -112,7 +84,7 @@ def _synapses(stack: FloatArray, filters: FloatArray, system: str) -> Sparse:
 
 def expand_first_layer(checkpoint: Checkpoint, propagation: FloatArray) -> tuple[Sparse, FloatArray]:
     """Weights (neurons, taxels * channels) and biases (neurons,) of a first layer, in the order of its neurons."""
-    weight = _synapses(stack_of(checkpoint, propagation), checkpoint.hops.astype(np.float64), checkpoint.system)
+    weight = synapses(stack_of(checkpoint, propagation), checkpoint.hops.astype(np.float64), checkpoint.system)
     bias = np.tile(checkpoint.conv_bias.astype(np.float64), (checkpoint.places, 1))
     return weight, in_order(checkpoint.system, bias)
 

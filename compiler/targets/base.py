@@ -1,4 +1,4 @@
-"""Chips: what a chip is, and the registry that finds each by its folder.
+"""Chips: what a chip is, how its numbers are read, and the registry that finds each by its folder.
 
 A target is a folder with ``chip.toml``, every number once with unit and source, and a module ``passes`` with ``PASSES``
 (from what is trained to a netlist), ``Options`` and ``start(source, options, target)``, which gives what the passes
@@ -7,8 +7,10 @@ begin with and those that are due. Nothing else knows which chips there are.
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Callable, Mapping
+import tomllib
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib import import_module
@@ -18,8 +20,21 @@ from typing import Any
 from spikeloom.compiler import targets
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.pipeline import Passes, run
-from spikeloom.compiler.targets.chip_file import COMPARTMENTS, CROSSBARS, Numbers, read_cost_tables, read_numbers
-from spikeloom.compiler.targets.price_tables import PICOSECONDS, EnergyTable, Quantity, TimeTable
+from spikeloom.compiler.targets.price_tables import (
+    CROSSBAR_EVENTS,
+    EVENTS,
+    FLOOR,
+    LATENCIES,
+    LINK_BUFFER,
+    PICOSECONDS,
+    POWER_UNIT,
+    PRICE_UNIT,
+    TIME_UNIT,
+    EnergyTable,
+    Quantity,
+    TimeTable,
+)
+from spikeloom.compiler.types import JsonObject
 
 __all__ = [
     "COMPARTMENTS",
@@ -35,12 +50,24 @@ __all__ = [
     "with_tables",
 ]
 
+COMPARTMENTS, CROSSBARS = "compartments", "crossbars"
+"""What cores are made of: lists of weighted synapses onto compartments (Loihi), or a binary crossbar (TrueNorth)."""
+
 _NOT_MODELLED = {"loihi2": "not modelled; no public per-event energies"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Target(Numbers):
+class Target:
     """A chip: its numbers, and how a network is compiled for it."""
+
+    name: str
+    title: str
+    limits: Mapping[str, Quantity]  # Whole numbers by rule
+    choices: Mapping[str, tuple[int, ...]]  # Permitted values by rule
+    energy: tuple[EnergyTable, ...]
+    time: tuple[TimeTable, ...]
+    static: Mapping[str, Quantity]  # Power of a chip, whether it computes or not
+    cores: str = COMPARTMENTS  # or ``CROSSBARS``, which have neither choices nor time tables
 
     def limit(self, rule: str) -> int:
         """Largest amount that `rule`, for example ``core.axons_in``, allows."""
@@ -74,15 +101,29 @@ class Target(Numbers):
 
 
 def read_target(path: str | os.PathLike[str]) -> Target:
-    """Read and check a target file; OptionError if it cannot be read or entries are wrong, with a line for each."""
-    return read_numbers(path, Target)
+    """Read a target file; OptionError if it cannot be read or an entry is wrong."""
+    raw = _toml(path, "a target file")
+    if missing := {"name", "title", "limits", "energy"} - raw.keys():
+        raise OptionError(f"{path}: {', '.join(sorted(missing))}: missing; give name, title, limits and energy")
+    cores = raw.get("cores", COMPARTMENTS)
+    energy, time = _cost_tables(path, raw, cores)
+    return Target(
+        name=raw["name"],
+        title=raw["title"],
+        cores=cores,
+        limits=_quantities(f"{path}: limits", raw["limits"]),
+        choices={rule: tuple(entry["values"]) for rule, entry in _entries(raw.get("choices", {}))},
+        energy=energy,
+        time=time,
+        static=_quantities(f"{path}: static", raw.get("static", {})),
+    )
 
 
 def with_tables(target: Target, name: str) -> Target:
     """Choose the tables that price and time a run: of the target by `name`, or of a TOML file of that name.
 
     The file has ``[energy.NAME]`` or ``[time.NAME]`` sections as a target file has; what it lacks stays the target's.
-    OptionError if there is no such table, or with a line for each fault of the file.
+    OptionError if there is no such table, or the file is wrong.
     """
     energy = tuple(table for table in target.energy if table.name == name)
     time = tuple(table for table in target.time if table.name == name)
@@ -90,7 +131,10 @@ def with_tables(target: Target, name: str) -> Target:
         if not name.endswith(".toml"):
             names = sorted({table.name for table in target.energy} | {table.name for table in target.time})
             raise OptionError(f"--table {name}: unknown; allowed: {', '.join(names)}, or a file that ends in .toml")
-        energy, time = read_cost_tables(name, target.cores)
+        raw = _toml(name, "a file of tables")
+        if not raw or raw.keys() - {"energy", "time"}:
+            raise OptionError(f"{name}: holds {', '.join(raw) or 'nothing'}; give [energy.NAME] or [time.NAME] alone")
+        energy, time = _cost_tables(name, raw, target.cores)
     return replace(target, energy=energy or target.energy, time=time or target.time)
 
 
@@ -125,3 +169,82 @@ def load_target(name: str, cores: str | None = None) -> Target:
         why = why if found is None else f"its cores are {found.cores}, this is for {cores}"
         raise OptionError(f"--target {name}: {why}; allowed: {', '.join(known_targets(cores))}")
     return found
+
+
+# -- numbers from TOML -------------------------------------------------------------------------------------------------
+
+
+def _toml(path: str | os.PathLike[str], what: str) -> JsonObject:
+    try:
+        return tomllib.loads(Path(path).read_text("utf-8"))
+    except OSError as error:
+        raise OptionError(f"{path}: cannot be read ({error.strerror or error}); give {what}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise OptionError(f"{path}: is not TOML ({error}); mend it") from error
+
+
+def _entries(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """What is said of each dotted name."""
+    for key, entry in table.items():
+        if isinstance(entry, dict) and all(isinstance(value, dict) for value in entry.values()):
+            yield from _entries(entry, f"{prefix}{key}.")
+        else:
+            yield prefix + key, entry
+
+
+def _quantity(where: str, entry: Any, unit: str = "") -> Quantity:
+    """A number with its unit, which must be `unit` if one is given, and its source."""
+    try:
+        found = Quantity(**entry)
+    except TypeError:
+        raise OptionError(f"{where}: is {entry!r}, not an entry of value, unit and source") from None
+    if type(found.value) not in (int, float) or not 0 <= found.value < math.inf:
+        raise OptionError(f"{where}: value is {found.value!r}, a finite number from 0 is needed")
+    if unit and found.unit != unit:
+        raise OptionError(f"{where}: unit is {found.unit!r}, allowed is {unit!r}")
+    return found
+
+
+def _quantities(where: str, table: Mapping[str, Any], units: Mapping[str, str] | None = None) -> dict[str, Quantity]:
+    """Numbers of a section by their dotted names; `units` are those that it may have, all by default."""
+    found = {}
+    for name, entry in _entries(table):
+        if units is not None and name not in units:
+            raise OptionError(f"{where}.{name}: unknown, allowed are {', '.join(units)}")
+        found[name] = _quantity(f"{where}.{name}", entry, units[name] if units else "")
+    return found
+
+
+def _cost_tables(
+    path: str | os.PathLike[str], raw: Mapping[str, Any], cores: str
+) -> tuple[tuple[EnergyTable, ...], tuple[TimeTable, ...]]:
+    """Energy tables and time tables of a file."""
+    events = CROSSBAR_EVENTS if cores == CROSSBARS else EVENTS
+    units = {event: POWER_UNIT if event == FLOOR else PRICE_UNIT for event in events}
+    energy = [
+        EnergyTable(name=name, title=title, prices=_quantities(where, table, units))
+        for name, where, title, table in _tables(path, raw, "energy")
+    ]
+    time = []
+    for name, where, title, table in _tables(path, raw, "time"):
+        barriers = table.pop("barrier", {})
+        latencies = _quantities(where, table, dict.fromkeys(LATENCIES, TIME_UNIT) | {LINK_BUFFER: ""})
+        missing = [event for event in (*LATENCIES, LINK_BUFFER) if event not in latencies]
+        if missing or not isinstance(barriers, dict) or "1" not in barriers or not all(map(str.isdecimal, barriers)):
+            wanted = ", ".join(missing) or "barrier.1, and others with a number of tiles"
+            raise OptionError(f"{where}: lacks {wanted}; a time table is whole")
+        least = {int(tiles): _quantity(f"{where}.barrier.{tiles}", barriers[tiles], TIME_UNIT) for tiles in barriers}
+        buffer = latencies.pop(LINK_BUFFER)
+        time.append(TimeTable(name=name, title=title, latencies=latencies, barriers=least, link_buffer=buffer))
+    return tuple(energy), tuple(time)
+
+
+def _tables(
+    path: str | os.PathLike[str], raw: Mapping[str, Any], kind: str
+) -> Iterator[tuple[str, str, str, JsonObject]]:
+    """Name, place in the file, title and entries of each table of a kind."""
+    sections = raw.get(kind, {})
+    for name, table in sections.items() if isinstance(sections, dict) else [("NAME", None)]:
+        if not isinstance(table, dict) or not isinstance(table.get("title"), str):
+            raise OptionError(f"{path}: {kind}.{name}: lacks its title; give title and entries")
+        yield name, f"{path}: {kind}.{name}", table["title"], {k: v for k, v in table.items() if k != "title"}

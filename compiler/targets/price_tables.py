@@ -9,7 +9,7 @@ PRICE_UNIT = "pJ"
 POWER_UNIT = "mW"
 TIME_UNIT = "ns"
 PICOSECONDS = 1000
-"""In a TIME_UNIT; finer latencies are refused."""
+"""In a TIME_UNIT; finer latencies are rounded."""
 
 EVENTS = (
     *("synaptic_operation", "synaptic_operation_dense", "synaptic_operation_sparse", "neuron_idle", "neuron_active"),
@@ -24,7 +24,6 @@ CROSSBAR_EVENTS = ("synaptic_event", FLOOR)
 """The same for crossbars: a synaptic event is a set crossing point that a spike on its axon meets."""
 
 LINK_BUFFER = "link_buffer"
-BARRIER = "barrier."
 
 LATENCIES = (
     *("neuron_access", "neuron_update", "spike", "axon_out", "axon_in"),

@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Mapping
 from typing import Any
 
-from spikeloom.compiler import MARGIN, Packing, __version__
+from spikeloom.compiler import Packing, __version__
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.errors import OptionError
 from spikeloom.runtime.inputs.network import LoadedNetwork
@@ -24,18 +24,11 @@ def provenance(arguments: argparse.Namespace, asked: LoadedNetwork, *, calibrate
         "spike_exact": arguments.spike_exact,
         "keep_all": arguments.keep_all,
         "prune_unused": arguments.prune_unused,
-        "ranges": arguments.ranges,
-        "margin": margin_of(arguments),
         "calibrated": calibrated,
         **({"cores_for": cores_for} if cores_for else {}),
         **({"chips": arguments.chips} if arguments.chips != 1 else {}),
         **({"optimize": arguments.optimize} if arguments.optimize != "cores" else {}),
     }
-
-
-def margin_of(arguments: argparse.Namespace) -> float:
-    """Share to add to observed ranges."""
-    return float(MARGIN if arguments.margin is None else arguments.margin)
 
 
 def whole_numbers(text: str, option: str) -> list[int]:

@@ -132,8 +132,6 @@ def _compile_options(made: Mapping[str, Any], data: str) -> JsonObject:
         if value != usual and not made.get("fine_tuned"):
             options[name] = ",".join(map(str, value)) if isinstance(value, list) else value
     options |= {name: made.get(name) or None for name in ("spike_exact", "keep_all", "prune_unused")}
-    if made.get("ranges", "proven") != "proven":
-        options |= {"ranges": made["ranges"], "margin": f"{made['margin']:g}"}
     if made.get("cores_for"):
         options["cores_for"] = ",".join(f"{layer}={count}" for layer, count in made["cores_for"].items())
     options |= {name: made.get(name) for name in ("chips", "optimize")}

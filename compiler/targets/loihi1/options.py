@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -13,16 +12,10 @@ from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.ir import Form
 from spikeloom.compiler.targets.base import Target
 
-RANGES = ("proven", "observed")
-"""How a scale is kept from overflowing the accumulator; ``observed`` trusts the calibration recordings."""
-
-GOALS = ("cores", "energy", "latency")
+GOALS = ("cores", "latency")
 """What a layout may be chosen for."""
 
 MAX_PLANES = 3
-
-MARGIN = 0.1
-"""Share that is added to observed ranges unless another is given."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,34 +42,28 @@ class Options:
     # (samples, taxels, polarities, steps), optional; training recordings for calibration, of which 32, evenly spaced,
     # are used; with several planes 256
     training_events: npt.NDArray[Any] | None = None
-    ranges: str = "proven"  # One of ``RANGES``
-    margin: float = MARGIN  # Share added to observed ranges
     # Least number of cores of a layer, by name; they hold no other. Its neurons are cut as evenly as possible.
     cores_for: Mapping[str, int] = field(default_factory=dict)
     chips: int = 1  # Number of chips at most; as few are used as hold the cores
-    # One of ``GOALS``: what the layout is chosen for, see :mod:`layout.choose`; all but cores need training events
+    # One of ``GOALS``: what the layout is chosen for, see :mod:`layout.choose`; latency needs training events
     optimize: str = "cores"
     provenance: Mapping[str, Any] = field(default_factory=dict)  # JSON values to store with the netlist
 
     def require_consistent(self, *, calibrated: bool) -> None:
         """Refuse options that contradict each other; `calibrated` where there are, or will be, training events."""
-        if not 0 <= self.margin < math.inf:
-            raise OptionError(f"--margin {self.margin:g}: is no share to add to a range; give a number from 0")
         fine_tuned = self.forms is not None
         if self.prune_unused and (not calibrated or self.keep_all or fine_tuned):
             raise OptionError(
                 "--prune-unused: needs --calibrate, and neither --keep-all nor a fine-tuned checkpoint; "
                 "change the options"
             )
-        if fine_tuned and (self.packings is not None or self.spike_exact or self.ranges != "proven"):
+        if fine_tuned and (self.packings is not None or self.spike_exact):
             raise OptionError(
                 "compile: the checkpoint was fine-tuned for its own storage; omit --weight-bits, --planes, "
-                "--scale-groups, --spike-exact and --ranges"
+                "--scale-groups and --spike-exact"
             )
         if self.spike_exact and not calibrated:
             raise OptionError("--spike-exact: nothing to be exact on; give --calibrate")
-        if self.spike_exact and self.ranges != "proven":
-            raise OptionError(f"--spike-exact: needs proven ranges, --ranges says {self.ranges}; omit --ranges")
         packings = self.packings or (Packing(),)
         if self.spike_exact and (len(packings) > 1 or packings[0] != Packing(bits=packings[0].bits)):
             raise OptionError(

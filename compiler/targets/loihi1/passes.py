@@ -64,9 +64,7 @@ def _quantize(done: Compilation) -> Compilation:
         check_packings(packings, len(network.populations), target)
         integer, choices, exactness = make_exact(network, target, done.calibration, bits=packings[0].bits)
         return replace(done, integer=integer, choices=choices, exactness=exactness, connected=LATER)
-    integer, choices = choose_storage(
-        network, target, packings=packings, calibration=done.calibration, ranges=options.ranges, margin=options.margin
-    )
+    integer, choices = choose_storage(network, target, packings=packings, calibration=done.calibration)
     return replace(done, integer=integer, choices=choices, connected=LATER)  # large, and no pass needs it again
 
 

@@ -6,12 +6,12 @@ import argparse
 import sys
 from dataclasses import replace
 
-from spikeloom.compiler import DEFAULT_TARGET, GOALS, MARGIN, RANGES, Compilation, compile_network, write_netlist
+from spikeloom.compiler import DEFAULT_TARGET, GOALS, Compilation, compile_network, write_netlist
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.runtime.commands.main_job.integers import brings_integers, compile_integers
 from spikeloom.runtime.commands.options import NETWORK_FILES, add_bin_option, add_network, group
-from spikeloom.runtime.inputs.compilation import margin_of, parse_cores, parse_packings, provenance
+from spikeloom.runtime.inputs.compilation import parse_cores, parse_packings, provenance
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import load_network
 from spikeloom.runtime.inputs.recordings import recordings
@@ -51,10 +51,6 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
         metavar="N",
         help="truenorth: lower a history-free network, N axons an input (2 to 4), whose sums travel in 20 ticks a step",
     )
-    storage.add_argument(
-        "--ranges", default="proven", help=f"how overflow is excluded: {' or '.join(RANGES)} (default: proven)"
-    )
-    storage.add_argument("--margin", type=float, help=f"share added to observed ranges (default: {MARGIN:g})")
     layout.add_argument(
         "--cores-for",
         metavar="LAYER=N[,…]",
@@ -65,7 +61,7 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
         "--optimize",
         default="cores",
         metavar="GOAL",
-        help=f"choose the cores for {', '.join(GOALS)}; the last two need --calibrate (default: cores)",
+        help=f"choose the layout for {' or '.join(GOALS)}, which needs --calibrate (default: cores)",
     )
     output.add_argument(
         "--dump-after", action="append", default=[], metavar="PASS", help="print the network after a pass, on stderr"
@@ -86,17 +82,11 @@ def run(arguments: argparse.Namespace) -> Outcome:
     if own is not None:
         return own.compile_network(arguments)  # type: ignore[no-any-return]
     refuse(arguments, ("in_time",), f"{arguments.target} has no such option")
-    if arguments.margin is not None and arguments.ranges != "observed":
-        raise OptionError(
-            f"--margin {arguments.margin:g}: only observed ranges have one; add --ranges observed or omit it"
-        )
     options = chip.options(
         packings=parse_packings(arguments),
         spike_exact=arguments.spike_exact,
         keep_all=arguments.keep_all,
         prune_unused=arguments.prune_unused,
-        ranges=arguments.ranges,
-        margin=margin_of(arguments),
         cores_for=parse_cores(arguments.cores_for),
         chips=arguments.chips,
         optimize=arguments.optimize,

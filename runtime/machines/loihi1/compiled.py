@@ -17,7 +17,6 @@ from spikeloom.compiler.targets.loihi1.storage.spike_exact import Exactness
 from spikeloom.runtime.machines.loihi1 import description
 from spikeloom.runtime.machines.loihi1.description import LayerFacts, NetlistFacts
 from spikeloom.runtime.report.encode import INLINE, OPTIONAL
-from spikeloom.runtime.report.numbers import si
 from spikeloom.runtime.report.sections import Block, Outcome, Section, Table, Text
 
 ZEROED = 0.25
@@ -172,10 +171,9 @@ def _placed(facts: CompilationFacts) -> Iterator[str]:
     placement, spiking = facts.placement, ""
     if facts.calibration[0].flips is None:
         spiking = " if every neuron spiked"
-    optimal = "optimal" if placement.spike_hops <= placement.bound else f"bound {placement.bound:.1f}"
     yield (
         f"cores: {facts.netlist.cores} used, {facts.core_bound} at least; "
-        f"spike-hops a step{spiking}: {placement.spike_hops:.1f} ({optimal})"
+        f"spike-hops a step{spiking}: {placement.spike_hops:.1f}"
     )
     if placement.between_chips:
         yield (
@@ -192,16 +190,14 @@ def _expected(layout: LayoutChoice, layers: Sequence[LayerFacts]) -> Iterator[st
         return
     held = ", ".join(layer.name for layer in layers if chosen.critical_core in layer.cores)
     yield (
-        f"expected step on the training recordings ({chosen.time_table} table): {chosen.step_ns:,.0f} ns, "
-        f"{si(chosen.step_j, 'J')}; slowest most often: core {chosen.critical_core} ({held}), "
+        f"expected step on the training recordings ({chosen.time_table} table): {chosen.step_ns:,.0f} ns; "
+        f"slowest most often: core {chosen.critical_core} ({held}), "
         f"{'receiving' if chosen.receiving else 'sweeping its neurons and sending'}"
     )
     if layout.expected != layout.usual and usual is not None:
-        time, energy = chosen.step_ns / usual.step_ns, chosen.step_j / usual.step_j
         yield (
             f"layout of fewest cores: {layout.usual.cores} instead of {layout.expected.cores}, "
-            f"{usual.step_ns:,.0f} ns, {si(usual.step_j, 'J')}; "
-            f"this one takes {time:.2f} times the time and {energy:.2f} times the energy"
+            f"{usual.step_ns:,.0f} ns; this one takes {chosen.step_ns / usual.step_ns:.2f} times the time"
         )
     elif layout.optimize != "cores":
         yield f"--optimize {layout.optimize}: found nothing better than the layout of fewest cores"

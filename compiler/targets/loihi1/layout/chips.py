@@ -66,7 +66,7 @@ def share(traffic: FloatArray, room: int) -> IntArray:
 def place_on_chips(traffic: FloatArray, target: Target) -> Placement:
     """Share cores among as few chips as hold them and place the cores of each, by packets per step (cores, cores).
 
-    Spike-hops are those within chips; their bound is for this share of the cores.
+    Spike-hops are those within chips.
     """
     room = target.limit("chip.cores")
     if len(traffic) <= room:
@@ -81,6 +81,5 @@ def place_on_chips(traffic: FloatArray, target: Target) -> Placement:
     return Placement(
         tiles=tuple(tiles.tolist()),
         spike_hops=sum(placement.spike_hops for placement in placed),
-        bound=sum(placement.bound for placement in placed),
         between_chips=float(traffic[chip[:, None] != chip].sum()),
     )

@@ -44,7 +44,7 @@ def _score(time: float, cores: int) -> float:
 
 
 def _busy(forecast: Forecast, core: Core) -> FloatArray:
-    longest: FloatArray = np.maximum(*forecast.core(core)[:2])
+    longest: FloatArray = np.maximum(*forecast.core(core))
     return longest
 
 
@@ -191,7 +191,7 @@ def _merged(forecast: Forecast, chunks: list[Chunk]) -> list[Core]:
     needs = forecast.needs
     cores: list[Core] = [(chunk,) for chunk in chunks]
     forecast.charge(tuple(cores))
-    loads = {core: forecast.core(core)[:2] for core in cores}
+    loads = {core: forecast.core(core) for core in cores}
     weight = {core: float(np.maximum(*load).mean()) for core, load in loads.items()}
     longest = np.max([np.maximum(*load) for load in loads.values()], axis=0)
     most = longest.mean() * (1 + WORTH)
@@ -208,7 +208,7 @@ def _merged(forecast: Forecast, chunks: list[Chunk]) -> list[Core]:
             joint = order_on_core(needs, (*core, *other))
             if needs.excess(joint):
                 continue
-            load = forecast.core(joint)[:2]
+            load = forecast.core(joint)
             if np.maximum(np.maximum(*load), longest).mean() <= most:
                 loads[joint], weight[joint] = load, float(np.maximum(*load).mean())
                 longest = np.maximum(longest, np.maximum(*load))

@@ -233,13 +233,12 @@ def partition(
     rates: tuple[FloatArray, ...] | None = None,
     *,
     cores_for: Mapping[int, int] | None = None,
-    shared: bool = False,
     chips: int = 1,
 ) -> Partition:
     """Assign every neuron to a core, on as few as the cut into chunks allows if the densest of a core comes first.
 
-    Populations in `cores_for` are cut as evenly as possible into so many chunks at least, each on a core of its own
-    unless cores may be `shared`; the others into full ones. Among equal packings, searched exhaustively up to
+    Populations in `cores_for` are cut as evenly as possible into so many chunks at least, each on a core of its own;
+    the others into full ones. Among equal packings, searched exhaustively up to
     ``EXACT_CHUNKS`` chunks, the one that keeps most traffic within a core is taken; `rates` are spikes per step
     (neurons,) of each population, all equal without.
 
@@ -262,6 +261,6 @@ def partition(
                 total += float(rates[source.population][inside].sum()) if rates is not None else len(inside)
         return total
 
-    alone = [chunk for chunk in chunks if chunk.population in least and not shared]
+    alone = [chunk for chunk in chunks if chunk.population in least]
     groups = _pack(needs, [chunk for chunk in chunks if chunk not in alone], traffic)
     return arrange(needs, [*groups, *((chunk,) for chunk in alone)], chips)

@@ -13,13 +13,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from spikeloom.compiler.errors import ModelError, OptionError
+from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX, decay_registers, reach, step_units
 from spikeloom.compiler.interpret import run_integer
 from spikeloom.compiler.ir import Form, IntegerNetwork, Network, Population, row_parts
 from spikeloom.compiler.passes.calibrate import MANY, Calibration, fewer
 from spikeloom.compiler.targets.base import Target
-from spikeloom.compiler.targets.loihi1.options import MARGIN, RANGES, Packing, check_packings
+from spikeloom.compiler.targets.loihi1.options import Packing, check_packings
 from spikeloom.compiler.targets.loihi1.storage.compensate import compensated
 from spikeloom.compiler.targets.loihi1.storage.scales import (
     FloatLayer,
@@ -28,7 +28,6 @@ from spikeloom.compiler.targets.loihi1.storage.scales import (
     flips,
     grouped,
     layer_of,
-    observed_sums,
     rounded,
 )
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import current_load
@@ -58,8 +57,8 @@ class Choice:
     candidates: int  # Scales that were compared
     flips: int | None  # Calibration spikes that differ from float64; None without calibration
     spikes: int | None  # Calibration spikes of the float64 model
-    # Share of the accumulator that the worst case (proven) or the largest observed step leaves free; of the current's
-    # register where a current that outlasts its step fills that sooner
+    # Share of the accumulator that the worst case leaves free; of the current's register where a current that outlasts
+    # its step fills that sooner
     headroom: float
 
 
@@ -198,32 +197,23 @@ def choose_storage(
     *,
     packings: Sequence[Packing] = (Packing(),),
     calibration: Calibration | None = None,
-    ranges: str = "proven",
-    margin: float = MARGIN,
 ) -> tuple[IntegerNetwork, tuple[Choice, ...]]:
     """Choose the scales of each population and round weights, thresholds, biases and decays.
 
     ``calibrate.FEW`` recordings of the calibration choose, several planes use ``MANY``; without it scales come from the
-    weights and the proven bounds alone. Proven `ranges` keep the accumulator in range for any input, observed ones only
-    for what the calibration recordings bring, plus a share `margin`, and leave the check to the simulator.
+    weights and the proven bounds alone.
 
     Raises
     ------
     OptionError
-        If the packings or `ranges` do not exist, or ``observed`` lacks a calibration.
+        If there are no such packings.
     ModelError
         If populations have no usable scale; a line for each.
     """
     packings = check_packings(packings, len(network.populations), target)
-    if ranges not in RANGES:
-        raise OptionError(f"--ranges {ranges}: unknown; allowed: {', '.join(RANGES)}")
-    if ranges == "observed" and calibration is None:
-        raise OptionError("--ranges observed: nothing was observed; give --calibrate, or use --ranges proven")
     exponents = target.choices["synapse.exponent"]
     few = None if calibration is None else fewer(calibration)
     layers = [layer_of(network, post, few) for post in range(len(packings))]
-    if ranges == "observed" and few is not None:
-        layers = [replace(layer, observed=observed_sums(layer, few) * (1 + margin)) for layer in layers]
     shortlists, faults = [], []
     for layer, packing in zip(layers, packings, strict=True):
         try:

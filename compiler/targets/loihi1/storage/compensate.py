@@ -21,7 +21,7 @@ from spikeloom.compiler.fixedpoint import ONE_STEP_SUM_MAX, reach, step_units
 from spikeloom.compiler.ir import Form
 from spikeloom.compiler.passes.calibrate import Calibration
 from spikeloom.compiler.targets.loihi1.storage.scales import FloatLayer, Rounded, flips
-from spikeloom.compiler.targets.loihi1.storage.weight_storage import in_registers, scales
+from spikeloom.compiler.targets.loihi1.storage.weight_storage import in_registers, loads, scales
 from spikeloom.compiler.types import FloatArray, IntArray
 
 DAMPING = 1e-3
@@ -69,7 +69,7 @@ def compensated(layer: FloatLayer, form: Form, calibration: Calibration) -> Roun
             integer, planes = in_registers(population, projections, form, [steps[place] for place in places], bias)
         except ValueError:
             return None
-        reached = float(np.max(layer.sums(integer, planes), initial=0))
+        reached = float(np.max(loads(integer, planes), initial=0))
         return Rounded(form=form, population=integer, projections=planes, reached=reached)
 
     nearest = np.rint(held).astype(np.int64)
@@ -80,8 +80,7 @@ def compensated(layer: FloatLayer, form: Form, calibration: Calibration) -> Roun
     if found is None or plain is None:
         return None
     back = flips(found, post, calibration) > flips(plain, post, calibration)
-    if layer.observed is None:
-        back |= layer.sums(found.population, found.projections) > ONE_STEP_SUM_MAX
+    back |= loads(found.population, found.projections) > ONE_STEP_SUM_MAX
     steps[back], errors[back] = nearest[back], 0
     return stored_as(steps, errors)
 

@@ -16,7 +16,6 @@ import numpy as np
 from spikeloom.compiler.fixedpoint import (
     BIAS_EXPONENT_MAX,
     BIAS_MANTISSA_MAX,
-    CURRENT_MAX,
     MEMBRANE_SHIFT,
     ONE_STEP_SUM_MAX,
     THRESHOLD_MANTISSA_MAX,
@@ -25,7 +24,7 @@ from spikeloom.compiler.fixedpoint import (
     step_units,
     weight_step,
 )
-from spikeloom.compiler.interpret import BATCH, integer_recurrence, integer_sums, lasting_currents, product
+from spikeloom.compiler.interpret import BATCH, integer_recurrence, integer_sums
 from spikeloom.compiler.ir import Form, IntegerPopulation, IntegerProjection, Network, Population, Projection, Sparse
 from spikeloom.compiler.passes.calibrate import Calibration
 from spikeloom.compiler.targets.loihi1.options import Packing
@@ -51,12 +50,6 @@ class FloatLayer:
     projections: tuple[Projection, ...]
     post: int  # Its index in the network
     calibration: Calibration | None = None  # Spikes of the float model
-    # Largest sums of each neuron that were observed, see :func:`observed_sums`; without them the proven ones count
-    observed: FloatArray | None = None
-
-    def sums(self, integer: IntegerPopulation, planes: tuple[IntegerProjection, ...]) -> FloatArray:
-        """Largest one-sided sum of one step of each neuron, weight units, observed or proven; shape (neurons,)."""
-        return loads(integer, planes) if self.observed is None else self.observed * integer.scale
 
     def peaks(self) -> FloatArray:
         """Magnitude of the largest weight of each neuron; shape (neurons,)."""
@@ -80,8 +73,8 @@ class Rounded:
     form: Form  # How it is stored
     population: IntegerPopulation
     projections: tuple[IntegerProjection, ...]
-    # Largest one-sided sum of one step, weight units: proven, or observed with its margin. A current that outlasts its
-    # step counts as the sum that fills the accumulator as far as it fills its own register.
+    # Largest one-sided sum of one step that any input brings, weight units. A current that outlasts its step counts as
+    # the sum that fills the accumulator as far as it fills its own register.
     reached: float
 
 
@@ -93,7 +86,7 @@ def rounded(layer: FloatLayer, form: Form) -> Rounded | None:
         return None
     if layer.population.relays and not _relays_follow(layer.population, integer, planes):
         return None
-    reached = float(np.max(layer.sums(integer, planes), initial=0))
+    reached = float(np.max(loads(integer, planes), initial=0))
     return Rounded(form=form, population=integer, projections=planes, reached=reached)
 
 
@@ -114,26 +107,6 @@ def in_batches(calibration: Calibration, measure: Callable[[slice], IntArray | F
 def _threads() -> ThreadPoolExecutor:
     """Started once: a layer is measured hundreds of times."""
     return ThreadPoolExecutor(os.cpu_count())
-
-
-def observed_sums(layer: FloatLayer, calibration: Calibration) -> FloatArray:
-    """Largest one-sided sum of each neuron of the float model on the calibration recordings, membrane units.
-
-    A current that outlasts its step counts, too, by the share of its register that it fills.
-    """
-    narrower = ONE_STEP_SUM_MAX * (1 << MEMBRANE_SHIFT) / CURRENT_MAX
-    sources = [(p.weight, calibration.source(p.pre, layer.post)) for p in layer.projections]
-
-    def largest(part: slice) -> FloatArray:
-        up = sum(product(weight.maximum(0), spikes[part], np.float64) for weight, spikes in sources)
-        down = sum(product(weight.minimum(0), spikes[part], np.float64) for weight, spikes in sources)
-        both: FloatArray = np.maximum(np.max(up, axis=(0, 1)), -np.min(down, axis=(0, 1)))
-        if layer.population.alpha:
-            lasting = lasting_currents(np.asarray(up + down), layer.population.alpha)
-            both = np.maximum(both, np.abs(lasting).max(axis=(0, 1)) * narrower)
-        return both
-
-    return np.asarray(np.max(in_batches(calibration, largest), axis=0))
 
 
 def flips(layer: Rounded, post: int, calibration: Calibration) -> IntArray:
@@ -249,7 +222,7 @@ def finest_thresholds(layer: FloatLayer, bits: int, exponents: tuple[int, ...], 
         middle = (low + high + 1) // 2
         middle = np.where(high - low > 1, middle, np.maximum(low, 1))
         form = Form(bits=bits, exponents=exponents, threshold=np.maximum(middle, 1))
-        good = layer.sums(*round_population(population, layer.projections, form)) <= ONE_STEP_SUM_MAX
+        good = loads(*round_population(population, layer.projections, form)) <= ONE_STEP_SUM_MAX
         low, high = np.where(good & (high - low > 1), middle, low), np.where(good | (high - low <= 1), high, middle)
     return low
 
