@@ -141,7 +141,7 @@ def _require_range(which: IntArray, found: dict[str, Any], where: str) -> None:
     if "overflow" in found and found["overflow"].any():
         raise NumericRangeError(
             f"onnx: recording {which[found['overflow']][0]}{where}: a register overflows, where the chip is not "
-            "defined; compile with --ranges proven"
+            "defined"
         )
 
 
