@@ -140,8 +140,7 @@ def _run(session: Any, given: dict[str, Any]) -> dict[str, Any]:
 def _require_range(which: IntArray, found: dict[str, Any], where: str) -> None:
     if "overflow" in found and found["overflow"].any():
         raise NumericRangeError(
-            f"onnx: recording {which[found['overflow']][0]}{where}: a register overflows, where the chip is not "
-            "defined"
+            f"onnx: recording {which[found['overflow']][0]}{where}: a register overflows, where the chip is not defined"
         )
 
 
