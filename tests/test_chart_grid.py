@@ -73,7 +73,7 @@ def test_windows(text, windows):
         ("groups=0", "groups=0: allowed are 1 to 8 scale groups"),
         ("prune=2", "prune=2: allowed are 0 (keep) and 1 (leave out)"),
         *((f"window={value}", "1 to 100 per cent") for value in ("50-101%", "0", "80-20%", "20-80%:0", "50%:5")),
-        *((f"cores={value}", "cores, energy, latency, or LAYER:N") for value in ("fast", "a:2+:3", "a:2+a:3", "a:0")),
+        *((f"cores={value}", "cores, latency, or LAYER:N") for value in ("fast", "a:2+:3", "a:2+a:3", "a:0")),
     ],
 )
 def test_a_mistake_names_the_value_and_what_is_allowed(text, telling):

@@ -117,7 +117,7 @@ def test_the_usual_mapping_is_the_manual_graph_at_eight_bits_on_whole_recordings
     other = point(6, 400, 80, 100, 1, bits=8, graph="knn:1")
     assert usual_point([other, *points]).number == 1
     assert usual_point([other, *points[1:]]).number == 6
-    for about in ({"fine_tuned": True}, {"prune": True}, {"window": 50}, {"planes": 2}, {"cores": "energy"}):
+    for about in ({"fine_tuned": True}, {"prune": True}, {"window": 50}, {"planes": 2}, {"cores": "latency"}):
         assert usual_point([point(7, 400, 80, 100, 1, bits=8, **about)]) is None
 
 

@@ -15,7 +15,7 @@ from spikeloom.models.recordings.events import BIN_S
 NETWORK = ("graph", "taxels", "edges", "directed", "system", "run", "weights", "beta", "theta")
 """Options that say how a checkpoint is read."""
 
-ROUNDING = ("weight_bits", "planes", "scale_groups", "spike_exact", "prune_unused", "ranges", "margin")
+ROUNDING = ("weight_bits", "planes", "scale_groups", "spike_exact", "prune_unused")
 """Options of ``compile`` that say how a float network is stored."""
 
 PLACING = ("keep_all", "cores_for", "chips", "optimize")
@@ -25,7 +25,6 @@ USUAL: Mapping[str, object] = {
     "run": 0,
     "target": DEFAULT_TARGET,
     "bin": BIN_S,
-    "ranges": "proven",
     "chips": 1,
     "optimize": "cores",
     "engine": "spikeloom",
