@@ -1,4 +1,4 @@
-"""Write a file whole or not at all, and know it again by its hash."""
+"""Write a file whole or not at all, read one of a network within limits, and know it again by its hash."""
 
 from __future__ import annotations
 
@@ -11,6 +11,11 @@ from contextlib import contextmanager
 from glob import escape
 from pathlib import Path
 from typing import BinaryIO
+
+from spikeloom.compiler.errors import ModelError
+
+SIZE_LIMIT = 2**28
+"""Bytes that the file of a trained network may have: 256 MiB, a hundred times the released ones."""
 
 RANDOM = 8
 """Letters that are drawn for a name."""
@@ -69,3 +74,25 @@ def sha256_of(path: str | os.PathLike[str]) -> str:
     """Hex sha256 of a file's content."""
     with Path(path).open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def read_whole(path: Path, what: str, remedy: str) -> bytes:
+    """Content of the file of a network; ModelError, without the path, if it is missing, unreadable or too large.
+
+    Messages say `what` it should be, and the `remedy`.
+    """
+    if not path.is_file():
+        raise ModelError(f"{'is not a file' if path.exists() else 'no such file'}; {remedy}")
+    try:
+        with path.open("rb") as file:
+            content = file.read(SIZE_LIMIT + 1)
+    except OSError as error:
+        raise ModelError(f"cannot be read ({error.strerror or error}); check its permissions") from error
+    require_size(len(content), what, remedy)
+    return content
+
+
+def require_size(size: int, what: str, remedy: str) -> None:
+    """Refuse more bytes than the file of a network may have: ModelError, without the path."""
+    if size > SIZE_LIMIT:
+        raise ModelError(f"more than {SIZE_LIMIT} bytes, the limit of a {what}; {remedy}")

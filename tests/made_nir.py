@@ -8,8 +8,8 @@ import torch
 from torch.nn import functional
 
 from spikeloom.compiler.formats.nir.file import graph_of
-from spikeloom.compiler.formats.nir.neurons import Steps
 from spikeloom.compiler.formats.nir.reader import network_of
+from spikeloom.compiler.formats.nir.steps import Steps
 
 
 def tree_of(graph):

@@ -75,9 +75,6 @@ FIRES = {
     "not": "c = LessOrEqual(u, theta); hot = Not(c); s = Cast(hot)",
     "shift": "d = Sub(u, theta); hot = Greater(d, zero); s = Cast(hot)",
     "share": "d = Div(u, theta); hot = Greater(d, one); s = Cast(hot)",
-    "sign": "d = Sub(u, theta); e = Sign(d); s = Relu(e)",
-    "heaviside": "d = Sub(u, theta); eq = Equal(d, zero); lt = Less(d, zero); step = Where(lt, zero, one); "
-    "s = Where(eq, zero, step)",
 }
 
 
@@ -127,17 +124,3 @@ def scanned(steps=4, last=(MEAN,), **more):
     scan = node("Scan", "r0 r0 r1 r1 sequence", "end0 end1 end2 end3 spikes", **more)
     nodes = [node("Unsqueeze", "events axis", "sequence"), scan, *last]
     return model(nodes, [("events", [steps, 4])], last[-1].output, RESTS | {"axis": np.array([1])})
-
-
-def looped(steps=4):
-    """All steps by a Loop that adds up the spikes."""
-    nodes = [node("Gather", "events step", "x", axis=2), *STAGE, *neuron(0, "current")]
-    nodes += [node("MatMul", "s0_new w2", "more"), *neuron(1, "more"), node("Add", "total s1_new", "total_new")]
-    nodes += [node("Identity", "going", "going_new")]
-    inputs = [value("step", [], TensorProto.INT64), value("going", [], TRUTH)]
-    inputs += [value(name, shape) for name, shape in [*STATE_IN, ("total", [1, 2])]]
-    outputs = [value(name, None) for name in ["going_new", *STATE_OUT, "total_new"]]
-    inside = helper.make_graph(nodes, "step", inputs, outputs)
-    loop = node("Loop", "count yes r0 r0 r1 r1 r1", "end0 end1 end2 end3 rate", body=inside)
-    constants = RESTS | {"count": np.array(steps), "yes": np.array(True)}
-    return model([loop], [("events", [1, 4, steps])], ["rate"], constants)

@@ -16,7 +16,8 @@ from made_files import checkpoint_bytes, state_dict
 
 from spikeloom.compiler.archive import npy_bytes, read_npy
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.formats.checkpoint_reader import SIZE_LIMIT, read_checkpoint
+from spikeloom.compiler.files import SIZE_LIMIT
+from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.formats.spikeloom_checkpoint import content_digest
 from spikeloom.models.graphs import Graph
 from spikeloom.models.networks.checkpoint import save_checkpoint

@@ -14,11 +14,10 @@ import pytest
 from spikeloom.compiler.errors import ModelError, SpikeloomError
 from spikeloom.compiler.formats import hdf5
 from spikeloom.compiler.formats.hdf5 import tree_of
-from spikeloom.compiler.formats.netx.layout import blocks_of
 from spikeloom.compiler.formats.netx.reader import integers_of
 from spikeloom.compiler.formats.nir.file import graph_of
-from spikeloom.compiler.formats.nir.neurons import Steps
 from spikeloom.compiler.formats.nir.reader import network_of
+from spikeloom.compiler.formats.nir.steps import Steps
 from spikeloom.compiler.invariants import verify
 
 
@@ -90,7 +89,7 @@ def trees():
 def read(tree):
     """Read a content as both formats do; whatever may be raised is raised."""
     if "layer" in tree:
-        network, facts = integers_of(blocks_of(tree), tree)
+        network, facts = integers_of(tree)
     else:
         found = network_of(graph_of(tree, ""), Steps(dt=1e-4, convention="euler"))
         network, facts = found.network, found.facts

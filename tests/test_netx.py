@@ -3,7 +3,6 @@
 import io
 import json
 import os
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -23,7 +22,6 @@ from spikeloom.compiler import Options, Packing, compile_network, lift
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats import hdf5
 from spikeloom.compiler.formats.netx import writer as netx_export
-from spikeloom.compiler.formats.netx.layout import blocks_of, read_blocks
 from spikeloom.compiler.formats.netx.reader import integers_of, read_netx
 from spikeloom.compiler.interpret import run_integer
 from spikeloom.compiler.invariants import verify
@@ -209,10 +207,9 @@ def recorded(name):
 
 def test_spikes_that_lava_dl_recorded():
     path = recorded("tiny.net")
-    blocks, tree, _ = read_blocks(path)
-    # the recording starts behind the input layer
-    first = replace(blocks[0], entries={k: v for k, v in blocks[0].entries.items() if k != "neuron"})
-    network, _ = integers_of([first, *blocks[1:]], tree, 3)
+    tree, _ = hdf5.read_hdf5(path, "netx file")
+    del tree["layer"]["0"]["neuron"]  # the recording starts behind the input layer
+    network, _ = integers_of(tree, 3)
     _, positions, _ = sensor_layout((3, 16, 16), polarities=3)
 
     def spikes(name, size):
@@ -261,11 +258,11 @@ def test_what_the_format_holds_comes_back_exactly(drawn):
     file = io.BytesIO()
     write(file, *blocks)
     tree = hdf5.tree_of(file.getvalue())
-    network, _ = integers_of(blocks_of(tree), tree, 1)
+    network, _ = integers_of(tree, 1)
     made = netx_export.blocks_for(network)
     assert not any(block.rounded or block.threshold_rounded or block.shift for block in made)
     written_ = netx_export.tree_of(network, made)
-    again, _ = integers_of(blocks_of(written_), written_)
+    again, _ = integers_of(written_)
     for ours, back in zip(network.projections, again.projections, strict=True):
         assert_array_equal(ours.effective().toarray(), back.effective().toarray())
     for ours, back in zip(network.populations, again.populations, strict=True):

@@ -10,11 +10,11 @@ import oracles
 import pytest
 from made_nir import affine, chain, cuba, graph_with, lif, lowered, tree_of
 
+from spikeloom.compiler import files
 from spikeloom.compiler.errors import ModelError, OptionError
-from spikeloom.compiler.formats import hdf5
 from spikeloom.compiler.formats.nir.file import graph_of
-from spikeloom.compiler.formats.nir.neurons import Steps
 from spikeloom.compiler.formats.nir.reader import network_of, read_nir
+from spikeloom.compiler.formats.nir.steps import Steps
 
 pytestmark = pytest.mark.usefixtures("hdf5_in_one_process")
 
@@ -211,5 +211,5 @@ def test_what_is_no_nir_file(tmp_path, monkeypatch):
     for length in (100, 10_000):
         other.write_bytes(GOOD.read_bytes()[:length])
         assert "is truncated or damaged (OSError)" in refused(read_nir, other, dt=1.0)
-    monkeypatch.setattr(hdf5, "SIZE_LIMIT", 1000)
-    assert f"has {GOOD.stat().st_size} bytes, 1000 are allowed" in refused(read_nir, GOOD, dt=1.0)
+    monkeypatch.setattr(files, "SIZE_LIMIT", 1000)
+    assert "more than 1000 bytes, the limit of a NIR file" in refused(read_nir, GOOD, dt=1.0)

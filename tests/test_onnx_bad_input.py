@@ -11,9 +11,10 @@ from fuzzed_bytes import changed_bytes
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from made_modules import NETS, example_of, exported, one_step
-from made_onnx import CONSTANTS, STAGE, STATE_IN, looped, model, neuron, node, scanned, two_layers, written
+from made_onnx import CONSTANTS, STAGE, STATE_IN, model, neuron, node, scanned, two_layers, written
 from onnx import AttributeProto, ModelProto, TensorProto, defs, helper
 
+from spikeloom.compiler import files
 from spikeloom.compiler.errors import SpikeloomError
 from spikeloom.compiler.formats.onnx import file as onnx_file
 from spikeloom.compiler.formats.onnx.reader import read_onnx
@@ -138,7 +139,7 @@ def test_one_line_says_where_and_why(refusal, words, content):
 def test_limits_of_files(refusal, monkeypatch):
     monkeypatch.setattr(onnx_file, "NODE_LIMIT", 5)
     assert "has more than 5 nodes" in refusal(two_layers())
-    monkeypatch.setattr(onnx_file, "SIZE_LIMIT", 100)
+    monkeypatch.setattr(files, "SIZE_LIMIT", 100)
     assert "more than 100 bytes, the limit of a network" in refusal(two_layers())
 
 
@@ -167,7 +168,7 @@ def beside(location, **more):
     ],
 )
 def test_data_beside_the_file(refusal, tmp_path, monkeypatch, location, more, words):
-    monkeypatch.setattr(onnx_file, "SIZE_LIMIT", 10_000)
+    monkeypatch.setattr(files, "SIZE_LIMIT", 10_000)
     folder = tmp_path / "inner"
     folder.mkdir()
     (tmp_path / "secret.bin").write_bytes(bytes(48))
@@ -238,7 +239,7 @@ def sources():
     """Good files of every form."""
     made = [two_layers(spelling) for spelling in ("product", "where", "truth", "after")]
     made += [one_step(NETS[name](), example_of(name)) for name in ("mlp", "tag", "grid", "gcn")]
-    return (*made, scanned(), looped())
+    return (*made, scanned())
 
 
 def _graphs(graph):

@@ -5,14 +5,12 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from made_files import released
 from numpy.testing import assert_allclose, assert_array_equal
-from oracles import probed, refused
+from oracles import probed
 from scipy import sparse
 from test_dynamics import surrogate_spike
 
 from spikeloom.compiler import Options, compile_network
-from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.interpret import channels_last, run_float
 from spikeloom.compiler.passes.expand import expand
@@ -198,24 +196,10 @@ def test_initial_weights_are_those_of_the_usual_layers(system, bound):
 
 
 # --- files -----------------------------------------------------------------------------------------------------------
-def torch_file(path, content):
-    torch.save(content, path)
-    return path
-
-
 @pytest.mark.parametrize(("system", "padding"), FORMED)
-def test_released_style_files_are_told_by_their_keys(tmp_path, system, padding):
+def test_spikes_are_those_of_plain_torch(tmp_path, system, padding):
     network = network_of(system, padding=padding)
-    state = state_of(network)
-    path = torch_file(tmp_path / "x.t7", released(state))
-    found = read_checkpoint(path, cells=grid_cells())
-    assert (found.system, found.layout, found.taxels, found.classes) == (system, "released", 39, 4)
-    assert (found.grid is None) == (system != GRID_CNN)
-    for name, array in network.export_weights().items():
-        dense = {f"{d.name}.{part}": getattr(d, part) for d in found.dense for part in ("weight", "bias")}
-        ours = {"conv1.hops": found.hops, "conv1.bias": found.conv_bias} | dense
-        assert_array_equal(ours[name], array)
-    assert read_checkpoint(path, cells=grid_cells(), system=system).system == system
+    state, found = state_of(network), saved(tmp_path, network, padding=padding)
     events = events_of(7)
     spikes = float_spikes(found, seen_by(system, padding), events, dtype="float64")
     for recording in range(len(events)):
@@ -223,28 +207,6 @@ def test_released_style_files_are_told_by_their_keys(tmp_path, system, padding):
         plain = plain_spikes(system, doubled, events[recording], padding=padding)
         for layer, expected in zip(spikes.values(), plain, strict=True):
             assert_array_equal(layer[recording], expected.bool())
-
-
-def without(state, *names):
-    return {name: tensor for name, tensor in state.items() if name not in names}
-
-
-@pytest.mark.parametrize(
-    ("system", "change", "words"),
-    [
-        (MLP, lambda s: without(s, "fc0.bias"), "fc0.bias is missing; give the weights of an MLP"),
-        (GCN, lambda s: s | {"conv1.lin.weight": torch.ones(4, 8)}, "conv1.lin.weight is (4, 8), wanted (4, 2)"),
-        (GRID_CNN, lambda s: s | {"conv1.weight": torch.ones(4, 2, 3, 2)}, "a window of 3 * 2, wanted a square one"),
-        (
-            GRID_CNN,
-            lambda s: s | {"fc1.weight": torch.ones(8, 400)},
-            "fc1 was trained on 100 places, a window of 3 * 3",
-        ),
-    ],
-)
-def test_faults_of_released_style_files(tmp_path, system, change, words):
-    path = torch_file(tmp_path / "x.t7", change(state_of(network_of(system))))
-    refused(ModelError, f"{path}: |{words}", read_checkpoint, path, cells=grid_cells())
 
 
 # --- to the chip -----------------------------------------------------------------------------------------------------

@@ -7,14 +7,27 @@ threshold and affine stages from other layers, and with how the output is counte
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.names import printable
-from spikeloom.compiler.ir import INPUT, Input, Network, Population, Projection, Readout, Sparse, depths
+from spikeloom.compiler.ir import INPUT, Input, IntegerNetwork, Network, Population, Projection, Readout, Sparse, depths
 from spikeloom.compiler.types import FloatArray, IntArray
+
+N = TypeVar("N", bound=Network | IntegerNetwork)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ReadNetwork(Generic[N]):
+    """A network, and what was found about the file of another framework that it is from."""
+
+    network: N
+    facts: tuple[str, ...]  # what was read and what was assumed, for people
+    sha256: str  # of the file, and of data beside it
+    read_as: Mapping[str, Any] = field(default_factory=dict)  # beyond what the file says: the time step of a NIR file
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -8,13 +8,10 @@ from pathlib import Path
 
 from spikeloom.compiler.checkpoint import WEIGHTS, Checkpoint, constant_faults
 from spikeloom.compiler.errors import ModelError, OptionError
+from spikeloom.compiler.files import read_whole
 from spikeloom.compiler.formats.spikeloom_checkpoint import members_of, read_own
 from spikeloom.compiler.formats.torch_checkpoint import GIVE, read_torch
 from spikeloom.compiler.systems import SYSTEMS
-from spikeloom.compiler.types import IntArray
-
-SIZE_LIMIT = 2**28
-"""Bytes that a checkpoint may have: 256 MiB, a hundred times the released ones."""
 
 
 def read_checkpoint(
@@ -25,7 +22,6 @@ def read_checkpoint(
     beta: float | None = None,
     theta: float | None = None,
     system: str | None = None,
-    cells: IntArray | None = None,
 ) -> Checkpoint:
     """Read a checkpoint of any known layout.
 
@@ -41,9 +37,7 @@ def read_checkpoint(
     beta, theta : float, optional
         Decay and threshold; taken from the file, or from the released code where the file does not say.
     system : str, optional
-        Which system it is; the file tells by itself.
-    cells : (taxels, 2) int64, optional
-        Row and column of each taxel on the grid of a grid-based CNN, where the file does not say.
+        Which system it must be; files in the released layout hold a TactileSGNet.
 
     Raises
     ------
@@ -61,17 +55,20 @@ def read_checkpoint(
     if faults := constant_faults(beta, theta):
         raise OptionError(faults[0])
     where = str(path)
-    content = _content(where, Path(path))
+    try:
+        content = read_whole(Path(path), "checkpoint", GIVE)
+    except ModelError as error:
+        raise ModelError(f"{where}: {error}") from error
     members = members_of(where, content)
     if members is None:
-        found = read_torch(where, content, run, system, cells)
+        found = read_torch(where, content, run)
         if weights not in (None, "last"):
             raise ModelError(f"{where}: --weights {weights}: the file holds the last epoch only; omit --weights")
     else:
         if run != 0:
             raise ModelError(f"{where}: --run {run}: the file holds only run 0; omit --run")
         found = read_own(where, content, members, weights)
-        _require_fit(where, found, system, beta, theta)
+    _require_fit(where, found, system, beta, theta)
     given = [name for name, value in (("beta", beta), ("theta", theta)) if value is not None]
     return replace(
         found,
@@ -82,7 +79,7 @@ def read_checkpoint(
 
 
 def _require_fit(where: str, found: Checkpoint, system: str | None, beta: float | None, theta: float | None) -> None:
-    """Refuse what contradicts a file of our own."""
+    """Refuse what contradicts the file."""
     if system not in (None, found.system):
         raise OptionError(f"--system {system}: {where} holds a {found.system}; omit --system")
     for name, value, held in (("beta", beta, found.beta), ("theta", theta, found.theta)):
@@ -91,17 +88,3 @@ def _require_fit(where: str, found: Checkpoint, system: str | None, beta: float 
     if beta is not None and found.dynamics.betas:
         decays = ", ".join(f"{each:g}" for each in found.dynamics.betas)
         raise OptionError(f"--beta {beta:g}: {where} has a decay for each layer, {decays}; omit --beta")
-
-
-def _content(where: str, path: Path) -> bytes:
-    """Bytes of the file."""
-    if not path.is_file():
-        raise ModelError(f"{where}: no such file; {GIVE}")
-    try:
-        with path.open("rb") as file:
-            content = file.read(SIZE_LIMIT + 1)
-    except OSError as error:
-        raise ModelError(f"{where}: cannot be read ({error.strerror or error}); check its permissions") from error
-    if len(content) > SIZE_LIMIT:
-        raise ModelError(f"{where}: more than {SIZE_LIMIT} bytes, the limit of a checkpoint; {GIVE}")
-    return content

@@ -13,21 +13,22 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from spikeloom.compiler import files
 from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.files import read_whole
+from spikeloom.compiler.types import FloatArray, IntArray
 
 Array = npt.NDArray[Any]
 
 Tree = dict[str, Any]
 """By name a further Tree, an Array of numbers or truth values, a string, lists of strings, or None for other things."""
-
-SIZE_LIMIT = 2**28
-"""Bytes that a file may have, and that all its arrays may have together: 256 MiB, as of a checkpoint."""
 
 ITEM_LIMIT = 100_000
 NESTING = 64
@@ -60,8 +61,14 @@ except ModelError:
 """
 
 
+AGAIN = "export it again"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Part:
     """A part of a file; printed, it says which."""
+
+    values: Tree  # Its entries
 
     def fail(self, problem: str) -> ModelError:
         """An error about this part, to be raised."""
@@ -75,26 +82,51 @@ class Part:
         except ModelError as error:
             raise self.fail(str(error)) from error
 
+    def has(self, key: str) -> bool:
+        """Whether there is such an entry."""
+        return self.values.get(key) is not None
 
-def read_hdf5(path: Path, what: str, remedy: str) -> tuple[Tree, str]:
-    """Content of a whole file, and its sha256; messages say `what` it should be and the `remedy` for a damaged one.
+    def numbers(self, key: str) -> FloatArray:
+        """An entry as float64, of its own shape; ModelError if there is none, or it is no finite numbers."""
+        if not self.has(key):
+            raise self.fail(f"has no {key}; {AGAIN}")
+        found = self.values[key]
+        if not isinstance(found, np.ndarray):
+            raise self.fail(f"{key} is no array of numbers; {AGAIN}")
+        array = found.astype(np.float64)
+        if bad := int(np.count_nonzero(~np.isfinite(array))):
+            raise self.fail(f"{key} has {bad} of {array.size} values NaN or infinite; train it again")
+        return array
+
+    def integers(self, key: str) -> IntArray:
+        """The same as int64; ModelError if it holds others than whole numbers of 32 bits."""
+        array = self.numbers(key)
+        wrong = array[(array != np.rint(array)) | (np.abs(array) >= 2**31)]
+        if wrong.size:
+            raise self.fail(f"{key} holds {wrong[0]:g}, allowed are whole numbers of 32 bits; export it quantised")
+        return array.astype(np.int64)
+
+    def few(self, key: str, count: int = 1) -> tuple[int, ...]:
+        """An entry of so many whole numbers, or of one for all."""
+        values = self.integers(key).ravel().tolist()
+        if len(values) not in (1, count):
+            raise self.fail(f"{key} has {len(values)} values, wanted {count}; {AGAIN}")
+        return tuple(values * count if len(values) == 1 else values)
+
+
+def read_hdf5(path: Path, what: str) -> tuple[Tree, str]:
+    """Content of a whole file, and its sha256; messages say `what` it should be.
 
     Raises ModelError, without the path, if it is missing, too large, no HDF5 file, or holds what may not be read.
     """
-    if not path.is_file():
-        found = "is not a file" if path.exists() else "no such file"
-        raise ModelError(f"{found}; give a {what}")
-    size = path.stat().st_size
-    if size > SIZE_LIMIT:
-        raise ModelError(f"has {size} bytes, {SIZE_LIMIT} are allowed; a {what} of one chip is smaller")
-    content = path.read_bytes()
+    content = read_whole(path, what, f"give a {what} of one chip")
     if not content.startswith(SIGNATURE):
-        raise ModelError(f"is no HDF5 file, as a {what} is; {remedy}")
+        raise ModelError(f"is no HDF5 file, as a {what} is; {AGAIN}")
     try:
         try_reading(content)
         return tree_of(content), hashlib.sha256(content).hexdigest()
     except ModelError as error:
-        raise ModelError(f"{error}; {remedy}") from error
+        raise ModelError(f"{error}; {AGAIN}") from error
 
 
 def try_reading(content: bytes) -> None:
@@ -132,7 +164,7 @@ class _Walk:
 
     def __init__(self) -> None:
         self.items = ITEM_LIMIT
-        self.bytes = SIZE_LIMIT
+        self.bytes = files.SIZE_LIMIT
 
     def group(self, group: Any, above: list[str]) -> Tree:
         import h5py
@@ -167,7 +199,7 @@ class _Walk:
             return None
         self.bytes -= item.dtype.itemsize * max(item.size, int(np.prod(item.chunks or (0,), dtype=object)))
         if self.bytes < 0:
-            raise ModelError(f"announces more than {SIZE_LIMIT} bytes of numbers")
+            raise ModelError(f"announces more than {files.SIZE_LIMIT} bytes of numbers")
         if item.dtype.kind == "S" or h5py.check_string_dtype(item.dtype) is not None:
             values = item[()]
             return _decoded(values.tolist() if isinstance(values, np.ndarray) else values)

@@ -19,47 +19,8 @@ from spikeloom.compiler.ir import Sparse
 COEFFICIENT_LIMIT = 2**25
 """Products of a kernel's weights with places: more than twice the synapses of a whole chip."""
 
-IMPOSSIBLE = "has a kernel size, stride or dilation below 1 or a padding below 0; export it again"
-
 Padding = Sequence[tuple[int, int]]
 """Zeros before and after each space axis."""
-
-
-def same_padding(kernel: Sequence[int], dilation: Sequence[int]) -> Padding:
-    """Padding that keeps the size at a stride of 1; the odd zero comes after, as in torch.
-
-    Examples
-    --------
-    >>> same_padding((3, 2), (1, 1))
-    [(1, 1), (0, 1)]
-    """
-    total = [step * (size - 1) for size, step in zip(kernel, dilation, strict=True)]
-    return [(zeros // 2, zeros - zeros // 2) for zeros in total]
-
-
-def places(
-    space: Sequence[int], kernel: Sequence[int], stride: Sequence[int], padding: Padding, dilation: Sequence[int]
-) -> tuple[int, ...]:
-    """Places that a kernel takes on each axis.
-
-    Examples
-    --------
-    >>> places((5, 4), (3, 2), (2, 1), [(1, 1), (0, 0)], (1, 1))
-    (3, 3)
-
-    Raises ModelError if it takes none.
-    """
-    numbers = [*kernel, *stride, *dilation]
-    pads = [zeros for pair in padding for zeros in pair]
-    if min(numbers, default=1) < 1 or min(pads, default=0) < 0:
-        raise ModelError(IMPOSSIBLE)
-    found = []
-    for size, taps, step, (before, after), apart in zip(space, kernel, stride, padding, dilation, strict=True):
-        covered = size + before + after - apart * (taps - 1)
-        if covered < 1:
-            raise ModelError(f"has a kernel of {taps} for {size} places; export it again")
-        found.append((covered - 1) // step + 1)
-    return tuple(found)
 
 
 def convolution(
@@ -92,17 +53,22 @@ def convolution(
             f"has kernels for {each} channels in {groups} groups and {filters} filters, its input has {channels} "
             f"channels; export it again"
         )
-    out = places(space, kernel, stride, padding, dilation)
+    if min((*kernel, *stride, *dilation), default=1) < 1 or any(min(pair) < 0 for pair in padding):
+        raise ModelError("has a kernel size, stride or dilation below 1 or a padding below 0; export it again")
+    spans = [apart * (taps - 1) + 1 for taps, apart in zip(kernel, dilation, strict=True)]
+    padded_space = [size + sum(zeros) for size, zeros in zip(space, padding, strict=True)]
+    for size, taps, span, covered in zip(space, kernel, spans, padded_space, strict=True):
+        if span > covered:
+            raise ModelError(f"has a kernel of {taps} for {size} places; export it again")
+    out = [(room - span) // step + 1 for room, span, step in zip(padded_space, spans, stride, strict=True)]
     points, taps = math.prod(out), math.prod(kernel)
-    padded = channels * math.prod(size + sum(zeros) for size, zeros in zip(space, padding, strict=True))
-    if max(weight.size * points, points, padded) > COEFFICIENT_LIMIT:
+    if max(weight.size * points, points, channels * math.prod(padded_space)) > COEFFICIENT_LIMIT:
         raise ModelError(
             f"has {weight.size * points:,} weights once written out, {COEFFICIENT_LIMIT:,} are allowed; this "
             "is no network of one chip"
         )
     # where in the input each tap looks from each place; -1 is the padding
     positions = np.pad(np.arange(math.prod(shape)).reshape(shape), [(0, 0), *padding], constant_values=-1)
-    spans = [apart * (length - 1) + 1 for length, apart in zip(kernel, dilation, strict=True)]
     windows = np.lib.stride_tricks.sliding_window_view(positions, (1, *spans))
     looks = windows[:, *(slice(None, None, step) for step in (*stride, 1, *dilation))]
     inner = filters // groups
@@ -121,27 +87,3 @@ def convolution(
 def block_diagonal(matrix: Sparse, copies: int) -> Sparse:
     """The same matrix for each of so many parts of a value."""
     return matrix if copies == 1 else sparse.csr_array(sparse.kron(sparse.identity(copies), matrix, format="csr"))
-
-
-def pooling(
-    shape: Sequence[int], *, kernel: Sequence[int], stride: Sequence[int], padding: Padding, mean: bool
-) -> tuple[Sparse, tuple[int, ...]]:
-    """Matrix of a sum or mean over windows, channel by channel; zeros of the padding count.
-
-    Examples
-    --------
-    >>> matrix, shape = pooling((1, 2, 2), kernel=(2, 2), stride=(2, 2), padding=[(0, 0)] * 2, mean=True)
-    >>> shape, matrix.toarray().tolist()
-    ((1, 1, 1), [[0.25, 0.25, 0.25, 0.25]])
-    """
-    if min(kernel) < 1:
-        raise ModelError(IMPOSSIBLE)
-    share = 1 / math.prod(kernel) if mean else 1.0
-    return convolution(
-        shape,
-        np.full((shape[0], 1, *kernel), share),
-        stride=stride,
-        padding=padding,
-        dilation=[1] * len(kernel),
-        groups=shape[0],
-    )

@@ -5,10 +5,6 @@ A ``.t7`` file is a dict whose ``net_list`` holds the state dicts, with the weig
 kinds in torch's zip and in its older format, with the keys of current torch_geometric (``conv1.lins.0.weight`` …) or
 of old releases (``conv1.lin.weight``, the filters of all hops side by side).
 
-The other systems are known by their keys: ``fc0.weight`` of an MLP (inputs ``taxel * 2 + polarity``), a
-``conv1.lin.weight`` with ``conv1.bias`` of a GCN (with self loops), ``conv1.weight`` of a grid-based CNN, whose picture
-is flattened channel by channel.
-
 torch is imported here only, late, and always with ``weights_only=True``: files that hold code are refused.
 """
 
@@ -21,7 +17,7 @@ import pickle
 import re
 import warnings
 import zipfile
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from typing import Any, NoReturn
 
 import numpy as np
@@ -30,8 +26,7 @@ from spikeloom.compiler.checkpoint import Checkpoint, layers_of
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.names import printable
 from spikeloom.compiler.formats.tensors import Arrays, Shape, faults_of, size, taxel_faults, wanted_dense
-from spikeloom.compiler.systems import GCN, GRID_CNN, MLP, TACTILESGNET, TITLES, Grid, kernel_of, window_forms
-from spikeloom.compiler.types import IntArray, JsonObject
+from spikeloom.compiler.types import JsonObject
 
 CHANNELS = 2
 """Polarities of a recording; old keys do not say how many channels a hop has."""
@@ -47,7 +42,7 @@ BETA, THETA = 0.2, 0.5
 """Decay and threshold of the released code; files in its layout do not hold them."""
 
 
-def read_torch(where: str, content: bytes, run: int, system: str | None, cells: IntArray | None) -> Checkpoint:
+def read_torch(where: str, content: bytes, run: int) -> Checkpoint:
     """Read the content of a torch file, called `where` in messages; raises as :func:`read_checkpoint`."""
     loaded = _load(where, content)
     if isinstance(loaded, dict) and "net_list" in loaded:
@@ -59,11 +54,8 @@ def read_torch(where: str, content: bytes, run: int, system: str | None, cells: 
     if not 0 <= run < len(states):
         held = "only run 0" if len(states) == 1 else f"runs 0 to {len(states) - 1}"
         raise ModelError(f"{where}: --run {run}: the file holds {held}; choose one that it holds")
-    arrays = _arrays(where, states[run], len(content), system)
-    system = system or _system_of(arrays)
-    arrays = _unified(where, arrays, system)
     return Checkpoint(
-        **layers_of(arrays),
+        **layers_of(_unified(where, _arrays(where, states[run], len(content)))),
         beta=BETA,
         theta=THETA,
         assumed=("beta", "theta"),
@@ -71,37 +63,6 @@ def read_torch(where: str, content: bytes, run: int, system: str | None, cells: 
         runs=len(states),
         training=_training(loaded, run, len(states)) if layout == "released" else None,
         sha256=hashlib.sha256(content).hexdigest(),
-        system=system,
-        grid=_grid(where, arrays, cells) if system == GRID_CNN else None,
-    )
-
-
-def _system_of(names: Collection[str]) -> str:
-    """System that the names of the tensors belong to."""
-    if "fc0.weight" in names:
-        return MLP
-    if "conv1.weight" in names:
-        return GRID_CNN
-    if "conv1.lin.weight" in names and "conv1.bias" in names:
-        return GCN
-    return TACTILESGNET
-
-
-def _grid(where: str, arrays: Arrays, cells: IntArray | None) -> Grid:
-    """Which of the two forms of the grid a network was trained on, which the number of places tells."""
-    if cells is None:
-        raise ModelError(f"{where}: where the taxels lie on the grid is not in this file; name the sensor")
-    filters, features, _ = arrays["conv1.hops"].shape
-    kernel, places = kernel_of(filters), arrays["fc1.weight"].shape[1] // features
-    forms = window_forms(cells, kernel)
-    counts = {form: math.prod(grid.places(kernel)) for form, grid in forms.items()}
-    for form, count in counts.items():
-        if count == places:
-            return forms[form]
-    sizes = " or ".join(f"{count} (padding {form})" for form, count in counts.items())
-    raise ModelError(
-        f"{where}: fc1 was trained on {places} places, a window of {kernel} * {kernel} on this sensor has {sizes}; "
-        "give the sensor that it was trained on"
     )
 
 
@@ -135,7 +96,7 @@ def _load(where: str, content: bytes) -> Any:
         raise ModelError(f"{where}: {DAMAGED if known else NOT_A_CHECKPOINT}") from error
 
 
-def _arrays(where: str, state: Any, file_size: int, system: str | None) -> Arrays:
+def _arrays(where: str, state: Any, file_size: int) -> Arrays:
     """Convert the tensors of a state dict to float32 arrays."""
     import torch
 
@@ -151,7 +112,7 @@ def _arrays(where: str, state: Any, file_size: int, system: str | None) -> Array
         if (fault := _tensor_fault(value, file_size)) is not None
     ]
     if faults:
-        _refuse(where, faults, system or _system_of(set(map(str, state))))
+        _refuse(where, faults)
     return {str(name): value.detach().to(torch.float32).numpy() for name, value in state.items()}
 
 
@@ -168,41 +129,8 @@ def _tensor_fault(value: Any, file_size: int) -> str | None:
     return None
 
 
-def _unified(where: str, arrays: Arrays, system: str) -> Arrays:
-    """Check everything and bring all key styles to the names of our own format."""
-    if system == TACTILESGNET:
-        return _unified_hops(where, arrays)
-    first = {MLP: "fc0.weight", GCN: "conv1.lin.weight", GRID_CNN: "conv1.weight"}[system]
-    bias = "fc0.bias" if system == MLP else "conv1.bias"
-    features = size(arrays, first, 4 if system == GRID_CNN else 2, 0, "features")
-    shapes: dict[str, tuple[int | str, ...]] = {
-        MLP: (features, "taxels * polarities"),
-        GCN: (features, CHANNELS),
-        GRID_CNN: (features, CHANNELS, size(arrays, first, 4, 2, "kernel"), size(arrays, first, 4, 3, "kernel")),
-    }
-    inputs: int | str = features if system == MLP else "places * features"
-    wanted = {first: shapes[system], bias: (features,)} | wanted_dense(arrays, DENSE_STAGES, inputs)
-    faults = faults_of(arrays, wanted, TITLES[system])
-    if not faults:
-        assert isinstance(features, int)
-        faults = taxel_faults(arrays, features)
-        shape = arrays[first].shape
-        if system == MLP and shape[1] % CHANNELS:
-            faults.append(f"fc0.weight has {shape[1]} inputs, not a whole number of taxels with {CHANNELS} polarities")
-        if system == GRID_CNN and shape[2] != shape[3]:
-            faults.append(f"conv1.weight has a window of {shape[2]} * {shape[3]}, wanted a square one")
-    if faults:
-        _refuse(where, faults, system)
-    weight = arrays.pop(first)
-    if system == GRID_CNN:
-        filters = weight.transpose(2, 3, 0, 1).reshape(-1, len(weight), CHANNELS)
-    else:
-        filters = weight.reshape(len(weight), -1, CHANNELS).transpose(1, 0, 2)
-    return {"conv1.hops": filters, "conv1.bias": arrays.pop(bias), **arrays}
-
-
-def _unified_hops(where: str, arrays: Arrays) -> Arrays:
-    """The same of a TactileSGNet, which has two key styles."""
+def _unified(where: str, arrays: Arrays) -> Arrays:
+    """Check everything and bring both key styles to the names of our own format."""
     hops = [int(match[1]) for key in arrays if (match := re.fullmatch(r"conv1\.lins\.(0|[1-9]\d?)\.weight", key))]
     features: int | str
     wanted: dict[str, Shape]
@@ -224,7 +152,7 @@ def _unified_hops(where: str, arrays: Arrays) -> Arrays:
         columns = arrays["conv1.lin.weight"].shape[1]
         faults = [f"conv1.lin.weight has {columns} columns, not a whole number of hops with {CHANNELS} channels each"]
     if faults:
-        _refuse(where, faults, TACTILESGNET)
+        _refuse(where, faults)
     if hops:
         filters = np.stack([arrays.pop(f"conv1.lins.{k}.weight") for k in range(len(hops))])
     else:
@@ -233,8 +161,8 @@ def _unified_hops(where: str, arrays: Arrays) -> Arrays:
     return {"conv1.hops": filters, "conv1.bias": arrays.pop(bias), **arrays}
 
 
-def _refuse(where: str, faults: list[str], system: str) -> NoReturn:
-    raise ModelError(f"{where}: {'; '.join(faults)}; give the weights of {TITLES[system]}")
+def _refuse(where: str, faults: list[str]) -> NoReturn:
+    raise ModelError(f"{where}: {'; '.join(faults)}; give the weights of a TactileSGNet")
 
 
 def _training(loaded: Mapping[str, Any], run: int, runs: int) -> JsonObject:

@@ -18,9 +18,9 @@ from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
 from spikeloom.compiler.formats.netx.layout import SUFFIX as NETX
 from spikeloom.compiler.formats.nir.reader import SUFFIX as NIR
-from spikeloom.compiler.formats.nir.reader import NirNetwork, read_nir
+from spikeloom.compiler.formats.nir.reader import read_nir
 from spikeloom.compiler.formats.onnx.reader import SUFFIX as ONNX
-from spikeloom.compiler.formats.onnx.reader import OnnxNetwork, read_onnx
+from spikeloom.compiler.formats.onnx.reader import read_onnx
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.passes.expand import Factored, expand
 from spikeloom.compiler.systems import GRAPH_SYSTEMS, TACTILESGNET, TITLES
@@ -29,7 +29,7 @@ from spikeloom.compiler.text import text
 from spikeloom.compiler.types import FloatArray, IntArray, JsonObject
 from spikeloom.models.graphs import CHOICES, NEUTOUCH, Graph
 from spikeloom.models.sensors import read_layout, sensor_graph
-from spikeloom.models.systems import NO_GRAPH, grid_cells, propagation_of
+from spikeloom.models.systems import NO_GRAPH, propagation_of
 from spikeloom.runtime.inputs.files import shipped
 from spikeloom.runtime.inputs.repeat import NETWORK, refuse
 from spikeloom.runtime.report.console import progress
@@ -111,14 +111,16 @@ def load_network(path: str | Network, arguments: argparse.Namespace, netlist: Ne
         )
     progress("reading the network")
     layout = {"polarities": arguments.polarities, "polarities_first": arguments.polarities_first}
-    found: OnnxNetwork | NirNetwork
     if suffix == ONNX:
-        found, read_as = read_onnx(path, **layout), dict[str, Any]()
+        found = read_onnx(path, **layout)
     else:
         found = read_nir(path, dt=arguments.dt, convention=arguments.convention, **layout)
-        read_as = {"dt": found.steps.dt, "convention": found.steps.convention}
     return LoadedNetwork(
-        network=found.network, sha256=found.sha256, facts=found.facts, format=NETWORKS[suffix].lower(), read_as=read_as
+        network=found.network,
+        sha256=found.sha256,
+        facts=found.facts,
+        format=NETWORKS[suffix].lower(),
+        read_as=found.read_as,
     )
 
 
@@ -202,7 +204,6 @@ def load_checkpoint(path: str, arguments: argparse.Namespace) -> Checkpoint:
     progress("reading the checkpoint")
     if (kind := stated(Path(shipped(path)), "format")) == TRAINED:
         raise ModelError(f"{path}: is {FORMATS[kind]}; compile, verify, inspect and join take it, this is for others")
-    places = sensor_places(getattr(arguments, "taxels", None))
     return read_checkpoint(
         shipped(path),
         run=arguments.run,
@@ -210,5 +211,4 @@ def load_checkpoint(path: str, arguments: argparse.Namespace) -> Checkpoint:
         beta=arguments.beta,
         theta=arguments.theta,
         system=arguments.system,
-        cells=grid_cells(places) if places.shape[1] == 2 else None,
     )

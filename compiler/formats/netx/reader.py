@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +13,10 @@ from scipy import sparse
 from spikeloom.compiler.dynamics import MOST_CLOCKS, MOST_STEPS, NO_CLOCKS, Clocks
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.fixedpoint import BIAS_MANTISSA_MAX, THRESHOLD_MANTISSA_MAX, kept_shares
-from spikeloom.compiler.formats.hdf5 import Tree
+from spikeloom.compiler.formats.assemble import ReadNetwork
+from spikeloom.compiler.formats.hdf5 import AGAIN, Tree, read_hdf5
 from spikeloom.compiler.formats.kernels import convolution
-from spikeloom.compiler.formats.netx.layout import BIAS_EXPONENT, DEFAULT_INPUT_WEIGHT, REMEDY, Block, read_blocks
+from spikeloom.compiler.formats.netx.layout import BIAS_EXPONENT, DEFAULT_INPUT_WEIGHT, Block, blocks_of
 from spikeloom.compiler.ir import (
     INPUT,
     MANTISSA,
@@ -39,18 +39,9 @@ OWN = "spikeloom"
 """Group of what our writer adds; others do not read it."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class NetxNetwork:
-    """A network, and what was found about the file that it is from."""
-
-    network: IntegerNetwork  # The numbers of the file
-    facts: tuple[str, ...]  # What was read and what was assumed, for people
-    sha256: str  # Of the file
-
-
 def read_netx(
     path: str | os.PathLike[str], *, polarities: int | None = None, polarities_first: bool | None = None
-) -> NetxNetwork:
+) -> ReadNetwork[IntegerNetwork]:
     """Read a network; polarities as of :func:`sensor_layout.sensor_layout`.
 
     Raises
@@ -61,18 +52,19 @@ def read_netx(
         If there are no such polarities.
     """
     try:
-        blocks, tree, sha256 = read_blocks(Path(path))
-        network, facts = integers_of(blocks, tree, polarities, polarities_first)
-        return NetxNetwork(network=network, facts=tuple(facts), sha256=sha256)
+        tree, sha256 = read_hdf5(Path(path), "netx file")
+        network, facts = integers_of(tree, polarities, polarities_first)
+        return ReadNetwork(network=network, facts=tuple(facts), sha256=sha256)
     except ModelError as error:
         raise ModelError(f"{path}: {error}") from error
 
 
 def integers_of(
-    blocks: Sequence[Block], tree: Tree, polarities: int | None = None, polarities_first: bool | None = None
+    tree: Tree, polarities: int | None = None, polarities_first: bool | None = None
 ) -> tuple[IntegerNetwork, list[str]]:
-    """Integer network of the layers of a file, and facts; raises as :func:`read_netx`."""
-    shape = _input_shape(blocks)
+    """Integer network of the content of a file, and facts; raises as :func:`read_netx`."""
+    blocks = blocks_of(tree)
+    shape = _input_shape(blocks[0])
     own = _own(tree, math.prod(shape), math.prod(blocks[-1].sizes()))
     if own is None:
         sensor, positions, words = sensor_layout(shape, polarities=polarities, polarities_first=polarities_first)
@@ -103,7 +95,7 @@ def integers_of(
         ]
         facts.append(_fact(block, populations[-1], max(len(planes) for planes in stored.values())))
     if not populations:
-        raise ModelError(f"has no layer of neurons; {REMEDY}")
+        raise ModelError(f"has no layer of neurons; {AGAIN}")
     voters = populations[-1].size
     label = np.arange(voters) if own is None else own[1]
     facts.append(f"classes: the spikes of {populations[-1].name}, {'a neuron each' if own is None else 'in groups'}")
@@ -117,29 +109,28 @@ def integers_of(
     return network, facts
 
 
-def _input_shape(blocks: Sequence[Block]) -> tuple[int, ...]:
-    first = blocks[0]
+def _input_shape(first: Block) -> tuple[int, ...]:
     if first.type == "input":
         return first.sizes()
     if first.type in ("dense", "dense_rec"):
         weight = first.integers("weight")
         if weight.ndim == 2 and weight.size:
             return (weight.shape[1],)
-        return (first.number_of("inFeatures"),)
+        return (first.few("inFeatures")[0],)
     raise first.fail("the shape of its input is nowhere, wanted is a layer of type input before it; add one")
 
 
 def _synapses(block: Block, shape: tuple[int, ...]) -> tuple[Sparse, tuple[int, ...]]:
     """Weights of a layer, csr_array (neurons, what it receives) int64, and the shape of its neurons."""
-    delay = block.entries.get("delay")
+    delay = block.values.get("delay")
     if isinstance(delay, np.ndarray) and np.any(block.integers("delay")):
         raise block.fail("has synaptic delays, allowed are none here; train without")
     if block.type == "input":
         if block.number:
             raise block.fail("is not the first; export one network")
-        gain = block.number_of("weight") if "weight" in block.entries else DEFAULT_INPUT_WEIGHT
+        gain = block.few("weight")[0] if "weight" in block.values else DEFAULT_INPUT_WEIGHT
         return sparse.csr_array(sparse.identity(math.prod(shape), dtype=np.int64, format="csr") * gain), shape
-    if "weight" in block.entries and block.inner("weight") is not None:
+    if "weight" in block.values and block.inner("weight") is not None:
         raise block.fail("has complex weights, allowed are real ones; use CUBA neurons")
     if block.type in ("dense", "dense_rec"):
         neurons = math.prod(block.sizes())
@@ -154,7 +145,7 @@ def _matrix(block: Block, key: str, neurons: int, received: int) -> IntArray:
     weight = weight.reshape(neurons, -1) if weight.ndim == 1 and weight.size == neurons * received else weight
     if weight.shape != (neurons, received):
         raise block.fail(
-            f"{key} has the shape {list(weight.shape)}, wanted {[neurons, received]}; the shapes disagree, {REMEDY}"
+            f"{key} has the shape {list(weight.shape)}, wanted {[neurons, received]}; the shapes disagree, {AGAIN}"
         )
     return weight
 
@@ -166,17 +157,17 @@ def _conv(block: Block, shape: tuple[int, ...]) -> tuple[Sparse, tuple[int, ...]
     if weight.ndim != 4 or not weight.size or len(shape) != 3:
         raise block.fail(
             f"weight has the shape {list(weight.shape)} and its input {list(shape)}, wanted are (filters, channels, "
-            f"height, width) and (channels, height, width); {REMEDY}"
+            f"height, width) and (channels, height, width); {AGAIN}"
         )
-    stride, dilation, groups = block.pair("stride"), block.pair("dilation"), block.number_of("groups")
-    padding = [(zeros, zeros) for zeros in block.pair("padding")]
+    stride, dilation, groups = block.few("stride", 2), block.few("dilation", 2), block.few("groups")[0]
+    padding = [(zeros, zeros) for zeros in block.few("padding", 2)]
     with block.named():
         matrix, out = convolution(
             shape, weight.astype(np.float64), stride=stride, padding=padding, dilation=dilation, groups=groups
         )
     declared = block.sizes()
     if declared != out:
-        raise block.fail(f"gives {list(out)}, the file says {list(declared)}; {REMEDY}")
+        raise block.fail(f"gives {list(out)}, the file says {list(declared)}; {AGAIN}")
     return matrix.astype(np.int64), out
 
 
@@ -200,27 +191,27 @@ def _planes(block: Block, weight: Sparse) -> list[tuple[Sparse, int]]:
 
 
 def _population(block: Block, size: int, shape: tuple[int, ...]) -> IntegerPopulation:
-    neuron = block.inner("neuron")
-    if neuron is None:
+    entries = block.inner("neuron")
+    if entries is None:
         raise block.fail("has no neuron, so its membranes are the result, and a chip counts spikes; remove it")
-    kind = neuron.get("type")
+    neuron, kind = replace(block, values=entries), entries.get("type")
     if kind not in NEURONS:
         raise block.fail(
             f"has neurons of type {str(kind)[:20]!r}, allowed are {' and '.join(NEURONS)}; train with them"
         )
-    graded = neuron.get("gradedSpike")
-    bits = neuron.get("messageBits")
+    graded = entries.get("gradedSpike")
+    bits = entries.get("messageBits")
     if any(isinstance(value, np.ndarray) and np.any(value) for value in (graded, bits)):
         raise block.fail("sends graded spikes, which Loihi 1 does not have; train without")
     for key, allowed in (("refDelay", 1), ("wgtExp", 0)):
-        if key in neuron and block.number_of(key, neuron) != allowed:
-            raise block.fail(f"{key} is {block.number_of(key, neuron)}, allowed is {allowed}; train it so")
-    decay_u, decay_v = block.number_of("iDecay", neuron) - 1, block.number_of("vDecay", neuron)
+        if key in entries and neuron.few(key)[0] != allowed:
+            raise block.fail(f"{key} is {neuron.few(key)[0]}, allowed is {allowed}; train it so")
+    decay_u, decay_v = neuron.few("iDecay")[0] - 1, neuron.few("vDecay")[0]
     if not (0 <= decay_u <= 4095 and 0 <= decay_v <= 4095):
         raise block.fail(
             f"has iDecay {decay_u + 1} and vDecay {decay_v}, allowed are 1 to 4096 and 0 to 4095; train it again"
         )
-    threshold = block.number_of("vThMant", neuron)
+    threshold = neuron.few("vThMant")[0]
     if not 0 <= threshold <= THRESHOLD_MANTISSA_MAX:
         raise block.fail(f"vThMant is {threshold}, allowed are 0 to {THRESHOLD_MANTISSA_MAX}; train it again")
     bias = _bias(block, size, shape)
@@ -241,11 +232,11 @@ def _population(block: Block, size: int, shape: tuple[int, ...]) -> IntegerPopul
 
 def _bias(block: Block, size: int, shape: tuple[int, ...]) -> IntArray:
     """Bias of each neuron, in weight steps: one for all, one for a channel, or one each."""
-    if "bias" not in block.entries:
+    if "bias" not in block.values:
         return np.zeros(size, np.int64)
     values = block.integers("bias").ravel()
     if values.size not in (1, shape[0], size):
-        raise block.fail(f"bias has {values.size} values for {size} neurons; the shapes disagree, {REMEDY}")
+        raise block.fail(f"bias has {values.size} values for {size} neurons; the shapes disagree, {AGAIN}")
     if np.any(np.abs(values) > BIAS_MANTISSA_MAX):
         raise block.fail(
             f"has biases up to {np.abs(values).max()}, allowed are {BIAS_MANTISSA_MAX} steps; train it again"
@@ -259,12 +250,12 @@ def _own(tree: Tree, inputs: int, voters: int) -> tuple[Input, IntArray] | None:
     entries = tree.get(OWN)
     if not isinstance(entries, dict):
         return None
-    said = Block(number=-1, type=OWN, entries=entries)
+    said = Block(number=-1, type=OWN, values=entries)
     limits = {"taxels": 2**20, "polarities": 2**20, "clocks": MOST_CLOCKS}
     limits |= {"clock_steps": MOST_STEPS, "bins": MOST_STEPS}
-    stated = {"bins": 1} | {key: said.number_of(key) for key in limits if key in entries or key != "bins"}
+    stated = {"bins": 1} | {key: said.few(key)[0] for key in limits if key in entries or key != "bins"}
     if any(not (key != "clocks") <= stated[key] <= most for key, most in limits.items()):
-        raise ModelError(f"group {OWN} describes no sensor; {REMEDY}")
+        raise ModelError(f"group {OWN} describes no sensor; {AGAIN}")
     taxels, polarities, channels, steps, bins = (stated[key] for key in limits)
     clocks = Clocks(channels=channels, steps=steps) if channels else NO_CLOCKS
     sensor = Input(taxels=taxels, polarities=polarities, clocks=clocks, bins=bins)
@@ -272,7 +263,7 @@ def _own(tree: Tree, inputs: int, voters: int) -> tuple[Input, IntArray] | None:
     if sensor.size != inputs or label.size != voters or label.min() < 0 or label.max() >= voters:
         raise ModelError(
             f"group {OWN} is for {sensor.size} inputs and {label.size} voting neurons, the layers have {inputs} and "
-            f"{voters}; {REMEDY}"
+            f"{voters}; {AGAIN}"
         )
     return sensor, label
 

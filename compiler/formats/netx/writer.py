@@ -18,7 +18,6 @@ import numpy as np
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.fixedpoint import BIAS_MANTISSA_MAX, MEMBRANE_SHIFT, THRESHOLD_MANTISSA_MAX, round_half_even
 from spikeloom.compiler.formats.hdf5 import Tree, hdf5_bytes
-from spikeloom.compiler.formats.netx.layout import blocks_of
 from spikeloom.compiler.formats.netx.reader import OWN, integers_of
 from spikeloom.compiler.interpret import run_integer
 from spikeloom.compiler.ir import INPUT, IntegerNetwork, IntegerPopulation
@@ -176,8 +175,7 @@ def moved_spikes(
     network: IntegerNetwork, blocks: Sequence[DenseLayer], events: BoolArray
 ) -> dict[str, tuple[int, int]]:
     """Spikes of each layer that the rounding moves, and how many the netlist has; events (samples, steps, channels)."""
-    tree = tree_of(network, blocks)
-    written, _ = integers_of(blocks_of(tree), tree)
+    written, _ = integers_of(tree_of(network, blocks))
     before, after = (run_integer(one, events).spikes for one in (network, written))
     return {
         block.name: (int(np.count_nonzero(a != b)), int(np.count_nonzero(a)))

@@ -1,4 +1,4 @@
-"""Read a NIR file as a flat graph of nodes, nested graphs resolved, trusting nothing in it.
+"""Read a NIR file as a flat graph of nodes in order, nested graphs resolved, trusting nothing in it.
 
 The layout is that of nir 1.0: ``version``; ``node``, a graph with ``type``, ``nodes`` (a group each, with ``type`` and
 its parameters) and ``edges`` (pairs of names). A nested graph is a node; what goes into it reaches its Input, what
@@ -16,20 +16,26 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import networkx as nx
 import numpy as np
 
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.formats.hdf5 import Part, Tree, read_hdf5
+from spikeloom.compiler.formats.hdf5 import AGAIN, Part, Tree, read_hdf5
 from spikeloom.compiler.formats.names import printable
-from spikeloom.compiler.types import FloatArray
-
-DAMAGED = "export it again"
 
 GRAPH, INPUT_NODE, OUTPUT_NODE = "NIRGraph", "Input", "Output"
+
+SPIKING = ("CubaLIF", "IF", "LIF", "Threshold")
 
 NODE_LIMIT = 10_000
 NESTING = 8
 """Nodes of a file and graphs within graphs that are read."""
+
+SHOWN = 8
+"""Nodes of a circle that are named."""
+
+Late = Mapping[str, tuple[str, ...]]
+"""Recurrent spiking nodes, and the nodes from which that comes."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -38,40 +44,10 @@ class Node(Part):
 
     name: str  # With the names of the graphs that it is in, ``a.b``
     type: str  # ``LIF`` …
-    values: Tree  # Its parameters
     metadata: Tree  # What it says beside them
 
     def __str__(self) -> str:
         return f"node {printable(self.name)} ({printable(self.type)})"
-
-    def has(self, key: str) -> bool:
-        """Whether there is such a parameter."""
-        return self.values.get(key) is not None
-
-    def numbers(self, key: str) -> FloatArray:
-        """A parameter as float64, of its own shape; ModelError if there is none, or it is no finite numbers."""
-        found = self.values.get(key)
-        if found is None:
-            raise self.fail(f"has no {key}; {DAMAGED}")
-        if not isinstance(found, np.ndarray):
-            raise self.fail(f"{key} is no array of numbers; {DAMAGED}")
-        array = found.astype(np.float64)
-        if not np.all(np.isfinite(array)):
-            bad = int(np.count_nonzero(~np.isfinite(array)))
-            raise self.fail(f"{key} has {bad} of {array.size} values NaN or infinite; train it again")
-        return array
-
-    def whole(self, key: str, length: int | None = None) -> tuple[int, ...]:
-        """A parameter as integers, flat; a single one is repeated to `length`."""
-        array = self.numbers(key).ravel()
-        if not array.size or np.any(array != np.rint(array)) or np.any(np.abs(array) > 2**31):
-            raise self.fail(f"{key} is no whole number; {DAMAGED}")
-        values = tuple(int(value) for value in array)
-        if length is not None and len(values) == 1:
-            values *= length
-        if length is not None and len(values) != length:
-            raise self.fail(f"{key} has {len(values)} values, wanted {length}; {DAMAGED}")
-        return values
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -95,14 +71,14 @@ class Graph:
 
 def read_graph(path: Path) -> Graph:
     """Read a file; ModelError, without the path, if it is none or inconsistent."""
-    return graph_of(*read_hdf5(path, "NIR file", DAMAGED))
+    return graph_of(*read_hdf5(path, "NIR file"))
 
 
 def graph_of(tree: Tree, sha256: str) -> Graph:
     """Graph of the content of a file; raises as :func:`read_graph`."""
     root = tree.get("node")
     if not isinstance(root, dict) or "type" not in root:
-        raise ModelError(f"has no node, so it is no NIR file; {DAMAGED}")
+        raise ModelError(f"has no node, so it is no NIR file; {AGAIN}")
     if _type(root) != GRAPH:
         root = {"type": GRAPH, "nodes": {"node": root}, "edges": []}
     nodes, edges = _flat(root, "", NESTING, [NODE_LIMIT])
@@ -133,7 +109,7 @@ def _flat(graph: Tree, above: str, nesting: int, left: list[int]) -> tuple[dict[
         raise ModelError(f"has graphs nested deeper than {NESTING}; export a flat one")
     members = graph.get("nodes")
     if not isinstance(members, dict) or not members:
-        raise ModelError(f"{where} has no nodes; {DAMAGED}")
+        raise ModelError(f"{where} has no nodes; {AGAIN}")
     nodes: dict[str, Node] = {}
     edges: list[tuple[str, str]] = []
     ends: dict[str, tuple[str, str]] = {}
@@ -143,7 +119,7 @@ def _flat(graph: Tree, above: str, nesting: int, left: list[int]) -> tuple[dict[
         if left[0] < 0:
             raise ModelError(f"has more than {NODE_LIMIT} nodes; this is no network of one chip")
         if not isinstance(entry, dict) or not _type(entry):
-            raise ModelError(f"node {printable(full)} has no type; {DAMAGED}")
+            raise ModelError(f"node {printable(full)} has no type; {AGAIN}")
         if _type(entry) == GRAPH:
             inner, pairs = _flat(entry, full, nesting - 1, left)
             ends[name] = (_end(inner, full, INPUT_NODE), _end(inner, full, OUTPUT_NODE))
@@ -160,7 +136,7 @@ def _flat(graph: Tree, above: str, nesting: int, left: list[int]) -> tuple[dict[
             if name not in ends:
                 raise ModelError(
                     f"{where} has an edge {printable(source)} -> {printable(target)}, there is no node "
-                    f"{printable(name)}; {DAMAGED}"
+                    f"{printable(name)}; {AGAIN}"
                 )
         edges.append((ends[source][1], ends[target][0]))
     return nodes, edges
@@ -170,7 +146,7 @@ def _end(inner: Mapping[str, Node], where: str, kind: str) -> str:
     """The only Input or Output of a nested graph itself, not of those in it."""
     found = [name for name, node in inner.items() if node.type == kind]
     if len(found) != 1:
-        raise ModelError(f"graph {printable(where)} has {len(found)} nodes of type {kind}, one is allowed; {DAMAGED}")
+        raise ModelError(f"graph {printable(where)} has {len(found)} nodes of type {kind}, one is allowed; {AGAIN}")
     return found[0]
 
 
@@ -182,5 +158,65 @@ def _pairs(graph: Tree, where: str) -> list[tuple[str, str]]:
         not isinstance(pair, list) or len(pair) != 2 or not all(isinstance(name, str) for name in pair)
         for pair in edges
     ):
-        raise ModelError(f"{where} has no list of edges; {DAMAGED}")
+        raise ModelError(f"{where} has no list of edges; {AGAIN}")
     return [(source, target) for source, target in edges]
+
+
+def loops(graph: Graph) -> Late:
+    """Recurrent nodes; ModelError if some feed each other in a circle that is no recurrent layer.
+
+    NIR says nothing of delays: its neurons are equations in continuous time. In steps, the frameworks that write or
+    read loops mean the spikes of the step before, as the chip does. So a loop through one spiking node, and stages that
+    are no neurons, is a recurrent layer, fed by its own spikes a step late. A loop through several layers is refused:
+    it takes the chip a step for each.
+    """
+    every = set(graph.edges)
+    found: dict[str, tuple[str, ...]] = {}
+    for members in nx.strongly_connected_components(nx.DiGraph(graph.edges)):
+        if len(members) == 1 and not every & {(name, name) for name in members}:
+            continue
+        ring = [name for name in graph.nodes if name in members]
+        neurons = [name for name in ring if graph.nodes[name].type in SPIKING]
+        pairs = [(source, target) for source, target in graph.edges if {source, target} <= members]
+        if len(neurons) > 1:
+            raise ModelError(
+                f"nodes feed each other in a circle ({_circle(pairs)}) with {len(neurons)} spiking ones in it; a spike "
+                "takes the chip a step from one to the next, so it would come back late: only a layer may feed itself, "
+                "train without the rest"
+            )
+        rest = [pair for pair in pairs if pair[1] not in neurons]
+        if not nx.is_directed_acyclic_graph(nx.DiGraph(rest)):
+            raise ModelError(
+                f"nodes feed each other in a circle ({_circle(rest)}) without neurons, so nothing in it takes a step; "
+                "put a spiking node into it or train without"
+            )
+        for source, target in graph.edges:
+            if target in ring and target not in neurons and source not in members:
+                raise graph.nodes[target].fail(
+                    f"is in the loop of {printable(neurons[0])} and receives {printable(source)} too, of which nothing "
+                    "tells the step; give each a stage of its own"
+                )
+        found[neurons[0]] = tuple(source for source, target in pairs if target == neurons[0])
+    return found
+
+
+def in_order(graph: Graph, late: Late) -> tuple[str, ...]:
+    """Names of the nodes, each after those that feed it, apart from what comes a step late."""
+    now = nx.DiGraph()
+    now.add_nodes_from(graph.nodes)
+    now.add_edges_from((source, target) for source, target in graph.edges if source not in late.get(target, ()))
+    for name, node in graph.nodes.items():
+        if not now.in_degree(name) and node.type != INPUT_NODE:
+            raise node.fail(
+                f"receives nothing{' but its own spikes' if name in late else ''}, so the input does not reach it; "
+                "remove it"
+            )
+    place = {name: number for number, name in enumerate(graph.nodes)}
+    return tuple(name for ready in nx.topological_generations(now) for name in sorted(ready, key=place.__getitem__))
+
+
+def _circle(pairs: list[tuple[str, str]]) -> str:
+    """One circle among edges, in the direction in which it runs."""
+    circle = [printable(source) for source, _ in nx.find_cycle(nx.DiGraph(pairs))]
+    shown = circle if len(circle) <= SHOWN else [*circle[: SHOWN - 1], "…"]
+    return " -> ".join([*shown, circle[0]])

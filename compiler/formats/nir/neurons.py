@@ -1,155 +1,87 @@
-"""Neurons of NIR in steps: from time constants to what a step keeps, and what the numbers tell about their origin.
+"""Spiking nodes of NIR as neurons in steps, and what the reader of a file would want to check about them.
 
-NIR neurons are differential equations and a file has no time step. In steps of `dt` a membrane with time constant tau
-keeps ``beta``, and the rest, ``1 - beta``, comes from ``v_leak + r * I``:
-
-``euler``
-    ``beta = 1 - dt / tau``, the forward Euler method, which snnTorch, Norse and SpikingJelly mean;
-``exponential``
-    ``beta = exp(-dt / tau)``, exact for an input that is constant over the step, which sinabs means.
-
-An IF neuron keeps everything and gets ``dt * r * I``. A neuron that resets to `v_reset` is one that resets to 0, with
-its threshold, leak and start shifted by it.
+An IF neuron keeps its whole membrane and gets ``dt * r * I``. A neuron that resets to `v_reset` is one that resets to
+0, with its threshold, leak and start shifted by it.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.fixedpoint import decay_registers, kept_shares
-from spikeloom.compiler.formats.nir.file import Node
-from spikeloom.compiler.types import FloatArray
-
-CONVENTIONS = ("euler", "exponential")
+from spikeloom.compiler.formats.names import printable
+from spikeloom.compiler.formats.nir.file import Graph, Node
+from spikeloom.compiler.formats.nir.stages import Value, filtered, scaled
+from spikeloom.compiler.formats.nir.steps import TOLERANCE, Steps, shared, spread, written_step
+from spikeloom.compiler.ir import Input
+from spikeloom.compiler.types import FloatArray, IntArray
 
 SOFT = ("subtract", "soft")
 """Words by which exporters tell a reset that leaves what exceeds the threshold."""
 
-SPIKING = ("CubaLIF", "IF", "LIF", "Threshold")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Steps:
-    """How time constants become decays."""
-
-    dt: float  # Seconds of a step
-    convention: str  # {"euler", "exponential"}; see the module
-
-    def keeps(self, node: Node, key: str, size: int, shape: tuple[int, ...]) -> FloatArray:
-        """Share that a step keeps, of a time constant, (size,); ModelError if there is none in this convention."""
-        tau = spread(node, key, size, shape)
-        if np.any(tau <= 0):
-            raise node.fail(f"{key} is {tau.min():g}, allowed are numbers above 0; train it again")
-        if self.convention == "exponential":
-            return np.asarray(np.exp(-self.dt / tau))
-        kept = 1 - self.dt / tau
-        if np.any(kept < -TOLERANCE):
-            written = written_for(node)
-            hint = "" if written is None else f" (its r is tau / {written:g}, so it was written in steps of that)"
-            raise node.fail(
-                f"{key} is {tau.min():g} s, shorter than the step of {self.dt:g} s, which the Euler convention cannot "
-                f"have{hint}; give another --dt, or --convention exponential"
-            )
-        return np.maximum(kept, 0)
-
-
-TOLERANCE = 1e-6
-"""What float32 leaves of equal numbers."""
-
-
-def written_for(node: Node) -> float | None:
-    """Step that a file was written in, where the parameters of a neuron tell: `r` is tau over it, and not 1.
-
-    Then a step adds its input as it is; snnTorch and SpikingJelly write so.
-    """
-    if not node.has("r"):
-        return None
-    key = {"LIF": "tau", "LI": "tau", "CubaLIF": "tau_mem"}.get(node.type)
-    r = node.numbers("r").ravel()
-    tau = node.numbers(key).ravel() if key and node.has(key) else np.ones(1)
-    if 0 in (tau.size, r.size) or (tau.size != r.size and 1 not in (tau.size, r.size)) or np.all(r == 1):
-        return None
-    with np.errstate(all="ignore"):
-        step = tau / r
-    same = step[0] > 0 and np.ptp(step) <= TOLERANCE * step[0]
-    return float(f"{step[0]:.6g}") if same else None
-
-
-def spread(node: Node, key: str, size: int, shape: tuple[int, ...]) -> FloatArray:
-    """A parameter for each neuron, (size,): one for all, one each, or one that broadcasts against `shape`."""
-    values = node.numbers(key)
-    if values.size == 1:
-        return np.full(size, float(values.ravel()[0]))
-    if values.size == size:
-        return values.ravel()
-    try:
-        return np.array(np.broadcast_to(values, shape)).ravel()
-    except ValueError:
-        raise node.fail(
-            f"{key} has the shape {list(values.shape)}, it gets {list(shape)}; the shapes must be equal, export it "
-            "again"
-        ) from None
+MOST_DECAYS = 16
+"""Membrane decays within a node; each becomes a layer of its own. A core holds 32."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Neurons:
     """A spiking node in steps, reset to 0; all arrays (neurons,) float64.
 
-    ``i <- alpha * i + gain * (input)``, ``u <- beta * u * (1 - s) + i + drive``, ``s = u > theta``.
+    ``u <- beta * u * (1 - s) + value``, ``s = u > theta``.
     """
 
+    node: Node  # As the file has it
+    value: Value  # What it gets, scaled to its membrane, with its leak
     beta: FloatArray
-    alpha: float
-    gain: FloatArray
-    drive: FloatArray
+    gain: FloatArray  # By which its input was scaled
     theta: FloatArray
     reset: FloatArray
+    groups: list[IntArray]  # Its neurons by their decays
 
 
-def neurons_of(node: Node, size: int, shape: tuple[int, ...], steps: Steps) -> Neurons:
-    """Neurons of a node of a type in ``SPIKING``; ModelError if the chip has no such neurons."""
+def neurons_of(node: Node, value: Value, steps: Steps) -> Neurons:
+    """Neurons of a node of a type in ``SPIKING`` that gets a value; ModelError if the chip has no such neurons."""
+    size, shape = value.size, value.shape
+    if not size:
+        raise node.fail("has no neurons; export it again")
     _require_reset(node)
-    none = np.zeros(size)
-    if node.type == "Threshold":
-        theta = spread(node, "threshold", size, shape)
-        found = Neurons(beta=none, alpha=0.0, gain=np.ones(size), drive=none, theta=theta, reset=none)
-    else:
-        found = _leaky(node, size, shape, steps)
-    if np.any(found.theta <= 0):
-        raise node.fail(f"fires {found.theta.min():g} above its reset, allowed are thresholds above it; train it again")
-    return found
 
+    def each(key: str) -> FloatArray:
+        return spread(node, key, size, shape)
 
-def _leaky(node: Node, size: int, shape: tuple[int, ...], steps: Steps) -> Neurons:
-    none = np.zeros(size)
-    r = spread(node, "r", size, shape)
-    reset = spread(node, "v_reset", size, shape) if node.has("v_reset") else none
-    theta = spread(node, "v_threshold", size, shape) - reset
+    nothing, alpha = np.zeros(size), 0.0
+    beta, gain, drive = nothing, np.ones(size), nothing
+    reset = each("v_reset") if node.has("v_reset") else nothing
+    theta = each("threshold" if node.type == "Threshold" else "v_threshold") - reset
     if node.type == "IF":
-        return Neurons(beta=np.ones(size), alpha=0.0, gain=r * steps.dt, drive=none, theta=theta, reset=reset)
-    beta = steps.keeps(node, "tau" if node.type == "LIF" else "tau_mem", size, shape)
-    drive = (1 - beta) * (spread(node, "v_leak", size, shape) - reset)
-    gain, alpha = r * (1 - beta), 0.0
-    if node.type == "CubaLIF":
-        alpha = one(node, "tau_syn", steps.keeps(node, "tau_syn", size, shape))
-        weight = spread(node, "w_in", size, shape) if node.has("w_in") else np.ones(size)
-        gain = gain * weight * (1 - alpha)
-    # r = tau / dt, stored in float32, makes a gain of 1 that is not quite one
-    gain = np.where(np.abs(gain - 1) < TOLERANCE, 1.0, gain)
-    return Neurons(beta=beta, alpha=alpha, gain=gain, drive=drive, theta=theta, reset=reset)
-
-
-def one(node: Node, key: str, decay: FloatArray) -> float:
-    """The decay that all neurons of a node share; ModelError if they have several."""
-    if np.ptp(decay) > TOLERANCE:
+        beta, gain = gain, each("r") * steps.dt
+    elif node.type in ("LIF", "CubaLIF"):
+        beta = steps.keeps(node, "tau" if node.type == "LIF" else "tau_mem", size, shape)
+        drive = (1 - beta) * (each("v_leak") - reset)
+        gain = each("r") * (1 - beta)
+        if node.type == "CubaLIF":
+            alpha = shared(node, "tau_syn", steps.keeps(node, "tau_syn", size, shape))
+            gain = gain * (each("w_in") if node.has("w_in") else np.ones(size)) * (1 - alpha)
+        # r = tau / dt, stored in float32, makes a gain of 1 that is not quite one
+        gain = np.where(np.abs(gain - 1) < TOLERANCE, 1.0, gain)
+    if np.any(theta <= 0):
+        raise node.fail(f"fires {theta.min():g} above its reset, allowed are thresholds above it; train it again")
+    with node.named():
+        own = filtered(value, alpha, gain, nothing) if alpha else scaled(value, gain)
+    decays = np.round(beta / TOLERANCE).astype(np.int64)
+    different = np.unique(decays)
+    if len(different) > MOST_DECAYS:
         raise node.fail(
-            f"{key} is different from neuron to neuron, allowed is one for a layer's currents; use one node for each"
+            f"has {len(different)} different membrane time constants, {MOST_DECAYS} are allowed in a node; train with "
+            "fewer"
         )
-    return float(decay[0]) if decay.size else 0.0
+    groups = [np.flatnonzero(decays == decay) for decay in different]
+    own = replace(own, bias=own.bias + drive)
+    return Neurons(node=node, value=own, beta=beta, gain=gain, theta=theta, reset=reset, groups=groups)
 
 
 def _require_reset(node: Node) -> None:
@@ -161,20 +93,48 @@ def _require_reset(node: Node) -> None:
             )
 
 
-def require_steps(dt: float) -> None:
-    """Refuse a time step that is none."""
-    if not 0 < dt < math.inf:
-        raise OptionError(f"--dt {dt:g}: is no time step; give seconds above 0")
+def facts_of(graph: Graph, steps: Steps, spiking: Sequence[Neurons], sensor: str, clocked: Input) -> list[str]:
+    """How a file was read, its layers, what its input (`sensor`, in words) was taken for, and what files may lose."""
+    version = printable(graph.version) or "of no version"
+    facts = [f"NIR {version}, read in steps of {steps.dt:g} s ({steps.convention})", sensor]
+    for one in spiking:
+        decays = " or ".join(_decay_words(float(one.beta[rows[0]])) for rows in one.groups[:4])
+        fact = f"layer {printable(one.node.name)} ({one.node.type}): {len(one.beta)} neurons, {decays}"
+        fact += f", current {one.value.alpha:.6g}" if one.value.alpha else ""
+        fact += f", fires at v > {_span(one.theta + one.reset)}, then v = {_span(one.reset)}"
+        if np.any(np.abs(one.gain - 1) > 1e-4):
+            fact += f"; a step adds {_span(one.gain)} of its input"
+        facts.append(fact)
+    facts.append(
+        "v goes to its reset as NIR says; a framework that subtracts the threshold instead means another network"
+    )
+    if any(one.node.type == "CubaLIF" for one in spiking):
+        facts.append(
+            "a reset leaves currents as they are, as NIR says; snnTorch's Synaptic with reset 'zero' clears them"
+        )
+    if looped := [printable(one.node.name) for place, one in enumerate(spiking) if place in one.value.terms]:
+        facts.append(
+            f"{', '.join(looped)}: is recurrent, fed by its own spikes of the step before; snnTorch's RLeaky with "
+            "reset 'zero' means this with reset_delay=False, else it loses the input of the step after each spike"
+        )
+    written = written_step(graph)
+    if written is not None and not math.isclose(written, steps.dt, rel_tol=1e-4):
+        facts.append(
+            f"drift: r is tau / {written:g} in every neuron, as of a file written in steps of {written:g} s; in steps "
+            f"of {steps.dt:g} s its decays and gains are others than there"
+        )
+    if clocked.clocks.channels:
+        facts.append("biases that go through a synaptic current come from a channel that always has an event")
+    return facts
 
 
-def decay_words(beta: float) -> str:
-    """A membrane decay, and what the chip makes of it where that differs.
-
-    Examples
-    --------
-    >>> decay_words(0.2), decay_words(0.5)
-    ('decay 0.2 (0.199951 on the chip)', 'decay 0.5')
-    """
+def _decay_words(beta: float) -> str:
+    """A membrane decay, and what the chip makes of it where that differs."""
     _, realised = kept_shares(*decay_registers(beta))
     same = math.isclose(beta, realised, abs_tol=TOLERANCE)
     return f"decay {beta:.6g}" + ("" if same else f" ({realised:.6g} on the chip)")
+
+
+def _span(values: FloatArray) -> str:
+    low, high = float(values.min()), float(values.max())
+    return f"{low:.6g}" if math.isclose(low, high, rel_tol=1e-6, abs_tol=1e-12) else f"{low:.6g} … {high:.6g}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,35 +13,21 @@ from scipy import sparse
 
 from spikeloom.compiler.dynamics import MOST_STEPS, RELAY_WEIGHT, Clocks
 from spikeloom.compiler.errors import ModelError, OptionError
-from spikeloom.compiler.formats.assemble import Layer, assemble, class_of_each, in_order
+from spikeloom.compiler.formats.assemble import Layer, ReadNetwork, assemble, class_of_each, in_order
 from spikeloom.compiler.formats.names import printable, unique_names
-from spikeloom.compiler.formats.nir.facts import SpikingNode, facts_of, hint, stated_step
-from spikeloom.compiler.formats.nir.file import Graph, Node, read_graph
-from spikeloom.compiler.formats.nir.neurons import CONVENTIONS, SPIKING, TOLERANCE, Steps, neurons_of, require_steps
-from spikeloom.compiler.formats.nir.order import in_order as nodes_in_order
-from spikeloom.compiler.formats.nir.order import loops
-from spikeloom.compiler.formats.nir.stages import KNOWN, STAGES, Value, added, filtered, scaled, spikes_of
+from spikeloom.compiler.formats.nir.file import INPUT_NODE, OUTPUT_NODE, SPIKING, Graph, Node, loops, read_graph
+from spikeloom.compiler.formats.nir.file import in_order as nodes_in_order
+from spikeloom.compiler.formats.nir.neurons import Neurons, facts_of, neurons_of
+from spikeloom.compiler.formats.nir.stages import KNOWN, STAGES, Value, added, rows_of, scaled, spikes_of
+from spikeloom.compiler.formats.nir.steps import CONVENTIONS, Steps, require_steps, stated_step, written_step
 from spikeloom.compiler.ir import INPUT, Input, Network, Sparse
 from spikeloom.compiler.sensor_layout import sensor_layout
 from spikeloom.compiler.types import FloatArray, IntArray
 
 SUFFIX = ".nir"
 
-MOST_DECAYS = 16
-"""Membrane decays within a node; each becomes a layer of its own. A core holds 32."""
-
 AXES, ELEMENTS = 8, 2**20
 """Of an input."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class NirNetwork:
-    """A network, and what was found about the file that it is from."""
-
-    network: Network  # In float64
-    facts: tuple[str, ...]  # What was read and what was assumed, for people
-    sha256: str  # Of the file
-    steps: Steps  # How time constants were read
 
 
 def read_nir(
@@ -51,7 +37,7 @@ def read_nir(
     convention: str | None = None,
     polarities: int | None = None,
     polarities_first: bool | None = None,
-) -> NirNetwork:
+) -> ReadNetwork[Network]:
     """Read a network, in steps of `dt` seconds, by default those that the metadata of the file tell.
 
     The `convention` (``euler`` by default) says how time constants become decays, see :mod:`nir.neurons`; polarities
@@ -69,7 +55,9 @@ def read_nir(
         graph = read_graph(Path(path))
         dt = stated_step(graph) if dt is None else dt
         if dt is None:
-            raise OptionError(f"{path}: NIR keeps no time step{hint(graph)}; give --dt SECONDS")
+            written = written_step(graph)
+            hint = "" if written is None else f", but its r is tau / {written:g}, as of steps of {written:g} s"
+            raise OptionError(f"{path}: NIR keeps no time step{hint}; give --dt SECONDS")
         steps = Steps(dt=dt, convention=convention or CONVENTIONS[0])
         require_steps(dt)
         with np.errstate(all="ignore"):  # what is not finite is refused at the end
@@ -80,10 +68,10 @@ def read_nir(
 
 def network_of(
     graph: Graph, steps: Steps, polarities: int | None = None, polarities_first: bool | None = None
-) -> NirNetwork:
+) -> ReadNetwork[Network]:
     """Network of a graph that was read; parameters and errors as of :func:`read_nir`, without the path."""
-    entry, end = graph.one("Input"), graph.one("Output")
-    shape = entry.whole("shape") if entry.has("shape") else ()
+    entry, end = graph.one(INPUT_NODE), graph.one(OUTPUT_NODE)
+    shape = tuple(entry.integers("shape").ravel().tolist()) if entry.has("shape") else ()
     if not shape or len(shape) > AXES or min(shape) < 1 or math.prod(shape) > ELEMENTS:
         raise entry.fail(f"has the shape {list(shape[:AXES])}, allowed are up to {ELEMENTS} values; export it again")
     sensor, positions, words = sensor_layout(shape, polarities=polarities, polarities_first=polarities_first)
@@ -97,22 +85,21 @@ def network_of(
     network = assemble(layers, sensor, place, label)
     facts = facts_of(graph, steps, spiking, f"input {printable(entry.name)}: {words}", sensor)
     facts.append(f"classes: the spikes of {printable(spiking[voters].node.name)} in output {printable(end.name)}")
-    return NirNetwork(network=network, facts=tuple(facts), sha256=graph.sha256, steps=steps)
+    return ReadNetwork(network=network, facts=tuple(facts), sha256=graph.sha256, read_as=asdict(steps))
 
 
-def _walk(graph: Graph, steps: Steps, shape: tuple[int, ...]) -> tuple[list[SpikingNode], Value]:
+def _walk(graph: Graph, steps: Steps, shape: tuple[int, ...]) -> tuple[list[Neurons], Value]:
     """All spiking nodes in order, and what the output gets."""
     received: dict[str, list[str]] = {name: [] for name in graph.nodes}
     for source, target in graph.edges:
         received[target].append(source)
     values: dict[str, Value] = {}
-    forward: dict[str, Value] = {}
-    spiking: list[SpikingNode] = []
-    result: Value | None = None
+    forward: list[Value] = []
+    spiking: list[Neurons] = []
     late = loops(graph)
     for name in nodes_in_order(graph, late):
         node = graph.nodes[name]
-        if node.type == "Input":
+        if node.type == INPUT_NODE:
             if received[name]:
                 raise node.fail("gets values from other nodes; remove these edges")
             values[name] = spikes_of(INPUT, shape)
@@ -121,50 +108,27 @@ def _walk(graph: Graph, steps: Steps, shape: tuple[int, ...]) -> tuple[list[Spik
             value = added([values[source] for source in received[name] if source not in late.get(name, ())])
         if node.type in SPIKING:
             values[name] = spikes_of(len(spiking), value.shape)
-            spiking.append(_spiking(node, value, steps))
-            forward[name] = value
+            spiking.append(neurons_of(node, value, steps))
+            forward.append(value)
         elif node.type in STAGES:
             values[name] = STAGES[node.type](node, value, steps)
         else:
             known = ", ".join(sorted([*SPIKING, *STAGES]))
             raise node.fail(KNOWN.get(node.type, f"is of a type that is not known here, known are {known}; replace it"))
-        if node.type == "Output":
-            result = values[name]
-    assert result is not None, "there is one output"
     for place, one in enumerate(spiking):
-        name = one.node.name
-        if name in late:
+        if one.node.name in late:
             with one.node.named():
-                value = added([forward[name], *(values[source] for source in late[name])])
-            spiking[place] = replace(_spiking(one.node, value, steps), recurrent=True)
+                value = added([forward[place], *(values[source] for source in late[one.node.name])])
+            spiking[place] = neurons_of(one.node, value, steps)
             if len(one.groups) > 1:
                 raise one.node.fail(
                     f"is recurrent and has {len(one.groups)} membrane time constants, which are layers of their own; "
                     "give it one"
                 )
-    return spiking, result
+    return spiking, values[graph.one(OUTPUT_NODE).name]
 
 
-def _spiking(node: Node, value: Value, steps: Steps) -> SpikingNode:
-    if not value.size:
-        raise node.fail("has no neurons; export it again")
-    neurons = neurons_of(node, value.size, value.shape, steps)
-    own = scaled(value, neurons.gain)
-    if neurons.alpha:
-        with node.named():
-            own = filtered(value, neurons.alpha, neurons.gain, np.zeros(value.size))
-    decays = np.round(neurons.beta / TOLERANCE).astype(np.int64)
-    different = np.unique(decays)
-    if len(different) > MOST_DECAYS:
-        raise node.fail(
-            f"has {len(different)} different membrane time constants, {MOST_DECAYS} are allowed in a node; train with "
-            "fewer"
-        )
-    groups = [np.flatnonzero(decays == decay) for decay in different]
-    return SpikingNode(node=node, value=own, neurons=neurons, groups=groups, recurrent=False)
-
-
-def _layers(spiking: Sequence[SpikingNode], positions: IntArray) -> tuple[list[Layer], list[FloatArray]]:
+def _layers(spiking: Sequence[Neurons], positions: IntArray) -> tuple[list[Layer], list[FloatArray]]:
     """A layer for each decay of each node, and what flows into the currents of its neurons in every step."""
     first = np.cumsum([0, *(len(one.groups) for one in spiking)]).tolist()
     named = unique_names([one.node.name for one in spiking])
@@ -172,42 +136,30 @@ def _layers(spiking: Sequence[SpikingNode], positions: IntArray) -> tuple[list[L
     held = []
     for one, name in zip(spiking, named, strict=True):
         for number, rows in enumerate(one.groups, 1):
-            place = len(layers)
             # Neurons of other thresholds are those of one, with their weights and biases in its units.
-            theta = float(one.neurons.theta[rows[0]])
-            units = theta / one.neurons.theta[rows]
+            theta = float(one.theta[rows[0]])
+            value = scaled(rows_of(one.value, rows), theta / one.theta[rows])
             sources: dict[int, Sparse] = {}
-            for source, weight in one.value.terms.items():
-                own = _rows_scaled(weight[rows], units)
+            for source, weight in value.terms.items():
+                weight.eliminate_zeros()
                 if source == INPUT:
-                    sources[INPUT] = own[:, positions]
+                    sources[INPUT] = weight[:, positions]
                     continue
                 for group, columns in enumerate(spiking[source].groups):
-                    sources[first[source] + group] = own[:, columns]
+                    sources[first[source] + group] = weight[:, columns]
             reached = {source: weight for source, weight in sources.items() if weight.nnz}
-            if not reached.keys() - {place}:
-                reached = sources
-            for weight in reached.values():
-                weight.sort_indices()
             layers.append(
                 Layer(
                     name=name if len(one.groups) == 1 else f"{name}_{number}",
-                    beta=float(one.neurons.beta[rows[0]]),
+                    beta=float(one.beta[rows[0]]),
                     theta=theta,
-                    bias=(one.value.bias + one.neurons.drive)[rows] * units,
-                    sources=reached,
-                    alpha=one.value.alpha,
+                    bias=value.bias,
+                    sources=reached if reached.keys() - {len(layers)} else sources,
+                    alpha=value.alpha,
                 )
             )
-            held.append(one.value.held[rows] * units)
+            held.append(value.held)
     return layers, held
-
-
-def _rows_scaled(weight: Sparse, factor: FloatArray) -> Sparse:
-    scaled_rows = weight.copy()
-    scaled_rows.data = scaled_rows.data * np.repeat(factor, np.diff(weight.indptr))
-    scaled_rows.eliminate_zeros()
-    return scaled_rows
 
 
 def _with_held(layers: list[Layer], held: list[FloatArray], sensor: Input) -> tuple[list[Layer], Input]:
@@ -221,50 +173,30 @@ def _with_held(layers: list[Layer], held: list[FloatArray], sensor: Input) -> tu
     depth: dict[int, int] = {INPUT: -1}
     for index in in_order(layers):
         depth[index] = max((depth[source] + 1 for source in layers[index].sources if source != index), default=0)
-    clocked = replace(sensor, clocks=Clocks(channels=1, steps=MOST_STEPS))
+
+    def with_channel(weight: Sparse | None, channel: FloatArray) -> Sparse:
+        """Weights of the input, if there are any, and beside them those of the channel."""
+        own = sparse.csr_array((len(channel), sensor.size)) if weight is None else weight
+        return sparse.hstack([own, sparse.csr_array(channel[:, None])], format="csr")
+
     found = []
-    relays = range(max(depth[index] for index in lasting))  # one a depth, on the way to the deepest
     for index, layer in enumerate(layers):
-        sources = dict(layer.sources)
-        own = held[index] if index in lasting else np.zeros(len(layer.bias))
-        column = _column(own)
-        if INPUT in sources:
-            sources[INPUT] = _beside(sources[INPUT], _column(own if not depth[index] else 0 * own))
-        elif not depth[index]:
-            sources[INPUT] = _beside(_column(np.zeros(len(own)), sensor.size), column)
-        if depth[index] and index in lasting:
-            sources[len(layers) + depth[index] - 1] = column
+        sources, deep = dict(layer.sources), depth[index]
+        if not deep or INPUT in sources:
+            sources[INPUT] = with_channel(sources.get(INPUT), held[index] * (not deep))
+        if deep and index in lasting:
+            sources[len(layers) + deep - 1] = sparse.csr_array(held[index][:, None])
         found.append(replace(layer, sources=sources))
-    for step in relays:
-        weight = _column(np.array([RELAY_WEIGHT]))
-        if not step:
-            weight = _beside(_column(np.zeros(1), sensor.size), weight)
-        found.append(
-            Layer(
-                name=f"always{step + 1}",
-                beta=0.0,
-                theta=1.0,
-                bias=np.zeros(1),
-                sources={INPUT if not step else len(layers) + step - 1: weight},
-                relays=1,
-            )
-        )
-    return found, clocked
+    relay = np.array([RELAY_WEIGHT])
+    for step in range(max(depth[index] for index in lasting)):  # one a depth, on the way to the deepest
+        source = len(layers) + step - 1 if step else INPUT
+        weight = sparse.csr_array(relay[:, None]) if step else with_channel(None, relay)
+        name = f"always{step + 1}"
+        found.append(Layer(name=name, beta=0.0, theta=1.0, bias=np.zeros(1), sources={source: weight}, relays=1))
+    return found, replace(sensor, clocks=Clocks(channels=1, steps=MOST_STEPS))
 
 
-def _column(values: FloatArray, width: int = 1) -> Sparse:
-    """csr_array whose first column is given, the others empty."""
-    rows = np.flatnonzero(values)
-    return sparse.csr_array((values[rows], (rows, np.zeros(len(rows), np.int64))), shape=(len(values), width))
-
-
-def _beside(left: Sparse, right: Sparse) -> Sparse:
-    both = sparse.csr_array(sparse.hstack([left, right], format="csr"))
-    both.sort_indices()
-    return both
-
-
-def _readout(end: Node, result: Value, spiking: Sequence[SpikingNode]) -> tuple[int, IntArray]:
+def _readout(end: Node, result: Value, spiking: Sequence[Neurons]) -> tuple[int, IntArray]:
     """The spiking node whose spikes are counted, and the class of each of its neurons."""
     remedy = "end the network with a spiking layer, one neuron or one group of neurons a class"
     if result.alpha:

@@ -10,11 +10,11 @@ import numpy as np
 from scipy import sparse
 
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.formats.kernels import Padding, block_diagonal, convolution, pooling, same_padding
+from spikeloom.compiler.formats.kernels import Padding, block_diagonal, convolution
 from spikeloom.compiler.formats.nir.file import Node
-from spikeloom.compiler.formats.nir.neurons import Steps, one, spread
+from spikeloom.compiler.formats.nir.steps import Steps, shared, spread
 from spikeloom.compiler.ir import Sparse
-from spikeloom.compiler.types import FloatArray
+from spikeloom.compiler.types import FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -46,6 +46,12 @@ def scaled(value: Value, gain: FloatArray) -> Value:
     rows = sparse.diags_array(gain, format="csr")
     terms = {source: sparse.csr_array(rows @ own) for source, own in value.terms.items()}
     return replace(value, terms=terms, bias=value.bias * gain, held=value.held * gain)
+
+
+def rows_of(value: Value, rows: IntArray) -> Value:
+    """Some elements of a value, flat."""
+    terms = {source: own[rows] for source, own in value.terms.items()}
+    return replace(value, shape=(len(rows),), terms=terms, bias=value.bias[rows], held=value.held[rows])
 
 
 def through(value: Value, matrix: Sparse, shape: tuple[int, ...]) -> Value:
@@ -147,13 +153,14 @@ def _image(node: Node, value: Value, axes: int) -> tuple[int, ...]:
 def _padding(node: Node, kernel: tuple[int, ...], dilation: tuple[int, ...], stride: tuple[int, ...]) -> Padding:
     said = node.values.get("padding")
     if not isinstance(said, str):
-        return [(zeros, zeros) for zeros in node.whole("padding", len(kernel))]
+        return [(zeros, zeros) for zeros in node.few("padding", len(kernel))]
     if said == "valid":
         return [(0, 0)] * len(kernel)
     if said == "same":
         if set(stride) != {1}:
             raise node.fail(f"has the padding 'same' at a stride of {max(stride)}, allowed is 1; export it again")
-        return same_padding(kernel, dilation)
+        total = [step * (size - 1) for size, step in zip(kernel, dilation, strict=True)]
+        return [(zeros // 2, zeros - zeros // 2) for zeros in total]  # the odd zero comes after, as in torch
     raise node.fail(f"has the padding {said[:20]!r}, allowed are numbers, 'same' and 'valid'; export it again")
 
 
@@ -166,11 +173,11 @@ def _conv(node: Node, value: Value, _steps: Steps) -> Value:
         )
     shape, kernel = _image(node, value, axes), weight.shape[2:]
     if node.has("input_shape"):
-        declared = node.whole("input_shape")
+        declared = tuple(node.integers("input_shape").ravel().tolist())
         if declared != shape[1:]:
             raise node.fail(f"is for inputs of {list(declared)}, it gets {list(shape[1:])}; export it again")
-    stride, dilation = node.whole("stride", axes), node.whole("dilation", axes)
-    padding, groups = _padding(node, kernel, dilation, stride), node.whole("groups", 1)[0]
+    stride, dilation = node.few("stride", axes), node.few("dilation", axes)
+    padding, groups = _padding(node, kernel, dilation, stride), node.few("groups")[0]
     with node.named():
         matrix, out = convolution(shape, weight, stride=stride, padding=padding, dilation=dilation, groups=groups)
     result = through(value, matrix, out)
@@ -181,19 +188,20 @@ def _conv(node: Node, value: Value, _steps: Steps) -> Value:
 
 def _pool(node: Node, value: Value, _steps: Steps) -> Value:
     shape = _image(node, value, 2)
-    kernel, stride = node.whole("kernel_size", 2), node.whole("stride", 2)
+    kernel, stride = node.few("kernel_size", 2), node.few("stride", 2)
     padding = _padding(node, kernel, (1, 1), stride)
-    mean = node.type == "AvgPool2d"
-    if max(kernel) > max(shape) + 2 * max(max(pair) for pair in padding):
+    if min(kernel) < 1 or max(kernel) > max(shape) + 2 * max(max(pair) for pair in padding):
         raise node.fail(f"has a window of {list(kernel)} for {list(shape[1:])} places; export it again")
+    share = 1 / math.prod(kernel) if node.type == "AvgPool2d" else 1.0
+    weight = np.full((shape[0], 1, *kernel), share)  # zeros of the padding count
     with node.named():
-        matrix, out = pooling(shape, kernel=kernel, stride=stride, padding=padding, mean=mean)
+        matrix, out = convolution(shape, weight, stride=stride, padding=padding, dilation=(1, 1), groups=shape[0])
     return through(value, matrix, out)
 
 
 def _flatten(node: Node, value: Value, _steps: Steps) -> Value:
-    first = node.whole("start_dim", 1)[0] if node.has("start_dim") else 1
-    last = node.whole("end_dim", 1)[0] if node.has("end_dim") else -1
+    first = node.few("start_dim")[0] if node.has("start_dim") else 1
+    last = node.few("end_dim")[0] if node.has("end_dim") else -1
     axes = len(value.shape)
     first, last = (end + axes if end < 0 else end for end in (first, last))
     if not 0 <= first < axes or not first <= last < axes:
@@ -208,7 +216,7 @@ def _flatten(node: Node, value: Value, _steps: Steps) -> Value:
 def _integrator(node: Node, value: Value, steps: Steps) -> Value:
     """A leaky integrator that does not spike: the synaptic filter of what comes after it."""
     kept = steps.keeps(node, "tau", value.size, value.shape)
-    alpha = one(node, "tau", kept)
+    alpha = shared(node, "tau", kept)
     gain = (1 - kept) * spread(node, "r", value.size, value.shape)
     drive = (1 - kept) * spread(node, "v_leak", value.size, value.shape)
     if not alpha:

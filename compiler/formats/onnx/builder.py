@@ -5,7 +5,6 @@ Operator set 17 with IR version 8, which onnxruntime reads since 1.13. Equal gra
 
 from __future__ import annotations
 
-import importlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -15,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler import __version__
-from spikeloom.compiler.errors import ModelError, OptionError
+from spikeloom.compiler.errors import ModelError
 
 OPSET = 17
 IR_VERSION = 8
@@ -60,7 +59,7 @@ class Nodes:
 
     def add(self, operator: str, inputs: Sequence[str], output: str, **attributes: Any) -> str:
         """Append a node with one output; returns the output's name."""
-        self.nodes.append(package("onnx").helper.make_node(operator, inputs, [output], name=output, **attributes))
+        self.nodes.append(_onnx().helper.make_node(operator, inputs, [output], name=output, **attributes))
         return output
 
     def cast(self, source: str, output: str, kind: npt.DTypeLike) -> str:
@@ -74,7 +73,7 @@ class Nodes:
 
     def graph(self, name: str, inputs: Sequence[Port], outputs: Sequence[Port]) -> Proto:
         """All of it as a message."""
-        onnx = package("onnx")
+        onnx = _onnx()
         ends = [
             [onnx.helper.make_tensor_value_info(port.name, _type(port.kind), list(port.shape)) for port in side]
             for side in (inputs, outputs)
@@ -87,19 +86,15 @@ Model = tuple[Nodes, list[Port], list[Port]]
 """Nodes, inputs and outputs. Of the form ``step`` the first input is ``events`` (batch, channels)."""
 
 
-def package(name: str) -> Any:
-    """Import ``onnx`` or ``onnxruntime``, which load slowly, when it is first needed.
+def _onnx() -> Any:
+    """The package, which loads slowly, so only where it is needed."""
+    import onnx
 
-    Raises OptionError if it is not installed.
-    """
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        raise OptionError(f"{name}: the package is not installed; install it with pip install {name}") from error
+    return onnx
 
 
 def _type(kind: npt.DTypeLike) -> int:
-    return int(package("onnx").helper.np_dtype_to_tensor_dtype(np.dtype(kind)))
+    return int(_onnx().helper.np_dtype_to_tensor_dtype(np.dtype(kind)))
 
 
 def require_room(size: int) -> None:
@@ -123,7 +118,7 @@ def whole_recordings(step: Model, layers: Mapping[str, tuple[int, int]], classes
     layers: neurons and depth of each layer by name; its spikes are shifted back by its depth.
     classes: for the votes.
     """
-    onnx = package("onnx")
+    onnx = _onnx()
     nodes, inputs, outputs = step
     left = {port.name for port in outputs}
     states = [port for port in inputs if f"{port.name}_next" in left]
@@ -199,7 +194,7 @@ def model_bytes(model: Model, *, name: str, about: str, facts: Mapping[str, Any]
     name, about: of the graph; what it says about itself.
     facts: JSON values for the metadata, beside the version of this program.
     """
-    onnx = package("onnx")
+    onnx = _onnx()
     nodes, inputs, outputs = model
     message = onnx.helper.make_model(
         nodes.graph(name, inputs, outputs),
@@ -221,7 +216,7 @@ def model_bytes(model: Model, *, name: str, about: str, facts: Mapping[str, Any]
 
 def port_words(content: bytes) -> tuple[list[str], list[str]]:
     """Inputs and outputs of a model for people, such as ``events uint8 (time, batch, 78)``."""
-    onnx = package("onnx")
+    onnx = _onnx()
     graph = onnx.load_from_string(content).graph
 
     def words(ports: Any) -> list[str]:

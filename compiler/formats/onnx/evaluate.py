@@ -1,12 +1,11 @@
 """Operators on numbers: ONNX's own reference runs them, once the shapes that it infers for their results are allowed.
 
-That is for constants, for the three values that a threshold chooses from, and for positions of elements, by which an
-operator that only moves numbers shows where each goes.
+That is for constants, and for positions of elements: an operator that only moves numbers shows by them where each goes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -14,28 +13,13 @@ import numpy as np
 
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.names import one_line
+from spikeloom.compiler.formats.onnx.affine import Table
 from spikeloom.compiler.formats.onnx.file import BOOL, Array, Node, decimal
-from spikeloom.compiler.formats.onnx.values import Table
 
 Operands = Sequence[Array | None]
 
 FLOATING = (1, 10, 11, 16)
 """Element types that Cast widens to float64."""
-
-COMPARISONS: Mapping[str, Callable[[Any, Any], Any]] = {
-    "Equal": np.equal,
-    "Greater": np.greater,
-    "GreaterOrEqual": np.greater_equal,
-    "Less": np.less,
-    "LessOrEqual": np.less_equal,
-}
-
-_ELEMENTWISE = """
-Abs Add And Cast Ceil Clip Div Exp Floor IsNaN Log Max Mean Min Mod Mul Neg Not Or Pow Reciprocal Relu
-Sigmoid Sign Sqrt Sub Sum Tanh Where Xor
-"""
-POINTWISE = frozenset(_ELEMENTWISE.split()) | frozenset(COMPARISONS)
-"""Operators that act on each element alone, and so on each of the three values that a threshold chooses from."""
 
 MOVES: Mapping[str, tuple[int, ...] | None] = {
     "Concat": None,
@@ -59,10 +43,12 @@ MOVES: Mapping[str, tuple[int, ...] | None] = {
 }
 """Operators whose results are elements of operands, and which operands these are (None: all of them)."""
 
-_WHOLE = """
-BatchNormalization ConstantOfShape Gemm MatMul NonZero Range ReduceMax ReduceMean ReduceMin ReduceProd ReduceSum
+_OTHERS = """
+Abs Add And BatchNormalization Cast Ceil Clip ConstantOfShape Div Equal Exp Floor Gemm Greater GreaterOrEqual IsNaN Less
+LessOrEqual Log MatMul Max Mean Min Mod Mul Neg NonZero Not Or Pow Range Reciprocal ReduceMax ReduceMean ReduceMin
+ReduceProd ReduceSum Relu Sigmoid Sign Sqrt Sub Sum Tanh Xor
 """
-NUMERIC = POINTWISE | frozenset(MOVES) | frozenset(_WHOLE.split())
+NUMERIC = frozenset(MOVES) | frozenset(_OTHERS.split())
 """Operators that are run on numbers. Others are refused, or are linear and run as their matrix."""
 
 LOOPS, LOOP_WORK = ("GatherND", "ScatterElements", "ScatterND"), 64
@@ -86,19 +72,12 @@ def evaluate(node: Node, table: Table, operands: Operands) -> list[Array]:
     if node.op in LOOPS:
         table.spend(LOOP_WORK * max(operand.size for operand in operands if operand is not None))
     with _of_onnx():
-        if node.op == "GatherElements":
-            data, indices = operands
-            return [_gathered(np.asarray(data), np.asarray(indices), int(node.attributes.get("axis", 0)))]
+        if node.op == "GatherElements":  # which the reference takes too long for
+            data, indices = map(np.asarray, operands)
+            axis = range(data.ndim)[int(node.attributes.get("axis", 0))]
+            sizes = [data.shape[axis] if place == axis else length for place, length in enumerate(indices.shape)]
+            return [np.take_along_axis(data[tuple(map(slice, sizes))], indices, axis)]
         return [np.asarray(result) for result in _operator(node, table).run(*operands)]
-
-
-def _gathered(data: Array, indices: Array, axis: int) -> Array:
-    """GatherElements, which the reference takes too long for."""
-    axis = range(data.ndim)[axis]
-    sizes = [length if place != axis else data.shape[axis] for place, length in enumerate(indices.shape)]
-    if len(sizes) != data.ndim or any(size > held for size, held in zip(sizes, data.shape, strict=True)):
-        raise IndexError("indices outside the tensor")
-    return np.take_along_axis(data[tuple(slice(size) for size in sizes)], indices, axis)
 
 
 def misfit(error: Exception) -> ModelError:

@@ -17,13 +17,11 @@ import numpy as np
 import numpy.typing as npt
 
 from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.files import read_whole, require_size
 from spikeloom.compiler.formats.names import one_line, printable
 
 Array = npt.NDArray[Any]
 """float64, int64 or bool."""
-
-SIZE_LIMIT = 2**28
-"""Bytes that a file may have, and its external data: 256 MiB, as of a checkpoint."""
 
 OPSETS = range(9, 27)
 """Versions of the operator set whose operators are known here."""
@@ -116,13 +114,7 @@ def read_model(path: Path) -> Model:
     from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
     from onnx import ModelProto
 
-    if not path.is_file():
-        raise ModelError("no such file; give a file of torch.onnx.export")
-    _require_size(path.stat().st_size)
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise ModelError(f"cannot be read ({error.strerror or error}); check its permissions") from error
+    content = read_whole(path, "network", "give a file of torch.onnx.export")
     proto = ModelProto()
     try:
         proto.ParseFromString(content)
@@ -148,11 +140,6 @@ def read_model(path: Path) -> Model:
     )
 
 
-def _require_size(size: int) -> None:
-    if size > SIZE_LIMIT:
-        raise ModelError(f"more than {SIZE_LIMIT} bytes, the limit of a network; export a smaller one")
-
-
 def _bring_data(graph: Any, folder: Path, digest: Any) -> None:
     """Put data that lie beside the file into its tensors; the onnx package refuses places outside the folder."""
     from onnx.external_data_helper import load_external_data_for_tensor
@@ -164,7 +151,7 @@ def _bring_data(graph: Any, folder: Path, digest: Any) -> None:
         location = next((entry.value for entry in tensor.external_data if entry.key == "location"), "")
         try:
             total += (folder / _text(location)).stat().st_size
-            _require_size(total)
+            require_size(total, "network", "export a smaller one")
             load_external_data_for_tensor(tensor, str(folder))
         except ModelError:
             raise
@@ -240,35 +227,33 @@ def _node(proto: Any) -> Node:
             f"{node}: is of the domain {printable(_text(proto.domain))}, allowed are the operators of ONNX itself; "
             "export without custom operators"
         )
-    attributes = {}
-    for entry in proto.attribute:
-        match entry.type:
-            case entry.FLOAT:
-                value: Any = decimal(entry.f)
-            case entry.INT:
-                value = int(entry.i)
-            case entry.STRING:
-                value = entry.s.decode("utf-8", "replace")
-            case entry.TENSOR:
-                value = _array(entry.t)
-            case entry.GRAPH:
-                value = _graph(entry.g)
-            case entry.FLOATS:
-                value = [decimal(number) for number in entry.floats]
-            case entry.INTS:
-                value = [int(number) for number in entry.ints]
-            case _:
-                raise ModelError(
-                    f"{node}: attribute {printable(_text(entry.name))} is of a kind that is not known; {DAMAGED}"
-                )
-        attributes[_text(entry.name)] = value
+    attributes = {_text(entry.name): _attribute(entry, node) for entry in proto.attribute}
     if node.op == "Dropout":  # passes on what it gets, outside training
         return replace(node, op="Identity", inputs=node.inputs[:1], outputs=node.outputs[:1])
     return replace(node, attributes=attributes)
 
 
+def _attribute(entry: Any, node: Node) -> Any:  # noqa: PLR0911 a kind each
+    match entry.type:
+        case entry.FLOAT:
+            return decimal(entry.f)
+        case entry.INT:
+            return int(entry.i)
+        case entry.STRING:
+            return entry.s.decode("utf-8", "replace")
+        case entry.TENSOR:
+            return _array(entry.t)
+        case entry.GRAPH:
+            return _graph(entry.g)
+        case entry.FLOATS:
+            return [decimal(number) for number in entry.floats]
+        case entry.INTS:
+            return [int(number) for number in entry.ints]
+    raise ModelError(f"{node}: attribute {printable(_text(entry.name))} is of a kind that is not known; {DAMAGED}")
+
+
 def _array(proto: Any) -> Array:
-    """A tensor, widened to float64, int64 or bool."""
+    """A tensor, its numbers widened to float64, int64 or bool."""
     from onnx import numpy_helper
 
     what = f"tensor {printable(_text(proto.name)) or '(no name)'}"
@@ -278,19 +263,11 @@ def _array(proto: Any) -> Array:
             f"truth values in up to {DIMENSIONS}; {DAMAGED}"
         )
     try:
-        return widened(numpy_helper.to_array(proto), what)
+        array = numpy_helper.to_array(proto)
     except (OverflowError, TypeError, ValueError) as error:
         raise ModelError(f"{what}: cannot be read ({one_line(error)}); {DAMAGED}") from error
-
-
-def widened(array: Array, what: str) -> Array:
-    """The same numbers as float64, int64 or bool."""
-    if array.dtype == np.float32 and array.ndim == 0:
-        return np.array(decimal(array))
     if array.dtype.kind == "f":
-        return array.astype(np.float64)
-    if array.dtype.kind == "b":
-        return array.astype(np.bool_)
+        return array.astype(np.float64) if array.ndim or array.dtype != np.float32 else np.array(decimal(array))
     if array.dtype == np.uint64 and np.any(array > np.iinfo(np.int64).max):
         raise ModelError(f"{what}: holds integers above 2**63; {DAMAGED}")
-    return array.astype(np.int64)
+    return array.astype(np.bool_ if array.dtype.kind == "b" else np.int64)

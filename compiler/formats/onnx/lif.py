@@ -13,16 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.formats.onnx.values import (
-    INPUT_ATOM,
-    MEMBRANE,
-    PRODUCT,
-    SPIKE,
-    Affine,
-    Table,
-    diagonal,
-    one_each,
-)
+from spikeloom.compiler.formats.onnx.affine import INPUT_ATOM, MEMBRANE, PRODUCT, SPIKE, Affine, Table, diagonal
 from spikeloom.compiler.ir import Sparse
 from spikeloom.compiler.types import FloatArray
 
@@ -56,44 +47,42 @@ def neurons_of(table: Table, outputs: Mapping[str, Affine]) -> list[Neurons]:
 
     Raises ModelError naming the operator of the first membrane that is none of such neurons, and why.
     """
+    spikes: dict[int, list[int]] = {}
+    for index, atom in enumerate(table.atoms):
+        if atom.kind == SPIKE and table.atoms[atom.of[0]].kind == MEMBRANE:
+            spikes.setdefault(atom.of[0], []).append(index)
     found = []
-    for membrane, definition in table.definitions.items():
+    for membrane in sorted(spikes):
         try:
-            neurons = _read(table, membrane, definition, outputs)
+            found.append(_read(table, membrane, spikes[membrane], outputs))
         except ModelError as error:
-            raise ModelError(f"{table.nodes[membrane]}: {error}") from error
-        if neurons is not None:
-            found.append(neurons)
+            raise ModelError(f"{table.atoms[membrane].node}: {error}") from error
     return found
 
 
-def _read(table: Table, membrane: int, definition: Affine, outputs: Mapping[str, Affine]) -> Neurons | None:
-    points = [index for index, point in enumerate(table.points) if point.membrane == membrane]
-    spikes = [index for index, atom in enumerate(table.atoms) if atom.kind == SPIKE and atom.of[0] in points]
-    if not spikes:
-        return None
-    if len(points) > 1 or len(spikes) > 1:
+def _read(table: Table, membrane: int, spikes: list[int], outputs: Mapping[str, Affine]) -> Neurons:
+    atom, spike = table.atoms[membrane], table.atoms[spikes[0]]
+    assert atom.definition is not None
+    if len(spikes) > 1:
         raise ModelError("is compared in several ways, which is no spike; compare a membrane with one threshold")
-    theta = table.points[points[0]].theta
-    if np.ptp(theta) > 0:
-        raise ModelError(
-            f"has thresholds from {theta.min():g} to {theta.max():g} in one layer; give all its neurons the same one"
-        )
-    terms = dict(definition.terms)
+    if np.ptp(spike.theta) > 0:
+        low, high = spike.theta.min(), spike.theta.max()
+        raise ModelError(f"has thresholds from {low:g} to {high:g} in one layer; give all its neurons the same one")
+    terms = dict(atom.definition.terms)
     previous, gate, beta = _carried(table, membrane, spikes[0], terms, outputs)
-    for atom, weight in terms.items():
-        _require_current(table, atom, weight, previous, membrane)
+    for other, weight in terms.items():
+        _require_current(table, other, weight, previous, membrane)
     return Neurons(
         membrane=membrane,
-        node=table.nodes[membrane],
+        node=atom.node,
         previous=previous,
         gate=gate,
         spike=spikes[0],
         beta=beta,
-        theta=float(theta[0]) if len(theta) else 0.0,
-        strict=table.atoms[spikes[0]].strict,
+        theta=float(spike.theta[0]) if atom.size else 0.0,
+        strict=spike.strict,
         current=terms,
-        bias=definition.bias,
+        bias=atom.definition.bias,
     )
 
 
@@ -108,12 +97,12 @@ def _carried(
         return _already_reset(table, membrane, spike, terms, outputs)
     pair = table.atoms[products[0]].of
     linear = [atom for atom in pair if atom in terms and table.atoms[atom].kind in (INPUT_ATOM, MEMBRANE)]
-    kept = [atom for atom in linear if _decay(terms[atom]) is not None] or linear
+    kept = [atom for atom in linear if diagonal(terms[atom], EQUAL) is not None] or linear
     if len(kept) != 1:
         raise ModelError(f"holds {table.atoms[products[0]]} in a way that is no reset; {RESET}")
     previous = kept[0]
     gate = pair[0] if pair[1] == previous else pair[1]
-    beta, removed = _decay(terms.pop(previous)), _decay(terms.pop(products[0]))
+    beta, removed = diagonal(terms.pop(previous), EQUAL), diagonal(terms.pop(products[0]), EQUAL)
     if beta is None or removed is None:
         raise ModelError(f"mixes or weighs the neurons of {table.atoms[previous]} differently; {RESET}")
     if abs(beta + removed) > EQUAL * max(abs(beta), abs(removed)):
@@ -127,34 +116,23 @@ def _carried(
     return previous, gate if table.atoms[gate].kind == INPUT_ATOM else None, beta
 
 
-def _decay(terms: Sparse) -> float | None:
-    """The one factor of all neurons, each on itself; factors that differ in the last digits are one."""
-    single = one_each(terms)
-    if single is None or terms.shape[0] != terms.shape[1]:
-        return None
-    factor, column = single
-    if not np.array_equal(column, np.arange(len(column))) or np.ptp(factor) > EQUAL * abs(factor[0]):
-        return None
-    return float(factor[0])
-
-
 def _already_reset(
     table: Table, membrane: int, spike: int, terms: dict[int, Sparse], outputs: Mapping[str, Affine]
 ) -> tuple[int | None, None, float | None]:
     """A state input that holds the membrane after its reset, so that nothing is reset at its use."""
     pair = table.known.get((PRODUCT, min(membrane, spike), max(membrane, spike)))
-    states = [atom for atom in terms if table.atoms[atom].kind == INPUT_ATOM and _decay(terms[atom]) is not None]
-    factors = [] if pair is None else [
-        factor
-        for output in outputs.values()
-        if (factor := _multiple(output, {membrane: 1.0, pair: -1.0})) is not None
-    ]  # fmt: skip
+    states = [
+        atom for atom in terms if table.atoms[atom].kind == INPUT_ATOM and diagonal(terms[atom], EQUAL) is not None
+    ]
+    reset = {} if pair is None else {membrane: 1.0, pair: -1.0}
+    ratios = [_multiple(output, reset) for output in outputs.values() if reset]
+    factors = [ratio for ratio in ratios if ratio is not None]
     if not factors or not states:
         return None, None, None
     if len(states) > 1:
         shown = " and ".join(str(table.atoms[atom]) for atom in states)
         raise ModelError(f"could carry either of {shown}; {RESET}, say which with a product that resets it")
-    beta = _decay(terms.pop(states[0]))
+    beta = diagonal(terms.pop(states[0]), EQUAL)
     assert beta is not None
     return states[0], None, beta * factors[0]
 
@@ -181,8 +159,7 @@ def _require_output(outputs: Mapping[str, Affine], wanted: Mapping[int, float], 
 def _require_same_threshold(table: Table, previous: int, gate: int, spike: int) -> None:
     """A reset by a comparison of the state itself must use the comparison that makes the spikes."""
     old, new = (table.atoms[atom] for atom in (gate, spike))
-    same = np.array_equal(table.points[old.of[0]].theta, table.points[new.of[0]].theta) and old.strict == new.strict
-    if not same:
+    if not np.array_equal(old.theta, new.theta) or old.strict != new.strict:
         raise ModelError(f"resets {table.atoms[previous]} by another threshold than it fires by; {RESET}")
 
 
@@ -193,8 +170,8 @@ def _require_current(table: Table, atom: int, terms: Sparse, previous: int | Non
         raise ModelError(f"takes the membrane of {found}, not its spikes, as its input or without a reset; {RESET}")
     if found.kind == PRODUCT:
         raise ModelError(f"holds {found} in a way that is no reset; {RESET}")
-    factor = _decay(terms)
-    own = found.kind == SPIKE and table.points[found.of[0]].membrane == previous
+    factor = diagonal(terms, EQUAL)
+    own = found.kind == SPIKE and found.of == (previous,)
     state = found.kind == INPUT_ATOM and previous is None and found.size == table.atoms[membrane].size
     if factor is not None and factor < 0 and (own or state):
         raise ModelError(f"loses {-factor:g} for a spike of {found}, a reset by subtraction; {RESET}")

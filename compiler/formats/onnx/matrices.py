@@ -8,14 +8,15 @@ from __future__ import annotations
 import math
 import string
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from scipy import sparse
 
 from spikeloom.compiler.formats.kernels import block_diagonal, convolution
+from spikeloom.compiler.formats.onnx.affine import COEFFICIENT_LIMIT, Table
 from spikeloom.compiler.formats.onnx.file import Array, Node
-from spikeloom.compiler.formats.onnx.values import COEFFICIENT_LIMIT, Table, size_of
 from spikeloom.compiler.ir import Sparse
 
 Operands = Sequence[Any]
@@ -50,7 +51,7 @@ def _contract(table: Table, spelled: str, place: Array, weight: Array, columns: 
         order = sorted(range(len(labels)), key=lambda axis: every.index(labels[axis]))
         return array.transpose(order).reshape([sizes[label] if label in labels else 1 for label in every])
 
-    target = np.arange(size_of([sizes[label] for label in out])).reshape([sizes[label] for label in out])
+    target = np.arange(math.prod([sizes[label] for label in out])).reshape([sizes[label] for label in out])
     return _matrix(spread(target, out), spread(place, left), spread(weight, right), (target.size, columns))
 
 
@@ -102,16 +103,13 @@ def _reduce_matrix(node: Node, table: Table, operands: Operands, _which: int) ->
     shape, axes = operands[0].shape, _reduce_axes(node, operands)
     letters = string.ascii_lowercase[: len(shape)]
     out = "".join(label for axis, label in enumerate(letters) if axis not in axes)
-    share = 1.0 if node.op == "ReduceSum" else 1 / size_of([shape[axis] for axis in axes])
+    share = 1.0 if node.op == "ReduceSum" else 1 / math.prod([shape[axis] for axis in axes])
     return _contract(table, f"{letters},->{out}", _positions(operands[0]), np.array(share), operands[0].size)
 
 
 def _conv_matrix(node: Node, table: Table, operands: Operands, _which: int) -> Sparse:
-    return _convolved(node, table, operands[0], operands[1], int(node.attributes.get("group", 1)))
-
-
-def _convolved(node: Node, table: Table, data: Array, weight: Array, groups: int) -> Sparse:
     """Matrix of a convolution of each recording of a batch; its size is checked before."""
+    data, weight = operands
     if node.attributes.get("auto_pad", "NOTSET") not in ("NOTSET", "VALID") or node.attributes.get("ceil_mode", 0):
         raise ValueError("auto_pad and ceil_mode are not known")
     axes = data.ndim - 2
@@ -122,7 +120,7 @@ def _convolved(node: Node, table: Table, data: Array, weight: Array, groups: int
         stride=node.attributes.get("strides", [1] * axes),
         padding=list(zip(pads[:axes], pads[axes:], strict=True)),
         dilation=node.attributes.get("dilations", [1] * axes),
-        groups=groups,
+        groups=int(node.attributes.get("group", 1)),
     )
     table.room([len(data), math.prod(out) * math.prod(weight.shape[1:])], COEFFICIENT_LIMIT)
     return block_diagonal(matrix, len(data))
@@ -133,7 +131,8 @@ def _pool_matrix(node: Node, table: Table, operands: Operands, _which: int) -> S
     everywhere = node.op == "GlobalAveragePool"
     kernel = data.shape[2:] if everywhere else [int(n) for n in node.attributes["kernel_shape"]]
     ones = np.ones(table.room([data.shape[1], 1, *kernel]))
-    matrix = _convolved(node, table, data, ones, data.shape[1])
+    depthwise = replace(node, attributes={**node.attributes, "group": data.shape[1]})
+    matrix = _conv_matrix(depthwise, table, [data, ones], 0)
     inside = np.diff(matrix.indptr)
     held = np.full(len(inside), math.prod(kernel)) if node.attributes.get("count_include_pad", 0) else inside
     matrix.data = matrix.data / np.repeat(held, inside)

@@ -10,21 +10,19 @@ import math
 import os
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.formats.assemble import Layer, assemble
+from spikeloom.compiler.formats.assemble import Layer, ReadNetwork, assemble
 from spikeloom.compiler.formats.names import printable, unique_names
+from spikeloom.compiler.formats.onnx.affine import INPUT_ATOM, Affine, Table, as_affine, require_finite
 from spikeloom.compiler.formats.onnx.file import BOOL, DOUBLE, Declared, Graph, Model, read_model
-from spikeloom.compiler.formats.onnx.gates import as_affine
 from spikeloom.compiler.formats.onnx.lif import Neurons, is_output, neurons_of
-from spikeloom.compiler.formats.onnx.operators import require_finite
 from spikeloom.compiler.formats.onnx.run import inner, run
 from spikeloom.compiler.formats.onnx.steps import Unrolled, group, readout
-from spikeloom.compiler.formats.onnx.values import INPUT_ATOM, Affine, Table
 from spikeloom.compiler.ir import INPUT, Network
 from spikeloom.compiler.sensor_layout import sensor_layout
 
@@ -34,19 +32,9 @@ OPEN_STEPS = 3
 """Steps that are run where a file leaves their number open: two show what carries on, a third that it goes on so."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class OnnxNetwork:
-    """A network, and what was found about the file that it is from."""
-
-    network: Network  # float stage, in float64
-    steps: int  # that the file holds; 1 where state goes in and out
-    facts: tuple[str, ...]  # what was read and what was assumed, for people
-    sha256: str  # of the file and of its external data
-
-
 def read_onnx(
     path: str | os.PathLike[str], *, polarities: int | None = None, polarities_first: bool | None = None
-) -> OnnxNetwork:
+) -> ReadNetwork[Network]:
     """Read a network.
 
     Parameters
@@ -75,11 +63,11 @@ def read_onnx(
         raise ModelError(f"{path}: {error}") from error
 
 
-def _network(model: Model, polarities: int | None, polarities_first: bool | None) -> OnnxNetwork:
+def _network(model: Model, polarities: int | None, polarities_first: bool | None) -> ReadNetwork[Network]:
     table = Table(opset=model.opset)
     facts: list[str] = []
     graph = _undecided(model.graph, facts)
-    loops = any(node.op in ("Loop", "Scan") for node in graph.nodes)
+    loops = any(node.op == "Scan" for node in graph.nodes)
     shapes: dict[int, tuple[int, ...]] = {}
     given = {}
     for declared in graph.inputs:
@@ -87,7 +75,7 @@ def _network(model: Model, polarities: int | None, polarities_first: bool | None
         atom = table.atom(INPUT_ATOM, declared.name, math.prod(table.room(shape)), binary=declared.kind == BOOL)
         shapes[atom], given[declared.name] = shape, table.value(atom, shape)
     results = zip(graph.outputs, run(graph, {}, given, table), strict=True)
-    outputs = {name: as_affine(table, value) for name, value in results}
+    outputs = {name: as_affine(value) for name, value in results}
     for name, value in outputs.items():
         require_finite(value, f"output {printable(name)}: ")
     found = group(table, neurons_of(table, outputs), shapes)
@@ -108,7 +96,7 @@ def _network(model: Model, polarities: int | None, polarities_first: bool | None
     network = assemble(layers, sensor, voters, label)
     facts += _facts(model, table, found, outputs, names, words)
     facts.append(f"classes: the spikes of {names[voters]} in output {printable(counted)}")
-    return OnnxNetwork(network=network, steps=len(found.layers[0]), facts=tuple(facts), sha256=model.sha256)
+    return ReadNetwork(network=network, facts=tuple(facts), sha256=model.sha256)
 
 
 def _fixed(declared: Declared, graph: Graph, facts: list[str], *, loops: bool) -> tuple[int, ...]:

@@ -2,46 +2,44 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.names import printable
-from spikeloom.compiler.formats.onnx.evaluate import COMPARISONS, misfit
-from spikeloom.compiler.formats.onnx.file import Array, Graph, Node
-from spikeloom.compiler.formats.onnx.gates import as_affine, present
-from spikeloom.compiler.formats.onnx.operators import apply, require_finite, rows_of_all
-from spikeloom.compiler.formats.onnx.values import (
+from spikeloom.compiler.formats.onnx.affine import (
     INPUT_ATOM,
     MEMBRANE,
-    NODE_WORK,
     Affine,
     Table,
     Value,
+    as_affine,
     diagonal,
     picked,
-    size_of,
+    picked_of_all,
+    require_finite,
 )
+from spikeloom.compiler.formats.onnx.evaluate import misfit
+from spikeloom.compiler.formats.onnx.file import Graph, Node
+from spikeloom.compiler.formats.onnx.operators import MIRRORED, apply
 
 STEP_LIMIT = 4096
-"""Steps of a Scan or a Loop that are unrolled."""
+"""Steps of a Scan that are unrolled."""
 
 _MISFIT = (ArithmeticError, AttributeError, LookupError, MemoryError, TypeError, ValueError)
 """What numpy and scipy were seen to raise on operands or attributes that do not fit each other."""
 
-COMPARING = frozenset((*COMPARISONS, "Sign"))
+NODE_WORK = 2**14
+"""What running one operator counts for beside its elements."""
+
 _SHIFTS = frozenset(("Add", "Cast", "Div", "Identity", "Mul", "Sub"))
 """Operators that may stand between a membrane and its comparison, as in ``u - theta > 0``."""
 
 
 def run(graph: Graph, outer: Mapping[str, Value], given: Mapping[str, Value], table: Table) -> list[Value]:
-    """Values of a graph's outputs.
-
-    graph: Graph
-    outer: values around it, where it is inside another graph.
-    given: values of its inputs.
-    table: takes the membranes and comparisons that are met.
+    """Values of a graph's outputs from those `outer` ones around it and those `given` for its inputs.
 
     Raises ModelError naming the operator that cannot be evaluated, or is not affine, and why.
     """
@@ -79,51 +77,39 @@ def _set_apart(node: Node, name: str, value: Value, table: Table) -> Value:
     known = len(value.terms) == 1 and diagonal(value.terms[only]) == 1 and not np.any(value.bias)
     if known and table.atoms[only].kind in (INPUT_ATOM, MEMBRANE):
         return value
-    atom = table.atom(MEMBRANE, name, size_of(value.shape))
-    table.definitions[atom], table.nodes[atom] = value, str(node)
-    return table.value(atom, value.shape)
+    return table.value(table.atom(MEMBRANE, name, len(value.bias), definition=value, node=str(node)), value.shape)
 
 
 def _evaluate(node: Node, values: Mapping[str, Value], table: Table) -> list[Value]:
     operands = [values[name] if name else None for name in node.inputs]
     match node.op:
         case "Constant":
-            results: list[Value] = [_constant(node)]
+            numbers = [value for value in node.attributes.values() if not isinstance(value, str | Graph)]
+            if not numbers:
+                raise ModelError("holds no number")
+            return [np.asarray(numbers[0])]
         case "Shape" | "Size":
-            shape = np.array(present(operands[0]).shape, np.int64)
+            shape = np.array(as_affine(operands[0]).shape, np.int64)
             cut = shape[node.attributes.get("start", 0) : node.attributes.get("end", len(shape))]
-            results = [cut if node.op == "Shape" else np.array(size_of(present(operands[0]).shape))]
+            return [cut if node.op == "Shape" else np.array(np.prod(shape))]
         case "If":
-            results = run(node.attributes["then_branch" if _truth(operands[0]) else "else_branch"], values, {}, table)
-        case "Loop" | "Scan":
-            results = _repeated(node, values, operands, table)
-        case _ if inner(node):
-            raise ModelError("holds a graph; only If, Loop and Scan may")
-        case _:
-            results = apply(node, table, operands)
-    return results
-
-
-def _constant(node: Node) -> Array:
-    for name in ("value", "value_float", "value_int", "value_floats", "value_ints"):
-        if name in node.attributes:
-            return np.asarray(node.attributes[name])
-    raise ModelError("holds no number")
-
-
-def _truth(value: Value | None) -> bool:
-    if not isinstance(value, np.ndarray):
-        raise ModelError("depends on what varies; only a fixed choice or number of steps can be unrolled")
-    return bool(value.reshape(()))
+            if not isinstance(operands[0], np.ndarray):
+                raise ModelError("depends on what varies; only a fixed choice can be read")
+            return run(node.attributes["then_branch" if operands[0].reshape(()) else "else_branch"], values, {}, table)
+        case "Scan":
+            return _scanned(node, values, operands, table)
+    if inner(node):
+        raise ModelError("holds a graph; only If and Scan may")
+    return apply(node, table, operands)
 
 
 def _taken(value: Value, step: int, axis: int, table: Table) -> Value:
     """One step of a sequence."""
-    table.spend(size_of(value.shape))
+    table.spend(math.prod(value.shape))
     if isinstance(value, np.ndarray):
         return np.asarray(value.take(step, axis))
-    places = np.arange(size_of(value.shape)).reshape(value.shape).take(step, axis)
-    return picked(as_affine(table, value), places.ravel(), places.shape)
+    places = np.arange(math.prod(value.shape)).reshape(value.shape).take(step, axis)
+    return picked(value, places.ravel(), places.shape)
 
 
 def _stacked(parts: Sequence[Value], axis: int, table: Table) -> Value:
@@ -131,47 +117,31 @@ def _stacked(parts: Sequence[Value], axis: int, table: Table) -> Value:
     if all(isinstance(part, np.ndarray) for part in parts):
         return np.stack(parts, axis)  # type: ignore[arg-type]
     shape = table.room((len(parts), *parts[0].shape))
-    places = np.moveaxis(np.arange(1, size_of(shape) + 1).reshape(shape), 0, axis)
-    return rows_of_all([as_affine(table, part) for part in parts], places, size_of(shape) + 1)
+    places = np.moveaxis(np.arange(1, math.prod(shape) + 1).reshape(shape), 0, axis)
+    return picked_of_all([as_affine(part) for part in parts], places)
 
 
-def _repeated(node: Node, values: Mapping[str, Value], operands: list[Value | None], table: Table) -> list[Value]:
-    """A Loop or a Scan, unrolled.
-
-    The body of a Loop takes the number of the step and whether to go on before the states, and leaves the latter; that
-    of a Scan takes a slice of each sequence after them.
-    """
-    attributes, body, loops = node.attributes, node.attributes["body"], node.op == "Loop"
+def _scanned(node: Node, values: Mapping[str, Value], operands: list[Value | None], table: Table) -> list[Value]:
+    """A Scan, unrolled: its body takes the states and a slice of each sequence, and leaves states and results."""
+    attributes, body = node.attributes, node.attributes["body"]
     if any(any(attributes.get(f"scan_{side}_directions", ())) for side in ("input", "output")):
         raise ModelError("runs backwards in time; only forward can be lowered")
-    given = [value for value in operands[2 if loops else 0 :] if value is not None]
-    carried = len(given) - int(attributes.get("num_scan_inputs", 0))
+    given = [value for value in operands if value is not None]
+    carried = len(given) - int(attributes["num_scan_inputs"])
     state, sequences = given[:carried], given[carried:]
     taken = attributes.get("scan_input_axes", [0] * len(sequences))
-    going: Value | None = None
-    if loops:
-        count, going = operands[:2]
-        if not isinstance(count, np.ndarray):
-            raise ModelError("runs an unknown number of steps; only a fixed one can be unrolled")
-        steps = int(count.reshape(()))
-    else:
-        steps = sequences[0].shape[taken[0]]
+    steps = sequences[0].shape[taken[0]]
     if not 1 <= steps <= STEP_LIMIT:
         raise ModelError(f"runs {steps} steps, allowed are 1 to {STEP_LIMIT}; export a shorter recording")
-    if len(body.inputs) != len(given) + 2 * loops or len(body.outputs) < carried + loops:
+    if len(body.inputs) != len(given) or len(body.outputs) < carried:
         raise ModelError("has a body of other inputs or outputs than it carries; export it again")
     kept: list[list[Value]] = []
     for step in range(steps):
-        if going is not None and not _truth(going):
-            break
-        now: list[Value] = [np.array(step), np.array(True)] if loops else []
-        now += [*state, *(_taken(each, step, axis, table) for each, axis in zip(sequences, taken, strict=True))]
+        now = [*state, *(_taken(each, step, axis, table) for each, axis in zip(sequences, taken, strict=True))]
         results = run(body, values, dict(zip((each.name for each in body.inputs), now, strict=True)), table)
-        if loops:
-            going = results.pop(0)
         state = results[:carried]
         kept.append(results[carried:])
-    put = attributes.get("scan_output_axes", [0] * len(results[carried:]))
+    put = attributes.get("scan_output_axes", [0] * len(kept[0]))
     return [*state, *(_stacked(parts, axis, table) for parts, axis in zip(zip(*kept, strict=True), put, strict=True))]
 
 
@@ -214,13 +184,13 @@ def membranes(order: list[Node], outputs: tuple[str, ...], varying: set[str]) ->
             moving |= set(node.outputs)
     found = set()
     for node in order:
-        if node.op not in COMPARING:
+        if node.op not in MIRRORED:
             continue
         for name in node.inputs:
             place = name
             while place in moving and place in makers and makers[place].op in _SHIFTS:
                 before = [other for other in makers[place].inputs if other in moving]
-                only_compared = place not in outputs and all(user.op in COMPARING for user in users[place])
+                only_compared = place not in outputs and all(user.op in MIRRORED for user in users[place])
                 if len(before) != 1 or not only_compared:
                     break
                 if len(users[before[0]]) < 2 and before[0] not in outputs:

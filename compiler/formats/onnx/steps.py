@@ -10,8 +10,8 @@ import numpy as np
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.assemble import class_of_each
 from spikeloom.compiler.formats.names import printable
+from spikeloom.compiler.formats.onnx.affine import INPUT_ATOM, MEMBRANE, Affine, Table
 from spikeloom.compiler.formats.onnx.lif import EQUAL, RESET, Neurons
-from spikeloom.compiler.formats.onnx.values import INPUT_ATOM, MEMBRANE, Affine, Table
 from spikeloom.compiler.ir import INPUT, Sparse
 from spikeloom.compiler.types import IntArray
 
@@ -55,32 +55,22 @@ def group(table: Table, neurons: Sequence[Neurons], shapes: Mapping[int, tuple[i
 
 def _chains(table: Table, neurons: Sequence[Neurons]) -> list[list[Neurons]]:
     """Neurons that carry on from each other, in order of steps."""
-    after: dict[int, Neurons] = {}
-    for n in neurons:
-        if n.previous is not None and table.atoms[n.previous].kind == MEMBRANE:
-            if n.previous in after:
-                raise ModelError(
-                    f"{n.node}: carries on from {table.atoms[n.previous]}, as another layer does; "
-                    "each membrane belongs to one layer"
-                )
-            after[n.previous] = n
-    heads = [n for n in neurons if n.previous is None or table.atoms[n.previous].kind == INPUT_ATOM]
-    chains = []
-    for head in heads:
-        chain = [head]
+    after = {n.previous: n for n in neurons if n.previous is not None and table.atoms[n.previous].kind == MEMBRANE}
+    chains = [[n] for n in neurons if n.previous is None or table.atoms[n.previous].kind == INPUT_ATOM]
+    for chain in chains:
         while (following := after.get(chain[-1].membrane)) is not None:
             chain.append(following)
-        chains.append(chain)
-    for chain in chains:
-        if len(chain) != len(chains[0]):
-            raise ModelError(
-                f"{chain[0].node}: runs {len(chain)} steps, another layer {len(chains[0])}; all layers run together"
-            )
-        if len(chain) > 1 and chain[0].previous is not None:
+        if chain[0].previous is not None and len(chain) > 1:
             raise ModelError(
                 f"{chain[0].node}: several steps of a network whose state goes in and out; export one step alone, or "
                 "let the state start at zero"
             )
+    lengths = [len(chain) for chain in chains]
+    if sum(lengths) != len(neurons) or len(set(lengths)) > 1:
+        raise ModelError(
+            f"{chains[-1][0].node}: layers run {min(lengths)} to {max(lengths)} steps, or share a membrane; all layers "
+            "run together, and each membrane belongs to one"
+        )
     return chains
 
 
@@ -159,14 +149,12 @@ def _sources(
 def _require_like(layer: list[Neurons], step: int, every: list[dict[int, Sparse]]) -> None:
     """Whether a step is the first one again; a threshold and a bias that both moved are the same neuron."""
     first, this = layer[0], layer[step]
-    last = step + 1 == len(layer)
-    shift = first.theta - this.theta if last else 0.0
-    decays = [n.beta for n in layer[1:]]
+    shift = first.theta - this.theta if step + 1 == len(layer) else 0.0
     same = (
         set(every[0]) == set(every[step])
         and this.strict == first.strict
         and abs(this.theta + shift - first.theta) <= EQUAL
-        and this.beta == decays[0]
+        and this.beta == layer[1].beta
         and np.allclose(this.bias + shift, first.bias, rtol=EQUAL, atol=EQUAL)
         and all(_equal(every[0][source], every[step][source]) for source in every[0])
     )

@@ -39,7 +39,7 @@ import numpy as np
 from spikeloom.compiler.dynamics import Clocks
 from spikeloom.compiler.fixedpoint import ACCUMULATOR_MAX, CURRENT_MAX, DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT
 from spikeloom.compiler.formats.onnx.builder import Model, Nodes, Port, model_bytes, next_of, whole_recordings
-from spikeloom.compiler.formats.onnx.writer_layers import Layer, digits, plan
+from spikeloom.compiler.formats.onnx.writer_layers import Layer, digits, of_sign, plan
 from spikeloom.compiler.ir import INPUT
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.netlist_file import netlist_bytes
@@ -51,8 +51,7 @@ FORMS = ("step", "scan")
 def export(netlist: Netlist, form: str) -> bytes:
     """Content of the ONNX file of a netlist in a form, see the module; equal netlists give equal bytes.
 
-    Raises ModelError if its weights as dense matrices are more than a file holds, OptionError if the package ``onnx``
-    is not installed.
+    Raises ModelError if its weights as dense matrices are more than a file holds.
     """
     layers = plan(netlist)
     model = _chip_step(netlist, layers)
@@ -108,7 +107,7 @@ def _chip_step(netlist: Netlist, layers: tuple[Layer, ...]) -> Model:
         states.append(Port(name=f"{layer.name}.membrane", kind=layer.kind, shape=size))
         if layer.remembers:
             states.append(Port(name=f"{layer.name}.current", kind=layer.kind, shape=size))
-        spikes = [received[source.pre] for source in layer.sources]
+        spikes = [received[pre] for pre in layer.sources]
         flags += _integrate(graph, layer, spikes, windows[layer.depth])
     outputs = []
     if flags:
@@ -179,8 +178,8 @@ def _sums(graph: Nodes, layer: Layer, spikes: list[str], sign: int) -> str:
     """Synaptic sums, membrane units, of all weights (0) or magnitudes of those of a sign; empty where none feeds it."""
     name = f"{layer.name}/{('product', 'positive', 'negative')[sign]}"
     total, count = "", 0
-    for received, source in zip(spikes, layer.sources, strict=True):
-        for digit, factor in digits(source.weight(sign)):
+    for received, weights in zip(spikes, layer.sources.values(), strict=True):
+        for digit, factor in digits(of_sign(weights, sign)):
             own = f"{name}/{count}"
             product = graph.add("MatMulInteger", [received, graph.constant(f"{own}/weight", digit, np.int8)], own)
             if layer.kind is not np.int32:

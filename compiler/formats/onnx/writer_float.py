@@ -48,8 +48,7 @@ def export_float(checkpoint: Checkpoint, adjacency: FloatArray, form: str, *, gr
     adjacency: (taxels, taxels) float64; normalised propagation matrix, rounded to float32.
     graph_name: of the taxel graph, for the metadata.
 
-    Raises ModelError if its weights are more than a file holds, or it has clocks or decays of single layers;
-    OptionError if the package ``onnx`` is not installed.
+    Raises ModelError if its weights are more than a file holds, or it has clocks or decays of single layers.
     """
     if not checkpoint.dynamics.is_plain:
         raise ModelError(

@@ -36,20 +36,14 @@ Digit = tuple[npt.NDArray[np.int8], IntArray]
 """Matrix (sources, neurons) of a digit, and what a one in it adds to each neuron, in weight units."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Source:
-    """What a layer receives from another one, or from the input.
+Weights = tuple[IntArray, IntArray]
+"""Sums of positive and of negative effective weights, as magnitudes, (neurons of the source, neurons)."""
 
-    Sums of positive and of negative effective weights, as magnitudes, (neurons of the source, neurons).
-    """
 
-    pre: int  # index into ``netlist.layers``, or ``INPUT``
-    positive: IntArray
-    negative: IntArray
-
-    def weight(self, sign: int) -> IntArray:
-        """All weights (0), or magnitudes of the positive (1) or the negative ones (-1)."""
-        return {0: self.positive - self.negative, 1: self.positive, -1: self.negative}[sign]
+def of_sign(weights: Weights, sign: int) -> IntArray:
+    """All weights (0), or magnitudes of the positive (1) or the negative ones (-1)."""
+    positive, negative = weights
+    return {0: positive - negative, 1: positive, -1: negative}[sign]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -60,7 +54,7 @@ class Layer:
     name: str  # unique, without dots
     ids: IntArray  # compartments
     depth: int  # steps that it lags behind the data
-    sources: tuple[Source, ...]
+    sources: dict[int, Weights]  # by the index of a layer in ``netlist.layers``, or ``INPUT``
     decay_u: IntArray
     decay_v: IntArray
     threshold: IntArray  # membrane units, as the bias
@@ -129,17 +123,15 @@ def plan(netlist: Netlist) -> tuple[Layer, ...]:
     require_room(sum(counts[a] * counts[b] for b, a in pairs.tolist()))
     row = np.append(np.arange(netlist.n_inputs), place)[netlist.axon_source[axon]]
 
-    def source(a: int, b: int) -> Source:
-        sides = []
-        for side in (weight > 0, weight < 0):
-            found = (pre == a) & (post == b) & side
-            entries = np.abs(weight[found]), (row[found], place[target[found]])
-            sides.append(sparse.coo_array(entries, shape=(counts[a], counts[b])).toarray())
-        return Source(pre=a, positive=sides[0], negative=sides[1])
+    def weights(a: int, b: int) -> Weights:
+        found = [(pre == a) & (post == b) & side for side in (weight > 0, weight < 0)]
+        entries = [(np.abs(weight[side]), (row[side], place[target[side]])) for side in found]
+        positive, negative = (sparse.coo_array(each, shape=(counts[a], counts[b])).toarray() for each in entries)
+        return positive, negative
 
     bounds = one_step_bounds(netlist)
     layers = [
-        _layer(netlist, index, name, tuple(source(a, b) for b, a in pairs.tolist() if b == index), bounds)
+        _layer(netlist, index, name, {a: weights(a, b) for b, a in pairs.tolist() if b == index}, bounds)
         for index, name in enumerate(names)
         if counts[index]
     ]
@@ -150,7 +142,7 @@ def _layer(
     netlist: Netlist,
     index: int,
     name: str,
-    sources: tuple[Source, ...],
+    sources: dict[int, Weights],
     bounds: tuple[IntArray, IntArray],
 ) -> Layer:
     ids = netlist.compartments_of(index)
@@ -190,8 +182,8 @@ def _layer(
     )
 
 
-def _gathered(sources: tuple[Source, ...]) -> int:
+def _gathered(sources: dict[int, Weights]) -> int:
     """Bound of any partial result while products with digits are added up, membrane units."""
-    every = [digit for source in sources for sign in (0, 1, -1) for digit in digits(source.weight(sign))]
+    every = [digit for weights in sources.values() for sign in (0, 1, -1) for digit in digits(of_sign(weights, sign))]
     sums = [(np.abs(digit.astype(np.int64)).sum(axis=0) * factor).max(initial=0) for digit, factor in every]
     return int(sum(sums)) << MEMBRANE_SHIFT

@@ -12,7 +12,6 @@ import numpy as np
 
 from spikeloom.compiler.errors import NumericRangeError
 from spikeloom.compiler.formats.onnx import writer as onnx_writer
-from spikeloom.compiler.formats.onnx.builder import package
 from spikeloom.compiler.formats.onnx.writer_layers import Layer, plan
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.types import BoolArray, IntArray
@@ -54,8 +53,9 @@ class OnnxTrace:
 
 
 def open_session(model: bytes) -> Any:
-    """Load a model into onnxruntime's CPU provider; OptionError if ``onnxruntime`` is not installed."""
-    onnxruntime = package("onnxruntime")
+    """Load a model into onnxruntime's CPU provider."""
+    import onnxruntime  # slow to load, so only where it is used
+
     settings = onnxruntime.SessionOptions()
     settings.intra_op_num_threads = settings.inter_op_num_threads = 1
     settings.log_severity_level = 3
@@ -65,9 +65,8 @@ def open_session(model: bytes) -> Any:
 def prepare(netlist: Netlist, *, form: str = "scan") -> OnnxEngine:
     """Export a netlist in a form, ``step`` or ``scan``, and load the file's content.
 
-    Raises OptionError if ``onnx`` or ``onnxruntime`` is not installed, ModelError if a file cannot hold the network.
+    Raises ModelError if a file cannot hold the network.
     """
-    package("onnxruntime")  # before any work
     session = open_session(onnx_writer.export(netlist, form))
     return OnnxEngine(netlist=netlist, layers=plan(netlist), form=form, session=session)
 
