@@ -17,8 +17,7 @@ from made_files import checkpoint_bytes, state_dict
 from spikeloom.compiler.archive import npy_bytes, read_npy
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.files import SIZE_LIMIT
-from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
-from spikeloom.compiler.formats.spikeloom_checkpoint import content_digest
+from spikeloom.compiler.formats.checkpoint_reader import content_digest, read_checkpoint
 from spikeloom.models.graphs import Graph
 from spikeloom.models.networks.checkpoint import save_checkpoint
 

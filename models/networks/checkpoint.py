@@ -1,4 +1,4 @@
-"""Write our own checkpoint format; :mod:`formats.spikeloom_checkpoint` describes and reads it."""
+"""Write our own checkpoint format; :mod:`formats.checkpoint_reader` describes and reads it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from spikeloom.compiler.archive import npy_bytes, zip_bytes
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.dynamics import PLAIN, Dynamics
 from spikeloom.compiler.files import write_atomically
-from spikeloom.compiler.formats.spikeloom_checkpoint import FORMAT, VERSION, content_digest
+from spikeloom.compiler.formats.checkpoint_reader import FORMAT, VERSION, content_digest
 from spikeloom.compiler.formats.towers import arrays_of
 from spikeloom.compiler.ir import Form
 from spikeloom.compiler.systems import TACTILESGNET, Grid

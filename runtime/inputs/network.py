@@ -16,7 +16,7 @@ from spikeloom.compiler.archive import FORMATS, TRAINED, stated
 from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
-from spikeloom.compiler.formats.netx.layout import SUFFIX as NETX
+from spikeloom.compiler.formats.netx.reader import SUFFIX as NETX
 from spikeloom.compiler.formats.nir.reader import SUFFIX as NIR
 from spikeloom.compiler.formats.nir.reader import read_nir
 from spikeloom.compiler.formats.onnx.reader import SUFFIX as ONNX

@@ -1,10 +1,21 @@
-"""Read a network from lava-dl's ``.net`` files as what it is: integers, registers and all."""
+"""Read a network from lava-dl's ``.net`` files as what it is: integers, registers and all.
+
+``layer/0`` … each have ``type`` and ``shape``; ``dense`` and ``conv`` have ``weight`` (to, from) or (filters, channels,
+height, width), maybe ``bias``, and ``neuron`` with ``iDecay``, ``vDecay``, ``vThMant``, ``refDelay``. Shapes of images
+are (channels, height, width), as torch has them, and kernels are not turned round. Numbers are the chip's registers,
+but for three: ``iDecay`` is one more than the register of the current's decay, biases count whole weight steps, and
+weights of both signs are even.
+
+References
+----------
+.. [1] lava-dl 0.6.0, ``netx/README.md``, ``netx/hdf5.py`` and ``slayer/block/base.py``.
+"""
 
 from __future__ import annotations
 
 import math
 import os
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +25,9 @@ from spikeloom.compiler.dynamics import MOST_CLOCKS, MOST_STEPS, NO_CLOCKS, Cloc
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.fixedpoint import BIAS_MANTISSA_MAX, THRESHOLD_MANTISSA_MAX, kept_shares
 from spikeloom.compiler.formats.assemble import ReadNetwork
-from spikeloom.compiler.formats.hdf5 import AGAIN, Tree, read_hdf5
+from spikeloom.compiler.formats.hdf5 import AGAIN, Part, Tree, read_hdf5
 from spikeloom.compiler.formats.kernels import convolution
-from spikeloom.compiler.formats.netx.layout import BIAS_EXPONENT, DEFAULT_INPUT_WEIGHT, Block, blocks_of
+from spikeloom.compiler.formats.names import printable
 from spikeloom.compiler.ir import (
     INPUT,
     MANTISSA,
@@ -31,12 +42,63 @@ from spikeloom.compiler.ir import (
 from spikeloom.compiler.sensor_layout import sensor_layout
 from spikeloom.compiler.types import IntArray
 
+SUFFIX = ".net"
+
+BIAS_EXPONENT = 6
+"""Biases are in whole weight steps."""
+
+DEFAULT_INPUT_WEIGHT = 64
+
+LAYER_LIMIT = 1000
+
 NEURONS = ("CUBA", "LOIHI")
 
 ALLOWED = "input, flatten, dense, dense_rec and conv"
 
 OWN = "spikeloom"
 """Group of what our writer adds; others do not read it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Block(Part):
+    """One layer of a file, with its entries."""
+
+    number: int
+    type: str
+
+    def __str__(self) -> str:
+        return f"layer {self.number} ({printable(self.type) or 'no type'})"
+
+    def inner(self, key: str) -> Tree | None:
+        """A group of entries, or None."""
+        found = self.values.get(key)
+        return found if isinstance(found, dict) else None
+
+    def sizes(self) -> tuple[int, ...]:
+        """Its ``shape``."""
+        values = tuple(self.integers("shape").ravel().tolist())
+        if not 1 <= len(values) <= 3 or min(values) < 1 or max(values) > 2**20:
+            raise self.fail(f"has the shape {list(values[:4])}, which is none; {AGAIN}")
+        return values
+
+
+def blocks_of(tree: Tree) -> list[Block]:
+    """Layers in the content of a file; ModelError if it is none."""
+    layers = tree.get("layer")
+    if not isinstance(layers, dict) or not layers:
+        raise ModelError(f"has no layers, so it is no netx file; {AGAIN}")
+    if len(layers) > LAYER_LIMIT or set(layers) != {str(number) for number in range(len(layers))}:
+        raise ModelError(f"has layers that are not numbered from 0 to {len(layers) - 1}; {AGAIN}")
+    found = []
+    for number in range(len(layers)):
+        entries = layers[str(number)]
+        if not isinstance(entries, dict):
+            raise ModelError(f"layer {number} is no group; {AGAIN}")
+        kind = entries.get("type")
+        while isinstance(kind, list) and kind:
+            kind = kind[0]
+        found.append(Block(number=number, type=kind[:20] if isinstance(kind, str) else "", values=entries))
+    return found
 
 
 def read_netx(

@@ -5,14 +5,12 @@ That is for constants, and for positions of elements: an operator that only move
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.formats.names import one_line
 from spikeloom.compiler.formats.onnx.affine import Table
 from spikeloom.compiler.formats.onnx.file import BOOL, Array, Node, decimal
 
@@ -61,7 +59,8 @@ SMALL = 64
 def evaluate(node: Node, table: Table, operands: Operands) -> list[Array]:
     """Results of an operator in ``NUMERIC`` on numbers, in float64, int64 or bool.
 
-    Raises ModelError if a result is too large, or operands and attributes do not fit each other.
+    Raises ModelError if a result is too large; the package onnx raises nearly anything on operands or attributes that
+    do not fit each other.
     """
     if node.op == "Cast" and operands[0] is not None:
         to = int(node.attributes["to"])
@@ -71,48 +70,32 @@ def evaluate(node: Node, table: Table, operands: Operands) -> list[Array]:
     shapes_of(node, table, operands)
     if node.op in LOOPS:
         table.spend(LOOP_WORK * max(operand.size for operand in operands if operand is not None))
-    with _of_onnx():
-        if node.op == "GatherElements":  # which the reference takes too long for
-            data, indices = map(np.asarray, operands)
-            axis = range(data.ndim)[int(node.attributes.get("axis", 0))]
-            sizes = [data.shape[axis] if place == axis else length for place, length in enumerate(indices.shape)]
-            return [np.take_along_axis(data[tuple(map(slice, sizes))], indices, axis)]
-        return [np.asarray(result) for result in _operator(node, table).run(*operands)]
-
-
-def misfit(error: Exception) -> ModelError:
-    """What is said of an operator whose operands or attributes do not fit each other."""
-    return ModelError(f"cannot be evaluated ({one_line(error)}); export it again")
-
-
-@contextmanager
-def _of_onnx() -> Iterator[None]:
-    """The package onnx raises nearly anything on operands or attributes that do not fit each other."""
-    try:
-        yield
-    except Exception as error:
-        raise misfit(error) from error
+    if node.op == "GatherElements":  # which the reference takes too long for
+        data, indices = map(np.asarray, operands)
+        axis = range(data.ndim)[int(node.attributes.get("axis", 0))]
+        sizes = [data.shape[axis] if place == axis else length for place, length in enumerate(indices.shape)]
+        return [np.take_along_axis(data[tuple(map(slice, sizes))], indices, axis)]
+    return [np.asarray(result) for result in _operator(node, table).run(*operands)]
 
 
 def shapes_of(node: Node, table: Table, operands: Operands) -> list[tuple[int, ...]]:
     """Shapes of an operator's results, as ONNX infers them.
 
-    Raises ModelError if one of them is too large, before anything is allocated for it, or unknown, or operands and
-    attributes do not fit each other.
+    Raises ModelError if one of them is too large, before anything is allocated for it, or unknown; else as
+    :func:`evaluate`.
     """
     from onnx import defs, helper, numpy_helper, shape_inference
 
-    with _of_onnx():
-        proto = _operator(node, table).onnx_node
-        given = {name: operand for name, operand in zip(proto.input, operands, strict=True) if operand is not None}
-        types = {
-            name: helper.make_tensor_type_proto(helper.np_dtype_to_tensor_dtype(array.dtype), array.shape)
-            for name, array in given.items()
-        }
-        small = {name: numpy_helper.from_array(array) for name, array in given.items() if array.size <= SMALL}
-        schema = defs.get_schema(node.op, table.opset, "")
-        version = helper.make_opsetid("", table.opset)
-        inferred = shape_inference.infer_node_outputs(schema, proto, types, small, opset_imports=[version])
+    proto = _operator(node, table).onnx_node
+    given = {name: operand for name, operand in zip(proto.input, operands, strict=True) if operand is not None}
+    types = {
+        name: helper.make_tensor_type_proto(helper.np_dtype_to_tensor_dtype(array.dtype), array.shape)
+        for name, array in given.items()
+    }
+    small = {name: numpy_helper.from_array(array) for name, array in given.items() if array.size <= SMALL}
+    schema = defs.get_schema(node.op, table.opset, "")
+    version = helper.make_opsetid("", table.opset)
+    inferred = shape_inference.infer_node_outputs(schema, proto, types, small, opset_imports=[version])
     found = []
     for name in proto.output:
         kind = inferred[name].tensor_type if name in inferred else None

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from spikeloom.compiler.errors import ModelError
-from spikeloom.compiler.formats.names import printable
+from spikeloom.compiler.formats.names import one_line, printable
 from spikeloom.compiler.formats.onnx.affine import (
     INPUT_ATOM,
     MEMBRANE,
@@ -21,15 +21,11 @@ from spikeloom.compiler.formats.onnx.affine import (
     picked_of_all,
     require_finite,
 )
-from spikeloom.compiler.formats.onnx.evaluate import misfit
 from spikeloom.compiler.formats.onnx.file import Graph, Node
 from spikeloom.compiler.formats.onnx.operators import MIRRORED, apply
 
 STEP_LIMIT = 4096
 """Steps of a Scan that are unrolled."""
-
-_MISFIT = (ArithmeticError, AttributeError, LookupError, MemoryError, TypeError, ValueError)
-"""What numpy and scipy were seen to raise on operands or attributes that do not fit each other."""
 
 NODE_WORK = 2**14
 """What running one operator counts for beside its elements."""
@@ -57,8 +53,8 @@ def run(graph: Graph, outer: Mapping[str, Value], given: Mapping[str, Value], ta
                 values[name] = _set_apart(node, name, result, table) if name in held else result
         except ModelError as error:
             raise ModelError(f"{node}: {error}") from error
-        except _MISFIT as error:
-            raise ModelError(f"{node}: {misfit(error)}") from error
+        except Exception as error:  # onnx, numpy and scipy raise nearly anything on operands that do not fit each other
+            raise ModelError(f"{node}: cannot be evaluated ({one_line(error)}); export it again") from error
         for name in reads(node):
             if last[name] == index and name not in outer and name not in graph.outputs:
                 values.pop(name, None)

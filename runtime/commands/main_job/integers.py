@@ -9,8 +9,7 @@ from typing import Any
 
 from spikeloom.compiler import Options, __version__, compile_network, write_netlist
 from spikeloom.compiler.errors import OptionError
-from spikeloom.compiler.formats.netx.layout import SUFFIX
-from spikeloom.compiler.formats.netx.reader import read_netx
+from spikeloom.compiler.formats.netx.reader import SUFFIX, read_netx
 from spikeloom.compiler.invariants import verify
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.runtime.inputs.compilation import parse_cores
